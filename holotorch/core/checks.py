@@ -1,0 +1,77 @@
+"""Argument checks in one voice: what was expected, what came, what to change."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+
+class SamplingWarning(UserWarning):
+    """A grid is too coarse or too small for what it is asked to carry; the message says what would do."""
+
+
+def positive(name: str, value: float, unit: str = "") -> float:
+    """Return ``value`` as float, or raise ValueError unless it is finite and above zero."""
+    number = finite(name, value, unit)
+    if number <= 0:
+        raise ValueError(f"{name} must be above zero{_in(unit)}, got {value!r}")
+    return number
+
+
+def finite(name: str, value: float, unit: str = "") -> float:
+    """Return ``value`` as float, or raise TypeError for what is no number and ValueError for NaN and infinity."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name} must be a number{_in(unit)}, got {type(value).__name__} {value!r}") from None
+    if not math.isfinite(number):
+        raise ValueError(f"{name} must be finite{_in(unit)}, got {value!r}")
+    return number
+
+
+def wavelengths(values: float | Sequence[float]) -> tuple[float, ...]:
+    """Return wavelengths in metres as a tuple, one per channel; a single number means one channel."""
+    items = [values] if isinstance(values, int | float) else list(values)
+    if not items:
+        raise ValueError("wavelengths must hold at least one value in metres, got none")
+    return tuple(positive("wavelength", item, "metres") for item in items)
+
+
+def field(name: str, value: Tensor, shape: tuple[int, ...], *, complex_valued: bool = True) -> None:
+    """Raise unless ``value`` is a tensor of the wanted kind whose last axes are ``shape``.
+
+    Raises:
+        TypeError: It is no tensor, or real where complex is needed, or the other way round.
+        ValueError: Its trailing axes differ from ``shape``, which is (C, H, W) or (H, W).
+    """
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
+    axes = "(C, H, W)" if len(shape) == 3 else "(H, W)"
+    if tuple(value.shape[-len(shape) :]) != shape:
+        raise ValueError(f"{name} must end in {axes} = {shape}, got {tuple(value.shape)}")
+    real(name, value) if not complex_valued else _complex(name, value)
+
+
+def real(name: str, value: Tensor) -> None:
+    """Raise TypeError unless ``value`` is a real floating-point tensor."""
+    if not isinstance(value, Tensor) or not value.is_floating_point():
+        raise TypeError(f"{name} must be a real floating-point tensor, got {getattr(value, 'dtype', type(value))}")
+
+
+def all_finite(name: str, value: Tensor) -> None:
+    """Raise ValueError naming the first NaN or infinite element, if any."""
+    bad = ~torch.isfinite(value)
+    if bad.any():
+        index = tuple(int(i) for i in bad.nonzero()[0])
+        count = int(bad.sum())
+        raise ValueError(f"{name} must be finite, but element {index} is {value[index].item()} ({count} in all)")
+
+
+def _complex(name: str, value: Tensor) -> None:
+    if not value.is_complex():
+        raise TypeError(f"{name} must be complex (complex64 or complex128), got {value.dtype}; use torch.complex")
+
+
+def _in(unit: str) -> str:
+    return f" in {unit}" if unit else ""

@@ -1,0 +1,75 @@
+"""Grid: the sampling of a plane."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+from holotorch.core.fourier import good_length
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Samples of a plane, ``shape`` = (H, W) of them, ``pitch`` = (y, x) metres apart; one number means both axes.
+
+    The optical axis lies on sample ``n // 2`` of each axis, so an even grid reaches one sample further to the
+    negative side.
+
+    Raises:
+        TypeError: A size is no integer or a pitch no number.
+        ValueError: A size below 1, or a pitch that is not finite and positive.
+    """
+
+    shape: tuple[int, int]
+    pitch: tuple[float, float]
+
+    def __init__(self, shape: tuple[int, int] | int, pitch: tuple[float, float] | float):
+        sizes = (shape, shape) if isinstance(shape, int) else tuple(shape)
+        steps = (pitch, pitch) if isinstance(pitch, int | float) else tuple(pitch)
+        if len(sizes) != 2 or len(steps) != 2:
+            raise ValueError(f"grid needs shape (H, W) and pitch (y, x), got shape {shape!r} and pitch {pitch!r}")
+        for size in sizes:
+            if isinstance(size, bool) or not isinstance(size, int):
+                raise TypeError(f"grid shape must hold integers, got {shape!r}")
+            if size < 1:
+                raise ValueError(f"grid shape must be at least (1, 1), got {shape!r}")
+        object.__setattr__(self, "shape", (sizes[0], sizes[1]))
+        object.__setattr__(self, "pitch", tuple(checks.positive("grid pitch", step, "metres") for step in steps))
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Height and width in metres, a whole pitch per sample."""
+        return self.shape[0] * self.pitch[0], self.shape[1] * self.pitch[1]
+
+    def coordinates(self, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
+        """Positions (y, x) in metres, float64 of shape [H, 1] and [1, W], zero on sample ``n // 2``."""
+        y, x = (
+            (torch.arange(size, dtype=torch.float64, device=device) - size // 2) * step
+            for size, step in zip(self.shape, self.pitch, strict=True)
+        )
+        return y[:, None], x[None, :]
+
+    def frequencies(self, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
+        """Spatial frequencies (fy, fx) in cycles per metre, FFT order, float64 of shape [H, 1] and [1, W]."""
+        fy, fx = (
+            torch.fft.fftfreq(size, step, dtype=torch.float64, device=device)
+            for size, step in zip(self.shape, self.pitch, strict=True)
+        )
+        return fy[:, None], fx[None, :]
+
+    def padded(self, factor: float | tuple[float, float]) -> "Grid":
+        """The same pitch on at least ``factor`` (per axis, >= 1) times the samples, a length that FFTs like.
+
+        A factor of exactly 1 leaves that axis as it is.
+        """
+        factors = (factor, factor) if isinstance(factor, int | float) else tuple(factor)
+        for value in factors:
+            if not (math.isfinite(value) and value >= 1):
+                raise ValueError(f"pad must be a finite factor of at least 1 (1 = periodic), got {factor!r}")
+        height, width = (
+            size if value == 1 else good_length(math.ceil(size * value - 1e-9))
+            for size, value in zip(self.shape, factors, strict=True)
+        )
+        return Grid((height, width), self.pitch)

@@ -1,0 +1,74 @@
+"""Operators as explicit matrices acting on flattened (H, W) arrays, float64, without FFTs and without holotorch."""
+
+import numpy as np
+
+
+def frequencies(n, pitch):
+    """DFT frequencies in FFT order: 0, 1, ..., (n-1)//2, -(n//2), ..., -1 over n * pitch."""
+    k = np.arange(n)
+    return np.where(k <= (n - 1) // 2, k, k - n) / (n * pitch)
+
+
+def dft(n):
+    """DFT matrix exp(-2 pi i m k / n), not normalised."""
+    k = np.arange(n)
+    return np.exp(-2j * np.pi * np.outer(k, k) / n)
+
+
+def centred_unitary_dft(shape):
+    """DFT matrix over (H, W) with the origin of both sides on sample n // 2, divided by the root of the size."""
+    h, w = shape
+    axes = [np.exp(-2j * np.pi * np.outer(np.arange(n) - n // 2, np.arange(n) - n // 2) / n) for n in (h, w)]
+    return np.kron(axes[0], axes[1]) / np.sqrt(h * w)
+
+
+def spectral_filter(shape, transfer):
+    """Zero-pad to the transfer function's size, DFT, multiply, inverse DFT, crop; as one matrix."""
+    (h, w), (big_h, big_w) = shape, transfer.shape
+    forward = np.kron(dft(big_h)[:, :h], dft(big_w)[:, :w])
+    inverse = np.kron(dft(big_h).conj()[:h], dft(big_w).conj()[:w]) / (big_h * big_w)
+    return inverse @ (transfer.reshape(-1, 1) * forward)
+
+
+def angular_spectrum_transfer(shape, pitch, wavelength, distance, band_limit):
+    """exp(2 pi i z sqrt(1/lambda^2 - f^2)), decaying with |z| where evanescent; band limit per sample."""
+    fy, fx = (frequencies(n, p) for n, p in zip(shape, pitch, strict=True))
+    transfer = np.zeros(shape, complex)
+    for i, v in enumerate(fy):
+        for j, u in enumerate(fx):
+            square = wavelength**-2 - u * u - v * v
+            if square >= 0:
+                value = np.exp(2j * np.pi * distance * np.sqrt(square))
+            else:
+                value = np.exp(-2 * np.pi * abs(distance) * np.sqrt(-square))
+            slope = abs(distance) / max(np.sqrt(abs(square)), 1e-300)  # metres of shift per unit of frequency
+            inside = slope * abs(v) <= shape[0] * pitch[0] / 2 and slope * abs(u) <= shape[1] * pitch[1] / 2
+            transfer[i, j] = value if inside or not band_limit or distance == 0 else 0
+    return transfer
+
+
+def fresnel_transfer(shape, pitch, wavelength, distance):
+    """exp(ikz) exp(-i pi lambda z f^2)."""
+    fy, fx = (frequencies(n, p) for n, p in zip(shape, pitch, strict=True))
+    square = fy[:, None] ** 2 + fx[None, :] ** 2
+    return np.exp(2j * np.pi * distance / wavelength) * np.exp(-1j * np.pi * wavelength * distance * square)
+
+
+def convolution(shape, kernel):
+    """out[p] = sum_q kernel[p - q + centre] in[q], zero outside, as a matrix."""
+    (h, w), (kh, kw) = shape, kernel.shape
+    matrix = np.zeros((h * w, h * w))
+    for y in range(h):
+        for x in range(w):
+            for v in range(h):
+                for u in range(w):
+                    i, j = y - v + kh // 2, x - u + kw // 2
+                    if 0 <= i < kh and 0 <= j < kw:
+                        matrix[y * w + x, v * w + u] = kernel[i, j]
+    return matrix
+
+
+def heat_kernel(sigma, size):
+    """exp(-d^2 / sigma^2) on size x size taps, thesis Eq. 4.2."""
+    d = np.arange(size) - size // 2
+    return np.exp(-(d[:, None] ** 2 + d[None, :] ** 2) / sigma**2)
