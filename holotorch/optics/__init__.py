@@ -1,0 +1,18 @@
+"""Propagation of light between parallel planes."""
+
+from holotorch.optics.geometry import diffraction_angle, least_padding, unaliased_distance
+from holotorch.optics.kernels import angular_spectrum_kernel, carrier, fresnel_kernel
+from holotorch.optics.propagators import AngularSpectrum, Fraunhofer, Fresnel, SpectralFilter
+
+__all__ = [
+    "AngularSpectrum",
+    "Fraunhofer",
+    "Fresnel",
+    "SpectralFilter",
+    "angular_spectrum_kernel",
+    "carrier",
+    "diffraction_angle",
+    "fresnel_kernel",
+    "least_padding",
+    "unaliased_distance",
+]
