@@ -1,0 +1,163 @@
+"""ThermalCrosstalk: heat that spreads between the pixels of a phased array."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from holotorch.core import checks
+
+_SMALLEST_TAP = 1e-12  # of the centre tap; smaller ones would only make denormal numbers, which are slow
+_WIDEST = 100  # pixels; K is singular to double precision long before
+_DROPPED_TAP = 1e-6  # of the centre tap; with no size given, the kernel ends where the taps fall below this
+
+
+class ThermalCrosstalk(nn.Module):
+    """Convolution of heater phases (or temperatures) with the heat kernel exp(-d^2 / sigma^2), zero outside the chip.
+
+    The centre tap is 1 and the kernel is not normalised: a heated pixel warms its neighbours on top of itself. Heat
+    that would land outside the array leaves it. Linear, real, dtype and device follow the input [..., H, W].
+
+    Args:
+        sigma_px: Width in pixels, 0 to 100; 0 means no crosstalk. The thesis's chip has 0.66.
+        size: Odd number of taps per axis. By default as many as have a tap above 1e-6 of the centre; the thesis always
+            takes 7, which loses 2.3 % of the heat at sigma 2.0 (see :attr:`lost_heat`).
+
+    Raises:
+        ValueError: ``sigma_px`` outside its range, ``size`` even or below 1; in a call: an array smaller than the
+            ``size`` that was asked for.
+
+    Source: thesis Eqs. 4.2-4.4.
+    """
+
+    def __init__(self, sigma_px: float, size: int | None = None):
+        super().__init__()
+        sigma = checks.finite("sigma_px", sigma_px, "pixels")
+        if not 0 <= sigma <= _WIDEST:
+            raise ValueError(f"sigma_px must lie between 0 and {_WIDEST} pixels, got {sigma_px!r}")
+        if size is not None and (size < 1 or size % 2 == 0):
+            raise ValueError(f"crosstalk size must be an odd number of taps of at least 1, got {size!r}")
+        radius = _needed_radius(sigma) if size is None else size // 2
+        taps = [[_tap(offset, sigma)] for offset in range(-radius, radius + 1)]
+        self._set_factors(torch.tensor(taps, dtype=torch.float64), torch.tensor(taps, dtype=torch.float64).T)
+        self.sigma_px, self.size_is_given = sigma, size is not None
+
+    @classmethod
+    def from_patch(cls, patch: Tensor) -> "ThermalCrosstalk":
+        """Build from a measured response: the temperature rises [h, w], odd sizes, around one heated centre pixel.
+
+        The patch is divided by its centre, so any unit will do; it need not be symmetric. Raises ValueError for even
+        sizes, NaN, negative rises or a centre that is not the warmest.
+        """
+        checks.real("patch", patch)
+        checks.all_finite("patch", patch)
+        if patch.ndim != 2 or patch.shape[0] % 2 == 0 or patch.shape[1] % 2 == 0:
+            raise ValueError(f"patch must have two odd sizes (h, w) around the heated pixel, got {tuple(patch.shape)}")
+        centre = patch[patch.shape[0] // 2, patch.shape[1] // 2]
+        if patch.min() < 0 or centre <= 0 or centre < patch.max():
+            raise ValueError(
+                f"patch must hold rises >= 0 with the heated centre the warmest, got centre {centre.item():g}, "
+                f"minimum {patch.min().item():g}, maximum {patch.max().item():g}"
+            )
+        self = cls(0.0)
+        self._set_factors(patch.detach().to("cpu", torch.float64) / centre.item())
+        self.sigma_px, self.size_is_given = math.nan, True
+        return self
+
+    @property
+    def kernel(self) -> Tensor:
+        """The two-dimensional kernel, float64 [h, w], centre 1."""
+        kernel = torch.ones(1, 1, dtype=torch.float64)
+        for factor in self._factors:
+            kernel = kernel * torch.tensor(factor, dtype=torch.float64)
+        return kernel
+
+    @property
+    def total(self) -> float:
+        """Sum of the kernel: the phase of a pixel in a uniformly heated array, per unit of heater phase."""
+        return self.kernel.sum().item()
+
+    @property
+    def lost_heat(self) -> float:
+        """Share of the Gaussian's heat that falls outside the taps kept; NaN for a measured patch."""
+        if math.isnan(self.sigma_px):
+            return math.nan
+        reach = _needed_radius(self.sigma_px) + 4
+        whole = sum(_tap(offset, self.sigma_px) for offset in range(-reach, reach + 1)) ** 2
+        return max(0.0, 1 - self.total / whole)
+
+    def forward(self, phase: Tensor) -> Tensor:
+        """Spread ``phase``, real [..., H, W]; the result has the same shape and unit."""
+        return self._apply_factors(phase, self._factors)
+
+    def adjoint(self, phase: Tensor) -> Tensor:
+        """Apply the transpose: correlation with the kernel, zero outside; equals forward for a symmetric kernel."""
+        flipped = tuple(tuple(row[::-1] for row in factor[::-1]) for factor in reversed(self._factors))
+        return self._apply_factors(phase, flipped)
+
+    def extra_repr(self) -> str:
+        """Width and number of taps, for ``print(module)``."""
+        return f"sigma_px={self.sigma_px:g}, taps={tuple(self.kernel.shape)}"
+
+    def _set_factors(self, *factors: Tensor) -> None:
+        # Taps as numbers, not buffers: they follow the input's dtype and device by themselves, at full precision.
+        self._factors = tuple(tuple(map(tuple, factor.tolist())) for factor in factors)
+
+    def _apply_factors(self, phase: Tensor, factors: tuple) -> Tensor:
+        checks.real("phase", phase)
+        if phase.ndim < 2:
+            raise ValueError(f"phase must end in (H, W), got {tuple(phase.shape)}")
+        size = max(len(factor) for factor in factors), max(len(factor[0]) for factor in factors)
+        if self.size_is_given and (size[0] > phase.shape[-2] or size[1] > phase.shape[-1]):
+            raise ValueError(
+                f"crosstalk kernel of {size[0]} x {size[1]} px is larger than the array of {phase.shape[-2]} x "
+                f"{phase.shape[-1]} px; give a smaller size or a larger grid"
+            )
+        for factor in factors:
+            phase = _ShiftAndAdd.apply(phase, factor)
+        return phase
+
+
+class _ShiftAndAdd(torch.autograd.Function):
+    """Convolution by summing shifted copies, one per tap.
+
+    On CPUs conv2d with a single channel spends 70 ms on the forward and backward pass of 3 x 512 x 512 px where this
+    takes under 2 ms; conv2d is its twin in the tests.
+    """
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(image: Tensor, taps: tuple[tuple[float, ...], ...]) -> Tensor:
+        height, width = image.shape[-2:]
+        rows, columns = len(taps), len(taps[0])
+        padded = functional.pad(image, (columns // 2, columns // 2, rows // 2, rows // 2))
+        result = torch.zeros_like(image)
+        for i, row in enumerate(taps):
+            for j, tap in enumerate(row):
+                if tap:
+                    y, x = rows - 1 - i, columns - 1 - j
+                    result.add_(padded[..., y : y + height, x : x + width], alpha=tap)
+        return result
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.taps = inputs[1]
+
+    @staticmethod
+    def backward(ctx, *gradients: Tensor):
+        flipped = tuple(row[::-1] for row in ctx.taps[::-1])
+        return _ShiftAndAdd.apply(gradients[0], flipped), None
+
+
+def _tap(offset: int, sigma: float) -> float:
+    if offset == 0:
+        return 1.0
+    ratio = offset / sigma if sigma > 0 else math.inf
+    tap = math.exp(-ratio * ratio)
+    return tap if tap >= _SMALLEST_TAP else 0.0
+
+
+def _needed_radius(sigma: float) -> int:
+    return max(0, math.ceil(sigma * math.sqrt(-math.log(_DROPPED_TAP))) - 1)

@@ -1,0 +1,54 @@
+"""PhasedArray: heater phases to the field that a nanophotonic phased array emits."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from holotorch.core import checks
+from holotorch.core.complex import phasor
+
+# The thesis's phase shifter turns red light of 630 nm by pi when it is 175 K above ambient.
+REFERENCE_WAVELENGTH = 630e-9
+REFERENCE_RESPONSE = math.pi / 175
+
+
+class PhasedArray(nn.Module):
+    """Thermally driven phased array with uniform amplitude: one heater and one antenna per pixel and colour.
+
+    Args:
+        wavelengths: In metres, one per channel.
+        crosstalk: Module that spreads heater phases [..., C, H, W], such as ``ThermalCrosstalk``.
+
+    A phase is a temperature rise above ambient times ``response`` (rad/K), which falls with the wavelength:
+    (pi/175 rad/K)(630 nm / wavelength). The thesis's text says "proportional" under Eq. 4.1; its three printed values
+    are inversely proportional.
+    """
+
+    def __init__(self, wavelengths: float | Sequence[float], crosstalk: nn.Module):
+        super().__init__()
+        self.wavelengths, self.crosstalk = checks.wavelengths(wavelengths), crosstalk
+
+    @property
+    def response(self) -> tuple[float, ...]:
+        """Phase per temperature rise in rad/K, one value per channel."""
+        return tuple(REFERENCE_RESPONSE * REFERENCE_WAVELENGTH / wavelength for wavelength in self.wavelengths)
+
+    def forward(self, phase: Tensor) -> Tensor:
+        """Emitted field, complex [..., C, H, W], for heater phases in rad, real [..., C, H, W]."""
+        return phasor(self.crosstalk(phase))
+
+    def temperature(self, phase: Tensor) -> Tensor:
+        """Temperature rise in kelvin that gives ``phase`` [..., C, H, W]; of the chip for a phase after spreading."""
+        return phase / self._response_like(phase)
+
+    def phase(self, temperature: Tensor) -> Tensor:
+        """Phase in rad that a temperature rise in kelvin, [..., C, H, W], gives; inverse of :meth:`temperature`."""
+        return temperature * self._response_like(temperature)
+
+    def _response_like(self, value: Tensor) -> Tensor:
+        checks.real("phase or temperature", value)
+        if value.ndim < 3 or value.shape[-3] != len(self.wavelengths):
+            raise ValueError(f"expected (C, H, W) with C = {len(self.wavelengths)}, got {tuple(value.shape)}")
+        return torch.tensor(self.response, dtype=value.dtype, device=value.device)[:, None, None]
