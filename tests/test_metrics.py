@@ -1,0 +1,60 @@
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from holotorch.metrics import psnr, ssim
+
+
+def pair(dtype=torch.float64, shape=(2, 3, 40, 33)):
+    reference = torch.rand(*shape, dtype=dtype)
+    return (reference + 0.1 * torch.randn_like(reference)).clamp(0, 1), reference
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-5), (torch.float64, 1e-12)])
+@pytest.mark.parametrize("data_range", [1.0, 255.0])
+def test_both_equal_scikit_image(dtype, tolerance, data_range):
+    image, reference = (tensor * data_range for tensor in pair(dtype))
+    quality, noise = ssim(image, reference, data_range=data_range), psnr(image, reference, data_range=data_range)
+    assert quality.shape == noise.shape == (2, 3) and quality.dtype == dtype
+    for b in range(2):
+        for c in range(3):
+            x, y = image[b, c].double().numpy(), reference[b, c].double().numpy()
+            wanted = structural_similarity(
+                x, y, data_range=data_range, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, full=True
+            )[1][5:-5, 5:-5].mean()
+            assert quality[b, c].item() == pytest.approx(wanted, abs=tolerance)
+            wanted = peak_signal_noise_ratio(y, x, data_range=data_range)
+            assert noise[b, c].item() == pytest.approx(wanted, rel=tolerance)
+
+
+def test_equal_images():
+    image = pair()[1]
+    assert torch.equal(ssim(image, image, data_range=1.0), torch.ones(2, 3, dtype=torch.float64))
+    assert torch.isinf(psnr(image, image, data_range=1.0)).all()
+    dark = torch.zeros(20, 20, dtype=torch.float64)
+    assert ssim(dark, dark, data_range=1.0).item() == 1
+
+
+def test_ssim_has_a_right_gradient():
+    image, reference = pair(shape=(1, 12, 13))
+    assert torch.autograd.gradcheck(lambda x: ssim(x, reference, data_range=1.0), (image.requires_grad_(),))
+
+
+def test_ssim_needs_its_window():
+    ok = torch.rand(11, 11)
+    ssim(ok, ok, data_range=1.0)
+    with pytest.raises(ValueError, match="at least 11 x 11 px, got 8 x 8; psnr has no such limit"):
+        ssim(torch.rand(8, 8), torch.rand(8, 8), data_range=1.0)
+    assert np.isfinite(psnr(torch.rand(8, 8), torch.rand(8, 8), data_range=1.0).item())
+
+
+def test_refuses_pairs_that_do_not_match():
+    with pytest.raises(ValueError, match="share a shape"):
+        ssim(torch.rand(12, 12), torch.rand(12, 13), data_range=1.0)
+    with pytest.raises(TypeError, match="real floating-point"):
+        psnr(torch.zeros(12, 12, dtype=torch.uint8), torch.rand(12, 12), data_range=1.0)
+    with pytest.raises(ValueError, match="data_range must be above zero"):
+        psnr(torch.rand(12, 12), torch.rand(12, 12), data_range=0.0)
+    with pytest.raises(TypeError):
+        psnr(torch.rand(12, 12), torch.rand(12, 12))  # type: ignore[call-arg]
