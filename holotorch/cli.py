@@ -1,0 +1,123 @@
+"""The ``holotorch`` command. Each subcommand loads only what it needs; ``--help`` loads nothing."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from holotorch import __version__
+
+OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one subcommand and return its exit status: 0 done, 2 bad input, 1 failure, 130 interrupted and saved."""
+    options = _parser().parse_args(arguments)
+    try:
+        return options.action(options)
+    except ValueError as error:
+        # ConfigError and everything that the library's own checks refuse.
+        print(error, file=sys.stderr)
+        return BAD_INPUT
+    except MemoryError as error:
+        print(f"out of memory: {error}; use a smaller grid or padding", file=sys.stderr)
+        return FAILED
+    except OSError as error:
+        print(f"{error.filename or 'file'}: {error.strerror or error}", file=sys.stderr)
+        return FAILED
+    except KeyboardInterrupt:
+        print("interrupted before anything could be saved", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _run(options: argparse.Namespace) -> int:
+    from holotorch.experiments.config import load_config
+
+    settings = load_config(options.config, options.overrides)
+    from holotorch.experiments.run import next_folder, run
+
+    return _finish(run, settings, options.out or next_folder(Path(options.config).stem))
+
+
+def _demo(options: argparse.Namespace) -> int:
+    from holotorch.experiments.config import load_config
+
+    settings = load_config(_bundled_config("demo.yaml"))
+    from holotorch.experiments.run import next_folder, run
+
+    return _finish(run, settings, options.out or next_folder("demo"))
+
+
+def _finish(run, settings, out: Path) -> int:
+    complete = run(settings, out)
+    print(out / "report.html")
+    return OK if complete else INTERRUPTED
+
+
+def _check(options: argparse.Namespace) -> int:
+    from holotorch.experiments.config import load_config
+
+    settings = load_config(options.config, options.overrides)
+    from holotorch.experiments.pec import build
+    from holotorch.experiments.plan import plan, plan_text
+
+    experiment = build(settings)
+    print(plan_text(experiment, plan(experiment)))
+    return OK
+
+
+def _report(options: argparse.Namespace) -> int:
+    from holotorch.experiments.report import write_report
+
+    out = options.out or (options.folders[0] if len(options.folders) == 1 else Path()) / "report.html"
+    write_report(options.folders, out)
+    print(out)
+    return OK
+
+
+def _doctor(_: argparse.Namespace) -> int:
+    from holotorch.experiments.doctor import diagnose
+
+    return OK if diagnose() else FAILED
+
+
+def _bundled_config(name: str) -> Path:
+    """A configuration of the project: inside an installed package, or beside the package in a checkout."""
+    package = Path(__file__).parent
+    return next(path for path in (package / "configs" / name, package.parent / "configs" / name) if path.is_file())
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="holotorch", description="Differentiable optics for VR and AR displays.")
+    parser.add_argument("--version", action="version", version=f"holotorch {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    demo = commands.add_parser("demo", help="a small real run on a bundled photograph, under a minute")
+    demo.add_argument("--out", type=Path, help="folder of the run (default: runs/demo-001, ...)")
+    demo.set_defaults(action=_demo)
+
+    run = commands.add_parser("run", help="one experiment: pictures, numbers and a report in a folder of its own")
+    _add_config(run)
+    run.add_argument("--out", type=Path, help="folder of the run (default: runs/CONFIG-001, ...)")
+    run.set_defaults(action=_run)
+
+    check = commands.add_parser("check", help="validate a configuration, print its plan and physics, compute nothing")
+    _add_config(check)
+    check.set_defaults(action=_check)
+
+    report = commands.add_parser("report", help="one HTML page for one or more run folders")
+    report.add_argument("folders", nargs="+", type=Path, metavar="DIR")
+    report.add_argument("--out", type=Path, help="file to write (default: DIR/report.html; ./report.html for several)")
+    report.set_defaults(action=_report)
+
+    doctor = commands.add_parser("doctor", help="check the installation and print what repairs it")
+    doctor.set_defaults(action=_doctor)
+    return parser
+
+
+def _add_config(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("config", metavar="CONFIG", help="YAML file, such as configs/pec/fourier.yaml")
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="settings to change, such as grid.pitch=8um")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Runs described by YAML files: validation, run folders, reports."""

@@ -1,0 +1,126 @@
+"""Is this installation sound? One line per question: OK, or the command that repairs it."""
+
+import platform
+import re
+import socket
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+from packaging.requirements import Requirement
+
+
+def diagnose() -> bool:
+    """Print one line per check and return whether all of them passed."""
+    sound = True
+    for name, check in _CHECKS.items():
+        try:
+            lines = list(check())
+        except Exception as error:  # a doctor reports what it meets, whatever it is
+            lines = [(False, f"{type(error).__name__}: {error}")]
+        for passed, text in lines:
+            sound &= passed
+            print(f"{'OK  ' if passed else 'FAIL'}  {name}: {text}")
+    return sound
+
+
+def _python() -> Iterator[tuple[bool, str]]:
+    fine = sys.version_info >= (3, 11)
+    yield fine, f"Python {platform.python_version()}" + ("" if fine else "; install Python 3.11 or newer")
+
+
+def _packages() -> Iterator[tuple[bool, str]]:
+    for line in metadata.requires("holotorch") or []:
+        wanted = Requirement(line)
+        if wanted.marker and "extra" in str(wanted.marker):
+            continue
+        found = _version(wanted.name)
+        if found and wanted.specifier.contains(found, prereleases=True):
+            yield True, f"{wanted.name} {found}"
+        else:
+            yield False, f"{wanted} needed, {found or 'nothing'} found; run: pip install '{wanted}'"
+
+
+def _devices() -> Iterator[tuple[bool, str]]:
+    import torch
+
+    yield True, f"CPU with {torch.get_num_threads()} threads"
+    for i in range(torch.cuda.device_count()):
+        yield True, f"CUDA {i}: {torch.cuda.get_device_name(i)}"
+    if not torch.cuda.is_available():
+        yield True, "no CUDA device; everything runs on the CPU"
+
+
+def _opencv() -> Iterator[tuple[bool, str]]:
+    wanted = "opencv-contrib-python-headless"
+    names = {dist.metadata["Name"].lower() for dist in metadata.distributions()}
+    others = sorted(name for name in names if name.startswith("opencv") and name != wanted)
+    if others:
+        repair = f"pip uninstall -y {' '.join(others)} && pip install --force-reinstall --no-deps {wanted}"
+        yield False, f"{', '.join(others)} beside {wanted} overwrite each other; run: {repair}"
+    else:
+        yield True, f"{wanted} alone"
+
+
+def _fft() -> Iterator[tuple[bool, str]]:
+    import torch
+
+    x = torch.randn(60, 75, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
+    error = (torch.fft.ifft2(torch.fft.fft2(x)) - x).abs().max().item()
+    fine = error < 1e-5
+    yield fine, f"round trip error {error:.1e}" + ("" if fine else "; run: pip install --force-reinstall torch")
+
+
+def _exr() -> Iterator[tuple[bool, str]]:
+    import OpenEXR
+
+    pixels = np.linspace(0, 1, 12, dtype=np.float32).reshape(3, 4)
+    with tempfile.TemporaryDirectory() as folder:
+        path = str(Path(folder) / "check.exr")
+        OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": pixels}).write(path)
+        fine = np.array_equal(OpenEXR.File(path).channels()["Y"].pixels, pixels)
+    yield fine, "round trip exact" if fine else "round trip differs; run: pip install --force-reinstall OpenEXR"
+
+
+def _udp() -> Iterator[tuple[bool, str]]:
+    with socket.socket(type=socket.SOCK_DGRAM) as receiver, socket.socket(type=socket.SOCK_DGRAM) as sender:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(2)
+        sender.sendto(b"holotorch", receiver.getsockname())
+        fine = receiver.recv(64) == b"holotorch"
+    yield fine, "loopback works" if fine else "loopback garbles packets; look at the firewall"
+
+
+def _extras() -> Iterator[tuple[bool, str]]:
+    missing: dict[str, list[str]] = {}
+    for line in metadata.requires("holotorch") or []:
+        wanted = Requirement(line)
+        match = re.search(r"""extra == ['"](\w+)['"]""", str(wanted.marker))
+        if match and _version(wanted.name) is None:
+            missing.setdefault(match[1], []).append(wanted.name)
+    for extra, names in missing.items():
+        yield True, f"{', '.join(names)} not installed (optional); to add: pip install 'holotorch[{extra}]'"
+    if not missing:
+        yield True, "all installed"
+
+
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+_CHECKS: dict[str, Callable[[], Iterator[tuple[bool, str]]]] = {
+    "python": _python,
+    "package": _packages,
+    "device": _devices,
+    "opencv": _opencv,
+    "fft": _fft,
+    "exr": _exr,
+    "udp": _udp,
+    "extra": _extras,
+}

@@ -1,0 +1,96 @@
+"""Validation errors in words that say what was expected, what came and what to write instead."""
+
+import difflib
+import math
+import re
+from typing import Any
+
+from pydantic import BaseModel
+
+from holotorch.experiments.source import Key, Source
+
+_EXPECTED = {
+    "int_": "a whole number",
+    "float_": "a number",
+    "finite_number": "a finite number",
+    "string_": "text",
+    "tuple_": "a list",
+    "model_": "settings, as in {key: value}",
+    "dict_": "settings, as in {key: value}",
+}
+
+
+def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
+    """One line for one entry of ``ValidationError.errors()``: place, key, what was expected, what came, a hint."""
+    key = _written_key(source, entry["loc"])
+    kind, given = entry["type"], entry["input"]
+    if kind == "extra_forbidden":
+        siblings = _names_at(model, entry["loc"][:-1])
+        return source.mistake(key, "unknown setting" + nearest(str(key[-1]), siblings))
+    if kind == "missing":
+        return source.mistake(key, "required, but missing")
+    if kind in ("union_tag_not_found", "union_tag_invalid"):
+        wanted = entry["ctx"].get("expected_tags", "")
+        options = re.findall(r"'([^']+)'", wanted) or _tags_at(model, entry["loc"])
+        got = given.get("kind", "none") if isinstance(given, dict) else given
+        hint = nearest(str(got), options)
+        return source.mistake((*key, "kind"), f"expected one of {', '.join(options)}, got {got!r}{hint}")
+    if kind == "picture":
+        return source.mistake(key, entry["msg"])
+    wanted = next((text for start, text in _EXPECTED.items() if kind.startswith(start)), None)
+    wanted = wanted or entry["msg"].replace("Input should be ", "").removeprefix("expected ")
+    near = difflib.get_close_matches(str(given), re.findall(r"'([^']+)'", wanted), 1)
+    shown = "nothing" if given is None else "NaN" if isinstance(given, float) and math.isnan(given) else repr(given)
+    return source.mistake(key, f"expected {wanted}, got {shown}" + (f"; did you mean {near[0]!r}?" if near else ""))
+
+
+def position(mistake: str) -> tuple[int, int]:
+    """Line and column of a mistake, so that a file's mistakes come in its order and the arguments' after them."""
+    match = re.search(r":(\d+):(\d+): ", mistake)
+    return (int(match[1]), int(match[2])) if match else (2**31, 0)
+
+
+def _written_key(source: Source, location: tuple[str | int, ...]) -> Key:
+    """The location without the union tags that pydantic puts between a section and its settings."""
+    key: list[str | int] = []
+    value: Any = source.data
+    for i, part in enumerate(location):
+        tagged = isinstance(value, dict) and value.get("kind") == part and i < len(location) - 1
+        if tagged and part not in value:
+            continue
+        if isinstance(part, int) and not isinstance(value, list):
+            break  # a single value that stands for a list
+        key.append(part)
+        try:
+            value = value[part]  # type: ignore[index]
+        except (KeyError, IndexError, TypeError):
+            value = None
+    return tuple(key)
+
+
+def _names_at(model: type[BaseModel], location: tuple[str | int, ...]) -> list[str]:
+    options: list[type[BaseModel]] = [model]
+    for part in location:
+        fields = [option.model_fields[str(part)] for option in options if str(part) in option.model_fields]
+        if not fields:  # a union tag
+            options = [option for option in options if part in _literals(option)]
+            continue
+        annotation = fields[0].annotation
+        parts = getattr(annotation, "__args__", (annotation,))
+        options = [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
+    return [name for option in options for name in option.model_fields]
+
+
+def _tags_at(model: type[BaseModel], location: tuple[str | int, ...]) -> list[str]:
+    field = model.model_fields[str(location[-1])]
+    return [tag for option in getattr(field.annotation, "__args__", ()) for tag in _literals(option)]
+
+
+def _literals(option: type[BaseModel]) -> tuple[str, ...]:
+    return getattr(option.model_fields["kind"].annotation, "__args__", ()) if "kind" in option.model_fields else ()
+
+
+def nearest(word: str, options: list[str]) -> str:
+    """A hint: the option nearest to ``word``, or all of them."""
+    near = difflib.get_close_matches(word, options, 1)
+    return f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(options)}" if options else ""

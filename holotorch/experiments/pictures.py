@@ -1,0 +1,53 @@
+"""Figures of a run, drawn without any global state of matplotlib."""
+
+import io
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from torch import Tensor
+
+
+def channel_maps(values: Tensor, names: Sequence[str], label: str, colormap: str, limits=(None, None)) -> bytes:
+    """PNG of maps [C, H, W] side by side with one colour bar each, ``label`` giving the unit."""
+    figure = Figure(figsize=(3.6 * len(names), 3.2), layout="constrained")
+    for i, (name, panel) in enumerate(zip(names, values.numpy(), strict=True)):
+        axes = figure.add_subplot(1, len(names), i + 1)
+        drawn = axes.imshow(panel, cmap=colormap, vmin=limits[0], vmax=limits[1], interpolation="nearest")
+        axes.set_title(name, fontsize=10)
+        axes.set_xticks([])
+        axes.set_yticks([])
+        figure.colorbar(drawn, ax=axes, label=label, shrink=0.85)
+    return _png(figure)
+
+
+def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[int, float]]) -> bytes:
+    """PNG of the loss per colour [steps + 1, C] (left axis, relative to the start) and of SSIM (right axis)."""
+    figure = Figure(figsize=(7.2, 3.2), layout="constrained")
+    axes = figure.add_subplot()
+    relative = (losses / losses[0].clamp(min=1e-30)).cpu().numpy()
+    for i, name in enumerate(names):
+        axes.semilogy(np.maximum(relative[:, i], 1e-16), label=name, linewidth=1.2, color=_LINES[i % len(_LINES)])
+    axes.set_xlabel("step")
+    axes.set_ylabel("loss / loss at the start")
+    axes.grid(alpha=0.3)
+    handles, labels = axes.get_legend_handles_labels()
+    if checked:
+        right = axes.twinx()
+        right.plot(*zip(*checked, strict=True), "k--", linewidth=1.2, label="SSIM")
+        right.set_ylabel("mean SSIM")
+        right.set_ylim(0, 1)
+        more = right.get_legend_handles_labels()
+        handles, labels = handles + more[0], labels + more[1]
+    axes.legend(handles, labels, fontsize=8, loc="center right")
+    return _png(figure)
+
+
+_LINES = ("#c0392b", "#27864a", "#2867b2")
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(buffer)
+    return buffer.getvalue()

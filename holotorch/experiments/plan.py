@@ -1,0 +1,144 @@
+"""What a run will do, what it will cost and what its physics says, before it starts."""
+
+import math
+from typing import Any
+
+import torch
+
+from holotorch.core.grid import Grid
+from holotorch.experiments.config import NearFieldSettings
+from holotorch.experiments.pec import PECExperiment
+from holotorch.optics import diffraction_angle, unaliased_distance
+
+# Seconds per sample of one evaluation on two CPU cores, measured at 128 to 512 px; the printed time is a guide only.
+_PIXEL_SECONDS, _FFT_SECONDS = 13e-9, 0.45e-9
+_BASE_BYTES = 480e6  # the interpreter with torch, OpenCV and matplotlib loaded
+
+
+def plan(experiment: PECExperiment) -> dict[str, Any]:
+    """Choices with their reasons, cost and physics, as plain JSON values."""
+    settings, light = experiment.settings, experiment.settings.propagator
+    grid = experiment.grid
+    padded = grid.padded(experiment.pad)
+    samples = len(experiment.wavelengths) * math.prod(padded.shape)
+    pixels = len(experiment.wavelengths) * math.prod(grid.shape)
+    evaluations = (2 if settings.solver.kind == "apg" else 1) * settings.solver.max_steps
+    seconds = evaluations * (_PIXEL_SECONDS * pixels + _FFT_SECONDS * samples * math.log2(max(2, samples)))
+    taps = experiment.crosstalk.kernel.shape[0]
+    size_rule = "as given" if settings.modulator.kernel_size else "chosen so that no tap above 1e-6 is dropped"
+    return {
+        "propagator": light.kind,
+        "padding": {"factor": experiment.pad, "samples": list(padded.shape), "reason": _padding_reason(experiment)},
+        "crosstalk": {"taps": taps, "lost_heat": experiment.crosstalk.lost_heat, "reason": size_rule},
+        "start": {"kind": experiment.start, "reason": _START_REASONS[experiment.start]},
+        "loss": "intensity" + (" at its best scale, since light may leave the window" if experiment.isolated else ""),
+        "device": str(experiment.device),
+        "precision": "complex64 in the solver, complex128 in the judge",
+        "predicted_evaluations_at_most": evaluations,
+        "predicted_seconds_at_most": round(seconds, 2),
+        "predicted_peak_bytes": round(_BASE_BYTES + 120 * samples + 200 * pixels + _judge_bytes(experiment)),
+        "physics": _physics(experiment, grid),
+        "notes": _notes(experiment, grid),
+    }
+
+
+def _notes(experiment: PECExperiment, grid: Grid) -> list[str]:
+    """Where the model stops being valid, in words."""
+    found = []
+    light = experiment.settings.propagator
+    if isinstance(light, NearFieldSettings):
+        longest = max(experiment.wavelengths)
+        limit = unaliased_distance(grid, longest, experiment.pad)
+        if light.boundary == "periodic":
+            found.append(
+                "periodic boundary: the array repeats without end, as in the thesis; a single chip forms another "
+                "image, scored as 'isolated' beside it"
+            )
+        if abs(light.distance) > limit:
+            found.append(
+                f"the kernel is undersampled beyond {limit * 1e3:.3g} mm at {longest * 1e9:.0f} nm and this grid and "
+                f"padding; at {light.distance * 1e3:.4g} mm the model aliases"
+            )
+    lost = experiment.crosstalk.lost_heat
+    if lost > 0.01:
+        found.append(f"{100 * lost:.1f} % of the heat falls outside the kernel's taps; leave modulator.kernel_size out")
+    dark = [i for i, on in enumerate(experiment.lit.tolist()) if not on]
+    if dark:
+        found.append(f"colour {', '.join(map(str, dark))} of the picture is black: its light source stays off")
+    return found
+
+
+def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
+    """The plan in words for a display engineer."""
+    settings, physics, crosstalk = experiment.settings, values["physics"], values["crosstalk"]
+    height, width = settings.grid.shape
+    colours = "colour" if len(experiment.lit) == 3 else "grey"
+    waves = ", ".join(f"{wave * 1e9:.4g} nm" for wave in experiment.wavelengths)
+    lines = [
+        f"Picture    {settings.target.image}, {colours}, on {height} x {width} px",
+        f"Array      {physics['width_mm']:.4g} x {physics['height_mm']:.4g} mm (width x height); heat spreads with "
+        f"sigma {settings.modulator.sigma_px:g} px over {crosstalk['taps']} taps ({crosstalk['reason']})",
+        f"Light      {waves}; field of view {_listed(physics['field_of_view_deg'], '.2f')} deg across",
+        f"Propagator {values['propagator']}, {values['padding']['reason']}",
+    ]
+    if "distance_mm" in physics:
+        lines.append(
+            f"Image      at {physics['distance_mm']:g} mm; smallest spot {_listed(physics['spot_um'])} um, sampled "
+            f"every {physics['pitch_um'][1]:.4g} um; alias-free up to {_listed(physics['alias_free_mm'])} mm"
+        )
+    lines += [
+        f"Solver     {settings.solver.kind}, at most {settings.solver.max_steps} steps from a "
+        f"{values['start']['kind']} start ({values['start']['reason']})",
+        f"Cost       at most {values['predicted_evaluations_at_most']} evaluations, about "
+        f"{values['predicted_seconds_at_most']:.2g} s on two cores, {values['predicted_peak_bytes'] / 1e9:.2g} GB of "
+        "memory at the peak",
+    ]
+    lines += [f"Note       {note}" for note in values["notes"]]
+    return "\n".join(lines)
+
+
+def _listed(values: list[float], form: str = ".3g") -> str:
+    return " / ".join(f"{value:{form}}" for value in values)
+
+
+_START_REASONS = {
+    "hot": "phases uniform on [0, 2 pi): light everywhere",
+    "cool": "uniform on [0, 2 pi / sum K): the same after spreading, at less heat",
+    "flat": "uniform on [0, 1): a nearly plane wave keeps its light in the window",
+}
+
+
+def _padding_reason(experiment: PECExperiment) -> str:
+    light = experiment.settings.propagator
+    if not isinstance(light, NearFieldSettings):
+        return "unpadded: the far field of the array itself"
+    if light.boundary == "periodic":
+        return "unpadded: the periodic model of the thesis"
+    chosen = "as given" if light.pad else "the least that keeps all light from wrapping around"
+    return f"padded {experiment.pad:.3g} times ({chosen})"
+
+
+def _physics(experiment: PECExperiment, grid: Grid) -> dict[str, Any]:
+    light, waves = experiment.settings.propagator, experiment.wavelengths
+    values: dict[str, Any] = {
+        "height_mm": grid.extent[0] * 1e3,
+        "width_mm": grid.extent[1] * 1e3,
+        "pitch_um": [step * 1e6 for step in grid.pitch],
+        "field_of_view_deg": [2 * math.degrees(diffraction_angle(grid, wave)[1]) for wave in waves],
+        "phase_response_rad_per_K": list(experiment.array.response),
+        "kernel_sum": experiment.crosstalk.total,
+    }
+    if isinstance(light, NearFieldSettings):
+        values |= {
+            "distance_mm": light.distance * 1e3,
+            "spot_um": [wave * abs(light.distance) / grid.extent[1] * 1e6 for wave in waves],
+            "alias_free_mm": [unaliased_distance(grid, wave, experiment.pad) * 1e3 for wave in waves],
+        }
+    return values
+
+
+def _judge_bytes(experiment: PECExperiment) -> float:
+    light = experiment.settings.propagator
+    if not isinstance(light, NearFieldSettings):
+        return 0.0
+    return 6.0 * torch.complex128.itemsize * experiment.judge_samples()

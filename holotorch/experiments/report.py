@@ -1,0 +1,185 @@
+"""One static HTML page for one or more run folders: pictures inline, no scripts, opens from disk years later."""
+
+import base64
+import html
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from holotorch.io.files import write_text
+
+_PICTURES = {
+    "target": "Target",
+    "none": "No correction",
+    "basic_ipec": "Basic iterative correction",
+    "corrected": "Corrected",
+}
+_FIGURES = {
+    "phase": "Heater phases, before the heat spreads",
+    "temperature": "Temperature rise of the chip above ambient, after the heat has spread",
+    "convergence": "Convergence of the solver",
+}
+_METHOD_NAMES = {"none": "no correction", "basic_ipec": "basic IPEC", "corrected": "corrected"}
+
+
+def write_report(folders: Sequence[Path], path: Path) -> None:
+    """Write the page of ``folders`` to ``path``. ValueError for a folder that holds no run."""
+    runs = [_Run(folder) for folder in folders]
+    body = [_comparison(runs)] if len(runs) > 1 else []
+    body += [_section(run, alone=len(runs) == 1) for run in runs]
+    title = "holotorch: " + (runs[0].title if len(runs) == 1 else f"{len(runs)} runs")
+    text = _PAGE.format(title=html.escape(title), style=_STYLE, body="\n".join(body))
+    write_text(path, text)
+
+
+class _Run:
+    """What a run folder says of itself."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        names = [name for name in ("summary.json", "interrupted.json") if (folder / name).is_file()]
+        if not names:
+            raise ValueError(f"{folder} holds no run: neither summary.json nor interrupted.json is there")
+        try:
+            self.summary = json.loads((folder / names[0]).read_text())
+            self.plan = json.loads((folder / "plan.json").read_text())
+            self.env = json.loads((folder / "env.json").read_text())
+            self.config = (folder / "config.yaml").read_text()
+            self.methods: dict[str, dict[str, Any]] = self.summary["methods"]
+        except (OSError, KeyError, ValueError) as error:
+            raise ValueError(f"{folder} holds a run that cannot be read: {error}") from None
+        self.title = folder.resolve().name
+
+    def picture(self, name: str) -> str:
+        path = self.folder / "images" / f"{name}.png"
+        if not path.is_file():
+            return ""
+        return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
+
+
+def _comparison(runs: list[_Run]) -> str:
+    rows = [[html.escape(run.title), *_numbers(run.methods["corrected"])] for run in runs]
+    return "<h1>Runs</h1>" + _table(["run", *_COLUMNS], rows)
+
+
+def _section(run: _Run, *, alone: bool) -> str:
+    status = "" if run.summary["status"] == "complete" else f' <span class="warn">{run.summary["status"]}</span>'
+    parts = [f"<h1>{html.escape(run.title)}{status}</h1>"]
+    parts.append(_table(["method", *_COLUMNS], [[_METHOD_NAMES[n], *_numbers(m)] for n, m in run.methods.items()]))
+    parts.append(f"<p>{_verdict(run)}</p>")
+    parts.append('<div class="row">')
+    for name, caption in _PICTURES.items():
+        if source := run.picture(name):
+            parts.append(_figure(source, f"{caption}{_score(run, name)}", "picture"))
+    parts.append("</div>")
+    for name, caption in _FIGURES.items():
+        if source := run.picture(name):
+            parts.append(_figure(source, caption, "wide"))
+    parts.append("<h2>Plan</h2>" + _table(["", ""], _plan_rows(run.plan), head=False))
+    for note in run.plan["notes"]:
+        parts.append(f'<p class="warn">{html.escape(note)}</p>')
+    command = f"holotorch run {run.title}/config.yaml --out ANOTHER-FOLDER"
+    repeat = f"Repeat with <code>{html.escape(command)}</code>. Configuration:<pre>{html.escape(run.config)}</pre>"
+    parts.append(f"<h2>How to repeat</h2>{repeat}")
+    parts.append(_table(["", ""], [[html.escape(k), html.escape(_plain(v))] for k, v in run.env.items()], head=False))
+    return "\n".join(parts)
+
+
+_COLUMNS = (
+    "SSIM",
+    "PSNR (dB)",
+    "SSIM, isolated chip",
+    "light in window",
+    "peak rise (degC)",
+    "heating power (K per pixel)",
+    "evaluations",
+    "seconds",
+)
+
+
+def _numbers(method: dict[str, Any]) -> list[str]:
+    isolated = method.get("isolated", {}).get("ssim_mean")
+    return [
+        _fixed(method.get("ssim_mean"), 4),
+        _fixed(method.get("psnr_mean"), 1),
+        _fixed(isolated, 3) if isolated is not None else "",
+        f"{100 * _lit_mean(method['efficiency']):.0f} %",
+        _fixed(max(method["peak_temperature_rise_K"]), 0),
+        _fixed(_lit_mean(method["heating_power_K_per_pixel"]), 0),
+        str(method["evaluations"]),
+        _fixed(method["seconds"], 2),
+    ]
+
+
+def _verdict(run: _Run) -> str:
+    corrected = run.methods["corrected"]
+    hottest = max(corrected["peak_temperature_rise_K"])
+    steps, done = max(corrected["steps"]), all(corrected["converged"])
+    stop = "met its stop rule" if done else "stalled" if any(corrected["stalled"]) else "ran out of steps"
+    return (
+        f"The hottest pixel of the corrected hologram is {hottest:.0f} degC above ambient. The solver took {steps} "
+        f"steps and {stop}. Peak memory {run.summary['peak_memory_bytes'] / 1e9:.2f} GB. Heating power is the mean "
+        "temperature rise that the heaters alone would cause, before the heat spreads; times the number of pixels and "
+        "the chip's watts per kelvin it is the power in watts. Scores are of a float64 simulation of the phases in "
+        "arrays/phase.npy."
+    )
+
+
+def _plan_rows(plan: dict[str, Any]) -> list[list[str]]:
+    shown = {name.replace("_", " "): _plain(value) for name, value in plan.items() if name != "notes"}
+    return [[html.escape(name), html.escape(text)] for name, text in shown.items()]
+
+
+def _score(run: _Run, name: str) -> str:
+    value = run.methods.get(name, {}).get("ssim_mean")
+    return "" if value is None else f": SSIM {value:.3f}"
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, dict):
+        return "; ".join(f"{k.replace('_', ' ')}: {_plain(v)}" for k, v in value.items())
+    if isinstance(value, list):
+        return ", ".join(_plain(item) for item in value)
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
+def _fixed(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _lit_mean(values: list[float]) -> float:
+    lit = [value for value in values if value > 0]
+    return sum(lit) / len(lit) if lit else 0.0
+
+
+def _figure(source: str, caption: str, kind: str) -> str:
+    return f'<figure class="{kind}"><img src="{source}" alt=""><figcaption>{html.escape(caption)}</figcaption></figure>'
+
+
+def _table(names: Sequence[str], rows: list[list[str]], *, head: bool = True) -> str:
+    # A column that is empty throughout says nothing.
+    kept = [i for i in range(len(names)) if any(row[i] for row in rows)]
+    top = "".join(f"<th>{names[i]}</th>" for i in kept)
+    lines = ["".join(f"<td>{row[i]}</td>" for i in kept) for row in rows]
+    return "<table>" + "".join(f"<tr>{line}</tr>" for line in ([top] if head else []) + lines) + "</table>"
+
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1150px; margin: 2em auto; padding: 0 1em; color: #222; }
+table { border-collapse: collapse; margin: 1em 0; }
+td, th { padding: .25em .8em; border-bottom: 1px solid #ddd; text-align: left; vertical-align: top; }
+.row { display: flex; flex-wrap: wrap; gap: 12px; }
+figure { margin: 0 0 1em 0; }
+.picture img { width: 270px; image-rendering: pixelated; display: block; }
+.wide img { max-width: 100%; }
+figcaption { color: #555; }
+.warn { color: #a33; }
+pre { background: #f5f5f5; padding: 1em; overflow-x: auto; }
+"""
+_PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{style}</style></head>
+<body>
+{body}
+</body></html>
+"""

@@ -1,0 +1,153 @@
+"""Pictures: bundled ones, files of the usual formats, and how one is fitted to a grid."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+from holotorch.io.bundled import BUNDLED_IMAGES, no_such_picture
+
+SMALLEST_SIDE = 11  # pixels; the window of ssim
+_LUMINANCE = (0.2126, 0.7152, 0.0722)  # ITU-R BT.709
+
+
+def load_image(source: str | Path) -> Tensor:
+    """Load a bundled photograph by name, or a PNG, JPEG, TIFF or EXR file by path.
+
+    Returns:
+        float64 [C, H, W] in [0, 1], C = 3 (red, green, blue) or 1. Integers are divided by their type's maximum and
+        not linearised: as in the thesis, pixel values are taken as intensities. Floating-point pictures are divided
+        by their maximum where that exceeds 1. Transparency shows black.
+
+    Raises:
+        ValueError: No such picture, not decodable, smaller than 11 px on a side, NaN, negative, or black throughout.
+    """
+    path = Path(source)
+    if str(source) in BUNDLED_IMAGES:
+        pixels = _bundled(str(source))
+    elif path.suffix.lower() == ".exr":
+        pixels = _read_exr(_existing(path))
+    else:
+        pixels = _decode(_existing(path))
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    image = torch.from_numpy(_unit_range(pixels)).permute(2, 0, 1)
+    if image.shape[0] in (2, 4):
+        image = image[:-1] * image[-1:]
+    return _checked(image, str(source))
+
+
+def fit_image(image: Tensor, shape: tuple[int, int], fit: str = "crop") -> Tensor:
+    """Bring ``image`` [C, h, w] to ``shape`` (H, W); a picture that has it already is returned as it is.
+
+    ``fit="crop"`` cuts the longer side to the wanted aspect, centred; ``fit="pad"`` adds black instead. Then bilinear
+    resampling with antialiasing: it never overshoots, so it makes no negative and no new black pixels.
+    """
+    if tuple(image.shape[-2:]) == tuple(shape):
+        return image
+    height, width = image.shape[-2:]
+    aspect = shape[1] / shape[0]
+    if fit == "crop":
+        size = min(height, round(width / aspect)), min(width, round(height * aspect))
+    elif fit == "pad":
+        size = max(height, round(width / aspect)), max(width, round(height * aspect))
+    else:
+        raise ValueError(f"fit must be 'crop' or 'pad', got {fit!r}")
+    size = max(size[0], 1), max(size[1], 1)
+    top, left = (size[0] - height) // 2, (size[1] - width) // 2
+    # Negative padding crops.
+    image = torch.nn.functional.pad(image, (left, size[1] - width - left, top, size[0] - height - top))
+    resampled = torch.nn.functional.interpolate(image[None], size=shape, mode="bilinear", antialias=True)[0]
+    return resampled.clamp(0, 1)
+
+
+def with_channels(image: Tensor, channels: int) -> Tensor:
+    """Match ``image`` [C, H, W] to 1 or 3 channels: colour becomes BT.709 luminance, grey is repeated."""
+    if image.shape[0] == channels:
+        return image
+    if channels == 1:
+        return (image * image.new_tensor(_LUMINANCE)[:, None, None]).sum(0, keepdim=True)
+    if image.shape[0] == 1:
+        return image.expand(channels, -1, -1)
+    raise ValueError(f"cannot show a picture of {image.shape[0]} channels on {channels} wavelengths; use 1 or 3")
+
+
+def encode_png(image: Tensor) -> bytes:
+    """8-bit PNG of ``image`` [C, H, W] in [0, 1], C = 1 or 3; values are rounded, those outside clipped."""
+    import cv2
+
+    checks.all_finite("image", image)
+    pixels = (image.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
+    ok, data = cv2.imencode(".png", np.ascontiguousarray(pixels[..., ::-1]))
+    if not ok:
+        raise ValueError(f"could not encode a picture of shape {tuple(image.shape)} as PNG")
+    return data.tobytes()
+
+
+def _existing(path: Path) -> Path:
+    if not path.is_file():
+        raise ValueError(no_such_picture(str(path)))
+    return path
+
+
+def _bundled(name: str) -> np.ndarray:
+    import skimage.data
+
+    return getattr(skimage.data, name)()
+
+
+def _decode(path: Path) -> np.ndarray:
+    import cv2
+
+    data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+    # JPEG through the colour reader, which turns the picture as its orientation tag says.
+    jpeg = path.suffix.lower() in (".jpg", ".jpeg")
+    pixels = cv2.imdecode(data, cv2.IMREAD_COLOR if jpeg else cv2.IMREAD_UNCHANGED) if data.size else None
+    if pixels is None:
+        raise ValueError(f"{path} is not a readable picture (PNG, JPEG, TIFF or EXR)")
+    if pixels.ndim == 3 and pixels.shape[2] >= 3:
+        pixels = np.concatenate([pixels[..., 2::-1], pixels[..., 3:]], axis=2)
+    return pixels
+
+
+def _read_exr(path: Path) -> np.ndarray:
+    import OpenEXR
+
+    try:
+        channels = OpenEXR.File(str(path), separate_channels=True).channels()
+    except Exception as error:  # the library raises bare RuntimeError and others
+        raise ValueError(f"{path} is not a readable EXR file: {error}") from None
+    names = next((wanted for wanted in (("R", "G", "B"), ("Y",)) if all(name in channels for name in wanted)), None)
+    if names is None:
+        raise ValueError(f"{path} must have channels R, G, B or Y, got {', '.join(sorted(channels))}")
+    return np.stack([channels[name].pixels for name in names], axis=-1)
+
+
+def _unit_range(pixels: np.ndarray) -> np.ndarray:
+    if pixels.dtype == bool:
+        return pixels.astype(np.float64)
+    if np.issubdtype(pixels.dtype, np.integer):
+        return pixels.astype(np.float64) / np.iinfo(pixels.dtype).max
+    values = pixels.astype(np.float64)
+    peak = values.max()
+    return values / peak if np.isfinite(peak) and peak > 1 else values
+
+
+def _checked(image: Tensor, source: str) -> Tensor:
+    try:
+        checks.all_finite(f"picture {source}", image)
+    except ValueError as error:
+        raise ValueError(f"{error}; repair the picture, every pixel [C, H, W] must be a number") from None
+    if image.min() < 0:
+        raise ValueError(f"picture {source} holds negative intensities, down to {image.min().item():g}; clip it first")
+    if min(image.shape[-2:]) < SMALLEST_SIDE:
+        height, width = image.shape[-2:]
+        raise ValueError(
+            f"picture {source} is {height} x {width} px; it must have at least {SMALLEST_SIDE} px a side for ssim, "
+            "use a larger one"
+        )
+    if image.max() == 0:
+        raise ValueError(f"picture {source} is black: there is no light to form; use another picture")
+    return image.contiguous()
