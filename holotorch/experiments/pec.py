@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -15,7 +16,7 @@ from holotorch.core.grid import Grid
 from holotorch.correction import APG, PECProblem, ProjectedAdam, Solution, gerchberg_saxton
 from holotorch.correction.problem import best_scale
 from holotorch.experiments.config import APGSettings, NearFieldSettings, PECSettings
-from holotorch.io.images import fit_image, load_image, with_channels
+from holotorch.io.images import fit_image, frame_image, load_image, with_channels
 from holotorch.metrics import psnr, ssim
 from holotorch.modulator import PhasedArray, ThermalCrosstalk
 from holotorch.optics import AngularSpectrum, Fraunhofer, Fresnel, least_padding
@@ -38,14 +39,34 @@ class PECExperiment:
     """A configuration made into operators. Colours in which the picture is black are left dark and not solved for."""
 
     settings: PECSettings
-    image: Tensor
+    source: Tensor
     lit: Tensor
-    crosstalk: ThermalCrosstalk
     array: PhasedArray
-    propagator: AngularSpectrum | Fresnel | Fraunhofer
     pad: float
     start: str
     device: torch.device
+
+    @property
+    def crosstalk(self) -> ThermalCrosstalk:
+        """Spreads heater phases."""
+        return self.array.crosstalk
+
+    @cached_property
+    def image(self) -> Tensor:
+        """The picture on the grid, float64 [C, H, W]; resampled when first used, so that a plan needs no memory."""
+        settings = self.settings
+        fitted = fit_image(self.source, settings.grid.shape, settings.target.fit)
+        return with_channels(fitted, len(settings.wavelengths)).contiguous()
+
+    @cached_property
+    def propagator(self) -> AngularSpectrum | Fresnel | Fraunhofer:
+        """From the array to the image. Built when first used: its kernel is the first large allocation."""
+        light = self.settings.propagator
+        if not isinstance(light, NearFieldSettings):
+            return Fraunhofer(self.grid, self.wavelengths)
+        kind = Fresnel if light.kind == "fresnel" else AngularSpectrum
+        with _without_warning():
+            return kind(self.grid, self.wavelengths, light.distance, pad=self.pad).to(self.device)
 
     @property
     def isolated(self) -> bool:
@@ -122,7 +143,8 @@ class PECExperiment:
         formed = torch.empty(self.target.shape, dtype=torch.float64)
         emitted = self.array(phase.detach().double())
         for i, wave in enumerate(self.wavelengths):  # one colour at a time: the padded grid is large
-            exact = AngularSpectrum(self.grid, wave, light.distance, pad=self._judge_pad(wave)).to(self.device)
+            with _without_warning():
+                exact = AngularSpectrum(self.grid, wave, light.distance, pad=self._judge_pad(wave)).to(self.device)
             formed[i] = intensity(exact(emitted[i : i + 1]))[0].cpu()
         scale = best_scale(formed, self.target)[:, None, None]
         numbers = self._quality(self._as_picture(formed * scale))
@@ -171,23 +193,23 @@ class PECExperiment:
 def build(settings: PECSettings) -> PECExperiment:
     """Load the picture and make the operators. ValueError for a picture that cannot be shown."""
     device = _device(settings.device)
-    image = fit_image(load_image(settings.target.image), settings.grid.shape, settings.target.fit)
-    image = with_channels(image, len(settings.wavelengths)).contiguous()
-    lit = image.amax((-2, -1)) > 0
+    source = load_image(settings.target.image)
+    framed = frame_image(source, settings.grid.shape[1] / settings.grid.shape[0], settings.target.fit)
+    lit = with_channels(framed, len(settings.wavelengths)).amax((-2, -1)) > 0
+    if not lit.any():
+        raise ValueError(f"picture {settings.target.image} is black inside its crop; use target.fit: pad")
     waves = [wave for wave, on in zip(settings.wavelengths, lit.tolist(), strict=True) if on]
     crosstalk = ThermalCrosstalk(settings.modulator.sigma_px, settings.modulator.kernel_size)
     grid, light = Grid(settings.grid.shape, settings.grid.pitch), settings.propagator
-    pad, start = 1.0, settings.solver.start or "hot"
-    if isinstance(light, NearFieldSettings):
-        pad, start = _padding(grid, waves, light), settings.solver.start or _start_for(light)
-        with warnings.catch_warnings():  # the plan says the same, once and in the report
-            warnings.simplefilter("ignore", SamplingWarning)
-            kind = Fresnel if light.kind == "fresnel" else AngularSpectrum
-            propagator = kind(grid, waves, light.distance, pad=pad)
-    else:
-        propagator = Fraunhofer(grid, waves)
-    array = PhasedArray(waves, crosstalk)
-    return PECExperiment(settings, image, lit, crosstalk, array, propagator.to(device), pad, start, device)
+    near = isinstance(light, NearFieldSettings)
+    pad = _padding(grid, waves, light) if near else 1.0
+    start = settings.solver.start or (_start_for(light) if near else "hot")
+    return PECExperiment(settings, source, lit, PhasedArray(waves, crosstalk), pad, start, device)
+
+
+def _without_warning() -> warnings.catch_warnings:
+    """The plan says what SamplingWarning would, once and in the report."""
+    return warnings.catch_warnings(action="ignore", category=SamplingWarning)
 
 
 def _padding(grid: Grid, waves: list[float], light: NearFieldSettings) -> float:

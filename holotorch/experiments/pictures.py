@@ -22,6 +22,19 @@ def channel_maps(values: Tensor, names: Sequence[str], label: str, colormap: str
     return _png(figure)
 
 
+def comparison(images: Sequence[Tensor], captions: Sequence[str]) -> bytes:
+    """PNG of pictures [C, H, W] in [0, 1] side by side with their captions."""
+    height, width = images[0].shape[-2:]
+    figure = Figure(figsize=(3.2 * len(images), 3.2 * height / width + 0.35), layout="constrained", dpi=120)
+    for i, (image, caption) in enumerate(zip(images, captions, strict=True)):
+        axes = figure.add_subplot(1, len(images), i + 1)
+        shown = image.clamp(0, 1).permute(1, 2, 0).squeeze(-1).numpy()
+        axes.imshow(shown, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        axes.set_title(caption, fontsize=10)
+        axes.set_axis_off()
+    return _png(figure)
+
+
 def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[int, float]]) -> bytes:
     """PNG of the loss per colour [steps + 1, C] (left axis, relative to the start) and of SSIM (right axis)."""
     figure = Figure(figsize=(7.2, 3.2), layout="constrained")

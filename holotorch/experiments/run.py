@@ -36,9 +36,10 @@ def run(settings: PECSettings, out: Path) -> bool:
         ValueError: The folder holds a run already or cannot be written, or the picture cannot be used.
     """
     experiment = build(settings)
-    _prepare(out)
     values = plan(experiment)
-    print(plan_text(experiment, values))
+    print(plan_text(experiment, values), flush=True)
+    _check_memory(values["predicted_peak_bytes"])
+    _prepare(out)
     write_text(out / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
     write_json(out / "env.json", environment(settings, experiment))
     write_json(out / "plan.json", values)
@@ -58,8 +59,11 @@ def run(settings: PECSettings, out: Path) -> bool:
 
     results = {"corrected": experiment.judge(solution.x)}
     results["corrected"].numbers.update(_effort(experiment, solution, seconds))
-    if not interrupted:
-        results |= _baselines(experiment, results)
+    try:
+        for name in () if interrupted else settings.report.baselines:
+            results[name] = _baseline(experiment, name)
+    except KeyboardInterrupt:
+        interrupted = True
     _write_results(out, experiment, results, log, solution)
     summary = {
         "experiment": settings.experiment,
@@ -156,15 +160,23 @@ def _prepare(out: Path) -> None:
         raise ValueError(f"cannot write to {out}: {error.strerror}; choose another place with --out") from None
 
 
-def _baselines(experiment: PECExperiment, results: dict[str, Result]) -> dict[str, Result]:
-    found = {}
-    for name in experiment.settings.report.baselines:
-        started = time.perf_counter()
-        solution = experiment.baseline(name)
-        seconds = time.perf_counter() - started
-        found[name] = experiment.judge(solution.x)
-        found[name].numbers.update(_effort(experiment, solution, seconds))
-    return found
+def _check_memory(needed: int) -> None:
+    meminfo = Path("/proc/meminfo")
+    match = re.search(r"MemAvailable:\s+(\d+) kB", meminfo.read_text()) if meminfo.is_file() else None
+    if match and needed > int(match[1]) * 1024:
+        raise ValueError(
+            f"the run needs about {needed / 1e9:.1f} GB and {int(match[1]) / 1e6:.1f} GB are free; use a smaller "
+            "grid, a shorter distance or less padding (propagator.pad)"
+        )
+
+
+def _baseline(experiment: PECExperiment, name: str) -> Result:
+    started = time.perf_counter()
+    solution = experiment.baseline(name)
+    seconds = time.perf_counter() - started
+    result = experiment.judge(solution.x)
+    result.numbers.update(_effort(experiment, solution, seconds))
+    return result
 
 
 def _effort(experiment: PECExperiment, solution: Solution, seconds: float) -> dict[str, Any]:
@@ -194,13 +206,23 @@ def _write_results(
     names = [f"{wave * 1e9:.0f} nm" for wave in experiment.wavelengths]
     phase = corrected.phase[experiment.lit]
     warm = experiment.array.temperature(experiment.crosstalk(phase))
+    shown = {"target": experiment.image} | {name: results[name].picture for name in _CAPTIONS if name in results}
+    captions = ["Target", *(f"{_CAPTIONS[name]}{_score(results[name])}" for name in shown if name in results)]
     figures = {
+        "comparison": pictures.comparison(list(shown.values()), captions),
         "phase": pictures.channel_maps(phase, names, "heater phase (rad)", "viridis"),
         "temperature": pictures.channel_maps(warm, names, "temperature rise (K)", "inferno", (0, None)),
         "convergence": pictures.convergence(solution.losses, names, log.checked),
     }
     for name, data in figures.items():
         write_bytes(out / "images" / f"{name}.png", data)
+
+
+_CAPTIONS = {"none": "No correction", "basic_ipec": "Basic iterative correction", "corrected": "Corrected"}
+
+
+def _score(result: Result) -> str:
+    return f", SSIM {result.numbers['ssim_mean']:.3f}" if "ssim_mean" in result.numbers else ""
 
 
 def _git_state() -> str | None:

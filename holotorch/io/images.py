@@ -42,25 +42,29 @@ def load_image(source: str | Path) -> Tensor:
 def fit_image(image: Tensor, shape: tuple[int, int], fit: str = "crop") -> Tensor:
     """Bring ``image`` [C, h, w] to ``shape`` (H, W); a picture that has it already is returned as it is.
 
-    ``fit="crop"`` cuts the longer side to the wanted aspect, centred; ``fit="pad"`` adds black instead. Then bilinear
-    resampling with antialiasing: it never overshoots, so it makes no negative and no new black pixels.
+    First its aspect is changed as :func:`frame_image` says, then it is resampled bilinearly with antialiasing: that
+    never overshoots, so it makes no negative and no new black pixels.
     """
     if tuple(image.shape[-2:]) == tuple(shape):
         return image
-    height, width = image.shape[-2:]
-    aspect = shape[1] / shape[0]
-    if fit == "crop":
-        size = min(height, round(width / aspect)), min(width, round(height * aspect))
-    elif fit == "pad":
-        size = max(height, round(width / aspect)), max(width, round(height * aspect))
-    else:
+    framed = frame_image(image, shape[1] / shape[0], fit)
+    resampled = torch.nn.functional.interpolate(framed[None], size=shape, mode="bilinear", antialias=True)[0]
+    return resampled.clamp(0, 1)
+
+
+def frame_image(image: Tensor, aspect: float, fit: str = "crop") -> Tensor:
+    """Bring ``image`` [C, h, w] to ``aspect`` (width / height) without resampling.
+
+    ``fit="crop"`` cuts the longer side, centred; ``fit="pad"`` adds black instead.
+    """
+    if fit not in ("crop", "pad"):
         raise ValueError(f"fit must be 'crop' or 'pad', got {fit!r}")
-    size = max(size[0], 1), max(size[1], 1)
+    height, width = image.shape[-2:]
+    choose = min if fit == "crop" else max
+    size = max(1, choose(height, round(width / aspect))), max(1, choose(width, round(height * aspect)))
     top, left = (size[0] - height) // 2, (size[1] - width) // 2
     # Negative padding crops.
-    image = torch.nn.functional.pad(image, (left, size[1] - width - left, top, size[0] - height - top))
-    resampled = torch.nn.functional.interpolate(image[None], size=shape, mode="bilinear", antialias=True)[0]
-    return resampled.clamp(0, 1)
+    return torch.nn.functional.pad(image, (left, size[1] - width - left, top, size[0] - height - top))
 
 
 def with_channels(image: Tensor, channels: int) -> Tensor:

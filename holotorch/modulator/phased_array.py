@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from holotorch.core import checks
 from holotorch.core.complex import phasor
+from holotorch.modulator.crosstalk import ThermalCrosstalk
 
 # The thesis's phase shifter turns red light of 630 nm by pi when it is 175 K above ambient.
 REFERENCE_WAVELENGTH = 630e-9
@@ -19,14 +20,16 @@ class PhasedArray(nn.Module):
 
     Args:
         wavelengths: In metres, one per channel.
-        crosstalk: Module that spreads heater phases [..., C, H, W], such as ``ThermalCrosstalk``.
+        crosstalk: Spreads heater phases [..., C, H, W].
 
     A phase is a temperature rise above ambient times ``response`` (rad/K), which falls with the wavelength:
     (pi/175 rad/K)(630 nm / wavelength). The thesis's text says "proportional" under Eq. 4.1; its three printed values
     are inversely proportional.
     """
 
-    def __init__(self, wavelengths: float | Sequence[float], crosstalk: nn.Module):
+    crosstalk: ThermalCrosstalk
+
+    def __init__(self, wavelengths: float | Sequence[float], crosstalk: ThermalCrosstalk):
         super().__init__()
         self.wavelengths, self.crosstalk = checks.wavelengths(wavelengths), crosstalk
 

@@ -1,0 +1,192 @@
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from holotorch.experiments.config import PECSettings, load_config
+from holotorch.experiments.source import ConfigError
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+GOOD = """\
+experiment: pec
+target: {image: coffee}
+grid: {shape: [32, 48], pitch: 9 um}
+wavelengths: [630 nm, 530 nm, 445 nm]
+modulator: {sigma_px: 0.66}
+propagator: {kind: fraunhofer}
+solver: {kind: apg}
+"""
+
+
+@pytest.fixture
+def written(tmp_path):
+    def write(text: str) -> Path:
+        path = tmp_path / "a.yaml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+def mistakes(path: Path, *overrides: str) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        load_config(path, list(overrides))
+    return [line.replace(f"{path}:", "") for line in caught.value.mistakes]
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.rglob("*.yaml")), ids=lambda path: path.stem)
+def test_every_config_of_the_project_loads(path):
+    assert isinstance(load_config(path), PECSettings)
+
+
+@pytest.mark.parametrize(
+    ("text", "metres"),
+    [
+        ("530 nm", 530e-9),
+        ("530nm", 530e-9),
+        ("0.53 um", 530e-9),
+        ("0.53 µm", 530e-9),
+        ("5.3e-7", 530e-9),
+        ("5.3e-4 mm", 530e-9),
+        ("5.3e-5 cm", 530e-9),
+        ("5.3e-7 m", 530e-9),
+        ("0.00000053", 530e-9),
+    ],
+)
+def test_lengths_take_units(written, text, metres):
+    assert load_config(written(GOOD), [f"wavelengths={text}"]).wavelengths == pytest.approx((metres,), rel=1e-15)
+
+
+def test_one_pitch_means_both_axes_and_conversion_rounds_once(written):
+    settings = load_config(written(GOOD))
+    assert settings.grid.pitch == (9e-6, 9e-6)
+    assert settings.wavelengths == (630e-9, 530e-9, 445e-9)
+
+
+def test_overrides_reach_any_depth_and_make_missing_sections(written):
+    path = written(GOOD)
+    settings = load_config(path, ["modulator.sigma_px=1.5", "report.metrics=[psnr]", "target.image=page", "seed=3"])
+    assert (settings.modulator.sigma_px, settings.report.metrics, settings.seed) == (1.5, ("psnr",), 3)
+    assert settings.target.image == "page"
+
+
+def test_the_resolved_settings_load_to_the_same(written):
+    settings = load_config(CONFIGS / "pec" / "fresnel.yaml")
+    again = load_config(written(yaml.safe_dump(settings.model_dump(mode="json"))))
+    assert again == settings
+
+
+def test_a_misspelt_key_names_its_place_and_the_nearest(written):
+    assert mistakes(written(GOOD.replace("sigma_px", "sgima_px"))) == [
+        "5:1: modulator.sigma_px: required, but missing",
+        "5:13: modulator.sgima_px: unknown setting; did you mean 'sigma_px'?",
+    ]
+
+
+def test_five_mistakes_at_once_each_with_its_place(written):
+    text = """\
+experiment: pec
+sede: 7
+target: {image: cofee}
+grid: {shape: [32, 48.5], pitch: -9 um}
+wavelengths: [630 nm, 0, 445 parsec]
+modulator: {sigma_px: wide, kernel_size: yes}
+propagator: {kind: fresnl, distance: 100 mm}
+solver: {kind: apg, tolerance: .nan, start: warm}
+"""
+    assert mistakes(written(text)) == [
+        "2:1: sede: unknown setting; did you mean 'seed'?",
+        "3:10: target.image: no such picture: 'cofee'; did you mean 'coffee'? give a path, or one of "
+        "astronaut, brick, camera, chelsea, coffee, coins, grass, moon, page, text",
+        "4:20: grid.shape.1: expected a whole number, got 48.5",
+        "4:27: grid.pitch: expected greater than 0, got '-9 um'",
+        "5:23: wavelengths.1: expected greater than 0, got 0",
+        "5:26: wavelengths.2: expected a length such as 530 nm, 3.74 um, 100 mm or a number of metres, "
+        "got '445 parsec'",
+        "6:13: modulator.sigma_px: expected a number, got 'wide'",
+        "6:29: modulator.kernel_size: expected a number, got True",
+        "7:14: propagator.kind: expected one of fraunhofer, fresnel, angular_spectrum, got 'fresnl'; "
+        "did you mean 'fresnel'?",
+        "8:21: solver.tolerance: expected a finite number, got NaN",
+        "8:38: solver.start: expected 'hot', 'cool' or 'flat', got 'warm'",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("wavelengths=0 nm", "wavelengths: expected greater than 0, got '0 nm'"),
+        ("grid.pitch=-1um", "grid.pitch: expected greater than 0, got '-1um'"),
+        ("modulator.sgima_px=1", "modulator.sgima_px: unknown setting; did you mean 'sigma_px'?"),
+        ("modulator.kernel_size=33", "expected at most 32, the smaller side of the grid, got 33"),
+        ("modulator.kernel_size=8", "expected an odd number of taps, got 8; use 9"),
+        ("grid.shape=[8,8]", "expected at least 11 x 11 px for ssim, got (8, 8); use a larger grid"),
+        ("wavelengths=[630 nm, 530 nm]", "expected 1 (grey) or 3 (red, green, blue), got 2"),
+        ("target.image=missing.png", "no such picture: 'missing.png'"),
+        ("propagator.distance=1 mm", "propagator.distance: unknown setting"),
+        ("solver={}", "solver.kind: expected one of apg, adam, got 'none'"),
+        ("solver=3", "solver: expected settings, as in {key: value}, got 3"),
+        ("seed=-1", "seed: expected greater than or equal to 0, got -1"),
+        ("grid.shape=", "grid.shape: expected a list, got nothing"),
+        ("seed", "expected key=value or key.sub=value"),
+        ("seed.value=3", "seed.value: "),
+        ("seed=[", "not valid YAML"),
+    ],
+)
+def test_overrides_get_the_same_messages(written, override, message):
+    lines = mistakes(written(GOOD + "seed: 1\n"), override)
+    assert any(message in line or "has no settings inside" in line for line in lines), lines
+    assert any(line.startswith(f"argument '{override}'") for line in lines), lines
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "1:1: the file is empty; expected settings such as 'experiment: pec'"),
+        ("[1, 2]", "1:1: expected settings such as 'experiment: pec', got [1, 2]"),
+        ("seed: 1\n", "1:1: experiment: expected one of pec, it is missing"),
+        ("experiment: pek\n", "1:1: experiment: expected one of pec, got 'pek'; did you mean 'pec'?"),
+        (GOOD + "seed: 1\nseed: 2\n", "9:1: seed: written twice; keep one"),
+        (GOOD + "seed: {\n", "9:1: not valid YAML: "),
+        (GOOD.replace("kind: apg", "kind: [1]"), "solver.kind: expected one of apg, adam"),
+    ],
+)
+def test_files_that_are_no_configuration(written, text, message):
+    assert any(message in line for line in mistakes(written(text)))
+
+
+def test_a_periodic_boundary_has_no_padding(written):
+    path = written(GOOD.replace("fraunhofer", "fresnel, distance: 1 mm, boundary: periodic, pad: 2"))
+    assert mistakes(path) == ["6:65: propagator.pad: expected no padding with a periodic boundary, got 2"]
+
+
+def test_missing_and_binary_files(tmp_path):
+    with pytest.raises(ConfigError, match="cannot read the configuration: No such file"):
+        load_config(tmp_path / "missing.yaml")
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="not a UTF-8 text file"):
+        load_config(tmp_path / "binary.yaml")
+
+
+def test_settings_are_frozen(written):
+    with pytest.raises(ValueError, match="frozen"):
+        load_config(written(GOOD)).seed = 3  # type: ignore[misc]
+
+
+def test_a_picture_may_be_a_path(written, tmp_path):
+    import cv2
+    import numpy as np
+
+    cv2.imwrite(str(tmp_path / "mine.png"), np.full((20, 20), 9, dtype=np.uint8))
+    assert load_config(written(GOOD), [f"target.image={tmp_path / 'mine.png'}"]).target.image.endswith("mine.png")
+
+
+def test_validation_needs_no_torch(tmp_path):
+    import subprocess
+
+    code = (
+        "import sys; from holotorch.experiments.config import load_config; load_config(sys.argv[1]);"
+        "assert not {'torch', 'cv2', 'kornia', 'matplotlib'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code, str(CONFIGS / "demo.yaml")], check=True, cwd=tmp_path)

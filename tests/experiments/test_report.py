@@ -1,0 +1,71 @@
+import base64
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from holotorch.experiments.config import load_config
+from holotorch.experiments.report import write_report
+from holotorch.experiments.run import run
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+VOID = {"meta", "img", "br"}
+
+
+class Balanced(HTMLParser):
+    """Fails on tags that are not closed in order."""
+
+    def __init__(self):
+        super().__init__()
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    base = tmp_path_factory.mktemp("runs")
+    words = ["grid.shape=[16,16]", "solver.max_steps=3"]
+    for name, config in (("first <b>", "fourier"), ("second", "fresnel")):
+        run(load_config(CONFIGS / "pec" / f"{config}.yaml", words), base / name)
+    return [base / "first <b>", base / "second"]
+
+
+def test_one_static_page_with_pictures_inside(folders):
+    page = (folders[0] / "report.html").read_text()
+    parser = Balanced()
+    parser.feed(page)
+    assert parser.open == []
+    assert "<script" not in page and "http" not in page
+    pictures = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
+    assert len(pictures) == page.count("<img") == 7
+    assert all(base64.b64decode(picture).startswith(b"\x89PNG") for picture in pictures)
+    for words in ("Target", "No correction", "Corrected", "Convergence", "degC above ambient", "sigma_px: 0.66"):
+        assert words in page
+    assert "first &lt;b&gt;" in page and "first <b>" not in page
+
+
+def test_columns_that_say_nothing_are_left_out(folders):
+    assert "isolated chip" not in (folders[0] / "report.html").read_text()
+    assert "isolated chip" in (folders[1] / "report.html").read_text()
+
+
+def test_several_runs_are_compared(folders, tmp_path):
+    write_report(folders, tmp_path / "both.html")
+    page = (tmp_path / "both.html").read_text()
+    assert page.count("<img") == 14
+    assert re.search(r"<h1>Runs</h1>.*first &lt;b&gt;.*second", page, re.S)
+
+
+def test_refuses_a_folder_without_a_run(tmp_path):
+    with pytest.raises(ValueError, match="holds no run: neither summary.json nor interrupted.json"):
+        write_report([tmp_path], tmp_path / "report.html")
+    (tmp_path / "summary.json").write_text("{")
+    with pytest.raises(ValueError, match="cannot be read"):
+        write_report([tmp_path], tmp_path / "report.html")

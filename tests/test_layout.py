@@ -1,0 +1,126 @@
+"""The house rules that a reader relies on: import directions, size of files, stable names, a README that runs."""
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "holotorch"
+# Each level may use those after it and itself; names on one level do not import each other.
+LEVELS = [
+    {"__main__"},
+    {"cli"},
+    {"experiments"},
+    {"io"},
+    {"hologram", "correction"},
+    {"scene", "modulator", "optics", "tracking", "perception", "metrics"},
+    {"core"},
+    {"__init__"},
+]
+ONLY_IN = {
+    "kornia": {"tracking", "metrics"},
+    "yaml": {"experiments"},
+    "matplotlib": {"experiments"},
+    "pydantic": {"experiments"},
+    "cv2": {"io", "tracking"},
+    "OpenEXR": {"io", "experiments"},
+}
+
+
+def level(part: str) -> int:
+    return next(i for i, parts in enumerate(LEVELS) if part in parts)
+
+
+def imports(path: Path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield node.module or ""
+
+
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_point_one_way(path):
+    part = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    if part == "__init__":
+        return
+    for name in imports(path):
+        top, *rest = name.split(".")
+        if top in ONLY_IN:
+            assert part in ONLY_IN[top], f"{path.name} imports {name}, which belongs to {ONLY_IN[top]}"
+        if top != "holotorch" or not rest or rest[0] == part:
+            continue
+        assert level(rest[0]) > level(part), f"{path.name} imports {name}: sideways or upwards"
+        if part == "correction":
+            assert rest[0] == "core", "operators reach correction as arguments"
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "tests" / "oracles").glob("*.py")), ids=lambda path: path.name)
+def test_oracles_know_nothing_of_the_library(path):
+    assert not any(name.split(".")[0] in ("holotorch", "torch") for name in imports(path))
+
+
+@pytest.mark.parametrize("path", [*FILES, *sorted((ROOT / "tests").rglob("*.py"))], ids=lambda path: path.name)
+def test_files_hold_one_idea(path):
+    assert len(path.read_text().splitlines()) <= 300
+
+
+def test_top_level_holds_what_was_agreed():
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("not a git checkout")
+    top = {line.split("/")[0] for line in listed.stdout.splitlines()}
+    agreed = {"pyproject.toml", "holotorch", "configs", "scripts", "tests", "README.md", "LICENSE"}
+    assert {name for name in top if not name.startswith(".")} == agreed
+
+
+def test_public_names():
+    from holotorch import Grid, __version__
+    from holotorch.correction import APG, PECProblem, ProjectedAdam, Solution, gerchberg_saxton
+    from holotorch.metrics import psnr, ssim
+    from holotorch.modulator import PhasedArray, ThermalCrosstalk
+    from holotorch.optics import AngularSpectrum, Fraunhofer, Fresnel
+
+    names = [Grid, APG, PECProblem, ProjectedAdam, Solution, gerchberg_saxton, psnr, ssim, PhasedArray]
+    names += [ThermalCrosstalk, AngularSpectrum, Fraunhofer, Fresnel]
+    assert all(name.__doc__ for name in names)
+    assert re.fullmatch(r"\d+\.\d+\.\d+", __version__)
+    with pytest.raises(AttributeError, match="no attribute 'Gird'"):
+        import holotorch
+
+        holotorch.Gird  # noqa: B018
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+
+
+def test_readme_example_runs_and_is_short():
+    (code,) = blocks("python")
+    steps = [line for line in code.splitlines() if line and not line.startswith(("import", "from"))]
+    assert len(steps) <= 10
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    before, after = re.findall(r"tensor\(\[([^]]+)\]", done.stdout)
+    losses = [[float(word) for word in text.split(",")] for text in (before, after)]
+    assert all(small < 0.1 * large for small, large in zip(*losses, strict=True))
+
+
+def test_readme_names_files_that_exist_and_commands_that_parse():
+    text = (ROOT / "README.md").read_text()
+    for path in re.findall(r"(?:configs|scripts)/[\w/.-]+\.(?:yaml|sh|png)", text):
+        assert (ROOT / path).is_file(), path
+    from holotorch.cli import _parser
+
+    for line in "\n".join(blocks("bash")).splitlines():
+        words = line.split("#")[0].split()
+        if words[:1] == ["holotorch"]:
+            _parser().parse_args(words[1:])
