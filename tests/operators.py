@@ -11,7 +11,7 @@ from torch import Tensor
 
 from holotorch import Grid
 from holotorch.modulator import ThermalCrosstalk
-from holotorch.optics import AngularSpectrum, Fraunhofer, Fresnel
+from holotorch.optics import AngularSpectrum, CroppedKernel, Fraunhofer, Fresnel
 
 GRID = Grid((12, 17), (5e-6, 4e-6))
 FINE = Grid((12, 17), (0.2e-6, 0.25e-6))  # below half a wavelength: the corners of the spectrum are evanescent
@@ -26,6 +26,7 @@ class Case:
     build: Callable[[], Any]
     matrix: Callable[[int], np.ndarray]  # of channel c
     real: bool = False
+    tolerance: float = 1e-11  # against the matrix: its phase k z of up to 2.4e4 rad carries 2.4e4 * 1e-16
     unitary: bool = False
 
     def field(self, *batch: int, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -56,7 +57,21 @@ def _fresnel(name: str, distance: float, pad: float, unitary: bool = False) -> C
     )
 
 
+def _cropped(name: str, distance: float, paraxial: bool, tolerance: float) -> Case:
+    return Case(
+        name,
+        lambda: CroppedKernel(GRID, WAVES, distance, paraxial=paraxial),
+        lambda c: dense.band_limited_propagation(GRID.shape, GRID.pitch, WAVES[c], distance, paraxial),
+        tolerance=tolerance,
+    )
+
+
 CASES = [
+    _cropped("cropped paraxial kernel, near", 30e-6, True, 1e-11),
+    _cropped("cropped paraxial kernel, far", -2e-3, True, 1e-11),
+    # 2.1 s^2 / sqrt(N) with s = 0.079 and N = 12, as derived in test_cropped.py.
+    _cropped("cropped exact kernel, near", 30e-6, False, 3.8e-3),
+    _cropped("cropped exact kernel, far", 2e-3, False, 3.8e-3),
     _angular("angular spectrum", GRID, 50e-6, 2),
     _angular("angular spectrum, far, band-limited", GRID, 2e-3, 2),
     _angular("angular spectrum, backwards", GRID, -80e-6, 2.5),

@@ -1,11 +1,13 @@
 """Propagation of light between parallel planes."""
 
+from holotorch.optics.cropped import CroppedKernel
 from holotorch.optics.geometry import diffraction_angle, least_padding, unaliased_distance
 from holotorch.optics.kernels import angular_spectrum_kernel, carrier, fresnel_kernel
 from holotorch.optics.propagators import AngularSpectrum, Fraunhofer, Fresnel, SpectralFilter
 
 __all__ = [
     "AngularSpectrum",
+    "CroppedKernel",
     "Fraunhofer",
     "Fresnel",
     "SpectralFilter",

@@ -32,9 +32,10 @@ def least_padding(grid: Grid, wavelength: float, distance: float, *, paraxial: b
     """Least padding factor (y, x) for which no light of the grid's full band wraps around into the kept window.
 
     Padding by P leaves (P - 1) times the extent for light to leave through, so P = 1 + reach / extent, where reach is
-    the geometric spread plus 3 sqrt(wavelength z) for the diffraction at the edges of the window. From P = 2 on the
-    same condition is the one that the kernel's phase is sampled finely enough. Infinite where light can travel at
-    90 degrees (a pitch of half a wavelength or less); 1 at distance 0.
+    the geometric spread plus 3 sqrt(wavelength z) for the diffraction at the edges of the window. Where P >= 2 the
+    kernel's phase is then sampled finely enough as well, since that needs reach <= P extent / 2. About 1 % of a
+    full-band field still wraps, in the tails of its samples; ``CroppedKernel`` has none of that. Infinite where light
+    can travel at 90 degrees (a pitch of half a wavelength or less); 1 at distance 0.
     """
     edge = 3 * math.sqrt(wavelength * abs(distance))
     spread = lateral_spread(grid, wavelength, distance, paraxial=paraxial)

@@ -13,7 +13,7 @@ def carrier(wavelength: Tensor | float, distance: Tensor | float) -> Tensor:
 
     k z reaches 1e6 rad and more, where float32 steps by 0.1 rad; whole turns are taken off in float64 first.
     """
-    return _turns(_float64(distance) / _float64(wavelength))
+    return turns_phasor(_float64(distance) / _float64(wavelength))
 
 
 def angular_spectrum_kernel(
@@ -44,7 +44,7 @@ def angular_spectrum_kernel(
     imaginary = torch.where(decays, torch.sqrt(torch.where(decays, sine2 - 1, 1)), 0)
 
     turns = -distance / wavelength * torch.where(travels, sine2 / (1 + cosine), 1)
-    kernel = torch.exp(-2 * math.pi * distance.abs() / wavelength * imaginary) * _turns(turns)
+    kernel = torch.exp(-2 * math.pi * distance.abs() / wavelength * imaginary) * turns_phasor(turns)
     if not band_limit:
         return kernel
     # tan(angle) = wavelength f / cos. The same limit on the evanescent side drops the slow decays next to the cut-off,
@@ -65,10 +65,10 @@ def fresnel_kernel(grid: Grid, wavelength: Tensor | float, distance: Tensor | fl
     """
     product = (_float64(wavelength) * _float64(distance))[..., None, None]
     fy, fx = grid.frequencies(product.device)
-    return _turns(-product / 2 * fy.square()) * _turns(-product / 2 * fx.square())
+    return turns_phasor(-product / 2 * fy.square()) * turns_phasor(-product / 2 * fx.square())
 
 
-def _turns(turns: Tensor) -> Tensor:
+def turns_phasor(turns: Tensor) -> Tensor:
     """exp(2 pi i turns), with whole turns taken off in float64; the gradient is that of the unreduced phase."""
     phase = 2 * math.pi * (turns - turns.detach().round())
     return torch.complex(torch.cos(phase), torch.sin(phase))

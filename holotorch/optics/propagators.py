@@ -129,6 +129,10 @@ class Fraunhofer(nn.Module):
         super().__init__()
         self.grid, self.wavelengths = grid, checks.wavelengths(wavelengths)
 
+    def extra_repr(self) -> str:
+        """Sampling and wavelengths, for ``print(module)``."""
+        return f"grid={self.grid}, wavelengths={self.wavelengths}"
+
     def forward(self, field: Tensor) -> Tensor:
         """Transform ``field`` [..., C, H, W]; TypeError if it is real, ValueError if its shape differs."""
         checks.field("field", field, (len(self.wavelengths), *self.grid.shape))
@@ -146,7 +150,8 @@ def _warn_if_short(module: AngularSpectrum | Fresnel, needed: tuple[float, float
     if all(have >= want for have, want in zip(actual, needed, strict=True)):
         return
     if all(math.isfinite(want) for want in needed):
-        advice = f"pad=({needed[0]:.3g}, {needed[1]:.3g}) keeps all of it"
+        y, x = (math.ceil(want * 100) / 100 for want in needed)  # rounded up, so that the advice holds
+        advice = f"pad=({y:.2f}, {x:.2f}) keeps all of it, CroppedKernel does at twice the window"
     else:
         advice = "no padding keeps all of it, since the pitch is at most half a wavelength"
     warnings.warn(

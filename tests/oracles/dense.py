@@ -54,6 +54,30 @@ def fresnel_transfer(shape, pitch, wavelength, distance):
     return np.exp(2j * np.pi * distance / wavelength) * np.exp(-1j * np.pi * wavelength * distance * square)
 
 
+def band_limited_propagation(shape, pitch, wavelength, distance, paraxial, nodes=400):
+    """out[p] = sum_q h(p - q) in[q], h the integral of the transfer function over the band that the samples carry.
+
+    By Gauss-Legendre quadrature over |f| < 1 / (2 pitch) on both axes; needs ``nodes`` above the number of turns of
+    the integrand, pi times (samples + wavelength z / (2 pitch^2)).
+    """
+    t, weight = np.polynomial.legendre.leggauss(nodes)
+    fy, fx = (t / (2 * p) for p in pitch)
+    wy, wx = (weight / 2 for _ in pitch)  # times the pitch, which the density of the samples gives back
+    square = wavelength**2 * (fy[:, None] ** 2 + fx[None, :] ** 2)
+    if paraxial:
+        transfer = np.exp(2j * np.pi * distance / wavelength) * np.exp(-1j * np.pi * distance / wavelength * square)
+    else:
+        transfer = np.exp(2j * np.pi * distance / wavelength * np.sqrt(1 - square + 0j))
+    (h, w), (py, px) = shape, pitch
+    dy, dx = np.arange(-(h - 1), h) * py, np.arange(-(w - 1), w) * px
+    kernel = (
+        (np.exp(2j * np.pi * np.outer(dy, fy)) * wy) @ transfer @ (np.exp(2j * np.pi * np.outer(fx, dx)) * wx[:, None])
+    )
+    rows, columns = np.arange(h)[:, None] - np.arange(h), np.arange(w)[:, None] - np.arange(w)
+    matrix = kernel[(rows + h - 1)[:, None, :, None], (columns + w - 1)[None, :, None, :]]
+    return matrix.reshape(h * w, h * w)
+
+
 def convolution(shape, kernel):
     """out[p] = sum_q kernel[p - q + centre] in[q], zero outside, as a matrix."""
     (h, w), (kh, kw) = shape, kernel.shape
