@@ -1,6 +1,7 @@
 """The ``holotorch`` command. Each subcommand loads only what it needs; ``--help`` loads nothing."""
 
 import argparse
+import re
 import sys
 from pathlib import Path
 
@@ -12,14 +13,18 @@ OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 def main(arguments: list[str] | None = None) -> int:
     """Run one subcommand and return its exit status: 0 done, 2 bad input, 1 failure, 130 interrupted and saved."""
     options = _parser().parse_args(arguments)
+    from holotorch.experiments.errors import ConfigError
+
     try:
         return options.action(options)
-    except ValueError as error:
-        # ConfigError and everything that the library's own checks refuse.
+    except ConfigError as error:
         print(error, file=sys.stderr)
         return BAD_INPUT
-    except MemoryError as error:
-        print(f"out of memory: {error}; use a smaller grid or padding", file=sys.stderr)
+    except (MemoryError, RuntimeError) as error:
+        # torch raises RuntimeError or a subclass of it, on the CPU and on CUDA.
+        if isinstance(error, RuntimeError) and not re.search(r"(?i)can.t allocate memory|out of memory", str(error)):
+            raise
+        print("out of memory; use a smaller grid", file=sys.stderr)
         return FAILED
     except OSError as error:
         print(f"{error.filename or 'file'}: {error.strerror or error}", file=sys.stderr)
@@ -33,35 +38,38 @@ def _run(options: argparse.Namespace) -> int:
     from holotorch.experiments.config import load_config
 
     settings = load_config(options.config, options.overrides)
-    from holotorch.experiments.run import next_folder, run
+    from holotorch.experiments.run import run
 
-    return _finish(run, settings, options.out or next_folder(Path(options.config).stem))
+    return _finish(*run(settings, options.out, Path(options.config).stem))
 
 
 def _demo(options: argparse.Namespace) -> int:
     from holotorch.experiments.config import load_config
 
     settings = load_config(_bundled_config("demo.yaml"))
-    from holotorch.experiments.run import next_folder, run
+    from holotorch.experiments.run import run
 
-    return _finish(run, settings, options.out or next_folder("demo"))
+    return _finish(*run(settings, options.out, "demo"))
 
 
-def _finish(run, settings, out: Path) -> int:
-    complete = run(settings, out)
-    print(out / "report.html")
+def _finish(folder: Path, complete: bool) -> int:
+    print(folder / "report.html")
     return OK if complete else INTERRUPTED
 
 
 def _check(options: argparse.Namespace) -> int:
     from holotorch.experiments.config import load_config
+    from holotorch.experiments.errors import ConfigError
 
     settings = load_config(options.config, options.overrides)
     from holotorch.experiments.pec import build
-    from holotorch.experiments.plan import plan, plan_text
+    from holotorch.experiments.plan import plan, plan_text, shortage
 
     experiment = build(settings)
-    print(plan_text(experiment, plan(experiment)))
+    values = plan(experiment)
+    print(plan_text(experiment, values))
+    if text := shortage(values):
+        raise ConfigError([text])
     return OK
 
 

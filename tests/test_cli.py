@@ -32,7 +32,7 @@ def test_run_prints_the_plan_and_ends_with_the_report(capsys):
 def test_check_computes_and_writes_nothing(capsys, tmp_path):
     assert main(["check", CONFIG, "propagator={kind: fresnel, distance: 100 mm}"]) == 0
     out = capsys.readouterr().out
-    assert "padded" in out and "field of view" in out and "GB of memory" in out
+    assert "exact kernel on twice the window" in out and "field of view" in out and "GB of memory" in out
     assert not list(tmp_path.iterdir())
 
 
@@ -72,12 +72,12 @@ def not_a_number(path):
         (["modulator.sigma=1"], "modulator.sigma: unknown setting; did you mean 'sigma_px'?"),
         (["modulator.sigma_px=wide"], "modulator.sigma_px: expected a number, got 'wide'"),
         (["target.image=missing.png"], "no such picture: 'missing.png'"),
-        (["grid.pitch=-9 um"], "grid.pitch: expected greater than 0"),
-        (["wavelengths=[630 nm, 0, 445 nm]"], "wavelengths.1: expected greater than 0, got 0"),
+        (["grid.pitch=-9 um"], "grid.pitch: expected a pitch between 1 nm and 1 mm"),
+        (["wavelengths=[630 nm, 0, 445 nm]"], "wavelengths.1: expected a wavelength between 100 nm and 20 um, got 0"),
         (["grid.shape=[16,16]", "modulator.kernel_size=17"], "expected at most 16, the smaller side of the grid"),
         (["grid.shape=[8,8]"], "expected at least 11 x 11 px for ssim, got (8, 8); use a larger grid"),
         (["target.image=black.png"], "is black: there is no light to form; use another picture"),
-        (["target.image=tiny.png"], "is 8 x 8 px; it must have at least 11 px a side for ssim, use a larger one"),
+        (["target.image=tiny.png"], "is 8 x 8 px, less than the 11 x 11 px window of ssim; use a larger one"),
         (["target.image=nan.tiff"], "is nan (400 in all); repair the picture"),
         (["--out", "file/inside"], "cannot write to file/inside: Not a directory; choose another place with --out"),
         (["a=1", "b=2", "grid=3", "seed=x", "solver.kind=y"], "solver.kind: expected one of apg, adam, got 'y'"),
@@ -116,7 +116,24 @@ def test_a_full_disk_is_a_failure_without_a_traceback(monkeypatch, capsys):
     monkeypatch.setattr("holotorch.experiments.run.save_array", full)
     assert main(["run", CONFIG, *TINY]) == 1
     assert "runs/a/arrays/phase.npy: No space left on device" in capsys.readouterr().err
-    assert not list(Path("runs").rglob("*.partial")) and not list(Path("runs").rglob("summary.json"))
+    assert not list(Path("runs").iterdir())
+
+
+def test_out_of_memory_is_a_failure_without_a_traceback(monkeypatch, capsys):
+    def greedy(*_):
+        import torch
+
+        return torch.empty(2**60, dtype=torch.float32)
+
+    monkeypatch.setattr("holotorch.experiments.pec.PECExperiment.solve", greedy)
+    assert main(["run", CONFIG, *TINY]) == 1
+    assert capsys.readouterr().err.splitlines()[-1] == "out of memory; use a smaller grid"
+
+
+def test_check_says_when_a_run_will_not_fit(capsys):
+    assert main(["check", CONFIG, "grid.shape=16384"]) == 2
+    captured = capsys.readouterr()
+    assert "GB of memory at the peak" in captured.out and "the run needs about" in captured.err
 
 
 def test_ctrl_c_exits_130_and_saves(tmp_path):

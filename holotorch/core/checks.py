@@ -1,7 +1,9 @@
 """Argument checks in one voice: what was expected, what came, what to change."""
 
 import math
+import numbers
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +23,11 @@ def positive(name: str, value: float, unit: str = "") -> float:
 
 def finite(name: str, value: float, unit: str = "") -> float:
     """Return ``value`` as float, or raise TypeError for what is no number and ValueError for NaN and infinity."""
+    if isinstance(value, Tensor) and value.requires_grad:
+        raise TypeError(f"{name} is fixed in a module and cannot carry a gradient; use the kernel function instead")
     try:
+        if isinstance(value, bool | str):
+            raise TypeError
         number = float(value)
     except (TypeError, ValueError):
         raise TypeError(f"{name} must be a number{_in(unit)}, got {type(value).__name__} {value!r}") from None
@@ -30,9 +36,18 @@ def finite(name: str, value: float, unit: str = "") -> float:
     return number
 
 
+def whole(name: str, value: int, least: int) -> int:
+    """Return ``value`` as int, or raise TypeError unless it is an integer and ValueError if it is below ``least``."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+        raise TypeError(f"{name} must be a whole number, got {type(value).__name__} {value!r}")
+    if value < least:
+        raise ValueError(f"{name} must be at least {least}, got {value!r}")
+    return int(value)
+
+
 def wavelengths(values: float | Sequence[float]) -> tuple[float, ...]:
     """Return wavelengths in metres as a tuple, one per channel; a single number means one channel."""
-    items = [values] if isinstance(values, int | float) else list(values)
+    items: list[Any] = [values] if _scalar(values) else list(values)  # type: ignore[arg-type]
     if not items:
         raise ValueError("wavelengths must hold at least one value in metres, got none")
     return tuple(positive("wavelength", item, "metres") for item in items)
@@ -71,6 +86,10 @@ def all_finite(name: str, value: Tensor) -> None:
 def _complex(name: str, value: Tensor) -> None:
     if not value.is_complex():
         raise TypeError(f"{name} must be complex (complex64 or complex128), got {value.dtype}; use torch.complex")
+
+
+def _scalar(value: Any) -> bool:
+    return isinstance(value, str | numbers.Real) or (isinstance(value, Tensor) and value.ndim == 0)
 
 
 def _in(unit: str) -> str:

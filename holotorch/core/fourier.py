@@ -8,10 +8,16 @@ def good_length(minimum: int) -> int:
     """Smallest length >= ``minimum`` with no prime factor above 5; FFTs of such lengths are up to twice as fast."""
     if minimum < 1:
         raise ValueError(f"an FFT length must be at least 1, got {minimum}")
-    length = minimum
-    while _without_small_factors(length) != 1:
-        length += 1
-    return length
+    best = 1 << (minimum - 1).bit_length()
+    fives = 1
+    while fives < best:
+        product = fives
+        while product < best:
+            # Multiplied by the least power of two that reaches the minimum.
+            best = min(best, product << max(0, (-(-minimum // product) - 1).bit_length()))
+            product *= 3
+        fives *= 5
+    return best
 
 
 def centred_fft2(field: Tensor) -> Tensor:
@@ -59,10 +65,3 @@ def convolve(image: Tensor, kernel: Tensor) -> Tensor:
 
 def _unitary(transform, field: Tensor) -> Tensor:
     return transform(torch.fft.ifftshift(field, dim=(-2, -1)), norm="ortho")
-
-
-def _without_small_factors(number: int) -> int:
-    for prime in (2, 3, 5):
-        while number % prime == 0:
-            number //= prime
-    return number

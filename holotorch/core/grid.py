@@ -1,6 +1,7 @@
 """Grid: the sampling of a plane."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -26,16 +27,11 @@ class Grid:
     pitch: tuple[float, float]
 
     def __init__(self, shape: tuple[int, int] | int, pitch: tuple[float, float] | float):
-        sizes = (shape, shape) if isinstance(shape, int) else tuple(shape)
-        steps = (pitch, pitch) if isinstance(pitch, int | float) else tuple(pitch)
+        sizes = tuple(shape) if isinstance(shape, Sequence) else (shape, shape)
+        steps = tuple(pitch) if isinstance(pitch, Sequence) else (pitch, pitch)
         if len(sizes) != 2 or len(steps) != 2:
             raise ValueError(f"grid needs shape (H, W) and pitch (y, x), got shape {shape!r} and pitch {pitch!r}")
-        for size in sizes:
-            if isinstance(size, bool) or not isinstance(size, int):
-                raise TypeError(f"grid shape must hold integers, got {shape!r}")
-            if size < 1:
-                raise ValueError(f"grid shape must be at least (1, 1), got {shape!r}")
-        object.__setattr__(self, "shape", (sizes[0], sizes[1]))
+        object.__setattr__(self, "shape", tuple(checks.whole("grid shape", size, 1) for size in sizes))
         object.__setattr__(self, "pitch", tuple(checks.positive("grid pitch", step, "metres") for step in steps))
 
     @property

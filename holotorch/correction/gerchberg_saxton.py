@@ -41,8 +41,10 @@ def gerchberg_saxton(
     checks.real("target", target)
     checks.all_finite("target", target)
     checks.all_finite("start", start)
-    if max_steps < 1:
-        raise ValueError(f"max_steps must be at least 1, got {max_steps!r}")
+    checks.whole("max_steps", max_steps, 1)
+    checks.field("start", start, tuple(target.shape), complex_valued=False)
+    if target.min() < 0:
+        raise ValueError(f"target is an intensity and must be >= 0, got a minimum of {target.min().item():g}")
     amplitude = target.to(start.dtype).sqrt()
     far = amplitude * phasor(start)
     phase, losses = start, []

@@ -22,7 +22,8 @@ class PECProblem(nn.Module):
 
     Raises:
         TypeError: ``target`` is not a real tensor.
-        ValueError: ``target`` is not [C, H, W], not finite, negative somewhere, or black in a channel.
+        ValueError: ``target`` is not [C, H, W], not finite, negative somewhere, or black in a channel; in a call: a
+            phase of another shape.
 
     Source: thesis Eqs. 4.9, 4.10 (Fourier) and 4.50, 4.51 (Fresnel; there H stands inside the transform by mistake).
     """
@@ -53,6 +54,8 @@ class PECProblem(nn.Module):
     def forward(self, phase: Tensor) -> Tensor:
         """Loss [..., C] for heater phases in rad, real [..., C, H, W]."""
         formed = self.intensity(phase)
+        if formed.shape[-3:] != self.target.shape:
+            raise ValueError(f"phase must end in (C, H, W) = {tuple(self.target.shape)}, got {tuple(phase.shape)}")
         target = self.target.to(formed.dtype)
         if self.scale_free:
             # s minimises the loss, so its own derivative is zero and need not be followed.

@@ -1,7 +1,8 @@
 """Solvers: frozen dataclasses that are called with an objective, a start and a projection.
 
-An objective maps x [..., C, H, W] to one loss per leading index, [..., C]. The items are independent: each has its own
-step length and its own stop, so a batch gives what its items give alone.
+An objective maps x [..., C, H, W] to one loss per leading index, [..., C], that is never negative and 0 for a perfect
+fit, as sums of squares are. The items are independent: each has its own step length and its own stop, so a batch gives
+what its items give alone.
 """
 
 from collections.abc import Callable
@@ -58,8 +59,8 @@ class APG:
         patience: ... for so many iterations in a row.
 
     Raises:
-        ValueError: A field out of range; in a call: a start that is not finite, whose loss is not finite, or whose
-            gradient vanishes although its loss does not (X = 0 is such a point for a Fourier hologram).
+        ValueError: A field out of range; in a call: a start that is not finite, whose loss is negative or not finite,
+            or whose gradient vanishes although its loss does not (X = 0 is such a point for a Fourier hologram).
     """
 
     step: float = 1.0
@@ -179,7 +180,13 @@ class _Run:
         self.objective, self.tolerance, self.patience = objective, tolerance, patience
         self.x, self.evaluations = start.detach(), 0
         loss, self.start_gradient = self.value_and_gradient(self.x)
+        if loss.shape != self.x.shape[:-2]:
+            raise ValueError(
+                f"the objective must return one loss per item, {tuple(self.x.shape[:-2])}, got {tuple(loss.shape)}"
+            )
         checks.all_finite("loss at the start", loss)
+        if loss.min() < 0:
+            raise ValueError(f"the objective must not be negative, got {loss.min().item():g} at the start")
         # To first order, moving every element by one unit (a radian) would change the loss by less than its rounding.
         rounding = 1e3 * torch.finfo(loss.dtype).eps * loss
         stuck = (self.start_gradient.abs().sum((-2, -1)) <= rounding) & (loss > 0)
@@ -230,7 +237,7 @@ class _Run:
 
 
 def _check_stop_rule(max_steps: int, tolerance: float, patience: int) -> None:
-    if max_steps < 1 or patience < 1:
-        raise ValueError(f"max_steps and patience must be at least 1, got {max_steps!r} and {patience!r}")
+    checks.whole("max_steps", max_steps, 1)
+    checks.whole("patience", patience, 1)
     if not tolerance >= 0:
         raise ValueError(f"tolerance must be at least 0, got {tolerance!r}")

@@ -1,29 +1,30 @@
 """What a configuration may say: frozen models, checked all at once, before torch is loaded."""
 
 import re
+from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
+from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.messages import describe, nearest, position
-from holotorch.experiments.source import ConfigError, Key, read_source
+from holotorch.experiments.source import Key, read_source
 from holotorch.io.bundled import BUNDLED_IMAGES, no_such_picture
 
-# Parts of a metre: dividing 530 by 1e9 gives 5.3e-07, multiplying by 1e-9 would not.
-_UNITS = {"m": 1.0, "cm": 1e2, "mm": 1e3, "um": 1e6, "µm": 1e6, "μm": 1e6, "nm": 1e9}
+_POWERS = {"m": 0, "cm": -2, "mm": -3, "um": -6, "µm": -6, "μm": -6, "nm": -9}  # of ten, in metres
 _LENGTH = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-zµμ]*)")
 
 
 def _metres(value: Any) -> Any:
     if isinstance(value, str):
         match = _LENGTH.fullmatch(value.strip())
-        if not match or (match[2] and match[2] not in _UNITS):
+        if not match or (match[2] and match[2] not in _POWERS):
             raise PydanticCustomError(
                 "length", "expected a length such as 530 nm, 3.74 um, 100 mm or a number of metres"
             )
-        return float(match[1]) / _UNITS[match[2] or "m"]
+        return float(Decimal(match[1]).scaleb(_POWERS[match[2] or "m"]))  # rounded once: 0.57 um is 5.7e-07
     return _number(value)
 
 
@@ -31,6 +32,21 @@ def _number(value: Any) -> Any:
     if isinstance(value, bool):
         raise PydanticCustomError("number", "expected a number")
     return value
+
+
+def _not_zero(value: float) -> float:
+    if abs(value) < 1e-6:
+        raise PydanticCustomError("distance", "expected a distance of 1 um or more: closer, a phase forms no image")
+    return value
+
+
+def _within(least: float, most: float, words: str) -> AfterValidator:
+    def check(value: float) -> float:
+        if not least <= value <= most:
+            raise PydanticCustomError("range", "expected {words}", {"words": words})
+        return value
+
+    return AfterValidator(check)
 
 
 def _pair(value: Any) -> Any:
@@ -50,7 +66,12 @@ def _picture(value: Any) -> Any:
 Number = Annotated[float, BeforeValidator(_number), Field(allow_inf_nan=False)]
 Count = Annotated[int, BeforeValidator(_number), Field(ge=1)]
 Length = Annotated[float, BeforeValidator(_metres), Field(allow_inf_nan=False)]
-PositiveLength = Annotated[Length, Field(gt=0)]
+# Ranges that catch a forgotten unit: 530 is no wavelength in metres and 9 no pitch.
+Wavelength = Annotated[Length, _within(1e-7, 2e-5, "a wavelength between 100 nm and 20 um")]
+Pitch = Annotated[Length, _within(1e-9, 1e-3, "a pitch between 1 nm and 1 mm")]
+
+
+Side = Annotated[Count, Field(le=16384)]
 
 
 class Settings(BaseModel):
@@ -62,8 +83,8 @@ class Settings(BaseModel):
 class GridSettings(Settings):
     """Samples (H, W) and their pitch (y, x); one pitch means both axes."""
 
-    shape: tuple[Annotated[Count, Field(le=16384)], Annotated[Count, Field(le=16384)]]
-    pitch: Annotated[tuple[PositiveLength, PositiveLength], BeforeValidator(_pair)]
+    shape: Annotated[tuple[Side, Side], BeforeValidator(_pair)]
+    pitch: Annotated[tuple[Pitch, Pitch], BeforeValidator(_pair)]
 
 
 class TargetSettings(Settings):
@@ -90,39 +111,41 @@ class NearFieldSettings(Settings):
     """Image at a distance. ``isolated``: the array stands alone; ``periodic``: it repeats without end (the thesis)."""
 
     kind: Literal["fresnel", "angular_spectrum"]
-    distance: Length
+    distance: Annotated[Length, AfterValidator(_not_zero)]
     boundary: Literal["isolated", "periodic"] = "isolated"
-    pad: Annotated[Number, Field(ge=1)] | None = None
 
 
 class APGSettings(Settings):
     """Accelerated proximal gradient, thesis Algorithm 2."""
 
     kind: Literal["apg"]
-    step: Annotated[Number, Field(gt=0)] = 1.0
+    step: Annotated[Number, Field(ge=1e-6, le=1e6)] = 1.0
     shrink: Annotated[Number, Field(gt=0, lt=1)] = 0.5
     max_steps: Count = 400
     tolerance: Annotated[Number, Field(ge=0)] = 1e-3
     patience: Count = 10
-    start: Literal["hot", "cool", "flat"] | None = None
+    start: Literal["hot", "flat"] | None = None
 
 
 class AdamSettings(Settings):
     """Adam with projection onto phases >= 0."""
 
     kind: Literal["adam"]
-    learning_rate: Annotated[Number, Field(gt=0)] = 0.1
+    learning_rate: Annotated[Number, Field(ge=1e-6, le=10)] = 0.1
     max_steps: Count = 400
     tolerance: Annotated[Number, Field(ge=0)] = 1e-3
     patience: Count = 10
-    start: Literal["hot", "cool", "flat"] | None = None
+    start: Literal["hot", "flat"] | None = None
 
 
 class ReportSettings(Settings):
     """What is measured and compared in the report."""
 
-    metrics: tuple[Literal["ssim", "psnr"], ...] = ("ssim", "psnr")
-    baselines: tuple[Literal["none", "basic_ipec"], ...] = ("none", "basic_ipec")
+    metrics: Annotated[tuple[Literal["ssim", "psnr"], ...], BeforeValidator(_several), Field(min_length=1)] = (
+        "ssim",
+        "psnr",
+    )
+    baselines: Annotated[tuple[Literal["none", "basic_ipec"], ...], BeforeValidator(_several)] = ("none", "basic_ipec")
 
 
 class PECSettings(Settings):
@@ -132,7 +155,7 @@ class PECSettings(Settings):
     seed: Annotated[int, BeforeValidator(_number), Field(ge=0, lt=2**63)] = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
     grid: GridSettings
-    wavelengths: Annotated[tuple[PositiveLength, ...], BeforeValidator(_several)]
+    wavelengths: Annotated[tuple[Wavelength, ...], BeforeValidator(_several)]
     target: TargetSettings
     modulator: ModulatorSettings
     propagator: Annotated[FraunhoferSettings | NearFieldSettings, Field(discriminator="kind")]
@@ -180,7 +203,8 @@ def _contradictions(settings: PECSettings) -> list[tuple[Key, str]]:
     elif size is not None and size > smallest:
         key = ("modulator", "kernel_size")
         found.append((key, f"expected at most {smallest}, the smaller side of the grid, got {size}"))
-    light = settings.propagator
-    if isinstance(light, NearFieldSettings) and light.boundary == "periodic" and light.pad not in (None, 1):
-        found.append((("propagator", "pad"), f"expected no padding with a periodic boundary, got {light.pad:g}"))
+    light, finest, longest = settings.propagator, min(settings.grid.pitch), max(settings.wavelengths)
+    if isinstance(light, NearFieldSettings) and finest < 0.9 * longest:
+        least = f"at least 0.9 of the longest wavelength, {0.9 * longest:.3g} m, for an image at a distance"
+        found.append((("grid", "pitch"), f"expected {least}, got {finest:g} m"))
     return found

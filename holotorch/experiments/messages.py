@@ -25,13 +25,13 @@ def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
     key = _written_key(source, entry["loc"])
     kind, given = entry["type"], entry["input"]
     if kind == "extra_forbidden":
-        siblings = _names_at(model, entry["loc"][:-1])
-        return source.mistake(key, "unknown setting" + nearest(str(key[-1]), siblings))
+        return source.mistake(key, _unknown(model, entry["loc"], str(key[-1])))
     if kind == "missing":
         return source.mistake(key, "required, but missing")
     if kind in ("union_tag_not_found", "union_tag_invalid"):
         wanted = entry["ctx"].get("expected_tags", "")
-        options = re.findall(r"'([^']+)'", wanted) or _tags_at(model, entry["loc"])
+        options = re.findall(r"'([^']+)'", wanted)
+        options = options or [tag for option in _options_at(model, entry["loc"]) for tag in _tags(option)]
         got = given.get("kind", "none") if isinstance(given, dict) else given
         hint = nearest(str(got), options)
         return source.mistake((*key, "kind"), f"expected one of {', '.join(options)}, got {got!r}{hint}")
@@ -42,6 +42,19 @@ def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
     near = difflib.get_close_matches(str(given), re.findall(r"'([^']+)'", wanted), 1)
     shown = "nothing" if given is None else "NaN" if isinstance(given, float) and math.isnan(given) else repr(given)
     return source.mistake(key, f"expected {wanted}, got {shown}" + (f"; did you mean {near[0]!r}?" if near else ""))
+
+
+def _unknown(model: type[BaseModel], location: tuple[str | int, ...], name: str) -> str:
+    others = [
+        tag for option in _options_at(model, location[:-2]) if name in option.model_fields for tag in _tags(option)
+    ]
+    if others and len(location) > 2:
+        section, kind = location[-3], location[-2]
+        whole = f"to change the kind give the whole section, as in '{section}={{kind: {kind}}}'"
+        return f"a setting of kind {' and '.join(others)}, not of {kind}; {whole}"
+    return "unknown setting" + nearest(
+        name, [name for option in _options_at(model, location[:-1]) for name in option.model_fields]
+    )
 
 
 def position(mistake: str) -> tuple[int, int]:
@@ -68,25 +81,21 @@ def _written_key(source: Source, location: tuple[str | int, ...]) -> Key:
     return tuple(key)
 
 
-def _names_at(model: type[BaseModel], location: tuple[str | int, ...]) -> list[str]:
+def _options_at(model: type[BaseModel], location: tuple[str | int, ...]) -> list[type[BaseModel]]:
+    """The sections that may stand at ``location``: several where a ``kind`` chooses and it is not part of it."""
     options: list[type[BaseModel]] = [model]
     for part in location:
         fields = [option.model_fields[str(part)] for option in options if str(part) in option.model_fields]
         if not fields:  # a union tag
-            options = [option for option in options if part in _literals(option)]
+            options = [option for option in options if part in _tags(option)]
             continue
         annotation = fields[0].annotation
         parts = getattr(annotation, "__args__", (annotation,))
         options = [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
-    return [name for option in options for name in option.model_fields]
+    return options
 
 
-def _tags_at(model: type[BaseModel], location: tuple[str | int, ...]) -> list[str]:
-    field = model.model_fields[str(location[-1])]
-    return [tag for option in getattr(field.annotation, "__args__", ()) for tag in _literals(option)]
-
-
-def _literals(option: type[BaseModel]) -> tuple[str, ...]:
+def _tags(option: type[BaseModel]) -> tuple[str, ...]:
     return getattr(option.model_fields["kind"].annotation, "__args__", ()) if "kind" in option.model_fields else ()
 
 

@@ -35,8 +35,8 @@ def comparison(images: Sequence[Tensor], captions: Sequence[str]) -> bytes:
     return _png(figure)
 
 
-def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[int, float]]) -> bytes:
-    """PNG of the loss per colour [steps + 1, C] (left axis, relative to the start) and of SSIM (right axis)."""
+def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[int, float]], metric: str) -> bytes:
+    """PNG of the loss per colour [steps + 1, C] (left axis, relative to the start) and of a metric (right axis)."""
     figure = Figure(figsize=(7.2, 3.2), layout="constrained")
     axes = figure.add_subplot()
     relative = (losses / losses[0].clamp(min=1e-30)).cpu().numpy()
@@ -48,9 +48,10 @@ def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[in
     handles, labels = axes.get_legend_handles_labels()
     if checked:
         right = axes.twinx()
-        right.plot(*zip(*checked, strict=True), "k--", linewidth=1.2, label="SSIM")
-        right.set_ylabel("mean SSIM")
-        right.set_ylim(0, 1)
+        right.plot(*zip(*checked, strict=True), "k--", linewidth=1.2, label=metric.upper())
+        right.set_ylabel(f"mean {metric.upper()}")
+        if metric == "ssim":
+            right.set_ylim(0, 1)
         more = right.get_legend_handles_labels()
         handles, labels = handles + more[0], labels + more[1]
     axes.legend(handles, labels, fontsize=8, loc="center right")

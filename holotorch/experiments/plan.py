@@ -1,6 +1,8 @@
 """What a run will do, what it will cost and what its physics says, before it starts."""
 
 import math
+import re
+from pathlib import Path
 from typing import Any
 
 from holotorch.core.grid import Grid
@@ -9,67 +11,49 @@ from holotorch.experiments.pec import BASELINE_PASSES, PECExperiment
 from holotorch.optics import diffraction_angle, unaliased_distance
 
 # Seconds of one evaluation per pixel, and per padded sample times log2 of their number, on two CPU cores. Measured at
-# 128 to 1024 px and within a factor of 2 there; the printed time is a guide.
+# 128 to 1024 px and within a factor of 2 there on an idle machine; the printed time is a guide.
 _PIXEL_SECONDS, _FFT_SECONDS = 8e-9, 0.8e-9
-# Measured on the same runs, within 20 %: the interpreter with its libraries; per pixel; per padded sample of the
-# solver; per sample of the judge's padded grid.
-_BASE_BYTES, _PIXEL_BYTES, _SOLVER_BYTES, _JUDGE_BYTES = 480e6, 600, 80, 96
+# Measured on the same runs, within 30 %: the interpreter with its libraries; per pixel; per padded sample of the
+# solver; per sample of the judge's grid of one colour.
+_BASE_BYTES, _PIXEL_BYTES, _SOLVER_BYTES, _JUDGE_BYTES = 480e6, 600, 80, 112
 
 
 def plan(experiment: PECExperiment) -> dict[str, Any]:
     """Choices with their reasons, cost and physics, as plain JSON values."""
-    settings, light = experiment.settings, experiment.settings.propagator
-    grid = experiment.grid
-    padded = grid.padded(experiment.pad)
+    settings, light, grid = experiment.settings, experiment.settings.propagator, experiment.grid
+    padded = grid.padded(2 if experiment.isolated else 1)
     samples = len(experiment.wavelengths) * math.prod(padded.shape)
     pixels = len(experiment.wavelengths) * math.prod(grid.shape)
     evaluations = (2 if settings.solver.kind == "apg" else 1) * settings.solver.max_steps
     work = evaluations + BASELINE_PASSES * len(settings.report.baselines)
     seconds = work * (_PIXEL_SECONDS * pixels + _FFT_SECONDS * samples * math.log2(max(2, samples)))
-    judge = 16 * samples + _JUDGE_BYTES * experiment.judge_samples() if isinstance(light, NearFieldSettings) else 0
-    peak = _BASE_BYTES + _PIXEL_BYTES * pixels + max(_SOLVER_BYTES * samples, judge)
-    taps = experiment.crosstalk.kernel.shape[0]
+    judge = 16 * samples + _JUDGE_BYTES * 5 * math.prod(grid.shape) if isinstance(light, NearFieldSettings) else 0
+    crosstalk = experiment.array.crosstalk
     size_rule = "as given" if settings.modulator.kernel_size else "chosen so that no tap above 1e-6 is dropped"
     return {
         "propagator": light.kind,
-        "padding": {"factor": experiment.pad, "samples": list(padded.shape), "reason": _padding_reason(experiment)},
-        "crosstalk": {"taps": taps, "lost_heat": experiment.crosstalk.lost_heat, "reason": size_rule},
+        "padding": {"samples": list(padded.shape), "reason": _padding_reason(experiment)},
+        "crosstalk": {"taps": crosstalk.kernel.shape[0], "lost_heat": crosstalk.lost_heat, "reason": size_rule},
         "start": {"kind": experiment.start, "reason": _START_REASONS[experiment.start]},
         "loss": "intensity" + (" at its best scale, since light may leave the window" if experiment.isolated else ""),
         "device": str(experiment.device),
         "precision": "complex64 in the solver, complex128 in the judge",
-        "predicted_evaluations_at_most": evaluations,
-        "predicted_seconds_at_most": round(seconds, 2),
-        "predicted_peak_bytes": round(peak),
+        "predicted_evaluations": evaluations,
+        "predicted_seconds": round(seconds, 2),
+        "predicted_peak_bytes": round(_BASE_BYTES + _PIXEL_BYTES * pixels + max(_SOLVER_BYTES * samples, judge)),
         "physics": _physics(experiment, grid),
         "notes": _notes(experiment, grid),
     }
 
 
-def _notes(experiment: PECExperiment, grid: Grid) -> list[str]:
-    """Where the model stops being valid, in words."""
-    found = []
-    light = experiment.settings.propagator
-    if isinstance(light, NearFieldSettings):
-        longest = max(experiment.wavelengths)
-        limit = unaliased_distance(grid, longest, experiment.pad)
-        if light.boundary == "periodic":
-            found.append(
-                "periodic boundary: the array repeats without end, as in the thesis; a single chip forms another "
-                "image, scored as 'isolated' beside it"
-            )
-        if abs(light.distance) > limit:
-            found.append(
-                f"the kernel is undersampled beyond {limit * 1e3:.3g} mm at {longest * 1e9:.0f} nm and this grid and "
-                f"padding; at {light.distance * 1e3:.4g} mm the model aliases"
-            )
-    lost = experiment.crosstalk.lost_heat
-    if lost > 0.01:
-        found.append(f"{100 * lost:.1f} % of the heat falls outside the kernel's taps; leave modulator.kernel_size out")
-    dark = [i for i, on in enumerate(experiment.lit.tolist()) if not on]
-    if dark:
-        found.append(f"colour {', '.join(map(str, dark))} of the picture is black: its light source stays off")
-    return found
+def shortage(values: dict[str, Any]) -> str | None:
+    """A line that says that the planned run does not fit into the memory that is free, or None."""
+    needed, meminfo = values["predicted_peak_bytes"], Path("/proc/meminfo")
+    match = re.search(r"MemAvailable:\s+(\d+) kB", meminfo.read_text()) if meminfo.is_file() else None
+    if not match or needed <= int(match[1]) * 1024:
+        return None
+    free = int(match[1]) * 1024
+    return f"the run needs about {needed / 1e9:.1f} GB and {free / 1e9:.1f} GB are free; use a smaller grid"
 
 
 def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
@@ -88,38 +72,75 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
     if "distance_mm" in physics:
         lines.append(
             f"Image      at {physics['distance_mm']:g} mm; smallest spot {_listed(physics['spot_um'])} um, sampled "
-            f"every {physics['pitch_um'][1]:.4g} um; alias-free up to {_listed(physics['alias_free_mm'])} mm"
+            f"every {physics['pitch_um'][1]:.4g} um; the periodic model is alias-free up to "
+            f"{_listed(physics['alias_free_mm'])} mm"
         )
     lines += [
         f"Solver     {settings.solver.kind}, at most {settings.solver.max_steps} steps from a "
         f"{values['start']['kind']} start ({values['start']['reason']})",
-        f"Cost       at most {values['predicted_evaluations_at_most']} evaluations, about "
-        f"{values['predicted_seconds_at_most']:.2g} s on two cores, {values['predicted_peak_bytes'] / 1e9:.2g} GB of "
-        "memory at the peak",
+        f"Cost       about {values['predicted_evaluations']} evaluations, {values['predicted_seconds']:.2g} s on two "
+        f"idle cores, {values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
     ]
     lines += [f"Note       {note}" for note in values["notes"]]
     return "\n".join(lines)
+
+
+_START_REASONS = {
+    "hot": "phases uniform on [0, 2 pi): light everywhere",
+    "flat": "phases uniform on [0, 1): a nearly plane wave keeps its light in the window",
+}
 
 
 def _listed(values: list[float], form: str = ".3g") -> str:
     return " / ".join(f"{value:{form}}" for value in values)
 
 
-_START_REASONS = {
-    "hot": "phases uniform on [0, 2 pi): light everywhere",
-    "cool": "uniform on [0, 2 pi / sum K): the same after spreading, at less heat",
-    "flat": "uniform on [0, 1): a nearly plane wave keeps its light in the window",
-}
-
-
 def _padding_reason(experiment: PECExperiment) -> str:
-    light = experiment.settings.propagator
-    if not isinstance(light, NearFieldSettings):
-        return "unpadded: the far field of the array itself"
-    if light.boundary == "periodic":
+    if experiment.isolated:
+        return "a chip that stands alone: its exact kernel on twice the window, nothing wraps around"
+    if isinstance(experiment.settings.propagator, NearFieldSettings):
         return "unpadded: the periodic model of the thesis"
-    chosen = "as given" if light.pad else "the least that keeps all light from wrapping around"
-    return f"padded {experiment.pad:.3g} times ({chosen})"
+    return "unpadded: the far field of the array, sampled once per pixel"
+
+
+def _notes(experiment: PECExperiment, grid: Grid) -> list[str]:
+    """Where the model stops being valid, in words."""
+    found = []
+    light, longest = experiment.settings.propagator, max(experiment.wavelengths)
+    if isinstance(light, NearFieldSettings):
+        limit = unaliased_distance(grid, longest, 1)
+        if not experiment.isolated:
+            found.append(
+                "periodic boundary: the array repeats without end, as in the thesis; a single chip forms another "
+                "picture, shown and scored beside it as 'isolated'"
+            )
+            if abs(light.distance) > limit:
+                found.append(
+                    f"the periodic kernel is undersampled beyond {limit * 1e3:.3g} mm at {longest * 1e9:.0f} nm; at "
+                    f"{light.distance * 1e3:.4g} mm this model aliases"
+                )
+        spot = longest * abs(light.distance) / min(grid.extent)
+        if spot > 1.5 * max(grid.pitch):
+            found.append(
+                f"the array resolves {spot * 1e6:.3g} um at this distance, {spot / max(grid.pitch):.1f} samples: finer "
+                "detail of the picture cannot be formed"
+            )
+    elif len(experiment.wavelengths) > 1:
+        found.append(
+            "each colour has its own field of view and is shown here sample by sample; on a display the shorter "
+            "wavelengths' pictures are smaller and the targets must be scaled to overlap"
+        )
+    lost = experiment.array.crosstalk.lost_heat
+    if lost > 0.01:
+        found.append(f"{100 * lost:.1f} % of the heat falls outside the kernel's taps; leave modulator.kernel_size out")
+    dark = [i for i, on in enumerate(experiment.lit.tolist()) if not on]
+    if dark:
+        found.append(f"colour {', '.join(map(str, dark))} of the picture is black: its light source stays off")
+    if experiment.source.mean() < 0.02:
+        found.append(
+            "the picture is very dark: SSIM and PSNR, which compare with full white, are near their best anyway"
+        )
+    return found
 
 
 def _physics(experiment: PECExperiment, grid: Grid) -> dict[str, Any]:
@@ -130,12 +151,12 @@ def _physics(experiment: PECExperiment, grid: Grid) -> dict[str, Any]:
         "pitch_um": [step * 1e6 for step in grid.pitch],
         "field_of_view_deg": [2 * math.degrees(diffraction_angle(grid, wave)[1]) for wave in waves],
         "phase_response_rad_per_K": list(experiment.array.response),
-        "kernel_sum": experiment.crosstalk.total,
+        "kernel_sum": experiment.array.crosstalk.total,
     }
     if isinstance(light, NearFieldSettings):
         values |= {
             "distance_mm": light.distance * 1e3,
-            "spot_um": [wave * abs(light.distance) / grid.extent[1] * 1e6 for wave in waves],
-            "alias_free_mm": [unaliased_distance(grid, wave, experiment.pad) * 1e3 for wave in waves],
+            "spot_um": [wave * abs(light.distance) / min(grid.extent) * 1e6 for wave in waves],
+            "alias_free_mm": [unaliased_distance(grid, wave, 1) * 1e3 for wave in waves],
         }
     return values

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from holotorch.experiments.errors import ConfigError
 from holotorch.io.files import write_text
 
 _PICTURES = {
@@ -14,20 +15,21 @@ _PICTURES = {
     "none": "No correction",
     "basic_ipec": "Basic iterative correction",
     "corrected": "Corrected",
+    "isolated": "Corrected, on a chip that stands alone",
 }
 _FIGURES = {
     "phase": "Heater phases, before the heat spreads",
-    "temperature": "Temperature rise of the chip above ambient, after the heat has spread",
+    "temperature": "Temperature of the chip above ambient, after the heat has spread",
     "convergence": "Convergence of the solver",
 }
 _METHOD_NAMES = {"none": "no correction", "basic_ipec": "basic IPEC", "corrected": "corrected"}
 
 
 def write_report(folders: Sequence[Path], path: Path) -> None:
-    """Write the page of ``folders`` to ``path``. ValueError for a folder that holds no run."""
+    """Write the page of ``folders`` to ``path``. ConfigError for a folder that holds no run."""
     runs = [_Run(folder) for folder in folders]
     body = [_comparison(runs)] if len(runs) > 1 else []
-    body += [_section(run, alone=len(runs) == 1) for run in runs]
+    body += [run.section for run in runs]
     title = "holotorch: " + (runs[0].title if len(runs) == 1 else f"{len(runs)} runs")
     text = _PAGE.format(title=html.escape(title), style=_STYLE, body="\n".join(body))
     write_text(path, text)
@@ -37,19 +39,19 @@ class _Run:
     """What a run folder says of itself."""
 
     def __init__(self, folder: Path):
-        self.folder = folder
+        self.folder, self.title = folder, folder.resolve().name
         names = [name for name in ("summary.json", "interrupted.json") if (folder / name).is_file()]
         if not names:
-            raise ValueError(f"{folder} holds no run: neither summary.json nor interrupted.json is there")
+            raise ConfigError([f"{folder} holds no run: neither summary.json nor interrupted.json is there"])
         try:
             self.summary = json.loads((folder / names[0]).read_text())
             self.plan = json.loads((folder / "plan.json").read_text())
             self.env = json.loads((folder / "env.json").read_text())
             self.config = (folder / "config.yaml").read_text()
             self.methods: dict[str, dict[str, Any]] = self.summary["methods"]
-        except (OSError, KeyError, ValueError) as error:
-            raise ValueError(f"{folder} holds a run that cannot be read: {error}") from None
-        self.title = folder.resolve().name
+            self.section = _section(self)
+        except (OSError, KeyError, IndexError, ValueError, TypeError, AttributeError) as error:
+            raise ConfigError([f"{folder} holds a run that cannot be read: {type(error).__name__} {error}"]) from None
 
     def picture(self, name: str) -> str:
         path = self.folder / "images" / f"{name}.png"
@@ -63,7 +65,7 @@ def _comparison(runs: list[_Run]) -> str:
     return "<h1>Runs</h1>" + _table(["run", *_COLUMNS], rows)
 
 
-def _section(run: _Run, *, alone: bool) -> str:
+def _section(run: _Run) -> str:
     status = "" if run.summary["status"] == "complete" else f' <span class="warn">{run.summary["status"]}</span>'
     parts = [f"<h1>{html.escape(run.title)}{status}</h1>"]
     parts.append(_table(["method", *_COLUMNS], [[_METHOD_NAMES[n], *_numbers(m)] for n, m in run.methods.items()]))
@@ -79,7 +81,7 @@ def _section(run: _Run, *, alone: bool) -> str:
     parts.append("<h2>Plan</h2>" + _table(["", ""], _plan_rows(run.plan), head=False))
     for note in run.plan["notes"]:
         parts.append(f'<p class="warn">{html.escape(note)}</p>')
-    command = f"holotorch run {run.title}/config.yaml --out ANOTHER-FOLDER"
+    command = f"holotorch run {run.folder / 'config.yaml'}"
     repeat = f"Repeat with <code>{html.escape(command)}</code>. Configuration:<pre>{html.escape(run.config)}</pre>"
     parts.append(f"<h2>How to repeat</h2>{repeat}")
     parts.append(_table(["", ""], [[html.escape(k), html.escape(_plain(v))] for k, v in run.env.items()], head=False))
@@ -89,21 +91,22 @@ def _section(run: _Run, *, alone: bool) -> str:
 _COLUMNS = (
     "SSIM",
     "PSNR (dB)",
-    "SSIM, isolated chip",
+    "SSIM between samples",
+    "SSIM, chip alone (exact)",
     "light in window",
-    "peak rise (degC)",
-    "heating power (K per pixel)",
+    "hottest pixel (degC above ambient)",
+    "heating power (mean drive, K)",
     "evaluations",
     "seconds",
 )
 
 
 def _numbers(method: dict[str, Any]) -> list[str]:
-    isolated = method.get("isolated", {}).get("ssim_mean")
     return [
         _fixed(method.get("ssim_mean"), 4),
         _fixed(method.get("psnr_mean"), 1),
-        _fixed(isolated, 3) if isolated is not None else "",
+        _fixed(method["between_samples"].get("ssim_mean"), 3),
+        _fixed(method.get("isolated", {}).get("ssim_mean"), 3),
         f"{100 * _lit_mean(method['efficiency']):.0f} %",
         _fixed(max(method["peak_temperature_rise_K"]), 0),
         _fixed(_lit_mean(method["heating_power_K_per_pixel"]), 0),
@@ -121,8 +124,9 @@ def _verdict(run: _Run) -> str:
         f"The hottest pixel of the corrected hologram is {hottest:.0f} degC above ambient. The solver took {steps} "
         f"steps and {stop}. Peak memory {run.summary['peak_memory_bytes'] / 1e9:.2f} GB. Heating power is the mean "
         "temperature rise that the heaters alone would cause, before the heat spreads; times the number of pixels and "
-        "the chip's watts per kelvin it is the power in watts. Scores are of a float64 simulation of the phases in "
-        "arrays/phase.npy."
+        "the chip's watts per kelvin it is the power in watts. Scores are of a float64 simulation of the phases. They "
+        "are taken at the samples of the image, where the solver controls the light; half a sample off, a Fourier "
+        "hologram is speckled (see 'between samples')."
     )
 
 
@@ -132,7 +136,8 @@ def _plan_rows(plan: dict[str, Any]) -> list[list[str]]:
 
 
 def _score(run: _Run, name: str) -> str:
-    value = run.methods.get(name, {}).get("ssim_mean")
+    isolated = run.methods["corrected"].get("isolated", {})
+    value = (isolated if name == "isolated" else run.methods.get(name, {})).get("ssim_mean")
     return "" if value is None else f": SSIM {value:.3f}"
 
 
@@ -145,7 +150,7 @@ def _plain(value: Any) -> str:
 
 
 def _fixed(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+    return "" if value is None else f"{value:.{digits}f}"
 
 
 def _lit_mean(values: list[float]) -> float:
@@ -154,7 +159,8 @@ def _lit_mean(values: list[float]) -> float:
 
 
 def _figure(source: str, caption: str, kind: str) -> str:
-    return f'<figure class="{kind}"><img src="{source}" alt=""><figcaption>{html.escape(caption)}</figcaption></figure>'
+    words = html.escape(caption)
+    return f'<figure class="{kind}"><img src="{source}" alt="{words}"><figcaption>{words}</figcaption></figure>'
 
 
 def _table(names: Sequence[str], rows: list[list[str]], *, head: bool = True) -> str:

@@ -1,110 +1,175 @@
 """One run: a folder that is complete, or one that says it was interrupted; never half a file."""
 
-import datetime
-import os
-import platform
 import re
 import resource
-import subprocess
+import shutil
+import signal
 import sys
 import time
-from importlib import metadata
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import torch
 import yaml
 from tqdm import tqdm
 
-import holotorch
 from holotorch.correction import Solution
 from holotorch.experiments import pictures
-from holotorch.experiments.config import NearFieldSettings, PECSettings
-from holotorch.experiments.pec import PECExperiment, Result, build
-from holotorch.experiments.plan import plan, plan_text
+from holotorch.experiments.config import PECSettings
+from holotorch.experiments.environment import environment
+from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.judge import Result, judge, quality
+from holotorch.experiments.pec import PECExperiment, build
+from holotorch.experiments.plan import plan, plan_text, shortage
 from holotorch.experiments.report import write_report
-from holotorch.io.files import replacing, save_array, write_bytes, write_json, write_text
+from holotorch.io.files import save_array, write_bytes, write_json, write_text
 from holotorch.io.images import encode_png
 
-_CHECK_EVERY = 10  # steps between two measurements of SSIM, which costs about as much as a step
+_CHECK_EVERY = 10  # steps between two measurements of quality, which cost about as much as a step
+_CAPTIONS = {"none": "No correction", "basic_ipec": "Basic iterative correction", "corrected": "Corrected"}
 
 
-def run(settings: PECSettings, out: Path) -> bool:
-    """Carry a run out and fill the folder ``out``. Returns False if it was interrupted; what was found is saved then.
+def run(settings: PECSettings, out: Path | None, name: str = "run") -> tuple[Path, bool]:
+    """Carry a run out and fill a folder: ``out``, or the next free ``runs/NAME-001``.
+
+    Returns:
+        The folder, and whether the run is complete; if it was interrupted, what it had found is in the folder.
 
     Raises:
-        ValueError: The folder holds a run already or cannot be written, or the picture cannot be used.
+        ConfigError: The folder holds files already or cannot be written, the picture cannot be used, the run does not
+            fit into memory, or the solver cannot start.
     """
     experiment = build(settings)
     values = plan(experiment)
     print(plan_text(experiment, values), flush=True)
-    _check_memory(values["predicted_peak_bytes"])
-    _prepare(out)
-    write_text(out / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
-    write_json(out / "env.json", environment(settings, experiment))
-    write_json(out / "plan.json", values)
-
-    log = _Log(experiment)
-    started = time.perf_counter()
-    interrupted = False
+    if text := shortage(values):
+        raise ConfigError([text])
+    folder = claim(out, name)
     try:
-        solution = experiment.solve(log)
+        return folder, _fill(folder, experiment, values)
     except KeyboardInterrupt:
-        interrupted, solution = True, log.last
-        if solution is None:
-            raise
-    finally:
-        log.close()
-    seconds = time.perf_counter() - started - log.seconds_spent
+        raise
+    except BaseException:
+        shutil.rmtree(folder)  # claimed empty a moment ago: only this run's own files are in it
+        raise
 
-    results = {"corrected": experiment.judge(solution.x)}
-    results["corrected"].numbers.update(_effort(experiment, solution, seconds))
+
+def claim(out: Path | None, name: str) -> Path:
+    """Make the folder of a run so that no other run can have it too. ConfigError where that is not possible."""
+    if out is None:
+        parent = Path("runs")
+        pattern = re.compile(re.escape(name) + r"-(\d+)")
+        try:
+            parent.mkdir(exist_ok=True)
+            while True:
+                matches = [pattern.fullmatch(path.name) for path in parent.iterdir()]
+                folder = parent / f"{name}-{max((int(match[1]) for match in matches if match), default=0) + 1:03d}"
+                try:
+                    folder.mkdir()
+                    return folder
+                except FileExistsError:
+                    continue  # another run was faster
+        except OSError as error:
+            raise ConfigError([f"cannot write to {parent}: {error.strerror}; choose a place with --out"]) from None
     try:
-        for name in () if interrupted else settings.report.baselines:
-            results[name] = _baseline(experiment, name)
-    except KeyboardInterrupt:
-        interrupted = True
-    _write_results(out, experiment, results, log, solution)
-    summary = {
-        "experiment": settings.experiment,
-        "status": "interrupted" if interrupted else "complete",
-        "methods": {name: result.numbers for name, result in results.items()},
-        "peak_memory_bytes": peak_memory(),
-    }
-    name = "interrupted.json" if interrupted else "summary.json"
-    write_json(out / name, summary)
-    write_report([out], out / "report.html")
-    return not interrupted
-
-
-def next_folder(name: str) -> Path:
-    """``runs/NAME-001`` or the next free number; the default place of a run."""
-    parent = Path("runs")
-    taken = [int(match[1]) for path in parent.glob(f"{name}-*") if (match := re.search(r"-(\d+)$", path.name))]
-    return parent / f"{name}-{max(taken, default=0) + 1:03d}"
-
-
-def environment(settings: PECSettings, experiment: PECExperiment) -> dict[str, Any]:
-    """Versions, device, seed and git state: what is needed to repeat the run."""
-    packages = ("torch", "numpy", "kornia", "scikit-image", "opencv-contrib-python-headless")
-    gpu = torch.cuda.get_device_name(experiment.device) if experiment.device.type == "cuda" else None
-    return {
-        "holotorch": holotorch.__version__,
-        "git": _git_state(),
-        "python": platform.python_version(),
-        "packages": {name: metadata.version(name) for name in packages},
-        "platform": platform.platform(),
-        "device": gpu or f"CPU, {torch.get_num_threads()} threads",
-        "seed": settings.seed,
-        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "command": ["holotorch", *sys.argv[1:]],
-    }
+        out.mkdir(parents=True, exist_ok=True)
+        if any(out.iterdir()):
+            raise ConfigError([f"{out} holds files already; choose another --out or delete it"])
+        (out / "images").mkdir()  # the claim: of two runs only one can make it
+    except FileExistsError:
+        raise ConfigError([f"{out} is a file, or in use by another run; choose another --out"]) from None
+    except OSError as error:
+        raise ConfigError([f"cannot write to {out}: {error.strerror}; choose another place with --out"]) from None
+    return out
 
 
 def peak_memory() -> int:
     """Largest resident size of this process so far, in bytes."""
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+
+
+def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
+    settings = experiment.settings
+    for part in ("arrays", "images"):
+        (out / part).mkdir(exist_ok=True)
+    write_text(out / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
+    write_json(out / "env.json", environment(settings.seed, experiment.device))
+    write_json(out / "plan.json", values)
+
+    log = _Log(experiment)
+    started = time.perf_counter()
+    with _interruptible() as pressed:
+        try:
+            solution = experiment.solve(log)
+        except KeyboardInterrupt:
+            solution = log.last
+        finally:
+            log.close()
+        if solution is None:
+            raise KeyboardInterrupt
+        seconds = time.perf_counter() - started - log.seconds_spent
+        with _deferred(pressed):  # from here on Ctrl-C is remembered; what was found is saved first
+            results = {"corrected": _result(experiment, solution, seconds)}
+            save_array(out / "arrays" / "phase.npy", results["corrected"].phase.float()[None])  # one frame
+        for name in settings.report.baselines:
+            try:
+                if not pressed:
+                    started = time.perf_counter()
+                    found = experiment.baseline(name)
+                    results[name] = _result(experiment, found, time.perf_counter() - started)
+            except KeyboardInterrupt:
+                pressed.append(signal.SIGINT)
+        with _deferred(pressed):
+            _write_results(out, experiment, results, log, solution)
+            summary = {
+                "experiment": settings.experiment,
+                "status": "interrupted" if pressed else "complete",
+                "methods": {name: result.numbers for name, result in results.items()},
+                "peak_memory_bytes": peak_memory(),
+            }
+            write_json(out / ("interrupted.json" if pressed else "summary.json"), summary)
+            write_report([out], out / "report.html")
+    if pressed:
+        steps = int(solution.steps.max())
+        print(f"interrupted; saved what {steps} steps have found", file=sys.stderr)
+    return not pressed
+
+
+@contextmanager
+def _interruptible() -> Iterator[list[int]]:
+    """Let SIGTERM act as Ctrl-C, and note in the list that either has come."""
+    pressed: list[int] = []
+
+    def note(number: int, _: Any) -> None:
+        pressed.append(number)
+        raise KeyboardInterrupt
+
+    with _handling(note):
+        yield pressed
+
+
+@contextmanager
+def _deferred(pressed: list[int]) -> Iterator[None]:
+    """Only note that Ctrl-C or SIGTERM has come."""
+    with _handling(lambda number, _: pressed.append(number)):
+        yield
+
+
+@contextmanager
+def _handling(handler) -> Iterator[None]:
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    try:
+        before = [signal.signal(number, handler) for number in numbers]
+    except ValueError:  # signals reach the main thread only
+        yield
+        return
+    try:
+        yield
+    finally:
+        for number, old in zip(numbers, before, strict=True):
+            signal.signal(number, old)
 
 
 class _Log:
@@ -118,22 +183,26 @@ class _Log:
         self.started = time.perf_counter()
         self.bar = tqdm(total=experiment.settings.solver.max_steps, desc="correcting", unit="step", dynamic_ncols=True)
 
+    @property
+    def metric(self) -> str:
+        """Name of what is measured on the way."""
+        return self.experiment.settings.report.metrics[0]
+
     def __call__(self, solution: Solution) -> None:
         entered = time.perf_counter()
         self.last = solution
         step = len(solution.losses) - 1
-        quality = ""
-        if step % _CHECK_EVERY == 0 and "ssim" in self.experiment.settings.report.metrics:
-            score = self.experiment.judge(solution.x).numbers["ssim_mean"]
-            self.checked.append((step, score))
-            quality = f"{score:.6f}"
+        shown, score = {}, ""
+        if step % _CHECK_EVERY == 0:
+            self.checked.append((step, quality(self.experiment, solution.x)))
+            score = f"{self.checked[-1][1]:.6f}"
         losses = solution.losses[-1].tolist()
         elapsed = entered - self.started - self.seconds_spent
-        self.rows.append([str(step), str(solution.evaluations), f"{elapsed:.4f}", quality, *map(repr, losses)])
+        self.rows.append([str(step), str(solution.evaluations), f"{elapsed:.4f}", score, *map(repr, losses)])
         relative = (solution.losses[-1] / solution.losses[0].clamp(min=1e-30)).mean().item()
-        shown = {"loss": f"{relative:.2e}", "mem": f"{peak_memory() / 1e9:.2f}GB"}
+        shown |= {"loss": f"{relative:.2e}", "mem": f"{peak_memory() / 1e9:.2f}GB"}
         if self.checked:
-            shown["ssim"] = f"{self.checked[-1][1]:.4f}"
+            shown[self.metric] = f"{self.checked[-1][1]:.4f}"
         self.bar.set_postfix(shown, refresh=False)
         self.bar.update()
         self.seconds_spent += time.perf_counter() - entered
@@ -143,53 +212,20 @@ class _Log:
 
     def table(self) -> str:
         colours = [f"loss_{wave * 1e9:.0f}nm" for wave in self.experiment.wavelengths]
-        header = ["step", "evaluations", "seconds", "ssim_mean", *colours]
+        header = ["step", "evaluations", "seconds", f"{self.metric}_mean", *colours]
         return "\n".join(",".join(row) for row in [header, *self.rows]) + "\n"
 
 
-def _prepare(out: Path) -> None:
-    for name in ("summary.json", "interrupted.json"):
-        if (out / name).exists():
-            raise ValueError(f"{out} holds a run already ({name}); choose another --out or delete it")
-    try:
-        for folder in (out, out / "arrays", out / "images"):
-            folder.mkdir(parents=True, exist_ok=True)
-        with replacing(out / "plan.json") as stream:
-            stream.write(b"{}\n")
-    except OSError as error:
-        raise ValueError(f"cannot write to {out}: {error.strerror}; choose another place with --out") from None
-
-
-def _check_memory(needed: int) -> None:
-    meminfo = Path("/proc/meminfo")
-    match = re.search(r"MemAvailable:\s+(\d+) kB", meminfo.read_text()) if meminfo.is_file() else None
-    if match and needed > int(match[1]) * 1024:
-        raise ValueError(
-            f"the run needs about {needed / 1e9:.1f} GB and {int(match[1]) / 1e6:.1f} GB are free; use a smaller "
-            "grid, a shorter distance or less padding (propagator.pad)"
-        )
-
-
-def _baseline(experiment: PECExperiment, name: str) -> Result:
-    started = time.perf_counter()
-    solution = experiment.baseline(name)
-    seconds = time.perf_counter() - started
-    result = experiment.judge(solution.x)
-    result.numbers.update(_effort(experiment, solution, seconds))
+def _result(experiment: PECExperiment, solution: Solution, seconds: float) -> Result:
+    result = judge(experiment, solution.x)
+    result.numbers.update(
+        evaluations=solution.evaluations,
+        steps=solution.steps.tolist(),
+        converged=solution.converged.tolist(),
+        stalled=solution.stalled.tolist(),
+        seconds=round(seconds, 4),
+    )
     return result
-
-
-def _effort(experiment: PECExperiment, solution: Solution, seconds: float) -> dict[str, Any]:
-    numbers: dict[str, Any] = {
-        "evaluations": solution.evaluations,
-        "steps": solution.steps.tolist(),
-        "converged": solution.converged.tolist(),
-        "stalled": solution.stalled.tolist(),
-        "seconds": round(seconds, 4),
-    }
-    if isinstance(experiment.settings.propagator, NearFieldSettings):
-        numbers["isolated"] = experiment.judge_isolated(solution.x)
-    return numbers
 
 
 def _write_results(
@@ -197,39 +233,27 @@ def _write_results(
 ) -> None:
     corrected = results["corrected"]
     write_text(out / "metrics.csv", log.table())
-    save_array(out / "arrays" / "phase.npy", corrected.phase.float()[None])  # [F, C, H, W] with one frame
     save_array(out / "arrays" / "intensity.npy", corrected.picture)
     save_array(out / "arrays" / "target.npy", experiment.image)
-    write_bytes(out / "images" / "target.png", encode_png(experiment.image))
-    for name, result in results.items():
-        write_bytes(out / "images" / f"{name}.png", encode_png(result.picture))
-    names = [f"{wave * 1e9:.0f} nm" for wave in experiment.wavelengths]
-    phase = corrected.phase[experiment.lit]
-    warm = experiment.array.temperature(experiment.crosstalk(phase))
     shown = {"target": experiment.image} | {name: results[name].picture for name in _CAPTIONS if name in results}
-    captions = ["Target", *(f"{_CAPTIONS[name]}{_score(results[name])}" for name in shown if name in results)]
+    captions = ["Target", *(_CAPTIONS[name] + _score(results[name].numbers) for name in shown if name in results)]
+    if corrected.isolated is not None and not experiment.isolated:
+        shown["isolated"] = corrected.isolated
+        captions.append("Corrected, on a chip that stands alone" + _score(corrected.numbers["isolated"]))
+    for name, picture in shown.items():
+        write_bytes(out / "images" / f"{name}.png", encode_png(picture))
+    names = [f"{wave * 1e9:.0f} nm" for wave in experiment.wavelengths]
+    phase = corrected.phase[experiment.lit].to(experiment.device)
+    warm = experiment.array.temperature(experiment.array.crosstalk(phase)).cpu()
     figures = {
         "comparison": pictures.comparison(list(shown.values()), captions),
-        "phase": pictures.channel_maps(phase, names, "heater phase (rad)", "viridis"),
-        "temperature": pictures.channel_maps(warm, names, "temperature rise (K)", "inferno", (0, None)),
-        "convergence": pictures.convergence(solution.losses, names, log.checked),
+        "phase": pictures.channel_maps(phase.cpu(), names, "heater phase (rad)", "viridis"),
+        "temperature": pictures.channel_maps(warm, names, "temperature rise (degC)", "inferno", (0, None)),
+        "convergence": pictures.convergence(solution.losses, names, log.checked, log.metric),
     }
     for name, data in figures.items():
         write_bytes(out / "images" / f"{name}.png", data)
 
 
-_CAPTIONS = {"none": "No correction", "basic_ipec": "Basic iterative correction", "corrected": "Corrected"}
-
-
-def _score(result: Result) -> str:
-    return f", SSIM {result.numbers['ssim_mean']:.3f}" if "ssim_mean" in result.numbers else ""
-
-
-def _git_state() -> str | None:
-    folder = os.path.dirname(os.path.abspath(holotorch.__file__))
-    try:
-        words = ["git", "-C", folder, "describe", "--always", "--dirty", "--abbrev=12"]
-        answer = subprocess.run(words, capture_output=True, text=True, timeout=5)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return answer.stdout.strip() or None
+def _score(numbers: dict[str, Any]) -> str:
+    return f", SSIM {numbers['ssim_mean']:.3f}" if "ssim_mean" in numbers else ""

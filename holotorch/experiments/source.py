@@ -6,15 +6,9 @@ from typing import Any
 
 import yaml
 
+from holotorch.experiments.errors import ConfigError
+
 Key = tuple[str | int, ...]
-
-
-class ConfigError(ValueError):
-    """One or more mistakes in a configuration, each a line ``file:line:column: key: what is wrong``."""
-
-    def __init__(self, mistakes: list[str]):
-        super().__init__("\n".join(mistakes))
-        self.mistakes = mistakes
 
 
 @dataclass
@@ -80,9 +74,9 @@ def _override(source: Source, word: str, mistakes: list[str]) -> None:
 
 
 def _parse(text: str, name: str, places: dict[Key, str], key: Key, mistakes: list[str]) -> Any:
-    loader = yaml.SafeLoader(text)
-    loader.name = name
     try:
+        loader = yaml.SafeLoader(text)
+        loader.name = name
         node = loader.get_single_node()
         return None if node is None else _construct(loader, node, name, places, key, mistakes)
     except yaml.MarkedYAMLError as error:
@@ -90,9 +84,9 @@ def _parse(text: str, name: str, places: dict[Key, str], key: Key, mistakes: lis
         place = f"{name}:{mark.line + 1}:{mark.column + 1}" if mark else name
         mistakes.append(f"{place}: not valid YAML: {error.problem or error.context}")
     except yaml.YAMLError as error:
-        mistakes.append(f"{name}: not valid YAML: {error}")
-    finally:
-        loader.dispose()
+        mistakes.append(f"{name}: not valid YAML: {' '.join(str(error).split())}")
+    except RecursionError:
+        mistakes.append(f"{name}: not a configuration: nested without end")
     return None
 
 
@@ -101,7 +95,7 @@ def _construct(loader, node: yaml.Node, name: str, places: dict[Key, str], key: 
     if isinstance(node, yaml.MappingNode):
         result: dict[str, Any] = {}
         for key_node, value_node in node.value:
-            part = str(key_node.value)
+            part = key_node.value if isinstance(key_node, yaml.ScalarNode) else "?"
             place = f"{name}:{key_node.start_mark.line + 1}:{key_node.start_mark.column + 1}"
             if part in result:
                 mistakes.append(f"{place}: {'.'.join(map(str, (*key, part)))}: written twice; keep one")
@@ -110,4 +104,8 @@ def _construct(loader, node: yaml.Node, name: str, places: dict[Key, str], key: 
         return result
     if isinstance(node, yaml.SequenceNode):
         return [_construct(loader, item, name, places, (*key, i), mistakes) for i, item in enumerate(node.value)]
-    return loader.construct_object(node)
+    try:
+        return loader.construct_object(node)
+    except (ValueError, TypeError) as error:  # an impossible date, a tag that does not fit
+        mistakes.append(f"{places[key]}: {'.'.join(map(str, key))}: not a value: {error}")
+        return None

@@ -17,9 +17,9 @@ def load_image(source: str | Path) -> Tensor:
     """Load a bundled photograph by name, or a PNG, JPEG, TIFF or EXR file by path.
 
     Returns:
-        float64 [C, H, W] in [0, 1], C = 3 (red, green, blue) or 1. Integers are divided by their type's maximum and
-        not linearised: as in the thesis, pixel values are taken as intensities. Floating-point pictures are divided
-        by their maximum where that exceeds 1. Transparency shows black.
+        float64 [C, H, W] in [0, 1], C = 3 (red, green, blue) or 1. 8 and 16 bit integers are divided by 255 and 65535
+        and not linearised: as in the thesis, pixel values are taken as intensities. All others are divided by their
+        maximum where that exceeds 1. Transparency shows black.
 
     Raises:
         ValueError: No such picture, not decodable, smaller than 11 px on a side, NaN, negative, or black throughout.
@@ -33,10 +33,11 @@ def load_image(source: str | Path) -> Tensor:
         pixels = _decode(_existing(path))
     if pixels.ndim == 2:
         pixels = pixels[..., None]
-    image = torch.from_numpy(_unit_range(pixels)).permute(2, 0, 1)
-    if image.shape[0] in (2, 4):
-        image = image[:-1] * image[-1:]
-    return _checked(image, str(source))
+    if pixels.shape[-1] in (2, 4):
+        values = _unit_range(pixels[..., :-1]) * _unit_range(pixels[..., -1:])
+    else:
+        values = _unit_range(pixels)
+    return _checked(torch.from_numpy(values).permute(2, 0, 1), str(source))
 
 
 def fit_image(image: Tensor, shape: tuple[int, int], fit: str = "crop") -> Tensor:
@@ -107,7 +108,7 @@ def _decode(path: Path) -> np.ndarray:
 
     data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
     # JPEG through the colour reader, which turns the picture as its orientation tag says.
-    jpeg = path.suffix.lower() in (".jpg", ".jpeg")
+    jpeg = data[:2].tobytes() == b"\xff\xd8"
     pixels = cv2.imdecode(data, cv2.IMREAD_COLOR if jpeg else cv2.IMREAD_UNCHANGED) if data.size else None
     if pixels is None:
         raise ValueError(f"{path} is not a readable picture (PNG, JPEG, TIFF or EXR)")
@@ -126,13 +127,16 @@ def _read_exr(path: Path) -> np.ndarray:
     names = next((wanted for wanted in (("R", "G", "B"), ("Y",)) if all(name in channels for name in wanted)), None)
     if names is None:
         raise ValueError(f"{path} must have channels R, G, B or Y, got {', '.join(sorted(channels))}")
+    if "RY" in channels:
+        raise ValueError(f"{path} stores colour as luminance and differences; convert it to R, G, B")
+    names = [*names, "A"] if "A" in channels else names
     return np.stack([channels[name].pixels for name in names], axis=-1)
 
 
 def _unit_range(pixels: np.ndarray) -> np.ndarray:
     if pixels.dtype == bool:
         return pixels.astype(np.float64)
-    if np.issubdtype(pixels.dtype, np.integer):
+    if pixels.dtype in (np.uint8, np.uint16):
         return pixels.astype(np.float64) / np.iinfo(pixels.dtype).max
     values = pixels.astype(np.float64)
     peak = values.max()
@@ -149,8 +153,8 @@ def _checked(image: Tensor, source: str) -> Tensor:
     if min(image.shape[-2:]) < SMALLEST_SIDE:
         height, width = image.shape[-2:]
         raise ValueError(
-            f"picture {source} is {height} x {width} px; it must have at least {SMALLEST_SIDE} px a side for ssim, "
-            "use a larger one"
+            f"picture {source} is {height} x {width} px, less than the {SMALLEST_SIDE} x {SMALLEST_SIDE} px window "
+            "of ssim; use a larger one"
         )
     if image.max() == 0:
         raise ValueError(f"picture {source} is black: there is no light to form; use another picture")

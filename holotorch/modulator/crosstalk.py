@@ -36,7 +36,7 @@ class ThermalCrosstalk(nn.Module):
         sigma = checks.finite("sigma_px", sigma_px, "pixels")
         if not 0 <= sigma <= _WIDEST:
             raise ValueError(f"sigma_px must lie between 0 and {_WIDEST} pixels, got {sigma_px!r}")
-        if size is not None and (size < 1 or size % 2 == 0):
+        if size is not None and checks.whole("crosstalk size", size, 1) % 2 == 0:
             raise ValueError(f"crosstalk size must be an odd number of taps of at least 1, got {size!r}")
         radius = _needed_radius(sigma) if size is None else size // 2
         taps = [[_tap(offset, sigma)] for offset in range(-radius, radius + 1)]
@@ -122,8 +122,9 @@ class ThermalCrosstalk(nn.Module):
 class _ShiftAndAdd(torch.autograd.Function):
     """Convolution by summing shifted copies, one per tap.
 
-    On CPUs conv2d with a single channel spends 70 ms on the forward and backward pass of 3 x 512 x 512 px where this
-    takes under 2 ms; conv2d is its twin in the tests.
+    With one channel, conv2d's backward pass on a CPU takes about ten times as long (``scripts/bench.py crosstalk``);
+    conv2d is the twin that judges this in the tests. There is no forward mode: torch.compile refuses a function that
+    defines one.
     """
 
     generate_vmap_rule = True

@@ -45,16 +45,18 @@ def test_padded_takes_good_lengths_and_leaves_factor_one_alone(factor, shape):
         ((8, 8), 0.0, ValueError, "above zero"),
         ((8, 8), float("nan"), ValueError, "finite"),
         ((8, 8), (1e-6, float("inf")), ValueError, "finite"),
-        ((8, 8), "wide", TypeError, "number"),
+        ((8, 8), ("wide", 1e-6), TypeError, "number"),
         ((0, 8), 1e-6, ValueError, "at least"),
-        ((8, 8.5), 1e-6, TypeError, "integers"),
-        ((8, True), 1e-6, TypeError, "integers"),
+        ((8, 8.5), 1e-6, TypeError, "whole number"),
+        ((8, True), 1e-6, TypeError, "whole number"),
+        (None, 1e-6, TypeError, "whole number"),
+        (8, True, TypeError, "number"),
         ((8, 8, 8), 1e-6, ValueError, r"\(H, W\)"),
     ],
 )
 def test_refuses_what_is_no_grid(shape, pitch, error, message):
     with pytest.raises(error, match=message):
-        Grid(shape, (pitch, pitch) if isinstance(pitch, str) else pitch)  # type: ignore[arg-type]
+        Grid(shape, pitch)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("factor", [0.5, 0, -1, float("nan"), float("inf")])

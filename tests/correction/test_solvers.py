@@ -197,7 +197,7 @@ def test_apg_says_stalled_when_no_step_is_accepted_and_keeps_what_it_has():
         (lambda: APG(step=0.0), "step must be above zero"),
         (lambda: APG(step=float("nan")), "step must be finite"),
         (lambda: APG(shrink=1.0), "shrink must lie between 0 and 1"),
-        (lambda: APG(max_steps=0), "max_steps and patience must be at least 1"),
+        (lambda: APG(max_steps=0), "max_steps must be at least 1"),
         (lambda: APG(tolerance=-1.0), "tolerance must be at least 0"),
         (lambda: APG(tolerance=float("nan")), "tolerance must be at least 0"),
         (lambda: ProjectedAdam(learning_rate=-0.1), "learning_rate must be above zero"),

@@ -1,11 +1,13 @@
 import base64
 import re
+import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
 
 from holotorch.experiments.config import load_config
+from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.report import write_report
 from holotorch.experiments.run import run
 
@@ -52,8 +54,8 @@ def test_one_static_page_with_pictures_inside(folders):
 
 
 def test_columns_that_say_nothing_are_left_out(folders):
-    assert "isolated chip" not in (folders[0] / "report.html").read_text()
-    assert "isolated chip" in (folders[1] / "report.html").read_text()
+    assert "chip alone" not in (folders[0] / "report.html").read_text()
+    assert "chip alone" in (folders[1] / "report.html").read_text()
 
 
 def test_several_runs_are_compared(folders, tmp_path):
@@ -63,9 +65,11 @@ def test_several_runs_are_compared(folders, tmp_path):
     assert re.search(r"<h1>Runs</h1>.*first &lt;b&gt;.*second", page, re.S)
 
 
-def test_refuses_a_folder_without_a_run(tmp_path):
-    with pytest.raises(ValueError, match="holds no run: neither summary.json nor interrupted.json"):
+def test_refuses_a_folder_without_a_run(folders, tmp_path):
+    with pytest.raises(ConfigError, match="holds no run: neither summary.json nor interrupted.json"):
         write_report([tmp_path], tmp_path / "report.html")
-    (tmp_path / "summary.json").write_text("{")
-    with pytest.raises(ValueError, match="cannot be read"):
-        write_report([tmp_path], tmp_path / "report.html")
+    shutil.copytree(folders[0], tmp_path / "a")
+    for text in ("{", "[]", '{"methods": {}}', '{"methods": {"corrected": {}}}', '{"methods": {"other": {}}}'):
+        (tmp_path / "a" / "summary.json").write_text(text)
+        with pytest.raises(ConfigError, match="cannot be read"):
+            write_report([tmp_path / "a"], tmp_path / "report.html")

@@ -3,8 +3,10 @@
 import csv
 import json
 import os
+import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -17,9 +19,10 @@ from skimage.metrics import structural_similarity
 from holotorch.correction import Solution
 from holotorch.experiments import run as run_module
 from holotorch.experiments.config import load_config
+from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.pec import PECExperiment, build
 from holotorch.experiments.plan import plan, plan_text
-from holotorch.experiments.run import next_folder, run
+from holotorch.experiments.run import claim, run
 from holotorch.io.images import load_image
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -34,7 +37,7 @@ def settings(config: str = "pec/fourier.yaml", *overrides: str):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run") / "a"
-    assert run(settings(), folder)
+    assert run(settings(), folder)[1]
     return folder
 
 
@@ -80,6 +83,13 @@ def test_scores_follow_from_the_saved_phase_alone(finished):
         assert numbers["peak_temperature_rise_K"][c] == pytest.approx(spread.max() * kelvin, rel=1e-9)
         assert numbers["heating_power_K_per_pixel"][c] == pytest.approx(phase[c].mean() * kelvin, rel=1e-9)
         assert numbers["efficiency"][c] == pytest.approx(1, rel=1e-9)
+        # Half a sample off: the same sum with frequencies m + 1/2.
+        ramp = np.exp(-1j * np.pi * ((np.arange(32) - 16)[:, None] / 32 + (np.arange(24) - 12)[None] / 24))
+        formed = np.abs(transform @ (np.exp(1j * spread) * ramp.ravel())) ** 2 * target[c].mean()
+        between = formed.clip(0, 1).reshape(32, 24)[:-1, :-1]
+        middle = (target[c][1:, 1:] + target[c][1:, :-1] + target[c][:-1, 1:] + target[c][:-1, :-1]) / 4
+        noise = -10 * np.log10(((between - middle) ** 2).mean())
+        assert numbers["between_samples"]["psnr"][c] == pytest.approx(noise, rel=1e-9)
     assert numbers["evaluations"] >= 24 and numbers["steps"] == [12, 12, 12]
 
 
@@ -89,7 +99,7 @@ def test_scores_follow_from_the_saved_phase_alone(finished):
         ("pec/fresnel.yaml",),
         ("pec/fresnel.yaml", "propagator.boundary=periodic"),
         ("pec/fresnel.yaml", "propagator.kind=angular_spectrum", "propagator.distance=-5 mm"),
-        ("pec/fresnel.yaml", "propagator.pad=2", "solver.start=cool"),
+        ("pec/fresnel.yaml", "solver.start=hot"),
         ("pec/fourier.yaml", "solver={kind: adam, learning_rate: 0.3, max_steps: 60}"),
         ("pec/fourier.yaml", "wavelengths=532 nm", "target.fit=pad"),
         ("pec/fourier.yaml", "target.image=page", "modulator={sigma_px: 1.5}", "grid.shape=[24,40]"),
@@ -99,9 +109,11 @@ def test_scores_follow_from_the_saved_phase_alone(finished):
     ids=lambda overrides: " ".join(overrides),
 )
 def test_every_kind_runs_and_improves_on_its_baselines(overrides, tmp_path):
-    assert run(settings(*overrides), tmp_path / "a")
+    assert run(settings(*overrides), tmp_path / "a")[1]
     methods = read(tmp_path / "a")["methods"]
     near = "fresnel" in overrides[0]
+    periodic = any("periodic" in word for word in overrides)
+    assert (tmp_path / "a" / "images" / "isolated.png").exists() == periodic
     for name, numbers in methods.items():
         assert ("isolated" in numbers) == near
         assert np.isfinite([numbers["psnr_mean"], *numbers["peak_temperature_rise_K"]]).all()
@@ -128,13 +140,13 @@ def test_one_black_colour_stays_dark_and_does_not_disturb_the_others(tmp_path):
     pixels[..., 0] = 0  # blue, as OpenCV orders
     cv2.imwrite(str(tmp_path / "yellow.png"), pixels)
     picture = f"target.image={tmp_path / 'yellow.png'}"
-    assert run(settings("pec/fourier.yaml", picture, "grid.shape=[24,24]"), tmp_path / "a")
+    assert run(settings("pec/fourier.yaml", picture, "grid.shape=[24,24]"), tmp_path / "a")[1]
     numbers = read(tmp_path / "a")["methods"]["corrected"]
     assert numbers["ssim"][2] == 1 and numbers["psnr"][2] is None
     assert numbers["heating_power_K_per_pixel"][2] == 0 and numbers["efficiency"][2] == 0
     assert np.load(tmp_path / "a" / "arrays" / "phase.npy")[0, 2].max() == 0
     assert numbers["ssim_mean"] == pytest.approx(np.mean(numbers["ssim"][:2]))
-    assert "colour 2 of the picture is black" in read(tmp_path / "a", "plan.json")["notes"][0]
+    assert any("colour 2 of the picture is black" in note for note in read(tmp_path / "a", "plan.json")["notes"])
 
 
 class StopAfter:
@@ -142,16 +154,14 @@ class StopAfter:
 
     def __init__(self, experiment: PECExperiment, step: int):
         self.log, self.step = LOG(experiment), step
-        self.last = None
 
     def __getattr__(self, name: str):
         return getattr(self.log, name)
 
     def __call__(self, solution: Solution) -> None:
         self.log(solution)
-        self.last = self.log.last
         if len(solution.losses) - 1 == self.step:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
 
 
 LOG = run_module._Log
@@ -159,7 +169,7 @@ LOG = run_module._Log
 
 def test_ctrl_c_saves_what_was_found(monkeypatch, tmp_path):
     monkeypatch.setattr(run_module, "_Log", lambda experiment: StopAfter(experiment, 5))
-    assert not run(settings(), tmp_path / "a")
+    assert not run(settings(), tmp_path / "a")[1]
     assert not (tmp_path / "a" / "summary.json").exists()
     saved = read(tmp_path / "a", "interrupted.json")
     assert saved["status"] == "interrupted" and saved["methods"]["corrected"]["steps"] == [5, 5, 5]
@@ -168,18 +178,35 @@ def test_ctrl_c_saves_what_was_found(monkeypatch, tmp_path):
     assert "interrupted" in (tmp_path / "a" / "report.html").read_text()
 
 
-def test_ctrl_c_in_a_baseline_keeps_the_correction(monkeypatch, tmp_path):
-    def interrupted(self, name):
-        raise KeyboardInterrupt
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("moment", ["judge", "save_array", "encode_png", "write_report", "baseline"])
+def test_ctrl_c_after_the_solver_loses_nothing(monkeypatch, tmp_path, moment, number):
+    where = PECExperiment if moment == "baseline" else run_module
+    original = getattr(where, moment)
 
-    monkeypatch.setattr(PECExperiment, "baseline", interrupted)
-    assert not run(settings(), tmp_path / "a")
-    assert set(read(tmp_path / "a", "interrupted.json")["methods"]) == {"corrected"}
+    def pressed(*words, **more):
+        signal.raise_signal(number)
+        return original(*words, **more)
+
+    monkeypatch.setattr(where, moment, pressed)
+    handlers = [signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)]
+    run(settings(), tmp_path / "a")
+    assert handlers == [signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)]
+    # Pressed in the last step of all, the summary is written already and the run is complete.
+    name, other = ("summary", "interrupted") if moment == "write_report" else ("interrupted", "summary")
+    assert (tmp_path / "a" / f"{name}.json").exists() and not (tmp_path / "a" / f"{other}.json").exists()
+    assert np.load(tmp_path / "a" / "arrays" / "phase.npy").max() > 0
+    assert "Corrected" in (tmp_path / "a" / "report.html").read_text()
+
+
+def test_a_run_outside_the_main_thread_works(tmp_path):
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(run, settings(), tmp_path / "a").result()[1]
 
 
 def test_a_folder_is_never_overwritten(finished):
     before = {path: path.stat().st_mtime_ns for path in finished.rglob("*")}
-    with pytest.raises(ValueError, match="holds a run already .*choose another --out or delete it"):
+    with pytest.raises(ConfigError, match="holds files already; choose another --out or delete it"):
         run(settings(), finished)
     assert {path: path.stat().st_mtime_ns for path in finished.rglob("*")} == before
 
@@ -187,41 +214,62 @@ def test_a_folder_is_never_overwritten(finished):
 def test_an_output_that_cannot_be_written_is_refused_before_the_work(tmp_path, monkeypatch):
     monkeypatch.setattr(PECExperiment, "solve", lambda *_: pytest.fail("computed before the folder was checked"))
     (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match="cannot write to .*: Not a directory; choose another place with --out"):
+    with pytest.raises(ConfigError, match="cannot write to .*: Not a directory; choose another place with --out"):
         run(settings(), tmp_path / "file" / "a")
 
 
 def test_a_run_that_does_not_fit_is_refused_before_anything_is_allocated(tmp_path, monkeypatch):
     monkeypatch.setattr(PECExperiment, "image", property(lambda _: pytest.fail("resampled before the check")))
-    giant = settings("pec/fresnel.yaml", "grid.shape=[16384,16384]", "propagator.pad=4")
-    with pytest.raises(ValueError, match=r"needs about \d+\.\d GB and .* GB are free; use a smaller grid"):
+    giant = settings("pec/fresnel.yaml", "grid.shape=[16384,16384]")
+    with pytest.raises(ConfigError, match=r"needs about \d+\.\d GB and .* GB are free; use a smaller grid"):
         run(giant, tmp_path / "a")
     assert not (tmp_path / "a").exists()
 
 
-def test_light_at_every_angle_cannot_be_padded(tmp_path):
-    fine = settings("pec/fresnel.yaml", "propagator.kind=angular_spectrum", "grid.pitch=0.3 um")
-    with pytest.raises(
-        ValueError, match=r"pitch 3e-07 m is at most half of the longest wavelength.*set propagator\.pad"
-    ):
-        run(fine, tmp_path / "a")
-    given = settings(
-        "pec/fresnel.yaml", "propagator={kind: angular_spectrum, distance: 10 um, pad: 3}", "grid.pitch=0.3 um"
-    )
-    assert run(given, tmp_path / "b")
+def test_a_failed_run_leaves_no_folder(tmp_path, monkeypatch):
+    def broken(*_):
+        raise OSError(28, "No space left on device", "phase.npy")
+
+    monkeypatch.setattr(run_module, "save_array", broken)
+    with pytest.raises(OSError, match="No space left"):
+        run(settings(), tmp_path / "a")
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_solver_that_cannot_start_is_the_users_to_mend(tmp_path, monkeypatch):
+    monkeypatch.setattr(PECExperiment, "start_phase", lambda self: torch.zeros(self.target.shape))
+    with pytest.raises(ConfigError, match="the solver cannot start: the gradient vanishes"):
+        run(settings(), tmp_path / "a")
+    assert not (tmp_path / "a").exists()
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a CUDA device is there")
 def test_says_when_there_is_no_cuda():
-    with pytest.raises(ValueError, match="torch finds no CUDA device; use device: auto or cpu"):
+    with pytest.raises(ConfigError, match="but torch finds no CUDA device; use device: auto or cpu"):
         build(settings("pec/fourier.yaml", "device=cuda"))
 
 
-def test_numbered_folders(tmp_path, monkeypatch):
+def test_numbered_folders_are_claimed_one_by_one(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert next_folder("demo") == Path("runs/demo-001")
+    assert claim(None, "demo") == Path("runs/demo-001")
     os.makedirs("runs/demo-007")
-    assert next_folder("demo") == Path("runs/demo-008")
+    os.makedirs("runs/demo-2-041")
+    assert claim(None, "demo") == Path("runs/demo-008")
+    with ThreadPoolExecutor(8) as pool:
+        folders = list(pool.map(lambda _: claim(None, "demo"), range(40)))
+    assert len(set(folders)) == 40
+    assert claim(None, "a[b]") == Path("runs/a[b]-001") and claim(None, "a[b]") == Path("runs/a[b]-002")
+
+
+def test_a_folder_that_is_given_is_claimed_once(tmp_path):
+    def attempt(_):
+        try:
+            return claim(tmp_path / "one", "demo")
+        except ConfigError:
+            return None
+
+    with ThreadPoolExecutor(8) as pool:
+        assert sum(folder is not None for folder in pool.map(attempt, range(40))) == 1
 
 
 def test_plan_warns_of_the_periodic_model_aliasing_and_lost_heat():

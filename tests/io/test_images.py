@@ -75,7 +75,7 @@ def test_refuses_black_tiny_missing_and_garbled_pictures(tmp_path):
     with pytest.raises(ValueError, match="is black: there is no light to form; use another picture"):
         load_image(tmp_path / "black.png")
     cv2.imwrite(str(tmp_path / "tiny.png"), np.ones((8, 8), dtype=np.uint8))
-    with pytest.raises(ValueError, match="is 8 x 8 px; it must have at least 11 px a side"):
+    with pytest.raises(ValueError, match="is 8 x 8 px, less than the 11 x 11 px window"):
         load_image(tmp_path / "tiny.png")
     with pytest.raises(ValueError, match="no such picture: 'cofee'; did you mean 'coffee'?"):
         load_image("cofee")

@@ -1,0 +1,53 @@
+"""Versions, device, seed and git state: what is needed to repeat a run."""
+
+import datetime
+import platform
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import holotorch
+
+_PACKAGES = ("torch", "numpy", "kornia", "scikit-image", "opencv-contrib-python-headless")
+
+
+def environment(seed: int, device: torch.device) -> dict[str, Any]:
+    """Plain JSON values for env.json."""
+    return {
+        "holotorch": holotorch.__version__,
+        "git": _git_state(Path(holotorch.__file__).parents[1]),
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in _PACKAGES},
+        "platform": platform.platform(),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _cpu(),
+        "seed": seed,
+        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "command": ["holotorch", *sys.argv[1:]],
+    }
+
+
+def _cpu() -> str:
+    return f"CPU, {torch.get_num_threads()} threads"
+
+
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _git_state(checkout: Path) -> str | None:
+    """Commit of this checkout, "-dirty" when changed; None for an installed package, also inside another repository."""
+    if not (checkout / ".git").exists():
+        return None
+    try:
+        words = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=12"]
+        answer = subprocess.run(words, capture_output=True, text=True, timeout=5)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return answer.stdout.strip() or None

@@ -1,0 +1,89 @@
+"""Speed as ratios: contenders take turns in one process, and the median of their times is divided by the baseline's.
+
+Usage: python scripts/bench.py [SUBJECT ...]; without a subject, all of them.
+"""
+
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator
+
+import torch
+from torch.nn import functional
+
+from holotorch import Grid
+from holotorch.modulator import ThermalCrosstalk
+from holotorch.optics import AngularSpectrum
+
+ROUNDS = 15
+Contenders = dict[str, Callable[[], object]]
+
+
+def crosstalk() -> Iterator[tuple[str, Contenders]]:
+    """Heat spreading, forward and backward, three colours: conv2d is the baseline."""
+    for size in (128, 256, 512):
+        module = ThermalCrosstalk(0.66, 7)
+        kernel = module.kernel.float()[None, None]
+        phase = torch.rand(3, 1, size, size, requires_grad=True)
+
+        def backward(spread: torch.Tensor, phase: torch.Tensor = phase) -> object:
+            return torch.autograd.grad(spread.sum(), phase)
+
+        yield (
+            f"{size} px, forward and backward",
+            {
+                "conv2d": lambda p=phase, k=kernel, b=backward: b(functional.conv2d(p, k, padding=3)),
+                "ThermalCrosstalk": lambda p=phase, m=module, b=backward: b(m(p)),
+            },
+        )
+
+
+def propagation() -> Iterator[tuple[str, Contenders]]:
+    """One call of a built propagator: the same two FFTs with a ready complex64 kernel are the baseline."""
+    for size in (256, 512, 1024):
+        module = AngularSpectrum(Grid(size, 8e-6), 530e-9, 5e-3)
+        kernel = torch.view_as_complex(module.kernel.float())
+        field = torch.randn(1, size, size, dtype=torch.complex64)
+
+        def bare(field: torch.Tensor = field, kernel: torch.Tensor = kernel, size: int = size) -> torch.Tensor:
+            spectrum = torch.fft.fft2(field, s=kernel.shape[-2:])
+            return torch.fft.ifft2(spectrum * kernel)[..., :size, :size]
+
+        yield (
+            f"{size} px, pad 2",
+            {"bare FFTs": bare, "AngularSpectrum": lambda m=module, f=field: m(f)},
+        )
+
+
+SUBJECTS = {"crosstalk": crosstalk, "propagation": propagation}
+
+
+def measure(contenders: Contenders) -> dict[str, float]:
+    """Median seconds of each contender over ROUNDS rounds in which all of them take one turn."""
+    times: dict[str, list[float]] = {name: [] for name in contenders}
+    for turn in range(ROUNDS + 2):
+        for name, call in contenders.items():
+            started = time.perf_counter()
+            call()
+            if turn >= 2:  # the first rounds warm up
+                times[name].append(time.perf_counter() - started)
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def main() -> None:
+    """Print one line per contender and case."""
+    names = sys.argv[1:] or list(SUBJECTS)
+    unknown = [name for name in names if name not in SUBJECTS]
+    if unknown:
+        sys.exit(f"unknown subject {', '.join(unknown)}; known: {', '.join(SUBJECTS)}")
+    print(f"torch {torch.__version__}, {torch.get_num_threads()} threads; medians of {ROUNDS} interleaved rounds")
+    for name in names:
+        for case, contenders in SUBJECTS[name]():
+            seconds = measure(contenders)
+            base = next(iter(seconds.values()))
+            for contender, value in seconds.items():
+                print(f"{name:12} {case:30} {contender:18} {value * 1e3:9.3f} ms  {value / base:6.3f} of the baseline")
+
+
+if __name__ == "__main__":
+    main()
