@@ -61,5 +61,11 @@ def test_refuses_bad_arguments():
         gerchberg_saxton(propagator, target, start, max_steps=0)
     with pytest.raises(ValueError, match="start must be finite"):
         gerchberg_saxton(propagator, target, start * float("nan"))
+    with pytest.raises(ValueError, match="target is an intensity and must be >= 0"):
+        gerchberg_saxton(propagator, -target, start)
+    with pytest.raises(ValueError, match=r"start must end in \(C, H, W\)"):
+        gerchberg_saxton(propagator, target, start[0])
+    with pytest.raises(TypeError, match="real floating-point"):
+        gerchberg_saxton(propagator, target, start.to(torch.int64))
     with pytest.raises(ValueError, match="target must be finite"):
         gerchberg_saxton(propagator, target * float("inf"), start)

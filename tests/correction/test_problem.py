@@ -130,6 +130,13 @@ def test_unitary_propagation_keeps_the_mean_at_one():
         assert problem.intensity(torch.rand(1, *GRID.shape)).mean().item() == pytest.approx(1, rel=1e-5)
 
 
+@pytest.mark.parametrize("shape", [(3, 12, 1), (1, 12, 17), (3, 1, 17)])
+def test_a_target_of_another_shape_is_not_broadcast(shape):
+    problem = PECProblem(ThermalCrosstalk(0), Fraunhofer(GRID, [WAVE] * 3), torch.ones(shape))
+    with pytest.raises(ValueError, match=rf"phase must end in \(C, H, W\) = \({shape[0]}, {shape[1]}, {shape[2]}\)"):
+        problem(torch.rand(3, *GRID.shape))
+
+
 @pytest.mark.parametrize(
     ("target", "error", "message"),
     [

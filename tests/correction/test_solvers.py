@@ -173,9 +173,11 @@ def test_says_when_the_start_is_a_stationary_point(solver, dtype):
     [
         (lambda x: x.square().sum((-2, -1)), torch.full((1, 2, 2), float("nan")), "start must be finite"),
         (lambda x: x.log().sum((-2, -1)), torch.zeros(1, 2, 2), "loss at the start must be finite"),
+        (lambda x: x.square().sum(), torch.ones(1, 2, 2), r"one loss per item, \(1,\), got \(\)"),
+        (lambda x: -x.square().sum((-2, -1)), torch.ones(1, 2, 2), "objective must not be negative, got -4"),
     ],
 )
-def test_refuses_a_start_that_is_not_finite(solver, objective, start, message):
+def test_refuses_a_start_or_an_objective_that_cannot_be_used(solver, objective, start, message):
     with pytest.raises(ValueError, match=message):
         solver(objective, start)
 
@@ -198,6 +200,8 @@ def test_apg_says_stalled_when_no_step_is_accepted_and_keeps_what_it_has():
         (lambda: APG(step=float("nan")), "step must be finite"),
         (lambda: APG(shrink=1.0), "shrink must lie between 0 and 1"),
         (lambda: APG(max_steps=0), "max_steps must be at least 1"),
+        (lambda: APG(max_steps=2.5), "max_steps must be a whole number, got float 2.5"),  # type: ignore[arg-type]
+        (lambda: APG(max_steps=True), "max_steps must be a whole number, got bool True"),
         (lambda: APG(tolerance=-1.0), "tolerance must be at least 0"),
         (lambda: APG(tolerance=float("nan")), "tolerance must be at least 0"),
         (lambda: ProjectedAdam(learning_rate=-0.1), "learning_rate must be above zero"),
@@ -205,5 +209,5 @@ def test_apg_says_stalled_when_no_step_is_accepted_and_keeps_what_it_has():
     ],
 )
 def test_refuses_impossible_settings(make, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, TypeError), match=message):
         make()

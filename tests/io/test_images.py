@@ -43,6 +43,30 @@ def write_exr(path, **channels):
     OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(str(path))
 
 
+def test_wide_integers_are_scaled_by_their_own_maximum(tmp_path, pixels):
+    # A 32 bit picture that holds 0 to 255 is not a black one.
+    cv2.imwrite(str(tmp_path / "wide.tiff"), pixels[..., 0].astype(np.int32))
+    np.testing.assert_allclose(load_image(tmp_path / "wide.tiff")[0], pixels[..., 0] / pixels[..., 0].max())
+
+
+def test_a_jpeg_by_another_name_is_still_a_jpeg(tmp_path, pixels):
+    cv2.imwrite(str(tmp_path / "a.jpg"), pixels)
+    (tmp_path / "a.png").write_bytes((tmp_path / "a.jpg").read_bytes())
+    torch.testing.assert_close(load_image(tmp_path / "a.png"), load_image(tmp_path / "a.jpg"))
+
+
+def test_exr_transparency_and_stored_differences(tmp_path):
+    values = np.random.default_rng(1).random((12, 14), dtype=np.float32)
+    write_exr(tmp_path / "a.exr", R=values, G=values, B=values, A=np.full_like(values, 0.25))
+    np.testing.assert_allclose(load_image(tmp_path / "a.exr")[1], values * 0.25, rtol=1e-6)
+    write_exr(tmp_path / "clear.exr", Y=values, A=np.zeros_like(values))
+    with pytest.raises(ValueError, match="is black"):
+        load_image(tmp_path / "clear.exr")
+    write_exr(tmp_path / "yc.exr", Y=values, RY=values, BY=values)
+    with pytest.raises(ValueError, match="luminance and differences; convert it to R, G, B"):
+        load_image(tmp_path / "yc.exr")
+
+
 def test_exr_colour_and_grey_and_its_scale(tmp_path):
     values = np.random.default_rng(1).random((3, 12, 14), dtype=np.float32)
     write_exr(tmp_path / "rgb.exr", **dict(zip("RGB", values, strict=True)))

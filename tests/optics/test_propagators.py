@@ -70,6 +70,11 @@ def test_refuses_a_padding_below_one_and_a_wavelength_that_is_no_number():
         Fraunhofer(GRID, ["530 nm"])  # type: ignore[list-item]
 
 
+def test_a_distance_with_a_gradient_is_sent_to_the_kernel_function():
+    with pytest.raises(TypeError, match="distance is fixed in a module and cannot carry a gradient; use the kernel"):
+        AngularSpectrum(GRID, 530e-9, torch.tensor(1e-3, requires_grad=True))  # type: ignore[arg-type]
+
+
 def test_far_field_of_a_tilted_wave_is_one_bright_sample():
     y, x = GRID.coordinates()
     wave = torch.exp(2j * torch.pi * (5 * y / GRID.extent[0] - 7 * x / GRID.extent[1]))[None]
