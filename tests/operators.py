@@ -11,7 +11,7 @@ from torch import Tensor
 
 from holotorch import Grid
 from holotorch.modulator import ThermalCrosstalk
-from holotorch.optics import AngularSpectrum, CroppedKernel, Fraunhofer, Fresnel
+from holotorch.optics import AngularSpectrum, CroppedKernel, Fraunhofer, Fresnel, Propagator, RayleighSommerfeld
 
 GRID = Grid((12, 17), (5e-6, 4e-6))
 FINE = Grid((12, 17), (0.2e-6, 0.25e-6))  # below half a wavelength: the corners of the spectrum are evanescent
@@ -81,6 +81,22 @@ CASES = [
     _fresnel("Fresnel", 50e-6, 2),
     _fresnel("Fresnel, backwards", -50e-6, 2),
     _fresnel("Fresnel, periodic", 50e-6, 1, unitary=True),
+    Case(
+        "Rayleigh-Sommerfeld sum",
+        lambda: RayleighSommerfeld(GRID, WAVES, 300e-6),
+        lambda c: dense.direct_sum(GRID.shape, GRID.pitch, WAVES[c], 300e-6),
+    ),
+    Case(
+        "Rayleigh-Sommerfeld sum, backwards",
+        lambda: RayleighSommerfeld(GRID, WAVES, -300e-6),
+        lambda c: dense.direct_sum(GRID.shape, GRID.pitch, WAVES[c], 300e-6).conj(),
+    ),
+    Case(
+        "planned",
+        lambda: Propagator(GRID, WAVES, 300e-6, tolerance=1e-3),
+        lambda c: dense.band_limited_propagation(GRID.shape, GRID.pitch, WAVES[c], 300e-6, False),
+        tolerance=1e-2,  # 1e-3 is the expectation of the mean; single samples may be ten times off
+    ),
     Case(
         "Fraunhofer",
         lambda: Fraunhofer(GRID, WAVES),

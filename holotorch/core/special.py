@@ -13,13 +13,13 @@ _STEP, _NODES = 0.13, 42
 
 def fresnel_integral(u: Tensor) -> Tensor:
     """int_0^u exp(-i pi t^2 / 2) dt = C(u) - i S(u) for abs(u) <= 1.3, complex128; a power series, odd in u."""
-    power = u.to(torch.complex128)
-    factor = -0.5j * math.pi * u.square()
-    total = power
+    factor = math.pi / 2 * u.square()
+    power, parts = u, [u, torch.zeros_like(u)]
     for n in range(1, _SERIES_TERMS):
         power = power * factor / n
-        total = total + power / (2 * n + 1)
-    return total
+        # (-i)^n: to C and S in turn, the sign changing after every two terms.
+        parts[n % 2] = parts[n % 2] + power * ((1 if n % 4 < 2 else -1) / (2 * n + 1))
+    return torch.complex(parts[0], -parts[1])
 
 
 def fresnel_auxiliary(u: Tensor) -> tuple[Tensor, Tensor]:
@@ -33,6 +33,6 @@ def fresnel_auxiliary(u: Tensor) -> tuple[Tensor, Tensor]:
     weight = torch.exp(-math.pi / 2 * t.square()) * _STEP
     weight[0] /= 2
     inverse = 1 / u
-    density = weight / (1 + (t * inverse[..., None]) ** 4)
+    density = weight / (1 + (t * inverse[..., None]).square().square())
     scale = math.sqrt(2) / math.pi
     return scale * density.sum(-1) * inverse, scale * (density * t.square()).sum(-1) * inverse**3

@@ -3,18 +3,25 @@
 from holotorch.optics.cropped import CroppedKernel
 from holotorch.optics.geometry import diffraction_angle, least_padding, unaliased_distance
 from holotorch.optics.kernels import angular_spectrum_kernel, carrier, fresnel_kernel
+from holotorch.optics.plan import plan_propagation
+from holotorch.optics.propagate import Propagator, propagate
 from holotorch.optics.propagators import AngularSpectrum, Fraunhofer, Fresnel, SpectralFilter
+from holotorch.optics.rayleigh_sommerfeld import RayleighSommerfeld
 
 __all__ = [
     "AngularSpectrum",
     "CroppedKernel",
     "Fraunhofer",
     "Fresnel",
+    "Propagator",
+    "RayleighSommerfeld",
     "SpectralFilter",
     "angular_spectrum_kernel",
     "carrier",
     "diffraction_angle",
     "fresnel_kernel",
     "least_padding",
+    "plan_propagation",
+    "propagate",
     "unaliased_distance",
 ]

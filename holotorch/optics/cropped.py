@@ -1,16 +1,16 @@
 """CroppedKernel: propagation that neither wraps light around nor cuts its band, at any distance."""
 
-import math
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.fourier import good_length
 from holotorch.core.grid import Grid
-from holotorch.optics.kernels import carrier
+from holotorch.optics.plan import FINEST, crop_length
+from holotorch.optics.predict import AxisContent
 from holotorch.optics.propagators import SpectralFilter
-from holotorch.optics.taps import fresnel_taps, remainder_kernel
+from holotorch.optics.transfer import transfer_function
 
 
 class CroppedKernel(SpectralFilter):
@@ -39,45 +39,18 @@ class CroppedKernel(SpectralFilter):
         distance = checks.finite("distance", distance, "metres")
         waves = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
         longest = waves.max().item()
-        if min(grid.pitch) < 0.9 * longest and not paraxial:
+        if min(grid.pitch) < FINEST * longest and not paraxial:
             raise ValueError(
-                f"CroppedKernel needs a pitch of at least 0.9 wavelengths, got {min(grid.pitch):g} m at {longest:g} m; "
-                "use AngularSpectrum"
+                f"CroppedKernel needs a pitch of at least {FINEST} wavelengths, got {min(grid.pitch):g} m at "
+                f"{longest:g} m; use AngularSpectrum"
             )
-        padded = grid.padded(2.0 if paraxial else _padding(grid, longest, distance))
-        super().__init__(grid, wavelengths, _kernel(padded, waves, distance, paraxial))
+        sizes = (
+            2 * size - 1 if paraxial else crop_length(AxisContent(size, pitch, 0.5 / pitch, longest, abs(distance)))
+            for size, pitch in zip(grid.shape, grid.pitch, strict=True)
+        )
+        height, width = (good_length(size) for size in sizes)
+        far = torch.tensor(distance, dtype=torch.float64)
+        padded = Grid((height, width), grid.pitch)
+        kernel = transfer_function(padded, waves, far, sampled=(False, False), paraxial=paraxial)
+        super().__init__(grid, wavelengths, kernel)
         self.distance = distance
-
-
-def _kernel(padded: Grid, waves: Tensor, distance: float, paraxial: bool) -> Tensor:
-    far = torch.tensor(distance, dtype=torch.float64)
-    kernel = carrier(waves, far)[:, None, None]
-    if distance == 0:
-        return kernel.expand(-1, *padded.shape)
-    columns, rows = (
-        torch.fft.fft(fresnel_taps(_indices(size), pitch, waves, far))
-        for size, pitch in zip(padded.shape, padded.pitch, strict=True)
-    )
-    kernel = kernel * columns[:, :, None] * rows[:, None, :]
-    if paraxial:
-        return kernel
-    fy, fx = padded.frequencies()
-    return kernel * remainder_kernel(fy, fx, waves[:, None, None], far)
-
-
-def _indices(size: int) -> Tensor:
-    """0, 1, ..., (n-1)//2, -(n//2), ..., -1."""
-    index = torch.arange(size)
-    return torch.where(index > (size - 1) // 2, index - size, index)
-
-
-def _padding(grid: Grid, wavelength: float, distance: float) -> tuple[float, float]:
-    """2 for the taps, and twice the shift by the remainder plus an eighth of the window for its tails."""
-    sines = [wavelength / (2 * pitch) for pitch in grid.pitch]
-    corner = min(math.hypot(*sines), 0.99)
-    # Light steeper than what lands in the window need not be followed.
-    reach = math.hypot(*grid.extent)
-    steepest = min(corner, reach / math.hypot(reach, distance))
-    shift = abs(distance) * (steepest / math.sqrt(1 - steepest**2) - steepest)
-    y, x = (2.25 + 2 * shift / extent for extent in grid.extent)
-    return y, x

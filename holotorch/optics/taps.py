@@ -44,6 +44,12 @@ def fresnel_taps(index: Tensor, pitch: float, wavelength: Tensor, distance: Tens
     return torch.where((distance < 0)[..., None], taps.conj(), taps)
 
 
+def fft_indices(size: int) -> Tensor:
+    """0, 1, ..., (n-1)//2, -(n//2), ..., -1: the samples, or frequencies, of an axis in FFT order."""
+    index = torch.arange(size)
+    return torch.where(index > (size - 1) // 2, index - size, index)
+
+
 def remainder_kernel(fy: Tensor, fx: Tensor, wavelength: Tensor, distance: Tensor) -> Tensor:
     """What the exact transfer function has on top of the paraxial one: exp(-i pi z s^4 / (wavelength (1 + cos)^2)).
 

@@ -78,6 +78,18 @@ def band_limited_propagation(shape, pitch, wavelength, distance, paraxial, nodes
     return matrix.reshape(h * w, h * w)
 
 
+def direct_sum(shape, pitch, wavelength, distance):
+    """First Rayleigh-Sommerfeld integral, pair by pair (Goodman, Eq. 3-36), for a positive distance."""
+    (h, w), (py, px), k = shape, pitch, 2 * np.pi / wavelength
+    matrix = np.zeros((h * w, h * w), complex)
+    for a in range(h * w):
+        for b in range(h * w):
+            dy, dx = (a // w - b // w) * py, (a % w - b % w) * px
+            r = np.sqrt(dy * dy + dx * dx + distance * distance)
+            matrix[a, b] = py * px / (2 * np.pi) * distance / r * (1 / r - 1j * k) * np.exp(1j * k * r) / r
+    return matrix
+
+
 def convolution(shape, kernel):
     """out[p] = sum_q kernel[p - q + centre] in[q], zero outside, as a matrix."""
     (h, w), (kh, kw) = shape, kernel.shape

@@ -1,0 +1,30 @@
+"""Plan: what a planned operation will do and cost, decided before it runs."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The cheapest adequate way found, and the one that came next.
+
+    Attributes:
+        method: Name of the method.
+        pad: Padding factor (y, x) actually used.
+        padded: Samples (y, x) of the transforms.
+        predicted_error: Expected relative L2 error of the result for the described content.
+        memory_bytes: Largest extra memory of one call with its kernel, for one channel.
+        flops: Arithmetic of one call with the kernel at hand, for one channel.
+        reason: One sentence that says why this one.
+        runner_up: One sentence that says which came next and why it lost.
+        adequate: Whether ``predicted_error`` is within the tolerance; False is only returned where nothing is.
+    """
+
+    method: str
+    pad: tuple[float, float]
+    padded: tuple[int, int]
+    predicted_error: float
+    memory_bytes: int
+    flops: float
+    reason: str
+    runner_up: str
+    adequate: bool = True
