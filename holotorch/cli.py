@@ -82,6 +82,15 @@ def _report(options: argparse.Namespace) -> int:
     return OK
 
 
+def _chart(options: argparse.Namespace) -> int:
+    from holotorch.experiments.chart import chart
+
+    out = options.out or Path("scripts/charts") / options.subject
+    print("\n".join(chart(options.subject, out)))
+    print(out)
+    return OK
+
+
 def _doctor(_: argparse.Namespace) -> int:
     from holotorch.experiments.doctor import diagnose
 
@@ -116,6 +125,11 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("folders", nargs="+", type=Path, metavar="DIR")
     report.add_argument("--out", type=Path, help="file to write (default: DIR/report.html; ./report.html for several)")
     report.set_defaults(action=_report)
+
+    chart = commands.add_parser("chart", help="speed against accuracy of every method, drawn and tabled")
+    chart.add_argument("subject", help="what to chart: propagation")
+    chart.add_argument("--out", type=Path, help="folder for the chart (default: scripts/charts/SUBJECT)")
+    chart.set_defaults(action=_chart)
 
     doctor = commands.add_parser("doctor", help="check the installation and print what repairs it")
     doctor.set_defaults(action=_doctor)

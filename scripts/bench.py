@@ -47,7 +47,7 @@ def propagation() -> Iterator[tuple[str, Contenders]]:
 
         def bare(field: torch.Tensor = field, kernel: torch.Tensor = kernel, size: int = size) -> torch.Tensor:
             spectrum = torch.fft.fft2(field, s=kernel.shape[-2:])
-            return torch.fft.ifft2(spectrum * kernel)[..., :size, :size]
+            return torch.fft.ifft2(spectrum * kernel, norm="forward")[..., :size, :size]
 
         yield (
             f"{size} px, pad 2",

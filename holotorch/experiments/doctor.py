@@ -68,10 +68,16 @@ def _opencv() -> Iterator[tuple[bool, str]]:
 def _fft() -> Iterator[tuple[bool, str]]:
     import torch
 
-    x = torch.randn(60, 75, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
-    error = (torch.fft.ifft2(torch.fft.fft2(x)) - x).abs().max().item()
-    fine = error < 1e-5
-    yield fine, f"round trip error {error:.1e}" + ("" if fine else "; run: pip install --force-reinstall torch")
+    from holotorch.core.fourier import fft2, ifft2
+
+    for size in ((60, 75), (2048, 2048)):
+        x = torch.randn(size, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
+        error = (ifft2(fft2(x)) - x).abs().max().item()
+        fine = error < 1e-5
+        advice = "" if fine else "; run: pip install --force-reinstall torch"
+        yield fine, f"round trip of {size[0]} x {size[1]} samples errs by {error:.1e}{advice}"
+    if (torch.fft.ifft2(torch.fft.fft2(x)) - x).abs().max() > 1e-3:
+        yield True, "torch.fft.ifft2 itself is wrong at 2048 x 2048 here (pytorch#169670); holotorch goes around it"
 
 
 def _exr() -> Iterator[tuple[bool, str]]:

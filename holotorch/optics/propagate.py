@@ -8,6 +8,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
+from holotorch.core.fourier import fft2, ifft2
 from holotorch.core.grid import Grid
 from holotorch.core.plan import Plan
 from holotorch.optics.plan import FINEST, Candidate, candidates, choose, plan_from
@@ -62,20 +63,20 @@ def propagate(
         turns = (distances / waves)[..., None, None]
         phase = 2 * torch.pi * (turns - turns.detach().round())
         return field * torch.complex(torch.cos(phase), torch.sin(phase)).to(field.dtype)
-    spectrum = torch.fft.fft2(field, s=way.padded)
+    spectrum = fft2(field, way.padded)
     height, width = grid.shape
     waves, distances = torch.broadcast_tensors(waves, distances)
     batch = torch.broadcast_shapes(waves.shape, spectrum.shape[:-2])
     if waves.numel() == 1:
-        kernel = _kernel(grid, way, waves.reshape(()), distances.reshape(()), field.dtype)
-        return torch.fft.ifft2(spectrum * kernel)[..., :height, :width].expand(*batch, height, width)
+        kernel = kernel_of(grid, way, waves.reshape(()), distances.reshape(()), field.dtype)
+        return ifft2(spectrum * kernel, grid.shape).expand(*batch, height, width)
     # One kernel at a time: all of them together would not fit into the processor's cache, nor perhaps into memory.
     pairs = zip(waves.reshape(-1), distances.reshape(-1), strict=True)
     spectra = spectrum.expand(*batch, *way.padded)
     lead = spectra.ndim - 2 - waves.ndim
     spectra = spectra.flatten(lead, -3)
     parts = [
-        torch.fft.ifft2(spectra[..., i, :, :] * _kernel(grid, way, wave, distance, field.dtype))[..., :height, :width]
+        ifft2(spectra[..., i, :, :] * kernel_of(grid, way, wave, distance, field.dtype), grid.shape)
         for i, (wave, distance) in enumerate(pairs)
     ]
     results = torch.stack(parts, -3)
@@ -118,7 +119,7 @@ class Propagator(SpectralFilter):
         found = candidates(grid, waves.tolist(), distance, band=band, margin=margin)
         plan = plan_from(found, grid, tolerance, memory_limit)
         way = _best(found, tolerance)
-        super().__init__(grid, wavelengths, _kernel(grid, way, waves, far, torch.complex128))
+        super().__init__(grid, wavelengths, kernel_of(grid, way, waves, far, torch.complex128))
         self.plan, self.distance = plan, float(distance)
 
 
@@ -136,7 +137,8 @@ def _best(found: list[Candidate], tolerance: float) -> Candidate:
     return best
 
 
-def _kernel(grid: Grid, way: Candidate, waves: Tensor, distances: Tensor, dtype: torch.dtype) -> Tensor:
+def kernel_of(grid: Grid, way: Candidate, waves: Tensor, distances: Tensor, dtype: torch.dtype) -> Tensor:
+    """Transfer function of a chosen way, carrier included: [..., H, W] of its padded grid, in ``dtype``."""
     padded = Grid(way.padded, grid.pitch)
     if way.method == "angular spectrum" and min(grid.pitch) < FINEST * waves.detach().max().item():
         return wide_transfer_function(padded, waves, distances, dtype=dtype)

@@ -13,7 +13,7 @@ from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import phasor
 from holotorch.optics import CroppedKernel, Propagator, plan_propagation, propagate
 from holotorch.optics.plan import candidates
-from holotorch.optics.propagate import _kernel
+from holotorch.optics.propagate import kernel_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:no way reaches:holotorch.core.checks.SamplingWarning")
 DISTANCES = (1e-3, 10e-3, 100e-3, 500e-3, 2.0, -100e-3)
@@ -114,7 +114,7 @@ def test_prediction_is_within_a_factor_of_ten_and_never_below_a_third_over_rando
         truths = {}
         for way in found:
             waves, far = torch.tensor(wavelength, dtype=torch.float64), torch.tensor(distance, dtype=torch.float64)
-            kernel = _kernel(grid, way, waves, far, torch.complex64)
+            kernel = kernel_of(grid, way, waves, far, torch.complex64)
             out = torch.fft.ifft2(torch.fft.fft2(field.to(torch.complex64), s=kernel.shape[-2:]) * kernel)
             truths[id(way)] = error(out[: grid.shape[0], : grid.shape[1]].to(torch.complex128), exact)
             if 1e-6 < way.error < 0.05:  # above rounding, and short of nonsense
