@@ -33,7 +33,8 @@ def propagate(
     Args:
         field: complex64 or complex128, shape [..., H, W].
         grid: Its sampling.
-        wavelength: In metres: a number, or a tensor whose shape broadcasts against the leading axes of ``field``.
+        wavelength: In metres: a number, or a tensor whose shape broadcasts against the leading axes of ``field``. In a
+            medium, the wavelength there: the one in vacuum divided by the refractive index.
         distance: In metres, likewise; both may carry gradients. Many distances share one forward transform: give the
             field an axis of size 1 where the distances have theirs.
         tolerance: Largest relative L2 error, in expectation over noise that fills ``band`` and the window.
