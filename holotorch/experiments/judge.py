@@ -12,7 +12,7 @@ from holotorch.correction.problem import best_scale
 from holotorch.experiments.config import NearFieldSettings
 from holotorch.experiments.pec import PECExperiment
 from holotorch.metrics import SSIM_WINDOW, psnr, ssim
-from holotorch.optics import CroppedKernel, SpectralFilter
+from holotorch.optics import CroppedKernel
 
 _METRICS = {"ssim": ssim, "psnr": psnr}
 
@@ -72,23 +72,17 @@ def _alone(experiment: PECExperiment, emitted: Tensor) -> tuple[Tensor, dict[str
     light = experiment.settings.propagator
     assert isinstance(light, NearFieldSettings)
     formed, between = (torch.empty(experiment.target.shape, dtype=torch.float64) for _ in range(2))
+    half = experiment.grid.pitch[0] / 2, experiment.grid.pitch[1] / 2
     for i, wave in enumerate(experiment.wavelengths):  # one colour at a time: float64 kernels are large
         exact = CroppedKernel(experiment.grid, wave, light.distance).to(experiment.device)
+        aside = CroppedKernel(experiment.grid, wave, light.distance, offset=half).to(experiment.device)
         formed[i] = intensity(exact(emitted[i : i + 1]))[0].cpu()
-        between[i] = intensity(_half_a_sample_on(exact)(emitted[i : i + 1]))[0].cpu()
+        between[i] = intensity(aside(emitted[i : i + 1]))[0].cpu()
     picture = _as_picture(experiment, formed, at_best_scale=True)
     numbers = _scores(experiment, picture, experiment.image)
     numbers["efficiency"] = _per_colour(experiment, formed.mean((-2, -1)))
     scale = best_scale(formed, experiment.target)[:, None, None]
     return picture, numbers, between * scale
-
-
-def _half_a_sample_on(exact: CroppedKernel) -> SpectralFilter:
-    """The same propagation, read half a sample further on both axes."""
-    kernel = torch.view_as_complex(exact.kernel)
-    fy, fx = (torch.fft.fftfreq(size, dtype=torch.float64, device=kernel.device) for size in kernel.shape[-2:])
-    ramp = torch.exp(1j * math.pi * (fy[:, None] + fx[None, :]))
-    return SpectralFilter(exact.grid, exact.wavelengths, kernel * ramp)
 
 
 def _between_scores(experiment: PECExperiment, between: Tensor) -> dict[str, Any]:

@@ -29,14 +29,25 @@ class CroppedKernel(SpectralFilter):
         wavelengths: In metres, one per channel.
         distance: In metres, negative to travel back.
         paraxial: Leave out the correction beyond the Fresnel approximation.
+        offset: Where (y, x) in metres the axis of the result lies beside that of the field: a window off the axis, or
+            one between the samples, at the same cost.
 
     Raises:
         ValueError: A wavelength that is not positive, a distance that is not finite, or a pitch below 0.9 wavelengths,
             where the two factors no longer separate; use ``AngularSpectrum`` there.
     """
 
-    def __init__(self, grid: Grid, wavelengths: float | Sequence[float], distance: float, *, paraxial: bool = False):
+    def __init__(
+        self,
+        grid: Grid,
+        wavelengths: float | Sequence[float],
+        distance: float,
+        *,
+        paraxial: bool = False,
+        offset: tuple[float, float] = (0.0, 0.0),
+    ):
         distance = checks.finite("distance", distance, "metres")
+        offset = checks.finite("offset", offset[0], "metres"), checks.finite("offset", offset[1], "metres")
         waves = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
         longest = waves.max().item()
         if min(grid.pitch) < FINEST * longest and not paraxial:
@@ -45,12 +56,14 @@ class CroppedKernel(SpectralFilter):
                 f"{longest:g} m; use AngularSpectrum"
             )
         sizes = (
-            2 * size - 1 if paraxial else crop_length(AxisContent(size, pitch, 0.5 / pitch, longest, abs(distance)))
-            for size, pitch in zip(grid.shape, grid.pitch, strict=True)
+            2 * size - 1
+            if paraxial
+            else crop_length(AxisContent(size, pitch, 0.5 / pitch, longest, abs(distance)), offset=shift)
+            for size, pitch, shift in zip(grid.shape, grid.pitch, offset, strict=True)
         )
         height, width = (good_length(size) for size in sizes)
         far = torch.tensor(distance, dtype=torch.float64)
         padded = Grid((height, width), grid.pitch)
-        kernel = transfer_function(padded, waves, far, sampled=(False, False), paraxial=paraxial)
+        kernel = transfer_function(padded, waves, far, sampled=(False, False), paraxial=paraxial, offset=offset)
         super().__init__(grid, wavelengths, kernel)
-        self.distance = distance
+        self.distance, self.offset = distance, offset

@@ -211,10 +211,10 @@ def _rounding(axes: list[AxisContent], sampled: tuple[bool, bool], dtype: torch.
     return 3 * torch.finfo(dtype).eps / math.sqrt(max(left, 1e-12))
 
 
-def crop_length(axis: AxisContent, room: float = CROP_PAD) -> int:
+def crop_length(axis: AxisContent, room: float = CROP_PAD, offset: float = 0.0) -> int:
     """Samples of a transform that holds the taps, and twice what the factor beyond Fresnel adds to their reach."""
     # Light steeper than what lands in the window need not be followed; sqrt(2) for the corner of the band.
-    reach = 2 * axis.size * axis.pitch
+    reach = 2 * axis.size * axis.pitch + abs(offset)
     sine = min(math.sqrt(2) * axis.wavelength * axis.nyquist, reach / math.hypot(reach, axis.distance), 0.99)
     shift = axis.distance * (sine / math.sqrt(1 - sine * sine) - sine) if room > 2 else 0.0
     return math.ceil(room * axis.size + 2 * shift / axis.pitch) - 1

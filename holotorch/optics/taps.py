@@ -9,16 +9,16 @@ from holotorch.core.special import FRESNEL_BORDER, fresnel_auxiliary, fresnel_in
 from holotorch.optics.kernels import turns_phasor
 
 
-def fresnel_taps(index: Tensor, pitch: float, wavelength: Tensor, distance: Tensor) -> Tensor:
-    """Weights of the paraxial propagation from one sample to another on the same pitch, one axis, carrier apart.
+def fresnel_taps(place: Tensor, pitch: float, wavelength: Tensor, distance: Tensor) -> Tensor:
+    """Weights of the paraxial propagation from a sample to places beside it, one axis, carrier apart.
 
-    t[n] = pitch * int_{-B}^{B} exp(-i pi wavelength z f^2) exp(2 pi i f n pitch) df with B = 1 / (2 pitch): the band
+    t(n) = pitch * int_{-B}^{B} exp(-i pi wavelength z f^2) exp(2 pi i f n pitch) df with B = 1 / (2 pitch): the band
     is cut exactly where the samples cut it. Completing the square turns it into two Fresnel integrals with arguments
     u = sqrt(2 wavelength |z|) (B -+ x / (wavelength |z|)), valid at every distance: at small ones the taps approach a
     single one with sinc tails, at large ones the sampled chirp of the point source. Every phase is reduced in turns.
 
     Args:
-        index: Integers n, shape [n].
+        place: n, in samples and not only whole ones, shape [n].
         pitch: In metres.
         wavelength: In metres, float64, shape [...].
         distance: In metres, float64, shape [...], not 0; negative gives the conjugate.
@@ -27,13 +27,14 @@ def fresnel_taps(index: Tensor, pitch: float, wavelength: Tensor, distance: Tens
         complex128 of shape [..., n].
     """
     product = (wavelength * distance.abs())[..., None]
-    position, edge = index.to(torch.float64) * pitch, 0.5 / pitch
+    place = place.to(torch.float64)
+    position, edge = place * pitch, 0.5 / pitch
     scale = torch.sqrt(2 * product)
     chirp = turns_phasor(position.square() / (2 * product))
-    # exp(-i pi u^2 / 2) times the chirp is exp(-i pi product B^2) exp(+-i pi n): the same for both ends of the band.
-    rim = turns_phasor(-product * edge**2 / 2) * (1 - 2 * (index % 2)).to(torch.float64)
     total = torch.zeros_like(chirp)
     for sign in (1, -1):
+        # exp(-i pi u^2 / 2) times the chirp: an end of the band, exp(-i pi product B^2) exp(+-2 pi i B x).
+        rim = turns_phasor(-product * edge**2 / 2 + sign * place / 2)
         u = scale * (edge - sign * position / product)
         far = u.abs() > FRESNEL_BORDER
         f, g = fresnel_auxiliary(torch.where(far, u.abs(), 2.0))

@@ -15,6 +15,7 @@ def transfer_function(
     *,
     sampled: tuple[bool, bool],
     paraxial: bool,
+    offset: tuple[float, float] = (0.0, 0.0),
     dtype: torch.dtype = torch.complex128,
 ) -> Tensor:
     """Kernel of a linear convolution on the padded grid, carrier included, differentiable in both tensors.
@@ -26,6 +27,7 @@ def transfer_function(
         sampled: Per axis (y, x), whether the paraxial factor is sampled in frequency, or its exact taps are cropped to
             the transform's length and transformed.
         paraxial: Leave out the factor beyond Fresnel.
+        offset: Where (y, x) in metres the axis of the result lies on that of the field; only with taps.
         dtype: Of the result. Phases are reduced in float64 and cast last.
 
     Returns:
@@ -33,8 +35,8 @@ def transfer_function(
     """
     wavelength, distance = torch.broadcast_tensors(wavelength, distance)
     columns, rows = (
-        _axis_factor(size, pitch, wavelength, distance, sampled=keep).to(dtype)
-        for size, pitch, keep in zip(padded.shape, padded.pitch, sampled, strict=True)
+        _axis_factor(size, pitch, wavelength, distance, shift / pitch, sampled=keep).to(dtype)
+        for size, pitch, shift, keep in zip(padded.shape, padded.pitch, offset, sampled, strict=True)
     )
     rows = rows * carrier(wavelength, distance).to(dtype)[..., None]
     kernel = columns[..., :, None] * rows[..., None, :]
@@ -55,14 +57,16 @@ def wide_transfer_function(padded: Grid, wavelength: Tensor, distance: Tensor, *
     return (kernel * carrier(wavelength, distance)[..., None, None]).to(dtype)
 
 
-def _axis_factor(size: int, pitch: float, wavelength: Tensor, distance: Tensor, *, sampled: bool) -> Tensor:
+def _axis_factor(
+    size: int, pitch: float, wavelength: Tensor, distance: Tensor, shift: float, *, sampled: bool
+) -> Tensor:
     """Paraxial factor of one axis in frequency, complex128 [..., size]."""
     index = fft_indices(size).to(distance.device)
     if sampled:
         frequency = index.to(torch.float64) / (size * pitch)
         return turns_phasor(-(wavelength * distance)[..., None] / 2 * frequency.square())
     here = (distance == 0)[..., None]
-    safe = torch.where(distance == 0, pitch, distance)
-    taps = fresnel_taps(index, pitch, wavelength, safe)
-    taps = torch.where(here, (index == 0).to(taps.dtype), taps)
-    return torch.fft.fft(taps)
+    place = index.to(torch.float64) + shift
+    taps = fresnel_taps(place, pitch, wavelength, torch.where(distance == 0, pitch, distance))
+    still = torch.sinc(place) if shift else (index == 0).to(torch.float64)
+    return torch.fft.fft(torch.where(here, still.to(taps.dtype), taps))

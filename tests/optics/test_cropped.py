@@ -55,6 +55,20 @@ def test_fine_pitches_down_to_the_border(pitch, crossovers):
     assert error <= estimate(grid, wavelength, distance, False)
 
 
+@pytest.mark.parametrize("paraxial", [True, False], ids=["paraxial", "exact"])
+@pytest.mark.parametrize("offset", [(4e-6, 3.75e-6), (-60e-6, 130e-6), (0.0, 400e-6)], ids=["half", "aside", "outside"])
+@pytest.mark.parametrize("crossovers", [0.0, 0.3, 1.0, -3.0])
+def test_windows_beside_the_axis(crossovers, offset, paraxial):
+    """(0, 400 um) lies wholly outside the light's own window of 180 um; there it is compared with the light inside."""
+    grid, wavelength = Grid(SHAPE, (8e-6, 7.5e-6)), 530e-9
+    distance = crossovers * 2 * grid.extent[1] * 7.5e-6 / wavelength
+    matrix = dense.band_limited_propagation(SHAPE, grid.pitch, wavelength, distance, paraxial, 400, offset)
+    operator, field = CroppedKernel(grid, wavelength, distance, paraxial=paraxial, offset=offset), white(grid)
+    wanted = (matrix @ field[0].numpy().ravel()).reshape(SHAPE)
+    error = np.linalg.norm(operator(field)[0].numpy() - wanted) / np.linalg.norm(field)
+    assert error <= estimate(grid, wavelength, distance, paraxial)
+
+
 def test_beyond_the_border_it_is_refused_with_the_way_out():
     with pytest.raises(ValueError, match=r"pitch of at least 0\.9 wavelengths, got 5e-07 m at 6\.3e-07 m; use Angular"):
         CroppedKernel(Grid(16, 0.5e-6), 630e-9, 1e-3)

@@ -54,7 +54,7 @@ def fresnel_transfer(shape, pitch, wavelength, distance):
     return np.exp(2j * np.pi * distance / wavelength) * np.exp(-1j * np.pi * wavelength * distance * square)
 
 
-def band_limited_propagation(shape, pitch, wavelength, distance, paraxial, nodes=400):
+def band_limited_propagation(shape, pitch, wavelength, distance, paraxial, nodes=400, offset=(0.0, 0.0)):
     """out[p] = sum_q h(p - q) in[q], h the integral of the transfer function over the band that the samples carry.
 
     By Gauss-Legendre quadrature over |f| < 1 / (2 pitch) on both axes; needs ``nodes`` above the number of turns of
@@ -69,7 +69,7 @@ def band_limited_propagation(shape, pitch, wavelength, distance, paraxial, nodes
     else:
         transfer = np.exp(2j * np.pi * distance / wavelength * np.sqrt(1 - square + 0j))
     (h, w), (py, px) = shape, pitch
-    dy, dx = np.arange(-(h - 1), h) * py, np.arange(-(w - 1), w) * px
+    dy, dx = np.arange(-(h - 1), h) * py + offset[0], np.arange(-(w - 1), w) * px + offset[1]
     kernel = (
         (np.exp(2j * np.pi * np.outer(dy, fy)) * wy) @ transfer @ (np.exp(2j * np.pi * np.outer(fx, dx)) * wx[:, None])
     )
