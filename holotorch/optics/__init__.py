@@ -7,6 +7,7 @@ from holotorch.optics.plan import plan_propagation
 from holotorch.optics.propagate import Propagator, propagate
 from holotorch.optics.propagators import AngularSpectrum, Fraunhofer, Fresnel, SpectralFilter
 from holotorch.optics.rayleigh_sommerfeld import RayleighSommerfeld
+from holotorch.optics.resampled import ResampledKernel
 
 __all__ = [
     "AngularSpectrum",
@@ -15,6 +16,7 @@ __all__ = [
     "Fresnel",
     "Propagator",
     "RayleighSommerfeld",
+    "ResampledKernel",
     "SpectralFilter",
     "angular_spectrum_kernel",
     "carrier",

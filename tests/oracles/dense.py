@@ -78,6 +78,22 @@ def band_limited_propagation(shape, pitch, wavelength, distance, paraxial, nodes
     return matrix.reshape(h * w, h * w)
 
 
+def band_limited_to_points(shape, pitch, out_shape, out_pitch, offset, wavelength, distance, nodes=300):
+    """The same integral from the samples of one grid to those of another whose axis lies at ``offset``."""
+    t, weight = np.polynomial.legendre.leggauss(nodes)
+    factors = []
+    for axis in (0, 1):
+        source = (np.arange(shape[axis]) - shape[axis] // 2) * pitch[axis]
+        reached = (np.arange(out_shape[axis]) - out_shape[axis] // 2) * out_pitch[axis] + offset[axis]
+        f = t / (2 * pitch[axis])
+        factors.append((f, np.exp(2j * np.pi * (reached[:, None] - source).reshape(-1, 1) * f) * weight / 2))
+    (fy, ey), (fx, ex) = factors
+    square = wavelength**2 * (fy[:, None] ** 2 + fx[None, :] ** 2)
+    kernel = ey @ np.exp(2j * np.pi * distance / wavelength * np.sqrt(1 - square + 0j)) @ ex.T
+    matrix = kernel.reshape(out_shape[0], shape[0], out_shape[1], shape[1]).transpose(0, 2, 1, 3)
+    return matrix.reshape(out_shape[0] * out_shape[1], shape[0] * shape[1])
+
+
 def direct_sum(shape, pitch, wavelength, distance):
     """First Rayleigh-Sommerfeld integral, pair by pair (Goodman, Eq. 3-36), for a positive distance."""
     (h, w), (py, px), k = shape, pitch, 2 * np.pi / wavelength
