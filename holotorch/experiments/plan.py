@@ -2,13 +2,14 @@
 
 import math
 import re
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from holotorch.core.grid import Grid
 from holotorch.experiments.config import NearFieldSettings
 from holotorch.experiments.pec import BASELINE_PASSES, PECExperiment
-from holotorch.optics import diffraction_angle, unaliased_distance
+from holotorch.optics import diffraction_angle, plan_propagation, unaliased_distance
 
 # Seconds of one evaluation per pixel, and per padded sample times log2 of their number, on two CPU cores. Measured at
 # 128 to 1024 px and within a factor of 2 there on an idle machine; the printed time is a guide.
@@ -28,11 +29,15 @@ def plan(experiment: PECExperiment) -> dict[str, Any]:
     work = evaluations + BASELINE_PASSES * len(settings.report.baselines)
     seconds = work * (_PIXEL_SECONDS * pixels + _FFT_SECONDS * samples * math.log2(max(2, samples)))
     judge = 16 * samples + _JUDGE_BYTES * 5 * math.prod(grid.shape) if isinstance(light, NearFieldSettings) else 0
+    single = {}
+    if experiment.isolated and isinstance(light, NearFieldSettings):
+        single = {"single_propagation": asdict(plan_propagation(grid, experiment.wavelengths, light.distance))}
     crosstalk = experiment.array.crosstalk
     size_rule = "as given" if settings.modulator.kernel_size else "chosen so that no tap above 1e-6 is dropped"
     return {
         "propagator": light.kind,
         "padding": {"samples": list(padded.shape), "reason": _padding_reason(experiment)},
+        **single,
         "crosstalk": {"taps": crosstalk.kernel.shape[0], "lost_heat": crosstalk.lost_heat, "reason": size_rule},
         "start": {"kind": experiment.start, "reason": _START_REASONS[experiment.start]},
         "loss": "intensity" + (" at its best scale, since light may leave the window" if experiment.isolated else ""),
@@ -75,6 +80,8 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
             f"every {physics['pitch_um'][1]:.4g} um; the periodic model is alias-free up to "
             f"{_listed(physics['alias_free_mm'])} mm"
         )
+    if planned := values.get("single_propagation"):
+        lines.append(f"Planned    one propagation over this distance: {planned['reason']}; {planned['runner_up']}")
     lines += [
         f"Solver     {settings.solver.kind}, at most {settings.solver.max_steps} steps from a "
         f"{values['start']['kind']} start ({values['start']['reason']})",
