@@ -11,6 +11,7 @@ from holotorch.core.checks import SamplingWarning
 from holotorch.core.fourier import fft2, ifft2
 from holotorch.core.grid import Grid
 from holotorch.core.plan import Plan
+from holotorch.optics.kernels import carrier
 from holotorch.optics.plan import FINEST, Candidate, candidates, choose, plan_from
 from holotorch.optics.propagators import SpectralFilter
 from holotorch.optics.transfer import transfer_function, wide_transfer_function
@@ -61,9 +62,7 @@ def propagate(
     found = candidates(grid, *listed, band=band, margin=margin, dtype=field.dtype)
     way = _best(found, checks.positive("tolerance", tolerance))
     if way.method == "identity":
-        turns = (distances / waves)[..., None, None]
-        phase = 2 * torch.pi * (turns - turns.detach().round())
-        return field * torch.complex(torch.cos(phase), torch.sin(phase)).to(field.dtype)
+        return field * carrier(waves, distances)[..., None, None].to(field.dtype)
     spectrum = fft2(field, way.padded)
     height, width = grid.shape
     waves, distances = torch.broadcast_tensors(waves, distances)
@@ -80,8 +79,7 @@ def propagate(
         ifft2(spectra[..., i, :, :] * kernel_of(grid, way, wave, distance, field.dtype), grid.shape)
         for i, (wave, distance) in enumerate(pairs)
     ]
-    results = torch.stack(parts, -3)
-    return results.reshape(*batch, height, width)
+    return torch.stack(parts, -3).reshape(*batch, height, width)
 
 
 class Propagator(SpectralFilter):
@@ -145,8 +143,7 @@ def kernel_of(grid: Grid, way: Candidate, waves: Tensor, distances: Tensor, dtyp
         return wide_transfer_function(padded, waves, distances, dtype=dtype)
     if way.method == "identity":
         ones = torch.ones(*torch.broadcast_shapes(waves.shape, distances.shape), *grid.shape, dtype=dtype)
-        phase = 2 * torch.pi * (distances / waves - (distances / waves).round())
-        return ones * torch.complex(torch.cos(phase), torch.sin(phase)).to(dtype)[..., None, None]
+        return ones * carrier(waves, distances)[..., None, None].to(dtype)
     return transfer_function(padded, waves, distances, sampled=way.sampled, paraxial=way.paraxial, dtype=dtype)
 
 
