@@ -21,7 +21,8 @@ from holotorch.core.fourier import fft2, filter_spectrum, ifft2
 from holotorch.core.grid import Grid
 from holotorch.experiments.chart import interleaved
 from holotorch.optics import AngularSpectrum, CroppedKernel, Fresnel, Propagator, unaliased_distance
-from holotorch.optics.plan import candidates
+from holotorch.optics.passage import Passage
+from holotorch.optics.plan import find
 from holotorch.optics.propagate import kernel_of
 
 WAVELENGTH = 530e-9
@@ -136,9 +137,10 @@ def _predictions() -> list[dict[str, Any]]:
         wide = Grid((4 * grid.shape[0], 4 * grid.shape[1]), pitch)
         large = torch.nn.functional.pad(field, (0, 3 * grid.shape[1], 0, 3 * grid.shape[0]))
         exact = CroppedKernel(wide, wavelength, distance)(large[None])[0, : grid.shape[0], : grid.shape[1]]
-        for way in candidates(grid, wavelength, distance, band=(share / 2 / pitch, share / 2 / pitch)):
+        path = Passage(grid, grid)
+        for way in find(path, [wavelength], [distance], band=(share / 2 / pitch, share / 2 / pitch)):
             wave, far = (torch.tensor(value, dtype=torch.float64) for value in (wavelength, distance))
-            kernel = kernel_of(grid, way, wave, far, torch.complex64)
+            kernel = kernel_of(path, way, wave, far, torch.complex64)
             out = filter_spectrum(field.to(torch.complex64), kernel).to(torch.complex128)
             rows.append(
                 {

@@ -3,6 +3,7 @@
 from holotorch.optics.cropped import CroppedKernel
 from holotorch.optics.geometry import diffraction_angle, least_padding, unaliased_distance
 from holotorch.optics.kernels import angular_spectrum_kernel, carrier, fresnel_kernel
+from holotorch.optics.pixels import PixelShape, order_efficiency
 from holotorch.optics.plan import plan_propagation
 from holotorch.optics.propagate import Propagator, propagate
 from holotorch.optics.propagators import AngularSpectrum, Fraunhofer, Fresnel, SpectralFilter
@@ -14,6 +15,7 @@ __all__ = [
     "CroppedKernel",
     "Fraunhofer",
     "Fresnel",
+    "PixelShape",
     "Propagator",
     "RayleighSommerfeld",
     "ResampledKernel",
@@ -23,6 +25,7 @@ __all__ = [
     "diffraction_angle",
     "fresnel_kernel",
     "least_padding",
+    "order_efficiency",
     "plan_propagation",
     "propagate",
     "unaliased_distance",

@@ -7,7 +7,8 @@ import torch
 from holotorch.core import checks
 from holotorch.core.fourier import good_length
 from holotorch.core.grid import Grid
-from holotorch.optics.plan import FINEST, crop_length
+from holotorch.optics.candidates import FINEST, crop_length
+from holotorch.optics.passage import passage, shifts
 from holotorch.optics.predict import AxisContent
 from holotorch.optics.propagators import SpectralFilter
 from holotorch.optics.transfer import transfer_function
@@ -47,23 +48,25 @@ class CroppedKernel(SpectralFilter):
         offset: tuple[float, float] = (0.0, 0.0),
     ):
         distance = checks.finite("distance", distance, "metres")
-        offset = checks.finite("offset", offset[0], "metres"), checks.finite("offset", offset[1], "metres")
         waves = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
         longest = waves.max().item()
+        path = passage(grid, None, offset, (0.0, 0.0), waves.tolist())
         if min(grid.pitch) < FINEST * longest and not paraxial:
             raise ValueError(
                 f"CroppedKernel needs a pitch of at least {FINEST} wavelengths, got {min(grid.pitch):g} m at "
                 f"{longest:g} m; use AngularSpectrum"
             )
-        sizes = (
-            2 * size - 1
-            if paraxial
-            else crop_length(AxisContent(size, pitch, 0.5 / pitch, longest, abs(distance)), offset=shift)
-            for size, pitch, shift in zip(grid.shape, grid.pitch, offset, strict=True)
-        )
-        height, width = (good_length(size) for size in sizes)
         far = torch.tensor(distance, dtype=torch.float64)
+        places = [place.item() for place in shifts(path, far, torch.zeros(2, dtype=torch.float64))]
+        height, width = (
+            good_length(
+                2 * size - 1
+                if paraxial
+                else crop_length(AxisContent(size, pitch, 0.5 / pitch, longest, abs(distance), shift=place))
+            )
+            for size, pitch, place in zip(grid.shape, grid.pitch, places, strict=True)
+        )
         padded = Grid((height, width), grid.pitch)
-        kernel = transfer_function(padded, waves, far, sampled=(False, False), paraxial=paraxial, offset=offset)
+        kernel = transfer_function(path, padded, waves, far, sampled=(False, False), paraxial=paraxial)
         super().__init__(grid, wavelengths, kernel)
-        self.distance, self.offset = distance, offset
+        self.distance, self.offset = distance, path.offset

@@ -1,19 +1,23 @@
 """propagate and Propagator: the planned way, which picks method and padding and says why."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
-from holotorch.core.fourier import fft2, ifft2
+from holotorch.core.fourier import fft2, ifft2, multiplied
 from holotorch.core.grid import Grid
 from holotorch.core.plan import Plan
+from holotorch.optics.candidates import FINEST, Candidate
 from holotorch.optics.kernels import carrier
-from holotorch.optics.plan import FINEST, Candidate, candidates, choose, plan_from
+from holotorch.optics.passage import Passage, passage
+from holotorch.optics.plan import choose, find, plan_from
 from holotorch.optics.propagators import SpectralFilter
+from holotorch.optics.resampled import ResampledKernel, resample, resampling_factors
 from holotorch.optics.transfer import transfer_function, wide_transfer_function
 
 _UNUSABLE = 0.1  # expected error from which a result is refused
@@ -27,9 +31,14 @@ def propagate(
     *,
     tolerance: float = 1e-3,
     band: tuple[float, float] | None = None,
+    spread: tuple[float, float] | None = None,
     margin: tuple[float, float] = (0.0, 0.0),
+    measure: bool = False,
+    out_grid: Grid | None = None,
+    offset: tuple[float, float] = (0.0, 0.0),
+    tilt: tuple[float, float] | Tensor = (0.0, 0.0),
 ) -> Tensor:
-    """Propagate ``field`` over ``distance`` on its own grid, by the cheapest way that is accurate enough.
+    """Propagate ``field`` over ``distance`` by the cheapest way that is accurate enough.
 
     Args:
         field: complex64 or complex128, shape [..., H, W].
@@ -40,10 +49,17 @@ def propagate(
             field an axis of size 1 where the distances have theirs.
         tolerance: Largest relative L2 error, in expectation over noise that fills ``band`` and the window.
         band: Highest frequencies (y, x) of the content, in cycles per metre; the grid's own by default.
+        spread: The same said as how far (y, x) in metres the content travels sideways over the distance.
         margin: Widths (y, x) in metres over which the content fades smoothly to nothing at the ends of each axis.
+        measure: Plan for this very field instead of a description, at the cost of two thin matrix products.
+        out_grid: Sampling of the result, of any shape and pitch; that of the field by default.
+        offset: Where (y, x) in metres the axis of the result lies beside that of the field.
+        tilt: Sines (y, x) of the direction of a carrier that is taken out: the light is
+            ``field`` exp(2 pi i (y s_y + x s_x) / wavelength), and the result times the same carrier is the light that
+            arrives, with y and x counted from the axis of the source in both. May be a tensor [2] with gradients.
 
     Returns:
-        Same dtype, shape [..., H, W] broadcast with the leading axes. The carrier exp(ikz) is included; evanescent
+        Same dtype, shape [..., H', W'] broadcast with the leading axes. The carrier exp(ikz) is included; evanescent
         waves decay for either sign of the distance.
 
     Raises:
@@ -53,37 +69,62 @@ def propagate(
 
     Warns:
         SamplingWarning: No way meets the tolerance; the most accurate one is used and its expected error named.
+
+    A gradient in the pitch, say a factor s on it and on the output's: nothing changes when all lengths are scaled, so
+    ``propagate(field, grid, wavelength / s, distance / s)`` is the field on a grid of s times the pitch.
     """
     checks.field("field", field, grid.shape)
     if not torch.compiler.is_compiling():
         checks.all_finite("field", torch.view_as_real(field.detach().resolve_conj()))
     waves, distances = _float64("wavelength", wavelength, field), _float64("distance", distance, field)
     listed = [values.detach().reshape(-1).tolist() for values in (waves, distances)]
-    found = candidates(grid, *listed, band=band, margin=margin, dtype=field.dtype)
+    path = passage(grid, out_grid, offset, tilt, listed[0])
+    slanted = tilt.to(field.device, torch.float64) if isinstance(tilt, Tensor) else None
+    sample = field if measure else None
+    found = find(path, *listed, band=band, spread=spread, margin=margin, field=sample, dtype=field.dtype)
     way = _best(found, checks.positive("tolerance", tolerance))
     if way.method == "identity":
         return field * carrier(waves, distances)[..., None, None].to(field.dtype)
-    spectrum = fft2(field, way.padded)
-    height, width = grid.shape
+    if not path.same_pitch:
+        if bool((distances == 0).any()):
+            raise ValueError("distance must not be 0 for a propagation onto another grid")
+
+        def dense(each: Tensor, wave: Tensor, far: Tensor) -> Tensor:
+            factors = resampling_factors(path, wave, far, paraxial=way.paraxial, tilt=slanted, dtype=field.dtype)
+            return resample(each, factors)
+
+        return _one_by_one(field, waves, distances, path.out.shape, dense)
+
+    def filtered(each: Tensor, wave: Tensor, far: Tensor) -> Tensor:
+        kernel = kernel_of(path, way, wave, far, field.dtype, slanted)
+        # The spectrum serves several distances; only when there is one may its memory be taken.
+        product = multiplied(each, kernel) if waves.numel() * distances.numel() == 1 else each * kernel
+        return ifft2(product, path.out.shape)
+
+    return _one_by_one(fft2(field, way.padded), waves, distances, path.out.shape, filtered)
+
+
+def _one_by_one(
+    field: Tensor,
+    waves: Tensor,
+    distances: Tensor,
+    shape: tuple[int, int],
+    apply: Callable[[Tensor, Tensor, Tensor], Tensor],
+) -> Tensor:
+    """``apply`` for each wavelength and distance: all kernels together would not fit into the cache, nor memory."""
     waves, distances = torch.broadcast_tensors(waves, distances)
-    batch = torch.broadcast_shapes(waves.shape, spectrum.shape[:-2])
+    batch = torch.broadcast_shapes(waves.shape, field.shape[:-2])
     if waves.numel() == 1:
-        kernel = kernel_of(grid, way, waves.reshape(()), distances.reshape(()), field.dtype)
-        return ifft2(spectrum * kernel, grid.shape).expand(*batch, height, width)
-    # One kernel at a time: all of them together would not fit into the processor's cache, nor perhaps into memory.
+        return apply(field, waves.reshape(()), distances.reshape(())).expand(*batch, *shape)
+    fields = field.expand(*batch, *field.shape[-2:])
+    fields = fields.flatten(fields.ndim - 2 - waves.ndim, -3)
     pairs = zip(waves.reshape(-1), distances.reshape(-1), strict=True)
-    spectra = spectrum.expand(*batch, *way.padded)
-    lead = spectra.ndim - 2 - waves.ndim
-    spectra = spectra.flatten(lead, -3)
-    parts = [
-        ifft2(spectra[..., i, :, :] * kernel_of(grid, way, wave, distance, field.dtype), grid.shape)
-        for i, (wave, distance) in enumerate(pairs)
-    ]
-    return torch.stack(parts, -3).reshape(*batch, height, width)
+    parts = [apply(fields[..., i, :, :], wave, far) for i, (wave, far) in enumerate(pairs)]
+    return torch.stack(parts, -3).reshape(*batch, *shape)
 
 
-class Propagator(SpectralFilter):
-    """The planned propagation as a module: plans once and keeps its kernel. Fields [..., C, H, W], as ``propagate``.
+class Propagator(nn.Module):
+    """The planned propagation as a module: plans once and keeps the one kernel that it needs.
 
     Args:
         grid: Sampling of the field.
@@ -91,7 +132,12 @@ class Propagator(SpectralFilter):
         distance: In metres, negative to travel back.
         tolerance: Largest relative L2 error, in expectation over noise that fills ``band`` and the window.
         band: Highest frequencies (y, x) of the content, in cycles per metre; the grid's own by default.
+        spread: The same said as how far (y, x) in metres the content travels sideways over the distance.
         margin: Widths (y, x) in metres over which the content fades smoothly to nothing at the ends of each axis.
+        example: A field [..., H, W] like those to come, to measure instead of a description.
+        out_grid: Sampling of the result; that of the field by default.
+        offset: Where (y, x) in metres the axis of the result lies beside that of the field.
+        tilt: Sines (y, x) of the direction of a carrier that is taken out, as in :func:`propagate`.
         memory_limit: Refuse a plan that needs more bytes than this per channel.
 
     Attributes:
@@ -110,16 +156,43 @@ class Propagator(SpectralFilter):
         *,
         tolerance: float = 1e-3,
         band: tuple[float, float] | None = None,
+        spread: tuple[float, float] | None = None,
         margin: tuple[float, float] = (0.0, 0.0),
+        example: Tensor | None = None,
+        out_grid: Grid | None = None,
+        offset: tuple[float, float] = (0.0, 0.0),
+        tilt: tuple[float, float] = (0.0, 0.0),
         memory_limit: int | None = None,
     ):
-        waves = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
-        far = torch.tensor(checks.finite("distance", distance, "metres"), dtype=torch.float64)
-        found = candidates(grid, waves.tolist(), distance, band=band, margin=margin)
-        plan = plan_from(found, grid, tolerance, memory_limit)
+        super().__init__()
+        self.wavelengths = checks.wavelengths(wavelengths)
+        self.distance = checks.finite("distance", distance, "metres")
+        path = passage(grid, out_grid, offset, tilt, self.wavelengths)
+        self.grid, self.out_grid, self.offset, self.tilt = grid, path.out, path.offset, path.tilt
+        content: dict[str, Any] = {"band": band, "spread": spread, "margin": margin, "field": example}
+        found = find(path, self.wavelengths, [self.distance], **content)
+        self.plan = plan_from(found, grid, tolerance, memory_limit)
         way = _best(found, tolerance)
-        super().__init__(grid, wavelengths, kernel_of(grid, way, waves, far, torch.complex128))
-        self.plan, self.distance = plan, float(distance)
+        if not path.same_pitch:
+            self.operator = ResampledKernel(
+                grid, self.wavelengths, self.distance, path.out, offset=offset, tilt=tilt, paraxial=way.paraxial
+            )
+            return
+        waves = torch.tensor(self.wavelengths, dtype=torch.float64)
+        kernel = kernel_of(path, way, waves, torch.tensor(self.distance, dtype=torch.float64), torch.complex128)
+        self.operator = SpectralFilter(grid, self.wavelengths, kernel, out_grid=path.out)
+
+    def forward(self, field: Tensor) -> Tensor:
+        """Propagate ``field``, complex [..., C, H, W], to [..., C, H', W'], same dtype."""
+        return self.operator(field)
+
+    def adjoint(self, field: Tensor) -> Tensor:
+        """Apply the conjugate transpose to ``field`` [..., C, H', W'] of the output grid."""
+        return self.operator.adjoint(field)
+
+    def extra_repr(self) -> str:
+        """Distance and plan, for ``print(module)``."""
+        return f"distance={self.distance}, method={self.plan.method!r}, padded={self.plan.padded}"
 
 
 def _best(found: list[Candidate], tolerance: float) -> Candidate:
@@ -136,15 +209,20 @@ def _best(found: list[Candidate], tolerance: float) -> Candidate:
     return best
 
 
-def kernel_of(grid: Grid, way: Candidate, waves: Tensor, distances: Tensor, dtype: torch.dtype) -> Tensor:
+def kernel_of(
+    path: Passage, way: Candidate, waves: Tensor, distances: Tensor, dtype: torch.dtype, tilt: Tensor | None = None
+) -> Tensor:
     """Transfer function of a chosen way, carrier included: [..., H, W] of its padded grid, in ``dtype``."""
+    grid = path.grid
     padded = Grid(way.padded, grid.pitch)
     if way.method == "angular spectrum" and min(grid.pitch) < FINEST * waves.detach().max().item():
-        return wide_transfer_function(padded, waves, distances, dtype=dtype)
+        return wide_transfer_function(path, padded, waves, distances, dtype=dtype)
     if way.method == "identity":
         ones = torch.ones(*torch.broadcast_shapes(waves.shape, distances.shape), *grid.shape, dtype=dtype)
         return ones * carrier(waves, distances)[..., None, None].to(dtype)
-    return transfer_function(padded, waves, distances, sampled=way.sampled, paraxial=way.paraxial, dtype=dtype)
+    return transfer_function(
+        path, padded, waves, distances, sampled=way.sampled, paraxial=way.paraxial, tilt=tilt, dtype=dtype
+    )
 
 
 def _float64(name: str, value: float | Tensor, field: Tensor) -> Tensor:

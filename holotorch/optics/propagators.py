@@ -16,12 +16,13 @@ from holotorch.optics.kernels import angular_spectrum_kernel, carrier, fresnel_k
 
 
 class SpectralFilter(nn.Module):
-    """A linear operator that is diagonal in frequency: fields complex [..., C, H, W] to the same shape and dtype.
+    """A linear operator that is diagonal in frequency: fields complex [..., C, H, W] to the same dtype.
 
     Args:
         grid: Sampling of the field.
         wavelengths: In metres, one per channel.
-        kernel: complex128, shape [C, H', W'], FFT order, at least as large as ``grid``; the excess is zero padding.
+        kernel: complex128, shape [C, P, Q], FFT order, at least as large as ``grid``; the excess is zero padding.
+        out_grid: Sampling of the result, its first samples on the padded grid; that of the field by default.
 
     ``kernel`` is kept as a pair of float64 numbers and cast to the field's precision in each call (3 % of a call), so
     complex64 and complex128 fields both get the best kernel of their kind. ``.to`` and ``.float()`` move it to another
@@ -30,22 +31,24 @@ class SpectralFilter(nn.Module):
 
     kernel: Tensor
 
-    def __init__(self, grid: Grid, wavelengths: float | Sequence[float], kernel: Tensor):
+    def __init__(
+        self, grid: Grid, wavelengths: float | Sequence[float], kernel: Tensor, *, out_grid: Grid | None = None
+    ):
         super().__init__()
-        self.grid, self.wavelengths = grid, checks.wavelengths(wavelengths)
+        self.grid, self.out_grid, self.wavelengths = grid, out_grid or grid, checks.wavelengths(wavelengths)
         # A real pair: Module.to(dtype) would drop the imaginary part of a complex buffer.
         self.register_buffer("kernel", torch.view_as_real(kernel).contiguous(), persistent=False)
 
     def forward(self, field: Tensor) -> Tensor:
         """Apply the filter to ``field`` [..., C, H, W]; TypeError if it is real, ValueError if its shape differs."""
-        return filter_spectrum(field, self._kernel_for(field))
+        return filter_spectrum(field, self._kernel_for(field, self.grid), self.out_grid.shape)
 
     def adjoint(self, field: Tensor) -> Tensor:
-        """Apply the conjugate transpose, same shapes as :meth:`forward`."""
-        return filter_spectrum(field, self._kernel_for(field).conj())
+        """Apply the conjugate transpose to ``field`` [..., C, H', W'] of the output grid."""
+        return filter_spectrum(field, self._kernel_for(field, self.out_grid).conj(), self.grid.shape)
 
-    def _kernel_for(self, field: Tensor) -> Tensor:
-        checks.field("field", field, (len(self.wavelengths), *self.grid.shape))
+    def _kernel_for(self, field: Tensor, grid: Grid) -> Tensor:
+        checks.field("field", field, (len(self.wavelengths), *grid.shape))
         return torch.view_as_complex(self.kernel.to(field.real.dtype))
 
     def _apply(self, fn, recurse=True):

@@ -12,7 +12,8 @@ from holotorch import Grid
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import phasor
 from holotorch.optics import CroppedKernel, Propagator, plan_propagation, propagate
-from holotorch.optics.plan import candidates
+from holotorch.optics.passage import Passage
+from holotorch.optics.plan import find
 from holotorch.optics.propagate import kernel_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:no way reaches:holotorch.core.checks.SamplingWarning")
@@ -110,11 +111,12 @@ def test_prediction_is_within_a_factor_of_ten_and_never_below_a_third_over_rando
         padded = torch.nn.functional.pad(field, (0, 3 * grid.shape[1], 0, 3 * grid.shape[0]))
         exact = CroppedKernel(wide, wavelength, distance)(padded[None])[0, : grid.shape[0], : grid.shape[1]]
         band = (share / (2 * pitch), share / (2 * pitch))
-        found = candidates(grid, wavelength, distance, band=band)
+        path = Passage(grid, grid)
+        found = find(path, [wavelength], [distance], band=band)
         truths = {}
         for way in found:
             waves, far = torch.tensor(wavelength, dtype=torch.float64), torch.tensor(distance, dtype=torch.float64)
-            kernel = kernel_of(grid, way, waves, far, torch.complex64)
+            kernel = kernel_of(path, way, waves, far, torch.complex64)
             out = torch.fft.ifft2(torch.fft.fft2(field.to(torch.complex64), s=kernel.shape[-2:]) * kernel)
             truths[id(way)] = error(out[: grid.shape[0], : grid.shape[1]].to(torch.complex128), exact)
             if 1e-6 < way.error < 0.05:  # above rounding, and short of nonsense

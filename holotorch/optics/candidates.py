@@ -1,0 +1,260 @@
+"""Every way to propagate, with its predicted error and its cost."""
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+
+from holotorch.core.fourier import good_length
+from holotorch.optics.content import Content
+from holotorch.optics.passage import Passage, shifts
+from holotorch.optics.predict import AxisContent, rms_beyond_fresnel
+
+FINEST = 0.9  # wavelengths of pitch below which the cropped kernel no longer separates
+CROP_PAD = 2.25  # of CroppedKernel
+_PADS = (1.0, 1.03125, 1.0625, 1.125, 1.25, 1.5)
+_WIDE_PADS = (2.0, 3.0, 4.0, 6.0, 8.0)
+_CROP_PADS = (2.0, CROP_PAD)
+_PRODUCT_SPEED = 4.0  # arithmetic of a dense product that takes the time of 1 in an FFT
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One way to propagate; its error is computed when first asked for.
+
+    Attributes:
+        method: Name.
+        sampled: Per axis (y, x), whether its transfer function is sampled, or its taps cropped.
+        padded: Samples of the transforms.
+        paraxial: Whether the factor beyond Fresnel is left out.
+        predict: Gives the expected relative L2 error.
+        flops: Arithmetic of one call.
+        memory: Bytes.
+        cost: What candidates are ranked by: ``flops``, those of dense products counted at their speed.
+    """
+
+    method: str
+    sampled: tuple[bool, bool]
+    padded: tuple[int, int]
+    paraxial: bool
+    predict: Callable[[], float]
+    flops: float
+    memory: int
+    cost: float
+
+    @cached_property
+    def error(self) -> float:
+        """Expected relative L2 error."""
+        return self.predict()
+
+
+Axes = tuple[AxisContent, AxisContent]
+
+
+def candidates(
+    path: Passage, waves: Sequence[float], distances: Sequence[float], content: Content, dtype: torch.dtype
+) -> list[Candidate]:
+    """Every way for ``path``; for several wavelengths and distances with the worst of their errors."""
+    if dtype not in (torch.complex64, torch.complex128):
+        raise TypeError(f"dtype must be complex64 or complex128, got {dtype}")
+    longest, far = max(waves), max(distances, key=abs)
+    scenes = [_axes(path, longest, distance, content) for distance in _extremes(path, distances)]
+    ways = [_identity(scenes)] if path.straight else []
+    if far == 0 and path.straight:
+        return ways
+    if not path.same_pitch:
+        return [_resampled(path, scenes, dtype, paraxial=paraxial) for paraxial in (True, False)]
+    wide = min(path.grid.pitch) < FINEST * longest
+    alike = scenes[0][0] is scenes[0][1]
+    tilted = any(path.tilt)
+    pads = _PADS + (_WIDE_PADS if wide or tilted or path.out != path.grid else ())
+    lengths = [_lengths(axis, pads) for axis in scenes[0]]
+    pairs = zip(*lengths, strict=False) if alike or wide or tilted else itertools.product(*lengths)
+    ways += [_sampled(scenes, pair, dtype) for pair in pairs]
+    if wide:
+        return ways
+    masks = (
+        [(False, False)] if alike or tilted or path.out != path.grid else [(False, False), (True, False), (False, True)]
+    )
+    rooms = [*_CROP_PADS, 3.0, 4.0] if tilted else [None, *_CROP_PADS]
+    return ways + [_cropped(scenes, mask, room, dtype) for mask in masks for room in rooms]
+
+
+def _extremes(path: Passage, distances: Sequence[float]) -> list[float]:
+    """Distances that stand for all: the farthest, and where the result is aside both ends of their range."""
+    if path.straight:
+        return [max(map(abs, distances)) or 1e-12]
+    return list(dict.fromkeys(z or 1e-12 for z in (min(distances), max(distances))))
+
+
+def _axes(path: Passage, wavelength: float, distance: float, content: Content) -> Axes:
+    places = shifts(path, torch.tensor(distance, dtype=torch.float64), torch.tensor(path.tilt, dtype=torch.float64))
+    y, x = (
+        AxisContent(
+            path.grid.shape[axis],
+            path.grid.pitch[axis],
+            content.band[axis],
+            wavelength,
+            abs(distance),
+            content.margin[axis],
+            path.out.shape[axis] if path.same_pitch else 0,
+            places[axis].item() if path.same_pitch else 0.0,
+            (path.tilt[axis], path.tilt[1 - axis]),
+            content.signals[axis] if content.signals else None,
+        )
+        for axis in (0, 1)
+    )
+    # What one axis has computed serves an equal other one.
+    return (y, y) if y == x and content.signals is None else (y, x)
+
+
+def _lengths(axis: AxisContent, pads: tuple[float, ...]) -> list[int]:
+    largest = max(axis.size, axis.window)
+    lengths = (largest if pad == 1 else good_length(math.ceil(largest * pad)) for pad in pads)
+    return list(dict.fromkeys(lengths))
+
+
+def _identity(scenes: list[Axes]) -> Candidate:
+    # rms over the content of the phase pi lambda z f^2, which is the whole effect but for the carrier.
+    y, x = max(scenes, key=lambda axes: axes[0].distance)
+    square = y.moment(4) + x.moment(4) + 2 * y.moment(2) * x.moment(2)
+    phase = min(math.pi * y.wavelength * y.distance * math.sqrt(square), 2.0)
+    if y.distance <= 1e-12:
+        phase = 0.0
+    size = (y.size, x.size)
+    work = float(math.prod(size))
+    return Candidate("identity", (True, True), size, False, lambda: phase, work, 0, work)
+
+
+def _sampled(scenes: list[Axes], padded: tuple[int, ...], dtype: torch.dtype) -> Candidate:
+    """The exact transfer function, sampled on both axes."""
+
+    def predict(axes: Axes) -> float:
+        energies = [axis.wrapped(length) for axis, length in zip(axes, padded, strict=True)]
+        return math.hypot(math.sqrt(sum(energies)), _rounding(axes, (True, True), dtype))
+
+    return _way("angular spectrum", (True, True), (padded[0], padded[1]), False, scenes, predict, dtype)
+
+
+def _cropped(scenes: list[Axes], mask: tuple[bool, bool], room: float | None, dtype: torch.dtype) -> Candidate:
+    """Cropped taps where ``mask`` is False, elsewhere a transfer function sampled at the largest padding below 2.
+
+    ``room`` None is paraxial; a number is the padding in which the factor beyond Fresnel finds its room.
+    """
+
+    def length(axis: int) -> int:
+        own = [axes[axis] for axes in scenes]
+        if mask[axis]:
+            return _lengths(own[0], _PADS)[-1]
+        return good_length(
+            own[0].size + own[0].window - 1 if room is None else max(crop_length(each, room) for each in own)
+        )
+
+    lengths = length(0), length(1)
+
+    def predict(axes: Axes) -> float:
+        energies = [_rounding(axes, mask, dtype) ** 2, 0.0]
+        if room is None:
+            energies[1] = max(rms_beyond_fresnel(list(axes)) ** 2, sum(axis.paraxial() for axis in axes))
+        for axis, other, padded, keep in zip(axes, axes[::-1], lengths, mask, strict=True):
+            if keep:
+                energies.append(axis.wrapped(padded))
+            elif room is not None and other is axis and len(energies) > 2:
+                energies.append(energies[-1])
+            elif room is not None:
+                # The cross frequency of rms size stands for the whole of the other axis.
+                energies.append(axis.cropped(padded, math.sqrt(other.moment(2))))
+        return math.sqrt(sum(energies))
+
+    method = ("Fresnel" if room is None else "cropped kernel") + (", one axis sampled" if any(mask) else "")
+    return _way(method, mask, lengths, room is None, scenes, predict, dtype)
+
+
+def _resampled(path: Passage, scenes: list[Axes], dtype: torch.dtype, *, paraxial: bool) -> Candidate:
+    """Dense taps between any two grids; the factor beyond Fresnel applied first, on a window with a rim for it."""
+    height, width = path.grid.shape
+    wavelength, far = scenes[0][0].wavelength, max(axes[0].distance for axes in scenes)
+    rims = (0, 0) if paraxial else tuple(resampling_rim(path, axis, wavelength, far) for axis in (0, 1))
+    padded = tuple(n if paraxial else good_length(n + 2 * rim) for n, rim in zip((height, width), rims, strict=True))
+
+    def predict(axes: Axes) -> float:
+        error = _rounding(axes, (False, False), dtype) ** 2
+        if paraxial:
+            return math.sqrt(error + max(rms_beyond_fresnel(list(axes)) ** 2, sum(axis.paraxial() for axis in axes)))
+        for axis, other, size, rim in zip(axes, axes[::-1], (height, width), rims, strict=True):
+            # The rim holds the short kernel as the room beyond twice the window does for the cropped one.
+            error += axis.cropped(good_length(2 * size + 2 * rim), math.sqrt(other.moment(2)))
+        return math.sqrt(error)
+
+    tall, broad = height + 2 * rims[0], width + 2 * rims[1]
+    products = 8.0 * path.out.shape[0] * broad * (tall + path.out.shape[1])
+    transforms = 0.0 if paraxial else _transforms(math.prod(padded))
+    memory = dtype.itemsize * (
+        path.out.shape[0] * (tall + broad)
+        + path.out.shape[1] * broad
+        + 3 * math.prod(padded)
+        + math.prod(path.out.shape)
+    )
+    method = "resampled Fresnel" if paraxial else "resampled kernel"
+    return Candidate(
+        method,
+        (False, False),
+        (padded[0], padded[1]),
+        paraxial,
+        lambda: max(predict(axes) for axes in scenes),
+        products + transforms,
+        memory,
+        products / _PRODUCT_SPEED + transforms,
+    )
+
+
+def resampling_rim(path: Passage, axis: int, wavelength: float, distance: float) -> int:
+    """Samples on each side for what the factor beyond Fresnel moves, and an eighth of the window for its tails."""
+    pitch = path.grid.pitch[axis]
+    sine = min(wavelength * math.hypot(*(0.5 / step for step in path.grid.pitch)), 0.99)
+    reach = path.grid.extent[axis] + path.out.extent[axis] + 2 * abs(path.offset[axis])
+    sine = min(sine, reach / math.hypot(reach, distance))
+    moved = distance * (sine / math.sqrt(1 - sine * sine) - sine)
+    return math.ceil(path.grid.shape[axis] / 8 + moved / pitch)
+
+
+def crop_length(axis: AxisContent, room: float = CROP_PAD) -> int:
+    """Samples of a transform that holds the taps, and twice what the factor beyond Fresnel adds to their reach."""
+    # Light steeper than what lands in the window need not be followed; sqrt(2) for the corner of the band.
+    reach = (axis.size + axis.window) * axis.pitch + abs(axis.shift) * axis.pitch
+    sine = min(math.sqrt(2) * axis.wavelength * axis.nyquist, reach / math.hypot(reach, axis.distance), 0.99)
+    moved = axis.distance * (sine / math.sqrt(1 - sine * sine) - sine) if room > 2 else 0.0
+    return math.ceil(room * (axis.size + axis.window) / 2 + 2 * moved / axis.pitch) - 1
+
+
+def _rounding(axes: Axes, sampled: tuple[bool, bool], dtype: torch.dtype) -> float:
+    """Rounding of the transforms, relative to what is left of the light in the window.
+
+    A sampled transfer function keeps all light on the padded grid, and rounds against it; cropped taps keep what lands.
+    """
+    left = math.prod(axis.captured for axis, keep in zip(axes, sampled, strict=True) if keep)
+    return 3 * torch.finfo(dtype).eps / math.sqrt(max(left, 1e-12))
+
+
+def _transforms(samples: int) -> float:
+    return 10 * samples * math.log2(max(2, samples)) + 6 * samples
+
+
+def _way(
+    method: str,
+    sampled: tuple[bool, bool],
+    padded: tuple[int, int],
+    paraxial: bool,
+    scenes: list[Axes],
+    predict: Callable[[Axes], float],
+    dtype: torch.dtype,
+) -> Candidate:
+    samples = math.prod(padded)
+    flops = _transforms(samples)
+    memory = 4 * samples * dtype.itemsize
+    return Candidate(
+        method, sampled, padded, paraxial, lambda: max(predict(axes) for axes in scenes), flops, memory, flops
+    )
