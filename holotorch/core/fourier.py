@@ -5,6 +5,7 @@ of its own, torch's transform of 2048 x 2048 complex64 samples is wrong on Intel
 of about the size (pytorch/pytorch#169670). Unscaled ones are right, and so are their gradients.
 """
 
+import itertools
 import math
 
 import torch
@@ -24,20 +25,27 @@ def ifft2(spectrum: Tensor, size: tuple[int, int] | None = None) -> Tensor:
     return field * (1 / math.prod(spectrum.shape[-2:]))
 
 
-def good_length(minimum: int) -> int:
-    """Smallest length >= ``minimum`` with no prime factor above 5; FFTs of such lengths are up to twice as fast."""
+def good_length(minimum: int, *, odd: bool = False) -> int:
+    """Smallest length >= ``minimum`` with no prime factor above 5; FFTs of such lengths are up to twice as fast.
+
+    ``odd`` ones may have factors of 7 as well. They have no highest frequency that stands for both ends of the band.
+    """
     if minimum < 1:
         raise ValueError(f"an FFT length must be at least 1, got {minimum}")
-    best = 1 << (minimum - 1).bit_length()
-    fives = 1
-    while fives < best:
-        product = fives
+    best = 3 ** math.ceil(math.log(minimum, 3) + 1e-9) if odd else 1 << (minimum - 1).bit_length()
+    for bases in itertools.product(_powers(7 if odd else 1, best), _powers(5, best)):
+        product = math.prod(bases)
         while product < best:
             # Multiplied by the least power of two that reaches the minimum.
-            best = min(best, product << max(0, (-(-minimum // product) - 1).bit_length()))
+            twos = 0 if odd else max(0, (-(-minimum // product) - 1).bit_length())
+            if product << twos >= minimum:
+                best = min(best, product << twos)
             product *= 3
-        fives *= 5
     return best
+
+
+def _powers(base: int, top: int) -> list[int]:
+    return [1] if base == 1 else [base**k for k in range(math.ceil(math.log(top, base)) + 1)]
 
 
 def centred_fft2(field: Tensor) -> Tensor:

@@ -107,7 +107,8 @@ class AxisContent:
         """
         if self._moved > padded / 4:
             return self._rim()
-        far = self._beyond_fresnel(good_length(2 * (self.size + self.window)), cross)
+        longer = max(2 * (self.size + self.window), 2 * padded if any(self.tilt) else 0)
+        far = self._beyond_fresnel(good_length(longer, odd=any(self.tilt)), cross)
         return self._energy(self._beyond_fresnel(padded, cross) - far) / self.captured
 
     def paraxial(self) -> float:

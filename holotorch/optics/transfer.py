@@ -108,8 +108,8 @@ def _level(axis: int, padded: Grid, wavelength: Tensor, distance: Tensor, tilt: 
     for sign in (1, -1):
         ends[axis] = torch.tensor(sign * top, dtype=torch.float64, device=tilt.device)
         turns.append(tilted_turns(ends[0], ends[1], wavelength, distance, tilt, squares=False))
-    # In turns per cycle per metre, over the pitch; any value gives the same kernel, so it carries no gradient.
-    return ((turns[0] - turns[1]) / (2 * top) / padded.pitch[axis]).detach()
+    # Turns per cycle per metre, over the pitch.
+    return (turns[0] - turns[1]) / (2 * top) / padded.pitch[axis]
 
 
 def _axis_factor(

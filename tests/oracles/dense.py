@@ -78,8 +78,13 @@ def band_limited_propagation(shape, pitch, wavelength, distance, paraxial, nodes
     return matrix.reshape(h * w, h * w)
 
 
-def band_limited_to_points(shape, pitch, out_shape, out_pitch, offset, wavelength, distance, nodes=300):
-    """The same integral from the samples of one grid to those of another whose axis lies at ``offset``."""
+def band_limited_to_points(
+    shape, pitch, out_shape, out_pitch, offset, wavelength, distance, nodes=300, tilt=(0.0, 0.0)
+):
+    """The same integral from the samples of one grid to those of another whose axis lies at ``offset``.
+
+    ``tilt``: frequencies are counted from a carrier's with these sines (y, x); the carrier is in neither field.
+    """
     t, weight = np.polynomial.legendre.leggauss(nodes)
     factors = []
     for axis in (0, 1):
@@ -88,7 +93,7 @@ def band_limited_to_points(shape, pitch, out_shape, out_pitch, offset, wavelengt
         f = t / (2 * pitch[axis])
         factors.append((f, np.exp(2j * np.pi * (reached[:, None] - source).reshape(-1, 1) * f) * weight / 2))
     (fy, ey), (fx, ex) = factors
-    square = wavelength**2 * (fy[:, None] ** 2 + fx[None, :] ** 2)
+    square = (wavelength * fy[:, None] + tilt[0]) ** 2 + (wavelength * fx[None, :] + tilt[1]) ** 2
     kernel = ey @ np.exp(2j * np.pi * distance / wavelength * np.sqrt(1 - square + 0j)) @ ex.T
     matrix = kernel.reshape(out_shape[0], shape[0], out_shape[1], shape[1]).transpose(0, 2, 1, 3)
     return matrix.reshape(out_shape[0] * out_shape[1], shape[0] * shape[1])
