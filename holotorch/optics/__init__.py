@@ -1,5 +1,6 @@
 """Propagation of light between parallel planes."""
 
+from holotorch.optics.converging import ConvergingFresnel, converging_fresnel
 from holotorch.optics.cropped import CroppedKernel
 from holotorch.optics.geometry import diffraction_angle, least_padding, unaliased_distance
 from holotorch.optics.kernels import angular_spectrum_kernel, carrier, fresnel_kernel
@@ -9,9 +10,11 @@ from holotorch.optics.propagate import Propagator, propagate
 from holotorch.optics.propagators import AngularSpectrum, Fraunhofer, Fresnel, SpectralFilter
 from holotorch.optics.rayleigh_sommerfeld import RayleighSommerfeld
 from holotorch.optics.resampled import ResampledKernel
+from holotorch.optics.zoomed import ZoomedFilter
 
 __all__ = [
     "AngularSpectrum",
+    "ConvergingFresnel",
     "CroppedKernel",
     "Fraunhofer",
     "Fresnel",
@@ -20,8 +23,10 @@ __all__ = [
     "RayleighSommerfeld",
     "ResampledKernel",
     "SpectralFilter",
+    "ZoomedFilter",
     "angular_spectrum_kernel",
     "carrier",
+    "converging_fresnel",
     "diffraction_angle",
     "fresnel_kernel",
     "least_padding",

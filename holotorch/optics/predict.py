@@ -144,7 +144,7 @@ class AxisContent:
 
     def _fresnel(self, index: Tensor) -> Tensor:
         wavelength, bent = (torch.tensor(value, dtype=torch.float64) for value in (self.wavelength, self.bent))
-        return fresnel_taps(index + self.shift, self.pitch, wavelength, bent)
+        return fresnel_taps(index.to(torch.float64) + self.shift, self.pitch, wavelength, bent)
 
     def _beyond_fresnel(self, padded: int, cross: float) -> Tensor:
         index = tap_indices(padded, self.size, self.window)

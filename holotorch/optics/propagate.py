@@ -19,7 +19,9 @@ from holotorch.optics.plan import choose, find, plan_from
 from holotorch.optics.propagators import SpectralFilter
 from holotorch.optics.resampled import ResampledKernel, resample, resampling_factors
 from holotorch.optics.transfer import transfer_function, wide_transfer_function
+from holotorch.optics.zoomed import ZoomedFilter, chirps, zoomed
 
+_ZOOMED = "angular spectrum, zoomed"
 _UNUSABLE = 0.1  # expected error from which a result is refused
 
 
@@ -89,11 +91,15 @@ def propagate(
         if bool((distances == 0).any()):
             raise ValueError("distance must not be 0 for a propagation onto another grid")
 
-        def dense(each: Tensor, wave: Tensor, far: Tensor) -> Tensor:
+        def elsewhere(each: Tensor, wave: Tensor, far: Tensor) -> Tensor:
+            if way.method == _ZOOMED:
+                padded = Grid(way.padded, grid.pitch)
+                kernel = kernel_of(_read_along(path), way, wave, far, field.dtype, slanted)
+                return zoomed(each, kernel, chirps(grid, padded, path.out, path.offset, field.device))
             factors = resampling_factors(path, wave, far, paraxial=way.paraxial, tilt=slanted, dtype=field.dtype)
             return resample(each, factors)
 
-        return _one_by_one(field, waves, distances, path.out.shape, dense)
+        return _one_by_one(field, waves, distances, path.out.shape, elsewhere)
 
     def filtered(each: Tensor, wave: Tensor, far: Tensor) -> Tensor:
         kernel = kernel_of(path, way, wave, far, field.dtype, slanted)
@@ -173,14 +179,18 @@ class Propagator(nn.Module):
         found = find(path, self.wavelengths, [self.distance], **content)
         self.plan = plan_from(found, grid, tolerance, memory_limit)
         way = _best(found, tolerance)
-        if not path.same_pitch:
+        if not path.same_pitch and way.method != _ZOOMED:
             self.operator = ResampledKernel(
                 grid, self.wavelengths, self.distance, path.out, offset=offset, tilt=tilt, paraxial=way.paraxial
             )
             return
-        waves = torch.tensor(self.wavelengths, dtype=torch.float64)
-        kernel = kernel_of(path, way, waves, torch.tensor(self.distance, dtype=torch.float64), torch.complex128)
-        self.operator = SpectralFilter(grid, self.wavelengths, kernel, out_grid=path.out)
+        waves, far = (torch.tensor(value, dtype=torch.float64) for value in (self.wavelengths, self.distance))
+        if path.same_pitch:
+            kernel = kernel_of(path, way, waves, far, torch.complex128)
+            self.operator = SpectralFilter(grid, self.wavelengths, kernel, out_grid=path.out)
+        else:
+            kernel = kernel_of(_read_along(path), way, waves, far, torch.complex128)
+            self.operator = ZoomedFilter(grid, self.wavelengths, kernel, path.out, offset=path.offset)
 
     def forward(self, field: Tensor) -> Tensor:
         """Propagate ``field``, complex [..., C, H, W], to [..., C, H', W'], same dtype."""
@@ -209,13 +219,18 @@ def _best(found: list[Candidate], tolerance: float) -> Candidate:
     return best
 
 
+def _read_along(path: Passage) -> Passage:
+    """The same light on the source's samples: where it is read elsewhere is left to the reading."""
+    return Passage(path.grid, path.grid, (0.0, 0.0), path.tilt)
+
+
 def kernel_of(
     path: Passage, way: Candidate, waves: Tensor, distances: Tensor, dtype: torch.dtype, tilt: Tensor | None = None
 ) -> Tensor:
     """Transfer function of a chosen way, carrier included: [..., H, W] of its padded grid, in ``dtype``."""
     grid = path.grid
     padded = Grid(way.padded, grid.pitch)
-    if way.method == "angular spectrum" and min(grid.pitch) < FINEST * waves.detach().max().item():
+    if way.method in ("angular spectrum", _ZOOMED) and min(grid.pitch) < FINEST * waves.detach().max().item():
         return wide_transfer_function(path, padded, waves, distances, dtype=dtype)
     if way.method == "identity":
         ones = torch.ones(*torch.broadcast_shapes(waves.shape, distances.shape), *grid.shape, dtype=dtype)

@@ -48,9 +48,9 @@ def fresnel_taps(place: Tensor, pitch: float, wavelength: Tensor, distance: Tens
 def tap_indices(padded: int, size: int, out: int) -> Tensor:
     """Displacements from n source samples to m samples of the result, 0 .. m - 1, ..., -(n - 1) .. -1, in FFT order.
 
-    ``padded`` >= n + m - 1 of them; those in excess are shared between the two ends.
+    ``padded`` >= n + m - 1 of them, float64; those in excess are shared between the two ends.
     """
-    index = torch.arange(padded)
+    index = torch.arange(padded, dtype=torch.float64)
     return torch.where(index > out - 1 + (padded - (size + out - 1)) // 2, index - padded, index)
 
 

@@ -16,6 +16,8 @@ from holotorch.optics import CroppedKernel, Propagator, plan_propagation, propag
 from holotorch.optics.passage import Passage, passage
 from holotorch.optics.plan import find
 from holotorch.optics.propagate import kernel_of
+from holotorch.optics.resampled import resample, resampling_factors
+from holotorch.optics.zoomed import chirps, zoomed
 
 pytestmark = pytest.mark.filterwarnings("ignore:no way reaches:holotorch.core.checks.SamplingWarning")
 GRID, WAVE = Grid((24, 20), (8e-6, 7e-6)), 530e-9
@@ -67,6 +69,29 @@ def test_white_phases_arrive_right_in_any_window(window, crossovers):
     y = torch.randn(1, *out.shape, dtype=torch.complex128)
     straight, back = (module(field[None]).conj() * y).sum(), (field.conj() * module.adjoint(y)).sum()
     assert abs(straight - back) <= 1e-12 * field.norm() * y.norm()
+
+
+@pytest.mark.parametrize("crossovers", [0.05, 0.3, 1.0, -1.0, 3.0])
+@pytest.mark.parametrize("window", WINDOWS)
+def test_every_way_into_a_window_errs_as_predicted(window, crossovers):
+    (out, offset), distance, field = WINDOWS[window], crossovers * CROSS_OVER, white()
+    wanted = exact(field, out, offset, distance)
+    path = passage(GRID, out, offset, (0.0, 0.0), [WAVE])
+    waves, far = (torch.tensor(value, dtype=torch.float64) for value in (WAVE, distance))
+    checked = 0
+    for way in find(path, [WAVE], [distance], dtype=torch.complex128):
+        if not 1e-6 < way.error < 0.1:
+            continue
+        if path.same_pitch:
+            got = filter_spectrum(field, kernel_of(path, way, waves, far, torch.complex128), out.shape)
+        elif way.method == "angular spectrum, zoomed":
+            kernel = kernel_of(Passage(GRID, GRID), way, waves, far, torch.complex128)
+            got = zoomed(field, kernel, chirps(GRID, Grid(way.padded, GRID.pitch), out, offset))
+        else:
+            got = resample(field, resampling_factors(path, waves, far, paraxial=way.paraxial))
+        checked += 1
+        assert way.error / 10 <= error(got, wanted) <= 3 * way.error, way
+    assert checked >= 2
 
 
 @pytest.mark.parametrize("crossovers", [0.1, 0.3, 1.0, -0.3, 3.0])
@@ -195,6 +220,11 @@ def test_spread_says_the_same_as_band():
 def test_what_a_plan_says_of_other_windows():
     plan = plan_propagation(Grid(512, 8e-6), WAVE, 0.2, out_grid=Grid(64, 2e-6))
     assert plan.method == "resampled kernel" and plan.adequate
+    # A smooth field nearby, read at many points: its spectrum is summed rather than every pair of samples.
+    many = plan_propagation(
+        Grid(2048, 8e-6), WAVE, 0.02, out_grid=Grid(2048, 5e-6), band=(1e4, 1e4), margin=(2e-3, 2e-3)
+    )
+    assert many.method == "angular spectrum, zoomed" and many.adequate
     stepped = plan_propagation(Grid(64, 8e-6), WAVE, [1e-3, 5e-2], out_grid=Grid(64, 8e-6), offset=(1e-3, 0.0))
     assert stepped.method == "cropped kernel"
 
