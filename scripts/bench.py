@@ -83,7 +83,25 @@ def distances() -> Iterator[tuple[str, Contenders]]:
         yield f"{size} px", {"one by one": one_by_one, **together}
 
 
-SUBJECTS = {"crosstalk": crosstalk, "propagation": propagation, "distances": distances}
+def peer() -> Iterator[tuple[str, Contenders]]:
+    """Torchoptics (extra ``bench``) at 512 px and every distance; the planned way, tolerance 1e-3, is the baseline."""
+    try:
+        from torchoptics import Field  # type: ignore[import-not-found]
+    except ImportError:
+        sys.exit("peer needs torchoptics: pip install torchoptics")
+    field = torch.randn(512, 512, dtype=torch.complex64)
+    for pitch in (8e-6, 3.74e-6):
+        for distance in (1e-3, 5e-3, 20e-3, 60e-3, 200e-3, 2.0):
+            module = Propagator(Grid(512, pitch), 530e-9, distance)
+
+            def theirs(pitch: float = pitch, distance: float = distance) -> object:
+                return Field(field, wavelength=530e-9, z=0, spacing=pitch).propagate_to_z(distance)
+
+            case = f"{pitch * 1e6:g} um, {distance * 1e3:g} mm"
+            yield case, {"planned": lambda m=module: m(field[None]), "torchoptics": theirs}
+
+
+SUBJECTS = {"crosstalk": crosstalk, "propagation": propagation, "distances": distances, "peer": peer}
 
 
 def measure(contenders: Contenders) -> dict[str, float]:

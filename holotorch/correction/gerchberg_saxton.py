@@ -8,7 +8,7 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.core.complex import intensity, phasor, wrapped
 from holotorch.core.operator import LinearOperator
-from holotorch.correction.solvers import Callback, Solution
+from holotorch.correction.run import Callback, Solution
 
 
 def gerchberg_saxton(

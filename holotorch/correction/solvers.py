@@ -1,47 +1,12 @@
-"""Solvers: frozen dataclasses that are called with an objective, a start and a projection.
+"""First-order solvers: frozen dataclasses that are called with an objective, a start and a projection."""
 
-An objective maps x [..., C, H, W] to one loss per leading index, [..., C], that is never negative and 0 for a perfect
-fit, as sums of squares are. The items are independent: each has its own step length and its own stop, so a batch gives
-what its items give alone.
-"""
-
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from holotorch.core import checks
-
-Objective = Callable[[Tensor], Tensor]
-Projection = Callable[[Tensor], Tensor]
-Callback = Callable[["Solution"], None]
-
-
-def nonnegative(x: Tensor) -> Tensor:
-    """Project onto x >= 0, since heaters cannot cool: the proximal operator of Eq. 4.13."""
-    return x.clamp(min=0)
-
-
-@dataclass(frozen=True)
-class Solution:
-    """What a solver found, or has so far.
-
-    Attributes:
-        x: The unknown, [..., C, H, W].
-        losses: Loss at the start and after each step, [steps + 1, ..., C]; an item that has stopped repeats its last.
-        steps: Steps that each item took, integer [..., C].
-        converged: Whether each item met the stop rule, [..., C]; False where it ran out of steps or stalled.
-        stalled: Whether each item stopped because no step, however short, was accepted, [..., C].
-        evaluations: How often the objective was evaluated, with or without its gradient.
-    """
-
-    x: Tensor
-    losses: Tensor
-    steps: Tensor
-    converged: Tensor
-    stalled: Tensor
-    evaluations: int
+from holotorch.correction.run import Callback, Objective, Projection, Run, Solution, State, check_stop_rule, nonnegative
 
 
 @dataclass(frozen=True)
@@ -49,11 +14,13 @@ class APG:
     """Accelerated proximal gradient with a backtracking step: thesis Algorithm 2 and Eq. 4.14.
 
     The printed test g(Z) < g' gets a rounding slack, without which it can never hold near convergence and the step
-    collapses. As printed, the step only shrinks.
+    collapses. As printed, the step only shrinks and the momentum only grows; ``grow`` and ``restart`` change that.
 
     Attributes:
         step: First step length tau.
         shrink: Factor beta in (0, 1) on a refused step.
+        grow: Factor >= 1 that an accepted step is tried with next.
+        restart: Drop the momentum of an item whose loss has risen (O'Donoghue and Candes 2015).
         max_steps: Most iterations.
         tolerance: Stop an item once its relative change of loss (Eq. 4.36) stays below this ...
         patience: ... for so many iterations in a row.
@@ -65,6 +32,8 @@ class APG:
 
     step: float = 1.0
     shrink: float = 0.5
+    grow: float = 1.0
+    restart: bool = False
     max_steps: int = 400
     tolerance: float = 1e-3
     patience: int = 10
@@ -73,7 +42,9 @@ class APG:
         checks.positive("step", self.step)
         if not 0 < self.shrink < 1:
             raise ValueError(f"shrink must lie between 0 and 1, got {self.shrink!r}")
-        _check_stop_rule(self.max_steps, self.tolerance, self.patience)
+        if not self.grow >= 1:
+            raise ValueError(f"grow must be at least 1, got {self.grow!r}")
+        check_stop_rule(self.max_steps, self.tolerance, self.patience)
 
     def __call__(
         self,
@@ -82,43 +53,48 @@ class APG:
         project: Projection = nonnegative,
         *,
         callback: Callback | None = None,
+        resume: State | None = None,
     ) -> Solution:
-        """Minimise ``objective`` over the set that ``project`` projects onto, from ``start`` [..., C, H, W].
+        """Minimise ``objective`` over the set that ``project`` projects onto, from ``start`` [..., *unknown].
 
-        ``callback`` sees the state after every step.
+        ``callback`` sees the state after every step; ``resume`` is the ``state`` of an earlier solution.
         """
-        run = _Run(objective, project(start), self.max_steps, self.tolerance, self.patience)
-        previous = run.x
-        step = torch.full_like(run.x[..., :1, :1], self.step)
-        for k in range(self.max_steps):
-            y = run.x + k / (k + 3) * (run.x - previous)
+        rule = {"max_steps": self.max_steps, "tolerance": self.tolerance, "patience": self.patience}
+        run = Run(objective, project(start), **rule, resume=resume)
+        previous = run.extra.get("previous", run.x)
+        step = run.extra.get("step_length", torch.full_like(run.loss, self.step))
+        count = run.extra.get("count", torch.zeros_like(run.loss))
+        while run.step < self.max_steps and run.active.any():
+            y = run.x + run.each(count / (count + 3)) * (run.x - previous)
             value, gradient = run.value_and_gradient(y)
             x, loss, step, stalled = self._descend(run, project, y, value, gradient, step)
+            count = count + 1
+            if self.restart:
+                count = torch.where(loss > run.loss, 0, count)
             previous = run.x
             run.advance(x, loss, stalled)
+            step = step * self.grow
             if callback:
-                callback(run.solution())
-            if not run.active.any():
-                break
-        return run.solution()
+                callback(run.solution(previous=previous, step_length=step, count=count))
+        return run.solution(previous=previous, step_length=step, count=count)
 
-    def _descend(self, run: "_Run", project: Projection, y, value, gradient, step):
+    def _descend(self, run: Run, project: Projection, y: Tensor, value: Tensor, gradient: Tensor, step: Tensor):
         """One proximal step from ``y``, its length shortened per item until Beck and Teboulle's bound holds."""
         slack = 8 * torch.finfo(y.dtype).eps * value
         least = self.step * torch.finfo(y.dtype).eps ** 2
         shortened = torch.zeros_like(run.active)
         while True:
-            z = project(y - step * gradient)
+            z = project(y - run.each(step) * gradient)
             moved = z - y
             loss = run.value(z)
-            bound = value + (gradient * moved).sum((-2, -1)) + moved.square().sum((-2, -1)) / (2 * step[..., 0, 0])
+            bound = value + run.total(gradient * moved) + run.total(moved.square()) / (2 * step)
             refused = run.active & ~(loss <= bound + slack)
-            stalled = refused & (step[..., 0, 0] <= least)
+            stalled = refused & (step <= least)
             if not (refused & ~stalled).any():
                 # Shortened until nothing moves is no progress either; unmoved at once is a minimum on the border.
-                stalled = stalled | (shortened & (moved == 0).all(-1).all(-1))
+                stalled = stalled | (shortened & (run.total(moved != 0) == 0))
                 return z, loss, step, stalled
-            step = torch.where(refused[..., None, None], step * self.shrink, step)
+            step = torch.where(refused, step * self.shrink, step)
             shortened = shortened | refused
 
 
@@ -127,13 +103,14 @@ class ProjectedAdam:
     """Adam with a projection after every step.
 
     Attributes:
-        learning_rate: Of Adam, in the unit of the unknown.
+        learning_rate: In the unit of the unknown.
         betas: Decay of its two running means.
         max_steps: Most iterations, one evaluation each.
         tolerance: Stop rule as for :class:`APG`.
         patience: Stop rule as for :class:`APG`.
 
     Raises as :class:`APG`. The loss need not fall at every step; the best point seen is not kept.
+    Source: Kingma and Ba (2015).
     """
 
     learning_rate: float = 0.1
@@ -144,7 +121,7 @@ class ProjectedAdam:
 
     def __post_init__(self):
         checks.positive("learning_rate", self.learning_rate)
-        _check_stop_rule(self.max_steps, self.tolerance, self.patience)
+        check_stop_rule(self.max_steps, self.tolerance, self.patience)
 
     def __call__(
         self,
@@ -153,91 +130,23 @@ class ProjectedAdam:
         project: Projection = nonnegative,
         *,
         callback: Callback | None = None,
+        resume: State | None = None,
     ) -> Solution:
         """Minimise ``objective`` as :meth:`APG.__call__` does."""
-        run = _Run(objective, project(start), self.max_steps, self.tolerance, self.patience)
-        x = run.x.clone()
-        adam = torch.optim.Adam([x], lr=self.learning_rate, betas=self.betas)
-        x.grad = run.start_gradient
-        for _ in range(self.max_steps):
-            adam.step()
-            x.copy_(torch.where(run.active[..., None, None], project(x), run.x))
-            loss, x.grad = run.value_and_gradient(x)
-            run.advance(x.clone(), loss, ~torch.isfinite(loss))
+        rule = {"max_steps": self.max_steps, "tolerance": self.tolerance, "patience": self.patience}
+        run = Run(objective, project(start), **rule, resume=resume)
+        gradient = run.extra.get("gradient", run.gradient)
+        mean = run.extra.get("mean", torch.zeros_like(run.x))
+        square = run.extra.get("square", torch.zeros_like(run.x))
+        while run.step < self.max_steps and run.active.any():
+            mean = mean + (1 - self.betas[0]) * (gradient - mean)
+            square = square + (1 - self.betas[1]) * (gradient.square() - square)
+            turn = run.step + 1
+            scale = torch.sqrt(square / (1 - self.betas[1] ** turn)) + 1e-8
+            x = project(run.x - self.learning_rate / (1 - self.betas[0] ** turn) * mean / scale)
+            x = torch.where(run.each(run.active), x, run.x)
+            loss, gradient = run.value_and_gradient(x)
+            run.advance(x, loss, ~torch.isfinite(loss))
             if callback:
-                callback(run.solution())
-            if not run.active.any():
-                break
-        return run.solution()
-
-
-class _Run:
-    """Bookkeeping that solvers share: evaluations, history, and which items still move."""
-
-    def __init__(self, objective: Objective, start: Tensor, max_steps: int, tolerance: float, patience: int):
-        checks.real("start", start)
-        checks.all_finite("start", start)
-        self.objective, self.tolerance, self.patience = objective, tolerance, patience
-        self.x, self.evaluations = start.detach(), 0
-        loss, self.start_gradient = self.value_and_gradient(self.x)
-        if loss.shape != self.x.shape[:-2]:
-            raise ValueError(
-                f"the objective must return one loss per item, {tuple(self.x.shape[:-2])}, got {tuple(loss.shape)}"
-            )
-        checks.all_finite("loss at the start", loss)
-        if loss.min() < 0:
-            raise ValueError(f"the objective must not be negative, got {loss.min().item():g} at the start")
-        # To first order, moving every element by one unit (a radian) would change the loss by less than its rounding.
-        rounding = 1e3 * torch.finfo(loss.dtype).eps * loss
-        stuck = (self.start_gradient.abs().sum((-2, -1)) <= rounding) & (loss > 0)
-        if stuck.any():
-            item = tuple(stuck.nonzero()[0].tolist())
-            raise ValueError(
-                f"the gradient vanishes at the start of item {item}, so no step can leave it; "
-                "start elsewhere, for example from random phases"
-            )
-        self.losses = loss.new_empty(max_steps + 1, *loss.shape)
-        self.losses[0], self.step = loss, 0
-        self.active = loss > 0
-        self.steps = torch.zeros_like(loss, dtype=torch.int64)
-        self.calm = torch.zeros_like(self.steps)
-        self.stalled = torch.zeros_like(self.active)
-
-    def value(self, x: Tensor) -> Tensor:
-        self.evaluations += 1
-        with torch.no_grad():
-            return self.objective(x)
-
-    def value_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        self.evaluations += 1
-        with torch.enable_grad():
-            x = x.detach().requires_grad_(True)
-            losses = self.objective(x)
-            (gradient,) = torch.autograd.grad(losses.sum(), x)
-        return losses.detach(), gradient
-
-    def advance(self, x: Tensor, loss: Tensor, stalled: Tensor) -> None:
-        """Take ``x`` for the items that still move, and stop those that have settled (Eq. 4.36) or stalled."""
-        last = self.losses[self.step]
-        self.stalled = self.stalled | (self.active & stalled)
-        self.active = self.active & ~stalled
-        self.x = torch.where(self.active[..., None, None], x, self.x)
-        loss = torch.where(self.active, loss, last)
-        self.step += 1
-        self.losses[self.step] = loss
-        self.steps += self.active
-        settled = (loss - last).abs() < self.tolerance * last
-        self.calm = torch.where(settled, self.calm + 1, 0)
-        self.active = self.active & (self.calm < self.patience) & (loss > 0)
-
-    def solution(self) -> Solution:
-        converged = ~self.active & ~self.stalled
-        losses = self.losses[: self.step + 1]
-        return Solution(self.x, losses, self.steps.clone(), converged, self.stalled, self.evaluations)
-
-
-def _check_stop_rule(max_steps: int, tolerance: float, patience: int) -> None:
-    checks.whole("max_steps", max_steps, 1)
-    checks.whole("patience", patience, 1)
-    if not tolerance >= 0:
-        raise ValueError(f"tolerance must be at least 0, got {tolerance!r}")
+                callback(run.solution(gradient=gradient, mean=mean, square=square))
+        return run.solution(gradient=gradient, mean=mean, square=square)

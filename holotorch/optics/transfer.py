@@ -51,6 +51,9 @@ def transfer_function(
     for axis in (0, 1):
         bent = distance * (1 - tilt[1 - axis].square()) / cosine2**1.5
         factors.append(_axis_factor(path, axis, padded, wavelength, bent, places[axis], sampled=sampled[axis]))
+        if path.straight and _alike(path.grid) and _alike(padded) and sampled[0] == sampled[1]:
+            factors *= 2  # one computation serves both axes
+            break
     columns, rows = (factor.to(dtype) for factor in factors)
     kernel = columns[..., :, None] * (rows * wave[..., None])[..., None, :]
     if paraxial:
@@ -68,8 +71,14 @@ def transfer_function(
     fy = torch.arange(height // 2 + 1, dtype=torch.float64, device=distance.device)[:, None] / (height * py)
     fx = torch.arange(width // 2 + 1, dtype=torch.float64, device=distance.device)[None, :] / (width * px)
     quadrant = remainder_kernel(fy, fx, wavelength, distance).to(dtype)
-    half = torch.cat([quadrant, quadrant[..., 1 : (width + 1) // 2].flip(-1)], -1)
-    return kernel * torch.cat([half, half[..., 1 : (height + 1) // 2, :].flip(-2)], -2)
+    right = quadrant[..., 1 : (width + 1) // 2].flip(-1)
+    if kernel.requires_grad or quadrant.requires_grad:
+        half = torch.cat([quadrant, right], -1)
+        return kernel * torch.cat([half, half[..., 1 : (height + 1) // 2, :].flip(-2)], -2)
+    for part, columns in ((quadrant, slice(0, width // 2 + 1)), (right, slice(width // 2 + 1, width))):
+        kernel[..., : height // 2 + 1, columns].mul_(part)
+        kernel[..., height // 2 + 1 :, columns].mul_(part[..., 1 : (height + 1) // 2, :].flip(-2))
+    return kernel
 
 
 def wide_transfer_function(
@@ -85,6 +94,10 @@ def wide_transfer_function(
         if bool((place != 0).any()):
             kernel = kernel * turns_phasor(frequency * pitch * place[..., None, None])
     return kernel.to(dtype)
+
+
+def _alike(grid: Grid) -> bool:
+    return grid.shape[0] == grid.shape[1] and grid.pitch[0] == grid.pitch[1]
 
 
 def _sampled_tilted(padded: Grid, wavelength: Tensor, distance: Tensor, tilt: Tensor, places: list[Tensor]) -> Tensor:

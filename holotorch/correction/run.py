@@ -1,0 +1,181 @@
+"""What solvers share: the result they return, the set they project onto, and the bookkeeping of a run.
+
+An objective maps x to one loss per item: losses of shape [...] for x of shape [..., *unknown]. The unknown of an item
+is everything behind the losses' axes, such as [H, W] for one hologram or [F, H, W] for frames that share an image. A
+loss is never negative and 0 for a perfect fit, as sums of squares are. The items are independent: each has its own step
+length and its own stop, so a batch gives what its items give alone.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+
+Objective = Callable[[Tensor], Tensor]
+Projection = Callable[[Tensor], Tensor]
+Callback = Callable[["Solution"], None]
+State = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Box:
+    """The set lower <= x <= upper, called to project onto it; bounds are numbers or tensors that broadcast."""
+
+    lower: float | Tensor = 0.0
+    upper: float | Tensor = torch.inf
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """The nearest point of the box."""
+        lower, upper = (torch.as_tensor(bound, dtype=x.dtype, device=x.device) for bound in (self.lower, self.upper))
+        return torch.minimum(torch.maximum(x, lower), upper)
+
+
+# X >= 0, since heaters cannot cool: the proximal operator of Eq. 4.13.
+nonnegative = Box()
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What a solver found, or has so far.
+
+    Attributes:
+        x: The unknown, [..., *unknown].
+        losses: Loss at the start and after each step, [steps + 1, ...]; an item that has stopped repeats its last.
+        steps: Steps that each item took, integer [...].
+        converged: Whether each item met the stop rule, [...]; False where it ran out of steps or stalled.
+        stalled: Whether each item stopped because no step, however short, was accepted, [...].
+        evaluations: How often the objective was evaluated, with or without its gradient.
+        state: Tensors by name; ``resume=`` of the same solver goes on from them as if it had never stopped, to the bit
+            on a CPU.
+    """
+
+    x: Tensor
+    losses: Tensor
+    steps: Tensor
+    converged: Tensor
+    stalled: Tensor
+    evaluations: int
+    state: State = field(default_factory=dict, repr=False)
+
+
+class Run:
+    """Bookkeeping of a solver: evaluations, history, which items still move, and what it takes to go on later."""
+
+    def __init__(
+        self,
+        objective: Objective,
+        start: Tensor,
+        *,
+        max_steps: int,
+        tolerance: float,
+        patience: int,
+        resume: State | None = None,
+    ):
+        checks.real("start", start)
+        checks.all_finite("start", start)
+        self.objective, self.tolerance, self.patience = objective, tolerance, patience
+        self.x, self.evaluations = start.detach(), 0
+        loss, self.gradient = self.value_and_gradient(self.x)
+        if loss.shape != self.x.shape[: loss.ndim] or loss.ndim == self.x.ndim:
+            raise ValueError(
+                f"the objective must return one loss per item, the first axes of {tuple(self.x.shape)}, got "
+                f"{tuple(loss.shape)}"
+            )
+        checks.all_finite("loss at the start", loss)
+        if loss.numel() and loss.min() < 0:
+            raise ValueError(f"the objective must not be negative, got {loss.min().item():g} at the start")
+        # To first order, moving every element by one unit (a radian) would change the loss by less than its rounding.
+        self.items = loss.ndim
+        rounding = 1e3 * torch.finfo(loss.dtype).eps * loss
+        stuck = (self.total(self.gradient.abs()) <= rounding) & (loss > 0)
+        if stuck.any():
+            item = tuple(stuck.nonzero()[0].tolist())
+            raise ValueError(
+                f"the gradient vanishes at the start of item {item}, so no step can leave it; "
+                "start elsewhere, for example from random phases"
+            )
+        self.losses = loss.new_empty(max_steps + 1, *loss.shape)
+        self.losses[0], self.step = loss, 0
+        self.active = loss > 0
+        self.steps = torch.zeros_like(loss, dtype=torch.int64)
+        self.calm = torch.zeros_like(self.steps)
+        self.stalled = torch.zeros_like(self.active)
+        self.extra: State = {}
+        if resume:
+            self._restore(resume)
+
+    @property
+    def loss(self) -> Tensor:
+        """Of the point ``x``, [...]."""
+        return self.losses[self.step]
+
+    def total(self, values: Tensor) -> Tensor:
+        """Sum over the unknown of each item, [...]."""
+        return values.flatten(self.items).sum(-1)
+
+    def each(self, values: Tensor) -> Tensor:
+        """Values of items, [...], with axes of 1 for the unknown."""
+        return values.reshape(*values.shape, *[1] * (self.x.ndim - self.items))
+
+    def value(self, x: Tensor) -> Tensor:
+        """Losses at ``x``."""
+        self.evaluations += 1
+        with torch.no_grad():
+            return self.objective(x)
+
+    def value_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Losses at ``x`` and their gradient."""
+        self.evaluations += 1
+        with torch.enable_grad():
+            x = x.detach().requires_grad_(True)
+            losses = self.objective(x)
+            (gradient,) = torch.autograd.grad(losses.sum(), x)
+        return losses.detach(), gradient
+
+    def advance(self, x: Tensor, loss: Tensor, stalled: Tensor) -> None:
+        """Take ``x`` for the items that still move, and stop those that have settled (Eq. 4.36) or stalled."""
+        last = self.loss
+        self.stalled = self.stalled | (self.active & stalled)
+        self.active = self.active & ~stalled
+        self.x = torch.where(self.each(self.active), x, self.x)
+        loss = torch.where(self.active, loss, last)
+        self.step += 1
+        self.losses[self.step] = loss
+        self.steps = self.steps + self.active
+        settled = (loss - last).abs() < self.tolerance * last
+        self.calm = torch.where(settled, self.calm + 1, 0)
+        self.active = self.active & (self.calm < self.patience) & (loss > 0)
+
+    def solution(self, **extra: Tensor) -> Solution:
+        """What has been found so far; ``extra`` is what the solver itself needs to go on."""
+        counts = torch.tensor([self.step, self.evaluations])
+        own = {"x": self.x, "active": self.active, "steps": self.steps, "calm": self.calm, "stalled": self.stalled}
+        losses = self.losses[: self.step + 1]
+        state = {**extra, **own, "losses": losses, "counts": counts}
+        return Solution(self.x, losses, self.steps, ~self.active & ~self.stalled, self.stalled, self.evaluations, state)
+
+    def _restore(self, state: State) -> None:
+        if state["x"].shape != self.x.shape or state["x"].dtype != self.x.dtype:
+            raise ValueError(
+                f"resume holds x of {tuple(state['x'].shape)} {state['x'].dtype}, the start is "
+                f"{tuple(self.x.shape)} {self.x.dtype}"
+            )
+        state = {name: values.to(self.x.device) for name, values in state.items()}
+        self.step, self.evaluations = (int(number) for number in state["counts"])
+        if self.step + 1 > len(self.losses):
+            raise ValueError(f"resume has taken {self.step} steps already, more than max_steps {len(self.losses) - 1}")
+        self.losses[: self.step + 1] = state["losses"]
+        self.x, self.active, self.steps = state["x"], state["active"], state["steps"]
+        self.calm, self.stalled = state["calm"], state["stalled"]
+        self.extra = state
+
+
+def check_stop_rule(max_steps: int, tolerance: float, patience: int) -> None:
+    """ValueError unless the fields of a solver's stop rule are in range."""
+    checks.whole("max_steps", max_steps, 1)
+    checks.whole("patience", patience, 1)
+    if not tolerance >= 0:
+        raise ValueError(f"tolerance must be at least 0, got {tolerance!r}")
