@@ -100,6 +100,16 @@ def convolve(image: Tensor, kernel: Tensor) -> Tensor:
     return full[..., kh // 2 : kh // 2 + h, kw // 2 : kw // 2 + w].to(dtype)
 
 
+def filter_real(image: Tensor, kernel: Tensor) -> Tensor:
+    """Multiply the spectrum of a real ``image`` [..., H, W], taken as periodic, by a real even ``kernel``.
+
+    ``kernel`` holds the frequencies of a real transform, [H, W // 2 + 1].
+    """
+    size = (image.shape[-2], image.shape[-1])
+    full = torch.fft.irfft2(torch.fft.rfft2(image) * kernel, s=size, norm="forward")
+    return full * (1 / math.prod(size))
+
+
 def _uncentred(field: Tensor) -> Tensor:
     return torch.fft.ifftshift(field, dim=(-2, -1))
 

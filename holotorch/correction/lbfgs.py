@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.fourier import fft2, filter_real
 from holotorch.correction.run import Box, Callback, Objective, Run, Solution, State, check_stop_rule, nonnegative
 
 _ENOUGH = 1e-4  # of the decrease that the slope promises (Armijo)
@@ -216,9 +217,9 @@ def spread_preconditioner(kernel: Tensor, floor: float = 0.1) -> Callable[[Tenso
             for i, row in enumerate(kernel.tolist()):
                 for j, tap in enumerate(row):
                     taps[(i - kernel.shape[0] // 2) % height, (j - kernel.shape[1] // 2) % width] += tap
-            power = torch.fft.rfft2(taps).abs().square()
+            power = fft2(taps.to(torch.complex128))[:, : width // 2 + 1].abs().square()
             factors.clear()
             factors[key] = (1 / (power / power.max() + floor)).to(x.device, x.dtype)
-        return torch.fft.irfft2(torch.fft.rfft2(x) * factors[key], s=(height, width))
+        return filter_real(x, factors[key])
 
     return precondition

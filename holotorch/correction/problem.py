@@ -13,22 +13,32 @@ class PECProblem(nn.Module):
     """g(X) = || U(X) - I ||^2 with U(X) = | F(exp(i P(X))) |^2, one value per hologram and colour.
 
     Args:
-        crosstalk: Real linear operator P on heater phases [..., C, H, W], such as ``ThermalCrosstalk``.
-        propagator: Complex linear operator F on fields [..., C, H, W].
-        target: Wanted intensity I, real [C, H, W], >= 0 and scaled to mean 1 per channel. A unitary F keeps the mean
-            at 1 (Parseval), so that no scale between U and I is left open.
+        crosstalk: Real linear operator P on heater phases [..., H, W], such as ``ThermalCrosstalk``.
+        propagator: Complex linear operator F on fields [..., C, H, W], to [..., C, *image].
+        target: Wanted intensity I, real [C, *image], >= 0 and scaled to mean 1 per channel where F keeps the light, as
+            a unitary one does (Parseval), so that no scale between U and I is left open. The image is [H, W], or
+            [D, H, W] for a propagator to several depths, such as ``DepthStack``.
+        mask: Weights >= 0 that broadcast to the target, 0 where anything may be: beside a signal region, or out of
+            focus at a depth.
         scale_free: Compare s U with I instead, s = <U, I> / <U, U> the best scale of each hologram and colour. For
-            propagators that let light leave the window; report the efficiency beside the result.
+            light that may leave the window or the mask; report the efficiency beside the result.
+        amplitude: Compare sqrt(U) with sqrt(I) instead, whose gradient does not vanish where U is dark.
+        frames: The unknown is [..., C, F, H, W], F frames shown in turn, and U the mean of their intensities.
+        limit: Upper limit on P(X) in rad, the temperature that the chip really reaches; a number or [C].
+        limit_weight: Weight of the penalty || max(P(X) - limit, 0) ||^2 that is added.
+        power_weight: Weight of the sum of X, the heating power, that is added.
 
     Raises:
         TypeError: ``target`` is not a real tensor.
-        ValueError: ``target`` is not [C, H, W], not finite, negative somewhere, or black in a channel; in a call: a
+        ValueError: ``target`` is not [C, *image], not finite, negative somewhere, or black in a channel; in a call: a
             phase of another shape.
 
     Source: thesis Eqs. 4.9, 4.10 (Fourier) and 4.50, 4.51 (Fresnel; there H stands inside the transform by mistake).
     """
 
     target: Tensor
+    mask: Tensor | None
+    limit: Tensor | None
 
     def __init__(
         self,
@@ -36,39 +46,82 @@ class PECProblem(nn.Module):
         propagator: Callable[[Tensor], Tensor],
         target: Tensor,
         *,
+        mask: Tensor | None = None,
         scale_free: bool = False,
+        amplitude: bool = False,
+        frames: bool = False,
+        limit: float | Tensor | None = None,
+        limit_weight: float = 1.0,
+        power_weight: float = 0.0,
     ):
         super().__init__()
         checks.real("target", target)
         checks.all_finite("target", target)
-        if target.ndim != 3:
-            raise ValueError(f"target must have axes (C, H, W), got {tuple(target.shape)}")
+        if target.ndim < 3:
+            raise ValueError(f"target must have axes (C, *image), such as (C, H, W), got {tuple(target.shape)}")
         if target.min() < 0:
             raise ValueError(f"target is an intensity and must be >= 0, got a minimum of {target.min().item():g}")
-        for channel, mean in enumerate(target.mean((-2, -1)).tolist()):
+        for channel, mean in enumerate(target.flatten(1).mean(1).tolist()):
             if mean == 0:
                 raise ValueError(f"target channel {channel} is black: there is no light to form, leave it out")
+        if mask is not None and (mask.min() < 0 or torch.broadcast_shapes(mask.shape, target.shape) != target.shape):
+            raise ValueError(f"mask must be >= 0 and broadcast to the target {tuple(target.shape)}")
         self.crosstalk, self.propagator, self.scale_free = crosstalk, propagator, scale_free
+        self.amplitude, self.frames = amplitude, frames
+        self.limit_weight, self.power_weight = limit_weight, power_weight
         self.register_buffer("target", target, persistent=False)
+        self.register_buffer("mask", mask, persistent=False)
+        if limit is not None:
+            # One value per channel, against [C, H, W] or [C, F, H, W].
+            limit = torch.as_tensor(limit, dtype=target.dtype).reshape(-1, *[1] * (3 if frames else 2))
+            if not (limit > 0).all():
+                raise ValueError("limit must be above zero in rad")
+        self.register_buffer("limit", limit, persistent=False)
 
     def forward(self, phase: Tensor) -> Tensor:
-        """Loss [..., C] for heater phases in rad, real [..., C, H, W]."""
-        formed = self.intensity(phase)
-        if formed.shape[-3:] != self.target.shape:
-            raise ValueError(f"phase must end in (C, H, W) = {tuple(self.target.shape)}, got {tuple(phase.shape)}")
-        target = self.target.to(formed.dtype)
-        if self.scale_free:
-            # s minimises the loss, so its own derivative is zero and need not be followed.
-            formed = formed * best_scale(formed.detach(), target)[..., None, None]
-        return (formed - target).square().sum((-2, -1))
+        """Loss [..., C] for heater phases in rad, real [..., C, H, W], or [..., C, F, H, W] with ``frames``."""
+        spread = self.crosstalk(phase)
+        loss = self.misfit(self._formed(spread))
+        behind = -3 if self.frames else -2
+        if self.limit is not None and self.limit_weight:
+            loss = loss + self.limit_weight * (spread - self.limit).clamp(min=0).square().flatten(behind).sum(-1)
+        if self.power_weight:
+            loss = loss + self.power_weight * phase.flatten(behind).sum(-1)
+        return loss
 
     def intensity(self, phase: Tensor) -> Tensor:
-        """U(X), real [..., C, H, W]."""
-        return intensity(self.propagator(phasor(self.crosstalk(phase))))
+        """U(X), real [..., C, *image]."""
+        return self._formed(self.crosstalk(phase))
+
+    def misfit(self, formed: Tensor) -> Tensor:
+        """Distance [..., C] of an intensity [..., C, *image] from the target."""
+        if formed.shape[-self.target.ndim :] != self.target.shape:
+            wanted = "end in (C, H, W)" if self.target.ndim == 3 else "give an image that ends in (C, *image)"
+            raise ValueError(f"phase must {wanted} = {tuple(self.target.shape)}, got {tuple(formed.shape)}")
+        target = self.target.to(formed.dtype)
+        if self.amplitude:
+            # The root of U + tiny has a gradient that stays bounded where U is 0.
+            formed, target = (formed + torch.finfo(formed.dtype).tiny).sqrt(), target.sqrt()
+        if self.mask is not None:
+            mask = self.mask.to(formed.dtype)
+            formed, target = formed * mask, target * mask
+        behind = 1 - self.target.ndim
+        if self.scale_free:
+            # s minimises the loss, so its own derivative is zero and need not be followed.
+            scale = best_scale(formed.detach(), target, behind)
+            formed = formed * scale.reshape(*scale.shape, *[1] * -behind)
+        return (formed - target).square().flatten(behind).sum(-1)
+
+    def _formed(self, spread: Tensor) -> Tensor:
+        if not self.frames:
+            return intensity(self.propagator(phasor(spread)))
+        # Fields keep their channel before the picture: frames go in front of it, and are averaged there.
+        formed = intensity(self.propagator(phasor(spread.movedim(-3, -4))))
+        return formed.mean(-1 - self.target.ndim)
 
 
-def best_scale(formed: Tensor, target: Tensor) -> Tensor:
-    """The scale s of ``formed`` [..., H, W] for which || s formed - target || is least; 1 for a black ``formed``."""
-    power = formed.square().sum((-2, -1))
+def best_scale(formed: Tensor, target: Tensor, behind: int = -2) -> Tensor:
+    """The scale s of ``formed`` with the least || s formed - target || over the axes from ``behind`` on; 1 if black."""
+    power = formed.square().flatten(behind).sum(-1)
     lit = power > 0
-    return torch.where(lit, (formed * target).sum((-2, -1)) / torch.where(lit, power, 1), 1)
+    return torch.where(lit, (formed * target).flatten(behind).sum(-1) / torch.where(lit, power, 1), 1)
