@@ -43,6 +43,12 @@ def _run(options: argparse.Namespace) -> int:
     return _finish(*run(settings, options.out, Path(options.config).stem))
 
 
+def _resume(options: argparse.Namespace) -> int:
+    from holotorch.experiments.run import resume
+
+    return _finish(*resume(options.folder))
+
+
 def _demo(options: argparse.Namespace) -> int:
     from holotorch.experiments.config import load_config
 
@@ -116,6 +122,10 @@ def _parser() -> argparse.ArgumentParser:
     _add_config(run)
     run.add_argument("--out", type=Path, help="folder of the run (default: runs/CONFIG-001, ...)")
     run.set_defaults(action=_run)
+
+    resume = commands.add_parser("resume", help="go on with an interrupted run, as if it had never stopped")
+    resume.add_argument("folder", type=Path, metavar="DIR", help="folder of the run")
+    resume.set_defaults(action=_resume)
 
     check = commands.add_parser("check", help="validate a configuration, print its plan and physics, compute nothing")
     _add_config(check)

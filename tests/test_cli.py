@@ -81,7 +81,7 @@ def not_a_number(path):
         (["target.image=tiny.png"], "is 8 x 8 px, less than the 11 x 11 px window of ssim; use a larger one"),
         (["target.image=nan.tiff"], "is nan (400 in all); repair the picture"),
         (["--out", "file/inside"], "cannot write to file/inside: Not a directory; choose another place with --out"),
-        (["a=1", "b=2", "grid=3", "seed=x", "solver.kind=y"], "solver.kind: expected one of apg, adam, got 'y'"),
+        (["a=1", "b=2", "grid=3", "seed=x", "solver.kind=y"], "solver.kind: expected one of apg, adam, lbfgs, got 'y'"),
     ],
 )
 @pytest.mark.parametrize("command", ["run", "check"])

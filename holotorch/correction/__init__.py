@@ -6,6 +6,7 @@ from holotorch.correction.lbfgs import LBFGS, spread_preconditioner
 from holotorch.correction.problem import PECProblem
 from holotorch.correction.run import Box, Solution, nonnegative
 from holotorch.correction.solvers import APG, ProjectedAdam
+from holotorch.correction.stages import Stage, below, limited, proximal_pec, run_stages
 
 __all__ = [
     "APG",
@@ -14,11 +15,16 @@ __all__ = [
     "PECProblem",
     "ProjectedAdam",
     "Solution",
+    "Stage",
+    "below",
     "deconvolve",
     "deconvolve_admm",
     "gerchberg_saxton",
     "inverse",
     "iterative_pec",
+    "limited",
     "nonnegative",
+    "proximal_pec",
+    "run_stages",
     "spread_preconditioner",
 ]

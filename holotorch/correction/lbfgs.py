@@ -11,7 +11,7 @@ from holotorch.core.fourier import fft2, filter_real
 from holotorch.correction.run import Box, Callback, Objective, Run, Solution, State, check_stop_rule, nonnegative
 
 _ENOUGH = 1e-4  # of the decrease that the slope promises (Armijo)
-_SHRINK = 0.5
+_SHRINK, _SHORTEST = 0.5, 2.0**-12
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,8 @@ class LBFGS:
     that a step costs a few passes over them whatever the number of items.
 
     Attributes:
-        memory: Pairs of steps and changes of gradient that are kept.
+        memory: Pairs of steps and changes of gradient that are kept. Holograms gain nothing from more than 3, and at
+            strong crosstalk they lose (``holotorch chart pec``).
         precondition: Symmetric positive linear operator on x, such as :func:`spread_preconditioner`; identity if None.
         first: Largest change of an element in the first step, in the unit of x.
         max_steps: Most iterations.
@@ -34,7 +35,7 @@ class LBFGS:
     Raises as ``APG``. Source: Nocedal and Wright, Algorithm 7.4.
     """
 
-    memory: int = 10
+    memory: int = 3
     precondition: Callable[[Tensor], Tensor] | None = None
     first: float = 0.5
     max_steps: int = 200
@@ -74,11 +75,15 @@ class LBFGS:
             largest = direction.abs().flatten(run.items).amax(-1)
             reach = self.first / largest.clamp(min=torch.finfo(largest.dtype).tiny)
             length = torch.where(memory.empty.reshape(run.loss.shape), reach, 1.0)
-            x, loss, after, stalled = self._search(run, project, direction, gradient, length)
+            x, loss, after, failed = self._search(run, project, direction, gradient, length)
+            # A step that fails with a memory may succeed without; one that fails without never will.
+            stalled = failed & memory.empty.reshape(run.loss.shape)
             change = after - gradient
+            if failed.any():
+                memory.forget(failed.reshape(-1))
             memory.add(*(part.reshape(flat) for part in (x - run.x, change, self._preconditioned(change))))
             run.advance(x, loss, stalled)
-            gradient = torch.where(run.each(run.active), after, gradient)
+            gradient = after if run.active.all() else torch.where(run.each(run.active), after, gradient)
             if callback:
                 callback(run.solution(gradient=gradient, **memory.state()))
         return run.solution(gradient=gradient, **memory.state())
@@ -96,53 +101,45 @@ class LBFGS:
     def _search(self, run: Run, project: Box, direction: Tensor, gradient: Tensor, length: Tensor):
         """Halve the step of each item until its loss falls enough; a gradient comes with every trial."""
         slack = 8 * torch.finfo(run.x.dtype).eps * run.loss
-        accepted = ~run.active
-        stalled = torch.zeros_like(accepted)
+        accepted, failed = ~run.active, torch.zeros_like(run.active)
+        shortest = length * _SHORTEST
         best, best_loss, best_gradient = run.x, run.loss, gradient
         while True:
             x = project(run.x + run.each(length) * direction)
             loss, after = run.value_and_gradient(x)
-            wanted = run.loss + _ENOUGH * run.total(gradient * (x - run.x))
-            # A slack for rounding, but never for a rise once the step no longer promises a fall.
-            enough = ~accepted & (loss <= wanted + slack)
+            promised = _ENOUGH * run.total(gradient * (x - run.x))
+            enough = ~accepted & (loss <= run.loss + promised + slack)
+            if enough.all():  # all at the first trial, as is most common
+                return x, loss, after, failed
             taken = run.each(enough)
             best, best_gradient = torch.where(taken, x, best), torch.where(taken, after, best_gradient)
             best_loss = torch.where(enough, loss, best_loss)
             accepted = accepted | enough
-            tiny = length <= torch.finfo(run.x.dtype).eps
-            stalled = stalled | (~accepted & tiny)
-            if (accepted | stalled).all():
-                return best, best_loss, best_gradient, stalled
+            failed = ~accepted & (length <= shortest)
+            if (accepted | failed).all():
+                return best, best_loss, best_gradient, failed
             length = torch.where(accepted, length, length * _SHRINK)
 
 
 class _Memory:
-    """The last m steps s, changes of gradient y, and z = H0 y, of every item, in slots that are used in turn.
+    """The last m steps s, changes of gradient y, and z = H0 y, of every item, oldest first; never changed in place.
 
-    A slot whose pair shows no positive curvature along s is left zero for that item, which takes no part.
+    A place whose pair shows no positive curvature along s is left zero for that item, and takes no part.
     """
 
     def __init__(self, size: int, run: Run):
         items = max(1, run.loss.numel())
-        length = run.x.numel() // items
         make = run.x.new_zeros
-        self.s, self.y, self.z = (make(items, size, length) for _ in range(3))
+        self.s = self.y = self.z = make(items, size, run.x.numel() // items)
         # Inner products s_i y_j and y_i z_j, in float64: triangular systems are solved with them.
-        self.sy, self.yz = (make(items, size, size, dtype=torch.float64) for _ in range(2))
+        self.sy = self.yz = make(items, size, size, dtype=torch.float64)
         self.scale = make(items, dtype=torch.float64) + 1
-        self.order: list[int] = []
-        names = ("s", "y", "z", "sy", "yz", "scale")
-        if "memory_s" in run.extra:
-            for name in names:
-                setattr(self, name, run.extra[f"memory_{name}"].clone())
-            self.order = run.extra["memory_order"].tolist()
+        for name in _MEMORY if "memory_s" in run.extra else ():
+            setattr(self, name, run.extra[f"memory_{name}"])
 
     def state(self) -> State:
         """Tensors by name, for ``Solution.state``."""
-        return {
-            **{f"memory_{name}": getattr(self, name).clone() for name in ("s", "y", "z", "sy", "yz", "scale")},
-            "memory_order": torch.tensor(self.order, dtype=torch.int64),
-        }
+        return {f"memory_{name}": getattr(self, name) for name in _MEMORY}
 
     @property
     def empty(self) -> Tensor:
@@ -151,48 +148,47 @@ class _Memory:
 
     def forget(self, which: Tensor) -> None:
         """Drop all pairs of the items [items]."""
-        for values in (self.s, self.y, self.z, self.sy, self.yz):
-            values[which] = 0
-        self.scale[which] = 1
+        for name in ("s", "y", "z", "sy", "yz"):
+            setattr(self, name, torch.where(which[:, None, None], 0, getattr(self, name)))
+        self.scale = torch.where(which, 1, self.scale)
 
     def add(self, step: Tensor, change: Tensor, preconditioned: Tensor) -> None:
-        """Keep one more pair, all [items, length], in the place of the oldest if the slots are full."""
-        size = self.s.shape[1]
-        slot = len(self.order) if len(self.order) < size else self.order.pop(0)
-        self.order.append(slot)
+        """Keep one more pair, all [items, length], and drop the oldest."""
         curvature = (step * change).sum(-1)
         good = curvature > 1e-8 * (step.square().sum(-1) * change.square().sum(-1)).sqrt()
-        for values, new in ((self.s, step), (self.y, change), (self.z, preconditioned)):
-            values[:, slot] = torch.where(good[:, None], new, 0)
-        newest = slice(slot, slot + 1)
-        self.sy[:, :, slot] = (self.s @ self.y[:, newest].mT)[..., 0].double()
-        self.sy[:, slot, :] = (self.y @ self.s[:, newest].mT)[..., 0].double()
-        products = (self.z @ self.y[:, newest].mT)[..., 0].double()
-        self.yz[:, :, slot] = self.yz[:, slot, :] = products
-        bent = products[:, slot]
-        self.scale = torch.where(good & (bent > 0), curvature.double() / torch.where(bent > 0, bent, 1), self.scale)
+        bad = ~good[:, None, None]
+        new = [part[:, None].masked_fill(bad, 0) for part in (step, change, preconditioned)]
+        self.s, self.y, self.z = (
+            torch.cat([old[:, 1:], part], 1) for old, part in zip((self.s, self.y, self.z), new, strict=True)
+        )
+        column, row = (self.s @ new[1].mT).double(), (new[0] @ self.y.mT).double()
+        self.sy = _bordered(self.sy, column, row)
+        bent = (self.y @ new[2].mT).double()
+        self.yz = _bordered(self.yz, bent, bent.mT)
+        newest = bent[:, -1, 0]
+        self.scale = torch.where(newest > 0, curvature.double() / newest.clamp(min=1e-300), self.scale)
 
     def direction(self, gradient: Tensor, preconditioned: Tensor) -> Tensor:
         """-H g for gradients [items, length] and their H0 g, by the compact form of the inverse (Byrd et al. 1994)."""
-        scale = self.scale.to(gradient.dtype)[:, None]
-        if not self.order:
-            return -scale * preconditioned
-        order = torch.tensor(self.order, device=gradient.device)
-        sy, yz = (values[:, order][:, :, order] for values in (self.sy, self.yz))
-        a = (self.s @ gradient[..., None]).double()[:, order]
-        b = self.scale[:, None, None] * (self.z @ gradient[..., None]).double()[:, order]
-        curvature = sy.diagonal(dim1=-2, dim2=-1)
-        idle = torch.diag_embed((curvature == 0).double())
-        upper = sy.triu() + idle
-        middle = torch.diag_embed(curvature) + self.scale[:, None, None] * yz
+        scale = self.scale[:, None, None]
+        curvature = self.sy.diagonal(dim1=-2, dim2=-1)
+        upper = self.sy.triu() + torch.diag_embed((curvature == 0).double())
+        a = (self.s @ gradient[..., None]).double()
+        b = scale * (self.z @ gradient[..., None]).double()
         u = torch.linalg.solve_triangular(upper, a, upper=True)
+        middle = torch.diag_embed(curvature) + scale * self.yz
         v = torch.linalg.solve_triangular(upper.mT, middle @ u - b, upper=False)
-        back = torch.zeros_like(v).index_copy(1, order, v).to(gradient.dtype)
-        forth = torch.zeros_like(u).index_copy(1, order, u).to(gradient.dtype)
-        if len(self.order) < self.s.shape[1]:
-            missing = self.s.shape[1] - len(self.order)
-            back, forth = (torch.nn.functional.pad(values, (0, 0, 0, missing)) for values in (back, forth))
-        return -scale * preconditioned - (back.mT @ self.s)[:, 0] + scale * (forth.mT @ self.z)[:, 0]
+        back, forth, scale = (part.to(gradient.dtype) for part in (v.mT, (scale * u).mT, scale[:, 0]))
+        return (forth @ self.z - back @ self.s)[:, 0] - scale * preconditioned
+
+
+_MEMORY = ("s", "y", "z", "sy", "yz", "scale")
+
+
+def _bordered(square: Tensor, column: Tensor, row: Tensor) -> Tensor:
+    """Matrices [items, m, m] without their first row and column, and with a new last column and row, [m] each."""
+    inner = torch.cat([square[:, 1:, 1:], column[:, :-1]], -1)
+    return torch.cat([inner, row], -2)
 
 
 def spread_preconditioner(kernel: Tensor, floor: float = 0.1) -> Callable[[Tensor], Tensor]:

@@ -58,7 +58,7 @@ class PECProblem(nn.Module):
         checks.real("target", target)
         checks.all_finite("target", target)
         if target.ndim < 3:
-            raise ValueError(f"target must have axes (C, *image), such as (C, H, W), got {tuple(target.shape)}")
+            raise ValueError(f"target must have axes (C, *image), as (C, H, W) has, got {tuple(target.shape)}")
         if target.min() < 0:
             raise ValueError(f"target is an intensity and must be >= 0, got a minimum of {target.min().item():g}")
         for channel, mean in enumerate(target.flatten(1).mean(1).tolist()):

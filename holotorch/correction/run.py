@@ -29,6 +29,8 @@ class Box:
 
     def __call__(self, x: Tensor) -> Tensor:
         """The nearest point of the box."""
+        if not isinstance(self.lower, Tensor) and not isinstance(self.upper, Tensor):
+            return x.clamp(self.lower, self.upper)
         lower, upper = (torch.as_tensor(bound, dtype=x.dtype, device=x.device) for bound in (self.lower, self.upper))
         return torch.minimum(torch.maximum(x, lower), upper)
 
@@ -140,7 +142,7 @@ class Run:
         last = self.loss
         self.stalled = self.stalled | (self.active & stalled)
         self.active = self.active & ~stalled
-        self.x = torch.where(self.each(self.active), x, self.x)
+        self.x = x if self.active.all() else torch.where(self.each(self.active), x, self.x)
         loss = torch.where(self.active, loss, last)
         self.step += 1
         self.losses[self.step] = loss

@@ -71,6 +71,8 @@ Wavelength = Annotated[Length, _within(1e-7, 2e-5, "a wavelength between 100 nm 
 Pitch = Annotated[Length, _within(1e-9, 1e-3, "a pitch between 1 nm and 1 mm")]
 
 
+# "hot": phases uniform on [0, 2 pi); "cool": their spread is; "flat": on [0, 1); "quadratic": a lens, after spreading.
+Start = Literal["hot", "cool", "flat", "quadratic"]
 Side = Annotated[Count, Field(le=16384)]
 
 
@@ -88,17 +90,30 @@ class GridSettings(Settings):
 
 
 class TargetSettings(Settings):
-    """A bundled photograph or a picture file, and how it is brought to the grid's aspect."""
+    """A bundled photograph or a picture file, and how it is brought to the grid's aspect, or to that of a region of it.
+
+    ``region``: size in pixels of the middle of the image in which the picture is wanted; the rest is free (thesis
+    Eqs. 4.7, 4.8). ``depths``: with several distances, ``bands`` puts as many vertical bands of the picture in focus,
+    one at each, and leaves them free elsewhere; ``full`` wants the whole picture at every distance.
+    """
 
     image: Annotated[str, BeforeValidator(_picture)]
     fit: Literal["crop", "pad"] = "crop"
+    region: Annotated[tuple[Side, Side], BeforeValidator(_pair)] | None = None
+    depths: Literal["bands", "full"] = "bands"
 
 
 class ModulatorSettings(Settings):
-    """The phased array: width of the heat kernel in pixels, number of taps (chosen from the width if not given)."""
+    """The phased array: width of the heat kernel in pixels, number of taps (chosen from the width if not given).
+
+    ``max_phase``: limit in rad on the phase after spreading, which the hottest pixel never passes (4 pi is 700 degC at
+    630 nm); no limit is the thesis's model. ``bits``: resolution of the heaters, between 0 and their largest phase.
+    """
 
     sigma_px: Annotated[Number, Field(ge=0, le=100)]
     kernel_size: Annotated[Count, Field(le=401)] | None = None
+    max_phase: Annotated[Number, Field(ge=0.1, le=1000)] | None = None
+    bits: Annotated[Count, Field(le=16)] | None = None
 
 
 class FraunhoferSettings(Settings):
@@ -108,10 +123,12 @@ class FraunhoferSettings(Settings):
 
 
 class NearFieldSettings(Settings):
-    """Image at a distance. ``isolated``: the array stands alone; ``periodic``: it repeats without end (the thesis)."""
+    """Image at one distance or more. ``isolated``: the array stands alone; ``periodic``: it repeats (the thesis)."""
 
     kind: Literal["fresnel", "angular_spectrum"]
-    distance: Annotated[Length, AfterValidator(_not_zero)]
+    distance: Annotated[
+        tuple[Annotated[Length, AfterValidator(_not_zero)], ...], BeforeValidator(_several), Field(min_length=1)
+    ]
     boundary: Literal["isolated", "periodic"] = "isolated"
 
 
@@ -121,10 +138,12 @@ class APGSettings(Settings):
     kind: Literal["apg"]
     step: Annotated[Number, Field(ge=1e-6, le=1e6)] = 1.0
     shrink: Annotated[Number, Field(gt=0, lt=1)] = 0.5
+    grow: Annotated[Number, Field(ge=1, le=10)] = 1.0
+    restart: bool = False
     max_steps: Count = 400
     tolerance: Annotated[Number, Field(ge=0)] = 1e-3
     patience: Count = 10
-    start: Literal["hot", "flat"] | None = None
+    start: Start | None = None
 
 
 class AdamSettings(Settings):
@@ -135,7 +154,21 @@ class AdamSettings(Settings):
     max_steps: Count = 400
     tolerance: Annotated[Number, Field(ge=0)] = 1e-3
     patience: Count = 10
-    start: Literal["hot", "flat"] | None = None
+    start: Start | None = None
+
+
+class LBFGSSettings(Settings):
+    """Preconditioned L-BFGS, in stages: the amplitude's loss first, and a limit on the heat by penalties."""
+
+    kind: Literal["lbfgs"]
+    memory: Annotated[Count, Field(le=100)] = 3
+    max_steps: Count = 300
+    tolerance: Annotated[Number, Field(ge=0)] = 1e-4
+    patience: Count = 10
+    start: Start | None = None
+
+
+Baseline = Literal["none", "basic_ipec", "ipec", "chopping", "shifting", "nonnegative"]
 
 
 class ReportSettings(Settings):
@@ -145,7 +178,7 @@ class ReportSettings(Settings):
         "ssim",
         "psnr",
     )
-    baselines: Annotated[tuple[Literal["none", "basic_ipec"], ...], BeforeValidator(_several)] = ("none", "basic_ipec")
+    baselines: Annotated[tuple[Baseline, ...], BeforeValidator(_several)] = ("none", "basic_ipec")
 
 
 class PECSettings(Settings):
@@ -159,7 +192,9 @@ class PECSettings(Settings):
     target: TargetSettings
     modulator: ModulatorSettings
     propagator: Annotated[FraunhoferSettings | NearFieldSettings, Field(discriminator="kind")]
-    solver: Annotated[APGSettings | AdamSettings, Field(discriminator="kind")]
+    frames: Annotated[Count, Field(le=64)] = 1
+    multiplexing: Literal["joint", "independent"] = "joint"
+    solver: Annotated[APGSettings | AdamSettings | LBFGSSettings, Field(discriminator="kind")]
     report: ReportSettings = ReportSettings()
 
 
@@ -207,4 +242,16 @@ def _contradictions(settings: PECSettings) -> list[tuple[Key, str]]:
     if isinstance(light, NearFieldSettings) and finest < 0.9 * longest:
         least = f"at least 0.9 of the longest wavelength, {0.9 * longest:.3g} m, for an image at a distance"
         found.append((("grid", "pitch"), f"expected {least}, got {finest:g} m"))
+    smaller = settings.target.region
+    if smaller and (smaller[0] > settings.grid.shape[0] or smaller[1] > settings.grid.shape[1]):
+        found.append((("target", "region"), f"expected at most the grid, {settings.grid.shape}, got {smaller}"))
+    if smaller and "ssim" in settings.report.metrics and min(smaller) < 11:
+        found.append((("target", "region"), f"expected at least 11 x 11 px for ssim, got {smaller}"))
+    limit = settings.modulator.max_phase
+    if limit is not None and settings.solver.kind != "lbfgs":
+        hint = "'solver={kind: lbfgs}'"
+        found.append((("modulator", "max_phase"), f"only the solver lbfgs keeps a limit; use {hint}, or leave it out"))
+    several = isinstance(light, NearFieldSettings) and len(light.distance) > 1
+    if several and smaller:
+        found.append((("target", "region"), "expected one distance beside a region"))
     return found

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from holotorch.core.complex import intensity
 from holotorch.correction.problem import best_scale
-from holotorch.experiments.config import NearFieldSettings
 from holotorch.experiments.pec import PECExperiment
 from holotorch.metrics import SSIM_WINDOW, psnr, ssim
 from holotorch.optics import CroppedKernel
@@ -22,8 +21,8 @@ class Result:
     """One method's outcome.
 
     Attributes:
-        phase: Heater phases in rad, [C, H, W].
-        picture: Intensity on the picture's own scale, float64 [C, H, W].
+        phase: Heater phases in rad, [F, C, H, W].
+        picture: Intensity on the picture's own scale, float64 [C, h, w].
         isolated: The same for a chip that stands alone; None in the far field.
         numbers: What summary.json says of the method.
     """
@@ -35,53 +34,65 @@ class Result:
 
 
 def quality(experiment: PECExperiment, phase: Tensor) -> float:
-    """Mean of the first metric over the lit colours for phases [C, H, W] of these; cheap, for progress bars."""
+    """Mean of the first metric over the lit colours for phases [F, C, H, W] of these; cheap, for progress bars."""
     name = experiment.settings.report.metrics[0]
-    formed = experiment.problem(torch.float64).intensity(phase.detach().double()).cpu()
-    picture = _as_picture(experiment, formed, at_best_scale=experiment.isolated)
+    seen = experiment.seen(experiment.formed(phase.double())).cpu()
+    picture = _as_picture(experiment, seen, at_best_scale=experiment.scale_free)
     return _scores(experiment, picture, experiment.image)[f"{name}_mean"]
 
 
 def judge(experiment: PECExperiment, phase: Tensor) -> Result:
-    """Score heater phases of the lit colours, [C, H, W]: in the model of the run, between its samples, and alone."""
+    """Score heater phases of the lit colours, [F, C, H, W]: in the model of the run, between its samples, and alone."""
     phase = phase.detach().double()
-    emitted = experiment.array(phase)
-    formed = intensity(experiment.propagator(emitted)).cpu()
-    picture = _as_picture(experiment, formed, at_best_scale=experiment.isolated)
+    seen = experiment.seen(experiment.formed(phase)).cpu()
+    picture = _as_picture(experiment, seen, at_best_scale=experiment.scale_free)
     warm = experiment.array.temperature(experiment.array.crosstalk(phase))
     driven = experiment.array.temperature(phase)
     numbers = _scores(experiment, picture, experiment.image) | {
-        "efficiency": _per_colour(experiment, formed.mean((-2, -1))),
-        "peak_temperature_rise_K": _per_colour(experiment, warm.amax((-2, -1))),
-        "mean_temperature_rise_K": _per_colour(experiment, warm.mean((-2, -1))),
-        "heating_power_K_per_pixel": _per_colour(experiment, driven.mean((-2, -1))),
+        "frames": len(phase),
+        "efficiency": _per_colour(experiment, _share(experiment, seen)),
+        "peak_phase_rad": experiment.array.crosstalk(phase).max().item(),
+        "peak_temperature_rise_K": _per_colour(experiment, warm.amax((0, -2, -1))),
+        "mean_temperature_rise_K": _per_colour(experiment, warm.mean((0, -2, -1))),
+        "heating_power_K_per_pixel": _per_colour(experiment, driven.mean((0, -2, -1))),
     }
     alone = None
-    if isinstance(experiment.settings.propagator, NearFieldSettings):
-        alone, numbers["isolated"], between = _alone(experiment, emitted)
+    if experiment.distances:
+        alone, numbers["isolated"], between = _alone(experiment, phase)
     else:
         (y, x), (height, width) = experiment.grid.coordinates(phase.device), experiment.grid.extent
         half_a_sample = torch.exp(-1j * math.pi * (y / height + x / width))
-        between = intensity(experiment.propagator(emitted * half_a_sample)).cpu()
+        shifted = [intensity(experiment.propagator(experiment.array(each) * half_a_sample)) for each in phase]
+        between = experiment.seen(torch.stack(shifted).mean(0)).cpu()
+        if experiment.scale_free:
+            between = between * best_scale(seen, experiment.wanted)[:, None, None]
     numbers["between_samples"] = _between_scores(experiment, between)
     return Result(_all_colours(experiment, phase.cpu()), picture, alone, numbers)
 
 
-def _alone(experiment: PECExperiment, emitted: Tensor) -> tuple[Tensor, dict[str, Any], Tensor]:
+def _share(experiment: PECExperiment, seen: Tensor) -> Tensor:
+    """Share of the array's light that the picture gets, [C]."""
+    return seen.sum((-2, -1)) / math.prod(experiment.grid.shape)
+
+
+def _alone(experiment: PECExperiment, phase: Tensor) -> tuple[Tensor, dict[str, Any], Tensor]:
     """What a single chip forms by the exact kernel: the picture, its scores, and the intensity between the samples."""
-    light = experiment.settings.propagator
-    assert isinstance(light, NearFieldSettings)
-    formed, between = (torch.empty(experiment.target.shape, dtype=torch.float64) for _ in range(2))
+    shape = (len(experiment.wavelengths), len(experiment.distances), *experiment.grid.shape)
+    formed, between = (torch.zeros(shape, dtype=torch.float64) for _ in range(2))
     half = experiment.grid.pitch[0] / 2, experiment.grid.pitch[1] / 2
-    for i, wave in enumerate(experiment.wavelengths):  # one colour at a time: float64 kernels are large
-        exact = CroppedKernel(experiment.grid, wave, light.distance).to(experiment.device)
-        aside = CroppedKernel(experiment.grid, wave, light.distance, offset=half).to(experiment.device)
-        formed[i] = intensity(exact(emitted[i : i + 1]))[0].cpu()
-        between[i] = intensity(aside(emitted[i : i + 1]))[0].cpu()
+    for i, wave in enumerate(experiment.wavelengths):  # one colour and one depth at a time: float64 kernels are large
+        for j, distance in enumerate(experiment.distances):
+            for offset, total in (((0.0, 0.0), formed), (half, between)):
+                exact = CroppedKernel(experiment.grid, wave, distance, offset=offset).to(experiment.device)
+                for each in phase:
+                    total[i, j] += intensity(exact(experiment.array(each)[i : i + 1]))[0].cpu() / len(phase)
+    if len(experiment.distances) == 1:
+        formed, between = formed[:, 0], between[:, 0]
+    formed, between = experiment.seen(formed), experiment.seen(between)
     picture = _as_picture(experiment, formed, at_best_scale=True)
     numbers = _scores(experiment, picture, experiment.image)
-    numbers["efficiency"] = _per_colour(experiment, formed.mean((-2, -1)))
-    scale = best_scale(formed, experiment.target)[:, None, None]
+    numbers["efficiency"] = _per_colour(experiment, _share(experiment, formed))
+    scale = best_scale(formed, experiment.wanted)[:, None, None]
     return picture, numbers, between * scale
 
 
@@ -103,17 +114,19 @@ def _scores(experiment: PECExperiment, picture: Tensor, image: Tensor) -> dict[s
 
 
 def _as_picture(experiment: PECExperiment, formed: Tensor, *, at_best_scale: bool) -> Tensor:
-    """Relative intensity of the lit colours to the picture's own scale, dark colours black."""
+    """Relative intensity of the lit colours [C, h, w] to the picture's own scale, dark colours black."""
     if at_best_scale:
-        formed = formed * best_scale(formed, experiment.target)[:, None, None]
+        formed = formed * best_scale(formed, experiment.wanted)[:, None, None]
     mean = experiment.image[experiment.lit].mean((-2, -1), keepdim=True)
     return _all_colours(experiment, formed * mean)
 
 
 def _all_colours(experiment: PECExperiment, lit: Tensor) -> Tensor:
-    whole = lit.new_zeros(len(experiment.lit), *lit.shape[1:])
-    whole[experiment.lit] = lit
-    return whole
+    """[..., C, h, w] or [C] of the lit colours to all, zero in the dark ones."""
+    axis = 0 if lit.ndim == 1 else lit.ndim - 3
+    shape = list(lit.shape)
+    shape[axis] = len(experiment.lit)
+    return lit.new_zeros(shape).index_copy(axis, experiment.lit.nonzero()[:, 0], lit)
 
 
 def _per_colour(experiment: PECExperiment, values: Tensor) -> list[float]:

@@ -5,20 +5,34 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from holotorch.core.checks import SamplingWarning
+from holotorch.core.complex import intensity
 from holotorch.core.grid import Grid
-from holotorch.correction import APG, PECProblem, ProjectedAdam, Solution, gerchberg_saxton
-from holotorch.experiments.config import APGSettings, NearFieldSettings, PECSettings
+from holotorch.correction import (
+    APG,
+    LBFGS,
+    PECProblem,
+    ProjectedAdam,
+    Solution,
+    Stage,
+    below,
+    limited,
+    run_stages,
+    spread_preconditioner,
+)
+from holotorch.correction.run import State
+from holotorch.experiments.config import APGSettings, LBFGSSettings, NearFieldSettings, PECSettings
 from holotorch.experiments.errors import ConfigError
 from holotorch.io.images import fit_image, frame_image, load_image, with_channels
-from holotorch.modulator import PhasedArray, ThermalCrosstalk
-from holotorch.optics import AngularSpectrum, CroppedKernel, Fraunhofer, Fresnel
+from holotorch.modulator import PhasedArray, ThermalCrosstalk, quantised
+from holotorch.optics import AngularSpectrum, CroppedKernel, DepthStack, Fraunhofer, Fresnel
+from holotorch.optics.propagators import SpectralFilter
 
-BASELINE_PASSES = 100  # of Gerchberg-Saxton and of basic IPEC, as in the thesis's comparison
 Progress = Callable[[Solution], None]
 
 
@@ -31,7 +45,7 @@ class PECExperiment:
         source: The picture as loaded, float64 [C', h, w].
         lit: Which colours are not black, [C].
         array: The phased array, over the lit colours.
-        start: Where the solver starts: "hot" or "flat".
+        start: Where the solver starts.
         device: Where it runs.
     """
 
@@ -53,87 +67,172 @@ class PECExperiment:
         return self.array.wavelengths
 
     @property
+    def distances(self) -> tuple[float, ...]:
+        """Of the image, in metres; none in the far field."""
+        light = self.settings.propagator
+        return light.distance if isinstance(light, NearFieldSettings) else ()
+
+    @property
     def isolated(self) -> bool:
-        """Whether light may leave the window, so that only the best scale can be compared."""
+        """Whether the array stands alone at a distance, and light may leave the window."""
         light = self.settings.propagator
         return isinstance(light, NearFieldSettings) and light.boundary == "isolated"
 
+    @property
+    def scale_free(self) -> bool:
+        """Whether light may leave the picture, so that only the best scale can be compared."""
+        return self.isolated or self.settings.target.region is not None
+
+    @property
+    def joint(self) -> bool:
+        """Whether several frames share one image and are solved for together."""
+        return self.settings.frames > 1 and self.settings.multiplexing == "joint"
+
     @cached_property
     def image(self) -> Tensor:
-        """The picture on the grid, float64 [C, H, W]; resampled when first used, so that a plan needs no memory."""
+        """The picture on its samples, float64 [C, H, W]; resampled when first used, so that a plan needs no memory."""
         settings = self.settings
-        fitted = fit_image(self.source, settings.grid.shape, settings.target.fit)
+        fitted = fit_image(self.source, settings.target.region or settings.grid.shape, settings.target.fit)
         return with_channels(fitted, len(settings.wavelengths)).contiguous()
 
     @property
-    def target(self) -> Tensor:
-        """The wanted intensity of the lit colours, mean 1 each."""
+    def wanted(self) -> Tensor:
+        """The intensity of the lit colours in the picture, mean 1 each, float64 [C, H, W]."""
         image = self.image[self.lit]
         return image / image.mean((-2, -1), keepdim=True)
 
-    @cached_property
-    def propagator(self) -> AngularSpectrum | CroppedKernel | Fresnel | Fraunhofer:
-        """From the array to the image. Built when first used: its kernel is the first large allocation."""
-        return self._build_propagator().to(self.device)
+    @property
+    def target(self) -> Tensor:
+        """The same where the propagator puts it: in the middle of the grid, or at each distance, [C, *image]."""
+        wanted = self.wanted
+        if region := self.settings.target.region:
+            whole = wanted.new_zeros(len(wanted), *self.grid.shape)
+            whole[self.window] = wanted
+            # Half of the light in the region is what such holograms reach; the scale is free.
+            return whole * (math.prod(self.grid.shape) / math.prod(region) / 2)
+        return wanted[:, None].repeat(1, len(self.distances), 1, 1) if len(self.distances) > 1 else wanted
 
-    def _build_propagator(self) -> AngularSpectrum | CroppedKernel | Fresnel | Fraunhofer:
-        light = self.settings.propagator
-        if not isinstance(light, NearFieldSettings):
-            return Fraunhofer(self.grid, self.wavelengths)
-        paraxial = light.kind == "fresnel"
-        if light.boundary == "isolated":
-            return CroppedKernel(self.grid, self.wavelengths, light.distance, paraxial=paraxial)
+    @property
+    def window(self) -> tuple[Any, ...]:
+        """Where the picture lies in [..., H, W]."""
+        size = self.settings.target.region or self.grid.shape
+        begin = [whole // 2 - part // 2 for whole, part in zip(self.grid.shape, size, strict=True)]
+        return (..., slice(begin[0], begin[0] + size[0]), slice(begin[1], begin[1] + size[1]))
+
+    @property
+    def mask(self) -> Tensor | None:
+        """1 where the target is to be met, float64, broadcasting to it; None for everywhere."""
+        depths, width = len(self.distances), self.grid.shape[1]
+        if self.settings.target.region:
+            mask = torch.zeros(1, *self.grid.shape, dtype=torch.float64)
+            mask[self.window] = 1
+            return mask
+        if depths < 2 or self.settings.target.depths == "full":
+            return None
+        mask = torch.zeros(1, depths, 1, width, dtype=torch.float64)
+        for depth in range(depths):
+            mask[:, depth, :, depth * width // depths : (depth + 1) * width // depths] = 1
+        return mask
+
+    def seen(self, formed: Tensor) -> Tensor:
+        """The picture in an intensity [..., C, *image]: its region, or what is in focus, [..., C, h, w]."""
+        if len(self.distances) < 2:
+            return formed[self.window]
+        mask = self.mask
+        return formed.mean(-3) if mask is None else (formed * mask.to(formed)).sum(-3)
+
+    @cached_property
+    def propagator(self) -> SpectralFilter | Fraunhofer | DepthStack:
+        """From the array to the image. Built when first used: its kernel is the first large allocation."""
+        if not self.distances:
+            return Fraunhofer(self.grid, self.wavelengths).to(self.device)
+        filters = [self._to_distance(distance).to(self.device) for distance in self.distances]
+        return filters[0] if len(filters) == 1 else DepthStack(filters)
+
+    def _to_distance(self, distance: float) -> SpectralFilter:
+        paraxial = self.settings.propagator.kind == "fresnel"
+        if self.isolated:
+            return CroppedKernel(self.grid, self.wavelengths, distance, paraxial=paraxial)
         with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the plan says the same
             if paraxial:
-                return Fresnel(self.grid, self.wavelengths, light.distance, pad=1)
-            return AngularSpectrum(self.grid, self.wavelengths, light.distance, pad=1, band_limit=False)
+                return Fresnel(self.grid, self.wavelengths, distance, pad=1)
+            return AngularSpectrum(self.grid, self.wavelengths, distance, pad=1, band_limit=False)
 
-    def problem(self, dtype: torch.dtype = torch.float32) -> PECProblem:
+    def problem(self, dtype: torch.dtype = torch.float32, **options) -> PECProblem:
         """The objective over the lit colours."""
-        target = self.target.to(self.device, dtype)
-        return PECProblem(self.array.crosstalk, self.propagator, target, scale_free=self.isolated)
+        target, mask = (None if part is None else part.to(self.device, dtype) for part in (self.target, self.mask))
+        assert target is not None
+        return PECProblem(
+            self.array.crosstalk,
+            self.propagator,
+            target,
+            mask=mask,
+            scale_free=self.scale_free,
+            frames=self.joint,
+            **options,
+        )
+
+    def formed(self, phase: Tensor) -> Tensor:
+        """Mean intensity of frames of heater phases [F, C, H, W] of the lit colours, [C, *image]."""
+        # One frame at a time: a stack of float64 fields at several depths is large.
+        return torch.stack([intensity(self.propagator(self.array(each))) for each in phase]).mean(0)
 
     def start_phase(self) -> Tensor:
-        """Heater phases of the start, float32 [C, H, W] over the lit colours, the same numbers on every device."""
-        generator = torch.Generator().manual_seed(self.settings.seed)
-        uniform = torch.rand(self.target.shape, generator=generator).to(self.device)
-        return uniform * {"hot": 2 * math.pi, "flat": 1.0}[self.start]
+        """The unknown at the start, float32 over the lit colours, the same numbers on every device.
 
-    def solve(self, progress: Progress | None = None) -> Solution:
-        """Run the configured solver on the lit colours. ConfigError where it cannot start."""
+        [C, H, W]; [C, F, H, W] for joint frames, [F, C, H, W] for independent ones.
+        """
+        generator = torch.Generator().manual_seed(self.settings.seed)
+        shape, frames = [len(self.wavelengths), *self.grid.shape], self.settings.frames
+        if frames > 1:
+            shape.insert(1 if self.joint else 0, frames)
+        uniform = torch.rand(shape, generator=generator).to(self.device)
+        spread = self.array.crosstalk.total
+        if self.start == "quadratic":
+            (y, x), (height, width) = self.grid.coordinates(self.device), self.grid.shape
+            y, x = y / self.grid.pitch[0], x / self.grid.pitch[1]
+            lens = math.pi * (y.square() / height + x.square() / width)  # its slope at the edge is pi per pixel
+            return (lens / spread + 0.01 * uniform).to(uniform.dtype)
+        return uniform * {"hot": 2 * math.pi, "cool": 2 * math.pi / spread, "flat": 1.0}[self.start]
+
+    def frames_of(self, unknown: Tensor) -> Tensor:
+        """Heater phases [F, C, H, W] of the solver's unknown, within the limit and in the heaters' steps."""
+        phase = unknown.detach()
+        if self.joint:
+            phase = phase.movedim(-3, 0)
+        elif self.settings.frames == 1:
+            phase = phase[None]
+        limit, bits = self.settings.modulator.max_phase, self.settings.modulator.bits
+        if limit is not None:
+            phase = below(limit, phase, self.array.crosstalk)
+        return phase if bits is None else quantised(phase, bits)
+
+    def stages(self) -> list[Stage]:
+        """What the configured solver does, one run after another."""
         solver = self.settings.solver
         rule = {"max_steps": solver.max_steps, "tolerance": solver.tolerance, "patience": solver.patience}
         if isinstance(solver, APGSettings):
-            method = APG(step=solver.step, shrink=solver.shrink, **rule)
-        else:
-            method = ProjectedAdam(learning_rate=solver.learning_rate, **rule)
+            return [Stage(self.problem(), APG(solver.step, solver.shrink, solver.grow, solver.restart, **rule))]
+        if not isinstance(solver, LBFGSSettings):
+            return [Stage(self.problem(), ProjectedAdam(solver.learning_rate, **rule))]
+        crosstalk = self.array.crosstalk
+        method = LBFGS(solver.memory, spread_preconditioner(crosstalk.kernel), **rule)
+        return limited(self.problem, method, crosstalk.total, self.settings.modulator.max_phase)
+
+    def solve(self, progress: Progress | None = None, resume: State | None = None) -> Solution:
+        """Run the configured solver on the lit colours. ConfigError where it cannot start."""
         try:
-            return method(self.problem(), self.start_phase(), callback=progress)
+            return run_stages(self.stages(), self.start_phase(), callback=progress, resume=resume)
         except ValueError as error:
             raise ConfigError([f"the solver cannot start: {error}"]) from error
-
-    def baseline(self, name: str, progress: Progress | None = None) -> Solution:
-        """Phases without correction ("none") or from basic IPEC ("basic_ipec"), by Gerchberg-Saxton.
-
-        Both begin with the image that the solver's own start forms, so that they have the same light to work with.
-        """
-        with torch.no_grad():
-            begin = torch.angle(self.propagator(self.array(self.start_phase())))
-        return gerchberg_saxton(
-            self.propagator,
-            self.target.to(self.device, torch.float32),
-            begin,
-            max_steps=BASELINE_PASSES,
-            crosstalk=self.array.crosstalk if name == "basic_ipec" else None,
-            callback=progress,
-        )
 
 
 def build(settings: PECSettings) -> PECExperiment:
     """Load the picture and choose what the configuration leaves open. ConfigError for what cannot be shown."""
+    shape = settings.target.region or settings.grid.shape
     try:
         source = load_image(settings.target.image)
-        framed = frame_image(source, settings.grid.shape[1] / settings.grid.shape[0], settings.target.fit)
+        framed = frame_image(source, shape[1] / shape[0], settings.target.fit)
         lit = with_channels(framed, len(settings.wavelengths)).amax((-2, -1)) > 0
     except ValueError as error:
         raise ConfigError([f"target.image: {error}"]) from error

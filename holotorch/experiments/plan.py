@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from holotorch.core.grid import Grid
+from holotorch.experiments.baselines import PASSES
 from holotorch.experiments.config import NearFieldSettings
-from holotorch.experiments.pec import BASELINE_PASSES, PECExperiment
+from holotorch.experiments.pec import PECExperiment
 from holotorch.optics import diffraction_angle, plan_propagation, unaliased_distance
 
 # Seconds of one evaluation per pixel, and per padded sample times log2 of their number, on two CPU cores. Measured at
@@ -23,15 +24,16 @@ def plan(experiment: PECExperiment) -> dict[str, Any]:
     """Choices with their reasons, cost and physics, as plain JSON values."""
     settings, light, grid = experiment.settings, experiment.settings.propagator, experiment.grid
     padded = grid.padded(2 if experiment.isolated else 1)
-    samples = len(experiment.wavelengths) * math.prod(padded.shape)
-    pixels = len(experiment.wavelengths) * math.prod(grid.shape)
+    pixels = len(experiment.wavelengths) * math.prod(grid.shape) * settings.frames
+    samples = len(experiment.wavelengths) * math.prod(padded.shape) * settings.frames
+    samples *= max(1, (1 + len(experiment.distances)) // 2)
     evaluations = (2 if settings.solver.kind == "apg" else 1) * settings.solver.max_steps
-    work = evaluations + BASELINE_PASSES * len(settings.report.baselines)
+    work = evaluations + PASSES / settings.frames * len(settings.report.baselines)
     seconds = work * (_PIXEL_SECONDS * pixels + _FFT_SECONDS * samples * math.log2(max(2, samples)))
     judge = 16 * samples + _JUDGE_BYTES * 5 * math.prod(grid.shape) if isinstance(light, NearFieldSettings) else 0
     single = {}
     if experiment.isolated and isinstance(light, NearFieldSettings):
-        single = {"single_propagation": asdict(plan_propagation(grid, experiment.wavelengths, light.distance))}
+        single = {"single_propagation": asdict(plan_propagation(grid, experiment.wavelengths, list(light.distance)))}
     crosstalk = experiment.array.crosstalk
     size_rule = "as given" if settings.modulator.kernel_size else "chosen so that no tap above 1e-6 is dropped"
     return {
@@ -39,8 +41,11 @@ def plan(experiment: PECExperiment) -> dict[str, Any]:
         "padding": {"samples": list(padded.shape), "reason": _padding_reason(experiment)},
         **single,
         "crosstalk": {"taps": crosstalk.kernel.shape[0], "lost_heat": crosstalk.lost_heat, "reason": size_rule},
+        "heat": _heat(experiment),
+        "frames": settings.frames,
         "start": {"kind": experiment.start, "reason": _START_REASONS[experiment.start]},
-        "loss": "intensity" + (" at its best scale, since light may leave the window" if experiment.isolated else ""),
+        "loss": "intensity"
+        + (" at its best scale, since light may leave the picture" if experiment.scale_free else ""),
         "device": str(experiment.device),
         "precision": "complex64 in the solver, complex128 in the judge",
         "predicted_evaluations": evaluations,
@@ -76,13 +81,17 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
     ]
     if "distance_mm" in physics:
         lines.append(
-            f"Image      at {physics['distance_mm']:g} mm; smallest spot {_listed(physics['spot_um'])} um, sampled "
-            f"every {physics['pitch_um'][1]:.4g} um; the periodic model is alias-free up to "
+            f"Image      at {_listed(physics['distance_mm'], 'g')} mm; smallest spot {_listed(physics['spot_um'])} um, "
+            f"sampled every {physics['pitch_um'][1]:.4g} um; the periodic model is alias-free up to "
             f"{_listed(physics['alias_free_mm'])} mm"
         )
     if planned := values.get("single_propagation"):
         lines.append(f"Planned    one propagation over this distance: {planned['reason']}; {planned['runner_up']}")
+    if settings.frames > 1:
+        how = "solved for together" if experiment.joint else "solved for one by one"
+        lines.append(f"Frames     {settings.frames}, shown in turn and {how}; the eye sees their mean")
     lines += [
+        f"Heat       {values['heat']}",
         f"Solver     {settings.solver.kind}, at most {settings.solver.max_steps} steps from a "
         f"{values['start']['kind']} start ({values['start']['reason']})",
         f"Cost       about {values['predicted_evaluations']} evaluations, {values['predicted_seconds']:.2g} s on two "
@@ -95,11 +104,23 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
 _START_REASONS = {
     "hot": "phases uniform on [0, 2 pi): light everywhere",
     "flat": "phases uniform on [0, 1): a nearly plane wave keeps its light in the window",
+    "cool": "spread phases uniform on [0, 2 pi): the least heat",
+    "quadratic": "a lens after spreading, slope pi per pixel at the edge: much heat, few vortices",
 }
 
 
 def _listed(values: list[float], form: str = ".3g") -> str:
     return " / ".join(f"{value:{form}}" for value in values)
+
+
+def _heat(experiment: PECExperiment) -> str:
+    """The limit on the temperature, or that there is none, in words."""
+    limit, bits = experiment.settings.modulator.max_phase, experiment.settings.modulator.bits
+    steps = "" if bits is None else f"; heaters with {2**bits} steps"
+    if limit is None:
+        return "no limit, as in the thesis: the hottest pixel is reported" + steps
+    kelvin = [limit / response for response in experiment.array.response]
+    return f"the phase after spreading stays below {limit:.4g} rad, {_listed(kelvin)} degC above ambient" + steps
 
 
 def _padding_reason(experiment: PECExperiment) -> str:
@@ -115,18 +136,18 @@ def _notes(experiment: PECExperiment, grid: Grid) -> list[str]:
     found = []
     light, longest = experiment.settings.propagator, max(experiment.wavelengths)
     if isinstance(light, NearFieldSettings):
-        limit = unaliased_distance(grid, longest, 1)
+        limit, farthest = unaliased_distance(grid, longest, 1), max(map(abs, light.distance))
         if not experiment.isolated:
             found.append(
                 "periodic boundary: the array repeats without end, as in the thesis; a single chip forms another "
                 "picture, shown and scored beside it as 'isolated'"
             )
-            if abs(light.distance) > limit:
+            if farthest > limit:
                 found.append(
                     f"the periodic kernel is undersampled beyond {limit * 1e3:.3g} mm at {longest * 1e9:.0f} nm; at "
-                    f"{light.distance * 1e3:.4g} mm this model aliases"
+                    f"{farthest * 1e3:.4g} mm this model aliases"
                 )
-        spot = longest * abs(light.distance) / min(grid.extent)
+        spot = longest * farthest / min(grid.extent)
         if spot > 1.5 * max(grid.pitch):
             found.append(
                 f"the array resolves {spot * 1e6:.3g} um at this distance, {spot / max(grid.pitch):.1f} samples: finer "
@@ -162,8 +183,8 @@ def _physics(experiment: PECExperiment, grid: Grid) -> dict[str, Any]:
     }
     if isinstance(light, NearFieldSettings):
         values |= {
-            "distance_mm": light.distance * 1e3,
-            "spot_um": [wave * abs(light.distance) / min(grid.extent) * 1e6 for wave in waves],
+            "distance_mm": [distance * 1e3 for distance in light.distance],
+            "spot_um": [wave * max(map(abs, light.distance)) / min(grid.extent) * 1e6 for wave in waves],
             "alias_free_mm": [unaliased_distance(grid, wave, 1) * 1e3 for wave in waves],
         }
     return values

@@ -13,7 +13,11 @@ from holotorch.io.files import write_text
 _PICTURES = {
     "target": "Target",
     "none": "No correction",
+    "chopping": "Matrix inverse, negative entries chopped",
+    "shifting": "Matrix inverse, shifted",
+    "nonnegative": "Non-negative deconvolution",
     "basic_ipec": "Basic iterative correction",
+    "ipec": "Iterative correction",
     "corrected": "Corrected",
     "isolated": "Corrected, on a chip that stands alone",
 }
@@ -22,7 +26,7 @@ _FIGURES = {
     "temperature": "Temperature of the chip above ambient, after the heat has spread",
     "convergence": "Convergence of the solver",
 }
-_METHOD_NAMES = {"none": "no correction", "basic_ipec": "basic IPEC", "corrected": "corrected"}
+_METHOD_NAMES = {"none": "no correction", "basic_ipec": "basic IPEC", "ipec": "IPEC"}
 
 
 def write_report(folders: Sequence[Path], path: Path) -> None:
@@ -68,7 +72,9 @@ def _comparison(runs: list[_Run]) -> str:
 def _section(run: _Run) -> str:
     status = "" if run.summary["status"] == "complete" else f' <span class="warn">{run.summary["status"]}</span>'
     parts = [f"<h1>{html.escape(run.title)}{status}</h1>"]
-    parts.append(_table(["method", *_COLUMNS], [[_METHOD_NAMES[n], *_numbers(m)] for n, m in run.methods.items()]))
+    parts.append(
+        _table(["method", *_COLUMNS], [[_METHOD_NAMES.get(n, n), *_numbers(m)] for n, m in run.methods.items()])
+    )
     parts.append(f"<p>{_verdict(run)}</p>")
     parts.append('<div class="row">')
     for name, caption in _PICTURES.items():

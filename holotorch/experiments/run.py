@@ -1,7 +1,7 @@
 """One run: a folder that is complete, or one that says it was interrupted; never half a file."""
 
+import json
 import re
-import resource
 import shutil
 import signal
 import sys
@@ -12,22 +12,32 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from tqdm import tqdm
+from torch import Tensor
 
 from holotorch.correction import Solution
 from holotorch.experiments import pictures
-from holotorch.experiments.config import PECSettings
+from holotorch.experiments.baselines import baseline
+from holotorch.experiments.config import PECSettings, load_config
 from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.judge import Result, judge, quality
+from holotorch.experiments.judge import Result, judge
+from holotorch.experiments.memory import peak_memory
 from holotorch.experiments.pec import PECExperiment, build
 from holotorch.experiments.plan import plan, plan_text, shortage
+from holotorch.experiments.progress import Log
 from holotorch.experiments.report import write_report
 from holotorch.io.files import save_array, write_bytes, write_json, write_text
 from holotorch.io.images import encode_png
 
-_CHECK_EVERY = 10  # steps between two measurements of quality, which cost about as much as a step
-_CAPTIONS = {"none": "No correction", "basic_ipec": "Basic iterative correction", "corrected": "Corrected"}
+_CAPTIONS = {
+    "none": "No correction",
+    "chopping": "Inverse, chopped",
+    "shifting": "Inverse, shifted",
+    "nonnegative": "Non-negative deconvolution",
+    "basic_ipec": "Basic iterative correction",
+    "ipec": "Iterative correction",
+    "corrected": "Corrected",
+}
 
 
 def run(settings: PECSettings, out: Path | None, name: str = "run") -> tuple[Path, bool]:
@@ -84,48 +94,61 @@ def claim(out: Path | None, name: str) -> Path:
     return out
 
 
-def peak_memory() -> int:
-    """Largest resident size of this process so far, in bytes."""
-    status = Path("/proc/self/status")
-    # On Linux getrusage also counts the program that started this one.
-    if status.is_file() and (match := re.search(r"VmHWM:\s+(\d+) kB", status.read_text())):
-        return int(match[1]) * 1024
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+def resume(folder: Path) -> tuple[Path, bool]:
+    """Go on with an interrupted run in its folder, as if it had never stopped; returns as :func:`run`.
+
+    Raises:
+        ConfigError: The folder holds no run of this program, or its configuration no longer works.
+    """
+    config = folder / "config.yaml"
+    if not config.is_file() or not (folder / "plan.json").is_file():
+        raise ConfigError([f"{folder} holds no run to resume: config.yaml and plan.json are not both there"])
+    if (folder / "summary.json").is_file():
+        print("this run is complete; nothing is left to do")
+        return folder, True
+    experiment = build(load_config(config))
+    return folder, _fill(folder, experiment, json.loads((folder / "plan.json").read_text()))
 
 
 def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
     settings = experiment.settings
     for part in ("arrays", "images"):
         (out / part).mkdir(exist_ok=True)
-    write_text(out / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
+    if not (out / "config.yaml").is_file():
+        write_text(out / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
     write_json(out / "env.json", environment(settings.seed, experiment.device))
     write_json(out / "plan.json", values)
 
-    log = _Log(experiment)
-    started = time.perf_counter()
+    checkpoint = out / "checkpoint.pt"
+    log = Log(experiment, checkpoint)
     with _interruptible() as pressed:
         try:
-            solution = experiment.solve(log)
+            solution = experiment.solve(log, log.resume)
         except KeyboardInterrupt:
             solution = log.last
         finally:
             log.close()
         if solution is None:
             raise KeyboardInterrupt
-        seconds = time.perf_counter() - started - log.seconds_spent
+        seconds = log.seconds
         with _deferred(pressed):  # from here on Ctrl-C is remembered; what was found is saved first
+            if pressed:
+                log.save()
             results = {"corrected": _result(experiment, solution, seconds)}
-            save_array(out / "arrays" / "phase.npy", results["corrected"].phase.float()[None])  # one frame
-        for name in settings.report.baselines:
+            save_array(out / "arrays" / "phase.npy", results["corrected"].phase.float())
+        for name in settings.report.baselines if len(experiment.distances) < 2 else ():
             try:
                 if not pressed:
                     started = time.perf_counter()
-                    found = experiment.baseline(name)
-                    results[name] = _result(experiment, found, time.perf_counter() - started)
+                    found = baseline(experiment, name)
+                    results[name] = _result(experiment, found, time.perf_counter() - started, single=True)
             except KeyboardInterrupt:
                 pressed.append(signal.SIGINT)
+            except ValueError as error:
+                print(f"{name} is left out: {error}", file=sys.stderr)
         with _deferred(pressed):
+            if pressed:
+                log.save()
             _write_results(out, experiment, results, log, solution)
             summary = {
                 "experiment": settings.experiment,
@@ -134,10 +157,13 @@ def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
                 "peak_memory_bytes": peak_memory(),
             }
             write_json(out / ("interrupted.json" if pressed else "summary.json"), summary)
+            if not pressed:
+                for left in (checkpoint, out / "interrupted.json"):
+                    left.unlink(missing_ok=True)
             write_report([out], out / "report.html")
     if pressed:
         steps = int(solution.steps.max())
-        print(f"interrupted; saved what {steps} steps have found", file=sys.stderr)
+        print(f"interrupted; saved what {steps} steps have found; go on with: holotorch resume {out}", file=sys.stderr)
     return not pressed
 
 
@@ -176,64 +202,21 @@ def _handling(handler) -> Iterator[None]:
             signal.signal(number, old)
 
 
-class _Log:
-    """Callback of the solver: progress bar, rows of metrics.csv, and the last state for an interrupted run."""
-
-    def __init__(self, experiment: PECExperiment):
-        self.experiment, self.last = experiment, None
-        self.rows: list[list[str]] = []
-        self.checked: list[tuple[int, float]] = []
-        self.seconds_spent = 0.0
-        self.started = time.perf_counter()
-        self.bar = tqdm(total=experiment.settings.solver.max_steps, desc="correcting", unit="step", dynamic_ncols=True)
-
-    @property
-    def metric(self) -> str:
-        """Name of what is measured on the way."""
-        return self.experiment.settings.report.metrics[0]
-
-    def __call__(self, solution: Solution) -> None:
-        entered = time.perf_counter()
-        self.last = solution
-        step = len(solution.losses) - 1
-        shown, score = {}, ""
-        if step % _CHECK_EVERY == 0:
-            self.checked.append((step, quality(self.experiment, solution.x)))
-            score = f"{self.checked[-1][1]:.6f}"
-        losses = solution.losses[-1].tolist()
-        elapsed = entered - self.started - self.seconds_spent
-        self.rows.append([str(step), str(solution.evaluations), f"{elapsed:.4f}", score, *map(repr, losses)])
-        relative = (solution.losses[-1] / solution.losses[0].clamp(min=1e-30)).mean().item()
-        shown |= {"loss": f"{relative:.2e}", "mem": f"{peak_memory() / 1e9:.2f}GB"}
-        if self.checked:
-            shown[self.metric] = f"{self.checked[-1][1]:.4f}"
-        self.bar.set_postfix(shown, refresh=False)
-        self.bar.update()
-        self.seconds_spent += time.perf_counter() - entered
-
-    def close(self) -> None:
-        self.bar.close()
-
-    def table(self) -> str:
-        colours = [f"loss_{wave * 1e9:.0f}nm" for wave in self.experiment.wavelengths]
-        header = ["step", "evaluations", "seconds", f"{self.metric}_mean", *colours]
-        return "\n".join(",".join(row) for row in [header, *self.rows]) + "\n"
-
-
-def _result(experiment: PECExperiment, solution: Solution, seconds: float) -> Result:
-    result = judge(experiment, solution.x)
+def _result(experiment: PECExperiment, solution: Solution, seconds: float, *, single: bool = False) -> Result:
+    """Score a solution; ``single`` for phases [C, H, W] of one frame, whatever the run has."""
+    result = judge(experiment, solution.x[None] if single else experiment.frames_of(solution.x))
     result.numbers.update(
         evaluations=solution.evaluations,
-        steps=solution.steps.tolist(),
-        converged=solution.converged.tolist(),
-        stalled=solution.stalled.tolist(),
+        steps=solution.steps.flatten().tolist(),
+        converged=solution.converged.flatten().tolist(),
+        stalled=solution.stalled.flatten().tolist(),
         seconds=round(seconds, 4),
     )
     return result
 
 
 def _write_results(
-    out: Path, experiment: PECExperiment, results: dict[str, Result], log: _Log, solution: Solution
+    out: Path, experiment: PECExperiment, results: dict[str, Result], log: Log, solution: Solution
 ) -> None:
     corrected = results["corrected"]
     write_text(out / "metrics.csv", log.table())
@@ -247,16 +230,21 @@ def _write_results(
     for name, picture in shown.items():
         write_bytes(out / "images" / f"{name}.png", encode_png(picture))
     names = [f"{wave * 1e9:.0f} nm" for wave in experiment.wavelengths]
-    phase = corrected.phase[experiment.lit].to(experiment.device)
+    phase = corrected.phase[0][experiment.lit].to(experiment.device)  # of several frames, the first
     warm = experiment.array.temperature(experiment.array.crosstalk(phase)).cpu()
     figures = {
         "comparison": pictures.comparison(list(shown.values()), captions),
         "phase": pictures.channel_maps(phase.cpu(), names, "heater phase (rad)", "viridis"),
         "temperature": pictures.channel_maps(warm, names, "temperature rise (degC)", "inferno", (0, None)),
-        "convergence": pictures.convergence(solution.losses, names, log.checked, log.metric),
+        "convergence": pictures.convergence(_per_colour(solution.losses, len(names)), names, log.checked, log.metric),
     }
     for name, data in figures.items():
         write_bytes(out / "images" / f"{name}.png", data)
+
+
+def _per_colour(losses: Tensor, colours: int) -> Tensor:
+    """Losses [steps, ..., C] as [steps, C], the mean of independent frames."""
+    return losses.reshape(len(losses), -1, colours).mean(1)
 
 
 def _score(numbers: dict[str, Any]) -> str:

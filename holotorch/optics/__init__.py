@@ -2,6 +2,7 @@
 
 from holotorch.optics.converging import ConvergingFresnel, converging_fresnel
 from holotorch.optics.cropped import CroppedKernel
+from holotorch.optics.depths import DepthStack
 from holotorch.optics.geometry import diffraction_angle, least_padding, unaliased_distance
 from holotorch.optics.kernels import angular_spectrum_kernel, carrier, fresnel_kernel
 from holotorch.optics.pixels import PixelShape, order_efficiency
@@ -16,6 +17,7 @@ __all__ = [
     "AngularSpectrum",
     "ConvergingFresnel",
     "CroppedKernel",
+    "DepthStack",
     "Fraunhofer",
     "Fresnel",
     "PixelShape",

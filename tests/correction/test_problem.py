@@ -140,7 +140,7 @@ def test_a_target_of_another_shape_is_not_broadcast(shape):
 @pytest.mark.parametrize(
     ("target", "error", "message"),
     [
-        (torch.ones(2, 3), ValueError, r"axes \(C, H, W\)"),
+        (torch.ones(2, 3), ValueError, r"axes .*\(C, H, W\)"),
         (torch.ones(1, 4, 4, dtype=torch.int64), TypeError, "real floating-point"),
         (torch.full((1, 4, 4), float("nan")), ValueError, r"element \(0, 0, 0\) is nan"),
         (-torch.ones(1, 4, 4), ValueError, "must be >= 0, got a minimum of -1"),

@@ -109,7 +109,7 @@ solver: {kind: apg, tolerance: .nan, start: warm}
         "7:14: propagator.kind: expected one of fraunhofer, fresnel, angular_spectrum, got 'fresnl'; "
         "did you mean 'fresnel'?",
         "8:21: solver.tolerance: expected a finite number, got NaN",
-        "8:38: solver.start: expected 'hot' or 'flat', got 'warm'",
+        "8:38: solver.start: expected 'hot', 'cool', 'flat' or 'quadratic', got 'warm'",
     ]
 
 
@@ -130,7 +130,7 @@ solver: {kind: apg, tolerance: .nan, start: warm}
         ("wavelengths=[630 nm, 530 nm]", "expected 1 (grey) or 3 (red, green, blue), got 2"),
         ("target.image=missing.png", "no such picture: 'missing.png'"),
         ("propagator.distance=1 mm", "propagator.distance: a setting of kind fresnel and angular_spectrum, not of"),
-        ("solver={}", "solver.kind: expected one of apg, adam, got 'none'"),
+        ("solver={}", "solver.kind: expected one of apg, adam, lbfgs, got 'none'"),
         ("solver=3", "solver: expected settings, as in {key: value}, got 3"),
         ("seed=-1", "seed: expected greater than or equal to 0, got -1"),
         ("grid.shape=", "grid.shape: expected a whole number, got nothing"),

@@ -152,8 +152,8 @@ def test_one_black_colour_stays_dark_and_does_not_disturb_the_others(tmp_path):
 class StopAfter:
     """Presses Ctrl-C in the given step."""
 
-    def __init__(self, experiment: PECExperiment, step: int):
-        self.log, self.step = LOG(experiment), step
+    def __init__(self, experiment: PECExperiment, checkpoint: Path, step: int):
+        self.log, self.step = LOG(experiment, checkpoint), step
 
     def __getattr__(self, name: str):
         return getattr(self.log, name)
@@ -164,11 +164,11 @@ class StopAfter:
             signal.raise_signal(signal.SIGINT)
 
 
-LOG = run_module._Log
+LOG = run_module.Log
 
 
 def test_ctrl_c_saves_what_was_found(monkeypatch, tmp_path):
-    monkeypatch.setattr(run_module, "_Log", lambda experiment: StopAfter(experiment, 5))
+    monkeypatch.setattr(run_module, "Log", lambda experiment, path: StopAfter(experiment, path, 5))
     assert not run(settings(), tmp_path / "a")[1]
     assert not (tmp_path / "a" / "summary.json").exists()
     saved = read(tmp_path / "a", "interrupted.json")
@@ -181,7 +181,7 @@ def test_ctrl_c_saves_what_was_found(monkeypatch, tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("moment", ["judge", "save_array", "encode_png", "write_report", "baseline"])
 def test_ctrl_c_after_the_solver_loses_nothing(monkeypatch, tmp_path, moment, number):
-    where = PECExperiment if moment == "baseline" else run_module
+    where = run_module
     original = getattr(where, moment)
 
     def pressed(*words, **more):

@@ -1,0 +1,23 @@
+"""Heaters with a limited number of steps."""
+
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+
+
+def quantised(phase: Tensor, bits: int) -> Tensor:
+    """``phase`` [..., H, W] >= 0 on the 2^bits levels between 0 and the largest phase of each hologram.
+
+    The gradient is that of the identity, so that a quantised array can be optimised (straight-through estimator).
+    Raises ValueError for fewer than 1 or more than 24 bits, or a negative phase.
+    """
+    checks.real("phase", phase)
+    if checks.whole("bits", bits, 1) > 24:
+        raise ValueError(f"bits must be at most 24, got {bits}")
+    if phase.numel() and phase.detach().min() < 0:
+        raise ValueError(f"phase must be >= 0 to be quantised, got a minimum of {phase.detach().min().item():g}")
+    top = phase.detach().amax((-2, -1), keepdim=True)
+    step = torch.where(top > 0, top, 1) / (2**bits - 1)
+    stepped = (phase.detach() / step).round() * step
+    return phase + (stepped - phase.detach())
