@@ -38,9 +38,14 @@ def _run(options: argparse.Namespace) -> int:
     from holotorch.experiments.config import load_config
 
     settings = load_config(options.config, options.overrides)
+    name = Path(options.config).stem
+    if settings.experiment == "pec_study":
+        from holotorch.experiments.study import run_study
+
+        return _finish(*run_study(settings, options.out, name))
     from holotorch.experiments.run import run
 
-    return _finish(*run(settings, options.out, Path(options.config).stem))
+    return _finish(*run(settings, options.out, name))
 
 
 def _resume(options: argparse.Namespace) -> int:
@@ -53,6 +58,7 @@ def _demo(options: argparse.Namespace) -> int:
     from holotorch.experiments.config import load_config
 
     settings = load_config(_bundled_config("demo.yaml"))
+    assert settings.experiment == "pec"
     from holotorch.experiments.run import run
 
     return _finish(*run(settings, options.out, "demo"))
@@ -68,6 +74,10 @@ def _check(options: argparse.Namespace) -> int:
     from holotorch.experiments.errors import ConfigError
 
     settings = load_config(options.config, options.overrides)
+    if settings.experiment == "pec_study":
+        print(f"Study      {settings.study} of {', '.join(settings.images)} on {settings.size} x {settings.size} px")
+        print(f"Sweep      {', '.join(f'{value:g}' for value in settings.sweep)}; {settings.max_steps} steps at most")
+        return OK
     from holotorch.experiments.pec import build
     from holotorch.experiments.plan import plan, plan_text, shortage
 

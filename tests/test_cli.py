@@ -37,6 +37,25 @@ def test_check_computes_and_writes_nothing(capsys, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+HEAT = "Heat       "
+NO_LIMIT = HEAT + "no limit, as in the thesis: the hottest pixel is reported"
+FOUR_PI = HEAT + "the phase after spreading stays below 12.57 rad, 700 / 589 / 494 degC above ambient"
+FRAMES = "Frames     4, shown in turn and solved for {}; the eye sees their mean"
+
+
+@pytest.mark.parametrize("path", sorted(Path(CONFIG).parent.glob("*.yaml")), ids=lambda path: path.stem)
+def test_check_says_how_hot_and_how_many_frames(path, capsys):
+    assert main(["check", str(path)]) == 0
+    out = capsys.readouterr().out.splitlines()
+    capped = path.stem == "capped"
+    assert [line for line in out if line.startswith(HEAT)] == [FOUR_PI if capped else NO_LIMIT]
+    assert [line for line in out if line.startswith("Frames")] == ([FRAMES.format("together")] if capped else [])
+    assert main(["check", str(path), "frames=4", "multiplexing=independent", "modulator.bits=6"]) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert (FOUR_PI if capped else NO_LIMIT) + "; heaters with 64 steps" in out
+    assert FRAMES.format("one by one") in out
+
+
 def test_report_of_several_runs(capsys):
     for name in ("a", "b"):
         main(["run", CONFIG, *TINY, "--out", name])

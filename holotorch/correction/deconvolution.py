@@ -52,6 +52,7 @@ def deconvolve(crosstalk: Crosstalk, phase: Tensor, *, max_steps: int = 30, star
 
     Source: thesis Eqs. 4.32-4.35, with M^T phi in the gradient; the step 1 / L needs no search, as L <= (sum K)^2.
     """
+    checks.real("phase", phase)
     checks.all_finite("phase", phase)
     checks.whole("max_steps", max_steps, 1)
     step = 1 / crosstalk.kernel.sum().item() ** 2

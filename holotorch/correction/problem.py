@@ -64,7 +64,7 @@ class PECProblem(nn.Module):
         for channel, mean in enumerate(target.flatten(1).mean(1).tolist()):
             if mean == 0:
                 raise ValueError(f"target channel {channel} is black: there is no light to form, leave it out")
-        if mask is not None and (mask.min() < 0 or torch.broadcast_shapes(mask.shape, target.shape) != target.shape):
+        if mask is not None and (mask.min() < 0 or not _broadcasts(mask.shape, target.shape)):
             raise ValueError(f"mask must be >= 0 and broadcast to the target {tuple(target.shape)}")
         self.crosstalk, self.propagator, self.scale_free = crosstalk, propagator, scale_free
         self.amplitude, self.frames = amplitude, frames
@@ -76,6 +76,8 @@ class PECProblem(nn.Module):
             limit = torch.as_tensor(limit, dtype=target.dtype).reshape(-1, *[1] * (3 if frames else 2))
             if not (limit > 0).all():
                 raise ValueError("limit must be above zero in rad")
+            if len(limit) not in (1, len(target)):
+                raise ValueError(f"limit must be a number or one per channel, {len(target)}, got {len(limit)}")
         self.register_buffer("limit", limit, persistent=False)
 
     def forward(self, phase: Tensor) -> Tensor:
@@ -115,9 +117,16 @@ class PECProblem(nn.Module):
     def _formed(self, spread: Tensor) -> Tensor:
         if not self.frames:
             return intensity(self.propagator(phasor(spread)))
+        if spread.ndim < 4:
+            raise ValueError(f"phase must end in (C, F, H, W), as frames=True has it, got {tuple(spread.shape)}")
         # Fields keep their channel before the picture: frames go in front of it, and are averaged there.
         formed = intensity(self.propagator(phasor(spread.movedim(-3, -4))))
         return formed.mean(-1 - self.target.ndim)
+
+
+def _broadcasts(shape: torch.Size, to: torch.Size) -> bool:
+    behind = to[len(to) - len(shape) :]
+    return len(shape) <= len(to) and all(have in (1, want) for have, want in zip(shape, behind, strict=True))
 
 
 def best_scale(formed: Tensor, target: Tensor, behind: int = -2) -> Tensor:

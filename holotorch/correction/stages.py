@@ -90,8 +90,9 @@ def limited(
         box, soft = Box(0.0, limit / spread), {"limit": 0.985 * limit}
         begin = whole // 3
         parts = [({"amplitude": amplitude}, box, begin)]
-        shares = zip((1.0, 10.0, 100.0, 1000.0), (0.3, 0.3, 0.25, 0.15), strict=True)
-        parts += [({**soft, "limit_weight": w}, nonnegative, round((whole - begin) * part)) for w, part in shares]
+        ends = [begin + round((whole - begin) * share) for share in (0.0, 0.3, 0.6, 0.85, 1.0)]
+        shares = zip((1.0, 10.0, 100.0, 1000.0), ends, ends[1:], strict=False)
+        parts += [({**soft, "limit_weight": w}, nonnegative, end - before) for w, before, end in shares]
     return [
         Stage(make(**keywords), replace(solver, max_steps=steps), box) for keywords, box, steps in parts if steps > 0
     ]

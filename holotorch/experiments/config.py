@@ -198,11 +198,25 @@ class PECSettings(Settings):
     report: ReportSettings = ReportSettings()
 
 
-KINDS: dict[str, type[PECSettings]] = {"pec": PECSettings}
+class StudySettings(Settings):
+    """A comparison of methods over several photographs; ``sweep`` are sigmas in pixels, or cut-offs for lowpass."""
+
+    experiment: Literal["pec_study"]
+    study: Literal["reproduction", "lowpass", "multiplexing", "iterations", "time", "focus", "limits", "targets"]
+    images: Annotated[
+        tuple[Annotated[str, BeforeValidator(_picture)], ...], BeforeValidator(_several), Field(min_length=1)
+    ]
+    size: Annotated[Count, Field(ge=24, le=1024)] = 128
+    sweep: Annotated[tuple[Annotated[Number, Field(gt=0, le=3)], ...], BeforeValidator(_several), Field(min_length=1)]
+    max_steps: Count = 400
+    seed: Annotated[int, BeforeValidator(_number), Field(ge=0, lt=2**63)] = 7
 
 
-def load_config(path: Path | str, overrides: list[str] | None = None) -> PECSettings:
-    """Read, override and check a configuration.
+KINDS: dict[str, type[PECSettings] | type[StudySettings]] = {"pec": PECSettings, "pec_study": StudySettings}
+
+
+def load_config(path: Path | str, overrides: list[str] | None = None) -> Any:
+    """Read, override and check a configuration; returns the settings of its kind, see ``KINDS``.
 
     Raises:
         ConfigError: Everything that is wrong with it, one line per mistake with its file, line and column.
@@ -217,6 +231,8 @@ def load_config(path: Path | str, overrides: list[str] | None = None) -> PECSett
     except ValidationError as error:
         mistakes = {describe(source, KINDS[kind], entry): None for entry in error.errors()}
         raise ConfigError(sorted(mistakes, key=position)) from None
+    if isinstance(settings, StudySettings):
+        return settings
     mistakes = [source.mistake(key, message) for key, message in _contradictions(settings)]
     if mistakes:
         raise ConfigError(mistakes)

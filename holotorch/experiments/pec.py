@@ -203,9 +203,10 @@ class PECExperiment:
         elif self.settings.frames == 1:
             phase = phase[None]
         limit, bits = self.settings.modulator.max_phase, self.settings.modulator.bits
-        if limit is not None:
-            phase = below(limit, phase, self.array.crosstalk)
-        return phase if bits is None else quantised(phase, bits)
+        if bits is not None:
+            phase = quantised(phase, bits)
+        # Last: rounding to the heaters' steps may pass the limit, scaling them all keeps their number.
+        return phase if limit is None else below(limit, phase, self.array.crosstalk)
 
     def stages(self) -> list[Stage]:
         """What the configured solver does, one run after another."""

@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -55,6 +56,30 @@ def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[in
         more = right.get_legend_handles_labels()
         handles, labels = handles + more[0], labels + more[1]
     axes.legend(handles, labels, fontsize=8, loc="center right")
+    return _png(figure)
+
+
+def curves(rows: Sequence[dict[str, Any]], title: str) -> bytes:
+    """PNG of SSIM against what a study sweeps, a line per method, a panel per kind of propagation."""
+    scored = [row for row in rows if row["ssim"] != ""]
+    kinds = list(dict.fromkeys(row["kind"] for row in scored))
+    figure = Figure(figsize=(7.5 * len(kinds), 4.2), layout="constrained")
+    for i, kind in enumerate(kinds):
+        axes = figure.add_subplot(1, len(kinds), i + 1)
+        own = [row for row in scored if row["kind"] == kind]
+        # Swept is sigma, or the setting where there is one.
+        places = list(dict.fromkeys((row["setting"], row["sigma_px"]) for row in own))
+        for k, method in enumerate(dict.fromkeys(row["method"] for row in own)):
+            points = [(places.index((r["setting"], r["sigma_px"])), r["ssim"]) for r in own if r["method"] == method]
+            axes.plot(*zip(*points, strict=True), "os^vD*PhX"[k % 9] + "-", label=method, markersize=5)
+        step = max(1, len(places) // 12)
+        words = [f"{setting}\n{sigma:g} px" if setting else f"{sigma:g} px" for setting, sigma in places]
+        axes.set_xticks(range(0, len(places), step), words[::step], fontsize=7, rotation=30 if step > 1 else 0)
+        axes.set_ylim(0, 1.02)
+        axes.set_ylabel("mean SSIM")
+        axes.set_title(f"{title}, {kind}", fontsize=9)
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=7)
     return _png(figure)
 
 

@@ -99,5 +99,6 @@ class Log:
             content = torch.load(self.path, weights_only=True)
             self.resume, self.rows = content["state"], content["rows"]
             self.checked, self.before = [tuple(pair) for pair in content["checked"]], content["seconds"]
-        except (OSError, RuntimeError, KeyError, ValueError, EOFError) as error:
-            raise ConfigError([f"{self.path} cannot be read: {error}; delete the folder and run again"]) from None
+        except Exception as error:  # what damaged bytes raise when unpickled is anyone's guess
+            reason = error.strerror if isinstance(error, OSError) else "it is damaged"
+            raise ConfigError([f"{self.path} cannot be read: {reason}; delete the folder and run again"]) from None

@@ -17,16 +17,21 @@ class DepthStack(nn.Module):
         filters: Propagators to each depth, of one grid, one set of wavelengths and one padded size.
 
     Raises:
-        ValueError: No filters, or ones that differ in these.
+        TypeError: A propagator that is no ``SpectralFilter``.
+        ValueError: No filters, ones that differ in these, or whose result has another grid than the field.
     """
 
     def __init__(self, filters: Sequence[SpectralFilter]):
         super().__init__()
         if not filters:
             raise ValueError("DepthStack needs at least one propagator")
+        if not all(isinstance(each, SpectralFilter) for each in filters):
+            raise TypeError("DepthStack needs propagators that are filters in frequency, such as Fresnel")
         first = filters[0]
+        if first.out_grid != first.grid:
+            raise ValueError("DepthStack needs propagators whose result has the grid of the field")
         for each in filters[1:]:
-            if (each.grid, each.wavelengths, each.kernel.shape) != (first.grid, first.wavelengths, first.kernel.shape):
+            if _kind(each) != _kind(first):
                 raise ValueError("DepthStack needs propagators of one grid, one set of wavelengths and one padded size")
         self.filters = nn.ModuleList(filters)
         self.grid, self.wavelengths = first.grid, first.wavelengths
@@ -39,7 +44,9 @@ class DepthStack(nn.Module):
 
     def adjoint(self, field: Tensor) -> Tensor:
         """Apply the conjugate transpose to ``field`` [..., C, D, H, W]."""
-        checks.field("field", field.movedim(-3, 0)[0], (len(self.wavelengths), *self.grid.shape))
+        wanted = len(self.wavelengths), len(self.filters), *self.grid.shape
+        if tuple(field.shape[-4:]) != wanted:
+            raise ValueError(f"field must end in (C, D, H, W) = {wanted}, got {tuple(field.shape)}")
         parts = zip(self._each(), field.unbind(-3), strict=True)
         return torch.stack([each.adjoint(part) for each, part in parts]).sum(0)
 
@@ -50,3 +57,7 @@ class DepthStack(nn.Module):
 
     def _each(self) -> list[SpectralFilter]:
         return [each for each in self.filters if isinstance(each, SpectralFilter)]
+
+
+def _kind(each: SpectralFilter) -> tuple:
+    return each.grid, each.out_grid, each.wavelengths, each.kernel.shape

@@ -7,11 +7,11 @@ import torch
 from scipy.optimize import nnls
 
 from holotorch import Grid
-from holotorch.correction import APG, PECProblem, ProjectedAdam, Solution, nonnegative
+from holotorch.correction import APG, LBFGS, PECProblem, ProjectedAdam, Solution, nonnegative
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import Fraunhofer
 
-SOLVERS = [APG(), ProjectedAdam()]
+SOLVERS = [APG(), ProjectedAdam(), LBFGS()]
 each_solver = pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: type(solver).__name__)
 
 
@@ -42,8 +42,12 @@ def pec_problem(channels: int = 2, dtype: torch.dtype = torch.float64) -> tuple[
 
 @pytest.mark.parametrize(
     "solver",
-    [APG(max_steps=3000, tolerance=1e-12), ProjectedAdam(learning_rate=0.01, max_steps=6000, tolerance=1e-12)],
-    ids=["APG", "ProjectedAdam"],
+    [
+        APG(max_steps=3000, tolerance=1e-12),
+        ProjectedAdam(learning_rate=0.01, max_steps=6000, tolerance=1e-12),
+        LBFGS(tolerance=1e-12),
+    ],
+    ids=["APG", "ProjectedAdam", "LBFGS"],
 )
 def test_finds_the_constrained_minimum_and_says_converged(solver):
     problem = LeastSquares(4)
@@ -85,6 +89,9 @@ def test_apg_takes_the_steps_of_algorithm_2():
 @each_solver
 def test_a_batch_gives_what_its_items_give_alone(solver):
     problem, start = pec_problem(1)
+    if isinstance(solver, LBFGS):
+        # From step to step rounding grows by a tenth, as does a change of the start by 1e-15: to 1e-11 in 40 steps.
+        solver = replace(solver, max_steps=40)
     starts = torch.stack([start, start.flip(-1) * 0.3, start * 2])
     together = solver(problem, starts)
     for i in range(3):
@@ -211,6 +218,9 @@ def test_apg_says_stalled_when_no_step_is_accepted_and_keeps_what_it_has():
         (lambda: APG(tolerance=float("nan")), "tolerance must be at least 0"),
         (lambda: ProjectedAdam(learning_rate=-0.1), "learning_rate must be above zero"),
         (lambda: ProjectedAdam(patience=0), "at least 1"),
+        (lambda: APG(grow=0.5), "grow must be at least 1"),
+        (lambda: LBFGS(memory=0), "memory must be at least 1"),
+        (lambda: LBFGS(first=0.0), "first must be above zero"),
     ],
 )
 def test_refuses_impossible_settings(make, message):

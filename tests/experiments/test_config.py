@@ -134,6 +134,27 @@ solver: {kind: apg, tolerance: .nan, start: warm}
         ("solver=3", "solver: expected settings, as in {key: value}, got 3"),
         ("seed=-1", "seed: expected greater than or equal to 0, got -1"),
         ("grid.shape=", "grid.shape: expected a whole number, got nothing"),
+        ("target.region=[33,48]", "target.region: expected at most the grid, (32, 48), got (33, 48)"),
+        ("target.region=[32,49]", "target.region: expected at most the grid, (32, 48), got (32, 49)"),
+        ("target.region=10", "target.region: expected at least 11 x 11 px for ssim, got (10, 10)"),
+        ("target.region=[12,0]", "target.region.1: expected greater than or equal to 1, got 0"),
+        ("target.regoin=12", "target.regoin: unknown setting; did you mean 'region'?"),
+        ("target.depths=band", "target.depths: expected 'bands' or 'full', got 'band'; did you mean 'bands'?"),
+        ("propagator={kind: fresnel, distance: [8 mm, 0]}", "distance.1: expected a distance of 1 um or more"),
+        ("propagator={kind: fresnel, distance: []}", "propagator.distance: expected"),
+        ("modulator.bits=0", "modulator.bits: expected greater than or equal to 1, got 0"),
+        ("modulator.bits=17", "modulator.bits: expected less than or equal to 16, got 17"),
+        ("modulator.bits=2.5", "modulator.bits: expected a whole number, got 2.5"),
+        (
+            "modulator.max_phase=9",
+            "modulator.max_phase: only the solver lbfgs keeps a limit; use 'solver={kind: lbfgs}",
+        ),
+        ("frames=0", "frames: expected greater than or equal to 1, got 0"),
+        ("frames=65", "frames: expected less than or equal to 64, got 65"),
+        ("frame=2", "frame: unknown setting; did you mean 'frames'?"),
+        ("multiplexing=jont", "expected 'joint' or 'independent', got 'jont'; did you mean 'joint'?"),
+        ("report.baselines=[ipecs]", "report.baselines.0: expected 'none', 'basic_ipec', 'ipec', 'chopping', "),
+        ("solver={kind: lbfgs, memory: 0}", "solver.memory: expected greater than or equal to 1, got 0"),
         ("seed", "expected key=value or key.sub=value"),
         ("seed.value=3", "'seed' is a single value and has no settings inside"),
         ("seed=[", "not valid YAML"),
@@ -172,6 +193,16 @@ def test_a_near_image_needs_a_pitch_of_about_a_wavelength(written):
         "image at a distance, got 5e-07 m"
     ]
     assert load_config(written(near), ["grid.pitch=0.57 um"]).grid.pitch == (0.57e-6, 0.57e-6)
+
+
+def test_a_region_goes_with_one_distance_and_may_be_small_without_ssim(written):
+    words = ["target.region=[12,12]", "propagator={kind: fresnel, distance: [8 mm, 9 mm]}"]
+    assert mistakes(written(GOOD), *words) == [
+        "argument 'target.region=[12,12]': target.region: expected one distance beside a region"
+    ]
+    assert load_config(written(GOOD), [words[0], "propagator={kind: fresnel, distance: [8 mm]}"])
+    assert load_config(written(GOOD), ["target.region=[5,4]", "report.metrics=psnr"]).target.region == (5, 4)
+    assert load_config(written(GOOD), ["target.region=12"]).target.region == (12, 12)
 
 
 def test_single_values_stand_for_lists(written):

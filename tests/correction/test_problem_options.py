@@ -1,0 +1,199 @@
+"""The options of PECProblem against plain numpy in float64, the limit on the heat, boxes."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from oracles import dense
+
+from holotorch import Grid
+from holotorch.correction import APG, LBFGS, Box, PECProblem, below, limited, run_stages, spread_preconditioner
+from holotorch.modulator import ThermalCrosstalk
+from holotorch.optics import DepthStack, Fraunhofer, Fresnel
+
+GRID, WAVES = Grid((6, 7), (5e-6, 4e-6)), (630e-9, 530e-9)
+DISTANCES = (0.1e-3, 0.25e-3)
+CROSSTALK, KERNEL = ThermalCrosstalk(0.9, 5), dense.heat_kernel(0.9, 5)
+pytestmark = pytest.mark.filterwarnings("ignore::holotorch.core.checks.SamplingWarning")
+
+OPTIONS = [
+    {name: value for name, value in zip(("mask", "scale_free", "amplitude", "frames", "depths"), chosen, strict=True)}
+    for chosen in itertools.product([False, True], repeat=5)
+]
+each_combination = pytest.mark.parametrize(
+    "options", OPTIONS, ids=lambda options: "+".join(name for name, on in options.items() if on) or "plain"
+)
+HEAT = {"limit": torch.tensor([2.0, 3.0], dtype=torch.float64), "limit_weight": 0.3, "power_weight": 0.02}
+
+
+def matrices(depths: bool) -> list[list[np.ndarray]]:
+    """Of channel c and depth d; a Fourier hologram has one."""
+    if not depths:
+        return [[dense.centred_unitary_dft(GRID.shape)] for _ in WAVES]
+    transfers = [[dense.fresnel_transfer(GRID.shape, GRID.pitch, wave, z) for z in DISTANCES] for wave in WAVES]
+    return [[dense.spectral_filter(GRID.shape, transfer) for transfer in row] for row in transfers]
+
+
+def setting(mask: bool, depths: bool, frames: bool, **options):
+    image = (2, *GRID.shape) if depths else GRID.shape
+    target = torch.rand(2, *image, dtype=torch.float64)
+    weights = torch.rand(image, dtype=torch.float64).round(decimals=1) if mask else None
+    filters = [Fresnel(GRID, WAVES, z, pad=1) for z in DISTANCES]
+    propagator = DepthStack(filters) if depths else Fraunhofer(GRID, WAVES)
+    problem = PECProblem(CROSSTALK, propagator, target, mask=weights, frames=frames, **options)
+    phase = torch.rand(3, 2, *([4] if frames else []), *GRID.shape, dtype=torch.float64) * 4
+    return problem, phase
+
+
+def loss_in_numpy(x, target, mask, operators, frames, scale_free, amplitude, limit, limit_weight, power_weight):
+    """Of one hologram and colour, from the docstring: x [F, H, W], target [D, H, W]."""
+    matrix = dense.convolution(GRID.shape, KERNEL)
+    spread = [matrix @ frame.ravel() for frame in x]
+    formed = [np.mean([np.abs(operator @ np.exp(1j * p)) ** 2 for p in spread], 0) for operator in operators]
+    u, i = np.stack(formed), target.reshape(len(operators), -1)
+    if amplitude:
+        u, i = np.sqrt(u), np.sqrt(i)
+    u, i = u * mask, i * mask
+    scale = (u * i).sum() / (u * u).sum() if scale_free else 1.0
+    over = sum((np.maximum(p - limit, 0) ** 2).sum() for p in spread)
+    return ((scale * u - i) ** 2).sum() + limit_weight * over + power_weight * x.sum()
+
+
+@each_combination
+def test_values(options):
+    problem, phase = setting(**options, **HEAT)
+    wanted = np.empty((3, 2))
+    for b, c in np.ndindex(3, 2):
+        x = phase[b, c].numpy().reshape(-1, *GRID.shape)
+        mask = 1.0 if problem.mask is None else problem.mask.numpy().reshape(1 + options["depths"], -1)
+        wanted[b, c] = loss_in_numpy(
+            x,
+            problem.target[c].numpy(),
+            mask,
+            matrices(options["depths"])[c],
+            options["frames"],
+            options["scale_free"],
+            options["amplitude"],
+            HEAT["limit"][c].item(),
+            0.3,
+            0.02,
+        )
+    np.testing.assert_allclose(problem(phase), wanted, rtol=1e-12)
+    assert CROSSTALK(phase).max() > 3  # the limit is at work
+
+
+@each_combination
+def test_gradcheck(options):
+    problem, phase = setting(**options, **HEAT)
+    assert problem(phase).shape == (3, 2)
+    assert torch.autograd.gradcheck(problem, (phase[:1].requires_grad_(),), fast_mode=True)
+
+
+def test_amplitude_has_a_finite_gradient_where_no_light_falls():
+    for dtype in (torch.float32, torch.float64):
+        target = torch.ones(1, 4, 4, dtype=dtype)
+        problem = PECProblem(ThermalCrosstalk(0), Fraunhofer(Grid(4, 9e-6), 530e-9), target, amplitude=True)
+        phase = torch.zeros(1, 4, 4, dtype=dtype, requires_grad=True)
+        (gradient,) = torch.autograd.grad(problem(phase).sum(), phase)
+        # Each of 16 samples changes by 1 / 4 in each of 16 pixels at most, times twice a residual of at most 4.
+        assert gradient.abs().max() <= 2 * 4 * 16 / 4
+
+
+def test_a_mask_may_be_of_one_channel_or_of_truth_values():
+    target, phase = torch.rand(2, *GRID.shape), torch.rand(2, *GRID.shape)
+    mask = torch.rand(GRID.shape) > 0.4
+    losses = [
+        PECProblem(CROSSTALK, Fraunhofer(GRID, WAVES), target, mask=m)(phase)
+        for m in (mask, mask.float(), mask[None].expand(2, -1, -1).double())
+    ]
+    torch.testing.assert_close(losses[0], losses[1], rtol=0, atol=0)
+    torch.testing.assert_close(losses[0], losses[2], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"mask": -torch.ones(6, 7)}, r"mask must be >= 0 and broadcast to the target \(2, 6, 7\)"),
+        ({"mask": torch.ones(3, 1, 6, 7)}, "mask must be >= 0 and broadcast"),
+        ({"mask": torch.ones(5, 7)}, "mask must be >= 0 and broadcast"),
+        ({"limit": 0.0}, "limit must be above zero in rad"),
+        ({"limit": torch.tensor([1.0, -1.0])}, "limit must be above zero in rad"),
+        ({"limit": math.nan}, "limit must be above zero in rad"),
+        ({"limit": torch.ones(3)}, "limit must be a number or one per channel"),
+    ],
+)
+def test_refuses_impossible_options(options, message):
+    with pytest.raises(ValueError, match=message):
+        PECProblem(CROSSTALK, Fraunhofer(GRID, WAVES), torch.ones(2, *GRID.shape), **options)
+
+
+@pytest.mark.parametrize("shape", [(2, 6, 7), (6, 7), (4, 2, 6, 7)])
+def test_frames_need_their_axis(shape):
+    problem = PECProblem(CROSSTALK, Fraunhofer(GRID, WAVES), torch.ones(2, *GRID.shape), frames=True)
+    with pytest.raises(ValueError, match=r"must (end in|give)"):
+        problem(torch.rand(shape))
+
+
+def test_a_target_of_several_depths_needs_an_image_of_them():
+    stack = DepthStack([Fresnel(GRID, WAVES, z, pad=1) for z in DISTANCES])
+    with pytest.raises(ValueError, match=r"give an image that ends in \(C, \*image\) = \(2, 3, 6, 7\)"):
+        PECProblem(CROSSTALK, stack, torch.ones(2, 3, 6, 7))(torch.rand(2, 6, 7))
+    with pytest.raises(ValueError, match=r"end in \(C, H, W\) = \(2, 6, 5\)"):
+        PECProblem(CROSSTALK, stack, torch.ones(2, 6, 5))(torch.rand(2, 6, 7))
+
+
+@pytest.mark.parametrize("sigma", [0.33, 0.66, 1.0, 2.0, 5.0])
+def test_below_never_passes_the_limit(sigma):
+    """Judged in float64; even and sharp pictures, as the rounding of a sum differs for both."""
+    crosstalk = ThermalCrosstalk(sigma)
+    for scale in (1e-3, 1.0, 77.0, 1e6):
+        phase = torch.rand(6, 3, 20, 21) * scale
+        phase[0], phase[1] = scale, (phase[1] > 0.98 * scale) * scale
+        for limit in (0.01, math.pi, 4 * math.pi, 1000 / 3):
+            held = below(limit, phase, crosstalk)
+            exact = crosstalk(held.double())
+            assert exact.max() <= limit and held.dtype == phase.dtype
+            cold = crosstalk(phase.double()).amax((-2, -1)) < 0.999 * limit
+            assert torch.equal(held[cold], phase[cold])
+            # Scaled no further than needed: what it leaves is 1e-6 and the rounding of the sum.
+            assert (exact.amax((-2, -1))[~cold] >= limit * (1 - 1e-3)).all()
+
+
+def test_limited_stages_end_near_the_limit():
+    image = torch.rand(1, 16, 16) ** 3
+    crosstalk = ThermalCrosstalk(0.66, 7)
+
+    def make(**options):
+        return PECProblem(crosstalk, Fraunhofer(Grid(16, 9e-6), 530e-9), image / image.mean(), **options)
+
+    limit = 2 * math.pi
+    start = torch.rand(1, 16, 16) * 2 * math.pi
+    solver = LBFGS(3, spread_preconditioner(crosstalk.kernel), max_steps=90, tolerance=0)
+    free, held = (run_stages(limited(make, solver, crosstalk.total, bound), start) for bound in (None, limit))
+    assert crosstalk(free.x).max() > 1.1 * limit
+    assert crosstalk(held.x).max() < 1.05 * limit and (held.x >= 0).all()
+    assert make()(below(limit, held.x, crosstalk)) < 0.5 * make()(below(limit, free.x, crosstalk))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_box_projects_element_by_element(dtype):
+    x = torch.randn(3, 2, 4, dtype=dtype)
+    lower = torch.tensor([-0.5, 0.0, 0.1, -math.inf], dtype=torch.float64)
+    upper = torch.tensor([[0.5], [0.2]])
+    for box in (Box(lower, upper), Box(lower), Box(-0.3, upper), Box(-0.3, 0.4)):
+        wanted = np.clip(x.numpy(), np.asarray(box.lower, x.numpy().dtype), np.asarray(box.upper, x.numpy().dtype))
+        found = box(x)
+        assert found.dtype == dtype
+        np.testing.assert_array_equal(found.numpy(), wanted)
+        assert torch.equal(box(found), found)
+
+
+@pytest.mark.parametrize("solver", [APG(), LBFGS()], ids=["APG", "LBFGS"])
+def test_solvers_keep_to_a_box_of_tensors(solver):
+    lower, upper = torch.rand(5, dtype=torch.float64) - 1, torch.rand(4, 1, dtype=torch.float64)
+    wanted = 2 * torch.randn(3, 4, 5, dtype=torch.float64)
+    box = Box(lower, upper)
+    solution = solver(lambda x: (x - wanted).square().sum((-2, -1)), torch.zeros_like(wanted), box)
+    torch.testing.assert_close(solution.x, box(wanted), rtol=0, atol=1e-6)
