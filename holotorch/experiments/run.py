@@ -105,16 +105,11 @@ def resume(folder: Path) -> tuple[Path, bool]:
     if (folder / "summary.json").is_file():
         print("this run is complete; nothing is left to do")
         return folder, True
-<<<<<<< ours
     settings = load_config(config)
     if not isinstance(settings, PECSettings):
         raise ConfigError([f"{folder} holds a study, which cannot be resumed; run it again"])
     experiment = build(settings)
-    return folder, _fill(folder, experiment, json.loads((folder / "plan.json").read_text()))
-=======
-    experiment = build(load_config(config))
     return folder, _fill(folder, experiment, plan(experiment))
->>>>>>> theirs
 
 
 def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
