@@ -43,17 +43,19 @@ def write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:
 
 def chart(subject: str, out: Path) -> list[str]:
     """Draw the chart of a subject into the folder ``out`` and return its verdict, line by line."""
-    if subject != "propagation":
-        raise ConfigError([f"no chart of {subject!r}; known: propagation"])
-    from holotorch.experiments.chart_propagation import propagation
-
+    if subject == "propagation":
+        from holotorch.experiments.chart_propagation import propagation as draw
+    elif subject == "pec":
+        from holotorch.experiments.chart_pec import pec as draw
+    else:
+        raise ConfigError([f"no chart of {subject!r}; known: pec, propagation"])
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError([f"cannot write to {out}: {error.strerror}; choose another place with --out"]) from None
-    rows, prediction, pictures, verdict = propagation()
+    rows, compared, pictures, verdict = draw()
     write_table(out / "chart.csv", rows)
-    write_table(out / "prediction.csv", prediction)
+    write_table(out / {"propagation": "prediction.csv", "pec": "comparison.csv"}[subject], compared)
     for name, data in pictures.items():
         write_bytes(out / f"{name}.png", data)
     write_text(out / "verdict.txt", "\n".join(verdict) + "\n")

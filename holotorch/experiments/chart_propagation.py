@@ -28,6 +28,7 @@ from holotorch.optics.propagate import kernel_of
 WAVELENGTH = 530e-9
 DISTANCES = (1e-3, 5e-3, 20e-3, 60e-3, 200e-3, 2.0)
 CASES = ((256, 8e-6), (512, 8e-6), (1024, 8e-6), (2048, 8e-6), (256, 3.74e-6), (512, 3.74e-6), (1024, 3.74e-6))
+SHOWN = (512, 8e-6)  # the case whose error is drawn against its time
 FEW_DISTANCES, LARGE = (5e-3, 60e-3, 2.0), 2000  # px from which only these are measured
 PEER_LIMIT = 512  # px up to which torchoptics is measured: it takes minutes beyond
 SOURCES = ("smooth", "slm", "white", "hard edge")
@@ -193,9 +194,9 @@ def _verdict(rows: list[dict], prediction: list[dict]) -> list[str]:
             if row["method"].startswith("planned, tol")
         }
         ratios = [row["ratio_to_bare"] / ours[row["size_px"], row["pitch_um"], row["distance_m"]] for row in peers]
-        at_512 = [ratio for row, ratio in zip(peers, ratios, strict=True) if row["size_px"] == 512]
+        at_512 = [ratio for row, ratio in zip(peers, ratios, strict=True) if row["size_px"] == SHOWN[0]]
         lines.append(
-            f"torchoptics takes {min(ratios):.1f} to {max(ratios):.1f} times as long as the planned way, at 512 px at "
+            f"torchoptics takes {min(ratios):.1f} to {max(ratios):.1f} times as long as the planned way, at {SHOWN[0]} px at "
             f"least {min(at_512):.1f} times"
         )
     checked = [row for row in prediction if 1e-6 < float(row["predicted"]) < 0.05]
@@ -215,7 +216,8 @@ def _verdict(rows: list[dict], prediction: list[dict]) -> list[str]:
 
 def _draw(rows: list[dict]) -> bytes:
     """Error against time, one panel per source and distance, at 512 px and 8 um."""
-    shown = [row for row in rows if row["size_px"] == 512 and row["pitch_um"] == 8]
+    size, pitch = SHOWN
+    shown = [row for row in rows if row["size_px"] == size and row["pitch_um"] == pitch * 1e6]
     names = list(dict.fromkeys(row["method"] for row in shown))
     figure = Figure(figsize=(3.2 * len(DISTANCES), 2.6 * len(SOURCES)), layout="constrained")
     panels = figure.subplots(len(SOURCES), len(DISTANCES), sharex=True, sharey=True)
@@ -226,10 +228,12 @@ def _draw(rows: list[dict]) -> bytes:
                 row = next(r for r in shown if (r["source"], r["distance_m"], r["method"]) == (kind, distance, name))
                 error = min(max(float(row["error"]), 1e-8), 10)
                 axes.loglog(row["ratio_to_bare"], error, "os^vD*PhX"[k % 9], color=f"C{k}", label=name, markersize=8)
-            crossovers = distance / unaliased_distance(Grid(512, 8e-6), WAVELENGTH, 2)
+            crossovers = distance / unaliased_distance(Grid(size, pitch), WAVELENGTH, 2)
             axes.set_title(f"{kind}, {distance * 1e3:g} mm = {crossovers:.2g} z_c", fontsize=9)
             axes.grid(alpha=0.3)
-    figure.supxlabel("time of one call / time of two bare FFTs at pad 2 (512 px, 8 um, 530 nm, complex64)")
+    figure.supxlabel(
+        f"time of one call / time of two bare FFTs at pad 2 ({size} px, {pitch * 1e6:g} um, 530 nm, complex64)"
+    )
     figure.supylabel("relative L2 error")
     handles, labels = panels[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=4, fontsize=9)

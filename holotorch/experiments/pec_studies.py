@@ -80,13 +80,14 @@ def iterations(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
     for sigma in tqdm(sigmas, desc="iterations", unit="sigma"):
         own = replace(bench, sigma_px=sigma)
         for name in ("PPEC", "ours"):
-            track = Track(own, every=10)
+            every = max(1, steps // 40)
+            track = Track(own, every)
             start = own.start("hot")
             own.algorithm2(start, steps=steps, callback=track) if name == "PPEC" else own.lbfgs(
                 start, steps=steps, callback=track
             )
             for k, (seconds, evaluations, quality) in enumerate(track.rows):
-                setting = f"step {10 * (k + 1)}"
+                setting = f"step {every * (k + 1)}"
                 rows.append(_row(own, name, {"ssim": quality}, seconds) | {"setting": setting, "count": evaluations})
     return rows
 

@@ -42,7 +42,8 @@ def test_2048_samples_in_single_precision():
     scale = field.detach().abs().max()
     assert (ifft2(fft2(field)) - field).abs().max() < 1e-5 * scale
     assert (centred_ifft2(centred_fft2(field)) - field).abs().max() < 1e-5 * scale
-    assert abs(centred_fft2(field.detach()).norm() / field.detach().norm() - 1) < 1e-5
+    power = centred_fft2(field.detach()).to(torch.complex128).norm() / field.detach().to(torch.complex128).norm()
+    assert abs(power - 1) < 1e-5  # summed in double precision: in single, 4e-5 are lost on one thread
     (gradient,) = torch.autograd.grad(centred_fft2(field).abs().square().sum(), field)
     assert (gradient - 2 * field).abs().max() < 1e-5 * scale
     (gradient,) = torch.autograd.grad(ifft2(fft2(field)).abs().square().sum(), field)

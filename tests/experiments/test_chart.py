@@ -10,7 +10,8 @@ from holotorch.experiments.chart import interleaved
 
 
 def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(chart_propagation, "CASES", ((512, 8e-6), (64, 8e-6)))
+    monkeypatch.setattr(chart_propagation, "CASES", ((48, 8e-6), (64, 8e-6)))
+    monkeypatch.setattr(chart_propagation, "SHOWN", (64, 8e-6))
     monkeypatch.setattr(chart_propagation, "DISTANCES", (1e-3, 60e-3))
     monkeypatch.setattr(chart_propagation, "PREDICTION_CASES", 3)
     assert main(["chart", "propagation", "--out", str(tmp_path / "c")]) == 0
@@ -26,7 +27,7 @@ def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
 
 def test_unknown_subject(tmp_path, capsys):
     assert main(["chart", "propagatoin", "--out", str(tmp_path)]) == 2
-    assert "no chart of 'propagatoin'; known: propagation" in capsys.readouterr().err
+    assert "no chart of 'propagatoin'; known: pec, propagation" in capsys.readouterr().err
 
 
 def test_contenders_take_turns():

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from holotorch.experiments.config import PECSettings, load_config
+from holotorch.experiments.config import PECSettings, StudySettings, load_config
 from holotorch.experiments.errors import ConfigError
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -37,7 +37,7 @@ def mistakes(path: Path, *overrides: str) -> list[str]:
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.rglob("*.yaml")), ids=lambda path: path.stem)
 def test_every_config_of_the_project_loads(path):
-    assert isinstance(load_config(path), PECSettings)
+    assert isinstance(load_config(path), PECSettings | StudySettings)
 
 
 @pytest.mark.parametrize(
@@ -171,8 +171,8 @@ def test_overrides_get_the_same_messages(written, override, message):
     [
         ("", "1:1: the file is empty; expected settings such as 'experiment: pec'"),
         ("[1, 2]", "1:1: expected settings such as 'experiment: pec', got [1, 2]"),
-        ("seed: 1\n", "1:1: experiment: expected one of pec, it is missing"),
-        ("experiment: pek\n", "1:1: experiment: expected one of pec, got 'pek'; did you mean 'pec'?"),
+        ("seed: 1\n", "1:1: experiment: expected one of pec, pec_study, it is missing"),
+        ("experiment: pek\n", "1:1: experiment: expected one of pec, pec_study, got 'pek'; did you mean 'pec'?"),
         (GOOD + "seed: 1\nseed: 2\n", "9:1: seed: written twice; keep one"),
         (GOOD + "seed: {\n", "9:1: not valid YAML: "),
         (GOOD.replace("kind: apg", "kind: [1]"), "solver.kind: expected one of apg, adam"),
