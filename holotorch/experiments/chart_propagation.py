@@ -196,8 +196,8 @@ def _verdict(rows: list[dict], prediction: list[dict]) -> list[str]:
         ratios = [row["ratio_to_bare"] / ours[row["size_px"], row["pitch_um"], row["distance_m"]] for row in peers]
         at_512 = [ratio for row, ratio in zip(peers, ratios, strict=True) if row["size_px"] == SHOWN[0]]
         lines.append(
-            f"torchoptics takes {min(ratios):.1f} to {max(ratios):.1f} times as long as the planned way, at {SHOWN[0]} px "
-            f"at least {min(at_512):.1f} times"
+            f"torchoptics takes {min(ratios):.1f} to {max(ratios):.1f} times as long as the planned way, at "
+            f"{SHOWN[0]} px at least {min(at_512):.1f} times"
         )
     checked = [row for row in prediction if 1e-6 < float(row["predicted"]) < 0.05]
     factors = [float(row["true"]) / float(row["predicted"]) for row in checked]
