@@ -11,6 +11,8 @@ class Plan:
         method: Name of the method.
         pad: Padding factor (y, x) actually used.
         padded: Samples (y, x) of the transforms.
+        precision: Of the fields that the plan is for, "complex64" or "complex128".
+        window: Samples (y, x), pitch and centre of the result, in metres.
         predicted_error: Expected relative L2 error of the result for the described content.
         memory_bytes: Largest extra memory of one call with its kernel, for one channel.
         flops: Arithmetic of one call with the kernel at hand, for one channel.
@@ -22,6 +24,8 @@ class Plan:
     method: str
     pad: tuple[float, float]
     padded: tuple[int, int]
+    precision: str
+    window: tuple[tuple[int, int], tuple[float, float], tuple[float, float]]
     predicted_error: float
     memory_bytes: int
     flops: float

@@ -71,8 +71,9 @@ Wavelength = Annotated[Length, _within(1e-7, 2e-5, "a wavelength between 100 nm 
 Pitch = Annotated[Length, _within(1e-9, 1e-3, "a pitch between 1 nm and 1 mm")]
 
 
-# "hot": phases uniform on [0, 2 pi); "cool": their spread is; "flat": on [0, 1); "quadratic": a lens, after spreading.
-Start = Literal["hot", "cool", "flat", "quadratic"]
+# "hot": phases uniform on [0, 2 pi); "cool": their spread is; "flat": on [0, 1); "quadratic": a lens, after spreading;
+# "retrieved": phases of Gerchberg-Saxton, deconvolved.
+Start = Literal["hot", "cool", "flat", "quadratic", "retrieved"]
 Side = Annotated[Count, Field(le=16384)]
 
 

@@ -21,6 +21,8 @@ from holotorch.correction import (
     Solution,
     Stage,
     below,
+    deconvolve,
+    gerchberg_saxton,
     limited,
     run_stages,
     spread_preconditioner,
@@ -193,7 +195,20 @@ class PECExperiment:
             y, x = y / self.grid.pitch[0], x / self.grid.pitch[1]
             lens = math.pi * (y.square() / height + x.square() / width)  # its slope at the edge is pi per pixel
             return (lens / spread + 0.01 * uniform).to(uniform.dtype)
+        if self.start == "retrieved":
+            return self._retrieved(2 * math.pi * uniform)
         return uniform * {"hot": 2 * math.pi, "cool": 2 * math.pi / spread, "flat": 1.0}[self.start]
+
+    def _retrieved(self, begin: Tensor) -> Tensor:
+        """Phases of 30 passes of Gerchberg-Saxton from random image phases, deconvolved, shaped as ``begin``."""
+        propagator = self.propagator
+        if isinstance(propagator, DepthStack):
+            raise ValueError("a retrieved start needs one distance; use another solver.start")
+        frames = begin.movedim(1, 0) if self.joint else begin
+        mask = None if self.mask is None else self.mask.to(begin)
+        found = gerchberg_saxton(propagator, self.target.to(begin), frames, max_steps=30, mask=mask)
+        phase = deconvolve(self.array.crosstalk, found.x, max_steps=100)
+        return phase.movedim(0, 1).contiguous() if self.joint else phase
 
     def frames_of(self, unknown: Tensor) -> Tensor:
         """Heater phases [F, C, H, W] of the solver's unknown, within the limit and in the heaters' steps."""

@@ -105,6 +105,7 @@ _START_REASONS = {
     "hot": "phases uniform on [0, 2 pi): light everywhere",
     "flat": "phases uniform on [0, 1): a nearly plane wave keeps its light in the window",
     "cool": "spread phases uniform on [0, 2 pi): the least heat",
+    "retrieved": "phases of Gerchberg-Saxton, deconvolved",
     "quadratic": "a lens after spreading, slope pi per pixel at the edge: much heat, few vortices",
 }
 

@@ -65,6 +65,30 @@ class ThermalCrosstalk(nn.Module):
         self.sigma_px, self.size_is_given = math.nan, True
         return self
 
+    @classmethod
+    def fitted(cls, patch: Tensor, size: int | None = None) -> "ThermalCrosstalk":
+        """Build from the Gaussian exp(-d^2 / sigma^2) that fits a measured response [h, w] best, as thesis Sec. 4.3.2.
+
+        The patch is as for :meth:`from_patch`, and larger than one pixel; ``size`` is that of the constructor. Least
+        squares in the rises themselves, so that the noise of the cold rim counts as what it is. Raises ValueError as
+        ``from_patch``, and for a patch that does not fall off.
+        """
+        measured = cls.from_patch(patch).kernel
+        y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in measured.shape)
+        square = y[:, None] ** 2 + x**2
+        if not (measured[square > 0] < 1).any():
+            raise ValueError("patch must fall off from its centre to be fitted")
+        low, high = 1e-2, _WIDEST**2
+        for _ in range(60):  # of the error's slope in 1 / sigma^2, bisected: it changes sign once
+            middle = math.sqrt(low * high)
+            model = torch.exp(-square / middle)
+            # d/ds of sum (exp(-d^2 / s) - k)^2, up to a positive factor
+            if ((model - measured) * model * square).sum() > 0:
+                high = middle
+            else:
+                low = middle
+        return cls(math.sqrt(low), size)
+
     @property
     def kernel(self) -> Tensor:
         """The two-dimensional kernel, float64 [h, w], centre 1."""

@@ -52,8 +52,9 @@ def plan_propagation(
         ValueError: Impossible numbers, or more memory than ``memory_limit``; the message says how to tile.
     """
     waves = checks.wavelengths(wavelength)
+    path = passage(grid, out_grid, offset, tilt, waves)
     found = find(
-        passage(grid, out_grid, offset, tilt, waves),
+        path,
         waves,
         [checks.finite("distance", z, "metres") for z in _listed(distance)],
         band=band,
@@ -62,7 +63,7 @@ def plan_propagation(
         field=field,
         dtype=dtype,
     )
-    return plan_from(found, grid, tolerance, memory_limit)
+    return plan_from(found, path, tolerance, memory_limit, dtype)
 
 
 def find(
@@ -84,7 +85,13 @@ def find(
     return candidates(path, waves, distances, content, dtype)
 
 
-def plan_from(found: list[Candidate], grid: Grid, tolerance: float, memory_limit: int | None = None) -> Plan:
+def plan_from(
+    found: list[Candidate],
+    path: Passage,
+    tolerance: float,
+    memory_limit: int | None = None,
+    dtype: torch.dtype = torch.complex64,
+) -> Plan:
     """The plan for the best of ``found``."""
     best, second = choose(found, checks.positive("tolerance", tolerance))
     adequate = best.error <= tolerance
@@ -100,9 +107,20 @@ def plan_from(found: list[Candidate], grid: Grid, tolerance: float, memory_limit
         f"{best.method} on {size} is {verdict} of {len(found)} ways: predicted error {best.error:.1e} for a tolerance "
         f"of {tolerance:.1e}"
     )
-    pad = best.padded[0] / grid.shape[0], best.padded[1] / grid.shape[1]
+    pad = best.padded[0] / path.grid.shape[0], best.padded[1] / path.grid.shape[1]
+    precision, window = str(dtype).removeprefix("torch."), (path.out.shape, path.out.pitch, path.offset)
     return Plan(
-        best.method, pad, best.padded, best.error, best.memory, best.flops, reason, _lost(best, second), adequate
+        best.method,
+        pad,
+        best.padded,
+        precision,
+        window,
+        best.error,
+        best.memory,
+        best.flops,
+        reason,
+        _lost(best, second),
+        adequate,
     )
 
 

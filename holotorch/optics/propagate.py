@@ -177,7 +177,7 @@ class Propagator(nn.Module):
         self.grid, self.out_grid, self.offset, self.tilt = grid, path.out, path.offset, path.tilt
         content: dict[str, Any] = {"band": band, "spread": spread, "margin": margin, "field": example}
         found = find(path, self.wavelengths, [self.distance], **content)
-        self.plan = plan_from(found, grid, tolerance, memory_limit)
+        self.plan = plan_from(found, path, tolerance, memory_limit)
         way = _best(found, tolerance)
         if not path.same_pitch and way.method != _ZOOMED:
             self.operator = ResampledKernel(

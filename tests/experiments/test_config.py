@@ -109,7 +109,7 @@ solver: {kind: apg, tolerance: .nan, start: warm}
         "7:14: propagator.kind: expected one of fraunhofer, fresnel, angular_spectrum, got 'fresnl'; "
         "did you mean 'fresnel'?",
         "8:21: solver.tolerance: expected a finite number, got NaN",
-        "8:38: solver.start: expected 'hot', 'cool', 'flat' or 'quadratic', got 'warm'",
+        "8:38: solver.start: expected 'hot', 'cool', 'flat', 'quadratic' or 'retrieved', got 'warm'",
     ]
 
 

@@ -120,3 +120,23 @@ def test_refuses_a_vector():
 
 def test_prints_its_width():
     assert repr(ThermalCrosstalk(0.66, 7)) == "ThermalCrosstalk(sigma_px=0.66, taps=(7, 7))"
+
+
+@pytest.mark.parametrize("sigma", [0.4, 0.66, 1.0, 2.3])
+def test_fit_finds_the_width_of_a_measured_patch(sigma):
+    y, x = torch.meshgrid(torch.arange(-3.0, 4), torch.arange(-2.0, 3), indexing="ij")
+    clean = 180 * torch.exp(-(y**2 + x**2).double() / sigma**2)
+    assert ThermalCrosstalk.fitted(clean).sigma_px == pytest.approx(sigma, rel=1e-9)
+    if sigma < 0.6:
+        return  # the neighbours are 0.2 % warm then, and drown in the noise below
+    noisy = (clean + 1.8 * torch.randn(clean.shape, dtype=torch.float64)).clamp(min=0)
+    noisy[3, 2] = 180  # the heated pixel itself is known well
+    # 1 % noise on each of 34 pixels, of which those around the centre carry the width.
+    assert ThermalCrosstalk.fitted(noisy, 7).sigma_px == pytest.approx(sigma, rel=0.05)
+
+
+def test_fit_refuses_what_has_no_width():
+    with pytest.raises(ValueError, match="must fall off"):
+        ThermalCrosstalk.fitted(torch.ones(3, 3))
+    with pytest.raises(ValueError, match="patch must have two odd sizes"):
+        ThermalCrosstalk.fitted(torch.ones(2, 3))

@@ -220,6 +220,7 @@ def test_spread_says_the_same_as_band():
 def test_what_a_plan_says_of_other_windows():
     plan = plan_propagation(Grid(512, 8e-6), WAVE, 0.2, out_grid=Grid(64, 2e-6))
     assert plan.method == "resampled kernel" and plan.adequate
+    assert plan.window == ((64, 64), (2e-6, 2e-6), (0.0, 0.0)) and plan.precision == "complex64"
     # A smooth field nearby, read at many points: its spectrum is summed rather than every pair of samples.
     many = plan_propagation(
         Grid(2048, 8e-6), WAVE, 0.02, out_grid=Grid(2048, 5e-6), band=(1e4, 1e4), margin=(2e-3, 2e-3)
