@@ -23,8 +23,10 @@ class PECProblem(nn.Module):
         scale_free: Compare s U with I instead, s = <U, I> / <U, U> the best scale of each hologram and colour. For
             light that may leave the window or the mask; report the efficiency beside the result.
         amplitude: Compare sqrt(U) with sqrt(I) instead, whose gradient does not vanish where U is dark.
-        frames: The unknown is [..., C, F, H, W], F frames shown in turn, and U the mean of their intensities.
-        limit: Upper limit on P(X) in rad, the temperature that the chip really reaches; a number or [C].
+        frames: The unknown is [..., C, F, H, W], F frames shown in turn, and U the mean of their intensities. A run's
+            ``phase.npy`` is [F, C, H, W].
+        limit: In rad, a number or [C]: from here on P(X), the temperature that the chip really reaches, is penalised. A
+            penalty alone does not keep it: ``limited`` with ``below`` does.
         limit_weight: Weight of the penalty || max(P(X) - limit, 0) ||^2 that is added.
         power_weight: Weight of the sum of X, the heating power, that is added.
 
