@@ -1,7 +1,7 @@
 """Image quality, one value per image and channel."""
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from holotorch.core import checks
 
@@ -41,6 +41,43 @@ def ssim(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
     images, references = (tensor.reshape(-1, 1, height, width) for tensor in (image, reference))
     scores = ssim_map(images, references, SSIM_WINDOW, float(data_range), eps=0.0, padding="valid")
     return scores.mean((-3, -2, -1)).reshape(image.shape[:-2])
+
+
+class PerceptualSimilarity(nn.Module):
+    """s = exp(-d) of the learned distance d (LPIPS) of two images, 1 for equal ones, as in the thesis's Fig. 4.17.
+
+    Needs the extra ``lpips`` and AlexNet's published weights, which its first use downloads to torch's cache.
+
+    Raises:
+        ImportError: The extra is missing.
+        OSError: The weights are neither in the cache nor to be had.
+
+    Source: Zhang et al. (2018).
+    """
+
+    def __init__(self):
+        super().__init__()
+        try:
+            from lpips import LPIPS  # pyright: ignore[reportMissingImports]
+        except ImportError as error:
+            raise ImportError(
+                "LPIPS is an extra of holotorch; install it with: pip install 'holotorch[lpips]'"
+            ) from error
+        self.distance = LPIPS(net="alex", verbose=False).requires_grad_(False)
+
+    def forward(self, image: Tensor, reference: Tensor) -> Tensor:
+        """[...] for images [..., C, H, W] with values in 0..1; C is 3, or 1, which is shown as grey.
+
+        ValueError for unequal shapes or another C.
+        """
+        _check_pair(image, reference, 1.0)
+        if image.ndim < 3 or image.shape[-3] not in (1, 3):
+            raise ValueError(f"images must be grey or red, green, blue, [..., 1 or 3, H, W], got {tuple(image.shape)}")
+        pair = (
+            part.expand(*part.shape[:-3], 3, -1, -1).reshape(-1, 3, *part.shape[-2:]) for part in (image, reference)
+        )
+        distances = self.distance(*(2 * part.float() - 1 for part in pair))
+        return torch.exp(-distances).reshape(image.shape[:-3]).to(image.dtype)
 
 
 def _check_pair(image: Tensor, reference: Tensor, data_range: float) -> None:

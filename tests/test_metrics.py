@@ -1,9 +1,12 @@
+import sys
+from types import ModuleType
+
 import numpy as np
 import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from holotorch.metrics import psnr, ssim
+from holotorch.metrics import PerceptualSimilarity, psnr, ssim
 
 
 def pair(dtype=torch.float64, shape=(2, 3, 40, 33)):
@@ -58,3 +61,36 @@ def test_refuses_pairs_that_do_not_match():
         psnr(torch.rand(12, 12), torch.rand(12, 12), data_range=0.0)
     with pytest.raises(TypeError):
         psnr(torch.rand(12, 12), torch.rand(12, 12))  # type: ignore[call-arg]
+
+
+class _Distance(torch.nn.Module):
+    """Stands in for the network: the mean absolute difference of colours in -1..1."""
+
+    def __init__(self, net: str, verbose: bool):
+        super().__init__()
+        assert net == "alex"
+
+    def forward(self, image, reference):
+        assert image.shape[1] == 3 and image.min() >= -1 and image.max() <= 1
+        return (image - reference).abs().mean((1, 2, 3), keepdim=True)
+
+
+def test_perceptual_similarity_shows_the_network_what_it_was_trained_on(monkeypatch):
+    module = ModuleType("lpips")
+    monkeypatch.setitem(sys.modules, "lpips", module)
+    module.LPIPS = _Distance  # pyright: ignore[reportAttributeAccessIssue]
+    similarity = PerceptualSimilarity()
+    image, reference = pair(shape=(2, 5, 1, 16, 20))
+    scores = similarity(image, reference)
+    assert scores.shape == (2, 5) and scores.dtype == torch.float64
+    wanted = torch.exp(-2 * (image - reference).abs().mean((-3, -2, -1)))
+    assert torch.allclose(scores, wanted, rtol=1e-5)  # the network works in float32
+    assert torch.equal(similarity(image, image), torch.ones(2, 5, dtype=torch.float64))
+    with pytest.raises(ValueError, match="grey or red, green, blue"):
+        similarity(torch.rand(2, 16, 16), torch.rand(2, 16, 16))
+
+
+def test_perceptual_similarity_names_its_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "lpips", None)
+    with pytest.raises(ImportError, match=r"pip install 'holotorch\[lpips\]'"):
+        PerceptualSimilarity()

@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+_LONGEST = 0.1  # metres; longer is a forgotten unit
+
 
 class SamplingWarning(UserWarning):
     """A grid is too coarse or too small for what it is asked to carry; the message says what would do."""
@@ -45,12 +47,23 @@ def whole(name: str, value: int, least: int) -> int:
     return int(value)
 
 
+def pair(name: str, values: Sequence[float], unit: str = "") -> tuple[float, float]:
+    """Return two finite numbers (y, x) as floats, or raise TypeError for what is no pair of numbers."""
+    items = values if isinstance(values, Sequence) and not isinstance(values, str) else ()
+    if len(items) != 2:
+        raise TypeError(f"{name} must be two numbers (y, x){_in(unit)}, got {values!r}")
+    return finite(name, items[0], unit), finite(name, items[1], unit)
+
+
 def wavelengths(values: float | Sequence[float]) -> tuple[float, ...]:
     """Return wavelengths in metres as a tuple, one per channel; a single number means one channel."""
     items: list[Any] = [values] if _scalar(values) else list(values)  # type: ignore[arg-type]
     if not items:
         raise ValueError("wavelengths must hold at least one value in metres, got none")
-    return tuple(positive("wavelength", item, "metres") for item in items)
+    found = tuple(positive("wavelength", item, "metres") for item in items)
+    if max(found) > _LONGEST:
+        raise ValueError(f"wavelength must be that of light in metres, got {max(found):g}; 530 nm is 530e-9")
+    return found
 
 
 def field(name: str, value: Tensor, shape: tuple[int, ...], *, complex_valued: bool = True) -> None:

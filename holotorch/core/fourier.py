@@ -78,6 +78,36 @@ def multiplied(spectrum: Tensor, kernel: Tensor) -> Tensor:
     return spectrum.mul_(kernel) if fits and not kernel.requires_grad else spectrum * kernel
 
 
+def even_fft2(quadrant: Tensor, size: tuple[int, int]) -> Tensor:
+    """One quadrant [H // 2 + 1, W // 2 + 1] of the transform of an array of ``size`` (H, W) that is even in both axes.
+
+    ``quadrant`` [h, w] holds the array's own first quadrant, h <= H // 2 + 1 and w <= W // 2 + 1; it is zero beyond.
+    Half the work of the whole transform.
+    """
+    (height, width), (rows, columns) = size, quadrant.shape[-2:]
+    # Along x on the rows that are not zero, then along y on the columns that are asked for.
+    whole = quadrant.new_zeros(*quadrant.shape[:-1], width)
+    whole[..., :columns] = quadrant
+    mirrored = min(columns, (width + 1) // 2)
+    whole[..., width - mirrored + 1 :] = quadrant[..., 1:mirrored].flip(-1)
+    half = torch.fft.fft(whole)[..., : width // 2 + 1]
+    whole = half.new_zeros(*half.shape[:-2], height, half.shape[-1])
+    whole[..., :rows, :] = half
+    mirrored = min(rows, (height + 1) // 2)
+    whole[..., height - mirrored + 1 :, :] = half[..., 1:mirrored, :].flip(-2)
+    return torch.fft.fft(whole, dim=-2)[..., : height // 2 + 1, :]
+
+
+def multiply_even(spectrum: Tensor, quadrant: Tensor) -> Tensor:
+    """``spectrum`` [..., H, W] times an even array given by its first quadrant, in the spectrum's memory."""
+    height, width = spectrum.shape[-2:]
+    right = quadrant[..., 1 : (width + 1) // 2].flip(-1)
+    for part, columns in ((quadrant, slice(0, width // 2 + 1)), (right, slice(width // 2 + 1, width))):
+        spectrum[..., : height // 2 + 1, columns].mul_(part)
+        spectrum[..., height // 2 + 1 :, columns].mul_(part[..., 1 : (height + 1) // 2, :].flip(-2))
+    return spectrum
+
+
 def convolve(image: Tensor, kernel: Tensor) -> Tensor:
     """Linear convolution, zero outside ``image``, cropped to its size; the kernel's origin is its sample ``n // 2``.
 

@@ -1,7 +1,9 @@
 """What the rest of the library calls a linear operator."""
 
+from collections.abc import Callable
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 
@@ -15,3 +17,19 @@ class LinearOperator(Protocol):
     def adjoint(self, field: Tensor, /) -> Tensor:
         """Apply the conjugate transpose."""
         ...
+
+
+def linear(x: Tensor, apply: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor]) -> Tensor:
+    """``apply(x)`` with ``adjoint`` as its derivative, of any order, whatever either does inside; keeps no tensor."""
+    return _Linear.apply(x, apply, adjoint)  # type: ignore[return-value]
+
+
+class _Linear(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x: Tensor, apply: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor]) -> Tensor:
+        ctx.maps = adjoint, apply
+        return apply(x)
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor):
+        return _Linear.apply(gradient, *ctx.maps), None, None

@@ -58,7 +58,7 @@ class LBFGS:
     ) -> Solution:
         """Minimise ``objective`` within the box ``project``, from ``start`` [..., *unknown]; else as ``APG``."""
         rule = {"max_steps": self.max_steps, "tolerance": self.tolerance, "patience": self.patience}
-        run = Run(objective, project(start), **rule, resume=resume)
+        run = Run(objective, start, project, **rule, resume=resume)
         gradient = run.extra.get("gradient", run.gradient)
         memory = _Memory(self.memory, run)
         flat = (*memory.s.shape[:1], -1)

@@ -70,6 +70,7 @@ class Run:
         self,
         objective: Objective,
         start: Tensor,
+        project: Projection,
         *,
         max_steps: int,
         tolerance: float,
@@ -79,7 +80,7 @@ class Run:
         checks.real("start", start)
         checks.all_finite("start", start)
         self.objective, self.tolerance, self.patience = objective, tolerance, patience
-        self.x, self.evaluations = start.detach(), 0
+        self.x, self.evaluations = project(start.detach()), 0
         loss, self.gradient = self.value_and_gradient(self.x)
         if loss.shape != self.x.shape[: loss.ndim] or loss.ndim == self.x.ndim:
             raise ValueError(

@@ -60,7 +60,7 @@ class APG:
         ``callback`` sees the state after every step; ``resume`` is the ``state`` of an earlier solution.
         """
         rule = {"max_steps": self.max_steps, "tolerance": self.tolerance, "patience": self.patience}
-        run = Run(objective, project(start), **rule, resume=resume)
+        run = Run(objective, start, project, **rule, resume=resume)
         previous = run.extra.get("previous", run.x)
         step = run.extra.get("step_length", torch.full_like(run.loss, self.step))
         count = run.extra.get("count", torch.zeros_like(run.loss))
@@ -134,7 +134,7 @@ class ProjectedAdam:
     ) -> Solution:
         """Minimise ``objective`` as :meth:`APG.__call__` does."""
         rule = {"max_steps": self.max_steps, "tolerance": self.tolerance, "patience": self.patience}
-        run = Run(objective, project(start), **rule, resume=resume)
+        run = Run(objective, start, project, **rule, resume=resume)
         gradient = run.extra.get("gradient", run.gradient)
         mean = run.extra.get("mean", torch.zeros_like(run.x))
         square = run.extra.get("square", torch.zeros_like(run.x))

@@ -109,12 +109,14 @@ class ModulatorSettings(Settings):
 
     ``max_phase``: limit in rad on the phase after spreading, which the hottest pixel never passes (4 pi is 700 degC at
     630 nm); no limit is the thesis's model. ``bits``: resolution of the heaters, between 0 and their largest phase.
+    ``power_weight``: of the sum of the heater phases in the loss, whose other part is a squared error of the image.
     """
 
     sigma_px: Annotated[Number, Field(ge=0, le=100)]
     kernel_size: Annotated[Count, Field(le=401)] | None = None
     max_phase: Annotated[Number, Field(ge=0.1, le=1000)] | None = None
     bits: Annotated[Count, Field(le=16)] | None = None
+    power_weight: Annotated[Number, Field(ge=0, le=1e6)] = 0.0
 
 
 class FraunhoferSettings(Settings):

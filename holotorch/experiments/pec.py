@@ -171,6 +171,7 @@ class PECExperiment:
             mask=mask,
             scale_free=self.scale_free,
             frames=self.joint,
+            power_weight=self.settings.modulator.power_weight,
             **options,
         )
 

@@ -29,7 +29,7 @@ from holotorch.correction import (
 from holotorch.correction.problem import best_scale
 from holotorch.correction.run import Callback
 from holotorch.io.images import fit_image, load_image
-from holotorch.metrics import psnr, ssim
+from holotorch.metrics import PerceptualSimilarity, psnr, ssim
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import CroppedKernel, DepthStack, Fraunhofer, Fresnel
 
@@ -56,6 +56,7 @@ class Bench:
         region: Pixels of a signal region, or 0 for the whole window.
         distances: Of the image, for the two kinds that have any; several make a scene of as many bands.
         lowpass: Cut-off of a Butterworth filter on the targets in cycles per pixel, or 0 for none.
+        perceptual: Scores the pictures too, where it can be had.
     """
 
     images: Sequence[str] = PHOTOGRAPHS
@@ -65,6 +66,7 @@ class Bench:
     region: int = 0
     distances: tuple[float, ...] = (DISTANCE,)
     lowpass: float = 0.0
+    perceptual: PerceptualSimilarity | None = None
 
     @cached_property
     def image(self) -> Tensor:
@@ -155,6 +157,7 @@ class Bench:
         steps: int = 300,
         limit: float | None = None,
         tolerance: float = 1e-4,
+        power_weight: float = 0.0,
         callback: Callback | None = None,
     ) -> Solution:
         """Our staged solver, joint where the start has frames."""
@@ -162,7 +165,7 @@ class Bench:
         solver = LBFGS(precondition=spread_preconditioner(self.crosstalk.kernel), max_steps=steps, tolerance=tolerance)
 
         def make(**options) -> PECProblem:
-            return self.problem(frames=frames, **options)
+            return self.problem(frames=frames, power_weight=power_weight, **options)
 
         found = run_stages(limited(make, solver, self.crosstalk.total, limit), start, callback=callback)
         return found if limit is None else replace(found, x=below(limit, found.x, self.crosstalk))
@@ -216,7 +219,10 @@ class Bench:
         if self.scale_free:
             formed = formed * best_scale(formed, self.wanted)[:, None, None]
         picture = (formed * self.image.mean((-2, -1), keepdim=True)).clamp(0, 1)
-        return {
+        learned = {}
+        if self.perceptual is not None:
+            learned = {"perceptual": self.perceptual(picture[:, None], self.image[:, None]).mean().item()}
+        return learned | {
             "ssim": ssim(picture, self.image, data_range=1.0).mean().item(),
             "psnr": psnr(picture, self.image, data_range=1.0).mean().item(),
             "efficiency": light.min().item(),
@@ -230,20 +236,21 @@ class Track:
 
     def __init__(self, bench: Bench, every: int = 5):
         self.bench, self.every = bench, every
-        self.rows: list[tuple[float, int, float]] = []  # seconds, evaluations, SSIM
+        self.rows: list[tuple[float, int, float, float]] = []  # seconds, evaluations, SSIM, largest phase in rad
         self.spent, self.started = 0.0, time.perf_counter()
 
     def __call__(self, solution: Solution) -> None:
         """Score every few steps."""
         entered = time.perf_counter()
         if (len(solution.losses) - 1) % self.every == 0:
-            quality = self.bench.scores(solution.x)["ssim"]
-            self.rows.append((entered - self.started - self.spent, solution.evaluations, quality))
+            scores = self.bench.scores(solution.x)
+            seconds = entered - self.started - self.spent
+            self.rows.append((seconds, solution.evaluations, scores["ssim"], scores["peak_rad"]))
         self.spent += time.perf_counter() - entered
 
-    def reached(self, quality: float) -> tuple[float, int] | None:
-        """Seconds and evaluations after which a quality was reached first."""
-        return next(((seconds, count) for seconds, count, ssim in self.rows if ssim >= quality), None)
+    def reached(self, quality: float) -> tuple[float, int, float, float] | None:
+        """The row in which a quality was reached first."""
+        return next((row for row in self.rows if row[2] >= quality), None)
 
 
 def butterworth(images: Tensor, cutoff: float) -> Tensor:

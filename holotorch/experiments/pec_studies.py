@@ -45,7 +45,7 @@ def lowpass(bench: Bench, cutoffs: Sequence[float], steps: int) -> list[Row]:
     rows = []
     for cutoff in tqdm(cutoffs, desc="low-pass targets", unit="cut-off"):
         own = replace(bench, lowpass=cutoff)
-        for name, phase, seconds in _methods(own, steps, ("IPEC", "PPEC", "ours")):
+        for name, phase, seconds in _methods(own, steps, ("basic IPEC", "IPEC", "PPEC", "ours")):
             rows.append(_row(own, name, own.scores(phase), seconds) | {"setting": f"cut-off {cutoff:g} cycles/px"})
     return rows
 
@@ -86,7 +86,7 @@ def iterations(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
             own.algorithm2(start, steps=steps, callback=track) if name == "PPEC" else own.lbfgs(
                 start, steps=steps, callback=track
             )
-            for k, (seconds, evaluations, quality) in enumerate(track.rows):
+            for k, (seconds, evaluations, quality, _) in enumerate(track.rows):
                 setting = f"step {every * (k + 1)}"
                 rows.append(_row(own, name, {"ssim": quality}, seconds) | {"setting": setting, "count": evaluations})
     return rows
@@ -129,7 +129,7 @@ def focus(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
 
 
 def limits(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
-    """SSIM against the temperature allowed, against a wrong sigma, and against the bits of the heaters."""
+    """SSIM against the temperature allowed, a wrong sigma, a weight on heating power, and the heaters' bits."""
     rows = []
     for sigma in tqdm(sigmas, desc="limits", unit="sigma"):
         own = replace(bench, sigma_px=sigma)
@@ -144,6 +144,9 @@ def limits(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
             true = ThermalCrosstalk(sigma * (1 + error), 7)
             row = _row(own, "1 frame", own.scores(phase, own.formed(phase, true)), 0.0)
             rows.append(row | {"setting": f"true sigma {100 * error:+.0f} %"})
+        for weight in (0.01, 0.1, 1.0):
+            found = own.lbfgs(own.start("hot"), steps=steps, power_weight=weight)
+            rows.append(_row(own, "1 frame", own.scores(found.x), 0.0) | {"setting": f"weight on power {weight:g}"})
         for bits in (4, 6, 8, 10, 12):
             rows.append(_row(own, "1 frame", own.scores(quantised(phase, bits)), 0.0) | {"setting": f"{bits} bits"})
     return rows
@@ -241,7 +244,7 @@ def _formed_of_slices(bench: Bench, phases: Tensor, weights: Tensor) -> Tensor:
 def _row(
     bench: Bench, method: str, scores: dict[str, float], seconds: float, thesis: float | None = None, verdict: str = ""
 ) -> Row:
-    keys = ("ssim", "psnr", "error", "efficiency", "peak_rad", "power_rad")
+    keys = ("ssim", "psnr", "perceptual", "error", "efficiency", "peak_rad", "power_rad")
     numbers = {key: round(scores[key], 4) if key in scores else "" for key in keys}
     kind = {"kind": bench.kind, "sigma_px": bench.sigma_px, "setting": "", "method": method}
     kelvin = round(scores["peak_rad"] * 175 / PI) if "peak_rad" in scores else ""

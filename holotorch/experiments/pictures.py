@@ -1,6 +1,7 @@
 """Figures of a run, drawn without any global state of matplotlib."""
 
 import io
+import textwrap
 from collections.abc import Sequence
 from typing import Any
 
@@ -26,12 +27,12 @@ def channel_maps(values: Tensor, names: Sequence[str], label: str, colormap: str
 def comparison(images: Sequence[Tensor], captions: Sequence[str]) -> bytes:
     """PNG of pictures [C, H, W] in [0, 1] side by side with their captions."""
     height, width = images[0].shape[-2:]
-    figure = Figure(figsize=(3.2 * len(images), 3.2 * height / width + 0.35), layout="constrained", dpi=120)
+    figure = Figure(figsize=(3.2 * len(images), 3.2 * height / width + 0.55), layout="constrained", dpi=120)
     for i, (image, caption) in enumerate(zip(images, captions, strict=True)):
         axes = figure.add_subplot(1, len(images), i + 1)
         shown = image.clamp(0, 1).permute(1, 2, 0).squeeze(-1).numpy()
         axes.imshow(shown, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
-        axes.set_title(caption, fontsize=10)
+        axes.set_title(textwrap.fill(caption, 34), fontsize=10)
         axes.set_axis_off()
     return _png(figure)
 
@@ -52,7 +53,7 @@ def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[in
         right.plot(*zip(*checked, strict=True), "k--", linewidth=1.2, label=metric.upper())
         right.set_ylabel(f"mean {metric.upper()}")
         if metric == "ssim":
-            right.set_ylim(0, 1)
+            right.set_ylim(0, 1.02)
         more = right.get_legend_handles_labels()
         handles, labels = handles + more[0], labels + more[1]
     axes.legend(handles, labels, fontsize=8, loc="center right")

@@ -81,12 +81,15 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
     ]
     if "distance_mm" in physics:
         lines.append(
-            f"Image      at {_listed(physics['distance_mm'], 'g')} mm; smallest spot {_listed(physics['spot_um'])} um, "
+            f"Image      at {_listed(physics['distance_mm'], 'g')} mm; smallest spot of each colour"
+            f"{', at the farthest,' if len(physics['distance_mm']) > 1 else ''} {_listed(physics['spot_um'])} um, "
             f"sampled every {physics['pitch_um'][1]:.4g} um; the periodic model is alias-free up to "
             f"{_listed(physics['alias_free_mm'])} mm"
         )
     if planned := values.get("single_propagation"):
         lines.append(f"Planned    one propagation over this distance: {planned['reason']}; {planned['runner_up']}")
+    if region := settings.target.region:
+        lines.append(f"Region     the middle {region[0]} x {region[1]} px hold the picture; light elsewhere is free")
     if settings.frames > 1:
         how = "solved for together" if experiment.joint else "solved for one by one"
         lines.append(f"Frames     {settings.frames}, shown in turn and {how}; the eye sees their mean")
@@ -138,6 +141,8 @@ def _notes(experiment: PECExperiment, grid: Grid) -> list[str]:
     light, longest = experiment.settings.propagator, max(experiment.wavelengths)
     if isinstance(light, NearFieldSettings):
         limit, farthest = unaliased_distance(grid, longest, 1), max(map(abs, light.distance))
+        if min(light.distance) < 0:
+            found.append("a distance is negative: that image is virtual, behind the array as seen from the observer")
         if not experiment.isolated:
             found.append(
                 "periodic boundary: the array repeats without end, as in the thesis; a single chip forms another "

@@ -46,7 +46,8 @@ class _Run:
         self.folder, self.title = folder, folder.resolve().name
         names = [name for name in ("summary.json", "interrupted.json") if (folder / name).is_file()]
         if not names:
-            raise ConfigError([f"{folder} holds no run: neither summary.json nor interrupted.json is there"])
+            cure = f"; finish it with: holotorch resume {folder}" if (folder / "plan.json").is_file() else ""
+            raise ConfigError([f"{folder} holds no run: neither summary.json nor interrupted.json is there{cure}"])
         try:
             self.summary = json.loads((folder / names[0]).read_text())
             self.plan = json.loads((folder / "plan.json").read_text())
@@ -95,6 +96,7 @@ def _section(run: _Run) -> str:
 
 
 _COLUMNS = (
+    "frames",
     "SSIM",
     "PSNR (dB)",
     "SSIM between samples",
@@ -109,6 +111,7 @@ _COLUMNS = (
 
 def _numbers(method: dict[str, Any]) -> list[str]:
     return [
+        str(method["frames"]),
         _fixed(method.get("ssim_mean"), 4),
         _fixed(method.get("psnr_mean"), 1),
         _fixed(method["between_samples"].get("ssim_mean"), 3),
@@ -125,14 +128,20 @@ def _verdict(run: _Run) -> str:
     corrected = run.methods["corrected"]
     hottest = max(corrected["peak_temperature_rise_K"])
     steps, done = max(corrected["steps"]), all(corrected["converged"])
-    stop = "met its stop rule" if done else "stalled" if any(corrected["stalled"]) else "ran out of steps"
+    stop = "met its stop rule" if done else "ran out of steps"
+    if any(corrected["stalled"]):
+        stop = "stopped where no step lowered the loss any more, at float precision or in a corner of the limit"
+    between = " (see 'between samples')"
+    if "isolated" not in corrected:
+        between = f"; half a sample off, a Fourier hologram is speckled{between}"
+    fewer = any(method["frames"] < corrected["frames"] for method in run.methods.values())
+    alone = " Methods that are compared with show a single frame." if fewer else ""
     return (
         f"The hottest pixel of the corrected hologram is {hottest:.0f} degC above ambient. The solver took {steps} "
         f"steps and {stop}. Peak memory {run.summary['peak_memory_bytes'] / 1e9:.2f} GB. Heating power is the mean "
         "temperature rise that the heaters alone would cause, before the heat spreads; times the number of pixels and "
         "the chip's watts per kelvin it is the power in watts. Scores are of a float64 simulation of the phases. They "
-        "are taken at the samples of the image, where the solver controls the light; half a sample off, a Fourier "
-        "hologram is speckled (see 'between samples')."
+        f"are taken at the samples of the image, where the solver controls the light{between}.{alone}"
     )
 
 

@@ -138,7 +138,10 @@ def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
                 log.save()
             results = {"corrected": _result(experiment, solution, seconds)}
             save_array(out / "arrays" / "phase.npy", results["corrected"].phase.float())
-        for name in settings.report.baselines if len(experiment.distances) < 2 else ():
+        several = len(experiment.distances) > 1
+        if several and settings.report.baselines:
+            print("baselines are left out: they know one distance only", file=sys.stderr)
+        for name in () if several else settings.report.baselines:
             try:
                 if not pressed:
                     started = time.perf_counter()

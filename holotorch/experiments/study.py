@@ -1,5 +1,6 @@
 """A study as a run: a folder with its table, a picture, and what it says in words."""
 
+import sys
 import time
 from html import escape
 from pathlib import Path
@@ -12,10 +13,12 @@ from holotorch.experiments.config import StudySettings
 from holotorch.experiments.environment import environment
 from holotorch.experiments.memory import peak_memory
 from holotorch.experiments.pec_bench import Bench
+from holotorch.experiments.pec_claims import with_claims
 from holotorch.experiments.pec_studies import STUDIES
 from holotorch.experiments.pictures import curves
 from holotorch.experiments.run import claim
 from holotorch.io.files import write_bytes, write_json, write_text
+from holotorch.metrics import PerceptualSimilarity
 
 
 def run_study(settings: StudySettings, out: Path | None, name: str) -> tuple[Path, bool]:
@@ -27,8 +30,8 @@ def run_study(settings: StudySettings, out: Path | None, name: str) -> tuple[Pat
     write_text(folder / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
     write_json(folder / "env.json", environment(settings.seed, torch.device("cpu")))
     started = time.perf_counter()
-    bench = Bench(images=settings.images, size=settings.size)
-    rows = STUDIES[settings.study](bench, settings.sweep, settings.max_steps)
+    bench = Bench(images=settings.images, size=settings.size, perceptual=_perceptual())
+    rows = with_claims(settings.study, STUDIES[settings.study](bench, settings.sweep, settings.max_steps))
     write_table(folder / "table.csv", rows)
     picture = curves(rows, f"{settings.study}: mean of {', '.join(settings.images)} at {settings.size} px")
     write_bytes(folder / "images" / "table.png", picture)
@@ -38,7 +41,7 @@ def run_study(settings: StudySettings, out: Path | None, name: str) -> tuple[Pat
         f"<title>{settings.study}</title><h1>{settings.study}</h1><img src='images/table.png'><pre>{escape(text)}</pre>"
     )
     write_text(folder / "report.html", f"<!DOCTYPE html><meta charset='utf-8'>{page}")
-    verdicts = [row["verdict"] for row in rows if row["verdict"]]
+    verdicts = [row["verdict"].split(":")[0] for row in rows if row["verdict"]]
     summary = {
         "experiment": settings.experiment,
         "study": settings.study,
@@ -51,6 +54,17 @@ def run_study(settings: StudySettings, out: Path | None, name: str) -> tuple[Pat
     write_json(folder / "summary.json", summary)
     print(text)
     return folder, True
+
+
+def _perceptual() -> PerceptualSimilarity | None:
+    """The learned similarity, if its extra is installed and its weights are at hand."""
+    try:
+        return PerceptualSimilarity()
+    except ImportError:
+        return None
+    except OSError as error:
+        print(f"LPIPS is left out: {error}", file=sys.stderr)
+        return None
 
 
 def table_text(rows: list[dict[str, Any]]) -> str:

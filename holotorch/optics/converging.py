@@ -119,7 +119,7 @@ class ConvergingFresnel(nn.Module):
         self.distance = checks.finite("distance", distance, "metres")
         unbent = isinstance(focus, float) and math.isinf(focus)
         self.focus = focus if unbent else checks.finite("focus", focus, "metres, or infinite")
-        self.offset = checks.finite("offset", offset[0], "metres"), checks.finite("offset", offset[1], "metres")
+        self.offset = checks.pair("offset", offset, "metres")
         if self.distance == 0:
             raise ValueError("distance must not be 0; at 0 multiply the field by the phase of the lens")
         if self.focus == 0:

@@ -45,12 +45,15 @@ def passage(
     tilt: Sequence[float] | Tensor,
     wavelengths: Sequence[float],
 ) -> Passage:
-    """A checked passage. ValueError for a tilt at which part of the grid's band would not travel."""
-    y, x = (checks.finite("offset", value, "metres") for value in offset)
-    sines = tilt.detach().reshape(-1).tolist() if isinstance(tilt, Tensor) else list(tilt)
-    if len(sines) != 2:
-        raise ValueError(f"tilt must be the sines (y, x) of the carrier's direction, got {len(sines)} numbers")
-    sy, sx = (checks.finite("tilt", value, "sines") for value in sines)
+    """A checked passage.
+
+    TypeError for arguments of another kind; ValueError for a tilt at which part of the grid's band would not travel.
+    """
+    if out is not None and not isinstance(out, Grid):
+        raise TypeError(f"out_grid must be a Grid, such as Grid((256, 256), pitch=8e-6), got {out!r}")
+    y, x = checks.pair("offset", offset, "metres")
+    sines = tilt.detach().reshape(-1).tolist() if isinstance(tilt, Tensor) else tilt
+    sy, sx = checks.pair("tilt", sines, "sines of the carrier's direction")
     if sy or sx:
         steepest = math.hypot(*(abs(s) + max(wavelengths) / 2 / p for s, p in zip((sy, sx), grid.pitch, strict=True)))
         if steepest >= 0.98:

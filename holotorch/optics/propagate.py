@@ -245,6 +245,6 @@ def _float64(name: str, value: float | Tensor, field: Tensor) -> Tensor:
         value = torch.tensor(checks.finite(name, value, "metres"), dtype=torch.float64)
     value = value.to(field.device, torch.float64)
     checks.all_finite(name, value.detach())
-    if name == "wavelength" and (value <= 0).any():
-        raise ValueError(f"wavelength must be above zero in metres, got {value.min().item()!r}")
+    if name == "wavelength":
+        checks.wavelengths(value.detach().reshape(-1).tolist() or 1.0)  # none at all is no mistake
     return value

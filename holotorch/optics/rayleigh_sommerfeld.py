@@ -1,12 +1,14 @@
 """RayleighSommerfeld: the diffraction integral as a plain double sum, the reference that everything else is held to."""
 
 import math
+import warnings
 from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor, nn
 
 from holotorch.core import checks
+from holotorch.core.checks import SamplingWarning
 from holotorch.core.grid import Grid
 
 _CHUNK = 4_000_000  # kernel values at a time: 64 MB of complex128
@@ -46,9 +48,23 @@ class RayleighSommerfeld(nn.Module):
         self.grid, self.out_grid = grid, out_grid or grid
         self.wavelengths = checks.wavelengths(wavelengths)
         self.distance = checks.finite("distance", distance, "metres")
-        self.offset = tuple(checks.finite("offset", value, "metres") for value in offset)
+        self.offset = checks.pair("offset", offset, "metres")
         if self.distance == 0:
             raise ValueError("distance must not be 0 for a sum over point sources")
+        self._check_sampling()
+
+    def _check_sampling(self) -> None:
+        for axis in range(2):
+            aside = abs(self.offset[axis]) + (self.grid.extent[axis] + self.out_grid.extent[axis]) / 2
+            step = self.grid.pitch[axis] / min(self.wavelengths) * aside / math.hypot(aside, self.distance)
+            if step > 1.01:
+                warnings.warn(
+                    f"between neighbouring points of the {'yx'[axis]} axis the farthest path changes by {step:.3g} "
+                    "wavelengths, more than one: the sum aliases whatever the field; use a finer pitch, a smaller "
+                    "window, a longer distance, or AngularSpectrum",
+                    SamplingWarning,
+                    stacklevel=3,
+                )
 
     def forward(self, field: Tensor) -> Tensor:
         """Propagate ``field``, complex [..., C, H, W], to [..., C, H', W'] of the output grid, same dtype."""

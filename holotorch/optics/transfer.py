@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from holotorch.core.fourier import multiply_even
 from holotorch.core.grid import Grid
 from holotorch.optics.kernels import angular_spectrum_kernel, carrier, turns_phasor
 from holotorch.optics.passage import Passage, shifts
@@ -71,14 +72,10 @@ def transfer_function(
     fy = torch.arange(height // 2 + 1, dtype=torch.float64, device=distance.device)[:, None] / (height * py)
     fx = torch.arange(width // 2 + 1, dtype=torch.float64, device=distance.device)[None, :] / (width * px)
     quadrant = remainder_kernel(fy, fx, wavelength, distance).to(dtype)
-    right = quadrant[..., 1 : (width + 1) // 2].flip(-1)
     if kernel.requires_grad or quadrant.requires_grad:
-        half = torch.cat([quadrant, right], -1)
+        half = torch.cat([quadrant, quadrant[..., 1 : (width + 1) // 2].flip(-1)], -1)
         return kernel * torch.cat([half, half[..., 1 : (height + 1) // 2, :].flip(-2)], -2)
-    for part, columns in ((quadrant, slice(0, width // 2 + 1)), (right, slice(width // 2 + 1, width))):
-        kernel[..., : height // 2 + 1, columns].mul_(part)
-        kernel[..., height // 2 + 1 :, columns].mul_(part[..., 1 : (height + 1) // 2, :].flip(-2))
-    return kernel
+    return multiply_even(kernel, quadrant)
 
 
 def wide_transfer_function(

@@ -226,3 +226,10 @@ def test_apg_says_stalled_when_no_step_is_accepted_and_keeps_what_it_has():
 def test_refuses_impossible_settings(make, message):
     with pytest.raises((ValueError, TypeError), match=message):
         make()
+
+
+@each_solver
+def test_a_complex_start_is_named(solver):
+    problem, start = pec_problem()
+    with pytest.raises(TypeError, match="start must be a real floating-point tensor, got torch.complex128"):
+        solver(problem, start.to(torch.complex128))

@@ -133,3 +133,20 @@ def test_four_frames_within_four_pi_form_a_photograph(tmp_path):
     scores = [array.ssim(formed[c] * target[c].mean(), target[c]) for c in range(3)]
     assert numbers["ssim"] == pytest.approx(scores, abs=1e-9)
     assert min(scores) >= 0.99
+
+
+def test_a_weight_on_the_heating_power_lowers_it(tmp_path):
+    powers = []
+    for weight in (0.0, 1.0):
+        run(load_config(CONFIG, [*SMALL, f"modulator.power_weight={weight}"]), tmp_path / str(weight))
+        numbers = json.loads((tmp_path / str(weight) / "summary.json").read_text())["methods"]["corrected"]
+        powers.append(sum(numbers["heating_power_K_per_pixel"]))
+    assert powers[1] < 0.9 * powers[0]
+
+
+def test_a_report_says_which_methods_show_fewer_frames(tmp_path):
+    run(load_config(CONFIG, [*SMALL, "frames=2", "report.baselines=[none]"]), tmp_path / "two")
+    page = (tmp_path / "two" / "report.html").read_text()
+    assert "<th>frames</th>" in page and "compared with show a single frame" in page
+    run(load_config(CONFIG, [*SMALL, "report.baselines=[none]"]), tmp_path / "one")
+    assert "single frame" not in (tmp_path / "one" / "report.html").read_text()

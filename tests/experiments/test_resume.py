@@ -15,7 +15,9 @@ import torch
 from holotorch.cli import main
 from holotorch.experiments import run as run_module
 from holotorch.experiments.config import load_config
+from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.progress import Log
+from holotorch.experiments.report import write_report
 from holotorch.experiments.run import run
 
 pytestmark = pytest.mark.usefixtures("tiny")
@@ -146,6 +148,8 @@ def test_stopped_before_anything_was_found_starts_anew(monkeypatch, tmp_path):
     press_in(monkeypatch, 0)
     with pytest.raises(KeyboardInterrupt):
         run(settings(LBFGS), tmp_path / "a")
+    with pytest.raises(ConfigError, match="finish it with: holotorch resume .*a$"):
+        write_report([tmp_path / "a"], tmp_path / "report.html")
     press_in(monkeypatch, None)
     assert not (tmp_path / "a" / "checkpoint.pt").exists()
     assert resume(tmp_path / "a") == 0

@@ -1,0 +1,110 @@
+"""What the thesis says of proximity effect correction in words, held against the numbers of a study."""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+Row = dict[str, Any]
+
+
+def with_claims(study: str, rows: list[Row]) -> list[Row]:
+    """``rows`` and behind them one row for each claim: what it says, what was found, and whether they agree."""
+    return rows + [
+        dict.fromkeys(rows[0], "") | {"setting": found, "method": "claim", "thesis": claim, "verdict": verdict}
+        for claim, found, verdict in _CLAIMS.get(study, _none)(rows)
+    ]
+
+
+Claims = Iterable[tuple[str, str, str]]
+
+
+def _none(_: list[Row]) -> Claims:
+    return ()
+
+
+def _reproduction(rows: list[Row]) -> Claims:
+    for name, words in (
+        ("PPEC", "PPEC and FPEC keep their quality up to sigma 0.9 and dip slightly at 1.0 (Sec. 4.5.1.1)"),
+        ("IPEC", "IFPEC degrades from sigma 0.4 on (Fig. 4.17)"),
+        ("none", "without correction quality falls from sigma 0.3 on (Fig. 4.17)"),
+    ):
+        kept = _ssim(rows, name, kind="fresnel")
+        below, above = ([kept[s] for s in kept if low <= s <= high] for low, high in ((0, 0.5), (0.6, 1.0)))
+        if below and above:
+            drop = max(below) - min(above)
+            agrees = drop < 0.1 if name == "PPEC" else drop > 0.1
+            yield words, f"SSIM falls by {drop:.3f} between sigma <= 0.5 and 1.0", _said(agrees)
+
+
+def _lowpass(rows: list[Row]) -> Claims:
+    for name in dict.fromkeys(row["method"] for row in rows):
+        values = [row["ssim"] for row in rows if row["method"] == name]
+        change = max(values) - min(values)
+        words = "no significant change with the picture's spatial frequency (Fig. 4.12)"
+        why = "" if change < 0.05 else ": SSIM is lower for smooth pictures, in which speckle stands out"
+        yield f"{name}: {words}", f"SSIM {min(values):.3f} to {max(values):.3f}", _said(change < 0.05) + why
+
+
+def _multiplexing(rows: list[Row]) -> Claims:
+    found = {row["method"]: row["ssim"] for row in rows if row["sigma_px"] < 0.7}
+    for name in ("IPEC, 10 runs", "IPEC, signal region"):
+        if name in found and "PPEC" in found:
+            behind = found["PPEC"] - found[name]
+            words = f"{name}: comparable with PPEC below sigma 0.7 (Fig. 4.14)"
+            why = "" if behind < 0.1 else ": PPEC runs to its end here and is better than the thesis's"
+            yield words, f"SSIM {found[name]:.3f}, PPEC {found['PPEC']:.3f}", _said(behind < 0.1) + why
+
+
+def _iterations(rows: list[Row]) -> Claims:
+    for sigma in dict.fromkeys(row["sigma_px"] for row in rows):
+        own = [row["ssim"] for row in rows if row["sigma_px"] == sigma and row["method"] == "PPEC"]
+        gain = own[-1] - own[len(own) // 2]
+        words = f"PPEC, sigma {sigma:g}: quality changes very little towards the end (Fig. 4.15)"
+        yield words, f"SSIM gains {gain:.3f} in the second half of the steps", _said(abs(gain) < 0.02)
+
+
+def _time(rows: list[Row]) -> Claims:
+    def seconds(name: str, **wanted: Any) -> list[float]:
+        return [r["seconds"] for r in rows if r["method"] == name and all(r[key] == wanted[key] for key in wanted)]
+
+    middle = {"setting": rows[0]["setting"], "sigma_px": 0.66}
+    basic, iterative, proximal = (min(seconds(name, **middle), default=0) for name in ("basic IPEC", "IPEC", "PPEC"))
+    found = f"basic {basic:.2f} s, IPEC {iterative:.2f} s, PPEC {proximal:.2f} s"
+    yield "basic IPEC is the fastest (Fig. 4.10)", found, _said(basic <= min(iterative, proximal))
+    why = "" if iterative >= proximal else ": 30 x 30 steps here; the thesis does not give its counts"
+    yield "IPEC is slower than PPEC (Fig. 4.10)", found, _said(iterative >= proximal) + why
+    for name in ("IPEC", "PPEC"):
+        grows = seconds(name, sigma_px=0.66)[-4:]
+        words = f"{name}: time grows with resolution (Fig. 4.11)"
+        yield words, ", ".join(f"{value:.2f}" for value in grows) + " s", _said(grows == sorted(grows))
+
+
+def _focus(rows: list[Row]) -> Claims:
+    for name in ("one hologram", "4 joint frames"):
+        sharp = total = 0
+        for sigma in dict.fromkeys(row["sigma_px"] for row in rows):
+            own = [r for r in rows if r["method"] == name and r["sigma_px"] == sigma and r["error"] != ""]
+            for band in dict.fromkeys(row["setting"].split(", ")[1] for row in own):
+                errors = {r["setting"].split(", ")[0]: r["error"] for r in own if r["setting"].endswith(band)}
+                sharp += band.split()[2] == min(errors, key=errors.__getitem__).split()[1]
+                total += 1
+        words = f"{name}: moving the focus brings one part of the scene after another into focus (Fig. 4.18)"
+        yield words, f"{sharp} of {total} bands are sharpest at their own depth", _said(sharp == total)
+
+
+_CLAIMS: dict[str, Callable[[list[Row]], Claims]] = {
+    "reproduction": _reproduction,
+    "lowpass": _lowpass,
+    "multiplexing": _multiplexing,
+    "iterations": _iterations,
+    "time": _time,
+    "focus": _focus,
+}
+
+
+def _ssim(rows: list[Row], method: str, kind: str) -> dict[float, float]:
+    chosen = [row for row in rows if row["method"] == method and row["kind"] == kind and row["ssim"] != ""]
+    return {row["sigma_px"]: row["ssim"] for row in chosen}
+
+
+def _said(agrees: bool) -> str:
+    return "reproduced" if agrees else "not reproduced"
