@@ -1,0 +1,299 @@
+"""AxialHologram: any number of planes by a few transforms, their spectra gathered on the way along the axis."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from holotorch.core import checks
+from holotorch.core.complex import phasor
+from holotorch.core.fourier import multiply_even
+from holotorch.core.grid import Grid
+from holotorch.core.operator import linear
+from holotorch.hologram.cone import Cone, check_layers, check_scene, taper
+from holotorch.hologram.guard import Axis, choose_length, faded_out
+from holotorch.hologram.nodes import Nodes, axial_range, choose_nodes
+from holotorch.hologram.raster import Raster
+from holotorch.optics.kernels import turns_phasor
+
+_BLOCK = 8  # planes that are spread at once: one matrix product instead of eight passes
+
+
+@dataclass(frozen=True)
+class AxialDesign:
+    """What an :class:`AxialHologram` does for layers of one shape.
+
+    Attributes:
+        nodes: Along the axis.
+        size: Samples of the transforms, (y, x).
+        predicted_error: Expected relative L2 error for sources like noise, against the cone's own definition.
+        adequate: Whether that is within the tolerance.
+    """
+
+    nodes: Nodes
+    size: tuple[int, int]
+    predicted_error: float
+    adequate: bool
+
+
+class AxialHologram(nn.Module):
+    """The sum over planes of waves exp(i k r) / r, limited in frequency; one small transform per node, not per plane.
+
+    Planes are spread onto the nodes (:class:`Nodes`), each node takes one transform at the sources' own resolution,
+    and spectra are summed by Horner's rule: on from node to node by one factor, the same each time. A factor for the
+    wave itself and one transform back end it. Evenly spaced planes are their own nodes where those would be more.
+
+    Args:
+        grid: Pixels of the hologram.
+        wavelength: In metres.
+        depths: Of the planes, in metres, above 0; any order and spacing.
+        cone: "taper" (soft rim) or "band" (sharp), both in frequency; see ``holotorch.hologram.cone``. Where the cone
+            is wider than all pairs of source and pixel they agree with every other definition that is not tapered.
+        stride: Pixels between neighbouring sources of a plane.
+        tolerance: Relative L2 error to stay below for sources like noise; 1e-6 at least in complex64.
+
+    Raises:
+        TypeError, ValueError: Impossible arguments; in a call: layers that are not complex [..., D, h, w].
+
+    Source: Sec. 5.3.2 of the thesis for the sum; Weyl's expansion exp(ikr)/r = i int exp(2 pi i (f x + z w)) / w df.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        wavelength: float,
+        depths: Sequence[float],
+        *,
+        cone: Cone = "taper",
+        stride: int = 1,
+        tolerance: float = 1e-3,
+    ):
+        super().__init__()
+        self.grid = grid
+        self.wavelength, self.depths, self.stride = check_scene(grid, wavelength, depths, stride)
+        if cone not in ("taper", "band"):
+            raise ValueError(f"AxialHologram works in frequency, with cone='taper' or 'band', got {cone!r}")
+        self.cone: Cone = cone
+        self.tolerance = checks.positive("tolerance", tolerance)
+        self._designs: dict[tuple[int, int], AxialDesign] = {}
+
+    def design(self, shape: tuple[int, int]) -> AxialDesign:
+        """Nodes and lengths for layers of ``shape`` (h, w)."""
+        if shape not in self._designs:
+            axes = [
+                Axis(
+                    (count - 1) * self.stride + 1,
+                    pixels,
+                    self.stride,
+                    pitch,
+                    self.wavelength,
+                    min(self.depths),
+                    max(self.depths),
+                    self.cone,
+                )
+                for count, pixels, pitch in zip(shape, self.grid.shape, self.grid.pitch, strict=True)
+            ]
+            (height, ey), (width, ex) = (choose_length(axis, 0.4 * self.tolerance) for axis in axes)
+            steepest = axes[0].fade(height)[1], axes[1].fade(width)[1]
+            low, high = axial_range(self.grid, self.wavelength, steepest)
+            nodes = choose_nodes(self.depths, low, high, 0.1 * self.tolerance)
+            error = math.hypot(ey, ex, nodes.error(low, high))
+            self._designs[shape] = AxialDesign(nodes, (height, width), error, error <= self.tolerance)
+        return self._designs[shape]
+
+    def forward(self, layers: Tensor) -> Tensor:
+        """Field [..., H, W] of ``layers``, complex [..., D, h, w], whose samples h // 2, w // 2 lie on the axis."""
+        check_layers(layers, len(self.depths))
+        shape = (layers.shape[-2], layers.shape[-1])
+        return linear(layers, self._formed, lambda field: self._gathered(field, shape))
+
+    def adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
+        """Conjugate transpose: layers [..., D, h, w] of ``shape`` (h, w) from a field [..., H, W]."""
+        return linear(field, lambda given: self._gathered(given, shape), self._formed)
+
+    def accumulate(self, planes: Iterable[Tensor], phase: Tensor | None = None) -> Tensor:
+        """Field [H, W] of planes [h, w], real or complex, as they come in the order of ``depths``; none is kept.
+
+        ``phase`` [h, w] in rad is common to all, and then costs nothing per plane. Depths must rise or fall.
+        """
+        total = None
+        for j, plane in enumerate(planes):
+            total = total or self.accumulator((plane.shape[-2], plane.shape[-1]), phase)
+            total.add(j, plane)
+        if total is None:
+            raise ValueError("there are no planes")
+        return total.finish()
+
+    def accumulator(self, shape: tuple[int, int], phase: Tensor | None = None) -> "Accumulator":
+        """A sum that planes are added to one by one; see :meth:`accumulate`."""
+        return Accumulator(self, shape, phase)
+
+    def _formed(self, layers: Tensor) -> Tensor:
+        order = sorted(range(len(self.depths)), key=self.depths.__getitem__)
+        fields = []
+        for item in layers.reshape(-1, *layers.shape[-3:]):
+            total = self.accumulator((item.shape[-2], item.shape[-1]))
+            for j in order:
+                total.add(j, item[j])
+            fields.append(total.finish())
+        return torch.stack(fields).reshape(*layers.shape[:-3], *self.grid.shape).to(layers.dtype)
+
+    def _gathered(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
+        waves = Waves(self, shape, field.dtype, field.device)
+        nodes, raster = waves.design.nodes, waves.raster
+        flat = field.reshape(-1, *field.shape[-2:])
+        out = flat.new_zeros(len(flat), len(self.depths), *shape)
+        touched = [nodes.weights(depth) for depth in self.depths]
+        back = waves.step(-1)
+        for given, layers in zip(flat, out, strict=True):
+            spectrum = multiply_even(raster.spectrum_of_pixels(given), waves.last(0).conj())
+            for m in range(nodes.count):
+                near = [j for j, (begin, _) in enumerate(touched) if begin <= m < begin + nodes.width]
+                layer = raster.layer(spectrum) if near else spectrum
+                for j in near:
+                    begin, weights = touched[j]
+                    layers[j] += layer * complex(weights[m - begin].conj())
+                spectrum *= back
+        return out.reshape(*field.shape[:-2], len(self.depths), *shape)
+
+
+class Waves:
+    """Factors in frequency of an :class:`AxialHologram` for layers of one shape."""
+
+    def __init__(self, operator: AxialHologram, shape: tuple[int, int], dtype: torch.dtype, device: torch.device):
+        self.operator, self.dtype = operator, dtype
+        self.design = operator.design(shape)
+        self.raster = Raster(operator.grid, shape, operator.stride, self.design.size)
+        size, (py, px) = self.design.size, operator.grid.pitch
+        self.fy = torch.arange(size[0] // 2 + 1, dtype=torch.float64, device=device)[:, None] / (size[0] * py)
+        self.fx = torch.arange(size[1] // 2 + 1, dtype=torch.float64, device=device)[None, :] / (size[1] * px)
+
+    def step(self, nodes: int) -> Tensor:
+        """The factor from one node to another, so many deeper, [N_y, N_x]."""
+        turns = self._beside() * (self.design.nodes.spacing * nodes)
+        whole = torch.ones(self.design.size, dtype=self.dtype, device=turns.device)
+        return multiply_even(whole, turns_phasor(turns).to(self.dtype))
+
+    def last(self, node: int) -> Tensor:
+        """What the sum at ``node`` is multiplied with in the end, a quadrant: phase, wave, cone, window."""
+        nodes, operator = self.design.nodes, self.operator
+        axial, beside = self._axial(), self._beside()
+        strength = 1 / (axial * math.prod(operator.grid.pitch) * nodes.response(beside))
+        low = 0.07 / operator.wavelength
+        strength = torch.where(axial > low, strength, 0)
+        for frequency, pitch, size, count, stride, pixels in zip(
+            (self.fy, self.fx),
+            operator.grid.pitch,
+            self.design.size,
+            self.raster.shape,
+            (operator.stride,) * 2,
+            operator.grid.shape,
+            strict=True,
+        ):
+            if operator.cone == "taper":
+                strength = strength * taper(2 * pitch * frequency)
+            near, far = min(operator.depths), max(operator.depths)
+            axis = Axis((count - 1) * stride + 1, pixels, stride, pitch, operator.wavelength, near, far, operator.cone)
+            strength = strength * faded_out(frequency / axial, *axis.fade(size))
+        wave = turns_phasor(beside * nodes.depth(node) + 0.25)  # the quarter turn is Weyl's i
+        return (wave * strength).to(self.dtype)
+
+    def _axial(self) -> Tensor:
+        square = self.operator.wavelength**-2 - self.fy.square() - self.fx.square()
+        return torch.sqrt(square.clamp(min=(0.05 / self.operator.wavelength) ** 2))
+
+    def _beside(self) -> Tensor:
+        return self._axial() - self.design.nodes.centre
+
+
+class Accumulator:
+    """The sum of an :class:`AxialHologram` while planes arrive, from near to far or from far to near."""
+
+    def __init__(self, operator: AxialHologram, shape: tuple[int, int], phase: Tensor | None = None):
+        self.operator, self.shape, self.phase = operator, shape, phase
+        self.nodes = operator.design(shape).nodes
+        self.waves: Waves | None = None
+        self.total: Tensor | None = None
+        self.step: Tensor | None = None
+        self.at = self.last = 0
+        self.rising: bool | None = None
+        self.pending: list[tuple[float, Tensor]] = []
+        self.open: dict[int, Tensor] = {}
+
+    def add(self, j: int, plane: Tensor) -> None:
+        """Add the plane of depth number ``j``, real or complex [h, w]; dark ones cost nothing."""
+        depth = self.operator.depths[j]
+        if self.pending:
+            before = self.pending[-1][0]
+            if depth != before and self.rising is None:
+                self.rising = depth > before
+            if depth != before and self.rising != (depth > before):
+                raise ValueError("planes that arrive one by one must come in rising or falling depth")
+        if plane.any():
+            self.pending.append((depth, plane.detach()))
+        if len(self.pending) > _BLOCK:
+            self._spread(self.pending[:-1])
+            self.pending = self.pending[-1:]
+
+    def finish(self) -> Tensor:
+        """The field [H, W]; complex zeros where no plane was lit."""
+        if self.pending:
+            self._spread(self.pending)
+            self.pending = []
+        for index in sorted(self.open, reverse=self.rising is False):
+            self._take(index)
+        if self.total is None or self.waves is None:
+            return torch.zeros(self.operator.grid.shape, dtype=torch.complex64)
+        self.step = None  # makes room for the transform
+        return self.waves.raster.pixels(multiply_even(self.total, self.waves.last(self.at)))
+
+    def _spread(self, planes: list[tuple[float, Tensor]]) -> None:
+        """Add planes to the nodes around them, and take the nodes that no later plane will touch."""
+        touched = [self.nodes.weights(depth) for depth, _ in planes]
+        begin = min(first for first, _ in touched)
+        end = max(first for first, _ in touched) + self.nodes.width
+        stack = torch.stack([plane.reshape(-1) for _, plane in planes])
+        dtype = torch.promote_types(stack.dtype, torch.complex64)
+        matrix = torch.zeros(end - begin, len(planes), dtype=torch.complex128)
+        for k, (first, weights) in enumerate(touched):
+            matrix[first - begin : first - begin + self.nodes.width, k] = torch.from_numpy(weights)
+        matrix = matrix.to(stack.device, dtype)
+        if stack.is_complex():
+            spread = matrix @ stack
+        else:
+            parts = torch.view_as_real(matrix).movedim(-1, 0).flatten(0, 1).to(stack.dtype) @ stack
+            spread = torch.complex(*parts.unflatten(0, (2, -1)))
+        for offset, node in enumerate(spread.reshape(-1, *self.shape)):
+            index = begin + offset
+            self.open[index] = self.open[index] + node if index in self.open else node
+        first = touched[-1][0]
+        if self.rising is False:
+            done = sorted((index for index in self.open if index >= first + self.nodes.width), reverse=True)
+        else:
+            done = sorted(index for index in self.open if index < first) if self.rising else []
+        for index in done:
+            self._take(index)
+
+    def _take(self, index: int) -> None:
+        """Horner's rule: carry the sum on to node ``index`` and add the node."""
+        node = self.open.pop(index)
+        if self.phase is not None:
+            node = node * phasor(self.phase).to(node.dtype)
+        if self.waves is None:
+            self.waves = Waves(self.operator, self.shape, node.dtype, node.device)
+        raster = self.waves.raster
+        period = raster.spectrum(node)
+        if self.total is None:
+            self.total = raster.repeated(period)
+        else:
+            # A deeper node's phase is ahead, so the sum falls behind.
+            forward = 1 if index > self.at else -1
+            if self.step is None:
+                self.step = self.waves.step(-forward)
+            for _ in range(abs(index - self.at) - 1):
+                self.total *= self.step
+            total = raster.tiles(self.total)
+            torch.addcmul(period[:, None, :], total, raster.tiles(self.step), out=total)
+        self.at = index

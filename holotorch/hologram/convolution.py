@@ -1,0 +1,109 @@
+"""ConvolutionHologram: one convolution per plane of sources, exact."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from holotorch.core.fourier import even_fft2, multiply_even
+from holotorch.core.grid import Grid
+from holotorch.core.operator import linear
+from holotorch.hologram.cone import Cone, check_layers, check_scene, cone_samples, spherical_wave
+from holotorch.hologram.raster import Raster, span, strided_length
+
+
+class ConvolutionHologram(nn.Module):
+    """The sum of ``DirectHologram`` by transforms: thesis Eqs. 5.8 to 5.14 and Algorithm 5, without error or waste.
+
+    The waves' phases are float64 and cast last. A plane takes the transform of its own sources, which are ``stride``
+    apart, and half a transform of its kernel, of which a quadrant is computed; planes are summed in frequency and
+    transformed back together. The length max(V, H, (V + H + K) / 2) keeps light from wrapping around, V and H the
+    samples that sources and pixels cover and K those of the cone; Sec. 5.6.1 takes H + K.
+
+    Args:
+        grid: Pixels of the hologram.
+        wavelength: In metres.
+        depths: Of the planes, in metres, above 0; any order and spacing.
+        cone: What is kept of each wave, see ``holotorch.hologram.cone``; not ``band``, which ``AxialHologram`` forms.
+        stride: Pixels between neighbouring sources of a plane.
+
+    Raises:
+        TypeError, ValueError: Impossible arguments; in a call: layers that are not complex [..., D, h, w].
+    """
+
+    def __init__(self, grid: Grid, wavelength: float, depths: Sequence[float], *, cone: Cone = "box", stride: int = 1):
+        super().__init__()
+        self.grid = grid
+        self.wavelength, self.depths, self.stride = check_scene(grid, wavelength, depths, stride)
+        if cone == "band":
+            raise ValueError("cone='band' has no kernel in space; use AxialHologram, or cone='taper'")
+        self.cone: Cone = cone
+
+    def forward(self, layers: Tensor) -> Tensor:
+        """Field [..., H, W] of ``layers``, complex [..., D, h, w], whose samples h // 2, w // 2 lie on the axis."""
+        check_layers(layers, len(self.depths))
+        shape = (layers.shape[-2], layers.shape[-1])
+        return linear(layers, self._formed, lambda field: self._gathered(field, shape))
+
+    def adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
+        """Conjugate transpose: layers [..., D, h, w] of ``shape`` (h, w) from a field [..., H, W]."""
+        return linear(field, lambda given: self._gathered(given, shape), self._formed)
+
+    def padded(self, shape: tuple[int, int]) -> tuple[int, int]:
+        """Samples of the transforms for layers of ``shape`` (h, w)."""
+        apart, least = span(self.grid, shape, self.stride)
+        cone = self._cone(max(self.depths), apart)
+        # Longer by one than the farthest pair and the farthest wave: no wave wraps around into a pair.
+        y, x = (
+            strided_length(max(length, far + wide + 1), self.stride)
+            for length, far, wide in zip(least, apart, cone, strict=True)
+        )
+        return y, x
+
+    def _cone(self, depth: float, apart: tuple[int, int]) -> tuple[int, int]:
+        """Farthest displacement (y, x) that the kernel of a depth has, in samples."""
+        if self.cone == "full":
+            return apart
+        half = cone_samples(self.grid, self.wavelength, depth)
+        y, x = (math.floor(min(reach, wide * (1 + 1e-12))) for reach, wide in zip(apart, half, strict=True))
+        return y, x
+
+    def _kernel(self, depth: float, raster: Raster, layers: Tensor) -> Tensor:
+        """A quadrant of the transform of a plane's wave."""
+        apart, _ = span(self.grid, raster.shape, self.stride)
+        cone = self._cone(depth, apart)
+        dy, dx = (
+            torch.arange(min(far, size // 2) + 1, dtype=torch.float64, device=layers.device) * pitch
+            for far, size, pitch in zip(cone, raster.size, self.grid.pitch, strict=True)
+        )
+        wave = spherical_wave(dy[:, None], dx[None], self.grid.pitch, self.wavelength, depth, self.cone)
+        return even_fft2(wave.to(layers.dtype), raster.size)
+
+    def _formed(self, layers: Tensor) -> Tensor:
+        raster = self._raster((layers.shape[-2], layers.shape[-1]))
+        flat = layers.reshape(-1, *layers.shape[-3:])
+        totals = flat.new_zeros(len(flat), *raster.size)
+        for j, depth in enumerate(self.depths):
+            lit = [item for item in range(len(flat)) if flat[item, j].any()]
+            if not lit:
+                continue
+            kernel = self._kernel(depth, raster, layers)
+            for item in lit:
+                totals[item] += multiply_even(raster.repeated(raster.spectrum(flat[item, j])), kernel)
+        fields = torch.stack([raster.pixels(total) for total in totals])
+        return fields.reshape(*layers.shape[:-3], *self.grid.shape)
+
+    def _gathered(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
+        raster = self._raster(shape)
+        flat = field.reshape(-1, *field.shape[-2:])
+        spectra = [raster.spectrum_of_pixels(item) for item in flat]
+        out = flat.new_zeros(len(flat), len(self.depths), *shape)
+        for j, depth in enumerate(self.depths):
+            kernel = self._kernel(depth, raster, field).conj()
+            for item, spectrum in enumerate(spectra):
+                out[item, j] = raster.layer(multiply_even(spectrum.clone(), kernel))
+        return out.reshape(*field.shape[:-2], len(self.depths), *shape)
+
+    def _raster(self, shape: tuple[int, int]) -> Raster:
+        return Raster(self.grid, shape, self.stride, self.padded(shape))

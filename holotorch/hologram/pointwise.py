@@ -1,0 +1,125 @@
+"""DirectHologram: every light source on every pixel, the slow sum that judges the fast ones."""
+
+from collections.abc import Iterator, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from holotorch.core.grid import Grid
+from holotorch.core.operator import linear
+from holotorch.hologram.cone import Cone, check_layers, check_scene, cone_samples, spherical_wave
+
+
+class DirectHologram(nn.Module):
+    """E(x) = sum_v A(v) exp(i phi(v)) exp(i k r) / r, thesis Eq. 5.1 and Algorithm 4, pair by pair in float64.
+
+    Sources lie on a raster, so pairs with one displacement share their wave: rows of sources are multiplied with the
+    matrix of one row of displacements, for both signs at once. No transform, no wrap-around, no approximation; dark
+    rows and columns of sources, and rows of pixels outside the cone, are left out.
+
+    Args:
+        grid: Pixels of the hologram.
+        wavelength: In metres.
+        depths: Of the planes, in metres, above 0; any order and spacing.
+        cone: What is kept of each wave, see ``holotorch.hologram.cone``; not ``band``.
+        stride: Pixels between neighbouring sources of a plane.
+
+    Raises:
+        TypeError, ValueError: Impossible arguments; in a call: layers that are not complex [..., D, h, w].
+    """
+
+    def __init__(self, grid: Grid, wavelength: float, depths: Sequence[float], *, cone: Cone = "box", stride: int = 1):
+        super().__init__()
+        self.grid = grid
+        self.wavelength, self.depths, self.stride = check_scene(grid, wavelength, depths, stride)
+        if cone == "band":
+            raise ValueError("a direct sum has no cone='band'; use ConvolutionHologram for it")
+        self.cone: Cone = cone
+
+    def forward(self, layers: Tensor) -> Tensor:
+        """Field [..., H, W] of ``layers``, complex [..., D, h, w], whose samples h // 2, w // 2 lie on the axis."""
+        check_layers(layers, len(self.depths))
+        shape = (layers.shape[-2], layers.shape[-1])
+        return linear(layers, self._formed, lambda field: self._gathered(field, shape))
+
+    def adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
+        """Conjugate transpose: layers [..., D, h, w] of ``shape`` (h, w) from a field [..., H, W]."""
+        return linear(field, lambda given: self._gathered(given, shape), self._formed)
+
+    def pairs(self, layers: Tensor) -> int:
+        """How many pairs of a lit source and a pixel inside its cone ``layers`` [D, h, w] have."""
+        total = 0
+        for plane, depth in zip(layers, self.depths, strict=True):
+            half = cone_samples(self.grid, self.wavelength, depth)
+            if self.cone == "full":
+                half = (float("inf"), float("inf"))
+            counts = []
+            for axis in (0, 1):
+                pixel = torch.arange(self.grid.shape[axis]) - self.grid.shape[axis] // 2
+                source = (torch.arange(plane.shape[axis]) - plane.shape[axis] // 2) * self.stride
+                counts.append(((pixel[:, None] - source).abs() <= half[axis]).sum(0))
+            total += int(((plane != 0) * (counts[0][:, None] * counts[1])).sum())
+        return total
+
+    def _formed(self, layers: Tensor) -> Tensor:
+        flat = layers.reshape(-1, *layers.shape[-3:]).to(torch.complex128)
+        out = flat.new_zeros(len(flat), *self.grid.shape)
+        for item, field in zip(flat, out, strict=True):
+            for plane, depth in zip(item, self.depths, strict=True):
+                rows, columns = plane.any(1).nonzero()[:, 0], plane.any(0).nonzero()[:, 0]
+                if len(rows) == 0:
+                    continue
+                low, high = int(columns[0]), int(columns[-1]) + 1
+                lit = plane[rows, low:high].flip(-1)
+                places = self._places(rows, plane.shape[-2])
+                for aside, matrix in self._rows(depth, plane.shape, (low, high), places):
+                    product = lit @ matrix
+                    for sign in (1, -1) if aside else (1,):
+                        inside, target = self._hit(places, sign * aside)
+                        field.index_add_(0, target, product[inside])
+        return out.reshape(*layers.shape[:-3], *self.grid.shape).to(layers.dtype)
+
+    def _gathered(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
+        flat = field.reshape(-1, *field.shape[-2:]).to(torch.complex128)
+        out = flat.new_zeros(len(flat), len(self.depths), *shape)
+        places = self._places(torch.arange(shape[0], device=field.device), shape[0])
+        for given, layers in zip(flat, out, strict=True):
+            for plane, depth in zip(layers, self.depths, strict=True):
+                back = torch.zeros_like(plane)
+                for aside, matrix in self._rows(depth, shape, (0, shape[1]), places):
+                    seen = given.new_zeros(shape[0], self.grid.shape[1])
+                    for sign in (1, -1) if aside else (1,):
+                        inside, target = self._hit(places, sign * aside)
+                        seen[inside] += given[target]
+                    back += seen @ matrix.mH
+                plane.copy_(back.flip(-1))
+        return out.reshape(*field.shape[:-2], len(self.depths), *shape).to(field.dtype)
+
+    def _places(self, rows: Tensor, height: int) -> Tensor:
+        """Rows of pixels on which rows of sources lie, counted from the hologram's first; may lie outside."""
+        return (rows - height // 2) * self.stride + self.grid.shape[0] // 2
+
+    def _hit(self, places: Tensor, aside: int) -> tuple[Tensor, Tensor]:
+        """Which sources have a row of pixels so far aside, and which."""
+        target = places + aside
+        inside = (target >= 0) & (target < self.grid.shape[0])
+        return inside, target[inside]
+
+    def _rows(
+        self, depth: float, shape: Sequence[int], columns: tuple[int, int], places: Tensor
+    ) -> Iterator[tuple[int, Tensor]]:
+        """For each distance between rows: the waves from a row's columns, last to first, to all pixels [w', W]."""
+        (height, width), (py, px), stride = self.grid.shape, self.grid.pitch, self.stride
+        low, high = columns
+        farthest = max(height - 1 - int(places.min()), int(places.max()))
+        if self.cone != "full":
+            farthest = int(min(farthest, cone_samples(self.grid, self.wavelength, depth)[0] + 1))
+        # Pixel b and source a lie b - W // 2 - (a - w // 2) stride samples apart; the last source comes first.
+        first = -(width // 2) - (high - 1 - shape[1] // 2) * stride
+        dx = (torch.arange((high - low - 1) * stride + width, dtype=torch.float64) + first)[None] * px
+        dx = dx.to(places.device)
+        for aside in range(farthest + 1):
+            dy = torch.full((1, 1), aside * py, dtype=torch.float64, device=dx.device)
+            wave = spherical_wave(dy, dx, self.grid.pitch, self.wavelength, depth, self.cone)[0]
+            if wave.any():
+                yield aside, wave.as_strided((high - low, width), (stride, 1)).clone()

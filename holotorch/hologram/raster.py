@@ -1,0 +1,86 @@
+"""Layers of sources and pixels of a hologram on one periodic array: where they lie, their spectra, and back."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from holotorch.core.fourier import fft2, good_length, ifft2
+from holotorch.core.grid import Grid
+
+
+class Raster:
+    """A periodic array of ``size`` samples (N_y, N_x) in which sources ``stride`` apart and pixels share positions.
+
+    Sources begin at sample 0. Their spectrum has the period N / stride, so it is a transform of that length, repeated.
+
+    Args:
+        grid: Pixels of the hologram.
+        shape: Sources (h, w) of a layer.
+        stride: Pixels between neighbouring sources.
+        size: Samples, multiples of ``stride``.
+    """
+
+    def __init__(self, grid: Grid, shape: tuple[int, int], stride: int, size: tuple[int, int]):
+        self.grid, self.shape, self.stride, self.size = grid, shape, stride, size
+        self.period = size[0] // stride, size[1] // stride
+        # Sample that the first pixel of each axis falls on.
+        self.first = [
+            (count // 2 * stride - pixels // 2) % length
+            for count, pixels, length in zip(shape, grid.shape, size, strict=True)
+        ]
+
+    def spectrum(self, layer: Tensor) -> Tensor:
+        """One period of the spectrum of a layer [h, w]: [N_y / stride, N_x / stride]."""
+        return fft2(layer, self.period)
+
+    def repeated(self, period: Tensor) -> Tensor:
+        """The whole spectrum, as a new tensor of ``size``."""
+        return period.repeat(self.stride, self.stride)
+
+    def tiles(self, spectrum: Tensor) -> Tensor:
+        """A view of a whole spectrum [..., N_y, N_x] as [..., s, N_y / s, s, N_x / s]: its periods."""
+        y, x = self.period
+        return spectrum.view(*spectrum.shape[:-2], self.stride, y, self.stride, x)
+
+    def pixels(self, spectrum: Tensor) -> Tensor:
+        """Field on the hologram [H, W] of a whole spectrum."""
+        field = ifft2(spectrum)
+        for axis, (first, count) in enumerate(zip(self.first, self.grid.shape, strict=True)):
+            end = first + count
+            if end <= self.size[axis]:
+                field = field.narrow(axis, first, count)
+            else:
+                parts = field.narrow(axis, first, self.size[axis] - first), field.narrow(axis, 0, end - self.size[axis])
+                field = torch.cat(parts, axis)
+        return field
+
+    def spectrum_of_pixels(self, field: Tensor) -> Tensor:
+        """Adjoint of :meth:`pixels`."""
+        rows, columns = (
+            (torch.arange(count, device=field.device) + first) % length
+            for first, count, length in zip(self.first, self.grid.shape, self.size, strict=True)
+        )
+        placed = field.new_zeros(self.size)
+        placed[rows[:, None], columns] = field
+        return fft2(placed) * (1 / math.prod(self.size))
+
+    def layer(self, spectrum: Tensor) -> Tensor:
+        """Adjoint of :meth:`spectrum` behind :meth:`repeated`: a layer [h, w] of a whole spectrum."""
+        folded = self.tiles(spectrum).sum((-4, -2))
+        return ifft2(folded, self.shape) * math.prod(self.period)
+
+
+def span(grid: Grid, shape: tuple[int, int], stride: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Per axis: the farthest that a source and a pixel lie apart, and how many samples both need side by side."""
+    apart, least = [], []
+    for count, pixels in zip(shape, grid.shape, strict=True):
+        low, high = -(count // 2) * stride, (count - 1 - count // 2) * stride
+        apart.append(max(pixels - 1 - pixels // 2 - low, high + pixels // 2))
+        least.append(max(high - low + 1, pixels))
+    return (apart[0], apart[1]), (least[0], least[1])
+
+
+def strided_length(minimum: int, stride: int) -> int:
+    """Smallest length >= ``minimum`` that is a multiple of ``stride`` and transforms fast."""
+    return stride * good_length(-(-minimum // stride))

@@ -1,0 +1,162 @@
+"""DirectHologram and ConvolutionHologram: the same sum, against pairs that are summed one by one."""
+
+import numpy as np
+import pytest
+import torch
+from oracles import holograms
+
+from holotorch import Grid
+from holotorch.hologram import ConvolutionHologram, DirectHologram
+
+BOTH = [DirectHologram, ConvolutionHologram]
+GRID = Grid((21, 16), (3.74e-6, 5e-6))
+WAVE = 520e-9
+
+
+def sources(*shape: int, dtype: torch.dtype = torch.complex128) -> torch.Tensor:
+    return torch.randn(shape, dtype=dtype, generator=torch.Generator().manual_seed(3))
+
+
+def relative(got: torch.Tensor, wanted) -> float:
+    wanted = torch.as_tensor(wanted)
+    return ((got.to(torch.complex128) - wanted).norm() / wanted.norm()).item()
+
+
+@pytest.mark.parametrize("kind", BOTH)
+@pytest.mark.parametrize("cone", ["full", "box", "disc", "taper"])
+@pytest.mark.parametrize(("stride", "shape"), [(1, (13, 20)), (2, (7, 9)), (3, (9, 4))])
+def test_equals_the_sum_over_pairs(kind, cone, stride, shape):
+    depths = (0.05e-3, 0.21e-3, 2e-3, 30e-3)  # narrower than the window, about as wide, far wider
+    layers = sources(4, *shape)
+    layers[1] = 0
+    layers[2, :, :2] = 0
+    wanted = holograms.direct(layers.numpy(), GRID.shape, GRID.pitch, WAVE, depths, cone, stride)
+    assert relative(kind(GRID, WAVE, depths, cone=cone, stride=stride)(layers), wanted) < 1e-12
+
+
+# Phases of k z up to 2e6 rad are reduced before they are added, so float64 keeps 1e-12; complex64 rounds by 6e-8 times
+# the root of some hundred additions.
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.complex64, 1e-6), (torch.complex128, 1e-11)])
+@pytest.mark.parametrize("wavelength", [636e-9, 520e-9, 455e-9])
+@pytest.mark.parametrize("depth", [2e-3, 20e-3, 158e-3])
+def test_both_agree_in_every_colour_near_and_far(dtype, tolerance, wavelength, depth):
+    grid, depths = Grid((96, 80), 3.74e-6), [depth, depth * 1.01, depth * 1.013]  # unevenly spaced
+    layers = sources(3, 40, 48)
+    layers[:, 5:-5, 5:-5] = 0  # corners and rims only
+    exact = DirectHologram(grid, wavelength, depths, stride=2)(layers)
+    assert relative(ConvolutionHologram(grid, wavelength, depths, stride=2)(layers.to(dtype)), exact) < tolerance
+
+
+def test_a_carrier_of_a_million_radians_is_right():
+    """Against 30 digits: one source on the axis, 158 mm away, at 455 nm."""
+    from decimal import Decimal, getcontext
+
+    getcontext().prec = 40
+    aside, far = Decimal("3.74e-6") * 7, Decimal("0.158")
+    r = (far * far + aside * aside).sqrt()
+    turns = float((r / Decimal("455e-9")) % 1)
+    field = DirectHologram(Grid((1, 15), 3.74e-6), 455e-9, [0.158])(torch.ones(1, 1, 1, dtype=torch.complex128))
+    wanted = np.exp(2j * np.pi * turns) / float(r)
+    # 3.5e5 turns in float64 leave 4e-11 of one: 2.4e-10 rad.
+    assert abs(field[0, 14].item() - wanted) < 5e-10 * abs(wanted)
+
+
+@pytest.mark.parametrize("kind", BOTH)
+@pytest.mark.parametrize("cone", ["box", "taper"])
+def test_adjoint_and_gradients(kind, cone):
+    operator = kind(GRID, WAVE, (0.3e-3, 1e-3), cone=cone, stride=2)
+    layers, field = sources(2, 2, 6, 5), sources(2, *GRID.shape)
+    formed, back = operator(layers), operator.adjoint(field, (6, 5))
+    assert back.shape == layers.shape
+    left, right = (formed.conj() * field).sum(), (layers.conj() * back).sum()
+    assert (left - right).abs() < 1e-12 * formed.norm() * field.norm()
+    small = kind(Grid((4, 5), 4e-6), WAVE, (0.3e-3, 1e-3), cone=cone)
+    assert torch.autograd.gradcheck(small, sources(2, 3, 2).requires_grad_())
+    assert torch.autograd.gradgradcheck(lambda x: small(x).abs().square(), sources(2, 3, 2).requires_grad_())
+
+
+@pytest.mark.parametrize("kind", BOTH)
+def test_a_batch_is_its_items_and_dark_planes_are_nothing(kind):
+    operator = kind(GRID, WAVE, (1e-3, 2e-3))
+    layers = sources(2, 3, 2, 5, 7)
+    batch = operator(layers)
+    assert batch.shape == (2, 3, *GRID.shape)
+    assert relative(batch[1, 2], operator(layers[1, 2])) < 1e-14
+    assert not operator(torch.zeros(2, 5, 7, dtype=torch.complex64)).any()
+    assert operator(layers.to(torch.complex64)).dtype == torch.complex64
+    one = torch.zeros(2, 5, 7, dtype=torch.complex128)
+    one[1, 2, 3] = torch.tensor(2j)  # on the axis
+    only = kind(GRID, WAVE, (2e-3,))(torch.full((1, 1, 1), 2j, dtype=torch.complex128))
+    assert relative(operator(one), only) < 1e-13
+
+
+def test_full_waves_alias_where_the_cone_is_narrower_than_the_window():
+    """The three definitions, at half the cone that the window has and beyond it (thesis Sec. 5.6.1)."""
+    grid = Grid(128, 3.74e-6)
+    layers = sources(1, 128, 128)
+    for depth, low, high in ((2.8e-3, 0.3, 1.0), (7e-3, 0.0, 1e-12)):  # K / (V + H) = 0.5, 1.25
+        full = ConvolutionHologram(grid, 636e-9, [depth], cone="full")(layers)
+        box = ConvolutionHologram(grid, 636e-9, [depth], cone="box")(layers)
+        assert low <= relative(full, box) <= high
+
+
+def test_lengths_are_those_of_the_cone_and_no_more():
+    grid = Grid(512, 3.74e-6)
+    near = ConvolutionHologram(grid, 636e-9, [1e-3], stride=2).padded((256, 256))
+    far = ConvolutionHologram(grid, 636e-9, [1.0], stride=2).padded((256, 256))
+    assert near == (540, 540)  # 511 between the farthest pair, 22 of the cone
+    assert far == (1024, 1024) and far[0] <= 2 * 512
+
+
+def test_direct_counts_its_pairs():
+    grid, depths = Grid((9, 8), 4e-6), (20e-6, 5e-3)
+    layers = sources(2, 3, 4)
+    layers[1, 0] = 0
+    operator = DirectHologram(grid, WAVE, depths, stride=2)
+    counted = 0
+    for plane, depth in zip(layers.numpy(), depths, strict=True):
+        for i, sy in enumerate(holograms.positions(3, 2) * 4e-6):
+            for j, sx in enumerate(holograms.positions(4, 2) * 4e-6):
+                dy, dx = (holograms.positions(n) * 4e-6 - s for n, s in ((9, sy), (8, sx)))
+                field = holograms.wave(dy[:, None], dx[None], (4e-6, 4e-6), WAVE, depth, "box")
+                counted += int((field != 0).sum()) * (plane[i, j] != 0)
+    assert operator.pairs(layers) == counted
+    assert DirectHologram(grid, WAVE, depths, stride=2, cone="full").pairs(layers) == (12 + 8) * 72
+
+
+@pytest.mark.parametrize("kind", BOTH)
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"depths": []}, ValueError, "at least one distance"),
+        ({"depths": [1e-3, 0.0]}, ValueError, "depths must be above zero, before the hologram, got 0.0"),
+        ({"depths": [-1e-3]}, ValueError, "depths must be above zero"),
+        ({"depths": [float("nan")]}, ValueError, "depth must be finite"),
+        ({"wavelength": 0.0}, ValueError, "wavelength must be above zero"),
+        ({"stride": 0}, ValueError, "stride must be at least 1"),
+        ({"cone": "band"}, ValueError, "cone='band'"),
+    ],
+)
+def test_impossible_arguments_are_named(kind, change, error, message):
+    arguments = {"grid": GRID, "wavelength": WAVE, "depths": [1e-3], **change}
+    with pytest.raises(error, match=message):
+        kind(**arguments)
+
+
+@pytest.mark.parametrize("kind", BOTH)
+def test_wrong_layers_are_named(kind):
+    operator = kind(GRID, WAVE, [1e-3, 2e-3])
+    with pytest.raises(TypeError, match=r"complex tensor \(..., D, h, w\), got torch.float32"):
+        operator(torch.zeros(2, 4, 4))
+    with pytest.raises(ValueError, match=r"D = 2 depths, got \(3, 4, 4\)"):
+        operator(torch.zeros(3, 4, 4, dtype=torch.complex64))
+    with pytest.raises(ValueError, match=r"got \(2, 0, 4\)"):
+        operator(torch.zeros(2, 0, 4, dtype=torch.complex64))
+
+
+@pytest.mark.parametrize("kind", BOTH)
+def test_a_pitch_below_half_a_wavelength_carries_every_direction(kind):
+    grid = Grid((9, 7), 0.2e-6)
+    layers = sources(1, 5, 5)
+    wanted = holograms.direct(layers.numpy(), grid.shape, grid.pitch, WAVE, [2e-6], "full")
+    assert relative(kind(grid, WAVE, [2e-6], cone="box")(layers), wanted) < 1e-12
