@@ -17,11 +17,15 @@ def fft2(field: Tensor, size: tuple[int, int] | None = None) -> Tensor:
     return torch.fft.fft2(field, s=size)
 
 
-def ifft2(spectrum: Tensor, size: tuple[int, int] | None = None) -> Tensor:
-    """Inverse of :func:`fft2`, cropped to its first ``size`` samples."""
+def ifft2(spectrum: Tensor, size: tuple[int, int] | None = None, first: tuple[int, int] = (0, 0)) -> Tensor:
+    """Inverse of :func:`fft2`, cropped to ``size`` samples from ``first`` on; it is periodic."""
     field = torch.fft.ifft2(spectrum, norm="forward")
-    if size is not None:
-        field = field[..., : size[0], : size[1]]
+    for axis, begin, count in zip((-2, -1), first, size or (), strict=False):
+        end, length = begin + count, field.shape[axis]
+        if end <= length:
+            field = field.narrow(axis, begin, count)
+        else:
+            field = torch.cat([field.narrow(axis, begin, length - begin), field.narrow(axis, 0, end - length)], axis)
     return field * (1 / math.prod(spectrum.shape[-2:]))
 
 

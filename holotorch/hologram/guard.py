@@ -109,7 +109,7 @@ def faded_out(values: Tensor, begin: float, end: float) -> Tensor:
 def choose_length(axis: Axis, tolerance: float) -> tuple[int, float]:
     """Shortest fast length whose error is within ``tolerance``, with that error; else the best of those tried.
 
-    Tried are lengths up to three windows and twelve times sqrt(wavelength z), which what diffracts around an edge needs.
+    Tried are lengths up to three windows and twelve times sqrt(wavelength z), how far light spreads around an edge.
     """
     length, best = axis.least(), None
     around = math.sqrt(axis.wavelength * axis.farthest) / axis.pitch

@@ -45,15 +45,7 @@ class Raster:
 
     def pixels(self, spectrum: Tensor) -> Tensor:
         """Field on the hologram [H, W] of a whole spectrum."""
-        field = ifft2(spectrum)
-        for axis, (first, count) in enumerate(zip(self.first, self.grid.shape, strict=True)):
-            end = first + count
-            if end <= self.size[axis]:
-                field = field.narrow(axis, first, count)
-            else:
-                parts = field.narrow(axis, first, self.size[axis] - first), field.narrow(axis, 0, end - self.size[axis])
-                field = torch.cat(parts, axis)
-        return field
+        return ifft2(spectrum, self.grid.shape, (self.first[0], self.first[1]))
 
     def spectrum_of_pixels(self, field: Tensor) -> Tensor:
         """Adjoint of :meth:`pixels`."""

@@ -1,0 +1,58 @@
+"""What a hologram shows: refocused at a depth, through the whole window or a pupil that looks from the side."""
+
+from collections.abc import Iterable, Iterator
+
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+from holotorch.core.complex import intensity
+from holotorch.core.fourier import fft2, ifft2
+from holotorch.core.grid import Grid
+from holotorch.hologram.cone import taper
+from holotorch.optics.propagate import propagate
+
+
+def refocused(hologram: Tensor, grid: Grid, wavelength: float, depth: float, *, tolerance: float = 1e-3) -> Tensor:
+    """Field [..., H, W] at ``depth`` metres from the hologram, where its sources are.
+
+    The hologram holds waves exp(+ikr) that come from there, so the light is followed back (Sec. 5.5.1). Brightness is
+    that of the waves: a source of amplitude A in focus has about A times a constant of the grid.
+    """
+    return propagate(hologram, grid, wavelength, -checks.positive("depth", depth, "metres"), tolerance=tolerance)
+
+
+def focal_stack(
+    hologram: Tensor, grid: Grid, wavelength: float, depths: Iterable[float], *, tolerance: float = 1e-3
+) -> Iterator[Tensor]:
+    """Intensity [..., H, W] at each depth, one after another."""
+    for depth in depths:
+        yield intensity(refocused(hologram, grid, wavelength, depth, tolerance=tolerance))
+
+
+def perspective(
+    hologram: Tensor, grid: Grid, wavelength: float, *, direction: tuple[float, float], aperture: float
+) -> Tensor:
+    """The part of a hologram [..., H, W] that reaches a far pupil: light within a cone of directions.
+
+    Args:
+        hologram: Complex.
+        grid: Its pixels.
+        wavelength: In metres.
+        direction: Sines (y, x) of the pupil's centre as seen from the hologram.
+        aperture: Sine of the half angle of the pupil, above 0; its rim is soft over the last 30 %.
+
+    Raises:
+        ValueError: A pupil that lies beyond the grid's band altogether.
+    """
+    y, x = checks.pair("direction", direction, "sines")
+    aperture = checks.positive("aperture", aperture)
+    for sine, pitch in zip((y, x), grid.pitch, strict=True):
+        if abs(sine) - aperture > wavelength / (2 * pitch):
+            raise ValueError(
+                f"direction {sine:g} with aperture {aperture:g} lies outside the hologram's band of sines up to "
+                f"{wavelength / (2 * pitch):.3g}"
+            )
+    fy, fx = grid.frequencies(hologram.device)
+    aside = torch.sqrt((fy * wavelength - y).square() + (fx * wavelength - x).square()) / aperture
+    return ifft2(fft2(hologram) * taper(aside).to(hologram.real.dtype))

@@ -1,0 +1,60 @@
+import math
+
+import pytest
+import torch
+
+from holotorch import Grid
+from holotorch.hologram import AxialHologram, ConvolutionHologram, DirectHologram, plan_hologram
+
+PITCH, WAVE = 3.74e-6, 520e-9
+
+
+def depths(count: int, low: float = 9e-3, high: float = 11e-3) -> list[float]:
+    return torch.linspace(low, high, count, dtype=torch.float64).tolist()
+
+
+def test_the_cheaper_way_is_taken_and_does_what_is_said():
+    grid = Grid(64, PITCH)
+    many = plan_hologram(grid, WAVE, depths(400), (32, 32), stride=2)
+    assert many.method == "axial nodes" and isinstance(many.operator, AxialHologram)
+    assert many.transforms < 100 and many.predicted_error <= 1e-3 and many.adequate
+    assert "400 planes on" in many.reason and "convolution: 400 transforms" in many.runner_up
+    layers = torch.randn(400, 32, 32, dtype=torch.complex128)
+    exact = DirectHologram(grid, WAVE, depths(400), stride=2, cone="full")(layers)
+    assert (many.operator(layers) - exact).norm() < 1e-3 * exact.norm()
+
+
+def test_a_tolerance_of_rounding_takes_the_exact_way():
+    plan = plan_hologram(Grid(64, PITCH), WAVE, depths(30), (64, 64), tolerance=1e-6)
+    assert plan.method == "convolution" and isinstance(plan.operator, ConvolutionHologram)
+    for cone in ("box", "disc"):
+        near = plan_hologram(Grid(256, PITCH), WAVE, depths(5, 1e-3, 2e-3), (256, 256), cone=cone)
+        assert near.method == "convolution" and near.cone == cone and near.near
+
+
+def test_far_away_every_definition_may_take_the_fast_way():
+    plan = plan_hologram(Grid(64, PITCH), WAVE, depths(300, 0.1, 0.11), (64, 64), cone="box")
+    assert plan.method == "axial nodes" and not plan.near
+
+
+def test_memory_is_foreseen_and_kept():
+    plan = plan_hologram(Grid(4096, PITCH), 636e-9, depths(290, 60e-3, 75e-3), (2048, 2048), stride=2)
+    assert 0.5e9 < plan.memory_bytes < 8e9
+    with pytest.raises(ValueError, match=r"needs .* GB and 0.10 GB are allowed"):
+        plan_hologram(Grid(4096, PITCH), 636e-9, depths(9), (2048, 2048), stride=2, memory_limit=10**8)
+
+
+def test_what_no_way_reaches_is_refused():
+    with pytest.raises(ValueError, match="no way reaches a tolerance of 1.0e-06 for cone='band'"):
+        plan_hologram(Grid(64, PITCH), WAVE, [1e-3], (64, 64), cone="band", tolerance=1e-6)
+    with pytest.raises(TypeError, match="complex64 or torch.complex128, got torch.float32"):
+        plan_hologram(Grid(64, PITCH), WAVE, [1e-3], (64, 64), dtype=torch.float32)
+
+
+def test_borders_of_validity_are_said():
+    cone = 2 * 30e-6 * math.tan(math.asin(WAVE / 2 / PITCH)) / PITCH
+    close = plan_hologram(Grid(32, PITCH), WAVE, [30e-6], (32, 32))
+    assert f"covers {cone:.2g} pixels" in close.notes[0] and "narrower than the window" in close.notes[1]
+    assert plan_hologram(Grid(32, PITCH), WAVE, [0.1], (32, 32)).notes == ()
+    fine = plan_hologram(Grid(16, 0.2e-6), WAVE, [5e-6], (8, 8), cone="box")
+    assert any("half a wavelength" in note for note in fine.notes)
