@@ -17,7 +17,7 @@ from holotorch.optics import diffraction_angle, plan_propagation, unaliased_dist
 _PIXEL_SECONDS, _FFT_SECONDS = 8e-9, 0.8e-9
 # Measured on the same runs, within 30 %: the interpreter with its libraries; per pixel; per padded sample of the
 # solver; per sample of the judge's grid of one colour.
-_BASE_BYTES, _PIXEL_BYTES, _SOLVER_BYTES, _JUDGE_BYTES = 480e6, 600, 80, 112
+_BASE_BYTES, _PIXEL_BYTES, _SOLVER_BYTES, _JUDGE_BYTES = 450e6, 240, 60, 112
 
 
 def plan(experiment: PECExperiment) -> dict[str, Any]:

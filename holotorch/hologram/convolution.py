@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from holotorch.core.complex import phasor
 from holotorch.core.fourier import even_fft2, multiply_even
 from holotorch.core.grid import Grid
 from holotorch.core.operator import linear
@@ -80,19 +81,18 @@ class ConvolutionHologram(nn.Module):
         wave = spherical_wave(dy[:, None], dx[None], self.grid.pitch, self.wavelength, depth, self.cone)
         return even_fft2(wave.to(layers.dtype), raster.size)
 
+    def accumulator(self, shape: tuple[int, int], phase: Tensor | None = None) -> "ConvolutionSum":
+        """A sum to which planes [h, w], real or complex, are added one by one; ``phase`` [h, w] is common to all."""
+        return ConvolutionSum(self, shape, phase)
+
     def _formed(self, layers: Tensor) -> Tensor:
-        raster = self._raster((layers.shape[-2], layers.shape[-1]))
-        flat = layers.reshape(-1, *layers.shape[-3:])
-        totals = flat.new_zeros(len(flat), *raster.size)
-        for j, depth in enumerate(self.depths):
-            lit = [item for item in range(len(flat)) if flat[item, j].any()]
-            if not lit:
-                continue
-            kernel = self._kernel(depth, raster, layers)
-            for item in lit:
-                totals[item] += multiply_even(raster.repeated(raster.spectrum(flat[item, j])), kernel)
-        fields = torch.stack([raster.pixels(total) for total in totals])
-        return fields.reshape(*layers.shape[:-3], *self.grid.shape)
+        fields = []
+        for item in layers.reshape(-1, *layers.shape[-3:]):
+            total = self.accumulator((item.shape[-2], item.shape[-1]))
+            for j, plane in enumerate(item):
+                total.add(j, plane)
+            fields.append(total.finish())
+        return torch.stack(fields).reshape(*layers.shape[:-3], *self.grid.shape).to(layers.dtype)
 
     def _gathered(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
         raster = self._raster(shape)
@@ -107,3 +107,28 @@ class ConvolutionHologram(nn.Module):
 
     def _raster(self, shape: tuple[int, int]) -> Raster:
         return Raster(self.grid, shape, self.stride, self.padded(shape))
+
+
+class ConvolutionSum:
+    """The sum of a :class:`ConvolutionHologram` while planes arrive, in any order."""
+
+    def __init__(self, operator: ConvolutionHologram, shape: tuple[int, int], phase: Tensor | None):
+        self.operator, self.raster, self.phase = operator, operator._raster(shape), phase
+        self.total: Tensor | None = None
+
+    def add(self, j: int, plane: Tensor) -> None:
+        """Add the plane of depth number ``j``; dark ones cost nothing."""
+        if not plane.any():
+            return
+        plane = plane.detach().to(torch.promote_types(plane.dtype, torch.complex64))
+        if self.phase is not None:
+            plane = plane * phasor(self.phase).to(plane.dtype)
+        kernel = self.operator._kernel(self.operator.depths[j], self.raster, plane)
+        added = multiply_even(self.raster.repeated(self.raster.spectrum(plane)), kernel)
+        self.total = added if self.total is None else self.total.add_(added)
+
+    def finish(self) -> Tensor:
+        """The field [H, W]; complex zeros where no plane was lit."""
+        if self.total is None:
+            return torch.zeros(self.operator.grid.shape, dtype=torch.complex64)
+        return self.raster.pixels(self.total)
