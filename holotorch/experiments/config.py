@@ -1,37 +1,28 @@
 """What a configuration may say: frozen models, checked all at once, before torch is loaded."""
 
-import re
-from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
+from holotorch.experiments.config_volume import VolumeSettings, contradictions
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.messages import describe, nearest, position
+from holotorch.experiments.settings import (
+    Count,
+    GridSettings,
+    Length,
+    Number,
+    Settings,
+    Side,
+    Wavelength,
+    number,
+    pair,
+    several,
+)
 from holotorch.experiments.source import Key, read_source
 from holotorch.io.bundled import BUNDLED_IMAGES, no_such_picture
-
-_POWERS = {"m": 0, "cm": -2, "mm": -3, "um": -6, "µm": -6, "μm": -6, "nm": -9}  # of ten, in metres
-_LENGTH = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-zµμ]*)")
-
-
-def _metres(value: Any) -> Any:
-    if isinstance(value, str):
-        match = _LENGTH.fullmatch(value.strip())
-        if not match or (match[2] and match[2] not in _POWERS):
-            raise PydanticCustomError(
-                "length", "expected a length such as 530 nm, 3.74 um, 100 mm or a number of metres"
-            )
-        return float(Decimal(match[1]).scaleb(_POWERS[match[2] or "m"]))  # rounded once: 0.57 um is 5.7e-07
-    return _number(value)
-
-
-def _number(value: Any) -> Any:
-    if isinstance(value, bool):
-        raise PydanticCustomError("number", "expected a number")
-    return value
 
 
 def _not_zero(value: float) -> float:
@@ -40,54 +31,15 @@ def _not_zero(value: float) -> float:
     return value
 
 
-def _within(least: float, most: float, words: str) -> AfterValidator:
-    def check(value: float) -> float:
-        if not least <= value <= most:
-            raise PydanticCustomError("range", "expected {words}", {"words": words})
-        return value
-
-    return AfterValidator(check)
-
-
-def _pair(value: Any) -> Any:
-    return value if isinstance(value, list | tuple) else (value, value)
-
-
-def _several(value: Any) -> Any:
-    return value if isinstance(value, list | tuple) else (value,)
-
-
 def _picture(value: Any) -> Any:
     if isinstance(value, str) and value not in BUNDLED_IMAGES and not Path(value).is_file():
         raise PydanticCustomError("picture", "{message}", {"message": no_such_picture(value)})
     return value
 
 
-Number = Annotated[float, BeforeValidator(_number), Field(allow_inf_nan=False)]
-Count = Annotated[int, BeforeValidator(_number), Field(ge=1)]
-Length = Annotated[float, BeforeValidator(_metres), Field(allow_inf_nan=False)]
-# Ranges that catch a forgotten unit: 530 is no wavelength in metres and 9 no pitch.
-Wavelength = Annotated[Length, _within(1e-7, 2e-5, "a wavelength between 100 nm and 20 um")]
-Pitch = Annotated[Length, _within(1e-9, 1e-3, "a pitch between 1 nm and 1 mm")]
-
-
 # "hot": phases uniform on [0, 2 pi); "cool": their spread is; "flat": on [0, 1); "quadratic": a lens, after spreading;
 # "retrieved": phases of Gerchberg-Saxton, deconvolved.
 Start = Literal["hot", "cool", "flat", "quadratic", "retrieved"]
-Side = Annotated[Count, Field(le=16384)]
-
-
-class Settings(BaseModel):
-    """Base of all sections: frozen, and an unknown key is an error."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class GridSettings(Settings):
-    """Samples (H, W) and their pitch (y, x); one pitch means both axes."""
-
-    shape: Annotated[tuple[Side, Side], BeforeValidator(_pair)]
-    pitch: Annotated[tuple[Pitch, Pitch], BeforeValidator(_pair)]
 
 
 class TargetSettings(Settings):
@@ -100,7 +52,7 @@ class TargetSettings(Settings):
 
     image: Annotated[str, BeforeValidator(_picture)]
     fit: Literal["crop", "pad"] = "crop"
-    region: Annotated[tuple[Side, Side], BeforeValidator(_pair)] | None = None
+    region: Annotated[tuple[Side, Side], BeforeValidator(pair)] | None = None
     depths: Literal["bands", "full"] = "bands"
 
 
@@ -130,7 +82,7 @@ class NearFieldSettings(Settings):
 
     kind: Literal["fresnel", "angular_spectrum"]
     distance: Annotated[
-        tuple[Annotated[Length, AfterValidator(_not_zero)], ...], BeforeValidator(_several), Field(min_length=1)
+        tuple[Annotated[Length, AfterValidator(_not_zero)], ...], BeforeValidator(several), Field(min_length=1)
     ]
     boundary: Literal["isolated", "periodic"] = "isolated"
 
@@ -177,21 +129,21 @@ Baseline = Literal["none", "basic_ipec", "ipec", "chopping", "shifting", "nonneg
 class ReportSettings(Settings):
     """What is measured and compared in the report."""
 
-    metrics: Annotated[tuple[Literal["ssim", "psnr"], ...], BeforeValidator(_several), Field(min_length=1)] = (
+    metrics: Annotated[tuple[Literal["ssim", "psnr"], ...], BeforeValidator(several), Field(min_length=1)] = (
         "ssim",
         "psnr",
     )
-    baselines: Annotated[tuple[Baseline, ...], BeforeValidator(_several)] = ("none", "basic_ipec")
+    baselines: Annotated[tuple[Baseline, ...], BeforeValidator(several)] = ("none", "basic_ipec")
 
 
 class PECSettings(Settings):
     """Proximity effect correction of one picture on a thermally driven phased array."""
 
     experiment: Literal["pec"]
-    seed: Annotated[int, BeforeValidator(_number), Field(ge=0, lt=2**63)] = 0
+    seed: Annotated[int, BeforeValidator(number), Field(ge=0, lt=2**63)] = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
     grid: GridSettings
-    wavelengths: Annotated[tuple[Wavelength, ...], BeforeValidator(_several)]
+    wavelengths: Annotated[tuple[Wavelength, ...], BeforeValidator(several)]
     target: TargetSettings
     modulator: ModulatorSettings
     propagator: Annotated[FraunhoferSettings | NearFieldSettings, Field(discriminator="kind")]
@@ -207,15 +159,19 @@ class StudySettings(Settings):
     experiment: Literal["pec_study"]
     study: Literal["reproduction", "lowpass", "multiplexing", "iterations", "time", "focus", "limits", "targets"]
     images: Annotated[
-        tuple[Annotated[str, BeforeValidator(_picture)], ...], BeforeValidator(_several), Field(min_length=1)
+        tuple[Annotated[str, BeforeValidator(_picture)], ...], BeforeValidator(several), Field(min_length=1)
     ]
     size: Annotated[Count, Field(ge=24, le=1024)] = 128
-    sweep: Annotated[tuple[Annotated[Number, Field(gt=0, le=3)], ...], BeforeValidator(_several), Field(min_length=1)]
+    sweep: Annotated[tuple[Annotated[Number, Field(gt=0, le=3)], ...], BeforeValidator(several), Field(min_length=1)]
     max_steps: Count = 400
-    seed: Annotated[int, BeforeValidator(_number), Field(ge=0, lt=2**63)] = 7
+    seed: Annotated[int, BeforeValidator(number), Field(ge=0, lt=2**63)] = 7
 
 
-KINDS: dict[str, type[PECSettings] | type[StudySettings]] = {"pec": PECSettings, "pec_study": StudySettings}
+KINDS: dict[str, type[PECSettings] | type[StudySettings] | type[VolumeSettings]] = {
+    "pec": PECSettings,
+    "pec_study": StudySettings,
+    "volume": VolumeSettings,
+}
 
 
 def load_config(path: Path | str, overrides: list[str] | None = None) -> Any:
@@ -236,7 +192,8 @@ def load_config(path: Path | str, overrides: list[str] | None = None) -> Any:
         raise ConfigError(sorted(mistakes, key=position)) from None
     if isinstance(settings, StudySettings):
         return settings
-    mistakes = [source.mistake(key, message) for key, message in _contradictions(settings)]
+    found = contradictions(settings) if isinstance(settings, VolumeSettings) else _contradictions(settings)
+    mistakes = [source.mistake(key, message) for key, message in found]
     if mistakes:
         raise ConfigError(mistakes)
     return settings

@@ -1,0 +1,73 @@
+"""Building blocks of configurations: units, ranges, and sections that all kinds share."""
+
+import re
+from decimal import Decimal
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic_core import PydanticCustomError
+
+_POWERS = {"m": 0, "cm": -2, "mm": -3, "um": -6, "µm": -6, "μm": -6, "nm": -9}  # of ten, in metres
+_LENGTH = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-zµμ]*)")
+
+
+def metres(value: Any) -> Any:
+    """A length with its unit, or a number of metres, as metres."""
+    if isinstance(value, str):
+        match = _LENGTH.fullmatch(value.strip())
+        if not match or (match[2] and match[2] not in _POWERS):
+            raise PydanticCustomError(
+                "length", "expected a length such as 530 nm, 3.74 um, 100 mm or a number of metres"
+            )
+        return float(Decimal(match[1]).scaleb(_POWERS[match[2] or "m"]))  # rounded once: 0.57 um is 5.7e-07
+    return number(value)
+
+
+def number(value: Any) -> Any:
+    """Anything but true and false, which are numbers in Python."""
+    if isinstance(value, bool):
+        raise PydanticCustomError("number", "expected a number")
+    return value
+
+
+def within(least: float, most: float, words: str) -> AfterValidator:
+    """A range, and the words for it."""
+
+    def check(value: float) -> float:
+        if not least <= value <= most:
+            raise PydanticCustomError("range", "expected {words}", {"words": words})
+        return value
+
+    return AfterValidator(check)
+
+
+def pair(value: Any) -> Any:
+    """One value for both axes."""
+    return value if isinstance(value, list | tuple) else (value, value)
+
+
+def several(value: Any) -> Any:
+    """One value as a list."""
+    return value if isinstance(value, list | tuple) else (value,)
+
+
+Number = Annotated[float, BeforeValidator(number), Field(allow_inf_nan=False)]
+Count = Annotated[int, BeforeValidator(number), Field(ge=1)]
+Length = Annotated[float, BeforeValidator(metres), Field(allow_inf_nan=False)]
+# Ranges that catch a forgotten unit: 530 is no wavelength in metres and 9 no pitch.
+Wavelength = Annotated[Length, within(1e-7, 2e-5, "a wavelength between 100 nm and 20 um")]
+Pitch = Annotated[Length, within(1e-9, 1e-3, "a pitch between 1 nm and 1 mm")]
+Side = Annotated[Count, Field(le=16384)]
+
+
+class Settings(BaseModel):
+    """Base of all sections: frozen, and an unknown key is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class GridSettings(Settings):
+    """Samples (H, W) and their pitch (y, x); one pitch means both axes."""
+
+    shape: Annotated[tuple[Side, Side], BeforeValidator(pair)]
+    pitch: Annotated[tuple[Pitch, Pitch], BeforeValidator(pair)]

@@ -1,0 +1,90 @@
+"""Volumes of the thesis that can be fetched: those of Table 5.2 whose checksum is known."""
+
+import difflib
+from dataclasses import dataclass
+from pathlib import Path
+
+from holotorch.io.volumes import load_volume
+from holotorch.scene.volume import Volume
+
+_ORIGIN = "http://klacansky.com/open-scivis-datasets"
+
+
+@dataclass(frozen=True)
+class Published:
+    """A volume of the Open SciVis Datasets: raw voxels, x fastest, in cubes of no stated size.
+
+    Attributes:
+        url: Of the raw file; its name says size (x, y, z) and type.
+        shape: Voxels (D, H, W).
+        dtype: Type of a voxel.
+        sha512: Of the raw file, as the catalogue publishes it.
+        acknowledgement: Whom the catalogue asks to name. It states no licence: do not pass the data on.
+    """
+
+    url: str
+    shape: tuple[int, int, int]
+    dtype: str
+    sha512: str
+    acknowledgement: str
+
+
+PUBLISHED = {
+    "tooth": Published(
+        f"{_ORIGIN}/tooth/tooth_103x94x161_uint8.raw",
+        (161, 94, 103),
+        "uint8",
+        "5ee3d77ae951e129d29062a4fd4d8730fd8670bdaf4d01ddf907848072180cbf"
+        "ea8ab897880147d2a79dc7f1d1806a34b32853074eca88f6758e01382469f9f6",
+        "",
+    ),
+    "boston_teapot": Published(
+        f"{_ORIGIN}/boston_teapot/boston_teapot_256x256x178_uint8.raw",
+        (178, 256, 256),
+        "uint8",
+        "b2bf7ba8ba7a7d5a8ea76ccd8fd2c0f5f043079a83cd6a3055e85f5e0a40c1c4"
+        "d872b9bbc7aedf628989eb57bffd5729767c29fe8ae018c581406b196caa6359",
+        "volvis.org and Terarecon Inc, MERL, Brigham and Women's Hospital",
+    ),
+    "bonsai": Published(
+        f"{_ORIGIN}/bonsai/bonsai_256x256x256_uint8.raw",
+        (256, 256, 256),
+        "uint8",
+        "b34156a0ffc80ffaf84d069f3d05a40fdd999a35f05492829a2b0c13403a3147"
+        "e73712b1d10c2cc34da66a59540a1632dae6adc96f3ebf3efa5d4d6c10598997",
+        "volvis.org and S. Roettger, VIS, University of Stuttgart",
+    ),
+}
+
+
+def fetch_volume(name: str, directory: str | Path | None = None) -> Volume:
+    """Fetch a volume of the thesis once, check it, and load it (mapped); later calls need no network.
+
+    Args:
+        name: One of :data:`PUBLISHED`. Engine, C60 and hand of Table 5.2 are not among them: no checksum of theirs is
+            known. Download them and use :func:`load_volume`; ``scene.c60`` computes a molecule.
+        directory: Where the file is kept; by default the user's cache.
+
+    Returns:
+        uint8, in cubes of relative size 1.
+
+    Raises:
+        ValueError: No such name, or what was fetched does not have the published checksum.
+        OSError: The file could not be fetched; the message says where to put it by hand.
+    """
+    if name not in PUBLISHED:
+        near = difflib.get_close_matches(str(name), PUBLISHED, 1)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        raise ValueError(
+            f"no such published volume: {name!r}; {hint}known are {', '.join(PUBLISHED)}. Load others with load_volume"
+        )
+    import pooch
+
+    entry = PUBLISHED[name]
+    folder = Path(directory) if directory is not None else Path(pooch.os_cache("holotorch"))
+    file = folder / entry.url.rsplit("/", 1)[1]
+    try:
+        pooch.retrieve(entry.url, known_hash=f"sha512:{entry.sha512}", fname=file.name, path=folder)
+    except OSError as error:  # those of requests are OSErrors as well
+        raise OSError(f"could not fetch {entry.url}: {error}; download it and put it at {file}") from error
+    return load_volume(file, spacing=1, unit="relative", shape=entry.shape, dtype=entry.dtype)

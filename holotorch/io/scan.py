@@ -1,0 +1,202 @@
+"""What a file of voxels states, before it becomes a Volume, and the checks that all formats share."""
+
+import importlib
+import math
+import mmap
+import sys
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from holotorch.scene.volume import IDENTITY, Triple
+
+_MAP_NORESERVE = 0x4000  # of Linux; Python has no name for it before 3.13
+_CHUNK = 1 << 24  # bytes read at once
+_METRES = {
+    "m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 1e-2, "mm": 1e-3, "millimeter": 1e-3, "um": 1e-6, "µm": 1e-6,
+    "micron": 1e-6, "nm": 1e-9, "angstrom": 1e-10,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Voxels and the geometry that their file states.
+
+    Attributes:
+        values: [D, H, W] in the file's type, possibly mapped.
+        spacing: Along (z, y, x) in ``unit``, or None where the file does not say.
+        unit: "m" or "relative".
+        origin: Of voxel [0, 0, 0], (z, y, x) in ``unit``.
+        orientation: Unit rows for the axes z, y, x, with (z, y, x) components.
+    """
+
+    values: np.ndarray
+    spacing: Triple | None = None
+    unit: str = "relative"
+    origin: Triple = (0.0, 0.0, 0.0)
+    orientation: tuple[Triple, Triple, Triple] = IDENTITY
+
+
+def metres(unit: str, path: Path) -> float:
+    """Length in metres of a ``unit`` that the file at ``path`` names."""
+    name = unit.strip().lower()
+    if name not in _METRES:
+        name = name.removesuffix("s")
+    if name not in _METRES:
+        raise ValueError(f"{path} gives its spacing in {unit!r}; known are {', '.join(_METRES)}; pass spacing= instead")
+    return _METRES[name]
+
+
+def placed(values: np.ndarray, axes: Any, origin: Any, unit: str, scale: float = 1.0) -> Scan:
+    """Scan of ``values`` whose file lists geometry in the order (x, y, z), as medical formats do.
+
+    Args:
+        values: [D, H, W].
+        axes: [3, 3], the step from one voxel to the next along x, y and z as rows of (x, y, z) components.
+        origin: (x, y, z) of the first voxel.
+        unit: "m" or "relative".
+        scale: Length of the file's unit in ``unit``.
+    """
+    steps = np.asarray(axes, dtype=np.float64)[::-1, ::-1]
+    lengths = np.linalg.norm(steps, axis=1)
+    if not (np.isfinite(lengths).all() and (lengths > 0).all()):
+        return Scan(values)
+    rows = [triple(row) for row in steps / lengths[:, None]]
+    return Scan(
+        values,
+        triple(lengths * scale),
+        unit,
+        triple(np.asarray(origin, dtype=np.float64)[::-1] * scale),
+        (rows[0], rows[1], rows[2]),
+    )
+
+
+def triple(values: Sequence[float] | np.ndarray) -> Triple:
+    """Three numbers as floats."""
+    z, y, x = (float(value) for value in values)
+    return z, y, x
+
+
+def existing(path: Path, named_by: Path | None = None) -> Path:
+    """``path``, or ValueError where it is missing or an empty file; ``named_by`` is the header that asks for it."""
+    where = f"the data file {path}, which {named_by} names," if named_by else f"{path}"
+    if not path.exists():
+        raise ValueError(f"{where} does not exist")
+    if path.is_file() and not path.stat().st_size:
+        raise ValueError(f"{where} is empty (0 bytes)")
+    return path
+
+
+def expect_bytes(path: Path, found: int, shape: Sequence[int], dtype: np.dtype) -> int:
+    """Number of bytes of ``shape`` voxels; ValueError where ``found`` is another."""
+    wanted = math.prod(shape) * dtype.itemsize
+    if found != wanted:
+        sizes = " x ".join(str(size) for size in shape)
+        raise ValueError(
+            f"{path}: expected {wanted} bytes = {sizes} (D x H x W) of {dtype.name}, found {found}; check shape and "
+            "dtype, or the file is truncated"
+        )
+    return wanted
+
+
+def mapped(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int = 0) -> np.ndarray:
+    """Voxels of a file that holds nothing else after ``offset`` bytes."""
+    expect_bytes(path, path.stat().st_size - offset, shape, dtype)
+    return mapped_from(path, shape, dtype, offset)
+
+
+def mapped_from(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int) -> np.ndarray:
+    """Voxels from ``offset`` bytes on, read when touched; what is written to them never reaches the file."""
+    if sys.platform != "linux":
+        return np.memmap(path, dtype, "c", offset, tuple(shape))
+    # numpy's mapping reserves memory for a copy of it all, so that volumes larger than memory would be refused.
+    with open(path, "rb") as stream:
+        access = {"flags": mmap.MAP_PRIVATE | _MAP_NORESERVE, "prot": mmap.PROT_READ | mmap.PROT_WRITE}
+        return np.ndarray(tuple(shape), dtype, mmap.mmap(stream.fileno(), 0, **access), offset)
+
+
+def unpacked(path: Path, data: bytes | bytearray, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
+    """Voxels of decompressed ``data``."""
+    expect_bytes(path, len(data), shape, dtype)
+    # A bytearray is writable, as torch wants it.
+    return np.frombuffer(data if isinstance(data, bytearray) else bytearray(data), dtype).reshape(tuple(shape))
+
+
+def gunzip(path: Path, offset: int = 0) -> bytearray:
+    """Decompressed content (gzip or zlib) from ``offset`` on; ValueError where it is damaged or cut short."""
+    content, rest, members = bytearray(), b"", 0
+    with open(path, "rb") as stream:
+        stream.seek(offset)
+        # A gzip file may hold several members, one after another, and padding.
+        while rest := rest or stream.read(_CHUNK):
+            if members and not rest.strip(b"\0"):
+                break
+            engine = zlib.decompressobj(32 + zlib.MAX_WBITS)  # whichever header it has
+            try:
+                while rest and not engine.eof:
+                    content += engine.decompress(rest)
+                    rest = engine.unused_data if engine.eof else stream.read(_CHUNK)
+            except zlib.error as error:
+                raise ValueError(f"{path} holds damaged gzip data: {error}; fetch it again") from None
+            if not engine.eof:
+                raise ValueError(f"{path} is truncated: its gzip data stop after {len(content)} bytes; fetch it again")
+            members += 1
+    return content
+
+
+def three_axes(values: np.ndarray, path: Path) -> np.ndarray:
+    """``values`` as [D, H, W] scalars; leading axes of length 1 are dropped, colours, vectors and series refused."""
+    if values.dtype.names or values.dtype.kind not in "buif":
+        raise ValueError(f"{path} holds {values.dtype} elements, not one real number per voxel; convert it to scalars")
+    while values.ndim > 3 and values.shape[0] == 1:
+        values = values[0]
+    if values.ndim != 3:
+        what = "one slice or fewer" if values.ndim < 3 else "colours, vectors or a series"
+        raise ValueError(
+            f"{path} must hold one scalar on three axes (z, y, x), got shape {values.shape}: {what}; select or convert "
+            "it to a single [D, H, W] array first"
+        )
+    return values
+
+
+@contextmanager
+def readable(path: Path, kind: str) -> Iterator[None]:
+    """Around a decoder: whatever it raises for a damaged file becomes a ValueError that names the file."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:  # libraries raise many kinds, bare RuntimeError and KeyError among them
+        raise ValueError(f"{path} is no readable {kind}, or is truncated: {error}") from None
+
+
+def extra(module: str, what: str) -> Any:
+    """Import an optional ``module``, or raise ImportError with the line that installs it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise ImportError(
+            f"{what} needs {module}, an extra of holotorch; install it with: pip install 'holotorch[volumes]'"
+        ) from None
+
+
+def split_member(path: str | Path) -> tuple[Path, str | None]:
+    """Path of the file and name of the array within it, written as ``file::name``."""
+    file, _, member = str(path).partition("::")
+    return Path(file), member or None
+
+
+def chosen(names: Sequence[str], member: str | None, path: Path) -> str:
+    """The array ``member`` of those in the file, or the only one."""
+    if member is None and len(names) == 1:
+        return names[0]
+    if member is None or member not in names:
+        listed = ", ".join(names) or "none"
+        asked = f"has no array {member!r}" if member else "does not hold exactly one volume"
+        raise ValueError(f"{path} {asked}; its arrays are: {listed}; choose one by writing {path}::name")
+    return member

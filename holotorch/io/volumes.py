@@ -1,0 +1,155 @@
+"""Volumes from files: one call for every format, which refuses what a file does not say."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import DTypeLike
+
+from holotorch.core import checks
+from holotorch.io import array_files, medical, raw_volumes, slices, vti
+from holotorch.io.scan import Scan, existing, split_member, triple
+from holotorch.scene.volume import Volume
+
+_READERS: dict[str, Callable[[Path], Scan]] = {
+    ".mhd": raw_volumes.read_metaimage,
+    ".mha": raw_volumes.read_metaimage,
+    ".nrrd": raw_volumes.read_nrrd,
+    ".nhdr": raw_volumes.read_nrrd,
+    ".tif": slices.read_tiff,
+    ".tiff": slices.read_tiff,
+    ".npy": array_files.read_npy,
+    ".nii": medical.read_nifti,
+    ".nii.gz": medical.read_nifti,
+}
+# Files that may hold several arrays, written as path::name.
+_MEMBER_READERS: dict[str, Callable[[Path, str | None], Scan]] = {
+    ".npz": array_files.read_npz,
+    ".vti": vti.read_vti,
+    ".h5": array_files.read_hdf5,
+    ".hdf5": array_files.read_hdf5,
+    ".zarr": array_files.read_zarr,
+}
+_LONGEST = 0.1  # metres between voxels; more is a forgotten unit
+
+
+def load_volume(
+    path: str | Path,
+    *,
+    spacing: float | Sequence[float] | None = None,
+    shape: Sequence[int] | None = None,
+    dtype: DTypeLike | None = None,
+    unit: str | None = None,
+) -> Volume:
+    """Read a volume, in the number type of the file, with its spacing in metres or marked as relative.
+
+    Args:
+        path: A file: raw (.raw, .raw.gz), MetaImage (.mhd, .mha), NRRD (.nrrd, .nhdr), TIFF stack, picture tiled with
+            slices (.png), NumPy (.npy, .npz), VTK (.vti), NIfTI (.nii, .nii.gz), HDF5 (.h5::dataset); or a folder:
+            numbered pictures, a DICOM series, Zarr (.zarr::array).
+        spacing: Between voxels along (z, y, x), or one number for cubes. Needed where the file states none; replaces
+            what it states.
+        shape: (D, H, W). Needed for a tiled picture and for raw files whose name does not say; checked for all others.
+        dtype: Type of raw voxels, such as "uint8", or ">i2" for big-endian. Checked for all others.
+        unit: Unit of ``spacing``: "m" (default), or "relative" for a volume that has proportions but no size.
+
+    Returns:
+        Voxels [D, H, W], mapped into memory where the file holds them in native byte order without compression; such
+        a file is read as it is used and never written. Floating-point values are not searched for NaN here, which
+        would read it all: see :meth:`Volume.check_finite`.
+
+    Raises:
+        ValueError: No such file, a format or geometry that is not known or not stated, a file that does not have the
+            size its header says, more than one number per voxel.
+        ImportError: The library for the format is not installed; the message has the line that installs it.
+    """
+    file, member = split_member(path)
+    if shape is not None:
+        shape = tuple(checks.whole("size of the volume", size, 1) for size in shape)
+        if len(shape) != 3:
+            raise ValueError(f"shape must be three sizes (D, H, W), got {shape}")
+    scan = _read(existing(file), member, shape, dtype)
+    _check_expected(file, scan.values, shape, dtype)
+    if spacing is None:
+        return _as_stated(file, scan, unit)
+    steps = (spacing,) * 3 if isinstance(spacing, int | float | np.number) else tuple(spacing)
+    if unit is None and any(checks.positive("spacing", step, "metres") > _LONGEST for step in steps):
+        raise ValueError(
+            f"spacing between voxels must be in metres, got {spacing!r}; 1 mm is 1e-3. For a volume without a size add "
+            "unit='relative'"
+        )
+    unit = unit or "m"
+    # A position in another unit than the spacing means nothing.
+    origin = scan.origin if scan.spacing is not None and scan.unit == unit else (0.0, 0.0, 0.0)
+    return Volume(_tensor(scan.values, file), steps, unit, origin, scan.orientation)  # type: ignore[arg-type]
+
+
+def _as_stated(file: Path, scan: Scan, unit: str | None) -> Volume:
+    if unit is not None:
+        raise ValueError(f"unit={unit!r} is that of spacing=, which was not given")
+    if scan.spacing is None or not all(np.isfinite(scan.spacing)) or min(scan.spacing) <= 0:
+        raise ValueError(
+            f"{file} does not state the spacing of its voxels: pass spacing=(z, y, x) in metres, such as (1e-3, 5e-4, "
+            "5e-4), or spacing=1, unit='relative' for cubes without a size"
+        )
+    return Volume(_tensor(scan.values, file), triple(scan.spacing), scan.unit, scan.origin, scan.orientation)
+
+
+def _read(file: Path, member: str | None, shape: Sequence[int] | None, dtype: DTypeLike | None) -> Scan:
+    name = file.name.lower()
+    for suffix, reader in _MEMBER_READERS.items():
+        if name.endswith(suffix):
+            return reader(file, member)
+    if any((file / mark).exists() for mark in ("zarr.json", ".zarray", ".zgroup")):
+        return array_files.read_zarr(file, member)
+    if member is not None:
+        raise ValueError(f"only {', '.join(_MEMBER_READERS)} hold named arrays, got {file}::{member}")
+    if file.is_dir():
+        return _read_folder(file)
+    if name.endswith((".raw", ".raw.gz")):
+        return raw_volumes.read_raw(file, shape, dtype)
+    if name.endswith(".png"):
+        return slices.read_tiles(file, shape)
+    suffix = max((known for known in _READERS if name.endswith(known)), key=len, default=None)
+    if suffix:
+        return _READERS[suffix](file)
+    if medical.is_dicom(file):
+        raise ValueError(f"{file} is one DICOM slice; load the folder of its series")
+    if shape is not None and dtype is not None:
+        return raw_volumes.read_raw(file, shape, dtype)
+    known = ", ".join((".raw", ".raw.gz", ".png", *_READERS, *_MEMBER_READERS))
+    raise ValueError(
+        f"{file} has no known extension; known are {known}, and folders of DICOM files or numbered pictures. Pass "
+        "shape=(D, H, W) and dtype= if it is raw under another name"
+    )
+
+
+def _read_folder(folder: Path) -> Scan:
+    if any(path.is_file() and medical.is_dicom(path) for path in folder.iterdir()):
+        return medical.read_dicom(folder)
+    return slices.read_folder(folder)
+
+
+def _check_expected(file: Path, values: np.ndarray, shape: Sequence[int] | None, dtype: DTypeLike | None) -> None:
+    if shape is not None and shape != values.shape:
+        raise ValueError(f"{file} holds {values.shape} voxels (D, H, W), but shape={shape} was asked for")
+    if dtype is not None and np.dtype(dtype).newbyteorder("=") != values.dtype.newbyteorder("="):
+        raise ValueError(f"{file} holds {values.dtype.name}, but dtype={dtype!r} was asked for")
+
+
+def _tensor(values: np.ndarray, file: Path) -> torch.Tensor:
+    if values.dtype.kind not in "buif" or values.dtype.itemsize > 8:
+        raise ValueError(f"{file} holds {values.dtype} elements; convert them to integers or floats of up to 64 bits")
+    if values.dtype == bool:
+        values = values.view(np.uint8)
+    elif values.dtype.kind == "u" and values.dtype.itemsize == 8:
+        if values.size and int(values.max()) > np.iinfo(np.int64).max:
+            raise ValueError(f"{file} holds unsigned 64-bit values above 2^63; divide or convert them first")
+        values = values.astype(np.int64)
+    if not values.dtype.isnative:
+        # torch knows only the native order: these are read here.
+        values = values.astype(values.dtype.newbyteorder("="))
+    if not values.flags.writeable or any(stride < 0 for stride in values.strides):
+        values = values.copy()
+    return torch.from_numpy(values)

@@ -1,0 +1,157 @@
+"""Volume: a scalar sampled on a box, with the size of the box."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+
+Triple = tuple[float, float, float]
+IDENTITY: tuple[Triple, Triple, Triple] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+_SLAB = 1 << 22  # samples looked at together: tens of megabytes of temporaries, whatever the volume's size
+_RIGHT_ANGLE = 1e-3  # direction cosines are printed to three digits or more
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """Samples of a scalar on a box, axes (z, y, x) throughout.
+
+    Attributes:
+        values: Real [D, H, W], in the type of the file: a uint8 volume stays uint8. May be a memory-mapped file.
+        spacing: Distance between samples along (z, y, x), in ``unit``.
+        unit: "m", or "relative": such a volume has proportions, but no size until it is placed in a scene.
+        origin: Position of sample [0, 0, 0] along the world's (z, y, x), in ``unit``. Kept as read.
+        orientation: Directions of the axes z, y, x as unit rows of (z, y, x) components in the world. Kept as read.
+
+    Raises:
+        TypeError: ``values`` is no real tensor, or a spacing no number.
+        ValueError: Not three axes, no voxel, a spacing that is not finite and positive, another unit, or axes that do
+            not stand at right angles.
+    """
+
+    values: Tensor
+    spacing: Triple
+    unit: str
+    origin: Triple = (0.0, 0.0, 0.0)
+    orientation: tuple[Triple, Triple, Triple] = IDENTITY
+
+    def __post_init__(self) -> None:
+        _check_values(self.values)
+        if self.unit not in ("m", "relative"):
+            raise ValueError(
+                f"volume unit must be 'm' or 'relative', got {self.unit!r}; convert other lengths to metres"
+            )
+        steps = _triple("volume spacing", self.spacing)
+        object.__setattr__(self, "spacing", tuple(checks.positive("volume spacing", step, self.unit) for step in steps))
+        object.__setattr__(self, "origin", _triple("volume origin", self.origin))
+        object.__setattr__(self, "orientation", _right_angled(self.orientation))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Voxels (D, H, W)."""
+        depth, height, width = self.values.shape
+        return depth, height, width
+
+    @property
+    def extent(self) -> Triple:
+        """Size (z, y, x) in ``unit``, a whole spacing per voxel."""
+        (depth, height, width), (z, y, x) = self.shape, self.spacing
+        return depth * z, height * y, width * x
+
+    def value_range(self) -> tuple[float, float]:
+        """Smallest and largest value; ValueError as from :meth:`check_finite` where one is NaN or infinite."""
+        ends = [torch.stack(slab.aminmax()).to(torch.float64) for _, slab in self._slabs()]
+        least, most = torch.stack(ends)[:, 0].min().item(), torch.stack(ends)[:, 1].max().item()
+        if not (abs(least) < float("inf") and abs(most) < float("inf")):
+            self.check_finite()
+        return least, most
+
+    def check_finite(self) -> None:
+        """Raise ValueError naming the first NaN or infinite voxel and their number; integers need no look."""
+        if not self.values.is_floating_point():
+            return
+        first, count = "", 0
+        for start, slab in self._slabs():
+            bad = ~torch.isfinite(slab)
+            found = int(bad.sum())
+            if found and not count:
+                # argmax of bytes is the first one; nonzero would list them all.
+                place = int(bad.flatten().to(torch.uint8).argmax())
+                z, y, x = (int(i) for i in torch.unravel_index(torch.tensor(place), slab.shape))
+                first = f"voxel (z, y, x) = ({start + z}, {y}, {x}) is {slab[z, y, x].item()}"
+            count += found
+        if count:
+            raise ValueError(
+                f"volume must be finite, but {first} ({count} of {self.values.numel()} in all); repair it first, for "
+                "instance with values.nan_to_num(nan=0, posinf=0, neginf=0)"
+            )
+
+    def bricks(self, size: int = 16) -> Tensor:
+        """Smallest and largest value of every brick, [2, ceil(D / size), ceil(H / size), ceil(W / size)].
+
+        Brick b holds the samples from b ``size`` to (b + 1) ``size``, both included: trilinear interpolation at index
+        coordinates within [b size, (b + 1) size] never leaves the two. So the brick of a position between 0 and n - 1
+        is floor(position / size) along every axis. In the type of the values (int64 for unsigned ones above 8 bits).
+
+        Raises:
+            ValueError: A voxel is NaN or infinite, as from :meth:`check_finite`.
+        """
+        size = checks.whole("brick size", size, 1)
+        ends = torch.stack([self._reduced(size, torch.amin), self._reduced(size, torch.amax)])
+        if ends.is_floating_point() and not torch.isfinite(ends).all():
+            self.check_finite()
+        return ends
+
+    def _reduced(self, size: int, reduce: Callable[..., Tensor]) -> Tensor:
+        result = self.values.detach()
+        for axis, count in enumerate(self.shape):
+            windows = ((start, min(size + 1, count - start)) for start in range(0, count, size))
+            parts = [reduce(_comparable(result.narrow(axis, start, length)), dim=axis) for start, length in windows]
+            result = torch.stack(parts, axis)
+        return result
+
+    def _slabs(self) -> Iterator[tuple[int, Tensor]]:
+        values = self.values.detach()
+        step = max(1, _SLAB // (values.shape[1] * values.shape[2]))
+        for start in range(0, values.shape[0], step):
+            yield start, _comparable(values[start : start + step])
+
+
+def _comparable(values: Tensor) -> Tensor:
+    # torch has no comparisons for the wide unsigned types.
+    return values.to(torch.int64) if values.dtype in (torch.uint16, torch.uint32) else values
+
+
+def _check_values(values: Tensor) -> None:
+    if not isinstance(values, Tensor):
+        raise TypeError(f"volume values must be a torch.Tensor, got {type(values).__name__}; use torch.from_numpy")
+    if values.is_complex() or values.dtype in (torch.bool, torch.uint64):
+        raise TypeError(
+            f"volume values must be real numbers, got {values.dtype}; convert them, for instance to float32"
+        )
+    if values.ndim != 3:
+        raise ValueError(f"volume values must have three axes (z, y, x), got shape {tuple(values.shape)}")
+    if not values.numel():
+        raise ValueError(f"volume must hold at least one voxel, got shape {tuple(values.shape)}")
+
+
+def _triple(name: str, values: Sequence[float]) -> Triple:
+    if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != 3:
+        raise TypeError(f"{name} must be three numbers (z, y, x), got {values!r}")
+    z, y, x = (checks.finite(name, value) for value in values)
+    return z, y, x
+
+
+def _right_angled(rows: Sequence[Sequence[float]]) -> tuple[Triple, Triple, Triple]:
+    if not isinstance(rows, Sequence) or len(rows) != 3:
+        raise TypeError(f"volume orientation must be three rows (z, y, x) of direction cosines, got {rows!r}")
+    z, y, x = (_triple("row of the volume's orientation", row) for row in rows)
+    axes = torch.tensor([z, y, x], dtype=torch.float64)
+    if (axes @ axes.T - torch.eye(3, dtype=torch.float64)).abs().max() > _RIGHT_ANGLE:
+        raise ValueError(
+            f"volume axes must be unit vectors at right angles, got {(z, y, x)}; resample a sheared volume (a tilted "
+            "gantry, for instance) first"
+        )
+    return z, y, x
