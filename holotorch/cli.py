@@ -43,6 +43,10 @@ def _run(options: argparse.Namespace) -> int:
         from holotorch.experiments.study import run_study
 
         return _finish(*run_study(settings, options.out, name))
+    if settings.experiment == "volume":
+        from holotorch.experiments.volume_run import run_volume
+
+        return _finish(*run_volume(settings, options.out, name))
     from holotorch.experiments.run import run
 
     return _finish(*run(settings, options.out, name))
@@ -78,12 +82,21 @@ def _check(options: argparse.Namespace) -> int:
         print(f"Study      {settings.study} of {', '.join(settings.images)} on {settings.size} x {settings.size} px")
         print(f"Sweep      {', '.join(f'{value:g}' for value in settings.sweep)}; {settings.max_steps} steps at most")
         return OK
-    from holotorch.experiments.pec import build
-    from holotorch.experiments.plan import plan, plan_text, shortage
+    from holotorch.experiments.plan import shortage
 
-    experiment = build(settings)
-    values = plan(experiment)
-    print(plan_text(experiment, values))
+    if settings.experiment == "volume":
+        from holotorch.experiments import volume, volume_plan
+
+        scene = volume.build(settings)
+        values = volume_plan.plan(scene)
+        print(volume_plan.plan_text(scene, values))
+    else:
+        from holotorch.experiments.pec import build
+        from holotorch.experiments.plan import plan, plan_text
+
+        experiment = build(settings)
+        values = plan(experiment)
+        print(plan_text(experiment, values))
     if text := shortage(values):
         raise ConfigError([text])
     return OK
@@ -147,7 +160,7 @@ def _parser() -> argparse.ArgumentParser:
     report.set_defaults(action=_report)
 
     chart = commands.add_parser("chart", help="speed against accuracy of every method, drawn and tabled")
-    chart.add_argument("subject", help="what to chart: pec, propagation")
+    chart.add_argument("subject", help="what to chart: pec, propagation, volume")
     chart.add_argument("--out", type=Path, help="folder for the chart (default: scripts/charts/SUBJECT)")
     chart.set_defaults(action=_chart)
 

@@ -31,5 +31,5 @@ class _Linear(torch.autograd.Function):
         return apply(x)
 
     @staticmethod
-    def backward(ctx, gradient: Tensor):
-        return _Linear.apply(gradient, *ctx.maps), None, None
+    def backward(ctx, *grad_outputs):
+        return _Linear.apply(*grad_outputs, *ctx.maps), None, None

@@ -47,15 +47,19 @@ def chart(subject: str, out: Path) -> list[str]:
         from holotorch.experiments.chart_propagation import propagation as draw
     elif subject == "pec":
         from holotorch.experiments.chart_pec import pec as draw
+    elif subject == "volume":
+        from holotorch.experiments.chart_volume import volume as draw
     else:
-        raise ConfigError([f"no chart of {subject!r}; known: pec, propagation"])
+        raise ConfigError([f"no chart of {subject!r}; known: pec, propagation, volume"])
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError([f"cannot write to {out}: {error.strerror}; choose another place with --out"]) from None
     rows, compared, pictures, verdict = draw()
     write_table(out / "chart.csv", rows)
-    write_table(out / {"propagation": "prediction.csv", "pec": "comparison.csv"}[subject], compared)
+    write_table(
+        out / {"propagation": "prediction.csv", "pec": "comparison.csv", "volume": "scaling.csv"}[subject], compared
+    )
     for name, data in pictures.items():
         write_bytes(out / f"{name}.png", data)
     write_text(out / "verdict.txt", "\n".join(verdict) + "\n")

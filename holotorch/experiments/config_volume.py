@@ -96,7 +96,10 @@ class HologramSettings(GridSettings):
 
 
 class VolumeReport(Settings):
-    """Depths of the refocused pictures (its front, middle and back by default), and random phases averaged in them."""
+    """Depths of the refocused pictures, and random phases that are averaged in them.
+
+    By default a tenth, half and nine tenths of the rays see something nearer than the depths.
+    """
 
     refocus: Annotated[tuple[Depth, ...], BeforeValidator(several)] | None = None
     seeds: Annotated[Count, Field(le=256)] = 1
@@ -105,7 +108,9 @@ class VolumeReport(Settings):
 class VolumeSettings(Settings):
     """The hologram of a volume, rendered directly into light sources, and what it shows.
 
-    ``phase``: of the sources. ``ray``: random, one per ray (the thesis); ``point``: random; ``smooth``; ``constant``.
+    ``phase``: of the sources. ``point``: random, each its own, so that planes add without interference; ``ray``: one
+    for each ray, as in the thesis, whose planes interfere colour by colour; ``smooth``; ``constant``. ``scale`` divides
+    pixels, rays, distances, the volume's width and a given number of planes, for a small version of a scene.
     """
 
     experiment: Literal["volume"]
@@ -117,7 +122,8 @@ class VolumeSettings(Settings):
     view: ViewSettings = ViewSettings()
     hologram: HologramSettings
     wavelengths: Annotated[tuple[Wavelength, ...], BeforeValidator(several)]
-    phase: Literal["ray", "point", "smooth", "constant"] = "ray"
+    phase: Literal["point", "ray", "smooth", "constant"] = "point"
+    scale: Annotated[Count, Field(le=64)] = 1
     report: VolumeReport = VolumeReport()
 
 
@@ -142,4 +148,7 @@ def contradictions(settings: VolumeSettings) -> list[tuple[tuple[str | int, ...]
     if isinstance(hologram.depths, int) and hologram.distance <= width / 2:
         hint = f"a volume {width:.3g} m wide needs more than {width / 2:.3g} m"
         found.append((("hologram", "distance"), f"expected the whole volume before the hologram; {hint}"))
+    least = min(side) // settings.scale
+    if least < 8 or any(size % settings.scale for size in side) or (rays is not None and rays % settings.scale):
+        found.append((("scale",), f"expected a divisor of the pixels {side} and rays that leaves 8 at least"))
     return found

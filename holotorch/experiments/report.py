@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.markup import figure, plain, table
+from holotorch.experiments.volume_report import volume_section
 from holotorch.io.files import write_text
 
 _PICTURES = {
@@ -32,7 +34,8 @@ _METHOD_NAMES = {"none": "no correction", "basic_ipec": "basic IPEC", "ipec": "I
 def write_report(folders: Sequence[Path], path: Path) -> None:
     """Write the page of ``folders`` to ``path``. ConfigError for a folder that holds no run."""
     runs = [_Run(folder) for folder in folders]
-    body = [_comparison(runs)] if len(runs) > 1 else []
+    corrected = [run for run in runs if run.methods]
+    body = [_comparison(corrected)] if len(corrected) > 1 else []
     body += [run.section for run in runs]
     title = "holotorch: " + (runs[0].title if len(runs) == 1 else f"{len(runs)} runs")
     text = _PAGE.format(title=html.escape(title), style=_STYLE, body="\n".join(body))
@@ -53,8 +56,10 @@ class _Run:
             self.plan = json.loads((folder / "plan.json").read_text())
             self.env = json.loads((folder / "env.json").read_text())
             self.config = (folder / "config.yaml").read_text()
-            self.methods: dict[str, dict[str, Any]] = self.summary["methods"]
-            self.section = _section(self)
+            volume = self.summary["experiment"] == "volume"
+            self.methods: dict[str, dict[str, Any]] = {} if volume else self.summary["methods"]
+            parts = volume_section(self.title, self.summary, self.plan, self.picture) if volume else _section(self)
+            self.section = "\n".join(parts + _repeat(self))
         except (OSError, KeyError, IndexError, ValueError, TypeError, AttributeError) as error:
             raise ConfigError([f"{folder} holds a run that cannot be read: {type(error).__name__} {error}"]) from None
 
@@ -67,32 +72,35 @@ class _Run:
 
 def _comparison(runs: list[_Run]) -> str:
     rows = [[html.escape(run.title), *_numbers(run.methods["corrected"])] for run in runs]
-    return "<h1>Runs</h1>" + _table(["run", *_COLUMNS], rows)
+    return "<h1>Runs</h1>" + table(["run", *_COLUMNS], rows)
 
 
-def _section(run: _Run) -> str:
+def _section(run: _Run) -> list[str]:
     status = "" if run.summary["status"] == "complete" else f' <span class="warn">{run.summary["status"]}</span>'
     parts = [f"<h1>{html.escape(run.title)}{status}</h1>"]
     parts.append(
-        _table(["method", *_COLUMNS], [[_METHOD_NAMES.get(n, n), *_numbers(m)] for n, m in run.methods.items()])
+        table(["method", *_COLUMNS], [[_METHOD_NAMES.get(n, n), *_numbers(m)] for n, m in run.methods.items()])
     )
     parts.append(f"<p>{_verdict(run)}</p>")
     parts.append('<div class="row">')
     for name, caption in _PICTURES.items():
         if source := run.picture(name):
-            parts.append(_figure(source, f"{caption}{_score(run, name)}", "picture"))
+            parts.append(figure(source, f"{caption}{_score(run, name)}", "picture"))
     parts.append("</div>")
     for name, caption in _FIGURES.items():
         if source := run.picture(name):
-            parts.append(_figure(source, caption, "wide"))
-    parts.append("<h2>Plan</h2>" + _table(["", ""], _plan_rows(run.plan), head=False))
+            parts.append(figure(source, caption, "wide"))
+    parts.append("<h2>Plan</h2>" + table(["", ""], _plan_rows(run.plan), head=False))
     for note in run.plan["notes"]:
         parts.append(f'<p class="warn">{html.escape(note)}</p>')
+    return parts
+
+
+def _repeat(run: _Run) -> list[str]:
     command = f"holotorch run {run.folder / 'config.yaml'}"
     repeat = f"Repeat with <code>{html.escape(command)}</code>. Configuration:<pre>{html.escape(run.config)}</pre>"
-    parts.append(f"<h2>How to repeat</h2>{repeat}")
-    parts.append(_table(["", ""], [[html.escape(k), html.escape(_plain(v))] for k, v in run.env.items()], head=False))
-    return "\n".join(parts)
+    rows = [[html.escape(key), html.escape(plain(value))] for key, value in run.env.items()]
+    return [f"<h2>How to repeat</h2>{repeat}", table(["", ""], rows, head=False)]
 
 
 _COLUMNS = (
@@ -146,7 +154,7 @@ def _verdict(run: _Run) -> str:
 
 
 def _plan_rows(plan: dict[str, Any]) -> list[list[str]]:
-    shown = {name.replace("_", " "): _plain(value) for name, value in plan.items() if name != "notes"}
+    shown = {name.replace("_", " "): plain(value) for name, value in plan.items() if name != "notes"}
     return [[html.escape(name), html.escape(text)] for name, text in shown.items()]
 
 
@@ -156,14 +164,6 @@ def _score(run: _Run, name: str) -> str:
     return "" if value is None else f": SSIM {value:.3f}"
 
 
-def _plain(value: Any) -> str:
-    if isinstance(value, dict):
-        return "; ".join(f"{k.replace('_', ' ')}: {_plain(v)}" for k, v in value.items())
-    if isinstance(value, list):
-        return ", ".join(_plain(item) for item in value)
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
-
-
 def _fixed(value: float | None, digits: int) -> str:
     return "" if value is None else f"{value:.{digits}f}"
 
@@ -171,19 +171,6 @@ def _fixed(value: float | None, digits: int) -> str:
 def _lit_mean(values: list[float]) -> float:
     lit = [value for value in values if value > 0]
     return sum(lit) / len(lit) if lit else 0.0
-
-
-def _figure(source: str, caption: str, kind: str) -> str:
-    words = html.escape(caption)
-    return f'<figure class="{kind}"><img src="{source}" alt="{words}"><figcaption>{words}</figcaption></figure>'
-
-
-def _table(names: Sequence[str], rows: list[list[str]], *, head: bool = True) -> str:
-    # A column that is empty throughout says nothing.
-    kept = [i for i in range(len(names)) if any(row[i] for row in rows)]
-    top = "".join(f"<th>{names[i]}</th>" for i in kept)
-    lines = ["".join(f"<td>{row[i]}</td>" for i in kept) for row in rows]
-    return "<table>" + "".join(f"<tr>{line}</tr>" for line in ([top] if head else []) + lines) + "</table>"
 
 
 _STYLE = """

@@ -17,6 +17,7 @@ from holotorch.correction import Solution
 from holotorch.experiments import pictures
 from holotorch.experiments.baselines import baseline
 from holotorch.experiments.config import PECSettings, load_config
+from holotorch.experiments.config_volume import VolumeSettings
 from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.judge import Result, judge
@@ -106,6 +107,10 @@ def resume(folder: Path) -> tuple[Path, bool]:
         print("this run is complete; nothing is left to do")
         return folder, True
     settings = load_config(config)
+    if isinstance(settings, VolumeSettings):
+        from holotorch.experiments.volume_run import resume_volume
+
+        return resume_volume(folder)
     if not isinstance(settings, PECSettings):
         raise ConfigError([f"{folder} holds a study, which cannot be resumed; run it again"])
     experiment = build(settings)
@@ -123,7 +128,7 @@ def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
 
     checkpoint = out / "checkpoint.pt"
     log = Log(experiment, checkpoint)
-    with _interruptible() as pressed:
+    with interruptible() as pressed:
         try:
             solution = experiment.solve(log, log.resume)
         except KeyboardInterrupt:
@@ -133,7 +138,7 @@ def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
         if solution is None:
             raise KeyboardInterrupt
         seconds = log.seconds
-        with _deferred(pressed):  # from here on Ctrl-C is remembered; what was found is saved first
+        with deferred(pressed):  # from here on Ctrl-C is remembered; what was found is saved first
             if pressed:
                 log.save()
             results = {"corrected": _result(experiment, solution, seconds)}
@@ -151,7 +156,7 @@ def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
                 pressed.append(signal.SIGINT)
             except ValueError as error:
                 print(f"{name} is left out: {error}", file=sys.stderr)
-        with _deferred(pressed):
+        with deferred(pressed):
             if pressed:
                 log.save()
             _write_results(out, experiment, results, log, solution)
@@ -173,7 +178,7 @@ def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
 
 
 @contextmanager
-def _interruptible() -> Iterator[list[int]]:
+def interruptible() -> Iterator[list[int]]:
     """Let SIGTERM act as Ctrl-C, and note in the list that either has come."""
     pressed: list[int] = []
 
@@ -186,7 +191,7 @@ def _interruptible() -> Iterator[list[int]]:
 
 
 @contextmanager
-def _deferred(pressed: list[int]) -> Iterator[None]:
+def deferred(pressed: list[int]) -> Iterator[None]:
     """Only note that Ctrl-C or SIGTERM has come."""
     with _handling(lambda number, _: pressed.append(number)):
         yield

@@ -212,12 +212,14 @@ class Accumulator:
     """The sum of an :class:`AxialHologram` while planes arrive, from near to far or from far to near."""
 
     def __init__(self, operator: AxialHologram, shape: tuple[int, int], phase: Tensor | None = None):
-        self.operator, self.shape, self.phase = operator, shape, phase
+        self.operator, self.shape = operator, shape
+        self.turn = None if phase is None else phasor(phase)
         self.nodes = operator.design(shape).nodes
         self.waves: Waves | None = None
         self.total: Tensor | None = None
         self.step: Tensor | None = None
-        self.at = self.last = 0
+        self.at = 0
+        self.before: float | None = None
         self.rising: bool | None = None
         self.pending: list[tuple[float, Tensor]] = []
         self.open: dict[int, Tensor] = {}
@@ -225,14 +227,20 @@ class Accumulator:
     def add(self, j: int, plane: Tensor) -> None:
         """Add the plane of depth number ``j``, real or complex [h, w]; dark ones cost nothing."""
         depth = self.operator.depths[j]
-        if self.pending:
-            before = self.pending[-1][0]
-            if depth != before and self.rising is None:
-                self.rising = depth > before
-            if depth != before and self.rising != (depth > before):
+        if self.before is not None and depth != self.before:
+            rising = depth > self.before
+            if self.rising not in (None, rising):
                 raise ValueError("planes that arrive one by one must come in rising or falling depth")
-        if plane.any():
-            self.pending.append((depth, plane.detach()))
+            self.rising = rising
+        self.before = depth
+        if not plane.any():
+            return
+        if self.nodes.width == 1:
+            index, (weight,) = self.nodes.weights(depth)
+            self.open[index] = plane.detach() * complex(weight)
+            self._take(index)
+            return
+        self.pending.append((depth, plane.detach()))
         if len(self.pending) > _BLOCK:
             self._spread(self.pending[:-1])
             self.pending = self.pending[-1:]
@@ -279,8 +287,8 @@ class Accumulator:
     def _take(self, index: int) -> None:
         """Horner's rule: carry the sum on to node ``index`` and add the node."""
         node = self.open.pop(index)
-        if self.phase is not None:
-            node = node * phasor(self.phase).to(node.dtype)
+        if self.turn is not None:
+            node *= self.turn
         if self.waves is None:
             self.waves = Waves(self.operator, self.shape, node.dtype, node.device)
         raster = self.waves.raster

@@ -1,0 +1,201 @@
+"""A run of the volume experiment: realisation after realisation, in one process or several, restartable."""
+
+import csv
+import io
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from torch import Tensor
+from tqdm import tqdm
+
+from holotorch.experiments import pictures
+from holotorch.experiments.config import load_config
+from holotorch.experiments.config_volume import VolumeSettings
+from holotorch.experiments.environment import environment
+from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.memory import peak_memory
+from holotorch.experiments.plan import shortage
+from holotorch.experiments.report import write_report
+from holotorch.experiments.run import claim, deferred, interruptible
+from holotorch.experiments.volume import Part, VolumeExperiment, build
+from holotorch.experiments.volume_judge import VolumeJudge
+from holotorch.experiments.volume_plan import plan, plan_text
+from holotorch.io.files import replacing, save_array, write_bytes, write_json, write_text
+from holotorch.io.images import encode_png
+
+_COLUMNS: tuple[str, ...] = (
+    "realisation",
+    "seconds",
+    "rendering_seconds",
+    "refocus_seconds",
+    "ssim_in_focus",
+    "speckle_contrast",
+)
+
+
+def run_volume(settings: VolumeSettings, out: Path | None, name: str) -> tuple[Path, bool]:
+    """Carry a run out and fill a folder; returns and raises as :func:`holotorch.experiments.run.run`."""
+    experiment = build(settings)
+    values = plan(experiment)
+    with _processes() as (rank, count):
+        if rank == 0:
+            print(plan_text(experiment, values), flush=True)
+            if text := shortage(values):
+                raise ConfigError([text])
+            out = claim(out, name)
+            for part in ("arrays", "images"):
+                (out / part).mkdir(exist_ok=True)
+            write_text(out / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
+            write_json(out / "plan.json", values)
+        return _fill(out or Path(), experiment, rank, count)
+
+
+def resume_volume(folder: Path) -> tuple[Path, bool]:
+    """Go on with an interrupted run after its last complete realisation; equal to one that never stopped."""
+    settings = load_config(folder / "config.yaml")
+    with _processes() as (rank, count):
+        return _fill(folder, build(settings), rank, count)
+
+
+def _fill(out: Path, experiment: VolumeExperiment, rank: int, count: int) -> tuple[Path, bool]:
+    settings, planes = experiment.settings, len(experiment.depths)
+    if rank == 0:
+        write_json(out / "env.json", environment(settings.seed, experiment.device))
+    judge = VolumeJudge(experiment) if rank == 0 else None
+    state = _State(out, judge)
+    start = _shared(torch.tensor(state.done)) if count > 1 else torch.tensor(state.done)
+    part = Part(rank, count, planes) if count > 1 else None
+    total = planes * settings.report.seeds
+    bar = tqdm(
+        total=total, initial=int(start) * planes, desc="rendering", unit="plane", disable=rank > 0, dynamic_ncols=True
+    )
+    with interruptible() as pressed, bar:
+        try:
+            for seed in range(int(start), settings.report.seeds):
+                started = time.perf_counter()
+
+                def seen() -> None:
+                    if bar.n % 10 == 0:
+                        bar.set_postfix(mem=f"{peak_memory() / 1e9:.2f}GB", refresh=False)
+                    bar.update()
+
+                hologram, rendering = experiment.hologram(seed, seen, part)
+                if count > 1:
+                    torch.distributed.all_reduce(hologram)  # of fields: each process has transformed its own sum
+                seconds = time.perf_counter() - started
+                if judge is not None:
+                    with deferred(pressed):
+                        state.take(hologram, seed, seconds, rendering)
+                    if pressed:
+                        break
+        except KeyboardInterrupt:
+            pass
+        if rank > 0:
+            return out, not pressed
+        assert judge is not None
+        if not judge.count:
+            raise KeyboardInterrupt
+        with deferred(pressed):
+            complete = state.done == settings.report.seeds
+            _write(out, experiment, judge, state, complete)
+    return out, complete
+
+
+class _State:
+    """What the realisations so far have given, on disk after each of them."""
+
+    def __init__(self, out: Path, judge: VolumeJudge | None):
+        self.judge, self.out, self.path = judge, out, out / "checkpoint.pt"
+        self.rows: list[dict[str, Any]] = []
+        if judge is not None and self.path.is_file():
+            try:
+                content = torch.load(self.path, weights_only=True)
+                judge.sums, judge.count, self.rows = content["sums"], content["count"], content["rows"]
+            except Exception:  # what damaged bytes raise when unpickled is anyone's guess
+                raise ConfigError(
+                    [f"{self.path} cannot be read: it is damaged; delete the folder and run again"]
+                ) from None
+
+    @property
+    def done(self) -> int:
+        """Complete realisations."""
+        return 0 if self.judge is None else self.judge.count
+
+    def take(self, hologram: Tensor, seed: int, seconds: float, rendering: float) -> None:
+        """Judge a realisation and keep it."""
+        assert self.judge is not None
+        started = time.perf_counter()
+        if seed == 0:
+            save_array(self.out / "arrays" / "hologram.npy", hologram.cpu())
+        self.judge.add(hologram)
+        refocusing = time.perf_counter() - started
+        numbers = self.judge.numbers()
+        row = (seed, round(seconds, 4), round(rendering, 4), round(refocusing, 4))
+        scores = (numbers.get("ssim_in_focus"), numbers["speckle_contrast"])
+        self.rows.append(dict(zip(_COLUMNS, (*row, *scores), strict=True)))
+        with replacing(self.path) as stream:
+            torch.save({"sums": self.judge.sums, "count": self.judge.count, "rows": self.rows}, stream)
+
+
+def _write(out: Path, experiment: VolumeExperiment, judge: VolumeJudge, state: _State, complete: bool) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(state.rows)
+    write_text(out / "metrics.csv", text.getvalue())
+    shown = judge.pictures
+    for name, array in (("rendering", judge.rendering), ("refocused", shown), ("depth", judge.depth)):
+        save_array(out / "arrays" / f"{name}.npy", array)
+    layers = {"depths_m": list(experiment.depths), "rays": list(experiment.rays.shape), "stride": experiment.stride}
+    write_json(out / "layers.json", layers | {"sign": "exp(+ikr) / r"})
+    images = {"rendering": judge.rendering, "in_focus": judge.sharpest(shown)}
+    images |= {f"focus_{f}": picture for f, picture in enumerate(shown)}
+    for name, picture in images.items():
+        write_bytes(out / "images" / f"{name}.png", encode_png(picture.clamp(0, 1)))
+    captions = ["Direct volume rendering", "Hologram, every ray at its depth"]
+    captions += [f"Hologram refocused at {depth * 1e3:.4g} mm" for depth in judge.depths]
+    write_bytes(out / "images" / "comparison.png", pictures.comparison([*images.values()], captions))
+    depth = torch.where(judge.opacity > 0.05, judge.depth * 1e3, torch.nan)
+    write_bytes(out / "images" / "depth.png", pictures.channel_maps(depth[None], ["what a ray sees"], "mm", "viridis"))
+    summary = {
+        "experiment": "volume",
+        "status": "complete" if complete else "interrupted",
+        "synthetic": experiment.synthetic,
+        "refocused_m": judge.depths,
+        **judge.numbers(),
+        "seconds": round(sum(row["seconds"] for row in state.rows), 3),
+        "rendering_seconds": round(sum(row["rendering_seconds"] for row in state.rows), 3),
+        "refocus_seconds": round(sum(row["refocus_seconds"] for row in state.rows), 3),
+        "peak_memory_bytes": peak_memory(),
+    }
+    write_json(out / ("summary.json" if complete else "interrupted.json"), summary)
+    if complete:
+        for left in (state.path, out / "interrupted.json"):
+            left.unlink(missing_ok=True)
+    write_report([out], out / "report.html")
+
+
+@contextmanager
+def _processes() -> Iterator[tuple[int, int]]:
+    """Number of this process and of all, as ``torchrun`` has started them."""
+    count = int(os.environ.get("WORLD_SIZE", "1"))
+    if count == 1:
+        yield 0, 1
+        return
+    torch.distributed.init_process_group("gloo")
+    try:
+        yield torch.distributed.get_rank(), count
+    finally:
+        torch.distributed.destroy_process_group()
+
+
+def _shared(value: Tensor) -> Tensor:
+    """The first process's value, in all."""
+    torch.distributed.broadcast(value, 0)
+    return value
