@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -12,30 +11,13 @@ from holotorch.core.complex import phasor
 from holotorch.core.fourier import multiply_even
 from holotorch.core.grid import Grid
 from holotorch.core.operator import linear
-from holotorch.hologram.cone import Cone, check_layers, check_scene, taper
-from holotorch.hologram.guard import Axis, choose_length, faded_out
-from holotorch.hologram.nodes import Nodes, axial_range, choose_nodes
+from holotorch.hologram.cone import Cone, check_layers, check_scene
+from holotorch.hologram.guard import Axis, choose_length
+from holotorch.hologram.nodes import axial_range, choose_nodes
 from holotorch.hologram.raster import Raster
-from holotorch.optics.kernels import turns_phasor
+from holotorch.hologram.waves import AxialDesign, Waves
 
 _BLOCK = 8  # planes that are spread at once: one matrix product instead of eight passes
-
-
-@dataclass(frozen=True)
-class AxialDesign:
-    """What an :class:`AxialHologram` does for layers of one shape.
-
-    Attributes:
-        nodes: Along the axis.
-        size: Samples of the transforms, (y, x).
-        predicted_error: Expected relative L2 error for sources like noise, against the cone's own definition.
-        adequate: Whether that is within the tolerance.
-    """
-
-    nodes: Nodes
-    size: tuple[int, int]
-    predicted_error: float
-    adequate: bool
 
 
 class AxialHologram(nn.Module):
@@ -82,19 +64,7 @@ class AxialHologram(nn.Module):
     def design(self, shape: tuple[int, int]) -> AxialDesign:
         """Nodes and lengths for layers of ``shape`` (h, w)."""
         if shape not in self._designs:
-            axes = [
-                Axis(
-                    (count - 1) * self.stride + 1,
-                    pixels,
-                    self.stride,
-                    pitch,
-                    self.wavelength,
-                    min(self.depths),
-                    max(self.depths),
-                    self.cone,
-                )
-                for count, pixels, pitch in zip(shape, self.grid.shape, self.grid.pitch, strict=True)
-            ]
+            axes = self._axes(shape)
             (height, ey), (width, ex) = (choose_length(axis, 0.4 * self.tolerance) for axis in axes)
             steepest = axes[0].fade(height)[1], axes[1].fade(width)[1]
             low, high = axial_range(self.grid, self.wavelength, steepest)
@@ -102,6 +72,20 @@ class AxialHologram(nn.Module):
             error = math.hypot(ey, ex, nodes.error(low, high))
             self._designs[shape] = AxialDesign(nodes, (height, width), error, error <= self.tolerance)
         return self._designs[shape]
+
+    def waves(self, shape: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Waves:
+        """Factors in frequency for layers of ``shape``."""
+        design = self.design(shape)
+        raster = Raster(self.grid, shape, self.stride, design.size)
+        return Waves(self.grid, self.wavelength, design, self._axes(shape), raster, dtype, device)
+
+    def _axes(self, shape: tuple[int, int]) -> tuple[Axis, Axis]:
+        near, far = min(self.depths), max(self.depths)
+        y, x = (
+            Axis((count - 1) * self.stride + 1, pixels, self.stride, pitch, self.wavelength, near, far, self.cone)
+            for count, pixels, pitch in zip(shape, self.grid.shape, self.grid.pitch, strict=True)
+        )
+        return y, x
 
     def forward(self, layers: Tensor) -> Tensor:
         """Field [..., H, W] of ``layers``, complex [..., D, h, w], whose samples h // 2, w // 2 lie on the axis."""
@@ -141,7 +125,7 @@ class AxialHologram(nn.Module):
         return torch.stack(fields).reshape(*layers.shape[:-3], *self.grid.shape).to(layers.dtype)
 
     def _gathered(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
-        waves = Waves(self, shape, field.dtype, field.device)
+        waves = self.waves(shape, field.dtype, field.device)
         nodes, raster = waves.design.nodes, waves.raster
         flat = field.reshape(-1, *field.shape[-2:])
         out = flat.new_zeros(len(flat), len(self.depths), *shape)
@@ -157,55 +141,6 @@ class AxialHologram(nn.Module):
                     layers[j] += layer * complex(weights[m - begin].conj())
                 spectrum *= back
         return out.reshape(*field.shape[:-2], len(self.depths), *shape)
-
-
-class Waves:
-    """Factors in frequency of an :class:`AxialHologram` for layers of one shape."""
-
-    def __init__(self, operator: AxialHologram, shape: tuple[int, int], dtype: torch.dtype, device: torch.device):
-        self.operator, self.dtype = operator, dtype
-        self.design = operator.design(shape)
-        self.raster = Raster(operator.grid, shape, operator.stride, self.design.size)
-        size, (py, px) = self.design.size, operator.grid.pitch
-        self.fy = torch.arange(size[0] // 2 + 1, dtype=torch.float64, device=device)[:, None] / (size[0] * py)
-        self.fx = torch.arange(size[1] // 2 + 1, dtype=torch.float64, device=device)[None, :] / (size[1] * px)
-
-    def step(self, nodes: int) -> Tensor:
-        """The factor from one node to another, so many deeper, [N_y, N_x]."""
-        turns = self._beside() * (self.design.nodes.spacing * nodes)
-        whole = torch.ones(self.design.size, dtype=self.dtype, device=turns.device)
-        return multiply_even(whole, turns_phasor(turns).to(self.dtype))
-
-    def last(self, node: int) -> Tensor:
-        """What the sum at ``node`` is multiplied with in the end, a quadrant: phase, wave, cone, window."""
-        nodes, operator = self.design.nodes, self.operator
-        axial, beside = self._axial(), self._beside()
-        strength = 1 / (axial * math.prod(operator.grid.pitch) * nodes.response(beside))
-        low = 0.07 / operator.wavelength
-        strength = torch.where(axial > low, strength, 0)
-        for frequency, pitch, size, count, stride, pixels in zip(
-            (self.fy, self.fx),
-            operator.grid.pitch,
-            self.design.size,
-            self.raster.shape,
-            (operator.stride,) * 2,
-            operator.grid.shape,
-            strict=True,
-        ):
-            if operator.cone == "taper":
-                strength = strength * taper(2 * pitch * frequency)
-            near, far = min(operator.depths), max(operator.depths)
-            axis = Axis((count - 1) * stride + 1, pixels, stride, pitch, operator.wavelength, near, far, operator.cone)
-            strength = strength * faded_out(frequency / axial, *axis.fade(size))
-        wave = turns_phasor(beside * nodes.depth(node) + 0.25)  # the quarter turn is Weyl's i
-        return (wave * strength).to(self.dtype)
-
-    def _axial(self) -> Tensor:
-        square = self.operator.wavelength**-2 - self.fy.square() - self.fx.square()
-        return torch.sqrt(square.clamp(min=(0.05 / self.operator.wavelength) ** 2))
-
-    def _beside(self) -> Tensor:
-        return self._axial() - self.design.nodes.centre
 
 
 class Accumulator:
@@ -290,7 +225,7 @@ class Accumulator:
         if self.turn is not None:
             node *= self.turn
         if self.waves is None:
-            self.waves = Waves(self.operator, self.shape, node.dtype, node.device)
+            self.waves = self.operator.waves(self.shape, node.dtype, node.device)
         raster = self.waves.raster
         period = raster.spectrum(node)
         if self.total is None:

@@ -1,5 +1,9 @@
 """Volumes, how they become light sources, and test scenes of known value."""
 
+from holotorch.scene.adaptive import AdaptivePicture, AdaptiveReport, adaptive_report, render_adaptively
+from holotorch.scene.compositing import corrected_opacity, front_to_back, safe_sqrt
+from holotorch.scene.layers import SourceLayers
+from holotorch.scene.lighting import Lighting
 from holotorch.scene.phantoms import (
     c60,
     c60_atoms,
@@ -9,15 +13,38 @@ from holotorch.scene.phantoms import (
     marschner_lobb,
     shells,
 )
+from holotorch.scene.phases import point_phases, random_phase, smooth_phase
+from holotorch.scene.sampler import DVRSampler
+from holotorch.scene.transfer import TransferFunction
+from holotorch.scene.transfer_presets import bone, industrial, soft_tissue, transfer_from_json, vessels
 from holotorch.scene.volume import Volume
 
 __all__ = [
+    "AdaptivePicture",
+    "AdaptiveReport",
+    "DVRSampler",
+    "Lighting",
+    "SourceLayers",
+    "TransferFunction",
     "Volume",
+    "adaptive_report",
+    "bone",
     "c60",
     "c60_atoms",
+    "corrected_opacity",
     "exponential_medium",
+    "front_to_back",
     "gaussian_ball",
     "homogeneous_slab",
+    "industrial",
     "marschner_lobb",
+    "point_phases",
+    "random_phase",
+    "render_adaptively",
+    "safe_sqrt",
     "shells",
+    "smooth_phase",
+    "soft_tissue",
+    "transfer_from_json",
+    "vessels",
 ]

@@ -38,13 +38,14 @@ def box_depths(start, direction, half):
     return (near, far) if near < far else None
 
 
-def march(values, spacing, table, unit, points, depths, edges, distance, rotation=np.eye(3), eye=None):
+def march(values, spacing, table, unit, points, depths, edges, distance, rotation=None, eye=None):
     """Contributions [D, n, 3] and transmittance [n] of rays through ``points`` [n, 2] (y, x) at depths[0].
 
     The volume, of ``spacing`` (z, y, x) in metres, has its centre on the axis at ``distance``. ``edges`` [D + 1] of the
     slabs, ``unit`` distance of the opacities in metres. Samples half-way through the part of a slab that the volume
     reaches into, paths cut by the faces of the volume.
     """
+    rotation = np.eye(3) if rotation is None else rotation
     half = np.array(values.shape) * np.array(spacing) / 2
     reach = np.abs(rotation[0]) @ half
     found = np.zeros((len(depths), len(points), 3))

@@ -1,0 +1,185 @@
+"""One volume and the rays that march through it, plane by plane."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from holotorch.scene.compositing import absorb, corrected_opacity
+from holotorch.scene.lighting import Lighting, flat_steps, slice_slopes, slopes
+from holotorch.scene.placement import Placement, Rays
+from holotorch.scene.reading import BRICK, PointReader, SliceReader, Window, mixed, occupied_box
+from holotorch.scene.transfer import TransferFunction
+from holotorch.scene.volume import Volume
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a plane adds to ``rays`` [n], flat indices into the window: ``weight`` T alpha [n] and ``colour`` [3, n]."""
+
+    plane: int
+    rays: Tensor
+    weight: Tensor
+    colour: Tensor
+
+
+class March:
+    """Composites ``volume`` along ``rays``, slab by slab, for those rays only that meet anything visible.
+
+    ``visible`` is the smallest and largest depth of what has any opacity, to a brick, or None.
+
+    Args:
+        volume: Scalar field.
+        place: Where it stands.
+        transfer: Colours and opacities.
+        lighting: Shading, or None.
+        rays: Their course.
+        depths: Of the planes, front to back.
+        spans: Smallest and largest depth of the slab of every plane.
+        early: Transmittance below which rays end.
+
+    Raises:
+        ValueError: A voxel is NaN or infinite.
+    """
+
+    def __init__(
+        self,
+        volume: Volume,
+        place: Placement,
+        transfer: TransferFunction,
+        lighting: Lighting | None,
+        rays: Rays,
+        depths: Sequence[float],
+        spans: Sequence[tuple[float, float]],
+        early: float,
+    ):
+        self.volume, self.place, self.transfer, self.lighting = volume, place, transfer, lighting
+        self.rays, self.depths, self.early = rays, depths, early
+        reach = place.reach()
+        self.spans = [
+            (max(low, reach[0]) - place.distance, min(high, reach[1]) - place.distance) for low, high in spans
+        ]
+        self.dtype = transfer.colours.dtype
+        if volume.values.is_floating_point():
+            self.dtype = torch.promote_types(self.dtype, volume.values.dtype)
+        self.device = volume.values.device
+        self.unit = transfer.unit_distance * max(place.half) * 2
+        self.steps_of_slope = flat_steps(volume) if lighting is not None else None
+        low, high = volume.bricks(BRICK)
+        self.occupied = transfer.visible(low, high)
+        box = occupied_box(self.occupied, volume.shape)
+        self.visible = place.reach(*box) if box is not None else None
+        rows, columns = place.footprint(rays, *box) if box is not None else (range(0), range(0))
+        like = torch.empty((), dtype=self.dtype, device=self.device)
+        self.window = Window.of(place, rays, rows, columns, like)
+
+    def steps(self, wanted: Tensor | None = None) -> Iterator[Step]:
+        """What the planes add, front to back; planes that add nothing are left out. ``wanted``: rays, bool [h, w]."""
+        if not self.window.size:
+            return
+        reader = self._reader()
+        transmittance = self.zeros(1)[0] + 1
+        if wanted is not None:
+            rows, columns = self.window.rows, self.window.columns
+            transmittance = transmittance * wanted[rows.start : rows.stop, columns.start : columns.stop].flatten()
+        for plane, (low, high) in enumerate(self.spans):
+            alive = transmittance.detach() > self.early
+            if low >= high:
+                continue
+            found = reader.read(low, high, alive)
+            if found is None:
+                if not alive.any():
+                    return
+                continue
+            colour, opacity = self.transfer(found.samples[0])
+            if self.lighting is not None:
+                colour = self._lit(colour, found.samples[1:])
+            before = transmittance.index_select(0, found.rays)
+            weight, after = absorb(before, corrected_opacity(opacity, found.length * (1 / self.unit)))
+            transmittance.index_copy_(0, found.rays, after)
+            yield Step(plane, found.rays, weight, colour)
+
+    def planes(self, after: Callable[[Tensor], Tensor]) -> Iterator[Tensor]:
+        """The radiance of every plane on the grid, [3, h, w], through the function ``after``, zero to zero."""
+        done = 0
+        for step in self.steps():
+            yield from (self.empty() for _ in range(done, step.plane))
+            done = step.plane + 1
+            scale = self.rays.scale(self.depths[step.plane])
+            if scale == 1:
+                yield self.whole_of(step.rays, after(step.weight * step.colour))
+            else:
+                window = self.zeros(3).index_copy(1, step.rays, step.weight * step.colour)
+                yield after(self._resampled(window, scale))
+        yield from (self.empty() for _ in range(done, len(self.depths)))
+
+    def zeros(self, channels: int) -> Tensor:
+        """[channels, rays of the window]."""
+        return torch.zeros(channels, self.window.size, dtype=self.dtype, device=self.device)
+
+    def empty(self) -> Tensor:
+        """A dark plane, [3, h, w]."""
+        return torch.zeros(3, *self.rays.grid.shape, dtype=self.dtype, device=self.device)
+
+    def whole(self, values: Tensor) -> Tensor:
+        """[c, rays of the window] on the grid, [c, h, w]."""
+        (height, width), rows, columns = self.rays.grid.shape, self.window.rows, self.window.columns
+        if not self.window.size:
+            return values.new_zeros(len(values), height, width)
+        framed = values.unflatten(1, (len(rows), len(columns)))
+        margins = (columns.start, width - columns.stop, rows.start, height - rows.stop)
+        return torch.nn.functional.pad(framed, margins)
+
+    def whole_of(self, rays: Tensor, values: Tensor) -> Tensor:
+        """Values [3, n] of some ``rays`` [n] of the window on the grid, [3, h, w]."""
+        (height, width), rows, columns = self.rays.grid.shape, self.window.rows, self.window.columns
+        if len(columns) < width:
+            rays = rays + torch.div(rays, len(columns), rounding_mode="floor") * (width - len(columns))
+        rays = rays + (rows.start * width + columns.start)
+        plane = torch.zeros(3, height * width, dtype=values.dtype, device=values.device)
+        return plane.index_copy_(1, rays, values).unflatten(1, (height, width))
+
+    def _reader(self) -> SliceReader | PointReader:
+        common = (self.place, self.rays, self.window)
+        support = self.transfer.support()
+        if self.place.turned:
+            return PointReader(*common, self._fields(), self.occupied, support)
+        return SliceReader(*common, self._slice_fields(), self.occupied, support)
+
+    def _fields(self) -> Tensor:
+        values = self.volume.values.to(self.dtype)
+        if self.steps_of_slope is None:
+            return values[None]
+        return torch.cat([values[None], slopes(values, self.steps_of_slope)])
+
+    def _slice_fields(self) -> Callable[[int], Tensor]:
+        # One gradient for all slices instead of a whole volume of zeros for each.
+        slices = self.volume.values.unbind(0)
+        steps = self.steps_of_slope
+        if steps is None:
+            return lambda k: slices[k].to(self.dtype)[None]
+        return lambda k: torch.cat([slices[k].to(self.dtype)[None], slice_slopes(slices, k, steps, self.dtype)])
+
+    def _lit(self, colour: Tensor, slope: Tensor) -> Tensor:
+        assert self.lighting is not None
+        rotation = torch.tensor(self.place.rotation, dtype=torch.float64, device=self.device)
+        rising = self.depths[-1] > self.depths[0] if len(self.depths) > 1 else self._eye_is_before()
+        return self.lighting.shade(colour, slope, rotation, -1.0 if rising else 1.0)
+
+    def _eye_is_before(self) -> bool:
+        return self.rays.eye is None or self.rays.eye < self.depths[0]
+
+    def _resampled(self, window: Tensor, scale: float) -> Tensor:
+        """Radiance [3, rays of the window] of rays ``scale`` times as far from the axis as on the grid, on the grid."""
+        framed = window.unflatten(1, (len(self.window.rows), len(self.window.columns)))
+        framed = torch.nn.functional.pad(framed, (1, 1, 1, 1))
+        for axis, part, count in zip(
+            (-2, -1), (self.window.rows, self.window.columns), self.rays.grid.shape, strict=True
+        ):
+            place = (torch.arange(count, dtype=torch.float64, device=window.device) - count // 2) / scale + count // 2
+            # Into the padded window, whose border is dark.
+            place = (place - (part.start - 1)).clamp(0, len(part) + 1)
+            first = place.floor().clamp_(max=len(part))
+            framed = mixed(framed, first.to(torch.int64), place - first, axis)
+        return framed

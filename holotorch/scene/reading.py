@@ -1,0 +1,252 @@
+"""Samples of a volume where the rays meet a plane, without a look at rays that see nothing there.
+
+Both readers do the same: trilinear interpolation at the depth of a plane, up to the faces of the volume (the outermost
+half voxels have the value of the outermost sample), for the rays still alive that cross a visible value. One mixes two
+slices of a volume that stands straight, the other looks up every point of one that is turned.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from holotorch.scene.placement import Placement, Rays
+
+BRICK = 16
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the rays meet on one plane: which ``rays`` [n] (flat index into the footprint), ``samples`` [c, n] there.
+
+    ``length`` is that of their paths through the slab in metres, [n] or one number for all.
+    """
+
+    rays: Tensor
+    samples: Tensor
+    length: Tensor | float
+
+
+@dataclass(frozen=True)
+class Window:
+    """The part of the rays' grid that meets anything visible, and when it does.
+
+    Attributes:
+        rows: Samples of the grid.
+        columns: Likewise.
+        down: Positions of the rows in metres at the reference depth, float64 [h].
+        across: Positions of the columns, float64 [w].
+        entry: Where every ray enters and leaves the box, depth from its centre, [h, w]; None: all rays are parallel to
+            the axis and pass through the front and the back.
+        exit: See ``entry``.
+        oblique: Path per depth, [h, w], or None for 1.
+    """
+
+    rows: range
+    columns: range
+    down: Tensor
+    across: Tensor
+    entry: Tensor | None
+    exit: Tensor | None
+    oblique: Tensor | None
+
+    @classmethod
+    def of(cls, place: Placement, rays: Rays, rows: range, columns: range, like: Tensor) -> "Window":
+        """Window of ``rows`` and ``columns``, in dtype and on the device of ``like``."""
+        y, x = (axis.flatten() for axis in rays.grid.coordinates(like.device))
+        down, across = y[rows.start : rows.stop], x[columns.start : columns.stop]
+        if not place.turned and rays.eye is None:
+            return cls(rows, columns, down, across, None, None, None)
+        entry, leave = (depth.to(like.dtype) for depth in place.crossing(rays, down, across))
+        oblique = None
+        if rays.eye is not None:
+            slope = rays.spread**2 * (down[:, None].square() + across.square())
+            oblique = (1 + slope).sqrt().to(like.dtype)
+        return cls(rows, columns, down, across, entry, leave, oblique)
+
+    @property
+    def size(self) -> int:
+        """Number of rays."""
+        return len(self.rows) * len(self.columns)
+
+    def length(self, low: float, high: float, rows: slice) -> Tensor | float:
+        """Path in the box between two depths from its centre: [rows, w], or the same number for all rays."""
+        if self.entry is None or self.exit is None:
+            return max(0.0, high - low)
+        path = (self.exit[rows].clamp(max=high) - self.entry[rows].clamp(min=low)).clamp_(min=0)
+        return path if self.oblique is None else path * self.oblique[rows]
+
+
+class SliceReader:
+    """Reads a volume whose slices are parallel to the hologram: two slices are mixed, then columns, then rows.
+
+    Args:
+        fields: Slice number -> [c, H, W]; the first channel is the value.
+        occupied: Whether a brick holds anything visible, bool [Dz, Hy, Wx].
+        support: See ``TransferFunction.support``.
+    """
+
+    def __init__(
+        self,
+        place: Placement,
+        rays: Rays,
+        window: Window,
+        fields: Callable[[int], Tensor],
+        occupied: Tensor,
+        support: tuple[float, float],
+    ):
+        self.place, self.rays, self.window, self.fields, self.support = place, rays, window, fields, support
+        self.bands = [_band(layer.any(1)) for layer in occupied]
+
+    def read(self, low: float, high: float, alive: Tensor) -> Found | None:
+        """Samples half-way between two depths from the centre, of the rays ``alive`` (bool, flat) in the window."""
+        place, width = self.place, len(self.window.columns)
+        depth = (low + high) / 2
+        index = min(max(depth / place.spacing[0] + (place.shape[0] - 1) / 2, 0.0), place.shape[0] - 1.0)
+        k = min(int(index), max(0, place.shape[0] - 2))
+        band = self.bands[k // BRICK]
+        if band is None:
+            return None
+        scale = self.rays.scale(place.distance + depth)
+        first, part = _taps(self.window.down * scale, place.shape[1], place.spacing[1])
+        # Rows come in the order of their voxels.
+        limits = first.new_tensor([band.start * BRICK, band.stop * BRICK])
+        start, stop = (int(row) for row in torch.searchsorted(first, limits))
+        if start >= stop:
+            return None
+        length = self.window.length(low, high, slice(start, stop))
+        mask = alive[start * width : stop * width]
+        if isinstance(length, Tensor):
+            mask = mask & (length > 0).flatten()
+        left, share = _taps(self.window.across * scale, place.shape[2], place.spacing[2])
+        lines = mixed(self._slice(k, index - k), left, share, -1)
+        first, part = first[start:stop], part[start:stop]
+        values = mixed(lines[:1], first, part, -2).flatten(1)
+        rays = _visible(mask, values[0], self.support)
+        if not rays.numel():
+            return None
+        samples = values.index_select(1, rays)
+        if len(lines) > 1:
+            samples = torch.cat([samples, _between_rows(lines[1:], first, part, rays)])
+        length = length.flatten().index_select(0, rays) if isinstance(length, Tensor) else length
+        return Found(rays + start * width, samples, length)
+
+    def _slice(self, k: int, part: float) -> Tensor:
+        here = self.fields(k)
+        return here if part == 0 else torch.lerp(here, self.fields(k + 1), part)
+
+
+class PointReader:
+    """Reads a volume that is turned, point by point with ``grid_sample``.
+
+    Args:
+        fields: All channels, [c, D, H, W]; the first one is the value.
+        occupied: As for :class:`SliceReader`.
+        support: Likewise.
+    """
+
+    def __init__(
+        self,
+        place: Placement,
+        rays: Rays,
+        window: Window,
+        fields: Tensor,
+        occupied: Tensor,
+        support: tuple[float, float],
+    ):
+        self.place, self.rays, self.window, self.fields, self.support = place, rays, window, fields, support
+        self.occupied = None if bool(occupied.all()) else occupied
+
+    def read(self, low: float, high: float, alive: Tensor) -> Found | None:
+        """As :meth:`SliceReader.read`."""
+        place, window = self.place, self.window
+        length = window.length(low, high, slice(None))
+        assert isinstance(length, Tensor)  # only straight volumes have one length for all
+        length = length.flatten()
+        rays = (alive & (length > 0)).nonzero().flatten()
+        down, across = place.offsets(self.rays, place.distance + (low + high) / 2, window.down, window.across)
+        # In samples from the middle one.
+        spacing = down.new_tensor(place.spacing)
+        down, across = ((offset / spacing).to(self.fields.dtype) for offset in (down, across))
+        row = torch.div(rays, len(window.columns), rounding_mode="floor")
+        points = down.index_select(0, row) + across.index_select(0, rays - row * len(window.columns))
+        if self.occupied is not None:
+            seen = self._in_bricks(points)
+            rays, points = rays[seen], points.index_select(0, seen)
+        if not rays.numel():
+            return None
+        ends = points.new_tensor([max(1, n - 1) / 2 for n in place.shape])
+        # align_corners: -1 and 1 are the first and the last sample; axes in the order (x, y, z).
+        samples = torch.nn.functional.grid_sample(
+            self.fields[None], (points / ends).flip(-1)[None, None, None], padding_mode="border", align_corners=True
+        )[0, :, 0, 0]
+        kept = _visible(None, samples[0], self.support)
+        if kept.numel() < rays.numel():
+            rays, samples = rays[kept], samples.index_select(1, kept)
+        return Found(rays, samples, length.index_select(0, rays)) if rays.numel() else None
+
+    def _in_bricks(self, points: Tensor) -> Tensor:
+        assert self.occupied is not None
+        flat = torch.zeros_like(points[:, 0], dtype=torch.int64)
+        for axis, (n, bricks) in enumerate(zip(self.place.shape, self.occupied.shape, strict=True)):
+            brick = ((points[:, axis] + (n - 1) / 2).clamp_(0, n - 1) * (1 / BRICK)).to(torch.int64)
+            flat = flat * bricks + brick
+        return self.occupied.flatten()[flat].nonzero().flatten()
+
+
+def occupied_box(occupied: Tensor, shape: tuple[int, int, int]) -> tuple[list[float], list[float]] | None:
+    """Smallest box of index coordinates with all occupied bricks, out to the faces of the volume; None if none is."""
+    low, high = [], []
+    for axis, n in enumerate(shape):
+        others = [other for other in range(3) if other != axis]
+        band = _band(occupied.any(others[1]).any(others[0]))
+        if band is None:
+            return None
+        low.append(band.start * BRICK if band.start else -0.5)
+        high.append(band.stop * BRICK if band.stop * BRICK < n else n - 0.5)
+    return low, high
+
+
+def _band(seen: Tensor) -> range | None:
+    places = seen.nonzero().flatten().tolist()
+    return range(places[0], places[-1] + 1) if places else None
+
+
+def _taps(offsets: Tensor, count: int, spacing: float) -> tuple[Tensor, Tensor]:
+    """First of two neighbouring samples [n] and the share of the second [n], for offsets from the middle in metres."""
+    index = (offsets / spacing + (count - 1) / 2).clamp(0, count - 1)
+    first = index.floor().clamp_(max=max(0, count - 2)).to(torch.int64)
+    return first, index - first
+
+
+def mixed(values: Tensor, first: Tensor, share: Tensor, axis: int) -> Tensor:
+    """Linear interpolation of ``values`` along ``axis`` (-2 or -1) between samples ``first`` [n] and the next ones."""
+    one = values.index_select(axis, first)
+    if values.shape[axis] == 1:
+        return one
+    other = values.index_select(axis, first + 1)
+    share = share.to(values.dtype)
+    return torch.lerp(one, other, share[:, None] if axis == -2 else share)
+
+
+def _between_rows(lines: Tensor, first: Tensor, share: Tensor, rays: Tensor) -> Tensor:
+    """As :func:`mixed` along the rows of ``lines`` [c, n, w], for some ``rays`` [m] (flat in [h, w]) only: [c, m]."""
+    width = lines.shape[2]
+    row = torch.div(rays, width, rounding_mode="floor")
+    place = rays + (first.index_select(0, row) - row) * width
+    following = place + width if lines.shape[1] > 1 else place
+    lines, share = lines.flatten(1), share.to(lines.dtype).index_select(0, row)
+    return torch.lerp(lines.index_select(1, place), lines.index_select(1, following), share)
+
+
+def _visible(mask: Tensor | None, values: Tensor, support: tuple[float, float]) -> Tensor:
+    """Where ``mask`` holds and the values have an opacity, as flat indices."""
+    low, high = support
+    values = values.detach()
+    if low > -math.inf:
+        mask = values > low if mask is None else mask & (values > low)
+    if high < math.inf:
+        mask = values < high if mask is None else mask & (values < high)
+    return torch.arange(values.numel(), device=values.device) if mask is None else mask.nonzero().flatten()

@@ -1,0 +1,226 @@
+"""Ready transfer functions, and those that ParaView and 3D Slicer save as JSON."""
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+
+from holotorch.core import checks
+from holotorch.scene.transfer import TransferFunction
+
+UNIT_DISTANCE = 0.01  # of the volume's width
+_STEP = 1e-6  # of the range of positions, the width given to a jump
+
+# Position between the two given values, red, green, blue, opacity.
+_BONE = [
+    (0.00, 0.50, 0.10, 0.08, 0.00),
+    (0.32, 0.60, 0.22, 0.16, 0.00),
+    (0.40, 0.84, 0.62, 0.45, 0.04),
+    (0.55, 0.95, 0.88, 0.75, 0.45),
+    (1.00, 1.00, 1.00, 0.96, 0.85),
+]
+_SOFT_TISSUE = [
+    (0.00, 0.40, 0.10, 0.08, 0.00),
+    (0.12, 0.55, 0.22, 0.15, 0.00),
+    (0.22, 0.88, 0.58, 0.45, 0.03),
+    (0.34, 0.80, 0.35, 0.28, 0.08),
+    (0.60, 0.98, 0.90, 0.80, 0.30),
+    (1.00, 1.00, 1.00, 0.95, 0.60),
+]
+_VESSELS = [
+    (0.00, 0.30, 0.00, 0.00, 0.00),
+    (0.25, 0.45, 0.02, 0.02, 0.00),
+    (0.40, 0.80, 0.10, 0.08, 0.30),
+    (0.70, 1.00, 0.35, 0.20, 0.70),
+    (1.00, 1.00, 0.80, 0.60, 0.90),
+]
+_INDUSTRIAL = [
+    (0.00, 0.20, 0.22, 0.25, 0.00),
+    (0.12, 0.30, 0.33, 0.38, 0.00),
+    (0.30, 0.52, 0.56, 0.62, 0.20),
+    (0.65, 0.75, 0.77, 0.80, 0.60),
+    (1.00, 0.95, 0.95, 0.97, 0.90),
+]
+
+
+def bone(low: float, high: float, *, unit_distance: float = UNIT_DISTANCE) -> TransferFunction:
+    """Bone in computed tomography: ivory, what is softer transparent. ``low`` is air, ``high`` the densest bone."""
+    return _scaled(_BONE, low, high, unit_distance)
+
+
+def soft_tissue(low: float, high: float, *, unit_distance: float = UNIT_DISTANCE) -> TransferFunction:
+    """Translucent skin and muscle over bone; ``low`` is air, ``high`` the densest bone."""
+    return _scaled(_SOFT_TISSUE, low, high, unit_distance)
+
+
+def vessels(low: float, high: float, *, unit_distance: float = UNIT_DISTANCE) -> TransferFunction:
+    """Vessels filled with contrast agent, red; ``low`` is what surrounds them, ``high`` the brightest vessel."""
+    return _scaled(_VESSELS, low, high, unit_distance)
+
+
+def industrial(low: float, high: float, *, unit_distance: float = UNIT_DISTANCE) -> TransferFunction:
+    """Grey metal and plastics in industrial tomography; ``low`` is air, ``high`` the densest part."""
+    return _scaled(_INDUSTRIAL, low, high, unit_distance)
+
+
+def transfer_from_json(text: str, *, unit_distance: float = UNIT_DISTANCE) -> TransferFunction:
+    """Transfer function saved by ParaView or 3D Slicer.
+
+    ParaView: the first map of the list, ``RGBPoints`` [x, r, g, b, ...] and ``Points`` [x, opacity, midpoint,
+    sharpness, ...]. 3D Slicer (volume property, schema 1): the first component's ``rgbTransferFunction`` and
+    ``scalarOpacity``. Colours and opacities keep their own positions, both are piecewise linear between all of them; a
+    jump becomes a slope over a millionth of the range. Lighting is left out.
+
+    Args:
+        text: Of the file.
+        unit_distance: Of the opacities, as a fraction of the volume's width. Neither file can tell: Slicer's
+            ``scalarOpacityUnitDistance`` is in millimetres of a volume that it does not name.
+
+    Raises:
+        ValueError: No such file, or something in it that a piecewise-linear function of one scalar cannot do; names
+            the field.
+    """
+    try:
+        content = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"a transfer function must be JSON text, got {text[:40]!r}: {error}") from None
+    first = content[0] if isinstance(content, list) and content else content
+    if isinstance(first, dict) and "RGBPoints" in first:
+        colours, opacities = _paraview(first)
+    elif isinstance(first, dict) and "volumeProperties" in first:
+        colours, opacities = _slicer(first)
+    else:
+        raise ValueError(
+            "a transfer function must be a ParaView colour map with 'RGBPoints' or a 3D Slicer file with "
+            f"'volumeProperties', got {_kind(first)}"
+        )
+    positions = np.union1d(colours[0], opacities[0])
+    found = np.stack([np.interp(positions, colours[0], channel) for channel in colours[1].T], -1)
+    opacity = np.interp(positions, opacities[0], opacities[1][:, 0])
+    return TransferFunction(positions.tolist(), found.tolist(), opacity.tolist(), unit_distance=unit_distance)
+
+
+Curve = tuple[np.ndarray, np.ndarray]  # positions [K] that rise, values [K, n]
+Point = tuple[str, float, list[float], float, float]  # its name, position, values, midpoint, sharpness
+
+
+def _paraview(content: dict[str, Any]) -> tuple[Curve, Curve]:
+    space = content.get("ColorSpace", "RGB")
+    if space != "RGB":
+        raise ValueError(f"ColorSpace must be RGB, in which colours are mixed linearly, got {space!r}; convert the map")
+    if content.get("UseLogScale"):
+        raise ValueError("UseLogScale must be off: positions are interpolated linearly")
+    colours = [(name, x, [r, g, b], 0.5, 0.0) for name, (x, r, g, b) in _fours("RGBPoints", content)]
+    opacities = [(name, x, [y], middle, sharp) for name, (x, y, middle, sharp) in _fours("Points", content)]
+    return _curve("RGBPoints", colours), _curve("Points", opacities)
+
+
+def _slicer(content: dict[str, Any]) -> tuple[Curve, Curve]:
+    where = "volumeProperties[0].components"
+    components = _objects(where, _objects("volumeProperties", content["volumeProperties"])[0].get("components"))
+    if len(components) > 1:
+        raise ValueError(f"{where} must be one, for a volume of one scalar, got {len(components)}")
+    component, where = components[0], where + "[0]"
+    steep = _points(f"{where}.gradientOpacity", component, "y") if component.get("gradientOpacity") else []
+    if not component.get("disableGradientOpacity") and any(value != [1.0] for _, _, value, _, _ in steep):
+        raise ValueError(f"{where}.gradientOpacity must be 1 throughout: opacity here depends on the value alone")
+    return (
+        _curve(f"{where}.rgbTransferFunction", _points(f"{where}.rgbTransferFunction", component, "color")),
+        _curve(f"{where}.scalarOpacity", _points(f"{where}.scalarOpacity", component, "y")),
+    )
+
+
+def _points(where: str, component: dict[str, Any], key: str) -> list[Point]:
+    function = component.get(where.rsplit(".", 1)[1])
+    if not isinstance(function, dict):
+        raise ValueError(f"{where} must be an object with 'points', got {_kind(function)}")
+    found: list[Point] = []
+    for k, point in enumerate(_objects(f"{where}.points", function.get("points"))):
+        name = f"{where}.points[{k}]"
+        value = point.get(key) if key == "color" else [point.get(key)]
+        if not isinstance(value, list) or len(value) != (3 if key == "color" else 1):
+            raise ValueError(f"{name}.{key} must be red, green and blue, got {_kind(value)}")
+        x, middle, sharp = (
+            _number(f"{name}.{part}", point.get(part, usual))
+            for part, usual in (("x", None), ("midpoint", 0.5), ("sharpness", 0.0))
+        )
+        found.append((name, x, [_number(f"{name}.{key}", part) for part in value], middle, sharp))
+    return found
+
+
+def _curve(where: str, points: list[Point]) -> Curve:
+    """Positions and values, with a point more where a midpoint is not in the middle, and no two at one position."""
+    places: list[float] = []
+    values: list[list[float]] = []
+    for k, (name, x, value, middle, sharp) in enumerate(points):
+        # Positions are kept in single precision: what is apart here must be apart there.
+        x = float(np.float32(x))
+        if k and x < float(np.float32(points[k - 1][1])):
+            raise ValueError(f"{name} must not lie below the one before, got {points[k - 1][1]:g} before {x:g}")
+        if min(value) < 0 or max(value) > 1:
+            raise ValueError(f"{name} must hold colours and opacities in [0, 1], got {value}")
+        places.append(x)
+        values.append(value)
+        if k + 1 == len(points):
+            break
+        if sharp != 0:
+            raise ValueError(f"{name} must have sharpness 0, which is piecewise linear, got {sharp:g}")
+        if not 0 < middle < 1:
+            raise ValueError(f"{name} must have its midpoint between 0 and 1, got {middle:g}")
+        if middle != 0.5:
+            _, following, other, _, _ = points[k + 1]
+            places.append(float(np.float32(x + middle * (following - x))))
+            values.append([(one + two) / 2 for one, two in zip(value, other, strict=True)])
+    span = places[-1] - places[0]
+    if span == 0:
+        raise ValueError(f"{where} must hold at least two different positions, got {places[0]:g} only")
+    for k in range(1, len(places)):
+        least = np.float32(places[k - 1] + _STEP * span)
+        if places[k] < least:
+            places[k] = float(max(least, np.nextafter(np.float32(places[k - 1]), np.float32(np.inf))))
+    return np.array(places), np.array(values)
+
+
+def _fours(name: str, content: dict[str, Any]) -> list[tuple[str, list[float]]]:
+    numbers = _list(name, content.get(name))
+    if len(numbers) % 4:
+        raise ValueError(f"{name} must hold four numbers per point, got {len(numbers)} in all")
+    found = [_number(f"{name}[{k}]", number) for k, number in enumerate(numbers)]
+    return [(f"{name}[{k}:{k + 4}]", found[k : k + 4]) for k in range(0, len(found), 4)]
+
+
+def _list(name: str, value: Any) -> list[Any]:
+    if not isinstance(value, list) or not value:
+        raise ValueError(f"{name} must be a list that is not empty, got {_kind(value)}")
+    return value
+
+
+def _objects(name: str, value: Any) -> list[dict[str, Any]]:
+    for k, item in enumerate(_list(name, value)):
+        if not isinstance(item, dict):
+            raise ValueError(f"{name}[{k}] must be an object, got {_kind(item)}")
+    return value
+
+
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"{name} must be a number, got {value!r}")
+    return float(value)
+
+
+def _kind(value: Any) -> str:
+    if value is None:
+        return "nothing"
+    return f"{type(value).__name__} {str(value)[:40]!r}"
+
+
+def _scaled(
+    rows: list[tuple[float, float, float, float, float]], low: float, high: float, unit_distance: float
+) -> TransferFunction:
+    low, high = checks.finite("low", low), checks.finite("high", high)
+    if not low < high:
+        raise ValueError(f"low must be below high, got {low:g} and {high:g}")
+    positions = [low + (high - low) * row[0] for row in rows]
+    colours, opacities = [list(row[1:4]) for row in rows], [row[4] for row in rows]
+    return TransferFunction(positions, colours, opacities, unit_distance=unit_distance)
