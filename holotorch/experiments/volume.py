@@ -18,7 +18,7 @@ from holotorch.io.catalogue import PUBLISHED, fetch_volume
 from holotorch.io.volumes import load_volume
 from holotorch.scene import phantoms, transfer_presets
 from holotorch.scene.lighting import Lighting
-from holotorch.scene.phases import point_phases, random_phase, smooth_phase
+from holotorch.scene.phases import PointPhases, point_phases, random_phase, smooth_phase
 from holotorch.scene.sampler import DVRSampler
 from holotorch.scene.transfer import TransferFunction
 from holotorch.scene.volume import Volume
@@ -121,7 +121,7 @@ class VolumeExperiment:
     def sampler(self, seed: int = 0) -> DVRSampler:
         """The renderer with the phases of a realisation."""
         generator = torch.Generator().manual_seed(self.settings.seed + seed)
-        phases: dict[str, Callable[[Grid], Tensor | Callable[[int], Tensor]] | None] = {
+        phases: dict[str, Callable[[Grid], Tensor | PointPhases] | None] = {
             "ray": lambda grid: random_phase(grid, generator=generator),
             "point": lambda grid: point_phases(grid, generator=generator),
             "smooth": lambda grid: smooth_phase(grid, _SMOOTH * grid.pitch[0], generator=generator),

@@ -13,7 +13,7 @@ from holotorch.scene.phantoms import (
     marschner_lobb,
     shells,
 )
-from holotorch.scene.phases import point_phases, random_phase, smooth_phase
+from holotorch.scene.phases import PointPhases, point_phases, random_phase, smooth_phase
 from holotorch.scene.sampler import DVRSampler
 from holotorch.scene.transfer import TransferFunction
 from holotorch.scene.transfer_presets import bone, industrial, soft_tissue, transfer_from_json, vessels
@@ -24,6 +24,7 @@ __all__ = [
     "AdaptiveReport",
     "DVRSampler",
     "Lighting",
+    "PointPhases",
     "SourceLayers",
     "TransferFunction",
     "Volume",

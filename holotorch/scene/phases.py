@@ -5,7 +5,7 @@ per ray, as in the thesis, spreads it over the whole eye box and makes speckle. 
 """
 
 import math
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -13,6 +13,8 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.core.fourier import filter_real
 from holotorch.core.grid import Grid
+
+_WINDOWS = 64  # places of a window along each axis
 
 
 def random_phase(grid: Grid, *, generator: torch.Generator | None = None) -> Tensor:
@@ -41,18 +43,38 @@ def smooth_phase(
     return filter_real(noise, kernel.to(noise.dtype))
 
 
-def point_phases(grid: Grid, *, generator: torch.Generator | None = None) -> Callable[[int], Tensor]:
-    """Uniform in [0, 2 pi), independent for every point of every plane: plane number -> float32 [h, w].
+@dataclass(frozen=True, eq=False)
+class PointPhases:
+    """Random phases for every point of every plane: windows of one larger map, each plane its own.
 
-    The same plane gets the same phases every time, so that layers can be gone through again.
+    Points of one ray, and of planes near to each other, have independent phases, which is what keeps planes from
+    interfering; points that do share one lie at places without a pattern. Drawing new ones for every plane would cost
+    more than rendering it.
+
+    Attributes:
+        phase: In [0, 2 pi), [h + 63, w + 63].
+        order: Of the 64 x 64 windows, whole numbers [4096]; planes beyond begin anew.
     """
-    device = _device(generator)
-    seed = int(torch.randint(1 << 62, (), generator=generator, device=device))
 
-    def phase(plane: int) -> Tensor:
-        return random_phase(grid, generator=torch.Generator(device).manual_seed(seed + plane))
+    phase: Tensor
+    order: Tensor
 
-    return phase
+    def window(self, values: Tensor, plane: int) -> Tensor:
+        """The part [h, w] of a map as large as ``phase`` that belongs to a plane; a view."""
+        y, x = divmod(int(self.order[plane % len(self.order)]), _WINDOWS)
+        height, width = (size - _WINDOWS + 1 for size in self.phase.shape)
+        return values[y : y + height, x : x + width]
+
+    def __call__(self, plane: int) -> Tensor:
+        """Phases of a plane, [h, w]; the same every time."""
+        return self.window(self.phase, plane)
+
+
+def point_phases(grid: Grid, *, generator: torch.Generator | None = None) -> PointPhases:
+    """Uniform in [0, 2 pi), float32, for every point of every plane; see :class:`PointPhases`."""
+    height, width = (size + _WINDOWS - 1 for size in grid.shape)
+    order = torch.randperm(_WINDOWS**2, generator=generator, device=_device(generator))
+    return PointPhases(random_phase(Grid((height, width), grid.pitch), generator=generator), order)
 
 
 def _device(generator: torch.Generator | None) -> torch.device:

@@ -13,11 +13,12 @@ from holotorch.scene.compositing import safe_sqrt
 from holotorch.scene.layers import SourceLayers
 from holotorch.scene.lighting import Lighting
 from holotorch.scene.march import March
-from holotorch.scene.placement import Placement, Rays, check_planes, check_rotation, slabs
+from holotorch.scene.phases import PointPhases
+from holotorch.scene.placement import Placement, Rays, check_planes, check_rotation, slabs, upright
 from holotorch.scene.transfer import TransferFunction
 from holotorch.scene.volume import Volume
 
-PhaseMaps = Tensor | Callable[[int], Tensor]
+PhaseMaps = Tensor | PointPhases
 _LOST = 1e-3  # of the visible depth
 
 
@@ -51,8 +52,7 @@ class DVRSampler(nn.Module):
             volume. Index 0 of z is nearest to the hologram without it.
         eye: Depth of the observer, in front of all slabs (negative: on the other side of the hologram); None: far away.
         lighting: Shading by the gradient of the volume; None: all points glow evenly.
-        phase: Grid -> phases in radians, [h, w] for every ray, or a function from plane number to [h, w]; see
-            ``phases``. None: 0.
+        phase: Grid -> phases in radians, [h, w] for every ray, or ``PointPhases``; see ``phases``. None: 0.
         early: Transmittance below which a ray ends, in [0, 1).
         boundaries: Of the slabs, [D + 1], if they are not half-way between the planes.
 
@@ -97,11 +97,12 @@ class DVRSampler(nn.Module):
         march = self._march(volume)
         maps = self.phase(self.grid) if self.phase is not None else None
         common = maps.to(march.device, march.dtype) if isinstance(maps, Tensor) else None
-        own = None if isinstance(maps, Tensor) else maps
+        own = maps if isinstance(maps, PointPhases) else None
+        turns = None if own is None else phasor(own.phase.to(march.device, march.dtype))
 
         def amplitudes() -> Iterator[Tensor]:
             for plane, amplitude in enumerate(march.planes(safe_sqrt)):
-                yield amplitude if own is None else amplitude * phasor(own(plane).to(march.device, march.dtype))
+                yield amplitude if own is None or turns is None else _turned(amplitude, own.window(turns, plane))
 
         return SourceLayers(self.grid, self.depths, 3, amplitudes, common)
 
@@ -134,7 +135,8 @@ class DVRSampler(nn.Module):
     def _march(self, volume: Volume) -> March:
         if not isinstance(volume, Volume):
             raise TypeError(f"volume must be a Volume, got {type(volume).__name__}; use Volume(values, spacing, unit)")
-        place = Placement.of(volume, self.width, self.distance, self.rotation)
+        volume, rotation = upright(volume, self.rotation)
+        place = Placement.of(volume, self.width, self.distance, rotation)
         spans = slabs(self.depths, self.boundaries, place.reach())
         near, far = min(span[0] for span in spans), max(span[1] for span in spans)
         if self.eye is not None:
@@ -158,3 +160,8 @@ class DVRSampler(nn.Module):
                 checks.SamplingWarning,
                 stacklevel=4,
             )
+
+
+def _turned(amplitude: Tensor, turn: Tensor) -> Tensor:
+    """Real [C, h, w] times complex [h, w], without making the real one complex first."""
+    return torch.view_as_complex(amplitude[..., None] * torch.view_as_real(turn))

@@ -210,6 +210,11 @@ def test_what_does_not_fit_into_memory_is_refused(capsys):
     assert "use a smaller grid" in capsys.readouterr().err
 
 
-def test_light_beside_the_rays_is_said():
-    experiment = build(settings("view={width: 0.4 mm}", "hologram.distance=3 mm"))
-    assert any("beside the rays and is cut off" in note for note in plan(experiment)["notes"])
+def test_light_beside_the_rays_is_said(tmp_path):
+    """A bar twice as wide as the rays: half of it is cut off."""
+    np.save(tmp_path / "bar.npy", np.full((8, 8, 32), 200, np.uint8))
+    source = f"volume={{path: {tmp_path / 'bar.npy'}, spacing: 1, unit: relative}}"
+    wide = build(settings(source, "view={width: 0.48 mm}"))  # the rays cover 0.239 mm
+    (note,) = (note for note in plan(wide)["notes"] if "beside the rays" in note)
+    assert float(note.split(" %")[0]) == pytest.approx(50, abs=2)
+    assert not any("beside" in note for note in plan(build(settings(source)))["notes"])
