@@ -93,11 +93,15 @@ def test_top_level_holds_what_was_agreed():
 def test_public_names():
     from holotorch import Grid, __version__
     from holotorch.correction import APG, PECProblem, ProjectedAdam, Solution, gerchberg_saxton
+    from holotorch.hologram import AxialHologram, ConvolutionHologram, DirectHologram, plan_hologram
     from holotorch.metrics import psnr, ssim
     from holotorch.modulator import PhasedArray, ThermalCrosstalk
     from holotorch.optics import AngularSpectrum, Fraunhofer, Fresnel
+    from holotorch.scene import DVRSampler, SourceLayers, TransferFunction, Volume
 
     names = [Grid, APG, PECProblem, ProjectedAdam, Solution, gerchberg_saxton, psnr, ssim, PhasedArray]
+    names += [AxialHologram, ConvolutionHologram, DirectHologram, plan_hologram]
+    names += [DVRSampler, SourceLayers, TransferFunction, Volume]
     names += [ThermalCrosstalk, AngularSpectrum, Fraunhofer, Fresnel]
     assert all(name.__doc__ for name in names)
     assert re.fullmatch(r"\d+\.\d+\.\d+", __version__)

@@ -118,7 +118,7 @@ def volume() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
 
 def _ways(scene: Scene, wave: float) -> dict[str, Callable[[], Any]]:
     """Calls that form the hologram of a colour; operators are built before, as for a sequence of holograms."""
-    layers = scene.layers()
+    layers, planes, phase = scene.layers(), list(scene.amplitudes()), scene.phase
     exact = ConvolutionHologram(scene.grid, wave, scene.depths, stride=2)
     soft, fine = (AxialHologram(scene.grid, wave, scene.depths, stride=2, tolerance=t) for t in (3e-3, 1e-4))
     for operator in (soft, fine):
@@ -128,8 +128,8 @@ def _ways(scene: Scene, wave: float) -> dict[str, Callable[[], Any]]:
         BASE: thesis,
         "the same, waves at hand": ready,
         "convolutions, exact": lambda: exact(layers),
-        "axial nodes, 3e-3": lambda: soft.accumulate(scene.amplitudes(), scene.phase),
-        "axial nodes, 1e-4": lambda: fine.accumulate(scene.amplitudes(), scene.phase),
+        "axial nodes, 3e-3": lambda: soft.accumulate(planes, phase),
+        "axial nodes, 1e-4": lambda: fine.accumulate(planes, phase),
     }
 
 
@@ -210,9 +210,10 @@ def _scaling() -> list[dict]:
         operator = AxialHologram(scene.grid, WAVES[0], scene.depths, stride=2, tolerance=3e-3)
         design = operator.design((scene.side // 2, scene.side // 2))
         times = []
+        planes, phase = list(scene.amplitudes()), scene.phase
         for _ in range(1 if scene.side == WHOLE else 3):
             started = time.perf_counter()
-            operator.accumulate(scene.amplitudes(), scene.phase)
+            operator.accumulate(planes, phase)
             times.append(time.perf_counter() - started)
         seconds = sorted(times)[len(times) // 2]
         rows.append(

@@ -16,10 +16,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from holotorch.experiments.pec_bench import Bench, Track
+from holotorch.experiments.pec_volume import SLICES, focal_sweep
 from holotorch.modulator import ThermalCrosstalk, quantised
 
 Row = dict[str, Any]
 PI = math.pi
+VOLUME = f"synthetic volume, {SLICES} slices in turn"
 
 
 def reproduction(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
@@ -125,6 +127,9 @@ def focus(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
                     error = (seen - own.wanted)[..., part].square().mean().sqrt() / own.wanted[..., part].std()
                     where = f"focus {plane * 1e3:g} mm, band of {depth * 1e3:g} mm"
                     rows.append(_row(own, name, {"error": error.item()}, 0.0) | {"setting": where})
+        for plane, depth, error in focal_sweep(replace(bench, sigma_px=sigma), min(steps, 100)):
+            where = f"focus {plane * 1e3:.3g} mm, part of {depth * 1e3:.3g} mm"
+            rows.append(_row(own, VOLUME, {"error": error}, 0.0) | {"setting": where})
     return rows
 
 

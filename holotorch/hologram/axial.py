@@ -14,10 +14,10 @@ from holotorch.core.operator import linear
 from holotorch.hologram.cone import Cone, check_layers, check_scene
 from holotorch.hologram.guard import Axis, choose_length
 from holotorch.hologram.nodes import axial_range, choose_nodes
-from holotorch.hologram.raster import Raster
+from holotorch.hologram.raster import Raster, lit
 from holotorch.hologram.waves import AxialDesign, Waves
 
-_BLOCK = 8  # planes that are spread at once: one matrix product instead of eight passes
+_BLOCK = 12  # planes that are spread at once: one matrix product instead of a pass for each
 
 
 class AxialHologram(nn.Module):
@@ -129,16 +129,15 @@ class AxialHologram(nn.Module):
         nodes, raster = waves.design.nodes, waves.raster
         flat = field.reshape(-1, *field.shape[-2:])
         out = flat.new_zeros(len(flat), len(self.depths), *shape)
-        touched = [nodes.weights(depth) for depth in self.depths]
+        begins, weights = nodes.weights(self.depths)
         back = waves.step(-1)
         for given, layers in zip(flat, out, strict=True):
             spectrum = multiply_even(raster.spectrum_of_pixels(given), waves.last(0).conj())
             for m in range(nodes.count):
-                near = [j for j, (begin, _) in enumerate(touched) if begin <= m < begin + nodes.width]
+                near = [j for j, begin in enumerate(begins) if begin <= m < begin + nodes.width]
                 layer = raster.layer(spectrum) if near else spectrum
                 for j in near:
-                    begin, weights = touched[j]
-                    layers[j] += layer * complex(weights[m - begin].conj())
+                    layers[j] += layer * complex(weights[j, m - begins[j]].conj())
                 spectrum *= back
         return out.reshape(*field.shape[:-2], len(self.depths), *shape)
 
@@ -150,13 +149,14 @@ class Accumulator:
         self.operator, self.shape = operator, shape
         self.turn = None if phase is None else phasor(phase)
         self.nodes = operator.design(shape).nodes
+        self.begins, self.weights = self.nodes.weights(operator.depths)
         self.waves: Waves | None = None
         self.total: Tensor | None = None
         self.step: Tensor | None = None
         self.at = 0
         self.before: float | None = None
         self.rising: bool | None = None
-        self.pending: list[tuple[float, Tensor]] = []
+        self.pending: list[tuple[int, Tensor]] = []
         self.open: dict[int, Tensor] = {}
 
     def add(self, j: int, plane: Tensor) -> None:
@@ -168,14 +168,15 @@ class Accumulator:
                 raise ValueError("planes that arrive one by one must come in rising or falling depth")
             self.rising = rising
         self.before = depth
-        if not plane.any():
-            return
+        if plane.stride() == (0, 0) and not plane[0, 0]:
+            return  # one zero for all, as renderers give for planes that they have nothing on
         if self.nodes.width == 1:
-            index, (weight,) = self.nodes.weights(depth)
-            self.open[index] = plane.detach() * complex(weight)
-            self._take(index)
+            if not lit(plane):
+                return
+            self.open[self.begins[j]] = plane.detach() * complex(self.weights[j, 0])
+            self._take(self.begins[j])
             return
-        self.pending.append((depth, plane.detach()))
+        self.pending.append((j, plane.detach()))
         if len(self.pending) > _BLOCK:
             self._spread(self.pending[:-1])
             self.pending = self.pending[-1:]
@@ -192,26 +193,12 @@ class Accumulator:
         self.step = None  # makes room for the transform
         return self.waves.raster.pixels(multiply_even(self.total, self.waves.last(self.at)))
 
-    def _spread(self, planes: list[tuple[float, Tensor]]) -> None:
+    def _spread(self, planes: list[tuple[int, Tensor]]) -> None:
         """Add planes to the nodes around them, and take the nodes that no later plane will touch."""
-        touched = [self.nodes.weights(depth) for depth, _ in planes]
-        begin = min(first for first, _ in touched)
-        end = max(first for first, _ in touched) + self.nodes.width
         stack = torch.stack([plane.reshape(-1) for _, plane in planes])
-        dtype = torch.promote_types(stack.dtype, torch.complex64)
-        matrix = torch.zeros(end - begin, len(planes), dtype=torch.complex128)
-        for k, (first, weights) in enumerate(touched):
-            matrix[first - begin : first - begin + self.nodes.width, k] = torch.from_numpy(weights)
-        matrix = matrix.to(stack.device, dtype)
-        if stack.is_complex():
-            spread = matrix @ stack
-        else:
-            parts = torch.view_as_real(matrix).movedim(-1, 0).flatten(0, 1).to(stack.dtype) @ stack
-            spread = torch.complex(*parts.unflatten(0, (2, -1)))
-        for offset, node in enumerate(spread.reshape(-1, *self.shape)):
-            index = begin + offset
-            self.open[index] = self.open[index] + node if index in self.open else node
-        first = touched[-1][0]
+        if lit(stack):
+            self._open(stack, [j for j, _ in planes])
+        first = self.begins[planes[-1][0]]
         if self.rising is False:
             done = sorted((index for index in self.open if index >= first + self.nodes.width), reverse=True)
         else:
@@ -219,9 +206,34 @@ class Accumulator:
         for index in done:
             self._take(index)
 
+    def _open(self, stack: Tensor, planes: list[int]) -> None:
+        """Add planes [J, h w] to the nodes around them."""
+        begins = [self.begins[j] for j in planes]
+        begin, end = min(begins), max(begins) + self.nodes.width
+        dtype = torch.promote_types(stack.dtype, torch.complex64)
+        matrix = torch.zeros(end - begin, len(planes), dtype=torch.complex128)
+        for k, j in enumerate(planes):
+            first = begins[k] - begin
+            matrix[first : first + self.nodes.width, k] = torch.from_numpy(self.weights[j])
+        matrix = matrix.to(stack.device, dtype)
+        if stack.is_complex():
+            spread = matrix @ stack
+        else:
+            # Real planes: rows of real and imaginary parts in turn, [nodes, 2, h w].
+            rows = torch.view_as_real(matrix).movedim(-1, 1).flatten(0, 1).to(stack.dtype)
+            spread = (rows @ stack).unflatten(0, (-1, 2))
+        for index, node in enumerate(spread, begin):
+            if index in self.open:
+                self.open[index] += node
+            else:
+                self.open[index] = node
+
     def _take(self, index: int) -> None:
         """Horner's rule: carry the sum on to node ``index`` and add the node."""
         node = self.open.pop(index)
+        if not node.is_complex():
+            node = torch.complex(node[0], node[1])
+        node = node.reshape(self.shape)
         if self.turn is not None:
             node *= self.turn
         if self.waves is None:

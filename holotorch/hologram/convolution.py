@@ -11,7 +11,10 @@ from holotorch.core.fourier import even_fft2, multiply_even
 from holotorch.core.grid import Grid
 from holotorch.core.operator import linear
 from holotorch.hologram.cone import Cone, check_layers, check_scene, cone_samples, spherical_wave
-from holotorch.hologram.raster import Raster, span, strided_length
+from holotorch.hologram.raster import Raster, lit, span, strided_length
+from holotorch.optics.candidates import FINEST
+from holotorch.optics.passage import passage
+from holotorch.optics.transfer import transfer_function
 
 
 class ConvolutionHologram(nn.Module):
@@ -26,7 +29,8 @@ class ConvolutionHologram(nn.Module):
         grid: Pixels of the hologram.
         wavelength: In metres.
         depths: Of the planes, in metres, above 0; any order and spacing.
-        cone: What is kept of each wave, see ``holotorch.hologram.cone``; not ``band``, which ``AxialHologram`` forms.
+        cone: What is kept of each wave, see ``holotorch.hologram.cone``. ``band`` has no closed form in space; its wave
+            is that of ``CroppedKernel``, exact but for about 2 s^2 / sqrt(N), s the sine of the steepest light.
         stride: Pixels between neighbouring sources of a plane.
 
     Raises:
@@ -37,8 +41,8 @@ class ConvolutionHologram(nn.Module):
         super().__init__()
         self.grid = grid
         self.wavelength, self.depths, self.stride = check_scene(grid, wavelength, depths, stride)
-        if cone == "band":
-            raise ValueError("cone='band' has no kernel in space; use AxialHologram, or cone='taper'")
+        if cone == "band" and min(grid.pitch) < FINEST * self.wavelength:
+            raise ValueError(f"cone='band' needs a pitch of at least {FINEST} wavelengths, got {min(grid.pitch):g} m")
         self.cone: Cone = cone
 
     def forward(self, layers: Tensor) -> Tensor:
@@ -64,7 +68,7 @@ class ConvolutionHologram(nn.Module):
 
     def _cone(self, depth: float, apart: tuple[int, int]) -> tuple[int, int]:
         """Farthest displacement (y, x) that the kernel of a depth has, in samples."""
-        if self.cone == "full":
+        if self.cone in ("full", "band"):
             return apart
         half = cone_samples(self.grid, self.wavelength, depth)
         y, x = (math.floor(min(reach, wide * (1 + 1e-12))) for reach, wide in zip(apart, half, strict=True))
@@ -73,6 +77,8 @@ class ConvolutionHologram(nn.Module):
     def _kernel(self, depth: float, raster: Raster, layers: Tensor) -> Tensor:
         """A quadrant of the transform of a plane's wave."""
         apart, _ = span(self.grid, raster.shape, self.stride)
+        if self.cone == "band":
+            return self._limited(depth, raster, apart).to(layers.device, layers.dtype)
         cone = self._cone(depth, apart)
         dy, dx = (
             torch.arange(min(far, size // 2) + 1, dtype=torch.float64, device=layers.device) * pitch
@@ -80,6 +86,19 @@ class ConvolutionHologram(nn.Module):
         )
         wave = spherical_wave(dy[:, None], dx[None], self.grid.pitch, self.wavelength, depth, self.cone)
         return even_fft2(wave.to(layers.dtype), raster.size)
+
+    def _limited(self, depth: float, raster: Raster, apart: tuple[int, int]) -> Tensor:
+        """The quadrant for ``band``: propagation of band-limited samples, times Weyl's i / w, per area of a sample."""
+        path = passage(
+            Grid((apart[0] + 1, apart[1] + 1), self.grid.pitch), None, (0.0, 0.0), (0.0, 0.0), [self.wavelength]
+        )
+        wave, far = (torch.tensor(value, dtype=torch.float64) for value in (self.wavelength, depth))
+        padded = Grid(raster.size, self.grid.pitch)
+        kernel = transfer_function(path, padded, wave, far, sampled=(False, False), paraxial=False)
+        rows, columns = (size // 2 + 1 for size in raster.size)
+        fy, fx = (frequency.abs() for frequency in padded.frequencies())
+        axial = torch.sqrt(self.wavelength**-2 - fy[:rows].square() - fx[:, :columns].square())
+        return 1j * kernel[:rows, :columns] / (axial * math.prod(self.grid.pitch))
 
     def accumulator(self, shape: tuple[int, int], phase: Tensor | None = None) -> "ConvolutionSum":
         """A sum to which planes [h, w], real or complex, are added one by one; ``phase`` [h, w] is common to all."""
@@ -118,7 +137,7 @@ class ConvolutionSum:
 
     def add(self, j: int, plane: Tensor) -> None:
         """Add the plane of depth number ``j``; dark ones cost nothing."""
-        if not plane.any():
+        if not lit(plane):
             return
         plane = plane.detach().to(torch.promote_types(plane.dtype, torch.complex64))
         if self.phase is not None:

@@ -7,6 +7,7 @@ spaced nodes: the exponential is a convolution with a window, divided by the win
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,15 +53,15 @@ class Nodes:
         # The window's transform reaches its sidelobes where the band's first image begins (Beatty et al. 2005).
         return math.pi * math.sqrt((self.width / self.oversampling * (self.oversampling - 0.5)) ** 2 - 0.8)
 
-    def weights(self, depth: float) -> tuple[int, np.ndarray]:
-        """First node that a plane touches, and what it adds to that node and the next, complex128 [width]."""
-        place = (depth - self.first) / self.spacing
-        turn = np.exp(2j * math.pi * math.fmod(depth * self.centre, 1.0))
+    def weights(self, depths: Sequence[float]) -> tuple[list[int], np.ndarray]:
+        """First node that each plane touches, and what it adds to that node and the next, complex128 [D, width]."""
+        places = (np.asarray(depths) - self.first) / self.spacing
+        turns = np.exp(2j * math.pi * np.fmod(np.asarray(depths) * self.centre, 1.0))[:, None]
         if self.width == 1:
-            return round(place), np.array([turn])
-        begin = math.ceil(place - self.width / 2)
-        aside = 2 * (begin + np.arange(self.width) - place) / self.width
-        return begin, np.i0(self._beta * np.sqrt(np.clip(1 - aside**2, 0, None))) * turn
+            return np.rint(places).astype(int).tolist(), turns
+        begin = np.ceil(places - self.width / 2).astype(int)
+        aside = 2 * (begin[:, None] + np.arange(self.width) - places[:, None]) / self.width
+        return begin.tolist(), np.i0(self._beta * np.sqrt(np.clip(1 - aside**2, 0, None))) * turns
 
     def response(self, frequency: Tensor) -> Tensor:
         """Transform of the window at axial frequencies beside ``centre``, in cycles per metre; what spreading costs."""
@@ -84,9 +85,9 @@ class Nodes:
         errors = []
         for part in np.linspace(0, 1, 16, endpoint=False):
             depth = self.first + (self.width + part) * self.spacing
-            begin, weights = self.weights(depth)
+            (begin,), weights = self.weights([depth])
             places = self.first + (begin + np.arange(self.width)) * self.spacing
-            wave = np.exp(2j * math.pi * np.outer(frequency, places - depth)) @ weights / response
+            wave = np.exp(2j * math.pi * np.outer(frequency, places - depth)) @ weights[0] / response
             errors.append(wave * np.exp(-2j * math.pi * math.fmod(depth * self.centre, 1.0)) - 1)
         return float(np.sqrt(np.mean(np.abs(errors) ** 2)))
 

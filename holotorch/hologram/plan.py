@@ -12,6 +12,7 @@ from holotorch.core.grid import Grid
 from holotorch.hologram.axial import AxialHologram
 from holotorch.hologram.cone import Cone, check_scene, cone_samples
 from holotorch.hologram.convolution import ConvolutionHologram
+from holotorch.optics.candidates import FINEST
 
 _ROUNDING = {torch.complex64: 5e-7, torch.complex128: 1e-12}
 # Arithmetic of a wave's sample in float64, measured against that of a transform; of passing over an array once.
@@ -88,7 +89,7 @@ def plan_hologram(
     if dtype not in _ROUNDING:
         raise TypeError(f"dtype must be torch.complex64 or torch.complex128, got {dtype}")
     found = []
-    if cone != "band":
+    if cone != "band" or min(grid.pitch) >= FINEST * wavelength:
         exact = ConvolutionHologram(grid, wavelength, listed, cone=cone or "taper", stride=stride)
         found.append(_convolution(exact, shape, dtype))
     if cone in (None, "taper", "band") or not _near(grid, wavelength, listed, shape, stride):
@@ -155,12 +156,18 @@ def _convolution(operator: ConvolutionHologram, shape: tuple[int, int], dtype: t
         "cone": operator.cone,
         "transforms": count,
         "size": size,
-        "predicted_error": _ROUNDING[dtype],
+        "predicted_error": _limited_error(operator, size) if operator.cone == "band" else _ROUNDING[dtype],
         "memory_bytes": round(bytes_ * (3.3 * samples + sources) + 80 * largest),
         "flops": flops + _transform(samples),
         "reason": f"{count} planes, each with a transform of its sources and half of one for its wave; exact",
         "operator": operator,
     }
+
+
+def _limited_error(operator: ConvolutionHologram, size: tuple[int, int]) -> float:
+    """Of a convolution with the band's own wave, as ``CroppedKernel`` derives it, for noise."""
+    sine = operator.wavelength / (2 * min(operator.grid.pitch))
+    return 2 * sine**2 / math.sqrt(min(size) / 2)
 
 
 def _axial(operator: AxialHologram, shape: tuple[int, int], dtype: torch.dtype) -> dict:

@@ -76,3 +76,11 @@ def span(grid: Grid, shape: tuple[int, int], stride: int) -> tuple[tuple[int, in
 def strided_length(minimum: int, stride: int) -> int:
     """Smallest length >= ``minimum`` that is a multiple of ``stride`` and transforms fast."""
     return stride * good_length(-(-minimum // stride))
+
+
+def lit(plane: Tensor) -> bool:
+    """Whether any element is not zero (NaN is not); several times faster than ``any``."""
+    if plane.is_complex():
+        plane = torch.view_as_real(plane.resolve_conj())
+    low, high = torch.aminmax(plane.detach())
+    return bool((low != 0) | (high != 0))

@@ -1,5 +1,6 @@
 """One volume and the rays that march through it, plane by plane."""
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -67,7 +68,9 @@ class March:
         self.unit = transfer.unit_distance * max(place.half) * 2
         self.steps_of_slope = flat_steps(volume) if lighting is not None else None
         low, high = volume.bricks(BRICK)
-        self.occupied = transfer.visible(low, high)
+        # A transparent voxel that is to be learned has a gradient, if it lies where opacity begins.
+        self.learned = volume.values.requires_grad
+        self.occupied = torch.ones_like(low, dtype=torch.bool) if self.learned else transfer.visible(low, high)
         box = occupied_box(self.occupied, volume.shape)
         self.visible = place.reach(*box) if box is not None else None
         rows, columns = place.footprint(rays, *box) if box is not None else (range(0), range(0))
@@ -119,8 +122,8 @@ class March:
         return torch.zeros(channels, self.window.size, dtype=self.dtype, device=self.device)
 
     def empty(self) -> Tensor:
-        """A dark plane, [3, h, w]."""
-        return torch.zeros(3, *self.rays.grid.shape, dtype=self.dtype, device=self.device)
+        """A dark plane, [3, h, w]: a single zero, expanded, which consumers can tell from a plane of zeros."""
+        return torch.zeros((), dtype=self.dtype, device=self.device).expand(3, *self.rays.grid.shape)
 
     def whole(self, values: Tensor) -> Tensor:
         """[c, rays of the window] on the grid, [c, h, w]."""
@@ -142,7 +145,7 @@ class March:
 
     def _reader(self) -> SliceReader | PointReader:
         common = (self.place, self.rays, self.window)
-        support = self.transfer.support()
+        support = (-math.inf, math.inf) if self.learned else self.transfer.support()
         if self.place.turned:
             return PointReader(*common, self._fields(), self.occupied, support)
         return SliceReader(*common, self._slice_fields(), self.occupied, support)

@@ -164,4 +164,6 @@ class DVRSampler(nn.Module):
 
 def _turned(amplitude: Tensor, turn: Tensor) -> Tensor:
     """Real [C, h, w] times complex [h, w], without making the real one complex first."""
+    if not any(amplitude.stride()):
+        return amplitude[0, 0, 0].to(turn.dtype).expand(amplitude.shape)  # a dark plane stays a single zero
     return torch.view_as_complex(amplitude[..., None] * torch.view_as_real(turn))

@@ -106,8 +106,7 @@ def test_exponentials_on_nodes_are_as_good_as_said(tolerance, depths):
     frequency = torch.linspace(low, high, 50, dtype=torch.float64)
     response = nodes.response(frequency - nodes.centre)
     worst = 0.0
-    for depth in depths:
-        begin, weights = nodes.weights(depth)
+    for depth, begin, weights in zip(depths, *nodes.weights(depths), strict=True):
         assert begin >= 0 and begin + nodes.width <= nodes.count
         total = sum(
             w * torch.exp(2j * math.pi * nodes.depth(begin + k) * (frequency - nodes.centre))
