@@ -118,7 +118,7 @@ def volume() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
 
 def _ways(scene: Scene, wave: float) -> dict[str, Callable[[], Any]]:
     """Calls that form the hologram of a colour; operators are built before, as for a sequence of holograms."""
-    layers, planes, phase = scene.layers(), list(scene.amplitudes()), scene.phase
+    layers, planes, phase = scene.layers(), torch.stack([*scene.amplitudes()]), scene.phase
     exact = ConvolutionHologram(scene.grid, wave, scene.depths, stride=2)
     soft, fine = (AxialHologram(scene.grid, wave, scene.depths, stride=2, tolerance=t) for t in (3e-3, 1e-4))
     for operator in (soft, fine):
@@ -210,7 +210,7 @@ def _scaling() -> list[dict]:
         operator = AxialHologram(scene.grid, WAVES[0], scene.depths, stride=2, tolerance=3e-3)
         design = operator.design((scene.side // 2, scene.side // 2))
         times = []
-        planes, phase = list(scene.amplitudes()), scene.phase
+        planes, phase = torch.stack([*scene.amplitudes()]), scene.phase
         for _ in range(1 if scene.side == WHOLE else 3):
             started = time.perf_counter()
             operator.accumulate(planes, phase)

@@ -17,7 +17,7 @@ from holotorch.hologram.nodes import axial_range, choose_nodes
 from holotorch.hologram.raster import Raster, lit
 from holotorch.hologram.waves import AxialDesign, Waves
 
-_BLOCK = 12  # planes that are spread at once: one matrix product instead of a pass for each
+_BLOCK = 16  # planes that are spread at once: one matrix product instead of a pass for each
 
 
 class AxialHologram(nn.Module):
@@ -68,7 +68,7 @@ class AxialHologram(nn.Module):
             (height, ey), (width, ex) = (choose_length(axis, 0.4 * self.tolerance) for axis in axes)
             steepest = axes[0].fade(height)[1], axes[1].fade(width)[1]
             low, high = axial_range(self.grid, self.wavelength, steepest)
-            nodes = choose_nodes(self.depths, low, high, 0.1 * self.tolerance)
+            nodes = choose_nodes(self.depths, low, high, 0.3 * self.tolerance)
             error = math.hypot(ey, ex, nodes.error(low, high))
             self._designs[shape] = AxialDesign(nodes, (height, width), error, error <= self.tolerance)
         return self._designs[shape]
@@ -195,7 +195,7 @@ class Accumulator:
 
     def _spread(self, planes: list[tuple[int, Tensor]]) -> None:
         """Add planes to the nodes around them, and take the nodes that no later plane will touch."""
-        stack = torch.stack([plane.reshape(-1) for _, plane in planes])
+        stack = _side_by_side([plane for _, plane in planes])
         if lit(stack):
             self._open(stack, [j for j, _ in planes])
         first = self.begins[planes[-1][0]]
@@ -252,3 +252,16 @@ class Accumulator:
             total = raster.tiles(self.total)
             torch.addcmul(period[:, None, :], total, raster.tiles(self.step), out=total)
         self.at = index
+
+
+def _side_by_side(planes: list[Tensor]) -> Tensor:
+    """Planes [h, w] as [J, h w]; a view where they lie side by side in memory already, as slices of one tensor do."""
+    first = planes[0]
+    size, store = first.numel(), first.untyped_storage().data_ptr()
+    begin, step = first.data_ptr(), size * first.element_size()
+    if all(
+        plane.is_contiguous() and plane.untyped_storage().data_ptr() == store and plane.data_ptr() == begin + k * step
+        for k, plane in enumerate(planes)
+    ):
+        return first.as_strided((len(planes), size), (size, 1))
+    return torch.stack([plane.reshape(-1) for plane in planes])
