@@ -68,6 +68,9 @@ def test_report_of_several_runs(capsys):
 def test_demo_runs_on_bundled_data(capsys):
     assert main(["demo", "--out", "here"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == "here/report.html"
+    page = Path("here/report.html").read_text()
+    assert "Corrected" in page and "Direct volume rendering" in page and "Synthetic volume" in page
+    assert {path.name for path in Path("here").iterdir()} == {"correction", "volume", "report.html"}
 
 
 def test_doctor(capsys):

@@ -19,16 +19,16 @@ _SEEN = 0.05
 
 
 def slices_of_a_volume(size: int, pitch: float) -> tuple[list[float], Tensor, Tensor]:
-    """Depths, light of each slice [D, h, w], and the depth of what each ray sees [h, w], of synthetic nested shells.
+    """Depths, light of each slice [D, h, w], and the depth of what each ray sees [h, w], of a synthetic C60 molecule.
 
     The phantom is as wide as the chip and stretched along the axis, as scenes for such chips are: 2 mm would lie within
     the depth of focus.
     """
-    values = phantoms.shells(64).values
+    values = phantoms.c60(64).values
     width = size * pitch
     volume = Volume(values, ((FAR - NEAR) / 64, width / 64, width / 64), "m")
     transfer = TransferFunction(
-        [0.0, 0.1, 0.5, 1.0], [[0, 0, 0], [0.8] * 3, [1.0] * 3, [1.0] * 3], [0, 0, 0.2, 0.9], unit_distance=0.05
+        [0.0, 0.3, 0.6, 1.0], [[0, 0, 0], [0.8] * 3, [1.0] * 3, [1.0] * 3], [0, 0, 0.5, 1.0], unit_distance=0.02
     )
     bench = Bench(size=size)
     step = (FAR - NEAR) / SLICES
