@@ -1,0 +1,21 @@
+"""Image quality and speckle."""
+
+from holotorch.metrics.quality import SSIM_WINDOW, PerceptualSimilarity, psnr, ssim
+from holotorch.metrics.seeds import SeedStatistics, seed_statistics, squared_blur, squared_error
+from holotorch.metrics.speckle import anisotropy, grain_size, power_spectrum, sharpness, speckle_contrast
+
+__all__ = [
+    "SSIM_WINDOW",
+    "PerceptualSimilarity",
+    "SeedStatistics",
+    "anisotropy",
+    "grain_size",
+    "power_spectrum",
+    "psnr",
+    "seed_statistics",
+    "sharpness",
+    "speckle_contrast",
+    "squared_blur",
+    "squared_error",
+    "ssim",
+]

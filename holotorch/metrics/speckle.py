@@ -1,0 +1,187 @@
+"""Speckle of a single picture: how strong, how coarse, how elongated, and what is left of the sharpness."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+from holotorch.core.fourier import fft2
+
+_BAND = (0.05, 0.25)  # cycles per sample, the middle of what a picture can hold
+_FINE = 16  # places per sample at which a correlation is looked up
+
+
+class Anisotropy(NamedTuple):
+    """Length over width of the grains, at least 1, and the angle of their length from x towards y in (-pi/2, pi/2]."""
+
+    ratio: Tensor
+    angle: Tensor
+
+
+def speckle_contrast(intensity: Tensor, *, reference: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
+    """Standard deviation over mean, [...] for intensities [..., H, W]: 1 for fully developed speckle.
+
+    Args:
+        intensity: Real, not negative.
+        reference: Speckle-free picture [..., H, W] for scenes that are not uniform. The contrast is then
+            rms(intensity - reference) / rms(reference); a uniform reference of the same mean gives the same number.
+        mask: Region of pixels, bool [..., H, W]; all by default.
+
+    Returns:
+        0 for a region that is black. Differentiable; where there is no speckle at all the gradient is 0.
+
+    Raises:
+        TypeError: An intensity that is not real floating-point, or a mask that is not bool.
+        ValueError: Shapes that do not match, or an empty mask.
+
+    Source: Goodman, Speckle Phenomena in Optics, Sec. 3.2.
+    """
+    _picture("intensity", intensity)
+    if mask is None:
+        mask = torch.ones((), dtype=torch.bool, device=intensity.device)
+    elif mask.dtype != torch.bool:
+        raise TypeError(f"mask must be bool, got {mask.dtype}")
+    for name, part in (("mask", mask), ("reference", reference)):
+        if part is not None and torch.broadcast_shapes(part.shape, intensity.shape) != intensity.shape:
+            raise ValueError(f"{name} must match intensity {tuple(intensity.shape)}, got {tuple(part.shape)}")
+    weight = mask.to(intensity.dtype).expand(intensity.shape)
+    count = weight.sum((-2, -1), keepdim=True)
+    if not torch.compiler.is_compiling() and (count == 0).any():
+        raise ValueError("mask leaves no pixel to measure")
+    if reference is None:
+        reference = (intensity * weight).sum((-2, -1), keepdim=True) / count
+    square = ((intensity - reference).square() * weight).sum((-2, -1)) / count[..., 0, 0]
+    scale = (reference.square() * weight).sum((-2, -1)) / count[..., 0, 0]
+    black = scale == 0
+    return _root(torch.where(black, 0.0, square / torch.where(black, 1.0, scale)))
+
+
+def power_spectrum(intensity: Tensor) -> Tensor:
+    """Share of each frequency in the squared contrast, [..., H, W] in FFT order, cycles per sample; 0 at frequency 0.
+
+    |DFT(I - mean)|^2 / (H W mean)^2, which adds up to ``speckle_contrast(I)**2``. The picture is taken as periodic: a
+    step from one border to the opposite one shows as a cross. All 0 for a black picture.
+
+    Source: Goodman, Speckle Phenomena in Optics, Sec. 4.3; Parseval's theorem.
+    """
+    _picture("intensity", intensity)
+    mean = intensity.mean((-2, -1), keepdim=True)
+    away = fft2((intensity - mean).to(_complex(intensity)))
+    size = intensity.shape[-2] * intensity.shape[-1]
+    return (away / torch.where(mean == 0, 1.0, mean * size)).abs().square()
+
+
+def grain_size(intensity: Tensor, *, level: float = 0.5) -> Tensor:
+    """Full width (y, x) of the speckle's autocorrelation at ``level``, in samples: [..., 2] for [..., H, W].
+
+    The correlation of I - mean along each axis, free of wrap-around, each lag divided by the number of its pairs, and
+    band-limited between the lags, so that grains of two samples are measured as well. Infinite where it never falls to
+    ``level`` within half the picture. Divide pictures of scenes that are not uniform by their speckle-free mean first.
+
+    At half height a square pupil of side D at distance z gives 0.8859 wavelength z / D, a round one of that diameter
+    1.0290 wavelength z / D; ``level=1/e`` gives the other usual width.
+
+    Raises:
+        ValueError: A level outside 0 to 1, or a picture without speckle.
+
+    Source: Goodman, Speckle Phenomena in Optics, Sec. 4.4.
+    """
+    _picture("intensity", intensity)
+    if not 0 < checks.finite("level", level) < 1:
+        raise ValueError(f"level must lie between 0 and 1, got {level!r}")
+    away = intensity - intensity.mean((-2, -1), keepdim=True)
+    if not away.detach().flatten(-2).any(-1).all():
+        raise ValueError("intensity is uniform: there are no grains to measure")
+    height, width = intensity.shape[-2:]
+    power = fft2(away.to(_complex(intensity)), (2 * height, 2 * width)).abs().square()
+    return torch.stack([_width(power.sum(-1), level), _width(power.sum(-2), level)], -1)
+
+
+def anisotropy(intensity: Tensor) -> Anisotropy:
+    """Elongation of the grains in whatever direction, from the second moments of the power spectrum under Hann windows.
+
+    Returns:
+        ``ratio`` and ``angle``, each [...] for [..., H, W]. An elliptical pupil gives the ratio of its diameters; the
+        grains lie along the shorter one. A ratio of 1 has no direction. White noise, being isotropic and strong at high
+        frequencies, draws the ratio towards 1.
+    """
+    _picture("intensity", intensity)
+    windows = [torch.hann_window(n, dtype=intensity.dtype, device=intensity.device) for n in intensity.shape[-2:]]
+    weight = windows[0][:, None] * windows[1]
+    mean = (intensity * weight).sum((-2, -1), keepdim=True) / weight.sum()
+    power = fft2(((intensity - mean) * weight).to(_complex(intensity))).abs().square()
+    fy, fx = _frequencies(intensity)
+    yy, xx, xy = ((power * part).sum((-2, -1)) for part in (fy.square(), fx.square(), fx * fy))
+    half, split = (xx + yy) / 2, torch.hypot((xx - yy) / 2, xy)
+    # The long side of a grain lies across its widest spectrum.
+    angle = torch.atan2(2 * xy, xx - yy) / 2 + math.pi / 2
+    angle = torch.where(angle > math.pi / 2, angle - math.pi, angle)
+    least = (half - split).clamp_min(torch.finfo(intensity.dtype).tiny)
+    return Anisotropy(torch.sqrt((half + split).clamp_min(least) / least), angle)
+
+
+def sharpness(intensity: Tensor, reference: Tensor, *, band: tuple[float, float] = _BAND) -> Tensor:
+    """How much of a sharp ``reference``'s detail a picture transfers: 1 for all of it, [...] for [..., H, W].
+
+    Re sum I^ conj(R^) / sum |R^|^2 over radial frequencies in ``band``, cycles per sample: the regression of the
+    picture on the reference, to which speckle adds no bias, as it does to the picture's own power. A reference that is
+    itself a mean of S seeds has noise, by which the result is too small.
+
+    Raises:
+        ValueError: Unequal shapes, a band that is not 0 <= low < high, or a reference without detail in it.
+    """
+    _picture("intensity", intensity)
+    _picture("reference", reference)
+    if intensity.shape[-2:] != reference.shape[-2:]:
+        raise ValueError(f"pictures must share (H, W), got {tuple(intensity.shape)} and {tuple(reference.shape)}")
+    low, high = checks.pair("band", band, "cycles per sample")
+    if not 0 <= low < high:
+        raise ValueError(f"band must be 0 <= low < high in cycles per sample, got {band!r}")
+    radius = torch.hypot(*_frequencies(intensity))
+    inside = ((radius >= low) & (radius <= high) & (radius > 0)).to(intensity.dtype)
+    seen, true = (fft2(part.to(_complex(part))) * inside for part in (intensity, reference))
+    power = true.abs().square().sum((-2, -1))
+    if not torch.compiler.is_compiling() and (power == 0).any():
+        raise ValueError(f"reference has no detail between {low:g} and {high:g} cycles per sample")
+    return (seen * true.conj()).real.sum((-2, -1)) / power
+
+
+def _width(power: Tensor, level: float) -> Tensor:
+    """Full width at ``level`` of the correlation whose spectrum over twice the window is ``power`` [..., 2n]."""
+    double = power.shape[-1]
+    window = double // 2
+    lag = torch.arange(1, _FINE * window // 2 + 1, dtype=power.dtype, device=power.device) / _FINE
+    place = torch.fft.fftfreq(double, dtype=power.dtype, device=power.device)
+    # Pairs at a lag become fewer in proportion to the overlap.
+    correlation = power @ torch.cos(2 * math.pi * place[:, None] * lag) / (1 - lag / window)
+    correlation = correlation / power.sum(-1, keepdim=True)
+    below = correlation <= level
+    first = below.int().argmax(-1, keepdim=True)
+    here = correlation.gather(-1, first)
+    before = torch.where(first > 0, correlation.gather(-1, (first - 1).clamp_min(0)), 1.0)
+    part = (before - level) / (before - here).clamp_min(torch.finfo(power.dtype).tiny)
+    found = 2 * (first + part)[..., 0] / _FINE
+    return torch.where(below.any(-1), found, math.inf)
+
+
+def _frequencies(image: Tensor) -> tuple[Tensor, Tensor]:
+    fy, fx = (torch.fft.fftfreq(n, dtype=image.dtype, device=image.device) for n in image.shape[-2:])
+    return fy[:, None], fx[None, :]
+
+
+def _root(square: Tensor) -> Tensor:
+    # The mask before the root keeps the gradient finite at 0.
+    some = square > 0
+    return torch.where(some, torch.sqrt(torch.where(some, square, 1.0)), 0.0)
+
+
+def _complex(image: Tensor) -> torch.dtype:
+    return torch.complex128 if image.dtype == torch.float64 else torch.complex64
+
+
+def _picture(name: str, image: Tensor) -> None:
+    checks.real(name, image)
+    if image.ndim < 2:
+        raise ValueError(f"{name} must be [..., H, W], got {tuple(image.shape)}")
