@@ -60,12 +60,22 @@ def _resume(options: argparse.Namespace) -> int:
 
 def _demo(options: argparse.Namespace) -> int:
     from holotorch.experiments.config import load_config
+    from holotorch.experiments.report import write_report
+    from holotorch.experiments.run import claim, run
+    from holotorch.experiments.volume_run import run_volume
 
-    settings = load_config(_bundled_config("demo.yaml"))
-    assert settings.experiment == "pec"
-    from holotorch.experiments.run import run
-
-    return _finish(*run(settings, options.out, "demo"))
+    image, scene = (load_config(_bundled_config(name)) for name in ("demo.yaml", "demo_volume.yaml"))
+    folder = claim(options.out, "demo")
+    if (folder / "images").is_dir():
+        (folder / "images").rmdir()  # the claim's; each run has a folder of its own
+    parts = []
+    for work, settings, name in ((run, image, "correction"), (run_volume, scene, "volume")):
+        part, complete = work(settings, folder / name, name)
+        parts.append(part)
+        if not complete:
+            break
+    write_report(parts, folder / "report.html")
+    return _finish(folder, len(parts) == 2 and complete)
 
 
 def _finish(folder: Path, complete: bool) -> int:
