@@ -47,6 +47,10 @@ def _run(options: argparse.Namespace) -> int:
         from holotorch.experiments.volume_run import run_volume
 
         return _finish(*run_volume(settings, options.out, name))
+    if settings.experiment == "eye":
+        from holotorch.experiments.eye_run import run_observer
+
+        return _finish(*run_observer(settings, options.out, name))
     from holotorch.experiments.run import run
 
     return _finish(*run(settings, options.out, name))
@@ -63,8 +67,10 @@ def _demo(options: argparse.Namespace) -> int:
     from holotorch.experiments.report import write_report
     from holotorch.experiments.run import claim, run
     from holotorch.experiments.volume_run import run_volume
+    from holotorch.io.bundled import find_config
 
-    image, scene = (load_config(_bundled_config(name)) for name in ("demo.yaml", "demo_volume.yaml"))
+    paths = [find_config(f"configs/{name}.yaml") for name in ("demo", "demo_volume")]
+    image, scene = (load_config(path) for path in paths if path is not None)
     folder = claim(options.out, "demo")
     if (folder / "images").is_dir():
         (folder / "images").rmdir()  # the claim's; each run has a folder of its own
@@ -91,6 +97,13 @@ def _check(options: argparse.Namespace) -> int:
     if settings.experiment == "pec_study":
         print(f"Study      {settings.study} of {', '.join(settings.images)} on {settings.size} x {settings.size} px")
         print(f"Sweep      {', '.join(f'{value:g}' for value in settings.sweep)}; {settings.max_steps} steps at most")
+        return OK
+    if settings.experiment == "eye":
+        from holotorch.experiments.eye import observer
+        from holotorch.experiments.eye_run import plan_text as looked_at
+        from holotorch.experiments.eye_run import scene_settings
+
+        print(looked_at(observer(settings, scene_settings(settings)))[0])
         return OK
     from holotorch.experiments.plan import shortage
 
@@ -136,10 +149,20 @@ def _doctor(_: argparse.Namespace) -> int:
     return OK if diagnose() else FAILED
 
 
-def _bundled_config(name: str) -> Path:
-    """A configuration of the project: inside an installed package, or beside the package in a checkout."""
-    package = Path(__file__).parent
-    return next(path for path in (package / "configs" / name, package.parent / "configs" / name) if path.is_file())
+def _export_slm(options: argparse.Namespace) -> int:
+    from holotorch.experiments.export import export_slm, export_text
+
+    out, report = export_slm(
+        options.folder,
+        options.slm[0],
+        options.out,
+        encoding=options.encoding,
+        form=options.format,
+        overrides=options.slm[1:],
+    )
+    print(export_text(report))
+    print(out)
+    return OK
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -173,6 +196,17 @@ def _parser() -> argparse.ArgumentParser:
     chart.add_argument("subject", help="what to chart: pec, propagation, volume")
     chart.add_argument("--out", type=Path, help="folder for the chart (default: scripts/charts/SUBJECT)")
     chart.set_defaults(action=_chart)
+
+    words = "holotorch export-slm DIR --slm FILE [key=value ...] [--out OUT] [--encoding ENCODING] [--format FORMAT]"
+    about = "frames for a phase panel from a run, and what those files show"
+    export = commands.add_parser("export-slm", help=about, usage=words)
+    export.add_argument("folder", type=Path, metavar="DIR", help="folder of a run of kind pec or volume")
+    panel = "a panel, such as configs/slm/lcos_2048.yaml, and its settings to change"
+    export.add_argument("--slm", nargs="+", required=True, metavar=("FILE", "key=value"), help=panel)
+    export.add_argument("--out", type=Path, help="folder for the files (default: DIR/slm)")
+    export.add_argument("--encoding", help="of a volume: double_phase (default), kinoform, error_diffusion")
+    export.add_argument("--format", default="png", help="png (default), bmp, or exr for phases instead of levels")
+    export.set_defaults(action=_export_slm)
 
     doctor = commands.add_parser("doctor", help="check the installation and print what repairs it")
     doctor.set_defaults(action=_doctor)

@@ -11,7 +11,17 @@ from torch import Tensor
 
 from holotorch import Grid
 from holotorch.modulator import ThermalCrosstalk
-from holotorch.optics import AngularSpectrum, CroppedKernel, Fraunhofer, Fresnel, Propagator, RayleighSommerfeld
+from holotorch.optics import (
+    AngularSpectrum,
+    Aperture,
+    CroppedKernel,
+    Fraunhofer,
+    Fresnel,
+    Lens,
+    OpticalPath,
+    Propagator,
+    RayleighSommerfeld,
+)
 
 GRID = Grid((12, 17), (5e-6, 4e-6))
 FINE = Grid((12, 17), (0.2e-6, 0.25e-6))  # below half a wavelength: the corners of the spectrum are evanescent
@@ -57,6 +67,12 @@ def _fresnel(name: str, distance: float, pad: float, unitary: bool = False) -> C
     )
 
 
+def _lens(c: int) -> np.ndarray:
+    y, x = ((np.arange(n) - n // 2) * p for n, p in zip(GRID.shape, GRID.pitch, strict=True))
+    square = y[:, None] ** 2 + x**2
+    return np.diag((np.exp(-1j * np.pi / WAVES[c] * square / 2e-3) * (square <= 28e-6**2)).ravel())
+
+
 def _cropped(name: str, distance: float, paraxial: bool, tolerance: float) -> Case:
     return Case(
         name,
@@ -81,6 +97,16 @@ CASES = [
     _fresnel("Fresnel", 50e-6, 2),
     _fresnel("Fresnel, backwards", -50e-6, 2),
     _fresnel("Fresnel, periodic", 50e-6, 1, unitary=True),
+    Case("lens", lambda: Lens(GRID, WAVES, 2e-3, radius=28e-6), _lens),
+    Case("aperture", lambda: Aperture(GRID, WAVES, 28e-6), lambda c: np.abs(_lens(c))),
+    Case(
+        "optical path",
+        lambda: OpticalPath([Lens(GRID, WAVES, 2e-3, radius=28e-6), Fresnel(GRID, WAVES, 50e-6, pad=1)]),
+        lambda c: (
+            dense.spectral_filter(GRID.shape, dense.fresnel_transfer(GRID.shape, GRID.pitch, WAVES[c], 50e-6))
+            @ _lens(c)
+        ),
+    ),
     Case(
         "Rayleigh-Sommerfeld sum",
         lambda: RayleighSommerfeld(GRID, WAVES, 300e-6),

@@ -62,7 +62,8 @@ def test_contrast_has_a_right_gradient_and_none_where_nothing_is():
         image.requires_grad_()
         contrast = speckle_contrast(image)
         contrast.backward()
-        assert contrast.item() == 0 and torch.equal(image.grad, torch.zeros(4, 5))
+        assert contrast.item() == 0 and image.grad is not None
+        assert torch.equal(image.grad, torch.zeros(4, 5))
 
 
 def test_power_spectrum_adds_up_to_the_squared_contrast_and_is_the_pupils_correlation():
@@ -70,7 +71,7 @@ def test_power_spectrum_adds_up_to_the_squared_contrast_and_is_the_pupils_correl
     power = power_spectrum(pictures)
     torch.testing.assert_close(power.sum((-2, -1)), speckle_contrast(pictures).square(), rtol=1e-12, atol=0)
     assert power[..., 0, 0].abs().max() < 1e-25
-    # Correlation of a square pupil with itself: a triangle per axis, 0 beyond its width, with a sum of 1 (Goodman 4.43).
+    # Correlation of a square pupil with itself: a triangle per axis, 0 beyond its width (Goodman 4.43).
     f = torch.fft.fftfreq(SIDE, dtype=torch.float64)
     triangle = (1 - f.abs() / 0.4).clamp_min(0)
     wanted = triangle[:, None] * triangle / triangle.sum() ** 2
@@ -81,9 +82,13 @@ def test_power_spectrum_adds_up_to_the_squared_contrast_and_is_the_pupils_correl
     assert (blocks[0][bright] / blocks[1][bright] - 1).abs().max() < 4.5 * 0.044
 
 
+def root(function, low: float, high: float) -> float:
+    return float(brentq(function, low, high))  # pyright: ignore[reportArgumentType]
+
+
 def half_width_of_airy(level: float) -> float:
     """Argument pi D r where (2 J1(x) / x)^2 falls to ``level``."""
-    return brentq(lambda x: (2 * j1(x) / x) ** 2 - level, 0.1, 3.8)
+    return root(lambda x: (2 * j1(x) / x) ** 2 - level, 0.1, 3.8)
 
 
 @pytest.mark.parametrize("level", [0.5, 1 / math.e])
@@ -92,11 +97,11 @@ def test_grain_size_is_that_of_the_pupil(widths, level):
     generator = np.random.default_rng(3)
     square = tensors(*(developed((SIDE, 400), widths, generator) for _ in range(6)))
     disc = tensors(*(developed_round((SIDE, 400), widths, generator) for _ in range(6)))
-    sinc = brentq(lambda x: np.sinc(x) ** 2 - level, 0.1, 0.9)
+    sinc = root(lambda x: np.sinc(x) ** 2 - level, 0.1, 0.9)
     airy = half_width_of_airy(level) / math.pi
     for pictures, half in ((square, sinc), (disc, airy)):
         wanted = torch.tensor([2 * half / width for width in widths], dtype=torch.float64)
-        # 6 pictures of 512 x 400 x 0.02 grains or more, the width's error a part of one over their root: 0.6 %, 3 sigma.
+        # 6 pictures of 512 x 400 x 0.02 grains or more, one over their root: 0.6 %, 3 sigma.
         torch.testing.assert_close(grain_size(pictures, level=level).mean(0), wanted, rtol=0.02, atol=0)
     assert grain_size(square[0].float()).dtype == torch.float32
     if level == 0.5:
@@ -106,7 +111,7 @@ def test_grain_size_is_that_of_the_pupil(widths, level):
 @pytest.mark.parametrize("turn", [0.0, 0.6, -1.2, math.pi / 2])
 def test_anisotropy_is_the_ratio_of_the_pupils_diameters(turn):
     generator = np.random.default_rng(5)
-    # Diameters across and along; the grains are long across the long diameter, which lies at ``turn``.
+    # The long diameter lies at ``turn``, so the grains are long across it.
     pictures = tensors(*(developed_round((SIDE, 384), (0.1, 0.25), generator, turn) for _ in range(4)))
     ratio, angle = anisotropy(pictures)
     # Grains: 512 x 384 x 0.02 x 3/8 for the window; second moments spread by 2 over the root of them, over 4 pictures.
@@ -150,7 +155,7 @@ def test_sharpness_measures_transfer_not_speckle():
     assert sharpness(scene, scene).item() == pytest.approx(1, rel=1e-12)
     assert sharpness(blurred, scene).item() == pytest.approx(wanted, rel=1e-12)
     speckle = squares(1)[0]
-    # Noise as strong as the scene's mean square against detail of variance 1/12, over 46 000 frequencies: 1.7 %, 3 sigma.
+    # Noise as strong as the scene's mean square against detail of variance 1/12, 46 000 frequencies: 1.7 %, 3 sigma.
     assert sharpness(blurred * speckle, scene).item() == pytest.approx(wanted, abs=0.05)
 
 
@@ -162,6 +167,8 @@ def test_refusals():
         speckle_contrast(picture, mask=torch.ones(8, 9))
     with pytest.raises(ValueError, match="reference must match"):
         speckle_contrast(picture, reference=torch.ones(2, 8, 9))
+    with pytest.raises(ValueError, match="mask must match"):
+        speckle_contrast(picture, mask=torch.ones(9, 8, dtype=torch.bool))
     with pytest.raises(TypeError, match="real floating-point"):
         power_spectrum(torch.zeros(8, 9, dtype=torch.complex64))
     with pytest.raises(ValueError, match="no grains"):

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
+from holotorch.experiments.config_eye import ObserverSettings
 from holotorch.experiments.config_volume import VolumeSettings, contradictions
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.messages import describe, nearest, position
@@ -167,10 +168,11 @@ class StudySettings(Settings):
     seed: Annotated[int, BeforeValidator(number), Field(ge=0, lt=2**63)] = 7
 
 
-KINDS: dict[str, type[PECSettings] | type[StudySettings] | type[VolumeSettings]] = {
+KINDS: dict[str, type[PECSettings] | type[StudySettings] | type[VolumeSettings] | type[ObserverSettings]] = {
     "pec": PECSettings,
     "pec_study": StudySettings,
     "volume": VolumeSettings,
+    "eye": ObserverSettings,
 }
 
 
@@ -190,7 +192,7 @@ def load_config(path: Path | str, overrides: list[str] | None = None) -> Any:
     except ValidationError as error:
         mistakes = {describe(source, KINDS[kind], entry): None for entry in error.errors()}
         raise ConfigError(sorted(mistakes, key=position)) from None
-    if isinstance(settings, StudySettings):
+    if isinstance(settings, StudySettings | ObserverSettings):
         return settings
     found = contradictions(settings) if isinstance(settings, VolumeSettings) else _contradictions(settings)
     mistakes = [source.mistake(key, message) for key, message in found]

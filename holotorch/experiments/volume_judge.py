@@ -44,7 +44,7 @@ class VolumeJudge:
         for f, depth in enumerate(self.depths):
             for colour, wave in enumerate(experiment.settings.wavelengths):
                 field = refocused(hologram[colour], experiment.grid, wave, depth, tolerance=3e-3)
-                self.sums[f, colour] += _pooled(intensity(field), stride).cpu()
+                self.sums[f, colour] += pooled(intensity(field), stride).cpu()
         self.count += 1
 
     @property
@@ -108,7 +108,7 @@ class VolumeJudge:
         return (ratio.std() / ratio.mean()).item()
 
 
-def _pooled(image: Tensor, stride: int) -> Tensor:
+def pooled(image: Tensor, stride: int) -> Tensor:
     """Mean of the pixels around each ray, [H / stride, W / stride]; the ray lies on pixel ``stride * i``."""
     if stride == 1:
         return image

@@ -58,9 +58,8 @@ def squared_blur(pictures: Tensor, references: Tensor) -> Tensor:
     """
     ours, theirs = seed_statistics(pictures), seed_statistics(references)
     if pictures.shape[1:] != references.shape[1:]:
-        raise ValueError(
-            f"pictures and references must match but in seeds, got {tuple(pictures.shape)} and {tuple(references.shape)}"
-        )
+        shapes = f"{tuple(pictures.shape)} and {tuple(references.shape)}"
+        raise ValueError(f"pictures and references must match but in seeds, got {shapes}")
     return (ours.mean - theirs.mean).square().mean((-2, -1)) - ours.noise - theirs.noise
 
 

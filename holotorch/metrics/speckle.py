@@ -1,6 +1,7 @@
 """Speckle of a single picture: how strong, how coarse, how elongated, and what is left of the sharpness."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -44,7 +45,7 @@ def speckle_contrast(intensity: Tensor, *, reference: Tensor | None = None, mask
     elif mask.dtype != torch.bool:
         raise TypeError(f"mask must be bool, got {mask.dtype}")
     for name, part in (("mask", mask), ("reference", reference)):
-        if part is not None and torch.broadcast_shapes(part.shape, intensity.shape) != intensity.shape:
+        if part is not None and not _fits(part.shape, intensity.shape):
             raise ValueError(f"{name} must match intensity {tuple(intensity.shape)}, got {tuple(part.shape)}")
     weight = mask.to(intensity.dtype).expand(intensity.shape)
     count = weight.sum((-2, -1), keepdim=True)
@@ -146,6 +147,11 @@ def sharpness(intensity: Tensor, reference: Tensor, *, band: tuple[float, float]
     if not torch.compiler.is_compiling() and (power == 0).any():
         raise ValueError(f"reference has no detail between {low:g} and {high:g} cycles per sample")
     return (seen * true.conj()).real.sum((-2, -1)) / power
+
+
+def _fits(shape: Sequence[int], whole: Sequence[int]) -> bool:
+    pairs = zip(reversed(shape), reversed(whole), strict=False)
+    return len(shape) <= len(whole) and all(size in (1, full) for size, full in pairs)
 
 
 def _width(power: Tensor, level: float) -> Tensor:

@@ -1,7 +1,18 @@
 """Devices that put a phase on light."""
 
 from holotorch.modulator.crosstalk import ThermalCrosstalk
+from holotorch.modulator.dispersion import BirefringenceTable, Cauchy, fit_cauchy, phase_scale
+from holotorch.modulator.panel import PhaseModulator
 from holotorch.modulator.phased_array import PhasedArray
 from holotorch.modulator.quantised import quantised
 
-__all__ = ["PhasedArray", "ThermalCrosstalk", "quantised"]
+__all__ = [
+    "BirefringenceTable",
+    "Cauchy",
+    "PhaseModulator",
+    "PhasedArray",
+    "ThermalCrosstalk",
+    "fit_cauchy",
+    "phase_scale",
+    "quantised",
+]

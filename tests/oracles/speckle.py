@@ -8,7 +8,8 @@ def developed(shape, widths, generator):
 
     Spectrum: circular complex Gaussian numbers, so the field is Gaussian whatever the size of the pupil.
     """
-    return _intensity(shape, *(abs(f) < width / 2 for f, width in zip(_axes(shape), widths, strict=True)), generator)
+    fy, fx = _axes(shape)
+    return _intensity(shape, abs(fy) < widths[0] / 2, abs(fx) < widths[1] / 2, generator)
 
 
 def developed_round(shape, diameters, generator, turn=0.0):
@@ -29,17 +30,18 @@ def _intensity(shape, one, other, generator):
     return intensity * (2 * np.prod(shape) ** 2 / (2 * 2 * (one & other & np.ones(shape, bool)).sum()))
 
 
-def replayed(source, pitch, design, wavelength, distance, aperture):
+def replayed(source, pitch, design, wavelength, distance, aperture, iris=True):
     """Intensity in focus of the hologram of ``source``, made at ``design`` and lit by ``wavelength``; periodic.
 
     The hologram's spectrum is the source's times exp(i d w(design)), w = 2 pi sqrt(1/lambda^2 - f^2); the light goes
-    back with w(wavelength) and passes a pupil of the sine ``aperture``.
+    back with w(wavelength) and passes a pupil of the sine ``aperture``: of the wavelength that comes (``iris``), or of
+    the design, when it is the hologram's own band that ends there.
     """
     fy, fx = (np.fft.fftfreq(n, pitch) for n in source.shape)
     square = fy[:, None] ** 2 + fx**2
     there, back = (2 * np.pi * np.sqrt(np.maximum(1 / w**2 - square, 0)) for w in (design, wavelength))
     phase = np.exp(1j * distance * (there - back - there[0, 0] + back[0, 0]))
-    pupil = square < (aperture / wavelength) ** 2
+    pupil = square < (aperture / (wavelength if iris else design)) ** 2
     return np.abs(np.fft.ifft2(np.fft.fft2(source) * phase * pupil)) ** 2
 
 

@@ -1,0 +1,93 @@
+"""What the configuration of an observer's view may say."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic_core import PydanticCustomError
+
+from holotorch.experiments.settings import Count, Length, Number, Settings, number, several
+from holotorch.io.bundled import find_config
+
+Source = Literal["laser", "narrow_sled", "sled", "led"]
+
+
+def _above_zero(value: float) -> float:
+    if not value > 0:
+        raise PydanticCustomError("above", "expected a length above zero")
+    return value
+
+
+def _there(value: Any) -> Any:
+    if isinstance(value, str) and find_config(value) is None:
+        raise PydanticCustomError("file", "expected a configuration file of a volume that exists")
+    return value
+
+
+Positive = Annotated[Length, AfterValidator(_above_zero)]
+
+
+class SceneSettings(Settings):
+    """The hologram that is looked at: a volume's configuration, with settings to change as on the command line."""
+
+    config: Annotated[str, BeforeValidator(_there)]
+    change: Annotated[tuple[str, ...], BeforeValidator(several)] = ()
+
+
+class MagnifyingSettings(Settings):
+    """The thesis's display (Fig. 5.5): an eyepiece beyond the volume, whose magnified image the eye sees.
+
+    ``lens_distance``: from hologram to eyepiece; by default where the volume's middle appears at ``focus_distance``.
+    """
+
+    kind: Literal["magnifying"]
+    focal_length: Positive = 20e-3
+    eye_distance: Positive = 50e-3
+    focus_distance: Positive = 120e-3
+    lens_distance: Positive | None = None
+
+
+class PlanarSettings(Settings):
+    """No eyepiece: the eye looks at the hologram from ``distance``."""
+
+    kind: Literal["planar"]
+    distance: Positive = 250e-3
+
+
+class EyeSettings(Settings):
+    """The eye: radius of its pupil, distance of its retina, and whether it has the colour error of human eyes."""
+
+    pupil_radius: Positive = 1.5e-3
+    axial_length: Positive = 24e-3
+    chromatic: bool = False
+
+
+class LightSettings(Settings):
+    """Sources to compare, by name or by their FWHM.
+
+    ``tolerance``: of the sum over wavelengths, relative to a picture's rms brightness.
+    """
+
+    sources: Annotated[tuple[Source, ...], BeforeValidator(several), Field(min_length=1)] = (
+        "laser",
+        "narrow_sled",
+        "sled",
+        "led",
+    )
+    tolerance: Annotated[Number, Field(gt=0, lt=1)] = 0.01
+
+
+class ObserverSettings(Settings):
+    """What an observer sees of a volume's hologram, for several light sources and depths of focus.
+
+    ``focus``: depths of the scene in which the eye is focused; a tenth, half and nine tenths of it by default.
+    ``seeds``: realisations of the phases, which are compared with the mean of as many others.
+    """
+
+    experiment: Literal["eye"]
+    seed: Annotated[int, BeforeValidator(number), Field(ge=0, lt=2**62)] = 0
+    scene: SceneSettings
+    display: Annotated[MagnifyingSettings | PlanarSettings, Field(discriminator="kind")]
+    eye: EyeSettings = EyeSettings()
+    light: LightSettings = LightSettings()
+    focus: Annotated[tuple[Positive, ...], BeforeValidator(several)] | None = None
+    seeds: Annotated[Count, Field(le=64)] = 2

@@ -1,0 +1,126 @@
+"""What a finished run wants a panel to show: phases, and the way to the picture that they form."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+from holotorch.core.complex import intensity
+from holotorch.core.grid import Grid
+from holotorch.experiments.config import PECSettings, load_config
+from holotorch.experiments.config_volume import VolumeSettings
+from holotorch.experiments.errors import ConfigError
+from holotorch.hologram import double_phase, encoding_loss, error_diffused, kinoform, refocused
+
+ENCODINGS: dict[str, Callable[[Tensor], Tensor]] = {
+    "double_phase": double_phase,
+    "kinoform": kinoform,
+    "error_diffusion": error_diffused,
+}
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a run wants a panel to show.
+
+    Attributes:
+        phase: float32 [F, C, H, W] in rad, not wrapped.
+        wavelengths: Of the C colours, in metres.
+        grid: Pixels of the hologram.
+        encoding: How the phases came from a field; "phase" where the run holds phases.
+        picture: Intensity [C, ...] that fields [F, C, H, W], one after another in time, form where it is looked at.
+        losses: Relative squared error of the picture by the encoding, one per colour, with no aperture, and by the
+            kinoform; empty for phases.
+    """
+
+    phase: Tensor
+    wavelengths: tuple[float, ...]
+    grid: Grid
+    encoding: str
+    picture: Callable[[Tensor], Tensor]
+    losses: dict[str, list[float]] = field(default_factory=dict)
+
+
+def load_wanted(folder: Path, encoding: str | None = None) -> Wanted:
+    """Phases and propagation of a run folder of kind ``pec`` or ``volume``. ConfigError where it cannot be used."""
+    if not (folder / "config.yaml").is_file():
+        raise ConfigError([f"{folder} holds no run: config.yaml is not there"])
+    if encoding is not None and encoding not in ENCODINGS:
+        raise ConfigError([f"expected one of {', '.join(ENCODINGS)} as the encoding, got {encoding!r}"])
+    settings = load_config(folder / "config.yaml")
+    try:
+        if isinstance(settings, PECSettings):
+            if encoding is not None:
+                raise ConfigError([f"{folder} holds phases already, which need no encoding; leave out --encoding"])
+            return _from_pec(folder, settings)
+        if isinstance(settings, VolumeSettings):
+            return _from_volume(folder, settings, encoding or "double_phase")
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError([f"{folder}: {error}"]) from error
+    raise ConfigError([f"{folder} holds a {settings.experiment}; only runs of kind pec and volume have a hologram"])
+
+
+def _from_pec(folder: Path, settings: PECSettings) -> Wanted:
+    from holotorch.experiments.pec import build
+
+    experiment = build(settings)
+    colours = len(settings.wavelengths)
+    heaters = _array(folder / "arrays" / "phase.npy", (settings.frames, colours, *settings.grid.shape))
+    checks.all_finite("phase", heaters)
+    phase = experiment.array.crosstalk(heaters[:, experiment.lit].double()).float()
+
+    def picture(fields: Tensor) -> Tensor:
+        device = experiment.device
+        formed = [intensity(experiment.propagator(each.to(device))) for each in fields]
+        return experiment.seen(torch.stack(formed).mean(0)).cpu()
+
+    return Wanted(phase, experiment.wavelengths, experiment.grid, "phase", picture)
+
+
+def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> Wanted:
+    height, width = (size // settings.scale for size in settings.hologram.shape)
+    grid = Grid((height, width), settings.hologram.pitch)
+    hologram = _array(folder / "arrays" / "hologram.npy", (len(settings.wavelengths), height, width))
+    checks.all_finite("hologram", torch.view_as_real(hologram))
+    depth = _depth(folder, settings)
+
+    def views(colour: int) -> Callable[[Tensor], Tensor]:
+        return lambda light: refocused(light, grid, settings.wavelengths[colour], depth, tolerance=3e-3)
+
+    def picture(fields: Tensor) -> Tensor:
+        return torch.stack([intensity(views(c)(fields[:, c])).mean(0) for c in range(fields.shape[1])])
+
+    phase = torch.stack([ENCODINGS[encoding](each) for each in hologram])
+    losses = {}
+    for name, phases in ((encoding, phase), ("kinoform", kinoform(hologram))):
+        losses[name] = [encoding_loss(hologram[c], phases[c], views(c)).item() for c in range(len(hologram))]
+    return Wanted(phase[None], settings.wavelengths, grid, encoding, picture, losses)
+
+
+def _depth(folder: Path, settings: VolumeSettings) -> float:
+    """The middle one of the depths at which the run's report looks."""
+    for name in ("summary.json", "interrupted.json"):
+        if (folder / name).is_file():
+            depths = json.loads((folder / name).read_text()).get("refocused_m") or []
+            if depths:
+                return depths[len(depths) // 2]
+    return settings.hologram.distance / settings.scale
+
+
+def _array(path: Path, shape: tuple[int, ...]) -> Tensor:
+    if not path.is_file():
+        raise ValueError(f"{path.name} is not in its arrays; the run has not come so far: holotorch resume")
+    try:
+        found = np.load(path, allow_pickle=False)
+    except Exception as error:  # what damaged bytes raise is anyone's guess
+        raise ValueError(f"{path.name} cannot be read: {error}") from None
+    if found.shape != shape:
+        raise ValueError(f"{path.name} must have the shape {shape} of its configuration, got {found.shape}")
+    return torch.from_numpy(found)

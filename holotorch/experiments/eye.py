@@ -1,0 +1,149 @@
+"""What an observer sees: a volume's hologram under real light sources, through a display and a focused eye."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from holotorch.core.complex import intensity
+from holotorch.experiments.config_eye import ObserverSettings, PlanarSettings
+from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.volume import VolumeExperiment, build
+from holotorch.experiments.volume_judge import pooled
+from holotorch.metrics import sharpness, speckle_contrast, ssim
+from holotorch.optics.coherence import optimum_fwhm, path_difference, predicted_contrast
+from holotorch.optics.display import Display
+from holotorch.optics.exposure import equal_power
+from holotorch.optics.eye import Eye
+from holotorch.optics.imaging import imaged
+from holotorch.optics.spectrum import Spectrum
+from holotorch.optics.viewing import eyepiece_distance, image_distance
+
+PRESETS: dict[str, Callable[[float], Spectrum]] = {
+    "laser": Spectrum.laser,
+    "narrow_sled": Spectrum.narrow_sled,
+    "sled": Spectrum.sled,
+    "led": Spectrum.led,
+}
+_OTHERS = 100_000  # seeds of the realisations that only make the reference
+_LIT = 0.05  # of the brightest of the reference: where speckle is measured
+
+
+@dataclass(frozen=True)
+class Observer:
+    """A configuration made into a scene, a display and an eye.
+
+    The hologram's waves come from behind it (exp(+ikr)/r); a display shows its conjugate, whose light converges to the
+    scene in front, towards the observer. Every wavelength of a source meets the same amplitude and phase, as in the
+    thesis; dispersion of a panel is left out.
+
+    Attributes:
+        settings: The configuration.
+        scene: The volume and its holograms.
+        focus: Depths of the scene, from the hologram, at which the eye is focused in turn.
+    """
+
+    settings: ObserverSettings
+    scene: VolumeExperiment
+    focus: tuple[float, ...]
+
+    @cached_property
+    def display(self) -> Display:
+        """Where everything stands."""
+        given = self.settings.display
+        if isinstance(given, PlanarSettings):
+            return Display.planar(given.distance)
+        far = given.lens_distance
+        if far is None:
+            far = eyepiece_distance(self.scene.distance, given.focus_distance, given.focal_length, given.eye_distance)
+        return Display(far, given.focal_length, given.eye_distance)
+
+    def accommodation(self, depth: float) -> float:
+        """Distance in front of the eye at which the depth appears, in metres."""
+        given, before = self.settings.display, float(self.display.lens_distance) - depth
+        if isinstance(given, PlanarSettings):
+            return before
+        return image_distance(before, given.focal_length) + given.eye_distance
+
+    def eye(self, depth: float) -> Eye:
+        """Focused at a depth of the scene."""
+        given = self.settings.eye
+        reference = self.settings_wave if given.chromatic else None
+        return Eye(given.pupil_radius, given.axial_length, self.accommodation(depth), chromatic_reference=reference)
+
+    @property
+    def settings_wave(self) -> float:
+        """The wavelength that is in focus in an eye with colour error: the middle one."""
+        return sorted(self.scene.settings.wavelengths)[1]
+
+    def aperture(self, depth: float) -> float:
+        """Sine of the half angle of light from the depth that reaches the retina: the pupil's, or the hologram's."""
+        seen = self.settings.eye.pupil_radius / abs(float(self.display.matrix(depth)[1]))
+        return min(seen, math.sin(math.atan(min(self.scene.grid.extent) / 2 / depth)))
+
+    def samples(self, source: str, wave: float, depth: float) -> tuple[Tensor, Tensor]:
+        """Wavelengths and weights that stand for a source within the tolerance."""
+        away = path_difference(depth, self.aperture(depth))
+        return PRESETS[source](wave).samples(tolerance=self.settings.light.tolerance, path_difference=away)
+
+    def seen(self, hologram: Tensor, source: str | None, depth: float) -> Tensor:
+        """Picture on the retina, referred back to the scene, real [3, h, w] on the rays; None: one wavelength each."""
+        eye, grid, pictures = self.eye(depth), self.scene.grid, []
+        for field, wave in zip(hologram.conj(), self.scene.settings.wavelengths, strict=True):
+            places, weights = ([wave], [1.0]) if source is None else self.samples(source, wave, depth)
+            total = torch.zeros(grid.shape, dtype=field.real.dtype, device=field.device)
+            for place, weight in zip(places, weights, strict=True):
+                image = imaged(field[None], grid, [float(place)], self.display, eye, plane=depth)
+                total += float(weight) * intensity(image[0])
+            pictures.append(pooled(total, self.scene.stride))
+        return torch.stack(pictures).cpu()
+
+    def row(self, source: str, depth: float, pictures: Tensor, reference: Tensor) -> dict[str, Any]:
+        """Numbers of a source at a focus: per colour, mean over realisations [S, 3, h, w], against [3, h, w]."""
+        mask = reference > _LIT * reference.amax((-2, -1), keepdim=True)
+        shown = equal_power(pictures, reference.expand_as(pictures))
+        scale = reference.amax((-2, -1), keepdim=True)
+        waves = self.scene.settings.wavelengths
+        spectra = [PRESETS[source](wave) for wave in waves]
+        away = path_difference(depth, self.aperture(depth))
+        return {
+            "source": source,
+            "focus_mm": depth * 1e3,
+            "wavelengths": [len(self.samples(source, wave, depth)[0]) for wave in waves],
+            "contrast": speckle_contrast(shown, reference=reference, mask=mask).mean(0).tolist(),
+            "contrast_predicted": [predicted_contrast(spectrum, away) for spectrum in spectra],
+            "ssim": ssim((shown / scale).clamp(0, 1), (reference / scale).expand_as(shown), data_range=1.0)
+            .mean(0)
+            .tolist(),
+            "sharpness": sharpness(shown, reference).mean(0).tolist(),
+            "best_fwhm_nm_by_formula": [optimum_fwhm(wave, self.aperture(depth), depth) * 1e9 for wave in waves],
+        }
+
+
+def observer(settings: ObserverSettings, scene_settings) -> Observer:
+    """Build the scene and choose the depths. ConfigError for a scene that the display cannot show."""
+    scene = build(scene_settings)
+    if settings.focus is not None:
+        focus = settings.focus
+    else:
+        depth = scene.sampler().depth_map(scene.volume)
+        inside = depth[depth > 0].sort().values
+        if not len(inside):
+            raise ConfigError(["scene: nothing of the volume can be seen; change its transfer function"])
+        focus = tuple(inside[round(part * (len(inside) - 1))].item() for part in (0.1, 0.5, 0.9))
+    found = Observer(settings, scene, focus)
+    for depth in found.focus:
+        try:
+            found.eye(depth)
+        except ValueError as error:
+            raise ConfigError([f"display: {error}; a depth of {depth * 1e3:.4g} mm cannot be looked at"]) from error
+    return found
+
+
+def realisations(count: int, *, reference: bool) -> list[int]:
+    """Seeds of ``count`` holograms, those of the reference disjoint from the others."""
+    return [(_OTHERS if reference else 0) + k for k in range(count)]

@@ -1,0 +1,193 @@
+"""A run of the observer: holograms once, then every source and focus, pictures, a table and a page."""
+
+import html
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from torch import Tensor
+from tqdm import tqdm
+
+from holotorch.experiments import pictures
+from holotorch.experiments.chart import write_table
+from holotorch.experiments.config import load_config
+from holotorch.experiments.config_eye import ObserverSettings
+from holotorch.experiments.config_volume import VolumeSettings
+from holotorch.experiments.environment import environment
+from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.eye import Observer, observer, realisations
+from holotorch.experiments.markup import figure, plain, table
+from holotorch.experiments.memory import peak_memory
+from holotorch.experiments.run import claim, deferred, interruptible
+from holotorch.io.bundled import find_config
+from holotorch.io.colour_tables import srgb_matrix, white_balance
+from holotorch.io.files import save_array, write_bytes, write_json, write_text
+from holotorch.io.images import encode_png
+from holotorch.optics.colour import desaturated, linear_srgb
+from holotorch.optics.exposure import equal_power, exposed
+from holotorch.optics.geometry import diffraction_angle
+from holotorch.optics.imaging import retinal_scale
+from holotorch.optics.viewing import scene_fov
+
+_BRIGHT = 0.995  # of the reference's pixels are at most as bright as what is shown white
+
+
+def scene_settings(settings: ObserverSettings) -> VolumeSettings:
+    """The volume's configuration with its changes. ConfigError for one of another kind."""
+    path = find_config(settings.scene.config)
+    assert path is not None  # as its settings have checked
+    found = load_config(path, list(settings.scene.change))
+    if not isinstance(found, VolumeSettings):
+        raise ConfigError([f"scene.config: {settings.scene.config} describes no volume but {found.experiment!r}"])
+    return found
+
+
+def plan_text(eye: Observer) -> tuple[str, dict[str, Any]]:
+    """What will be done, in words and as JSON values."""
+    settings, scene, display = eye.settings, eye.scene, eye.display
+    depths = [depth * 1e3 for depth in eye.focus]
+    waves = scene.settings.wavelengths
+    counts = {
+        source: [len(eye.samples(source, wave, max(eye.focus))[0]) for wave in waves]
+        for source in settings.light.sources
+    }
+    angles = [2 * diffraction_angle(scene.grid, wave)[1] for wave in waves]
+    magnifying = settings.display.kind == "magnifying"
+    before = float(display.lens_distance) - scene.distance
+    across = (
+        scene_fov(scene.width, before, float(display.focal_length), float(display.eye_distance)) if magnifying else None
+    )
+    values = {
+        "scene": settings.scene.config,
+        "synthetic": scene.synthetic,
+        "display": {
+            "kind": settings.display.kind,
+            "lens_distance_mm": float(display.lens_distance) * 1e3,
+            "eye_distance_mm": float(display.eye_distance) * 1e3,
+        },
+        "focus_mm": depths,
+        "accommodation_mm": [eye.accommodation(depth) * 1e3 for depth in eye.focus],
+        "retinal_scale": [float(retinal_scale(display, eye.eye(depth), depth)) for depth in eye.focus],
+        "aperture": [eye.aperture(depth) for depth in eye.focus],
+        "wavelengths": counts,
+        "hologram_fov_deg": [angle * 57.29577951308232 for angle in angles],
+        "scene_fov_deg": None if across is None else across * 57.29577951308232,
+    }
+    lines = [
+        f"Scene      {settings.scene.config}" + (f" (synthetic: {scene.synthetic})" if scene.synthetic else ""),
+        f"Display    {settings.display.kind}; eyepiece {values['display']['lens_distance_mm']:.4g} mm from the "
+        f"hologram, eye {values['display']['eye_distance_mm']:.4g} mm behind it"
+        + ("" if across is None else f"; the scene spans {values['scene_fov_deg']:.3g} deg"),
+        f"Focus      at {', '.join(f'{depth:.4g}' for depth in depths)} mm, seen at "
+        f"{', '.join(f'{far:.4g}' for far in values['accommodation_mm'])} mm; aperture "
+        f"{', '.join(f'{sine:.3g}' for sine in values['aperture'])}",
+        "Light      " + "; ".join(f"{source}: {plain(count)} wavelengths" for source, count in counts.items()),
+        f"Phases     {settings.seeds} realisation(s), compared with the mean of {8 * settings.seeds} others",
+    ]
+    return "\n".join(lines), values
+
+
+def run_observer(settings: ObserverSettings, out: Path | None, name: str) -> tuple[Path, bool]:
+    """Carry a run out and fill a folder; returns and raises as :func:`holotorch.experiments.run.run`."""
+    eye = observer(settings, scene_settings(settings))
+    text, values = plan_text(eye)
+    print(text, flush=True)
+    folder = claim(out, name)
+    for part in ("arrays", "images"):
+        (folder / part).mkdir(exist_ok=True)
+    write_text(folder / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
+    write_json(folder / "plan.json", values)
+    write_json(folder / "env.json", environment(settings.seed, eye.scene.device))
+    started = time.perf_counter()
+    references, own = realisations(8 * settings.seeds, reference=True), realisations(settings.seeds, reference=False)
+    sources, focus = settings.light.sources, eye.focus
+    reference, seen = torch.zeros(()), []
+    total = len(references) * (1 + len(focus)) + len(own) * (1 + len(focus) * len(sources))
+    with interruptible() as pressed, tqdm(total=total, desc="looking", unit="picture", dynamic_ncols=True) as bar:
+        try:
+            for seed in references:
+                hologram = _hologram(eye, seed, bar)
+                reference = reference + torch.stack([_seen(eye, hologram, None, depth, bar) for depth in focus])
+            reference = reference / len(references)
+            for seed in own:
+                hologram = _hologram(eye, seed, bar)
+                rows = [torch.stack([_seen(eye, hologram, source, at, bar) for at in focus]) for source in sources]
+                seen.append(torch.stack(rows))
+        except KeyboardInterrupt:
+            if not seen:
+                raise
+        with deferred(pressed):
+            _write(folder, eye, reference, torch.stack(seen), values, time.perf_counter() - started, not pressed)
+    return folder, not pressed
+
+
+def _hologram(eye: Observer, seed: int, bar: tqdm) -> Tensor:
+    hologram, _ = eye.scene.hologram(eye.settings.seed + seed)
+    bar.set_postfix(mem=f"{peak_memory() / 1e9:.2f}GB", refresh=False)
+    bar.update()
+    return hologram
+
+
+def _seen(eye: Observer, hologram: Tensor, source: str | None, depth: float, bar: tqdm) -> Tensor:
+    picture = eye.seen(hologram, source, depth)
+    bar.update()
+    return picture
+
+
+def _write(
+    out: Path, eye: Observer, reference: Tensor, seen: Tensor, values: dict[str, Any], seconds: float, complete: bool
+) -> None:
+    """``reference`` [F, 3, h, w], ``seen`` [S, sources, F, 3, h, w]."""
+    sources, focus = eye.settings.light.sources, eye.focus
+    save_array(out / "arrays" / "retina.npy", seen[0])
+    save_array(out / "arrays" / "reference.npy", reference)
+    # Sources are set so that equal values are neutral grey, and each colour's light is that of the rendering.
+    waves = eye.scene.settings.wavelengths
+    matrix = srgb_matrix(waves, white_balance(waves)).float()
+    with torch.no_grad():
+        rendering = eye.scene.sampler().render(eye.scene.volume)[0].cpu()
+    reference = equal_power(reference, rendering.expand_as(reference))
+    shown, captions = [], []
+    for f, depth in enumerate(focus):
+        peak = desaturated(linear_srgb(reference[f], matrix)).flatten().quantile(_BRIGHT)
+        for s, source in enumerate(("reference", *sources)):
+            light = reference[f] if s == 0 else equal_power(seen[0, s - 1, f], reference[f])
+            picture = exposed(desaturated(linear_srgb(light, matrix)), peak=peak)
+            write_bytes(out / "images" / f"{source}_{f}.png", encode_png(picture))
+            shown.append(picture)
+            captions.append(f"{source.replace('_', ' ')}, focus {depth * 1e3:.4g} mm")
+    columns = len(sources) + 1
+    rows = [
+        pictures.comparison(shown[k : k + columns], captions[k : k + columns]) for k in range(0, len(shown), columns)
+    ]
+    for f, data in enumerate(rows):
+        write_bytes(out / "images" / f"comparison_{f}.png", data)
+    found = [
+        eye.row(source, depth, seen[:, s, f], reference[f])
+        for s, source in enumerate(sources)
+        for f, depth in enumerate(focus)
+    ]
+    flat = [{key: plain(value) for key, value in row.items()} for row in found]
+    write_table(out / "table.csv", flat)
+    cells = [[html.escape(value) for value in row.values()] for row in flat]
+    names = [key.replace("_", " ") for key in flat[0]]
+    body = "<h1>What the observer sees</h1>"
+    if values["synthetic"]:
+        body += f"<p>Synthetic volume: {html.escape(values['synthetic'])}.</p>"
+    body += "".join(
+        figure(f"images/comparison_{f}.png", f"focus {z * 1e3:.4g} mm", "wide") for f, z in enumerate(focus)
+    )
+    body += table(names, cells) + f"<pre>{html.escape(plan_text(eye)[0])}</pre>"
+    write_text(out / "report.html", f"<!DOCTYPE html><meta charset='utf-8'><title>observer</title>{body}")
+    summary = {
+        "experiment": "eye",
+        "status": "complete" if complete else "interrupted",
+        "synthetic": values["synthetic"],
+        "realisations": len(seen),
+        "rows": found,
+        "seconds": round(seconds, 2),
+        "peak_memory_bytes": peak_memory(),
+    }
+    write_json(out / ("summary.json" if complete else "interrupted.json"), summary)

@@ -1,0 +1,86 @@
+"""Colours of light by the tables of colour-science: the matrix from wavelengths to linear sRGB."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+
+_OBSERVER = "CIE 1931 2 Degree Standard Observer"
+
+
+def tristimulus(wavelengths: float | Sequence[float]) -> Tensor:
+    """CIE 1931 colour-matching functions (2 degrees) X, Y, Z at wavelengths in metres, float64 [3, K].
+
+    Spline between the table's whole nanometres (Sprague's, recommended by CIE 167).
+
+    Raises:
+        ValueError: A wavelength outside the table, 360 to 830 nm.
+    """
+    from colour import MSDS_CMFS, SpragueInterpolator
+
+    table = MSDS_CMFS[_OBSERVER]
+    places = np.array(checks.wavelengths(wavelengths)) * 1e9
+    first, last = float(table.wavelengths[0]), float(table.wavelengths[-1])
+    wrong = places[(places < first) | (places > last)]
+    if wrong.size:
+        raise ValueError(
+            f"wavelength {wrong[0]:g} nm has no colour: the CIE 1931 table covers {first:g} to {last:g} nm"
+        )
+    columns = [SpragueInterpolator(table.wavelengths, table.values[:, i])(places) for i in range(3)]
+    return torch.from_numpy(np.stack(columns).reshape(3, -1))
+
+
+def srgb_matrix(
+    wavelengths: Sequence[float], weights: Sequence[float] | Tensor | None = None, *, white: Tensor | None = None
+) -> Tensor:
+    """Matrix [3, K] from intensities at ``wavelengths`` to linear sRGB, float64; a column per wavelength.
+
+    Args:
+        wavelengths: In metres.
+        weights: Power of each, 1 by default, such as the weights of :class:`~holotorch.optics.spectrum.Spectrum` rules.
+        white: Intensities [K] of a picture's white, for a luminance of 1; all ones by default.
+
+    The colours are those of the light itself: equal intensities of three sources show the white of equal energy of the
+    three, not the grey of D65. :func:`white_balance` gives weights that show D65.
+
+    Raises:
+        ValueError: Wavelengths outside the table, weights that do not match or are negative, or a white without light.
+    """
+    from colour.models import RGB_COLOURSPACE_sRGB
+
+    matching = tristimulus(wavelengths)
+    count = matching.shape[1]
+    power = torch.ones(count, dtype=torch.float64) if weights is None else torch.as_tensor(weights, dtype=torch.float64)
+    shown = torch.ones(count, dtype=torch.float64) if white is None else white.to(torch.float64)
+    for name, part in (("weights", power), ("white", shown)):
+        if tuple(part.shape) != (count,) or not (part >= 0).all():
+            raise ValueError(f"{name} must be {count} nonnegative numbers, one per wavelength, got {part.tolist()}")
+    matrix = matching * power
+    luminance = matrix[1] @ shown
+    if luminance <= 0:
+        raise ValueError("white has no luminance; give positive weights within the visible range")
+    return torch.from_numpy(np.array(RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB)) @ matrix / luminance
+
+
+def white_balance(wavelengths: Sequence[float]) -> Tensor:
+    """Powers [3] of three sources whose sum is the white of sRGB, D65, relative to the strongest one, float64.
+
+    The rule for a picture's white: a display is balanced so that equal values are neutral grey.
+
+    Raises:
+        ValueError: Not three wavelengths, or three that cannot mix D65.
+    """
+    from colour.models import RGB_COLOURSPACE_sRGB
+
+    matching = tristimulus(wavelengths)
+    if matching.shape[1] != 3:
+        raise ValueError(f"white balance needs three wavelengths, got {matching.shape[1]}")
+    wanted = torch.from_numpy(np.linalg.inv(RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB) @ np.ones(3))
+    powers = torch.linalg.solve(matching, wanted) if torch.linalg.matrix_rank(matching) == 3 else -torch.ones(3)
+    if (powers <= 0).any():
+        found = ", ".join(f"{value * 1e9:g}" for value in wavelengths)
+        raise ValueError(f"{found} nm cannot mix the white D65; take one red, one green and one blue source")
+    return powers / powers.max()

@@ -1,0 +1,166 @@
+"""Files that a phase panel shows: grey levels as PNG or BMP, phases as EXR, each with what it was made from."""
+
+import json
+import struct
+import tempfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+from holotorch.io.files import write_bytes
+
+_KEY = "holotorch"  # of the PNG text chunk and the EXR attribute that hold the metadata as JSON
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def write_levels(path: Path, levels: Tensor, metadata: Mapping[str, Any]) -> None:
+    """Write a frame of grey levels, uint8 or uint16 [H, W], as ``.png`` or (uint8 only) ``.bmp``, whole or not at all.
+
+    Levels are stored as they are: those of a panel of 10 bits are 0 to 1023 in a file of 16. The metadata, anything
+    that JSON holds, go into a text chunk of the PNG, and into ``NAME.bmp.json`` beside a BMP, which has no room.
+
+    Raises:
+        TypeError: Levels of another kind, or metadata that JSON does not hold.
+        ValueError: Another shape, another ending, 16 bits in a BMP, or NaN in the metadata.
+    """
+    import cv2
+
+    if not isinstance(levels, Tensor) or levels.dtype not in (torch.uint8, torch.uint16):
+        raise TypeError(f"levels must be a tensor of uint8 or uint16, got {getattr(levels, 'dtype', type(levels))}")
+    _two_axes("levels", levels)
+    suffix = path.suffix.lower()
+    if suffix not in (".png", ".bmp"):
+        raise ValueError(f"{path}: levels are written as .png or .bmp, got {suffix or 'no ending'}")
+    if suffix == ".bmp" and levels.dtype == torch.uint16:
+        raise ValueError(f"{path}: a BMP holds 8 bits and these levels have more; use .png")
+    text = _json(metadata)
+    ok, data = cv2.imencode(suffix, np.ascontiguousarray(levels.detach().cpu().numpy()))
+    if not ok:
+        raise ValueError(f"{path}: could not encode levels of shape {tuple(levels.shape)}")
+    if suffix == ".png":
+        write_bytes(path, _with_text(data.tobytes(), text))
+        return
+    write_bytes(_beside(path), text.encode() + b"\n")
+    write_bytes(path, data.tobytes())
+
+
+def read_levels(path: Path) -> tuple[Tensor, dict[str, Any]]:
+    """Read a frame of grey levels, uint8 or uint16 [H, W], and its metadata; empty where the file has none.
+
+    Raises:
+        ValueError: Not a grey PNG or BMP, or damaged.
+    """
+    import cv2
+
+    data = _existing(path).read_bytes()
+    pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    if pixels is None:
+        raise ValueError(f"{path} is not a readable PNG or BMP")
+    if pixels.ndim == 3 and (pixels == pixels[..., :1]).all():
+        pixels = pixels[..., 0]  # a grey BMP is read as three equal channels
+    if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"{path} must be grey with 8 or 16 bits, got {pixels.shape} of {pixels.dtype}")
+    text = _text_of(data) if data.startswith(_PNG) else None
+    if text is None and _beside(path).is_file():
+        text = _beside(path).read_text(encoding="utf-8")
+    return torch.from_numpy(pixels.copy()), _metadata(path, text)
+
+
+def write_phases(path: Path, phase: Tensor, metadata: Mapping[str, Any]) -> None:
+    """Write phases in rad, float32 [H, W], as the channel Y of an ``.exr``, to the bit, whole or not at all.
+
+    Raises:
+        TypeError: Not float32, which is what the file keeps, or metadata that JSON does not hold.
+        ValueError: Another shape or ending, NaN or infinity, in the phases or the metadata.
+    """
+    import OpenEXR
+
+    if not isinstance(phase, Tensor) or phase.dtype != torch.float32:
+        raise TypeError(f"EXR keeps float32 phases, got {getattr(phase, 'dtype', type(phase))}; use phase.float()")
+    _two_axes("phase", phase)
+    checks.all_finite("phase", phase)
+    if path.suffix.lower() != ".exr":
+        raise ValueError(f"{path}: phases are written as .exr, got {path.suffix or 'no ending'}")
+    # A copy in rows: the library reads the memory of its arrays without looking at their strides.
+    pixels = np.array(phase.detach().cpu().numpy(), dtype=np.float32, order="C", copy=True)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, _KEY: _json(metadata)}
+    with tempfile.TemporaryDirectory() as folder:  # the library writes to names only
+        made = Path(folder) / "phase.exr"
+        OpenEXR.File(header, {"Y": pixels}).write(str(made))
+        data = made.read_bytes()
+    write_bytes(path, data)
+
+
+def read_phases(path: Path) -> tuple[Tensor, dict[str, Any]]:
+    """Read phases in rad, float32 [H, W], and their metadata from an EXR file with a channel Y.
+
+    Raises:
+        ValueError: Not an EXR file of that kind, or damaged.
+    """
+    import OpenEXR
+
+    try:
+        file = OpenEXR.File(str(_existing(path)), separate_channels=True)
+        header, channels = file.header(), file.channels()
+    except ValueError:
+        raise
+    except Exception as error:  # the library raises bare RuntimeError and others
+        raise ValueError(f"{path} is not a readable EXR file: {error}") from None
+    if "Y" not in channels or channels["Y"].pixels.dtype != np.float32:
+        raise ValueError(f"{path} must have a float32 channel Y, got {', '.join(sorted(channels))}")
+    return torch.from_numpy(np.array(channels["Y"].pixels)), _metadata(path, header.get(_KEY))
+
+
+def _with_text(png: bytes, text: str) -> bytes:
+    """A PNG with an international text chunk (UTF-8, not compressed) after its header."""
+    end = len(_PNG) + 12 + struct.unpack(">I", png[8:12])[0]
+    body = b"iTXt" + _KEY.encode() + b"\0\0\0\0\0" + text.encode()
+    return png[:end] + struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body)) + png[end:]
+
+
+def _text_of(png: bytes) -> str | None:
+    place = len(_PNG)
+    while place + 12 <= len(png):
+        length = struct.unpack(">I", png[place : place + 4])[0]
+        kind, body = png[place + 4 : place + 8], png[place + 8 : place + 8 + length]
+        if kind == b"iTXt" and body.startswith(_KEY.encode() + b"\0\0\0\0\0"):
+            return body[len(_KEY) + 5 :].decode("utf-8", "replace")
+        place += 12 + length
+    return None
+
+
+def _json(metadata: Mapping[str, Any]) -> str:
+    return json.dumps(dict(metadata), allow_nan=False, ensure_ascii=False, sort_keys=True)
+
+
+def _metadata(path: Path, text: str | None) -> dict[str, Any]:
+    if text is None:
+        return {}
+    try:
+        found = json.loads(text)
+    except ValueError:
+        raise ValueError(f"{path}: its metadata are damaged: not JSON") from None
+    if not isinstance(found, dict):
+        raise ValueError(f"{path}: its metadata are damaged: expected settings, got {found!r}")
+    return found
+
+
+def _beside(path: Path) -> Path:
+    return path.with_name(path.name + ".json")
+
+
+def _existing(path: Path) -> Path:
+    if not path.is_file():
+        raise ValueError(f"no such file: {path}")
+    return path
+
+
+def _two_axes(name: str, value: Tensor) -> None:
+    if value.ndim != 2 or 0 in value.shape:
+        raise ValueError(f"{name} must be one frame (H, W), got {tuple(value.shape)}")

@@ -1,0 +1,92 @@
+"""Display: where hologram, eyepiece and eye stand, and the ray matrices between them."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+
+Length = float | Tensor
+Matrix = tuple[Length, Length, Length, Length]
+
+
+@dataclass(frozen=True)
+class Display:
+    """Hologram, eyepiece, eye on one axis: the thesis's volume-magnifying display (Fig. 5.5), or one of its relatives.
+
+    All in metres; each may be a tensor that carries a gradient.
+
+    Attributes:
+        lens_distance: d_el from hologram to eyepiece, at least 0; beyond ``focal_length`` it magnifies the volume.
+        focal_length: f_el of the eyepiece, infinite for none.
+        eye_distance: d_eye from eyepiece to the lens of the eye, at least 0.
+        lens_radius: r_el, half the clear width of the eyepiece; None does not limit the light.
+
+    Raises:
+        ValueError: A distance below 0, a focal length of 0, a radius that is not positive.
+    """
+
+    lens_distance: Length
+    focal_length: Length
+    eye_distance: Length
+    lens_radius: Length | None = None
+
+    def __post_init__(self):
+        for name in ("lens_distance", "eye_distance"):
+            if checks.finite(name, number(getattr(self, name)), "metres") < 0:
+                raise ValueError(f"{name} must be at least 0 metres, got {getattr(self, name)!r}")
+        focal_length = number(self.focal_length)
+        if focal_length == 0 or math.isnan(focal_length):
+            raise ValueError("focal_length must be other than 0 metres, infinite for no eyepiece")
+        if self.lens_radius is not None:
+            checks.positive("lens_radius", number(self.lens_radius), "metres")
+
+    @classmethod
+    def planar(cls, distance: Length) -> "Display":
+        """Hologram under a plane wave looked at from ``distance``, without an eyepiece (Fig. 5.4 top)."""
+        return cls(distance, math.inf, 0.0)
+
+    @classmethod
+    def spherical(cls, focal_length: Length, lens_radius: Length | None = None) -> "Display":
+        """Lens at the hologram and the eye at its focal point: spherical illumination (Fig. 5.4 bottom)."""
+        return cls(0.0, focal_length, focal_length, lens_radius)
+
+    def matrix(self, plane: Length) -> Matrix:
+        """Ray matrix (A, B, C, D) from the plane at distance ``plane`` from the hologram to the pupil of the eye.
+
+        A = 1 - d_eye / f, B = s0 + d_eye (1 - s0 / f) in metres, C = -1 / f, D = 1 - s0 / f, with s0 = d_el - plane.
+        """
+        power, s0 = inverse(self.focal_length), self.lens_distance - plane
+        back = 1 - s0 * power
+        return 1 - self.eye_distance * power, s0 + self.eye_distance * back, -power, back
+
+    def focus_plane(self, accommodation: Length) -> Length:
+        """Distance in metres from the hologram of the plane that an eye focused at ``accommodation`` sees sharply.
+
+        d_el - s0 with 1 / s0 = 1 / (accommodation - d_eye) + 1 / f; negative lies behind the hologram.
+
+        Raises:
+            ValueError: That plane is at infinity.
+        """
+        ahead = accommodation - self.eye_distance
+        if math.isinf(number(ahead)):
+            power = inverse(self.focal_length)
+            if number(power) == 0:
+                raise ValueError("an eye focused at infinity sees no plane of a display without eyepiece; give plane")
+            return self.lens_distance - 1 / power
+        share = 1 + ahead * inverse(self.focal_length)
+        if abs(number(share)) < 1e-9:
+            raise ValueError(f"an eye focused at {number(accommodation):g} m sees no plane in front of this eyepiece")
+        return self.lens_distance - ahead / share
+
+
+def number(value: Length) -> float:
+    """A plain number, of a tensor without its gradient."""
+    return float(value.detach()) if isinstance(value, Tensor) else float(value)
+
+
+def inverse(value: Length) -> Length:
+    """1 / value, 0 for infinity."""
+    return torch.reciprocal(value) if isinstance(value, Tensor) else (0.0 if math.isinf(value) else 1 / value)

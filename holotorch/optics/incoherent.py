@@ -1,0 +1,104 @@
+"""Sums of intensities over what does not interfere: wavelengths, and points of an extended source."""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from holotorch.core import checks
+from holotorch.core.grid import Grid
+
+Place = TypeVar("Place")
+
+
+def incoherent_sum(
+    intensity_of: Callable[[Place], Tensor],
+    places: Iterable[Place] | Tensor,
+    weights: Sequence[float] | Tensor,
+    *,
+    recompute: bool = False,
+) -> Tensor:
+    """Sum of ``weights[k] * intensity_of(places[k])``, one after another, so that one is in memory at a time.
+
+    Args:
+        intensity_of: Intensity [...] of one wavelength in metres, or of one tilt of the illumination.
+        places: Wavelengths [K], given on as floats, or a sequence of anything else.
+        weights: [K], such as those of ``Spectrum.samples``; a tensor may carry gradients.
+        recompute: When gradients are wanted, compute each intensity a second time on the way back instead of keeping
+            what it was made of: memory of one, for a third more time.
+
+    Raises:
+        TypeError: An intensity that is complex: a field was given.
+        ValueError: No places, or another number of weights.
+    """
+    items = places.tolist() if isinstance(places, Tensor) else list(places)
+    if not items or len(items) != len(weights):
+        raise ValueError(f"places and weights must be equally many and at least one, got {len(items)}, {len(weights)}")
+    total = None
+    for place, weight in zip(items, weights, strict=True):
+        part = (
+            checkpoint(intensity_of, place, use_reentrant=False)
+            if recompute and torch.is_grad_enabled()
+            else intensity_of(place)
+        )
+        assert isinstance(part, Tensor)
+        checks.real("intensity", part)
+        # A float, or a tensor's float64 scalar, leaves the dtype of the intensity as it is.
+        weight = weight.to(part.device) if isinstance(weight, Tensor) else weight
+        total = part * weight if total is None else total + part * weight
+    assert total is not None
+    return total
+
+
+def disc_source(radius: float, rings: int = 2) -> tuple[list[tuple[float, float]], Tensor]:
+    """Points of a uniform disc and their weights: an extended source for :func:`incoherent_sum`.
+
+    Gauss's rule in the squared radius on ``rings`` rings, each of 4 rings equally spaced points: exact for polynomials
+    of the two sines up to degree 4 rings - 1.
+
+    Args:
+        radius: Sine of the half angle under which the hologram sees the source, above 0 and below 1.
+        rings: At least 1.
+
+    Returns:
+        Sines (y, x) of 4 rings^2 directions, and weights [4 rings^2] that add up to 1, float64.
+    """
+    radius, rings = checks.positive("radius", radius), checks.whole("rings", rings, 1)
+    if radius >= 1:
+        raise ValueError(f"radius is a sine and must be below 1, got {radius:g}")
+    nodes, weights = np.polynomial.legendre.leggauss(rings)
+    around = 4 * rings
+    points = [
+        (radius * math.sqrt((1 + node) / 2) * math.sin(turn), radius * math.sqrt((1 + node) / 2) * math.cos(turn))
+        for node in nodes.tolist()
+        for turn in (2 * math.pi * (k + 0.5) / around for k in range(around))
+    ]
+    return points, torch.from_numpy(np.repeat(weights / (2 * around), around))
+
+
+def tilted_wave(grid: Grid, wavelength: float, direction: tuple[float, float]) -> Tensor:
+    """Plane wave exp(2 pi i (y sy + x sx) / wavelength) on ``grid``, complex128 [H, W]: illumination from one point.
+
+    Args:
+        grid: Of the hologram, whose field is multiplied by this.
+        wavelength: In metres.
+        direction: Sines (y, x) of where the wave goes.
+
+    Raises:
+        ValueError: A direction that the grid cannot sample.
+    """
+    wave = checks.wavelengths(wavelength)[0]
+    sines = checks.pair("direction", direction, "sines")
+    for sine, pitch in zip(sines, grid.pitch, strict=True):
+        if abs(sine) > wave / (2 * pitch):
+            raise ValueError(
+                f"direction {sine:g} is beyond what a pitch of {pitch:g} m samples at {wave:g} m, "
+                f"{wave / (2 * pitch):.3g}; use a smaller source or a finer grid"
+            )
+    y, x = grid.coordinates()
+    turns = y * (sines[0] / wave) + x * (sines[1] / wave)
+    return torch.polar(torch.ones_like(turns), 2 * math.pi * turns)

@@ -1,0 +1,202 @@
+"""What a display shows of a scene, by geometry: fields of view, placement, eye box, spots. Plain metres, radians.
+
+Symbols of the thesis, Sec. 5.4 and 5.6.2: hologram of width w, eyepiece of focal length f, object s0 in front of it
+with its image s1 in front of it (virtual, on the same side), eye d_eye behind it and focused on s_eye = s1 + d_eye.
+"""
+
+import math
+
+from holotorch.core import checks
+
+
+def planar_fov(pitch: float, wavelength: float) -> float:
+    """Field of view in radians of a hologram under a plane wave: 2 asin(wavelength / (2 pitch)), at most pi."""
+    return 2 * math.asin(_sine(pitch, wavelength))
+
+
+def magnified_fov(width: float, focal_length: float) -> float:
+    """Field of view in radians, 2 atan(w / 2f), with the eye at the focal point of a lens.
+
+    For spherical illumination (the lens close to the hologram) and for the volume-magnifying display alike. Its limit:
+    light that leaves the hologram. What of the scene fills it is :func:`scene_fov`, what passes the iris
+    :func:`vignetting`.
+    """
+    return 2 * math.atan(checks.positive("width", width, "metres") / (2 * _positive_focal_length(focal_length)))
+
+
+def image_distance(object_distance: float, focal_length: float) -> float:
+    """Distance s1 = f s0 / (f - s0) in metres of the virtual image of an object nearer than f; infinite at s0 = f.
+
+    Raises:
+        ValueError: The object is farther than the focal length: its image is real, behind the lens.
+    """
+    s0, f = checks.positive("object_distance", object_distance, "metres"), _positive_focal_length(focal_length)
+    if math.isinf(f):
+        return s0
+    if s0 > f:
+        raise ValueError(f"object_distance must be at most the focal length {f:g} m for a virtual image, got {s0:g} m")
+    return f * s0 / (f - s0) if s0 < f else math.inf
+
+
+def object_distance(image_distance: float, focal_length: float) -> float:
+    """Inverse of :func:`image_distance`: s0 = f s1 / (f + s1), f itself for an infinite s1."""
+    f = _positive_focal_length(focal_length)
+    if image_distance == math.inf:
+        return f
+    s1 = checks.positive("image_distance", image_distance, "metres")
+    return 1 / (1 / s1 + 1 / f)
+
+
+def eyepiece_distance(volume_distance: float, focus_distance: float, focal_length: float, eye_distance: float) -> float:
+    """Distance d_el in metres from hologram to eyepiece at which the volume is seen ``focus_distance`` from the eye.
+
+    d_el = d_V + s0 with s1 = s_eye - d_eye (thesis Sec. 5.5.2.1); 45.56 mm for its display.
+
+    Raises:
+        ValueError: The focus lies between eyepiece and eye.
+    """
+    s1 = _before_eyepiece(focus_distance, eye_distance)
+    return checks.finite("volume_distance", volume_distance, "metres") + object_distance(s1, focal_length)
+
+
+def scene_fov(size: float, object_distance: float, focal_length: float, eye_distance: float) -> float:
+    """Angle in radians that an object of ``size`` spans from the eye: 2 atan(V f / (2 (f - s0) (s1 + d_eye))).
+
+    Written V / (2 (s0 + d_eye (1 - s0 / f))), which is finite for an image at infinity (thesis Sec. 5.6.2).
+    """
+    image_distance(object_distance, focal_length)
+    across = object_distance + eye_distance * (1 - object_distance / focal_length)
+    return 2 * math.atan(checks.positive("size", size, "metres") / (2 * across))
+
+
+def volume_size(fov: float, focus_distance: float, focal_length: float, eye_distance: float) -> float:
+    """Width V_max in metres of an object that spans ``fov`` radians, seen at ``focus_distance``.
+
+    10.919 mm for 40 deg, 120 mm, f = 10 mm and the d_eye = 50 mm that the thesis leaves out there (it prints 10.91).
+    """
+    if not 0 < fov < math.pi:
+        raise ValueError(f"fov must lie between 0 and pi radians, got {fov!r}; 40 degrees are {math.radians(40):.3f}")
+    s0 = object_distance(_before_eyepiece(focus_distance, eye_distance), focal_length)
+    return 2 * math.tan(fov / 2) * (s0 + eye_distance * (1 - s0 / focal_length))
+
+
+def accommodation_range(
+    near: float, far: float, eyepiece_distance: float, focal_length: float, eye_distance: float
+) -> tuple[float, float]:
+    """Distances in metres from the eye at which planes ``near`` and ``far`` from the hologram are seen, nearest first.
+
+    ``near`` and ``far`` are distances from the hologram towards the eyepiece. Differences of 1 / distance are dioptres.
+    """
+    seen = [image_distance(eyepiece_distance - z, focal_length) + eye_distance for z in (near, far)]
+    return min(seen), max(seen)
+
+
+def region_apex(width: float, pitch: float, wavelength: float) -> float:
+    """Distance in metres at which regions I and III of Sec. 5.6.2 touch on the axis: w / (2 tan(theta))."""
+    return checks.positive("width", width, "metres") / (2 * _tangent(pitch, wavelength))
+
+
+def region(height: float, distance: float, width: float, pitch: float, wavelength: float) -> int:
+    """Region 1, 2 or 3 of Sec. 5.6.2 (Fig. 5.11) of a point ``height`` beside the axis; 0 where no light arrives.
+
+    The point's cone cuts the hologram's plane in z tan(theta) to both sides. 1: all of it is hologram, finest spots.
+    3: the hologram is all within it, spots grow with distance only. 2: part of either.
+    """
+    cone, half = abs(distance) * _tangent(pitch, wavelength), width / 2
+    if abs(height) + cone <= half:
+        return 1
+    if cone - abs(height) >= half:
+        return 3
+    return 2 if abs(height) - cone < half else 0
+
+
+def placement(size: float, width: float, pitch: float, wavelength: float, depth: float | None = None) -> float:
+    """Distance in metres to the centre of a volume whose near face just lies in region III.
+
+    (V + w) / (2 tan(theta)) + depth / 2, a cube by default. The thesis's 157.81 mm is for 455 nm: blue, with the
+    narrowest cone, decides.
+    """
+    near = (checks.positive("size", size, "metres") + width) / (2 * _tangent(pitch, wavelength))
+    return near + (size if depth is None else depth) / 2
+
+
+def section(height: float, distance: float, width: float, pitch: float, wavelength: float) -> float:
+    """Length in metres, along one axis, of the part of the hologram whose cones hold a point."""
+    cone = abs(distance) * _tangent(pitch, wavelength)
+    return max(0.0, min(width / 2, height + cone) - max(-width / 2, height - cone))
+
+
+def smallest_spot(wavelength: float, distance: float, section: float) -> float:
+    """Width in metres of the finest spot, wavelength distance / section (Rayleigh, one axis, to the first zero).
+
+    ``section`` is that of :func:`section`; 0 gives infinity.
+    """
+    return wavelength * abs(distance) / section if section > 0 else math.inf
+
+
+def vignetting(height: float, first: float, second: float, pupil_radius: float, sine: float) -> float:
+    """Share of the light of a point that passes the pupil, relative to a pupil that it fills, along one axis.
+
+    Args:
+        height: Of the point beside the axis, in metres.
+        first: A of the ray matrix from the point's plane to the pupil (``Display.matrix``): 1 - d_eye / f.
+        second: B in metres: s0 + d_eye (1 - s0 / f).
+        pupil_radius: In metres.
+        sine: Largest slope of the light, wavelength / (2 pitch) in regions I and II.
+
+    The light spans A y +- B sine on the pupil's plane. Rays only: where it misses the pupil 0.5 % still arrive by
+    diffraction in the thesis's display. A is 0, and nothing is lost, with the eye at the focal point of the eyepiece.
+    """
+    half = abs(second) * sine
+    low, high = max(-pupil_radius, first * height - half), min(pupil_radius, first * height + half)
+    return max(0.0, high - low) / (2 * checks.positive("pupil_radius", pupil_radius, "metres"))
+
+
+def visible_half_width(first: float, second: float, pupil_radius: float, sine: float) -> float:
+    """Height in metres from which no light reaches the pupil: (r + B sine) / A, infinite for A = 0."""
+    reach = pupil_radius + abs(second) * sine
+    return reach / abs(first) if first else math.inf
+
+
+def eye_box(size: float, first: float, second: float, sine: float) -> float:
+    """Width in metres of the box in the pupil's plane that light of every point within ``size`` reaches, at least 0.
+
+    2 (B sine - A size / 2); arguments as for :func:`vignetting`.
+    """
+    return max(0.0, 2 * abs(second) * sine - abs(first) * size)
+
+
+def fresnel_number(radius: float, wavelength: float, distance: float) -> float:
+    """w^2 / (wavelength z) of an aperture of half width w (thesis Fig. 4.2)."""
+    return radius**2 / (wavelength * checks.positive("distance", distance, "metres"))
+
+
+def fresnel_distance(radius: float, wavelength: float, number: float) -> float:
+    """Distance in metres at which the Fresnel number is ``number``.
+
+    Fig. 4.2: for w = 1 mm and 530 nm it is below 30, where the thesis takes Fresnel's model, from 62.89 mm on, and
+    below 1 from 1886.79 mm on, far beyond which it takes Fraunhofer's.
+    """
+    return radius**2 / (wavelength * checks.positive("number", number))
+
+
+def _sine(pitch: float, wavelength: float) -> float:
+    return min(1.0, checks.positive("wavelength", wavelength, "m") / (2 * checks.positive("pitch", pitch, "m")))
+
+
+def _tangent(pitch: float, wavelength: float) -> float:
+    sine = _sine(pitch, wavelength)
+    if sine == 1:
+        raise ValueError(f"pitch must exceed half the wavelength for a diffraction cone, got {pitch!r} m")
+    return math.tan(math.asin(sine))
+
+
+def _positive_focal_length(value: float) -> float:
+    return math.inf if value == math.inf else checks.positive("focal_length", value, "metres")
+
+
+def _before_eyepiece(focus_distance: float, eye_distance: float) -> float:
+    if not focus_distance > eye_distance:
+        raise ValueError(f"focus_distance must exceed the eye's distance from the eyepiece, {eye_distance:g} m, got "
+                         f"{focus_distance!r} m")  # fmt: skip
+    return focus_distance - eye_distance

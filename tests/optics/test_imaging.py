@@ -1,0 +1,201 @@
+"""Two ways to the retina against the thesis's simulation on one axis, oversampled, in plain numpy."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from oracles import eye as oracle
+
+from holotorch import Grid
+from holotorch.core.checks import SamplingWarning
+from holotorch.optics import (
+    Display,
+    Eye,
+    Retina,
+    imaged,
+    least_oversampling,
+    plan_retina,
+    retinal_image,
+    retinal_scale,
+    through_elements,
+)
+from holotorch.optics.elements import ElementSampling
+from holotorch.optics.imaging import CollapseSampling, collapse_sampling
+from holotorch.optics.retina import collapse_error
+
+RED, PITCH, SIZE, FAR = 636e-9, 3.74e-6, 2048, 30e-3
+GRID = Grid((1, SIZE), PITCH)
+DISPLAY, EYE = Display(FAR + 140e-3 / 9, 20e-3, 50e-3), Eye(1.5e-3, 24e-3, 120e-3)
+SMALL = Grid((48, 40), (8e-6, 9e-6))  # planar display for small two-dimensional checks
+NEAR = Display.planar(20e-3)
+NARROW = Eye(0.5e-3, 24e-3, 25e-3, softness=20e-6)
+
+
+def relative(got, wanted) -> float:
+    return float(np.linalg.norm(got - wanted) / np.linalg.norm(wanted))
+
+
+def reference(height: float, oversampling: int, paraxial: bool, **options) -> tuple[torch.Tensor, np.ndarray]:
+    """Hologram of a point, and the retina's intensity at the scaled points of the hologram's grid."""
+    hologram = oracle.point_hologram(SIZE, PITCH, RED, FAR, height, paraxial)
+    x = (np.arange(SIZE) - SIZE // 2) * PITCH
+    near = np.abs(x - height) < 0.4e-3  # holds all of the light but 1e-3 of its intensity's norm
+    scale = retinal_scale(DISPLAY, EYE)
+    display, eye = (DISPLAY.lens_distance, 20e-3, 50e-3), (EYE.focal_length, 1.5e-3, 24e-3)
+    light = np.zeros(SIZE)
+    points = x[near] * scale
+    field = oracle.retina(hologram, PITCH, RED, display, eye, points, oversampling, paraxial, **options)
+    light[near] = np.abs(field) ** 2 * abs(scale)
+    return torch.from_numpy(hologram)[None, None], light
+
+
+@pytest.mark.parametrize("height", [0, 1e-3, 2e-3])
+def test_collapse_equals_the_oversampled_elements(height):
+    hologram, light = reference(height, 8, paraxial=True)
+    got = imaged(hologram, GRID, RED, DISPLAY, EYE, paraxial=True)[0, 0].abs().square().numpy()
+    # Pupil edges fall between samples of 2.2 um here and 1.4 um there, 1e-3 of its width; the issue asks for 2 %.
+    assert relative(got * (light > 0), light) < 4e-3
+    long = through_elements(hologram, GRID, RED, DISPLAY, EYE, paraxial=True)[0, 0].abs().square().numpy()
+    assert relative(long * (light > 0), light) < 1e-3
+
+
+def test_collapse_on_the_axis_equals_exact_legs():
+    # The issue asks for 3 %. Without the spherical aberration of the legs behind the plane: 3.3 %.
+    hologram, light = reference(0.0, 8, paraxial=False)
+    got = imaged(hologram, GRID, RED, DISPLAY, EYE)[0, 0].abs().square().numpy()
+    assert relative(got * (light > 0), light) < 5e-3
+
+
+def test_work_is_a_tenth():
+    full = Grid(2048, PITCH)
+    short = collapse_sampling(full, (RED,), DISPLAY, EYE, FAR)
+    long = least_oversampling(full, (RED,), DISPLAY, EYE)
+    eight = ElementSampling((8, 8), long.padded, (8 * 3 * 2048, 8 * 3 * 2048))
+    assert short.flops < long.flops / 30
+    assert short.flops < eight.flops / 100
+
+
+def test_vignetting():
+    # Rays give 1 / 0.756 / 0.256 / 0 (test_viewing.py); diffraction smooths the edge.
+    powers = []
+    for height in (0, 1e-3, 2e-3, 2.6e-3):
+        hologram = torch.from_numpy(oracle.point_hologram(SIZE, PITCH, RED, FAR, height))[None, None]
+        powers.append(imaged(hologram, GRID, RED, DISPLAY, EYE).abs().square().sum().item())
+    assert np.array(powers) / powers[0] == pytest.approx([1, 0.75, 0.25, 0.005], abs=5e-3)
+
+
+def test_the_hologram_s_own_sampling_aliases():
+    """The pitch of the hologram everywhere, as Algorithm 6 has it: fine on the axis, wrong where the lens is steep."""
+    padded, window = [], []
+    for height in (0, 1e-3, 2e-3):
+        _, light = reference(height, 8, paraxial=True)
+        padded.append(relative(reference(height, 1, paraxial=True)[1], light))
+        window.append(relative(reference(height, 1, paraxial=True, windows=1, impulse=True)[1], light))
+    # With room and a transfer function it is right on the axis, where light that aliases at the eyepiece misses the
+    # pupil. On the hologram's own window with Voelz's impulse response it is nowhere.
+    assert padded == pytest.approx([0.002, 0.001, 0.590], abs=2e-3)
+    assert window == pytest.approx([0.206, 0.277, 1.006], abs=0.03)
+    hologram = reference(0.0, 1, paraxial=False)[0]
+    with pytest.warns(SamplingWarning, match=r"alias in a lens; 4\.76 times would do"):
+        through_elements(hologram, GRID, RED, DISPLAY, EYE, sampling=ElementSampling((1, 1), (1, 4608), (1, 6144)))
+    with pytest.warns(SamplingWarning, match=r"aliases into the pupil; 2\.1\d times would do"):
+        imaged(hologram, GRID, RED, DISPLAY, EYE, sampling=CollapseSampling((1, 1), (1, 4096), (1, 2048), (1, 2048)))
+
+
+def test_plan_takes_the_cheaper_way_that_is_good_enough():
+    on_axis = plan_retina(GRID, RED, DISPLAY, EYE, tolerance=0.02, reach=0.02e-3)
+    assert (on_axis.method, on_axis.adequate) == ("collapse", True)
+    whole = plan_retina(GRID, RED, DISPLAY, EYE, tolerance=0.02, reach=1e-3)
+    assert (whole.method, whole.adequate) == ("elements", True)
+    assert "collapse: error" in whole.runner_up
+    assert plan_retina(GRID, RED, DISPLAY, EYE, tolerance=0.02, paraxial=True).method == "collapse"
+    least = plan_retina(GRID, RED, DISPLAY, EYE, tolerance=1e-5, reach=1e-3)
+    assert (least.method, least.adequate) == ("elements", False)
+    with pytest.raises(ValueError, match="no way to the retina fits into"):
+        plan_retina(GRID, RED, DISPLAY, EYE, memory_limit=1000)
+    rim = Display(DISPLAY.lens_distance, 20e-3, 50e-3, lens_radius=0.5e-3)
+    assert plan_retina(GRID, RED, rim, EYE, tolerance=0.02, paraxial=True).method == "elements"
+
+
+@pytest.mark.parametrize(("height", "error"), [(1e-3, 0.117), (1.5e-3, 0.058), (2e-3, 0.142)])
+def test_predicted_error_beside_the_axis_is_the_measured_one(height, error):
+    hologram, light = reference(height, 8, paraxial=False)
+    got = imaged(hologram, GRID, RED, DISPLAY, EYE)[0, 0].abs().square().numpy()
+    measured = relative(got * (light > 0), light)
+    assert measured == pytest.approx(error, abs=5e-3)
+    # First order in the phase left out, of up to a radian, and rays that end sharply at the edge of the light.
+    assert collapse_error(GRID, RED, DISPLAY, EYE, FAR, [height]) == pytest.approx(measured, rel=0.15)
+
+
+def test_shift_is_most_of_the_error_beside_the_axis():
+    hologram, light = reference(1e-3, 8, paraxial=False)
+    spectrum = np.fft.fft(imaged(hologram, GRID, RED, DISPLAY, EYE)[0, 0].numpy())
+    moved = np.exp(2j * np.pi * np.fft.fftfreq(SIZE, PITCH) * -0.425e-6)  # a ninth of a sample
+    measured = relative(np.abs(np.fft.ifft(spectrum * moved)) ** 2 * (light > 0), light)
+    assert measured == pytest.approx(0.035, abs=3e-3)
+    # The least-squares ramp of the phase is not quite the best shift of the intensity.
+    predicted = collapse_error(GRID, RED, DISPLAY, EYE, FAR, [1e-3], registered=True)
+    assert 0.5 * measured < predicted < measured
+    plan = plan_retina(GRID, RED, DISPLAY, EYE, tolerance=0.05, registered=True)
+    assert plan.method == "collapse"
+
+
+def random_field(grid: Grid) -> torch.Tensor:
+    parts = torch.randn(2, 1, *grid.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    return torch.complex(parts[0], parts[1])
+
+
+def test_both_ways_agree_in_two_dimensions():
+    field = random_field(SMALL)
+    short = Retina(SMALL, RED, NEAR, NARROW, paraxial=True, tolerance=0.1)
+    assert short.plan.method == "collapse"
+    long = through_elements(field, SMALL, RED, NEAR, NARROW, paraxial=True).abs().square()
+    # The collapse loses what leaves the window of 0.38 mm before the plane, 5 mm behind; both see the same middle.
+    middle = (..., slice(12, 36), slice(10, 30))
+    assert relative(short(field)[middle].numpy(), long[middle].numpy()) < 0.05
+    torch.testing.assert_close(
+        retinal_image(field, SMALL, RED, NEAR, NARROW, paraxial=True, tolerance=0.1), short(field)
+    )
+    assert short.scale == pytest.approx(-24 / 25)
+
+
+def test_defocus_and_the_focus_plane_agree():
+    """Seen through the hologram's own plane, a defocused pupil must show what the plane in focus shows."""
+    eye = Eye(0.5e-3, 24e-3, 22e-3, softness=20e-6)
+    y, x = SMALL.coordinates()
+    field = torch.exp(-(y.square() + x.square()) / (2 * 40e-6**2)).to(torch.complex128)[None]
+    at = imaged(field, SMALL, RED, NEAR, eye, paraxial=True).abs().square()
+    through = imaged(field, SMALL, RED, NEAR, eye, plane=0.0, paraxial=True).abs().square()
+    # The same retina in other units: 22 mm against 20 mm of object plane per retina.
+    scale = retinal_scale(NEAR, eye, 0.0) / retinal_scale(NEAR, eye)
+    second = [(light * (x.square() + 0 * y)).sum() / light.sum() for light in (at, through)]
+    assert math.sqrt(second[1] / second[0]) == pytest.approx(1 / scale, rel=2e-3)
+    assert through.sum().item() == pytest.approx(at.sum().item(), rel=2e-3)
+
+
+@pytest.mark.parametrize("way", [imaged, through_elements])
+def test_gradients(way):
+    field, weight = random_field(SMALL), torch.rand(SMALL.shape, dtype=torch.float64)
+    values = [20e-3, 50e-3, 10e-3, 0.5e-3, 30e-3, 24e-3]
+
+    # Sizes fixed: they step with the lengths, by amounts that only matter to finite differences.
+    wide = Eye(0.7e-3, 24e-3, 30e-3, softness=20e-6)
+    if way is imaged:
+        sizes = collapse_sampling(SMALL, (RED,), Display(*values[:3]), wide, 5e-3)
+    else:
+        sizes = least_oversampling(SMALL, (RED,), Display(*values[:3]), wide, plane=5e-3)
+
+    def loss(*lengths):
+        d_el, f_el, d_eye, radius, focus, depth = lengths
+        display, eye = Display(d_el, f_el, d_eye), Eye(radius, depth, focus, softness=20e-6)
+        return (way(field, SMALL, RED, display, eye, plane=5e-3, sampling=sizes).abs().square() * weight).sum()
+
+    given = [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in values]
+    found = torch.autograd.grad(loss(*given), given)
+    for i, (value, gradient) in enumerate(zip(values, found, strict=True)):
+        step = 1e-4 * value
+        ends = [loss(*(v + sign * step * (j == i) for j, v in enumerate(values))).item() for sign in (1, -1)]
+        wanted = (ends[0] - ends[1]) / (2 * step)
+        # Central differences: the third derivative, over phases of tens of radians, leaves about (1e-4 * 30)^2.
+        assert gradient.item() == pytest.approx(wanted, rel=1e-3, abs=1e-5 * loss(*values).item() / value)
