@@ -193,7 +193,7 @@ def _parser() -> argparse.ArgumentParser:
     report.set_defaults(action=_report)
 
     chart = commands.add_parser("chart", help="speed against accuracy of every method, drawn and tabled")
-    chart.add_argument("subject", help="what to chart: pec, propagation, volume")
+    chart.add_argument("subject", help="what to chart: eye, pec, propagation, volume")
     chart.add_argument("--out", type=Path, help="folder for the chart (default: scripts/charts/SUBJECT)")
     chart.set_defaults(action=_chart)
 

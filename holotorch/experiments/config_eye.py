@@ -73,7 +73,7 @@ class LightSettings(Settings):
         "sled",
         "led",
     )
-    tolerance: Annotated[Number, Field(gt=0, lt=1)] = 0.01
+    tolerance: Annotated[Number, Field(gt=0, lt=1)] = 0.02
 
 
 class ObserverSettings(Settings):

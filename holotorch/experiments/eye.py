@@ -87,8 +87,16 @@ class Observer:
 
     def samples(self, source: str, wave: float, depth: float) -> tuple[Tensor, Tensor]:
         """Wavelengths and weights that stand for a source within the tolerance."""
-        away = path_difference(depth, self.aperture(depth))
-        return PRESETS[source](wave).samples(tolerance=self.settings.light.tolerance, path_difference=away)
+        key = (source, wave, depth)
+        if key not in self._rules:
+            away = path_difference(depth, self.aperture(depth))
+            tolerance = self.settings.light.tolerance
+            self._rules[key] = PRESETS[source](wave).samples(tolerance=tolerance, path_difference=away)
+        return self._rules[key]
+
+    @cached_property
+    def _rules(self) -> dict[tuple[str, float, float], tuple[Tensor, Tensor]]:
+        return {}  # choosing wavelengths may take a second
 
     def seen(self, hologram: Tensor, source: str | None, depth: float) -> Tensor:
         """Picture on the retina, referred back to the scene, real [3, h, w] on the rays; None: one wavelength each."""

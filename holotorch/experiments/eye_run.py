@@ -29,6 +29,7 @@ from holotorch.optics.colour import desaturated, linear_srgb
 from holotorch.optics.exposure import equal_power, exposed
 from holotorch.optics.geometry import diffraction_angle
 from holotorch.optics.imaging import retinal_scale
+from holotorch.optics.retina import plan_retina
 from holotorch.optics.viewing import scene_fov
 
 _BRIGHT = 0.995  # of the reference's pixels are at most as bright as what is shown white
@@ -49,6 +50,8 @@ def plan_text(eye: Observer) -> tuple[str, dict[str, Any]]:
     settings, scene, display = eye.settings, eye.scene, eye.display
     depths = [depth * 1e3 for depth in eye.focus]
     waves = scene.settings.wavelengths
+    middle = eye.focus[len(eye.focus) // 2]
+    way = plan_retina(scene.grid, waves, display, eye.eye(middle), plane=middle, reach=scene.width / 2, registered=True)
     counts = {
         source: [len(eye.samples(source, wave, max(eye.focus))[0]) for wave in waves]
         for source in settings.light.sources
@@ -71,6 +74,7 @@ def plan_text(eye: Observer) -> tuple[str, dict[str, Any]]:
         "accommodation_mm": [eye.accommodation(depth) * 1e3 for depth in eye.focus],
         "retinal_scale": [float(retinal_scale(display, eye.eye(depth), depth)) for depth in eye.focus],
         "aperture": [eye.aperture(depth) for depth in eye.focus],
+        "retina": {"method": way.method, "predicted_error": way.predicted_error, "reason": way.reason},
         "wavelengths": counts,
         "hologram_fov_deg": [angle * 57.29577951308232 for angle in angles],
         "scene_fov_deg": None if across is None else across * 57.29577951308232,
@@ -83,6 +87,7 @@ def plan_text(eye: Observer) -> tuple[str, dict[str, Any]]:
         f"Focus      at {', '.join(f'{depth:.4g}' for depth in depths)} mm, seen at "
         f"{', '.join(f'{far:.4g}' for far in values['accommodation_mm'])} mm; aperture "
         f"{', '.join(f'{sine:.3g}' for sine in values['aperture'])}",
+        f"Retina     {way.reason}; next: {way.runner_up}",
         "Light      " + "; ".join(f"{source}: {plain(count)} wavelengths" for source, count in counts.items()),
         f"Phases     {settings.seeds} realisation(s), compared with the mean of {8 * settings.seeds} others",
     ]

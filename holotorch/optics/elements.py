@@ -180,7 +180,7 @@ def _passed(
 
     eyepiece = lens(torch.as_tensor(inverse(display.focal_length), dtype=torch.float64))
     if display.lens_radius is not None:
-        eyepiece = eyepiece * pupil(fine, display.lens_radius, softness=eye.softness)
+        eyepiece = eyepiece * pupil(fine, display.lens_radius, softness=eye.softness).to(field.device)
     light = filter_spectrum(light * eyepiece.to(field.dtype), space(fine, display.eye_distance))
     iris = lens(torch.as_tensor(inverse(eye.focal_length), dtype=torch.float64)) * eye.pupil_function(y, x, wave)
     spectrum = fft2(light * iris.to(field.dtype))

@@ -42,6 +42,7 @@ from holotorch.optics.zoomed import chirps, zoomed
 
 _ROOM = 1.02  # of every limit, for what edges spread beyond the rays
 _FINEST = 64.0
+_SPOTS = 16  # of a point behind a hard pupil kept around the window: its tails carry light in and out
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class CollapseSampling:
     Attributes:
         oversampling: How much finer than the hologram the object plane is sampled.
         padded: Samples of the transform that leads to the object plane, at the hologram's pitch.
-        window: The object plane at the hologram's pitch, wide enough that defocus moves nothing round.
+        window: The object plane at the hologram's pitch, with room for defocus and the tails of spots.
         fine: The same window, oversampled.
     """
 
@@ -154,7 +155,8 @@ def collapse_sampling(
                 each.append(1)
             continue
         # An even number more, so that the axis stays on sample n // 2 of both.
-        wide = size + 2 * math.ceil(blur / pitch)
+        spot = max(wavelengths) * abs(second) / (2 * radius)
+        wide = size + 2 * math.ceil((blur + _SPOTS * spot) / pitch)
         factor = 1.0
         for wave in wavelengths:
             if abs(second) <= 1e-9 * (abs(far) + number(display.eye_distance)):

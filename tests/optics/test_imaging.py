@@ -91,11 +91,11 @@ def test_the_hologram_s_own_sampling_aliases():
     for height in (0, 1e-3, 2e-3):
         _, light = reference(height, 8, paraxial=True)
         padded.append(relative(reference(height, 1, paraxial=True)[1], light))
-        window.append(relative(reference(height, 1, paraxial=True, windows=1, impulse=True)[1], light))
-    # With room and a transfer function it is right on the axis, where light that aliases at the eyepiece misses the
-    # pupil. On the hologram's own window with Voelz's impulse response it is nowhere.
-    assert padded == pytest.approx([0.002, 0.001, 0.590], abs=2e-3)
-    assert window == pytest.approx([0.206, 0.277, 1.006], abs=0.03)
+        window.append(relative(reference(height, 1, paraxial=True, windows=1)[1], light))
+    # Near the axis the light that aliases at the eyepiece misses the pupil; on the hologram's own window more comes
+    # back.
+    assert padded == pytest.approx([0.002, 0.001, 0.590], abs=3e-3)
+    assert window[0] < 0.01 < window[1] < 0.1 < 0.5 < window[2]
     hologram = reference(0.0, 1, paraxial=False)[0]
     with pytest.warns(SamplingWarning, match=r"alias in a lens; 4\.76 times would do"):
         through_elements(hologram, GRID, RED, DISPLAY, EYE, sampling=ElementSampling((1, 1), (1, 4608), (1, 6144)))
@@ -116,6 +116,17 @@ def test_plan_takes_the_cheaper_way_that_is_good_enough():
         plan_retina(GRID, RED, DISPLAY, EYE, memory_limit=1000)
     rim = Display(DISPLAY.lens_distance, 20e-3, 50e-3, lens_radius=0.5e-3)
     assert plan_retina(GRID, RED, rim, EYE, tolerance=0.02, paraxial=True).method == "elements"
+
+
+def test_impossible_ways():
+    with pytest.raises(ValueError, match="the pupil is an image of this object plane"):
+        imaged(random_field(SMALL), SMALL, RED, NEAR, NARROW, plane=20e-3)
+    with pytest.warns(SamplingWarning, match="no way meets the tolerance 1e-06; elements at"):
+        Retina(SMALL, RED, NEAR, NARROW, tolerance=1e-6)
+    with pytest.raises(ValueError, match=r"field must end in \(C, H, W\) = \(1, 48, 40\)"):
+        imaged(random_field(SMALL)[0], SMALL, RED, NEAR, NARROW)
+    with pytest.raises(TypeError, match="field must be complex"):
+        through_elements(random_field(SMALL).real, SMALL, RED, NEAR, NARROW)
 
 
 @pytest.mark.parametrize(("height", "error"), [(1e-3, 0.117), (1.5e-3, 0.058), (2e-3, 0.142)])

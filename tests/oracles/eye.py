@@ -11,12 +11,11 @@ def point_hologram(size, pitch, wavelength, distance, height, paraxial=True):
     return np.exp(-1j * k * path) * (np.abs(x) <= distance * tangent)
 
 
-def retina(hologram, pitch, wavelength, display, eye, points, oversampling, paraxial=True, windows=3, impulse=False):
+def retina(hologram, pitch, wavelength, display, eye, points, oversampling, paraxial=True, windows=3):
     """Field at ``points`` of the retina: free space, lens, free space, lens of the eye, free space.
 
     ``display`` is (d_el, f_el, d_eye), ``eye`` (f_eye, r_eye, d_r). Samples are ``oversampling`` times as fine as those
-    of the hologram, which is interpolated by its own spectrum, on a window of ``windows`` holograms. ``impulse`` takes
-    the sampled impulse response for free space, as Voelz does for long distances, instead of the transfer function.
+    of the hologram, which is interpolated by its own spectrum, on a window of ``windows`` holograms.
     """
     (d_el, f_el, d_eye), (f_eye, r_eye, d_r) = display, eye
     size = windows * len(hologram)
@@ -30,12 +29,11 @@ def retina(hologram, pitch, wavelength, display, eye, points, oversampling, para
     spectrum = np.fft.ifftshift(spectrum)
     step = pitch / oversampling
     x, f = (np.arange(many) - many // 2) * step, np.fft.fftfreq(many, step)
-    space = impulse_response if impulse else transfer
     for distance, focal_length, radius in ((d_el, f_el, np.inf), (d_eye, f_eye, r_eye)):
-        field = np.fft.fftshift(np.fft.ifft(spectrum * space(f, wavelength, distance, paraxial)))
+        field = np.fft.fftshift(np.fft.ifft(spectrum * transfer(f, wavelength, distance, paraxial)))
         field = field * np.exp(-1j * np.pi * x**2 / (wavelength * focal_length)) * (np.abs(x) <= radius)
         spectrum = np.fft.fft(np.fft.ifftshift(field))
-    spectrum = spectrum * space(f, wavelength, d_r, paraxial)
+    spectrum = spectrum * transfer(f, wavelength, d_r, paraxial)
     return np.exp(2j * np.pi * np.outer(points, f)) @ spectrum / many
 
 
@@ -47,11 +45,3 @@ def transfer(frequency, wavelength, distance, paraxial):
     travels = s2 < 1
     cosine = np.sqrt(np.where(travels, 1 - s2, 0))
     return np.where(travels, np.exp(-2j * np.pi / wavelength * distance * s2 / (1 + cosine)), 0)
-
-
-def impulse_response(frequency, wavelength, distance, paraxial=True):
-    """Transform of Fresnel's impulse response, sampled; it aliases where the window exceeds lambda z / step."""
-    assert paraxial
-    step = 1 / (len(frequency) * frequency[1])
-    x = np.fft.fftfreq(len(frequency), 1 / len(frequency)) * step
-    return np.fft.fft(np.exp(1j * np.pi * x**2 / (wavelength * distance))) * step / np.sqrt(1j * wavelength * distance)

@@ -1,0 +1,189 @@
+"""The way to the retina: error against time, wavelengths against error, and speckle against sharpness."""
+
+import io
+import math
+import time
+import warnings
+from dataclasses import replace
+from typing import Any
+
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from holotorch.core.checks import SamplingWarning
+from holotorch.core.complex import intensity
+from holotorch.core.fourier import good_length
+from holotorch.experiments.config import load_config
+from holotorch.experiments.config_eye import ObserverSettings
+from holotorch.experiments.config_volume import VolumeSettings
+from holotorch.experiments.eye import PRESETS, Observer, observer
+from holotorch.experiments.eye_tradeoff import WIDTHS, Case, fitted_prefactor, tradeoff
+from holotorch.io.bundled import find_config
+from holotorch.optics.coherence import path_difference
+from holotorch.optics.elements import ElementSampling, least_oversampling, through_elements
+from holotorch.optics.imaging import imaged
+from holotorch.optics.retina import plan_retina
+
+SIDE, DISTANCES = 512, (10e-3, 20e-3, 30e-3)
+SCENE = "hologram={{shape: [{0}, {0}], pitch: 3.74 um, distance: 30 mm, depths: 58, rays: {1}}}"
+FACTORS = (1.0, 2.0, 4.0)
+
+
+def eye() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
+    """Rows of ways and of sources, rows of the trade-off, pictures by name, and the verdict."""
+    looking, shown = find_config("configs/eye/teapot.yaml"), find_config("configs/volume/c60.yaml")
+    assert looking is not None and shown is not None
+    settings, scene = load_config(looking), load_config(shown, [_scene()])
+    assert isinstance(settings, ObserverSettings) and isinstance(scene, VolumeSettings)
+    found = observer(settings.model_copy(update={"focus": (30e-3,)}), scene)
+    ways = _ways(found)
+    counts = _counts(found)
+    cases = tradeoff(settings, scene, DISTANCES)
+    rows = [_case_row(case, fitted_prefactor(cases)) for case in cases]
+    return ways + counts, rows, {"chart": _draw(ways, counts, cases)}, _verdict(ways, counts, cases)
+
+
+def _scene() -> str:
+    return SCENE.format(SIDE, SIDE // 2)
+
+
+def _ways(eye: Observer) -> list[dict]:
+    """Collapse and elements for green light, paraxial: error of the retina's intensity against finer elements."""
+    grid, depth, wave = eye.scene.grid, eye.focus[0], eye.scene.settings.wavelengths[1]
+    hologram, _ = eye.scene.hologram(0)
+    field, looking, display = hologram[1].conj()[None], eye.eye(depth), eye.display
+    least = least_oversampling(grid, [wave], display, looking, plane=depth)
+    wanted = intensity(
+        through_elements(field, grid, [wave], display, looking, plane=depth, sampling=_finer(least, 1.6), paraxial=True)
+    )
+    plan = plan_retina(grid, [wave], display, looking, plane=depth, paraxial=True)
+    needed = max(least.oversampling)
+    calls: dict[str, Any] = {
+        "collapse": lambda: imaged(field, grid, [wave], display, looking, plane=depth, paraxial=True)
+    }
+    for factor in (*(f for f in FACTORS if f < 0.95 * needed), needed):
+        sampling = _finer(least, factor / needed)
+        name = f"elements, {factor:.2g} x" + (", the thesis's sampling" if factor == 1 else "")
+        calls[name] = lambda sampling=sampling: through_elements(
+            field, grid, [wave], display, looking, plane=depth, sampling=sampling, paraxial=True
+        )
+    rows = []
+    for name, call in calls.items():
+        with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the coarse ones alias: that is shown
+            call()
+            started = time.perf_counter()
+            seen = intensity(call())
+            seconds = time.perf_counter() - started
+        error = ((seen - wanted).square().sum() / wanted.square().sum()).sqrt().item()
+        predicted = f"{plan.predicted_error:.1e}" if name == "collapse" else ""
+        rows.append(_row("way", name, seconds=f"{seconds:.3f}", error=f"{error:.1e}", predicted=predicted))
+    return rows
+
+
+def _finer(least: ElementSampling, factor: float) -> ElementSampling:
+    """``least`` with so many times its samples."""
+    fine = tuple(good_length(math.ceil(size * factor / 2) * 2) for size in least.fine)
+    times = tuple(m * now / size for m, now, size in zip(least.oversampling, fine, least.fine, strict=True))
+    return replace(least, oversampling=times, fine=fine)  # type: ignore[arg-type]
+
+
+def _counts(eye: Observer) -> list[dict]:
+    """Error of a picture in green light by the number of wavelengths, against one every nanometre."""
+    depth, wave = eye.focus[0], eye.scene.settings.wavelengths[1]
+    hologram, _ = eye.scene.hologram(0)
+    away = path_difference(depth, eye.aperture(depth))
+    rows = []
+    for source, make in PRESETS.items():
+        spectrum = make(wave)
+        dense, weights = spectrum.every(1e-9)
+        wanted = _sum(eye, hologram[1], dense, weights)
+        for count in sorted({1, 2, 3, 4, 6, 9, 14, 20} | {len(dense)}):
+            if count > len(dense):
+                continue
+            few = spectrum.samples(count, path_difference=away) if count < len(dense) else (dense, weights)
+            started = time.perf_counter()
+            seen = _sum(eye, hologram[1], *few)
+            seconds = time.perf_counter() - started
+            error = ((seen - wanted).square().mean() / wanted.square().mean()).sqrt().item()
+            rows.append(_row(source, f"{count} of {len(dense)}", seconds=f"{seconds:.3f}", error=f"{error:.1e}"))
+    return rows
+
+
+def _sum(eye: Observer, field: Tensor, places: Tensor, weights: Tensor) -> Tensor:
+    depth, looking, total = eye.focus[0], eye.eye(eye.focus[0]), torch.zeros(())
+    for place, weight in zip(places.tolist(), weights.tolist(), strict=True):
+        image = imaged(field.conj()[None], eye.scene.grid, [place], eye.display, looking, plane=depth)
+        total = total + weight * intensity(image[0])
+    return total
+
+
+def _row(subject: str, what: str, **numbers: str) -> dict:
+    return {"subject": subject, "what": what, "seconds": "", "error": "", "predicted": ""} | numbers
+
+
+def _case_row(case: Case, prefactor: float) -> dict:
+    return {
+        "distance_mm": case.distance * 1e3,
+        "wavelength_nm": round(case.wavelength * 1e9),
+        "aperture": round(case.aperture, 4),
+        "best_fwhm_nm": round(case.best * 1e9, 2),
+        "inside": case.inside,
+        "formula_nm": round(case.formula(prefactor) * 1e9, 2),
+        **{f"ssim_{width * 1e9:g}": round(value, 4) for width, value in zip(WIDTHS, case.ssim, strict=True)},
+        **{f"contrast_{width * 1e9:g}": round(value, 3) for width, value in zip(WIDTHS, case.contrast, strict=True)},
+        **{f"predicted_{width * 1e9:g}": round(case.predicted(width), 3) for width in WIDTHS},
+    }
+
+
+def _verdict(ways: list[dict], counts: list[dict], cases: list[Case]) -> list[str]:
+    lines = [f"torch {torch.__version__}, {torch.get_num_threads()} threads; {SIDE} px, synthetic C60 at 30 mm, 520 nm"]
+    lines += [f"{row['what']}: error {row['error']}, {row['seconds']} s {row['predicted']}".rstrip() for row in ways]
+    for source in PRESETS:
+        own = [row for row in counts if row["subject"] == source]
+        lines.append(f"{source}: " + "; ".join(f"{row['what']} nm steps {row['error']}" for row in own[:-1]))
+    prefactor = fitted_prefactor(cases)
+    inside = [case for case in cases if case.inside]
+    off = [case.best / case.formula(prefactor) - 1 for case in inside]
+    lines.append(
+        f"best FWHM = 2 x {prefactor:.2f} wavelength^2 / (aperture^2 distance): {len(inside)} of {len(cases)} optima "
+        f"lie inside the widths tried, off by {min(off, default=0):+.0%} to {max(off, default=0):+.0%}"
+    )
+    for case in cases:
+        narrow = WIDTHS[max(range(len(WIDTHS)), key=case.ssim.__getitem__)] * 1e9
+        lines.append(
+            f"{case.distance * 1e3:g} mm, {case.wavelength * 1e9:.0f} nm, aperture {case.aperture:.3f}: best "
+            f"{case.best * 1e9:.1f} nm (formula {case.formula(prefactor) * 1e9:.1f}); of those tried {narrow:g} nm"
+        )
+    return lines
+
+
+def _draw(ways: list[dict], counts: list[dict], cases: list[Case]) -> bytes:
+    figure = Figure(figsize=(16, 5), layout="constrained")
+    first, second, third = (figure.add_subplot(1, 3, k + 1) for k in range(3))
+    for k, row in enumerate(ways):
+        first.loglog(float(row["seconds"]), max(float(row["error"]), 1e-6), "os^vDP"[k % 6], label=row["what"])
+    first.set_xlabel("seconds")
+    first.set_ylabel("relative L2 error of the retina's intensity")
+    for source in PRESETS:
+        own = [row for row in counts if row["subject"] == source][:-1]
+        second.semilogy(
+            [int(row["what"].split()[0]) for row in own], [float(row["error"]) for row in own], "o-", label=source
+        )
+    second.set_xlabel("wavelengths")
+    second.set_ylabel("relative L2 error against one every nm")
+    for k, case in enumerate(cases):
+        label = f"{case.distance * 1e3:g} mm, {case.wavelength * 1e9:.0f} nm"
+        widths = [width * 1e9 for width in WIDTHS]
+        third.semilogx(
+            widths, case.ssim, color=("C3", "C2", "C0")[k % 3], linestyle=("-", "--", ":")[k // 3 % 3], label=label
+        )
+    third.set_xlabel("FWHM (nm)")
+    third.set_ylabel("SSIM to the speckle-free mean")
+    for axes in (first, second, third):
+        axes.grid(alpha=0.3, which="both")
+        axes.legend(fontsize=7)
+    buffer = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(buffer)
+    return buffer.getvalue()

@@ -1,0 +1,129 @@
+"""Speckle against sharpness: which spectral width shows a volume best, per colour and depth (thesis Sec. 6.4.2)."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from holotorch.core.complex import intensity
+from holotorch.experiments.config_eye import ObserverSettings
+from holotorch.experiments.config_volume import VolumeSettings
+from holotorch.experiments.eye import Observer, observer
+from holotorch.experiments.volume_judge import pooled
+from holotorch.metrics import seed_statistics, sharpness, speckle_contrast, ssim
+from holotorch.optics.coherence import optimum_fwhm, path_difference, predicted_contrast
+from holotorch.optics.exposure import equal_power, exposed
+from holotorch.optics.imaging import imaged
+from holotorch.optics.spectrum import Spectrum
+
+WIDTHS = tuple(1e-9 * width for width in (1.4, 2.5, 4, 6, 9, 13, 19, 28, 40))
+_AWAY = 1e-9 * np.array([0, 0.5, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 15, 18, 22, 26, 30, 36, 42, 50, 60])
+_OTHERS = 1000  # seeds of the reference
+
+
+@dataclass(frozen=True)
+class Case:
+    """One colour at one distance.
+
+    Attributes:
+        distance: Of the scene from the hologram, in metres.
+        wavelength: In metres.
+        aperture: Sine that the eye, or the hologram, collects.
+        ssim: Of each of ``WIDTHS``, against the mean of other realisations.
+        contrast: Of each.
+        sharpness: Of each.
+        best: FWHM of the highest SSIM, by a parabola through its neighbours, in metres.
+        inside: Whether it lies inside the range of widths.
+    """
+
+    distance: float
+    wavelength: float
+    aperture: float
+    ssim: tuple[float, ...]
+    contrast: tuple[float, ...]
+    sharpness: tuple[float, ...]
+    best: float
+    inside: bool
+
+    def formula(self, prefactor: float) -> float:
+        """The closed form's FWHM in metres."""
+        return optimum_fwhm(self.wavelength, self.aperture, self.distance, defocus=prefactor)
+
+    def predicted(self, width: float) -> float:
+        """Contrast in closed form at a FWHM."""
+        spectrum = Spectrum.lorentzian(self.wavelength, width)
+        return predicted_contrast(spectrum, path_difference(self.distance, self.aperture))
+
+
+def tradeoff(
+    settings: ObserverSettings, scene: VolumeSettings, distances: tuple[float, ...], *, seeds: int = 2, others: int = 12
+) -> list[Case]:
+    """Cases for every distance and colour; the eye is focused on the middle of the scene."""
+    cases = []
+    for distance in tqdm(distances, desc="speckle against sharpness", unit="distance"):
+        moved = scene.model_copy(update={"hologram": scene.hologram.model_copy(update={"distance": distance})})
+        found = observer(settings.model_copy(update={"focus": (distance,)}), moved)
+        found = replace(found, focus=(distance,))
+        own = [found.scene.hologram(seed)[0] for seed in range(seeds)]
+        rest = [found.scene.hologram(_OTHERS + seed)[0] for seed in range(others)]
+        for colour, wave in enumerate(moved.wavelengths):
+            reference = seed_statistics(torch.stack([_seen(found, h[colour], wave) for h in rest])).mean
+            cases.append(_case(found, colour, wave, own, reference))
+    return cases
+
+
+def _seen(eye: Observer, field: Tensor, wave: float) -> Tensor:
+    depth = eye.focus[0]
+    image = imaged(field.conj()[None], eye.scene.grid, [wave], eye.display, eye.eye(depth), plane=depth)
+    return pooled(intensity(image[0]), eye.scene.stride)
+
+
+def _case(eye: Observer, colour: int, wave: float, holograms: list[Tensor], reference: Tensor) -> Case:
+    depth = eye.focus[0]
+    places = wave + np.concatenate([-_AWAY[:0:-1], _AWAY])
+    shown = []
+    for hologram in holograms:
+        stack = torch.stack([_seen(eye, hologram[colour], float(place)) for place in places])
+        shown.append(torch.stack([_weighted(stack, places, Spectrum.lorentzian(wave, width)) for width in WIDTHS]))
+    pictures = equal_power(torch.stack(shown), reference.expand(len(holograms), len(WIDTHS), *reference.shape))
+    peak = reference.flatten().quantile(0.995)
+    tone = exposed(pictures[..., None, :, :], peak=peak), exposed(reference[None], peak=peak)
+    quality = ssim(tone[0], tone[1].expand_as(tone[0]).contiguous(), data_range=1.0)[..., 0].mean(0)
+    mask = reference > 0.05 * reference.max()
+    contrast = speckle_contrast(pictures, reference=reference, mask=mask).mean(0)
+    best, inside = _peak(np.log(np.array(WIDTHS)), quality.numpy())
+    return Case(
+        depth,
+        wave,
+        eye.aperture(depth),
+        tuple(quality.tolist()),
+        tuple(contrast.tolist()),
+        tuple(sharpness(pictures, reference).mean(0).tolist()),
+        float(np.exp(best)),
+        inside,
+    )
+
+
+def _weighted(stack: Tensor, places: np.ndarray, spectrum: Spectrum) -> Tensor:
+    """Sum over wavelengths by the trapezoidal rule within the spectrum's band."""
+    low, high = spectrum.band()
+    inside = torch.tensor((places >= low - 1e-13) & (places <= high + 1e-13))
+    spacing = torch.from_numpy(np.gradient(places))
+    power = spectrum.power(torch.from_numpy(np.clip(places, low, high))) * spacing * inside
+    return torch.tensordot((power / power.sum()).to(stack), stack, 1)
+
+
+def _peak(places: np.ndarray, values: np.ndarray) -> tuple[float, bool]:
+    i = int(values.argmax())
+    if not 0 < i < len(places) - 1:
+        return float(places[i]), False
+    a, b, _ = np.polyfit(places[i - 1 : i + 2], values[i - 1 : i + 2], 2)
+    return float(-b / (2 * a)), True
+
+
+def fitted_prefactor(cases: list[Case]) -> float:
+    """Prefactor of the closed form that fits the measured optima best, in the mean of their logarithms."""
+    ratios = [np.log(case.best / case.formula(1.0)) for case in cases if case.inside]
+    return float(np.exp(np.mean(ratios))) if ratios else float("nan")
