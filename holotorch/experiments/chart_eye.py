@@ -151,10 +151,10 @@ def _verdict(ways: list[dict], counts: list[dict], cases: list[Case]) -> list[st
         f"lie inside the widths tried, off by {min(off, default=0):+.0%} to {max(off, default=0):+.0%}"
     )
     for case in cases:
-        narrow = WIDTHS[max(range(len(WIDTHS)), key=case.ssim.__getitem__)] * 1e9
         lines.append(
             f"{case.distance * 1e3:g} mm, {case.wavelength * 1e9:.0f} nm, aperture {case.aperture:.3f}: best "
-            f"{case.best * 1e9:.1f} nm (formula {case.formula(prefactor) * 1e9:.1f}); of those tried {narrow:g} nm"
+            f"{case.best * 1e9:.1f} nm (formula {case.formula(prefactor) * 1e9:.1f}), nearest to a "
+            f"{case.source.replace('_', ' ')}"
         )
     return lines
 

@@ -1,5 +1,6 @@
 """Speckle against sharpness: which spectral width shows a volume best, per colour and depth (thesis Sec. 6.4.2)."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from tqdm import tqdm
 from holotorch.core.complex import intensity
 from holotorch.experiments.config_eye import ObserverSettings
 from holotorch.experiments.config_volume import VolumeSettings
-from holotorch.experiments.eye import Observer, observer
+from holotorch.experiments.eye import PRESETS, Observer, observer
 from holotorch.experiments.volume_judge import pooled
 from holotorch.metrics import seed_statistics, sharpness, speckle_contrast, ssim
 from holotorch.optics.coherence import optimum_fwhm, path_difference, predicted_contrast
@@ -30,7 +31,7 @@ class Case:
     Attributes:
         distance: Of the scene from the hologram, in metres.
         wavelength: In metres.
-        aperture: Sine that the eye, or the hologram, collects.
+        aperture: Sine up to which detail is carried: by the eye, the hologram, or the rays' own pitch.
         ssim: Of each of ``WIDTHS``, against the mean of other realisations.
         contrast: Of each.
         sharpness: Of each.
@@ -50,6 +51,11 @@ class Case:
     def formula(self, prefactor: float) -> float:
         """The closed form's FWHM in metres."""
         return optimum_fwhm(self.wavelength, self.aperture, self.distance, defocus=prefactor)
+
+    @property
+    def source(self) -> str:
+        """Preset whose FWHM is nearest to the best."""
+        return min(PRESETS, key=lambda name: abs(math.log(PRESETS[name](self.wavelength).fwhm / self.best)))
 
     def predicted(self, width: float) -> float:
         """Contrast in closed form at a FWHM."""
@@ -97,7 +103,7 @@ def _case(eye: Observer, colour: int, wave: float, holograms: list[Tensor], refe
     return Case(
         depth,
         wave,
-        eye.aperture(depth),
+        eye.detail(depth, wave),
         tuple(quality.tolist()),
         tuple(contrast.tolist()),
         tuple(sharpness(pictures, reference).mean(0).tolist()),

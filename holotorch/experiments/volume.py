@@ -1,6 +1,7 @@
 """The volume experiment: a configuration made into a volume, its renderer and a hologram per colour."""
 
 import math
+import textwrap
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -228,7 +229,7 @@ def _volume(source: VolumeSource) -> tuple[Volume, str]:
                 try:
                     return fetch_volume(name, source.directory), ""
                 except (OSError, ValueError) as error:
-                    why = f"{source.scene} could not be fetched ({error})"
+                    why = f"{source.scene} could not be fetched ({textwrap.shorten(str(error), 70)})"
             else:
                 why = f"no checksum of {source.scene} is published; give its file as volume.path"
             if not source.phantom:
