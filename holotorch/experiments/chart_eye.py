@@ -19,7 +19,7 @@ from holotorch.experiments.config import load_config
 from holotorch.experiments.config_eye import ObserverSettings
 from holotorch.experiments.config_volume import VolumeSettings
 from holotorch.experiments.eye import PRESETS, Observer, observer
-from holotorch.experiments.eye_tradeoff import WIDTHS, Case, fitted_prefactor, tradeoff
+from holotorch.experiments.eye_tradeoff import WIDTHS, Case, fitted_prefactor, in_words, tradeoff
 from holotorch.io.bundled import find_config
 from holotorch.optics.coherence import path_difference
 from holotorch.optics.elements import ElementSampling, least_oversampling, through_elements
@@ -41,7 +41,7 @@ def eye() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
     ways = _ways(found)
     counts = _counts(found)
     cases = tradeoff(settings, scene, DISTANCES)
-    rows = [_case_row(case, fitted_prefactor(cases)) for case in cases]
+    rows = [case.row(fitted_prefactor(cases)) for case in cases]
     return ways + counts, rows, {"chart": _draw(ways, counts, cases)}, _verdict(ways, counts, cases)
 
 
@@ -123,39 +123,13 @@ def _row(subject: str, what: str, **numbers: str) -> dict:
     return {"subject": subject, "what": what, "seconds": "", "error": "", "predicted": ""} | numbers
 
 
-def _case_row(case: Case, prefactor: float) -> dict:
-    return {
-        "distance_mm": case.distance * 1e3,
-        "wavelength_nm": round(case.wavelength * 1e9),
-        "aperture": round(case.aperture, 4),
-        "best_fwhm_nm": round(case.best * 1e9, 2),
-        "inside": case.inside,
-        "formula_nm": round(case.formula(prefactor) * 1e9, 2),
-        **{f"ssim_{width * 1e9:g}": round(value, 4) for width, value in zip(WIDTHS, case.ssim, strict=True)},
-        **{f"contrast_{width * 1e9:g}": round(value, 3) for width, value in zip(WIDTHS, case.contrast, strict=True)},
-        **{f"predicted_{width * 1e9:g}": round(case.predicted(width), 3) for width in WIDTHS},
-    }
-
-
 def _verdict(ways: list[dict], counts: list[dict], cases: list[Case]) -> list[str]:
     lines = [f"torch {torch.__version__}, {torch.get_num_threads()} threads; {SIDE} px, synthetic C60 at 30 mm, 520 nm"]
     lines += [f"{row['what']}: error {row['error']}, {row['seconds']} s {row['predicted']}".rstrip() for row in ways]
     for source in PRESETS:
         own = [row for row in counts if row["subject"] == source]
         lines.append(f"{source}: " + "; ".join(f"{row['what']} nm steps {row['error']}" for row in own[:-1]))
-    prefactor = fitted_prefactor(cases)
-    inside = [case for case in cases if case.inside]
-    off = [case.best / case.formula(prefactor) - 1 for case in inside]
-    lines.append(
-        f"best FWHM = 2 x {prefactor:.2f} wavelength^2 / (aperture^2 distance): {len(inside)} of {len(cases)} optima "
-        f"lie inside the widths tried, off by {min(off, default=0):+.0%} to {max(off, default=0):+.0%}"
-    )
-    for case in cases:
-        lines.append(
-            f"{case.distance * 1e3:g} mm, {case.wavelength * 1e9:.0f} nm, aperture {case.aperture:.3f}: best "
-            f"{case.best * 1e9:.1f} nm (formula {case.formula(prefactor) * 1e9:.1f}), nearest to a "
-            f"{case.source.replace('_', ' ')}"
-        )
+    lines += in_words(cases)
     return lines
 
 

@@ -80,7 +80,8 @@ class ObserverSettings(Settings):
     """What an observer sees of a volume's hologram, for several light sources and depths of focus.
 
     ``focus``: depths of the scene in which the eye is focused; a tenth, half and nine tenths of it by default.
-    ``seeds``: realisations of the phases, which are compared with the mean of as many others.
+    ``seeds``: realisations of the phases, which are compared with the mean of eight times as many others.
+    ``tradeoff``: distances at which the best spectral width is looked for as well, colour by colour.
     """
 
     experiment: Literal["eye"]
@@ -91,3 +92,4 @@ class ObserverSettings(Settings):
     light: LightSettings = LightSettings()
     focus: Annotated[tuple[Positive, ...], BeforeValidator(several)] | None = None
     seeds: Annotated[Count, Field(le=64)] = 2
+    tradeoff: Annotated[tuple[Positive, ...], BeforeValidator(several)] = ()

@@ -18,6 +18,7 @@ from holotorch.experiments.config_volume import VolumeSettings
 from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.eye import Observer, observer, realisations
+from holotorch.experiments.eye_tradeoff import fitted_prefactor, in_words, tradeoff
 from holotorch.experiments.markup import figure, plain, table
 from holotorch.experiments.memory import peak_memory
 from holotorch.experiments.run import claim, deferred, interruptible
@@ -125,6 +126,10 @@ def run_observer(settings: ObserverSettings, out: Path | None, name: str) -> tup
                 raise
         with deferred(pressed):
             _write(folder, eye, reference, torch.stack(seen), values, time.perf_counter() - started, not pressed)
+    if settings.tradeoff and not pressed:
+        cases = tradeoff(settings, scene_settings(settings), settings.tradeoff)
+        write_table(folder / "tradeoff.csv", [case.row(fitted_prefactor(cases)) for case in cases])
+        print("\n".join(in_words(cases)))
     return folder, not pressed
 
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -51,6 +52,22 @@ class Case:
     def formula(self, prefactor: float) -> float:
         """The closed form's FWHM in metres."""
         return optimum_fwhm(self.wavelength, self.aperture, self.distance, defocus=prefactor)
+
+    def row(self, prefactor: float) -> dict[str, Any]:
+        """A line of a table; ``prefactor`` is that of the closed form."""
+        return {
+            "distance_mm": self.distance * 1e3,
+            "wavelength_nm": round(self.wavelength * 1e9),
+            "aperture": round(self.aperture, 4),
+            "best_fwhm_nm": round(self.best * 1e9, 2),
+            "inside": self.inside,
+            "formula_nm": round(self.formula(prefactor) * 1e9, 2),
+            **{f"ssim_{width * 1e9:g}": round(value, 4) for width, value in zip(WIDTHS, self.ssim, strict=True)},
+            **{
+                f"contrast_{width * 1e9:g}": round(value, 3) for width, value in zip(WIDTHS, self.contrast, strict=True)
+            },
+            **{f"predicted_{width * 1e9:g}": round(self.predicted(width), 3) for width in WIDTHS},
+        }
 
     @property
     def source(self) -> str:
@@ -133,3 +150,22 @@ def fitted_prefactor(cases: list[Case]) -> float:
     """Prefactor of the closed form that fits the measured optima best, in the mean of their logarithms."""
     ratios = [np.log(case.best / case.formula(1.0)) for case in cases if case.inside]
     return float(np.exp(np.mean(ratios))) if ratios else float("nan")
+
+
+def in_words(cases: list[Case]) -> list[str]:
+    """What the cases say: the closed form that fits them, how far off it is, and the best source of each."""
+    lines = []
+    prefactor = fitted_prefactor(cases)
+    inside = [case for case in cases if case.inside]
+    off = [case.best / case.formula(prefactor) - 1 for case in inside]
+    lines.append(
+        f"best FWHM = 2 x {prefactor:.2f} wavelength^2 / (aperture^2 distance): {len(inside)} of {len(cases)} optima "
+        f"lie inside the widths tried, off by {min(off, default=0):+.0%} to {max(off, default=0):+.0%}"
+    )
+    for case in cases:
+        lines.append(
+            f"{case.distance * 1e3:g} mm, {case.wavelength * 1e9:.0f} nm, aperture {case.aperture:.3f}: best "
+            f"{case.best * 1e9:.1f} nm (formula {case.formula(prefactor) * 1e9:.1f}), nearest to a "
+            f"{case.source.replace('_', ' ')}"
+        )
+    return lines

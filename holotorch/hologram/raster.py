@@ -8,6 +8,8 @@ from torch import Tensor
 from holotorch.core.fourier import fft2, good_length, ifft2
 from holotorch.core.grid import Grid
 
+_SOME = 251  # elements between those that are asked first
+
 
 class Raster:
     """A periodic array of ``size`` samples (N_y, N_x) in which sources ``stride`` apart and pixels share positions.
@@ -79,8 +81,10 @@ def strided_length(minimum: int, stride: int) -> int:
 
 
 def lit(plane: Tensor) -> bool:
-    """Whether any element is not zero (NaN is not); several times faster than ``any``."""
+    """Whether any element is not zero (NaN is not). A few are asked first, then all, faster than ``any`` does."""
     if plane.is_complex():
         plane = torch.view_as_real(plane.resolve_conj())
+    if plane.is_contiguous() and plane.detach().view(-1)[::_SOME].any():
+        return True
     low, high = torch.aminmax(plane.detach())
     return bool((low != 0) | (high != 0))
