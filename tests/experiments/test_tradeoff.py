@@ -1,0 +1,57 @@
+"""Speckle against sharpness: the best width, and the closed form that goes with it."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from holotorch.experiments import eye_tradeoff
+from holotorch.experiments.config import load_config
+from holotorch.experiments.eye_tradeoff import WIDTHS, Case, fitted_prefactor, in_words, tradeoff
+from holotorch.io.bundled import find_config
+from holotorch.optics.spectrum import Spectrum
+
+
+def case(distance: float, wavelength: float, aperture: float, best: float, inside: bool = True) -> Case:
+    flat = (0.5,) * len(WIDTHS)
+    return Case(distance, wavelength, aperture, flat, flat, flat, best, inside)
+
+
+def test_the_prefactor_is_that_of_the_cases():
+    """FWHM = 2 k wavelength^2 / (aperture^2 distance), with k = 0.5 and one case off by a tenth each way."""
+    cases = []
+    for distance, off in ((0.01, 1.1), (0.02, 1 / 1.1), (0.03, 1.0)):
+        cases.append(case(distance, 520e-9, 0.04, off * 520e-9**2 / (0.04**2 * distance)))
+    cases.append(case(0.05, 520e-9, 0.04, 1e-6, inside=False))  # beyond the widths tried: it tells nothing
+    assert fitted_prefactor(cases) == pytest.approx(0.5, rel=1e-12)
+    words = in_words(cases)
+    assert "3 of 4 optima" in words[0] and "-9% to +10%" in words[0] and "nearest to a narrow sled" in words[2]
+    assert math.isnan(fitted_prefactor([cases[-1]]))
+
+
+def test_weights_are_those_of_the_spectrum():
+    places = 520e-9 + np.arange(-40, 41) * 1e-9
+    stack = torch.from_numpy((places - 520e-9) ** 2)[:, None, None]
+    spectrum = Spectrum.lorentzian(520e-9, 10e-9)
+    dense, weights = spectrum.measure()
+    wanted = (weights * (dense - 520e-9).square()).sum().item()
+    found = eye_tradeoff._weighted(stack, places, spectrum).item()
+    # The trapezoidal rule in steps of a tenth of the width, cut at a band that need not end on a step.
+    assert found == pytest.approx(wanted, rel=0.05)
+
+
+def test_a_small_scene_has_its_cases(monkeypatch):
+    monkeypatch.setattr(eye_tradeoff, "_AWAY", 1e-9 * np.array([0, 5, 15, 40]))
+    looking, shown = find_config("configs/eye/teapot.yaml"), find_config("configs/volume/c60.yaml")
+    assert looking is not None and shown is not None
+    change = "hologram={shape: [128, 128], pitch: 3.74 um, distance: 12 mm, depths: 8, rays: 64}"
+    scene = load_config(shown, [change, "volume={phantom: c60, samples: 24}"])
+    cases = tradeoff(load_config(looking), scene, (12e-3,), seeds=1, others=2)
+    assert [found.wavelength for found in cases] == list(scene.wavelengths)
+    for found in cases:
+        assert len(found.ssim) == len(WIDTHS) and found.contrast[0] > found.contrast[-1]
+        # 64 rays of 7.48 um: what they carry, or what a hologram of 0.48 mm at 12 mm collects.
+        assert found.aperture == pytest.approx(min(0.02, found.wavelength / 14.96e-6), rel=0.02)
+        row = found.row(0.5)
+        assert row["ssim_1.4"] == round(found.ssim[0], 4) and row["inside"] == found.inside
