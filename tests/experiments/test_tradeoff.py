@@ -26,7 +26,7 @@ def test_the_prefactor_is_that_of_the_cases():
     cases.append(case(0.05, 520e-9, 0.04, 1e-6, inside=False))  # beyond the widths tried: it tells nothing
     assert fitted_prefactor(cases) == pytest.approx(0.5, rel=1e-12)
     words = in_words(cases)
-    assert "3 of 4 optima" in words[0] and "-9% to +10%" in words[0] and "nearest to a narrow sled" in words[2]
+    assert "3 of 4 optima" in words[0] and "-9% to +10%" in words[0] and "nearest to a sled" in words[2]
     assert math.isnan(fitted_prefactor([cases[-1]]))
 
 
