@@ -89,8 +89,8 @@ def pydicom():
 
 def write_series(folder, values, **changes):
     """Slices in files whose names run against their positions; a change may be a function of the slice's number."""
-    from pydicom.dataset import FileDataset, FileMetaDataset
-    from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
+    from pydicom.dataset import FileDataset, FileMetaDataset  # pyright: ignore[reportMissingImports]
+    from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid  # pyright: ignore[reportMissingImports]
 
     series = generate_uid()
     folder.mkdir(exist_ok=True)
