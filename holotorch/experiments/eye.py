@@ -29,7 +29,7 @@ PRESETS: dict[str, Callable[[float], Spectrum]] = {
     "sled": Spectrum.sled,
     "led": Spectrum.led,
 }
-BEST = 0.47  # prefactor of the best FWHM for the CT of a teapot; smooth scenes want more, C60 0.8 (chart eye)
+BEST = 0.46  # prefactor of the best FWHM for the CT of a teapot; smooth scenes want more, C60 0.8
 _OTHERS = 100_000  # seeds of the realisations that only make the reference
 _LIT = 0.05  # of the brightest of the reference: where speckle is measured
 
