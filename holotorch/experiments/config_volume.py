@@ -37,7 +37,9 @@ Depth = Annotated[Length, AfterValidator(_ahead)]
 
 
 class VolumeSource(Settings):
-    """A file, a scene of the public catalogue, or a synthetic phantom; a phantom beside a scene stands in for it.
+    """A file, a scene of the public catalogue, or a synthetic phantom: the first of them that is given.
+
+    A phantom beside a scene stands in for it where it cannot be fetched.
 
     ``spacing`` (z, y, x), ``shape`` (D, H, W), ``dtype`` and ``unit`` say what a file does not: see ``load_volume``.
     ``directory``: where scenes are kept once fetched.
@@ -131,8 +133,8 @@ def contradictions(settings: VolumeSettings) -> list[tuple[tuple[str | int, ...]
     """Settings that are fine one by one and not together."""
     found: list[tuple[tuple[str | int, ...], str]] = []
     source, transfer, hologram = settings.volume, settings.transfer, settings.hologram
-    if source.path and (source.scene or source.phantom) or not (source.path or source.scene or source.phantom):
-        found.append((("volume",), "expected one of path, scene or phantom (a phantom may stand in for a scene)"))
+    if not (source.path or source.scene or source.phantom):
+        found.append((("volume",), "expected a path, a scene or a phantom"))
     if sum(item is not None for item in (transfer.preset, transfer.file, transfer.points)) != 1:
         found.append((("transfer",), "expected one of preset, file or points"))
     if transfer.preset and (transfer.low is None or transfer.high is None or transfer.low >= transfer.high):

@@ -163,6 +163,10 @@ def test_a_file_is_read_and_a_broken_one_named(tmp_path):
     source = f"volume={{path: {tmp_path / 'ball.npy'}, spacing: [1, 1, 2], unit: relative}}"
     experiment = build(settings(source))
     assert experiment.volume.shape == (6, 5, 4) and experiment.volume.extent == (6, 5, 8) and not experiment.synthetic
+    # As the README has it: a file takes the place of a configuration's own scene and phantom.
+    words = [f"volume.path={tmp_path / 'ball.npy'}", "volume.spacing=1", "volume.unit=relative", "scale=16"]
+    own = build(load_config(CONFIGS / "tooth.yaml", words))
+    assert own.volume.shape == (6, 5, 4) and not own.synthetic
     with pytest.raises(ConfigError, match="volume: .*spacing"):
         build(settings(f"volume={{path: {tmp_path / 'ball.npy'}}}"))
     values = np.zeros((4, 4, 4), np.float32)
@@ -188,7 +192,7 @@ def test_an_empty_volume_is_black(tmp_path):
         ("hologram.distance=50 um", "hologram.distance: expected the whole volume before the hologram"),
         ("hologram.distance=-3 mm", "hologram.distance: expected a distance above zero"),
         ("hologram.rays=33", "hologram.rays: expected a number that divides the hologram's sides"),
-        ("volume={}", "volume: expected one of path, scene or phantom"),
+        ("volume={}", "volume: expected a path, a scene or a phantom"),
         ("volume={path: no/such.nrrd}", "volume.path: expected a file or folder that exists, got 'no/such.nrrd'"),
         ("volume={scene: tooht}", "did you mean 'tooth'"),
         ("transfer={preset: bone}", "transfer: a preset needs low and high"),
