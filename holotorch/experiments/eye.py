@@ -73,11 +73,11 @@ class Observer:
     def eye(self, depth: float) -> Eye:
         """Focused at a depth of the scene."""
         given = self.settings.eye
-        reference = self.settings_wave if given.chromatic else None
+        reference = self.reference_wavelength if given.chromatic else None
         return Eye(given.pupil_radius, given.axial_length, self.accommodation(depth), chromatic_reference=reference)
 
     @property
-    def settings_wave(self) -> float:
+    def reference_wavelength(self) -> float:
         """The wavelength that is in focus in an eye with colour error: the middle one."""
         return sorted(self.scene.settings.wavelengths)[1]
 

@@ -4,15 +4,15 @@ import math
 from collections.abc import Iterable, Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.complex import phasor
 from holotorch.core.fourier import multiply_even
 from holotorch.core.grid import Grid
-from holotorch.core.operator import linear
-from holotorch.hologram.cone import Cone, check_layers, check_scene
+from holotorch.hologram.cone import Cone
 from holotorch.hologram.guard import Axis, choose_length
+from holotorch.hologram.layered import LayerHologram
 from holotorch.hologram.nodes import axial_range, choose_nodes
 from holotorch.hologram.raster import Raster, lit
 from holotorch.hologram.waves import AxialDesign, Waves
@@ -20,7 +20,7 @@ from holotorch.hologram.waves import AxialDesign, Waves
 _BLOCK = 16  # planes that are spread at once: one matrix product instead of a pass for each
 
 
-class AxialHologram(nn.Module):
+class AxialHologram(LayerHologram):
     """The sum over planes of waves exp(i k r) / r, limited in frequency; one small transform per node, not per plane.
 
     Planes are spread onto the nodes (:class:`Nodes`), each node takes one transform at the sources' own resolution,
@@ -52,12 +52,9 @@ class AxialHologram(nn.Module):
         stride: int = 1,
         tolerance: float = 1e-3,
     ):
-        super().__init__()
-        self.grid = grid
-        self.wavelength, self.depths, self.stride = check_scene(grid, wavelength, depths, stride)
+        super().__init__(grid, wavelength, depths, cone, stride)
         if cone not in ("taper", "band"):
             raise ValueError(f"AxialHologram works in frequency, with cone='taper' or 'band', got {cone!r}")
-        self.cone: Cone = cone
         self.tolerance = checks.positive("tolerance", tolerance)
         self._designs: dict[tuple[int, int], AxialDesign] = {}
 
@@ -86,16 +83,6 @@ class AxialHologram(nn.Module):
             for count, pixels, pitch in zip(shape, self.grid.shape, self.grid.pitch, strict=True)
         )
         return y, x
-
-    def forward(self, layers: Tensor) -> Tensor:
-        """Field [..., H, W] of ``layers``, complex [..., D, h, w], whose samples h // 2, w // 2 lie on the axis."""
-        check_layers(layers, len(self.depths))
-        shape = (layers.shape[-2], layers.shape[-1])
-        return linear(layers, self._formed, lambda field: self._gathered(field, shape))
-
-    def adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
-        """Conjugate transpose: layers [..., D, h, w] of ``shape`` (h, w) from a field [..., H, W]."""
-        return linear(field, lambda given: self._gathered(given, shape), self._formed)
 
     def accumulate(self, planes: Iterable[Tensor], phase: Tensor | None = None) -> Tensor:
         """Field [H, W] of planes [h, w], real or complex, as they come in the order of ``depths``; none is kept.

@@ -4,20 +4,20 @@ import math
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from holotorch.core.complex import phasor
 from holotorch.core.fourier import even_fft2, multiply_even
 from holotorch.core.grid import Grid
-from holotorch.core.operator import linear
-from holotorch.hologram.cone import Cone, check_layers, check_scene, cone_samples, spherical_wave
+from holotorch.hologram.cone import Cone, cone_samples, spherical_wave
+from holotorch.hologram.layered import LayerHologram
 from holotorch.hologram.raster import Raster, lit, span, strided_length
 from holotorch.optics.candidates import FINEST
 from holotorch.optics.passage import passage
 from holotorch.optics.transfer import transfer_function
 
 
-class ConvolutionHologram(nn.Module):
+class ConvolutionHologram(LayerHologram):
     """The sum of ``DirectHologram`` by transforms: thesis Eqs. 5.8 to 5.14 and Algorithm 5, without error or waste.
 
     The waves' phases are float64 and cast last. A plane takes the transform of its own sources, which are ``stride``
@@ -38,22 +38,9 @@ class ConvolutionHologram(nn.Module):
     """
 
     def __init__(self, grid: Grid, wavelength: float, depths: Sequence[float], *, cone: Cone = "box", stride: int = 1):
-        super().__init__()
-        self.grid = grid
-        self.wavelength, self.depths, self.stride = check_scene(grid, wavelength, depths, stride)
+        super().__init__(grid, wavelength, depths, cone, stride)
         if cone == "band" and min(grid.pitch) < FINEST * self.wavelength:
             raise ValueError(f"cone='band' needs a pitch of at least {FINEST} wavelengths, got {min(grid.pitch):g} m")
-        self.cone: Cone = cone
-
-    def forward(self, layers: Tensor) -> Tensor:
-        """Field [..., H, W] of ``layers``, complex [..., D, h, w], whose samples h // 2, w // 2 lie on the axis."""
-        check_layers(layers, len(self.depths))
-        shape = (layers.shape[-2], layers.shape[-1])
-        return linear(layers, self._formed, lambda field: self._gathered(field, shape))
-
-    def adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
-        """Conjugate transpose: layers [..., D, h, w] of ``shape`` (h, w) from a field [..., H, W]."""
-        return linear(field, lambda given: self._gathered(given, shape), self._formed)
 
     def padded(self, shape: tuple[int, int]) -> tuple[int, int]:
         """Samples of the transforms for layers of ``shape`` (h, w)."""

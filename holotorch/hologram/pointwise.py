@@ -3,14 +3,14 @@
 from collections.abc import Iterator, Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from holotorch.core.grid import Grid
-from holotorch.core.operator import linear
-from holotorch.hologram.cone import Cone, check_layers, check_scene, cone_samples, spherical_wave
+from holotorch.hologram.cone import Cone, cone_samples, spherical_wave
+from holotorch.hologram.layered import LayerHologram
 
 
-class DirectHologram(nn.Module):
+class DirectHologram(LayerHologram):
     """E(x) = sum_v A(v) exp(i phi(v)) exp(i k r) / r, thesis Eq. 5.1 and Algorithm 4, pair by pair in float64.
 
     Sources lie on a raster, so pairs with one displacement share their wave: rows of sources are multiplied with the
@@ -29,22 +29,9 @@ class DirectHologram(nn.Module):
     """
 
     def __init__(self, grid: Grid, wavelength: float, depths: Sequence[float], *, cone: Cone = "box", stride: int = 1):
-        super().__init__()
-        self.grid = grid
-        self.wavelength, self.depths, self.stride = check_scene(grid, wavelength, depths, stride)
+        super().__init__(grid, wavelength, depths, cone, stride)
         if cone == "band":
             raise ValueError("a direct sum has no cone='band'; use ConvolutionHologram for it")
-        self.cone: Cone = cone
-
-    def forward(self, layers: Tensor) -> Tensor:
-        """Field [..., H, W] of ``layers``, complex [..., D, h, w], whose samples h // 2, w // 2 lie on the axis."""
-        check_layers(layers, len(self.depths))
-        shape = (layers.shape[-2], layers.shape[-1])
-        return linear(layers, self._formed, lambda field: self._gathered(field, shape))
-
-    def adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
-        """Conjugate transpose: layers [..., D, h, w] of ``shape`` (h, w) from a field [..., H, W]."""
-        return linear(field, lambda given: self._gathered(given, shape), self._formed)
 
     def pairs(self, layers: Tensor) -> int:
         """How many pairs of a lit source and a pixel inside its cone ``layers`` [D, h, w] have."""

@@ -1,0 +1,48 @@
+"""LayerHologram: what every way from planes of sources to a hologram has in common."""
+
+from collections.abc import Sequence
+
+from torch import Tensor, nn
+
+from holotorch.core.grid import Grid
+from holotorch.core.operator import linear
+from holotorch.hologram.cone import Cone, check_layers, check_scene
+
+
+class LayerHologram(nn.Module):
+    """A linear map from layers of sources to the field on a hologram, with its conjugate transpose.
+
+    A way is its two halves ``_formed`` and ``_gathered``; gradients of any order follow from them.
+
+    Args:
+        grid: Pixels of the hologram.
+        wavelength: In metres.
+        depths: Of the planes, in metres, above 0; any order and spacing.
+        cone: What is kept of each wave, see ``holotorch.hologram.cone``.
+        stride: Pixels between neighbouring sources of a plane.
+
+    Raises:
+        TypeError, ValueError: Impossible arguments; in a call: layers that are not complex [..., D, h, w].
+    """
+
+    def __init__(self, grid: Grid, wavelength: float, depths: Sequence[float], cone: Cone, stride: int):
+        super().__init__()
+        self.grid = grid
+        self.wavelength, self.depths, self.stride = check_scene(grid, wavelength, depths, stride)
+        self.cone: Cone = cone
+
+    def forward(self, layers: Tensor) -> Tensor:
+        """Field [..., H, W] of ``layers``, complex [..., D, h, w], whose samples h // 2, w // 2 lie on the axis."""
+        check_layers(layers, len(self.depths))
+        shape = (layers.shape[-2], layers.shape[-1])
+        return linear(layers, self._formed, lambda field: self._gathered(field, shape))
+
+    def adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
+        """Conjugate transpose: layers [..., D, h, w] of ``shape`` (h, w) from a field [..., H, W]."""
+        return linear(field, lambda given: self._gathered(given, shape), self._formed)
+
+    def _formed(self, layers: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def _gathered(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
+        raise NotImplementedError
