@@ -12,7 +12,7 @@ from holotorch.scene import DVRSampler
 
 # Seconds per flop of the plan's own measure, and per ray and plane of the renderer, on two CPU cores.
 _FLOP_SECONDS, _RAY_SECONDS = 4.2e-11, 1.5e-8
-_BASE_BYTES, _RAY_BYTES, _SLAB = 500e6, 120, 28
+_BASE_BYTES, _RAY_BYTES, _SLAB = 500e6, 120, 42
 _COARSE = 64  # rays along each side of a rendering that tells how much is cut off
 
 
