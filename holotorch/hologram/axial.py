@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,7 +18,7 @@ from holotorch.hologram.nodes import axial_range, choose_nodes
 from holotorch.hologram.raster import Raster, lit
 from holotorch.hologram.waves import AxialDesign, Waves
 
-_BLOCK = 16  # planes that are spread at once: one matrix product instead of a pass for each
+_GROUP = 16  # planes that are spread at once, by one matrix product instead of a pass for each
 
 
 class AxialHologram(LayerHologram):
@@ -130,13 +131,20 @@ class AxialHologram(LayerHologram):
 
 
 class Accumulator:
-    """The sum of an :class:`AxialHologram` while planes arrive, from near to far or from far to near."""
+    """The sum of an :class:`AxialHologram` while planes arrive, from near to far or from far to near.
+
+    Nodes that are still open lie in one block of memory, node m in row m modulo its rows, so that each group of planes
+    is one matrix product added in place: about what it takes to read them.
+    """
 
     def __init__(self, operator: AxialHologram, shape: tuple[int, int], phase: Tensor | None = None):
         self.operator, self.shape = operator, shape
         self.turn = None if phase is None else phasor(phase)
         self.nodes = operator.design(shape).nodes
         self.begins, self.weights = self.nodes.weights(operator.depths)
+        # Rows beyond a plane's own, so that a group holds several planes where they are sparse.
+        spare = math.ceil(_GROUP / 2 * self.nodes.count / len(operator.depths))
+        self.rows = self.nodes.width + min(spare, self.nodes.width)
         self.waves: Waves | None = None
         self.total: Tensor | None = None
         self.step: Tensor | None = None
@@ -144,7 +152,8 @@ class Accumulator:
         self.before: float | None = None
         self.rising: bool | None = None
         self.pending: list[tuple[int, Tensor]] = []
-        self.open: dict[int, Tensor] = {}
+        self.open: set[int] = set()
+        self.block: Tensor | None = None  # [rows, h w] complex, or [rows, 2, h w] while all planes are real
 
     def add(self, j: int, plane: Tensor) -> None:
         """Add the plane of depth number ``j``, real or complex [h, w]; dark ones cost nothing."""
@@ -157,69 +166,68 @@ class Accumulator:
         self.before = depth
         if plane.stride() == (0, 0) and not plane[0, 0]:
             return  # one zero for all, as renderers give for planes that they have nothing on
+        plane = plane.detach()
         if self.nodes.width == 1:
-            if not lit(plane):
-                return
-            self.open[self.begins[j]] = plane.detach() * complex(self.weights[j, 0])
-            self._take(self.begins[j])
+            if lit(plane):
+                self._take(self.begins[j], plane * complex(self.weights[j, 0]))
             return
-        self.pending.append((j, plane.detach()))
-        if len(self.pending) > _BLOCK:
-            self._spread(self.pending[:-1])
-            self.pending = self.pending[-1:]
+        if self.pending:
+            span = abs(self.begins[j] - self.begins[self.pending[0][0]])
+            alike = plane.dtype == self.pending[0][1].dtype
+            if len(self.pending) == _GROUP or span > self.rows - self.nodes.width or not alike:
+                self._spread()
+        self.pending.append((j, plane))
 
     def finish(self) -> Tensor:
         """The field [H, W]; complex zeros where no plane was lit."""
-        if self.pending:
-            self._spread(self.pending)
-            self.pending = []
-        for index in sorted(self.open, reverse=self.rising is False):
-            self._take(index)
+        self._spread()
+        self._close(self.open)
         if self.total is None or self.waves is None:
             return torch.zeros(self.operator.grid.shape, dtype=torch.complex64)
-        self.step = None  # makes room for the transform
+        self.step = self.block = None  # makes room for the transform
         return self.waves.raster.pixels(multiply_even(self.total, self.waves.last(self.at)))
 
-    def _spread(self, planes: list[tuple[int, Tensor]]) -> None:
-        """Add planes to the nodes around them, and take the nodes that no later plane will touch."""
+    def _spread(self) -> None:
+        """Add the pending planes to the nodes around them, once the nodes that none of them touches are taken."""
+        planes, self.pending = self.pending, []
+        if not planes:
+            return
         stack = _side_by_side([plane for _, plane in planes])
-        if lit(stack):
-            self._open(stack, [j for j, _ in planes])
-        first = self.begins[planes[-1][0]]
-        if self.rising is False:
-            done = sorted((index for index in self.open if index >= first + self.nodes.width), reverse=True)
-        else:
-            done = sorted(index for index in self.open if index < first) if self.rising else []
-        for index in done:
-            self._take(index)
-
-    def _open(self, stack: Tensor, planes: list[int]) -> None:
-        """Add planes [J, h w] to the nodes around them."""
-        begins = [self.begins[j] for j in planes]
-        begin, end = min(begins), max(begins) + self.nodes.width
+        if not lit(stack):
+            return
+        order = [j for j, _ in planes]
+        begins = np.asarray([self.begins[j] for j in order])
+        touched = {*range(begins.min(), begins.max() + self.nodes.width)}
+        self._close(self.open - touched)
+        self.open |= touched
+        spread = np.zeros((self.rows, len(order)), np.complex128)
+        slots = (begins + np.arange(self.nodes.width)[:, None]) % self.rows
+        spread[slots, np.arange(len(order))] = self.weights[order].T
+        matrix = torch.from_numpy(spread)
         dtype = torch.promote_types(stack.dtype, torch.complex64)
-        matrix = torch.zeros(end - begin, len(planes), dtype=torch.complex128)
-        for k, j in enumerate(planes):
-            first = begins[k] - begin
-            matrix[first : first + self.nodes.width, k] = torch.from_numpy(self.weights[j])
-        matrix = matrix.to(stack.device, dtype)
-        if stack.is_complex():
-            spread = matrix @ stack
+        if self.block is None:
+            shape = (self.rows, stack.shape[1]) if stack.is_complex() else (self.rows, 2, stack.shape[1])
+            self.block = stack.new_zeros(shape, dtype=dtype if stack.is_complex() else dtype.to_real())
+        elif stack.is_complex() and not self.block.is_complex():
+            self.block = torch.complex(self.block[:, 0], self.block[:, 1])
+        if self.block.is_complex():
+            self.block.addmm_(matrix.to(self.block), stack.to(self.block.dtype))
         else:
-            # Real planes: rows of real and imaginary parts in turn, [nodes, 2, h w].
-            rows = torch.view_as_real(matrix).movedim(-1, 1).flatten(0, 1).to(stack.dtype)
-            spread = (rows @ stack).unflatten(0, (-1, 2))
-        for index, node in enumerate(spread, begin):
-            if index in self.open:
-                self.open[index] += node
-            else:
-                self.open[index] = node
+            # Real planes: rows of real and imaginary parts in turn.
+            rows = torch.view_as_real(matrix).movedim(-1, 1).flatten(0, 1)
+            self.block.flatten(0, 1).addmm_(rows.to(self.block), stack.to(self.block.dtype))
 
-    def _take(self, index: int) -> None:
+    def _close(self, nodes: set[int]) -> None:
+        """Take ``nodes``, that no later plane will touch, and make their rows free."""
+        for index in sorted(nodes, reverse=self.rising is False):
+            assert self.block is not None
+            row = self.block[index % self.rows]
+            self._take(index, row.clone() if row.is_complex() else torch.complex(row[0], row[1]))
+            row.zero_()
+        self.open = self.open - nodes
+
+    def _take(self, index: int, node: Tensor) -> None:
         """Horner's rule: carry the sum on to node ``index`` and add the node."""
-        node = self.open.pop(index)
-        if not node.is_complex():
-            node = torch.complex(node[0], node[1])
         node = node.reshape(self.shape)
         if self.turn is not None:
             node *= self.turn
