@@ -1,0 +1,63 @@
+"""Catheter: a straight thin tube with bands of colour at known distances from its tip."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+
+
+@dataclass(frozen=True)
+class Catheter:
+    """What the camera looks for.
+
+    Attributes:
+        edges: Where the bands begin and end, in metres from the tip, rising; at least 4, of any spacing. Neighbouring
+            bands touch: band i reaches from edge i to edge i + 1.
+        colours: Of the bands, 8-bit sRGB triples, ``len(edges) - 1`` of them; neighbours differ.
+        radius: In metres, outside.
+        length: From the tip to the rear end, in metres.
+
+    Raises:
+        TypeError, ValueError: Impossible values, all edges and colours counted.
+
+    Source: Sec. 3.3.1 and Fig. 3.5 of the thesis: three bands of 38 mm that begin 70 mm from the tip.
+    """
+
+    edges: tuple[float, ...]
+    colours: tuple[tuple[int, int, int], ...]
+    radius: float
+    length: float
+
+    def __post_init__(self) -> None:
+        edges = tuple(checks.finite("edges", float(edge)) for edge in self.edges)
+        if len(edges) < 4 or edges[0] < 0 or any(b <= a for a, b in zip(edges, edges[1:], strict=False)):
+            raise ValueError(f"edges must be at least 4 rising distances from the tip in metres, got {edges}")
+        colours = tuple(tuple(int(value) for value in colour) for colour in self.colours)
+        if len(colours) != len(edges) - 1:
+            raise ValueError(f"{len(edges)} edges bound {len(edges) - 1} bands, got {len(colours)} colours")
+        for colour in colours:
+            if len(colour) != 3 or not all(0 <= value <= 255 for value in colour):
+                raise ValueError(f"colours must be triples of 8-bit levels, got {colour}")
+        for one, other in zip(colours, colours[1:], strict=False):
+            if math.dist(one, other) < 40:
+                raise ValueError(f"neighbouring bands must differ in colour, got {one} beside {other}")
+        checks.positive("radius", self.radius, "m")
+        if checks.positive("length", self.length, "m") < edges[-1]:
+            raise ValueError(f"length must reach the last edge at {edges[-1]:g} m, got {self.length:g} m")
+        if self.radius > min(b - a for a, b in zip(edges, edges[1:], strict=False)) / 2:
+            raise ValueError(f"bands must be longer than they are wide, got radius {self.radius:g} m, edges {edges}")
+        if max(edges) > 10:
+            raise ValueError(f"edges are in metres, got {edges}")
+        object.__setattr__(self, "edges", edges)
+        object.__setattr__(self, "colours", colours)
+
+    @property
+    def positions(self) -> Tensor:
+        """Of the edges in metres from the tip, float64 [N]."""
+        return torch.tensor(self.edges, dtype=torch.float64)
+
+
+THESIS = Catheter((0.070, 0.108, 0.146, 0.184), ((200, 40, 45), (40, 150, 70), (40, 70, 190)), 1.0e-3, 0.35)

@@ -1,0 +1,130 @@
+"""Pose of a catheter in front of a camera, how sure it is, and why there is none."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+class Status(enum.IntEnum):
+    """What became of a frame, as trackers for surgery report it: a pose, or the first stage that could not go on."""
+
+    OK = 0
+    UNVERIFIED = 1  # a pose from three edges: nothing is left to check it with
+    BAD_FRAME = 2  # not an image: unreadable, wrong size, no contrast
+    NO_CATHETER = 3  # nothing of the bands' colours, thin and long
+    BANDS_MISSING = 4  # fewer than two neighbouring bands
+    NO_AXIS = 5  # bands that lie on no straight line
+    TOO_NARROW = 6  # no pixel shows one colour alone
+    EDGES_UNCLEAR = 7  # fewer than three edges between colours
+    OUT_OF_FRAME = 8  # an edge lies at the border of the image
+    OUTSIDE_CAMERA = 9  # where the distortion cannot be inverted
+    INCONSISTENT = 10  # edges that no pose explains
+    UNCERTAIN = 11  # a pose, but too uncertain to be used
+
+    @property
+    def answered(self) -> bool:
+        """Whether there is a pose."""
+        return self <= Status.UNVERIFIED
+
+    @property
+    def stage(self) -> str:
+        """Where it was decided: "frame", "colour", "axis", "edges", "camera" or "pose"."""
+        return _STAGES.get(self, "pose")
+
+
+_STAGES = {
+    Status.BAD_FRAME: "frame",
+    Status.NO_CATHETER: "colour",
+    Status.BANDS_MISSING: "colour",
+    Status.NO_AXIS: "axis",
+    Status.TOO_NARROW: "axis",
+    Status.EDGES_UNCLEAR: "edges",
+    Status.OUT_OF_FRAME: "edges",
+    Status.OUTSIDE_CAMERA: "camera",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Of one catheter or of many ([...]: leading axes, alike for all), in the camera's frame.
+
+    x points right, y down, z forward.
+
+    Attributes:
+        tip: [..., 3] in metres; NaN where there is no pose, as in all that follows.
+        direction: [..., 3], unit vector from the tip to the rear: ``tip + s * direction`` lies s metres from the tip.
+        covariance: [..., 6, 6] of (tip, direction) in m^2, m and 1; of rank 5.
+        chi_square: [...] squared deviations of the edges from the pose, each over its variance.
+        freedom: [...] degrees of freedom of ``chi_square``.
+        status: One, or a tuple of them for a batch.
+        reason: A sentence; empty where all is well.
+    """
+
+    tip: Tensor
+    direction: Tensor
+    covariance: Tensor
+    chi_square: Tensor
+    freedom: Tensor
+    status: Status | tuple[Status, ...]
+    reason: str = ""
+
+    @staticmethod
+    def refused(status: Status, reason: str) -> Pose:
+        """No pose, and why."""
+        if status.answered:
+            raise ValueError(f"{status.name} is no refusal")
+        nowhere = torch.full((3,), torch.nan, dtype=torch.float64)
+        covariance = torch.full((6, 6), torch.nan, dtype=torch.float64)
+        none = torch.zeros((), dtype=torch.float64)
+        return Pose(nowhere, nowhere.clone(), covariance, none * torch.nan, none, status, reason)
+
+    @property
+    def answered(self) -> bool:
+        """Whether there is a pose; of one pose only."""
+        if not isinstance(self.status, Status):
+            raise ValueError("a batch of poses has a status for each; ask pose[i].answered")
+        return self.status.answered
+
+    @property
+    def tip_sd(self) -> Tensor:
+        """Standard deviation of the tip in metres [...], over all three axes: the root of the variances' sum."""
+        return self.covariance[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+
+    @property
+    def camera_from_tool(self) -> Tensor:
+        """[..., 4, 4]: the tool's z axis onto ``direction`` by the smallest rotation, its origin at the tip."""
+        x, y, z = self.direction.unbind(-1)
+        square = x * x + y * y
+        back = (z < 0) & (square < 1e-30)  # half a turn about x
+        # 1 / (1 + z), without the digits that cancel where the tool points back.
+        share = torch.where(z < 0, (1 - z) / torch.where(back | (z >= 0), 1.0, square), 1 / (1 + z.clamp(min=0)))
+        zero, one = torch.zeros_like(z), torch.ones_like(z)
+        columns = [
+            torch.stack([torch.where(back, one, 1 - x * x * share), torch.where(back, zero, -x * y * share), -x], -1),
+            torch.stack([torch.where(back, zero, -x * y * share), torch.where(back, -one, 1 - y * y * share), -y], -1),
+            self.direction,
+            self.tip,
+        ]
+        matrix = torch.stack(columns, -1)
+        last = torch.tensor([0.0, 0, 0, 1], dtype=matrix.dtype, device=matrix.device).expand(*matrix.shape[:-2], 1, 4)
+        return torch.cat([matrix, last], -2)
+
+    def point(self, along: float | Tensor) -> Tensor:
+        """Point [..., 3] ``along`` metres from the tip."""
+        return self.tip + torch.as_tensor(along, dtype=self.tip.dtype)[..., None] * self.direction
+
+    def __len__(self) -> int:
+        return len(self.tip) if self.tip.ndim > 1 else 1
+
+    def __getitem__(self, index: int) -> Pose:
+        """One of a batch."""
+        if isinstance(self.status, Status):
+            raise IndexError("this is one pose, not a batch")
+        tip, direction, covariance = self.tip[index], self.direction[index], self.covariance[index]
+        return Pose(
+            tip, direction, covariance, self.chi_square[index], self.freedom[index], self.status[index], self.reason
+        )
