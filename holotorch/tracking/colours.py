@@ -1,0 +1,56 @@
+"""Which 8-bit colours may belong to which band: a table of 32 x 32 x 32, looked up without a float frame."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from holotorch.tracking.camera import Camera
+from holotorch.tracking.catheter import Catheter
+
+_BITS = 5
+_TURN = math.radians(32)  # between chromas in linear light
+_PURE = 0.35  # of a band's own saturation; gloss and mixed pixels have less
+_DARK = 24 / 255  # levels below are noise
+
+
+class ColourTable:
+    """Labels of pixels: 0 for none, c + 1 for the c-th of ``colours``, whatever the light's strength.
+
+    Attributes:
+        colours: The distinct colours of the catheter's bands.
+        bands: For each band, which of ``colours`` it has.
+
+    Raises:
+        ValueError: Bands that are grey, or whose hues cannot be told apart.
+    """
+
+    def __init__(self, camera: Camera, catheter: Catheter):
+        self.colours = tuple(dict.fromkeys(catheter.colours))
+        self.bands = tuple(self.colours.index(colour) for colour in catheter.colours)
+        levels = torch.arange(1 << _BITS, dtype=torch.float64) * 8 + 3.5
+        cells = torch.cartesian_prod(levels, levels, levels)
+        chroma, pure = _chroma(camera.linear(cells))
+        wanted, saturation = _chroma(camera.linear(torch.tensor(self.colours, dtype=torch.float64)))
+        if float(saturation.min()) < 0.2:
+            raise ValueError(f"bands must be of saturated colours, got {self.colours[int(saturation.argmin())]}")
+        between = wanted @ wanted.T - 2 * torch.eye(len(wanted), dtype=torch.float64)
+        if float(between.max()) > math.cos(math.radians(25)):
+            raise ValueError(f"hues of the bands must lie 25 degrees apart at least, got {self.colours}")
+        like, label = (chroma @ wanted.T).max(-1)
+        good = (like > math.cos(_TURN)) & (pure > _PURE * saturation[label]) & (cells.amax(-1) > 255 * _DARK)
+        self.table = torch.where(good, label + 1, 0).to(torch.uint8)
+
+    def labels(self, red: Tensor, green: Tensor, blue: Tensor) -> Tensor:
+        """uint8 [...] of the three channels, uint8 [...]."""
+        index = (red >> 3).to(torch.int32) << 10
+        index |= (green >> 3).to(torch.int32) << 5
+        index |= blue >> 3
+        return self.table.to(red.device).index_select(0, index.reshape(-1)).reshape(index.shape)
+
+
+def _chroma(light: Tensor) -> tuple[Tensor, Tensor]:
+    """Unit vector [..., 3] away from grey, and saturation [...]: its length over the light's."""
+    away = light - light.mean(-1, keepdim=True)
+    length = away.norm(dim=-1)
+    return away / length.clamp(min=1e-9)[..., None], length / light.norm(dim=-1).clamp(min=1e-9)

@@ -1,0 +1,222 @@
+"""CatheterTracker: frames in, for each a pose with its covariance or the reason why there is none."""
+
+import math
+import time
+from collections.abc import Sequence
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+from holotorch.tracking.bands import Stretches
+from holotorch.tracking.camera import Camera
+from holotorch.tracking.catheter import Catheter
+from holotorch.tracking.coarse import find_segments
+from holotorch.tracking.colours import ColourTable
+from holotorch.tracking.measure import Axis, Edges, Refusal, bulge_px, find_bands, measure_axis, measure_edges
+from holotorch.tracking.pose import closed_form, solve_pose
+from holotorch.tracking.status import Pose, Status
+from holotorch.tracking.strips import Line, Sampler
+
+_FLOOR = 0.02  # pixels: what model and pixels leave in an edge, however little noise there is
+_UNLIKELY = {1: 10.83, 2: 13.82, 3: 16.27, 4: 18.47, 5: 20.52, 6: 22.46, 7: 24.32, 8: 26.12, 9: 27.88}  # 0.1 % of chi^2
+_MOVED = 30.0  # pixels that a catheter may move between two frames
+
+
+class CatheterTracker:
+    """Finds the catheter's bands on frames, and from their edges the pose.
+
+    Coarse detection by a table of colours on every second pixel, a few line hypotheses, one strip of the frame along
+    each in the lens's own coordinates, edges in linear light, five unknowns by :func:`solve_pose`. With a previous pose
+    only the strip around it is read. The work for a frame is bounded.
+
+    Args:
+        camera: Intrinsics and tone curve.
+        catheter: What to look for; colours saturated, of hues 25 degrees apart.
+        most_sd: Standard deviation of the tip in metres above which a pose is refused as UNCERTAIN.
+
+    Attributes:
+        times: Seconds that each stage of the last call took: colour, axis, edges, pose.
+
+    Raises:
+        TypeError, ValueError: In a call: frames that are not uint8 [B, 3, H, W]; as many previous poses as frames.
+
+    Source: Chapter 3 of the thesis for bands, one camera and what is asked; the method is our own.
+    """
+
+    def __init__(self, camera: Camera, catheter: Catheter, *, most_sd: float = 1.5e-3):
+        self.camera, self.catheter = camera, catheter
+        self.most_sd = checks.positive("most_sd", most_sd, "m")
+        self.table = ColourTable(camera, catheter)
+        self.light = camera.table()
+        self.times: dict[str, float] = {}
+
+    def __call__(self, frames: Tensor, previous: Sequence[Pose] | None = None) -> list[Pose]:
+        """A pose for each frame of uint8 [B, 3, H, W]; ``previous`` poses of the same cameras narrow the search."""
+        if frames.ndim != 4 or frames.shape[1] != 3 or frames.dtype != torch.uint8:
+            raise ValueError(f"frames must be uint8 of shape [B, 3, H, W], got {frames.dtype}, {list(frames.shape)}")
+        if previous is not None and len(previous) != len(frames):
+            raise ValueError(f"{len(frames)} frames take {len(frames)} previous poses, got {len(previous)}")
+        self.times = dict.fromkeys(("colour", "axis", "edges", "pose"), 0.0)
+        with torch.no_grad():
+            return [self._track(frame, previous[i] if previous else None) for i, frame in enumerate(frames)]
+
+    def _track(self, frame: Tensor, before: Pose | None) -> Pose:
+        height, width = frame.shape[-2:]
+        if height < 32 or width < 32:
+            return Pose.refused(Status.BAD_FRAME, f"a frame of {height} x {width} px is too small")
+        sampler = Sampler(frame, self.light.to(frame.device))
+        if before is not None and before.answered:
+            try:
+                return self._along(sampler, self._expected(before), _MOVED, before)
+            except Refusal:
+                pass  # it moved more, or something hides it: look everywhere
+        with self._timed("colour"):
+            segments = find_segments(frame, self.table)
+        if not segments:
+            return Pose.refused(Status.NO_CATHETER, "nothing thin in the bands' colours")
+        first: Refusal | None = None
+        for segment in segments:
+            try:
+                ends = torch.tensor([segment.start, segment.end], dtype=torch.float64, device=frame.device)
+                line = Line.through(self.camera, ends)
+                if not bool(torch.isfinite(line.origin).all()):
+                    raise Refusal(Status.OUTSIDE_CAMERA, "it lies where the lens's distortion cannot be inverted")
+                length = math.dist(segment.start, segment.end)
+                return self._along(sampler, (line, 0.5 * length + max(40.0, 0.7 * length)), 10.0, None)
+            except Refusal as refusal:
+                # What came nearest to a pose tells most.
+                if first is None or refusal.status > first.status:
+                    first = refusal
+        assert first is not None
+        return Pose.refused(first.status, first.reason)
+
+    def _expected(self, pose: Pose) -> tuple[Line, float]:
+        """Where the bands of a pose lie, and half their length with room to move."""
+        ends = pose.tip + self.catheter.positions[[0, -1], None] * pose.direction
+        line = Line.between(self.camera, ends[:, :2] / ends[:, 2:])
+        t, _ = line.place(ends[:, :2] / ends[:, 2:])
+        return line, float((t[1] - t[0]).abs()) / 2 + 1.5 * _MOVED
+
+    def _along(self, sampler: Sampler, around: tuple[Line, float], aside: float, before: Pose | None) -> Pose:
+        """The pose on a line, or a Refusal."""
+        line, half = around
+        half = min(half, 1.5 * math.hypot(sampler.height, sampler.width))
+        with self._timed("axis"):
+            reach = min(0.15, 2 * aside / half) if before is not None else 0.06
+            line, stretches = find_bands(sampler, self.camera, line, self.table, half, aside, reach)
+            if stretches.known < 3:
+                few = "a band hides, is drowned by its surroundings or leaves the frame"
+                raise Refusal(Status.BANDS_MISSING, f"{stretches.known} edges of bands are seen, 3 are needed: {few}")
+            axis = measure_axis(sampler, self.camera, line, stretches, self._width(stretches, before), 0.9)
+        guess, _ = axis.line.place(line.plane(stretches.edges, torch.zeros_like(stretches.edges)))
+        if before is not None:
+            with self._timed("edges"):
+                curve = bulge_px(before, self.catheter, axis.line)
+                edges = measure_edges(sampler, self.camera, axis, guess, stretches.doubtful, 0.9, curve)
+            with self._timed("pose"):
+                pose = self._solved(axis, edges)
+                again = bulge_px(pose, self.catheter, axis.line)
+            if float((again - curve).abs().max()) < 0.05:
+                return self._judged(pose, axis, edges)
+        else:
+            with self._timed("edges"):
+                edges = measure_edges(sampler, self.camera, axis, guess, stretches.doubtful, 0.9)
+            pose = self._sketched(axis, edges)
+        with self._timed("edges"):
+            curve = bulge_px(pose, self.catheter, axis.line)
+            edges = measure_edges(sampler, self.camera, axis, edges.t, stretches.doubtful, edges.blur, curve)
+        with self._timed("pose"):
+            return self._judged(self._solved(axis, edges), axis, edges)
+
+    def _width(self, stretches: Stretches, before: Pose | None) -> float:
+        """Of the tube's image in pixels, roughly: from the pose before, or from the bands' lengths at a slight tilt."""
+        if before is not None:
+            scale = float(self.camera.matrix[0, 0]) / float(before.point(self.catheter.edges[1])[2])
+        else:
+            seen = torch.isfinite(stretches.edges)
+            ends = stretches.edges[seen][[0, -1]], self.catheter.positions.to(seen.device)[seen][[0, -1]]
+            scale = 1.15 * float((ends[0][1] - ends[0][0]) / (ends[1][1] - ends[1][0]))
+        return min(max(2 * self.catheter.radius * scale, 2.0), 120.0)
+
+    def _sketched(self, axis: Axis, edges: Edges) -> Pose:
+        """Near enough to tell how much the rings' fronts bulge."""
+        known = self._known(edges)
+        with self._timed("pose"):
+            t = edges.t[known]
+            pixels = self.camera.distort(axis.line.plane(t, torch.zeros_like(t)))
+            tip, direction = closed_form(pixels[None], self.catheter.positions.to(t.device)[known], self.camera)
+            none = torch.zeros((), dtype=t.dtype, device=t.device)
+            return Pose(tip[0], direction[0], none.expand(6, 6), none, none, Status.UNVERIFIED)
+
+    def _known(self, edges: Edges) -> Tensor:
+        known = torch.isfinite(edges.t)
+        count = int(known.sum())
+        if count < 3:
+            if edges.hidden:
+                raise Refusal(Status.EDGES_UNCLEAR, f"{count} edges are clear, 3 are needed: something lies across")
+            if edges.outside:
+                raise Refusal(Status.OUT_OF_FRAME, f"{count} edges lie within the frame, 3 are needed")
+            raise Refusal(Status.EDGES_UNCLEAR, f"{count} edges are clear, 3 are needed")
+        return known
+
+    def _solved(self, axis: Axis, edges: Edges) -> Pose:
+        known = self._known(edges)
+        count, t = int(known.sum()), edges.t[known]
+        pixels = self.camera.distort(axis.line.plane(t, torch.zeros_like(t)))
+        along = (edges.deviation[known].square() + _FLOOR**2).sqrt()
+        # All edges lie on one fitted line; this deviation gives the pose the line's own covariance.
+        spread = float((t - t.mean()).square().sum())
+        about = math.hypot(axis.offset_sd, axis.slope_sd * (float(t.mean()) - axis.centre))
+        across = max(about * math.sqrt(count), axis.slope_sd * math.sqrt(spread))
+        pose = solve_pose(
+            pixels[None],
+            self.catheter.positions.to(pixels.device)[known],
+            self.camera,
+            along_px=along[None],
+            across_px=across,
+        )[0]
+        if not pose.answered:
+            raise Refusal(Status(pose.status), "no pose in front of the camera explains the edges")
+        return pose
+
+    def _judged(self, pose: Pose, axis: Axis, edges: Edges) -> Pose:
+        """The pose, if nothing speaks against it."""
+        count = int(torch.isfinite(edges.t).sum())
+        freedom = count - 3  # the line is fitted by itself, so only places along it can disagree
+        limit = _UNLIKELY.get(freedom, freedom + 4 * math.sqrt(2 * freedom) + 6) if freedom else math.inf
+        if float(pose.chi_square) > limit:
+            text = f"edges disagree with any pose: chi-square {float(pose.chi_square):.1f} of {freedom}"
+            raise Refusal(Status.INCONSISTENT, text)
+        seen = torch.isfinite(edges.t)
+        points = pose.tip + self.catheter.positions.to(pose.tip.device)[seen, None] * pose.direction
+        wide = 2 * self.catheter.radius * axis.line.scale / points.norm(dim=-1) * _obliquity(points)
+        ratio = axis.width_at(float(edges.t[seen].mean())) / float(wide.mean())
+        most = (0.25 if freedom else 0.12) + (0.4 + 2 * axis.width_sd) / float(wide.mean())
+        if not freedom and axis.width_sd > 0.08 * axis.width:
+            raise Refusal(Status.INCONSISTENT, "three edges, and a width too unclear to check them with")
+        if abs(ratio - 1) > most:
+            raise Refusal(
+                Status.INCONSISTENT, f"{ratio:.2f} times as wide as it should be at {float(points[:, 2].mean()):.2f} m"
+            )
+        if float(pose.tip_sd) > self.most_sd:
+            text = f"tip uncertain to {1e3 * float(pose.tip_sd):.1f} mm, above {1e3 * self.most_sd:g} mm"
+            raise Refusal(Status.UNCERTAIN, text)
+        status = Status.OK if freedom else Status.UNVERIFIED
+        reason = "" if freedom else "three edges determine a pose and leave nothing to check it with"
+        values = (pose.tip, pose.direction, pose.covariance, pose.chi_square)
+        return Pose(*values, pose.freedom.new_tensor(float(freedom)), status, reason)
+
+    @contextmanager
+    def _timed(self, stage: str):
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.times[stage] += time.perf_counter() - began
+
+
+def _obliquity(points: Tensor) -> Tensor:
+    """Pixels of the plane z = 1 per angle at points [N, 3], across a line through the image's middle: 1 / cos."""
+    return points.norm(dim=-1) / points[:, 2]
