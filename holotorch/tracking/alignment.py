@@ -1,0 +1,137 @@
+"""Where the camera sits on a headset, from poses of one tool that both have seen."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+
+TOOL_LENGTH = 0.127  # metres: the thesis's alignment uses the tip and the middle of the bands, 127 mm behind it
+_FEWEST = 3
+_SAME_DIRECTION = math.radians(10)
+_LENGTHS_DIFFER = 0.02  # metres; more is no hand's tremor
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A rigid map between the frames of camera and headset, and how well it fits.
+
+    Attributes:
+        headset_from_camera: float64 [4, 4]: ``p_headset = headset_from_camera @ p_camera``, metres.
+        residuals: [n] rms distance in metres that the map leaves at the two points of each alignment.
+        leave_one_out: [n] the same under the map fitted without that alignment: what a new one would show. Infinite
+            where the others do not determine a map.
+    """
+
+    headset_from_camera: Tensor
+    residuals: Tensor
+    leave_one_out: Tensor
+
+
+def tool_points(tip: Tensor, direction: Tensor, length: float = TOOL_LENGTH) -> Tensor:
+    """[..., 2, 3]: a tool's tip and the point ``length`` metres behind it; ``direction`` [..., 3] is normalised."""
+    checks.positive("length", length, "metres")
+    for name, value in (("tip", tip), ("direction", direction)):
+        if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape[-1:] != (3,):
+            raise ValueError(f"{name} must be a floating tensor [..., 3], got {getattr(value, 'shape', value)}")
+        checks.all_finite(name, value)
+    size = direction.norm(dim=-1, keepdim=True)
+    if bool((size.detach() < 1e-6).any()):
+        raise ValueError("direction must not be a null vector")
+    return torch.stack([tip, tip + length * direction / size], -2).to(torch.float64)
+
+
+def headset_from_camera(camera: Tensor, headset: Tensor) -> Alignment:
+    """Fit the rigid map that takes a tool's points in the camera's frame to those in the headset's.
+
+    A straight tool shows nothing of its roll, so that one alignment, or several parallel ones, would leave a turn about
+    it open (the thesis's Eqs. 3.1 and 3.2 use one: 103 mm median error elsewhere); therefore a fit to three or more.
+
+    Args:
+        camera: [n, 2, 3] two points of the tool in each alignment, in metres; :func:`tool_points` of its pose.
+        headset: The same points in the headset's frame, which must be right-handed.
+
+    Returns:
+        The map, differentiable to both arguments, with its residuals.
+
+    Raises:
+        ValueError: Fewer than 3 alignments, all parallel to within 10 degrees, tools of different length, or a headset
+            with a left-handed frame; with what to do.
+
+    Source: Kabsch (1976) in float64, no scale; the sign of the determinant as in Umeyama (1991).
+    """
+    points = []
+    for name, value in (("camera", camera), ("headset", headset)):
+        if not isinstance(value, Tensor) or not value.is_floating_point():
+            raise TypeError(f"{name} must be a floating tensor, got {getattr(value, 'dtype', type(value).__name__)}")
+        if value.ndim != 3 or value.shape[1:] != (2, 3):
+            raise ValueError(f"{name} must be of shape [n, 2, 3], two points for each alignment, got {value.shape}")
+        checks.all_finite(name, value)
+        points.append(value.to(torch.float64))
+    source, target = points
+    if len(source) != len(target):
+        raise ValueError(f"camera and headset must hold the same alignments, got {len(source)} and {len(target)}")
+    if len(source) < _FEWEST:
+        raise ValueError(
+            f"an alignment needs {_FEWEST} poses of the tool or more, not parallel to each other, got {len(source)}; "
+            "one leaves the turn about the tool open"
+        )
+    lengths = [(part[:, 1] - part[:, 0]).detach().norm(dim=-1) for part in points]
+    differing = (lengths[0] - lengths[1]).abs()
+    worst = int(differing.argmax())
+    if bool(differing[worst] > _LENGTHS_DIFFER):
+        raise ValueError(
+            f"the two points must be equally far apart in both frames, got {lengths[0][worst]:.3f} and "
+            f"{lengths[1][worst]:.3f} m in alignment {worst}; are both in metres, and the same points?"
+        )
+    for name, part in zip(("camera", "headset"), points, strict=True):
+        spread = _spread(part.detach())
+        if spread < _SAME_DIRECTION:
+            raise ValueError(
+                f"the alignments are parallel to within {math.degrees(spread):.1f} degrees in the {name}'s frame, "
+                "which leaves the turn about the tool nearly open; hold the tool in different directions, 45 degrees "
+                "apart or more"
+            )
+    fitted = _rigid(source, target)
+    residuals = _residuals(fitted, source, target)
+    rms = residuals.detach().square().mean().sqrt()
+    mirrored = _residuals(_rigid(source, target, -1.0), source, target).detach().square().mean().sqrt()
+    if rms > 5e-3 and mirrored < 0.5 * rms:
+        raise ValueError(
+            "the headset's points are mirror images of the camera's: its frame is left-handed (as Unity's is); change "
+            "the sign of one of its axes"
+        )
+    alone = []
+    for i in range(len(source)):
+        rest = torch.arange(len(source), device=source.device) != i
+        if _spread(source[rest].detach()) < _SAME_DIRECTION:
+            alone.append(source.new_tensor(math.inf))
+            continue
+        alone.append(_residuals(_rigid(source[rest], target[rest]), source[i : i + 1], target[i : i + 1])[0])
+    return Alignment(fitted, residuals, torch.stack(alone))
+
+
+def _spread(points: Tensor) -> float:
+    """Largest angle between two of the tools, as lines."""
+    along = torch.nn.functional.normalize(points[:, 1] - points[:, 0], dim=-1)
+    n = len(along)
+    crossed = torch.linalg.cross(along[:, None].expand(n, n, 3), along[None].expand(n, n, 3)).norm(dim=-1)
+    return float(torch.atan2(crossed, (along @ along.mT).abs()).max())
+
+
+def _rigid(source: Tensor, target: Tensor, sign: float = 1.0) -> Tensor:
+    """[4, 4] rigid map of points [n, 2, 3]; with ``sign`` -1 the best mirroring one."""
+    a, b = source.reshape(-1, 3), target.reshape(-1, 3)
+    u, _, vh = torch.linalg.svd((b - b.mean(0)).mT @ (a - a.mean(0)))
+    turned = sign * torch.linalg.det(u.detach() @ vh.detach()).sign()
+    rotation = u @ torch.diag(torch.stack([torch.ones_like(turned), torch.ones_like(turned), turned])) @ vh
+    shift = b.mean(0) - rotation @ a.mean(0)
+    last = torch.tensor([[0.0, 0, 0, 1]], dtype=rotation.dtype, device=rotation.device)
+    return torch.cat([torch.cat([rotation, shift[:, None]], 1), last])
+
+
+def _residuals(matrix: Tensor, source: Tensor, target: Tensor) -> Tensor:
+    moved = source @ matrix[:3, :3].mT + matrix[:3, 3]
+    return (moved - target).square().sum(-1).mean(-1).clamp(min=1e-30).sqrt()

@@ -1,0 +1,103 @@
+"""A camera's tone curve, from light to 8-bit levels, as several exposures of one still scene show it."""
+
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+
+_CLIPPED = 3  # levels at both ends that may stand for less or more light than they say
+_SMOOTH = 1.0  # weight of the mean curvature beside the mean over pixels
+_NEEDED = 0.8  # share of the levels between the clipped ones that must occur
+_MISFIT = 0.1  # of ln(light); exposures by a step of 10 % wrong, or a scene that moved
+
+
+def tone_curve(frames: Tensor, exposures: Tensor) -> Tensor:
+    """Estimate the light of each 8-bit level from frames of a still scene at known exposures.
+
+    A constant power of the exposures cannot be told from one of the curve: the exposure times must be true, gain and
+    white balance fixed. Averaging frames of the same exposure before helps against noise.
+
+    Args:
+        frames: uint8 [E, 3, H, W] or [E, H, W], E >= 3 exposures that together use the range of levels. The three
+            colours are taken to have one curve.
+        exposures: [E] exposure times, or ratios of them; only their ratios count.
+
+    Returns:
+        float64 [256], rising from 0 to 1: ``Camera.tone``. Levels below 3 and above 252 are extrapolated.
+
+    Raises:
+        TypeError, ValueError: Too few exposures or levels, exposures that do not fit the frames, or no rising curve.
+
+    Source: Debevec and Malik (1997), Eq. 3. Over the pairs of levels of all pixels in successive exposures instead of
+    a few hundred sampled pixels (as OpenCV has it), so that the radiances drop out and noise counts less.
+    """
+    counts, steps = _pairs(*_checked(frames, exposures))
+    level = torch.arange(256, dtype=torch.float64)
+    inside = (level >= _CLIPPED) & (level <= 255 - _CLIPPED)
+    seen = (counts.sum((0, 1)) + counts.sum((0, 2)) > 0) & inside
+    if seen.sum() < _NEEDED * inside.sum():
+        raise ValueError(
+            f"only {int(seen.sum())} of {int(inside.sum())} levels occur in two exposures that are not clipped; add "
+            "exposures between the others, or a scene with more shades"
+        )
+    # Noise of equal size in levels is one of 1 / level in the logarithm.
+    trust = torch.minimum(level, 255 - level).clamp(min=0) * inside
+    weights = counts * trust[:, None] * trust
+    weights = weights / weights.sum()
+    normal, right = weights.new_zeros(256, 256), weights.new_zeros(256)
+    for weight, step in zip(weights, steps, strict=True):  # g(second) - g(first) = step
+        normal += torch.diag(weight.sum(0) + weight.sum(1)) - weight - weight.T
+        right += step * (weight.sum(0) - weight.sum(1))
+    # Straight in the logarithm of the level, so that a power law is not bent.
+    place = level.clamp(min=0.5).log()
+    curvature = torch.zeros(254, 256, dtype=torch.float64)
+    rows = torch.arange(254)
+    before, after = place.diff()[:-1], place.diff()[1:]
+    curvature[rows, rows], curvature[rows, rows + 2] = 1 / before, 1 / after
+    curvature[rows, rows + 1] = -(1 / before + 1 / after)
+    curvature *= (2 * (before + after)).sqrt()[:, None]  # finer steps are more of them
+    normal += _SMOOTH / 254 * curvature.mT @ curvature
+    normal[255, 255] += 1.0  # the scale: the logarithm of level 255 is 0
+    curve = torch.linalg.solve(normal, right)
+    misfit = sum(
+        float((weight * (curve[None] - curve[:, None] - step).square()).sum())
+        for weight, step in zip(weights, steps, strict=True)
+    )
+    if not misfit**0.5 < _MISFIT:
+        raise ValueError(
+            f"the frames do not fit their exposures, by {100 * misfit**0.5:.0f} % of the light; was the scene still, "
+            "the light steady, gain and white balance fixed, the exposure times true?"
+        )
+    light = (curve - curve[255]).exp()
+    light[:_CLIPPED] = light[_CLIPPED] * level[:_CLIPPED] / _CLIPPED
+    if not bool((light.diff() > 0).all()):
+        at = int((light.diff() <= 0).nonzero()[0])
+        raise ValueError(f"the curve does not rise at level {at}; average several frames of each exposure")
+    return light
+
+
+def _checked(frames: Tensor, exposures: Tensor) -> tuple[Tensor, Tensor]:
+    if not isinstance(frames, Tensor) or frames.dtype != torch.uint8:
+        raise TypeError(f"frames must be a uint8 tensor, got {getattr(frames, 'dtype', type(frames).__name__)}")
+    if frames.ndim not in (3, 4) or (frames.ndim == 4 and frames.shape[1] != 3) or frames.numel() == 0:
+        raise ValueError(f"frames must be of shape [E, 3, H, W] or [E, H, W], got {list(frames.shape)}")
+    times = torch.as_tensor(exposures, dtype=torch.float64).cpu()
+    if times.shape != frames.shape[:1]:
+        raise ValueError(f"exposures must be of shape [{len(frames)}], one for each frame, got {list(times.shape)}")
+    checks.all_finite("exposures", times)
+    times, order = times.sort()
+    if len(times) < 3 or bool((times <= 0).any()) or bool((times[1:] / times[:-1] < 1.05).any()):
+        raise ValueError(f"exposures must be 3 or more, above zero, 5 % apart or more, got {times.tolist()}")
+    return frames.cpu()[order].flatten(1).long(), times
+
+
+def _pairs(levels: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+    """[E - 1, 256, 256]: how many pixels have which level in one exposure and in the next; and ln of their ratios."""
+    both = 256 * levels[:-1] + levels[1:]
+    counts = torch.stack([torch.bincount(row, minlength=65536).view(256, 256) for row in both])
+    # A clipped level says nothing of the light.
+    counts[:, :_CLIPPED], counts[:, 256 - _CLIPPED :] = 0, 0
+    counts[:, :, :_CLIPPED], counts[:, :, 256 - _CLIPPED :] = 0, 0
+    if not bool(counts.sum((1, 2)).gt(0).all()):
+        raise ValueError("two successive exposures share no pixel that is clipped in neither; take smaller steps")
+    return counts.to(torch.float64), times.log().diff()

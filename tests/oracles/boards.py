@@ -1,0 +1,89 @@
+"""Synthetic photographs of calibration boards: each pixel's ray is followed to the board, Brown's distortion undone."""
+
+import cv2
+import numpy as np
+
+PRINTED = 40  # samples of the printed board along a square
+
+
+def chessboard_print(columns, rows):
+    """Board of columns x rows inner corners with a white rim: grey samples, and the sample of the first corner."""
+    y, x = np.mgrid[: rows + 1, : columns + 1]
+    squares = np.where((x + y) % 2, 255.0, 0.0)
+    whole = np.pad(np.kron(squares, np.ones((PRINTED, PRINTED))), PRINTED, constant_values=255)
+    return whole, np.array([2 * PRINTED - 0.5, 2 * PRINTED - 0.5])
+
+
+def charuco_print(columns, rows, dictionary, marker_share, legacy=False):
+    """ChArUco board by OpenCV's own printing; the sample of its origin, the corner of the first square."""
+    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    board = cv2.aruco.CharucoBoard((columns, rows), 1.0, marker_share, known)
+    board.setLegacyPattern(legacy)
+    size = columns * PRINTED, rows * PRINTED
+    return np.pad(board.generateImage(size).astype(float), PRINTED, constant_values=255), np.full(2, PRINTED - 0.5)
+
+
+def rotation(vector):
+    """Matrix of a rotation vector."""
+    return cv2.Rodrigues(np.asarray(vector, dtype=float))[0]
+
+
+def undistorted(pixels, matrix, distortion):
+    """Points on z = 1 of pixels, by fifty fixed-point steps."""
+    k1, k2, p1, p2, k3 = distortion
+    goal = (pixels - matrix[:2, 2]) / [matrix[0, 0], matrix[1, 1]]
+    plane = goal.copy()
+    for _ in range(50):
+        x, y = plane[..., 0], plane[..., 1]
+        r = x * x + y * y
+        shift = np.stack([2 * p1 * x * y + p2 * (r + 2 * x * x), p1 * (r + 2 * y * y) + 2 * p2 * x * y], -1)
+        plane = (goal - shift) / (1 + r * (k1 + r * (k2 + r * k3)))[..., None]
+    return plane
+
+
+class Camera:
+    """A camera that takes photographs of printed boards: 2 x 2 rays a pixel, a lens blur of 0.6 px, noise in levels."""
+
+    def __init__(self, matrix, distortion, shape):
+        self.matrix, self.distortion, self.shape = np.asarray(matrix, float), np.asarray(distortion, float), shape
+        steps = [(np.arange(2 * n) - 0.5) / 2 for n in shape[::-1]]
+        plane = undistorted(np.stack(np.meshgrid(*steps), -1), self.matrix, self.distortion)
+        self.rays = np.concatenate([plane, np.ones_like(plane[..., :1])], -1)
+
+    def photograph(self, printed, origin, square, turned, at, noise=1.0, seed=0):
+        """uint8 [H, W] of a board with its origin at ``at`` in metres, turned by a rotation vector, on grey."""
+        axes = rotation(turned)
+        # Point on the board (u, v): u a + v b + at = depth * ray.
+        u, v, depth = np.moveaxis(self.rays @ np.linalg.inv(np.column_stack([axes[:, :2], at])).T, -1, 0)
+        place = (np.stack([u / depth, v / depth], -1) / square * PRINTED + origin).astype(np.float32)
+        seen = cv2.remap(printed.astype(np.float32), place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderValue=110)
+        seen = cv2.resize(seen, self.shape[::-1], interpolation=cv2.INTER_AREA)
+        seen = cv2.GaussianBlur(seen, (0, 0), 0.6) * 0.8 + 20
+        seen += np.random.default_rng(seed).normal(0, noise, seen.shape)
+        return np.clip(np.rint(seen), 0, 255).astype(np.uint8)
+
+    def project(self, points):
+        """Pixels of points [n, 3], by Brown's formula."""
+        k1, k2, p1, p2, k3 = self.distortion
+        x, y = (points[:, :2] / points[:, 2:]).T
+        r = x * x + y * y
+        radial = 1 + r * (k1 + r * (k2 + r * k3))
+        x, y = (
+            x * radial + 2 * p1 * x * y + p2 * (r + 2 * x * x),
+            y * radial + p1 * (r + 2 * y * y) + 2 * p2 * x * y,
+        )
+        return np.stack([x, y], -1) * self.matrix[[0, 1], [0, 1]] + self.matrix[:2, 2]
+
+
+def around(centre, turned, at):
+    """Where the board's origin is when the board's point ``centre`` [2] is to be at ``at``."""
+    return np.asarray(at) - rotation(turned)[:, :2] @ np.asarray(centre)
+
+
+def handheld(count, centre, size=1.0, tilt=0.7, seed=0):
+    """Poses (rotation vector, position of the origin) of a board whose point ``centre`` stays in view."""
+    generator = np.random.default_rng(seed)
+    for _ in range(count):
+        turned = generator.uniform(-1, 1, 3) * [tilt, tilt, 0.3]
+        at = generator.uniform(-1, 1, 3) * [0.08, 0.05, 0.08] * size + [0, 0, 0.42 * size]
+        yield turned, around(centre, turned, at)
