@@ -1,0 +1,229 @@
+"""The datagram that carries one pose, and the one that compares two clocks. Version 1, little-endian, no padding.
+
+A pose is 460 bytes, below any path's limit, so it is never cut into fragments:
+
+====== ===== ======== =================================================================================================
+offset bytes type     meaning
+====== ===== ======== =================================================================================================
+0      4     bytes    ``HTPS``
+4      2     uint16   version, 1
+6      1     uint8    kind: 1 pose, 2 clock request, 3 clock reply
+7      1     uint8    flags: bit 0 is set when there is a pose; the others are 0 and to be ignored
+8      8     uint64   stream: a number the sender draws when it starts, so that a restart is seen
+16     8     uint64   sequence: 0, 1, 2, ... within a stream; a refusal has one of its own
+24     8     float64  capture time of the camera frame, seconds (see :func:`now`)
+32     8     float64  time of sending, seconds, the same clock
+40     4     bytes    axes of the camera frame: ``RDF`` and a zero: x right, y down, z forward; right-handed
+44     2     bytes    unit of length: ``m`` and a zero
+46     2     bytes    order of the matrix: ``RM``, row by row, for points as columns: p_camera = M p_tool
+48     32    bytes    name of the matrix, ASCII, filled with zeros: ``camera_from_tool``
+80     2     uint16   status: the integer of ``holotorch.tracking.status.Status``; 0 OK, 1 UNVERIFIED, above: refused
+82     2     uint16   degrees of freedom of chi-square; 0 where nothing was left to check the pose with
+84     4     float32  seconds by which smoothing lags behind a steady motion; 0 where there was none
+88     128   float64  matrix [4, 4]. The last column is the tip, the third the direction from the tip to the rear;
+                      the roll about it is not observed. NaN where refused
+216    168   float64  covariance of (tip, direction) in m^2, m and 1: upper triangle of 6 x 6, row by row, 21 numbers;
+                      NaN where refused
+384    8     float64  chi-square
+392    64    bytes    reason, UTF-8, cut at 64 bytes, filled with zeros; empty when OK
+456    4     uint32   CRC-32 (IEEE 802.3, zlib's) of all bytes before it
+====== ===== ======== =================================================================================================
+
+A clock request or reply is 52 bytes: the first 24 as above (``stream`` and ``sequence`` are the asker's own), three
+float64 at 24, 32 and 40 (asker's time of asking; answerer's time of hearing; answerer's time of answering; the last two
+0 in a request), CRC-32 at 48. A reply is no longer than its request.
+
+Nothing here is secret or signed: who can send to a receiver's port can forge poses. Use a network of your own.
+"""
+
+import math
+import struct
+import time
+import zlib
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from holotorch.tracking.status import Pose, Status
+
+VERSION, POSE, ASK, REPLY = 1, 1, 2, 3
+FRAME = "camera_from_tool"
+_MAGIC, _AXES, _UNIT, _ORDER = b"HTPS", b"RDF\0", b"m\0", b"RM"
+_HEAD, _CRC = struct.Struct("<4sHBBQQ"), struct.Struct("<I")
+_BODY, _STAMPS = struct.Struct("<dd4s2s2s32sHHf16d21dd64s"), struct.Struct("<ddd")
+_LENGTHS = {
+    kind: _HEAD.size + part.size + _CRC.size for kind, part in ((POSE, _BODY), (ASK, _STAMPS), (REPLY, _STAMPS))
+}
+_UPPER = torch.triu_indices(6, 6)
+_FARTHEST = 100.0  # metres; a tip farther off was given in another unit
+_START = time.time() - time.perf_counter()
+
+
+class PacketError(ValueError):
+    """These bytes are not a packet of this version; the message says at what they fail."""
+
+
+def now() -> float:
+    """Seconds since 1970 by the computer's clock when this program started, carried on by its steady counter.
+
+    It never steps and resolves a microsecond or less on every system; between two programs it may differ by what
+    the clock was corrected meanwhile, which the clock request measures.
+    """
+    return _START + time.perf_counter()
+
+
+@dataclass(frozen=True, eq=False)
+class PosePacket:
+    """One pose on its way. Times in seconds by the sender's :func:`now`.
+
+    Attributes:
+        pose: A single one, axes of :class:`Pose` without leading ones.
+        captured: When the camera took the frame.
+        sent: When it left.
+        sequence: Within the stream.
+        stream: Which run of a sender.
+        frame: Name of the matrix; its left part says whose axes it is in.
+        lag: Seconds that smoothing added.
+    """
+
+    pose: Pose
+    captured: float
+    sent: float
+    sequence: int
+    stream: int = 0
+    frame: str = FRAME
+    lag: float = 0.0
+
+    @property
+    def answered(self) -> bool:
+        """Whether it carries a pose, not a refusal."""
+        return self.pose.answered
+
+
+@dataclass(frozen=True)
+class Echo:
+    """Stamps that compare two clocks, as NTP does (RFC 5905, Sec. 8); ``heard`` and ``answered`` are 0 in a request."""
+
+    stream: int
+    number: int
+    asked: float
+    heard: float = 0.0
+    answered: float = 0.0
+    reply: bool = False
+
+
+def encode(packet: PosePacket | Echo) -> bytes:
+    """Bytes of a packet; ValueError for what :func:`decode` would refuse, TypeError for a batch of poses."""
+    if isinstance(packet, Echo):
+        head = _HEAD.pack(_MAGIC, VERSION, REPLY if packet.reply else ASK, 0, packet.stream, packet.number)
+        return _sealed(head + _STAMPS.pack(packet.asked, packet.heard, packet.answered))
+    pose = packet.pose
+    if not isinstance(pose.status, Status) or pose.tip.shape != (3,):
+        raise TypeError(f"a packet carries one pose with one status, got tips {list(pose.tip.shape)}; index the batch")
+    status, answered = pose.status, pose.status.answered
+    matrix, covariance = torch.full((4, 4), torch.nan, dtype=torch.float64), torch.full((21,), torch.nan)
+    if answered:
+        matrix = pose.camera_from_tool.detach().to("cpu", torch.float64, copy=True)
+        # The given numbers themselves, and the other axes square to them whatever the rounding.
+        along, first = pose.direction.detach().to(matrix), matrix[:3, 0]
+        first = torch.nn.functional.normalize(first - (first @ along) * along, dim=0)
+        matrix[:3, :3] = torch.stack([first, torch.linalg.cross(along, first), along], -1)
+        matrix[:3, 3] = pose.tip.detach()
+        covariance = pose.covariance.detach().to("cpu", torch.float64)[_UPPER[0], _UPPER[1]]
+    chi_square, freedom = float(pose.chi_square), float(pose.freedom)
+    freedom = int(freedom) if math.isfinite(freedom) else 0
+    frame = packet.frame.encode("ascii", "replace")
+    if not 1 <= len(frame) <= 32 or not packet.frame.isascii() or not packet.frame.isprintable():
+        raise ValueError(f"frame must be 1 to 32 printable ASCII characters, got {packet.frame!r}")
+    wrong = _mistake(status, matrix, covariance, chi_square, freedom, (packet.captured, packet.sent, packet.lag))
+    if wrong:
+        raise ValueError(wrong)
+    body = _BODY.pack(
+        *(packet.captured, packet.sent, _AXES, _UNIT, _ORDER, frame, int(status), freedom, packet.lag),
+        *(*matrix.flatten().tolist(), *covariance.tolist(), chi_square, _cut(pose.reason, 64)),
+    )
+    return _sealed(_HEAD.pack(_MAGIC, VERSION, POSE, int(answered), packet.stream, packet.sequence) + body)
+
+
+def decode(data: bytes) -> PosePacket | Echo:
+    """What :func:`encode` was given, float64 on the CPU; a reason longer than 64 bytes comes back cut.
+
+    Raises:
+        PacketError: Another magic, version, kind, length or CRC, other axes, unit or order, an unknown status, a pose
+            that is NaN or impossible, or a refusal that carries a pose.
+    """
+    if len(data) < _HEAD.size or data[:4] != _MAGIC:
+        raise PacketError(f"not a pose packet: {len(data)} bytes beginning with {bytes(data[:4])!r}, not {_MAGIC!r}")
+    _, version, kind, flags, stream, sequence = _HEAD.unpack_from(data)
+    if version != VERSION:
+        raise PacketError(
+            f"packet of version {version}, this is version {VERSION}; use the same holotorch on both ends"
+        )
+    if kind not in _LENGTHS:
+        raise PacketError(f"unknown kind of packet {kind}")
+    if len(data) != _LENGTHS[kind]:
+        raise PacketError(f"a packet of kind {kind} has {_LENGTHS[kind]} bytes, got {len(data)}")
+    if _CRC.unpack_from(data, len(data) - 4)[0] != zlib.crc32(data[:-4]):
+        raise PacketError("the CRC does not fit; the packet was damaged on its way")
+    if kind != POSE:
+        stamps = _STAMPS.unpack_from(data, _HEAD.size)
+        if not all(map(math.isfinite, stamps)):
+            raise PacketError(f"clock stamps must be finite, got {stamps}")
+        return Echo(stream, sequence, *stamps, reply=kind == REPLY)
+    return _pose_packet(_BODY.unpack_from(data, _HEAD.size), flags, stream, sequence)
+
+
+def _pose_packet(fields: tuple, flags: int, stream: int, sequence: int) -> PosePacket:
+    captured, sent, axes, unit, order, frame, code, freedom, lag = fields[:9]
+    if (axes, unit, order) != (_AXES, _UNIT, _ORDER):
+        raise PacketError(f"expected axes, unit and order {(_AXES, _UNIT, _ORDER)}, got {(axes, unit, order)}")
+    try:
+        status = Status(code)
+        name = frame.rstrip(b"\0").decode("ascii")
+        reason = fields[47].rstrip(b"\0").decode("utf-8")
+    except ValueError as error:
+        raise PacketError(f"status, frame name or reason cannot be read: {error}") from None
+    if not name or not name.isprintable():
+        raise PacketError(f"the frame name must be printable, got {name!r}")
+    if bool(flags & 1) != status.answered:
+        raise PacketError(f"flags {flags} do not fit the status {status.name}")
+    matrix = torch.tensor(fields[9:25], dtype=torch.float64).reshape(4, 4)
+    upper, chi_square = torch.tensor(fields[25:46], dtype=torch.float64), fields[46]
+    if wrong := _mistake(status, matrix, upper, chi_square, freedom, (captured, sent, lag)):
+        raise PacketError(wrong)
+    covariance = torch.empty(6, 6, dtype=torch.float64)
+    covariance[_UPPER[0], _UPPER[1]] = covariance[_UPPER[1], _UPPER[0]] = upper
+    chi, free = (torch.tensor(float(value), dtype=torch.float64) for value in (chi_square, freedom))
+    pose = Pose(matrix[:3, 3].clone(), matrix[:3, 2].clone(), covariance, chi, free, status, reason)
+    return PosePacket(pose, captured, sent, sequence, stream, name, lag)
+
+
+def _mistake(status: Status, matrix: Tensor, upper: Tensor, chi: float, freedom: int, times: tuple) -> str:
+    """What is impossible about a pose, or nothing."""
+    if not all(map(math.isfinite, times)) or min(times) < 0:
+        return f"capture time, time of sending and lag must be finite and not negative, got {times}"
+    if not status.answered:
+        carried = not bool(matrix.isnan().all()) or not bool(upper.isnan().all())
+        return f"a refusal ({status.name}) must not carry a pose; its matrix and covariance are NaN" if carried else ""
+    if not bool(matrix.isfinite().all()) or not bool(upper.isfinite().all()) or (freedom and not math.isfinite(chi)):
+        return f"a pose that is {status.name} must have a finite matrix, covariance and chi-square"
+    rotation, last = matrix[:3, :3], matrix.new_tensor([0.0, 0, 0, 1])
+    # 1e-6 rad is 0.1 micrometres at the bands, and float32 poses pass.
+    twisted = (rotation.T @ rotation - torch.eye(3, dtype=matrix.dtype)).abs().max() > 1e-6
+    if bool(twisted) or bool((matrix[3] != last).any()) or torch.linalg.det(rotation) < 0:
+        return "the matrix must be a right-handed rotation and a translation, with a unit direction in its third column"
+    if matrix[:3, 3].abs().max() > _FARTHEST:
+        return f"the tip must be within {_FARTHEST:g} m, in metres, got {matrix[:3, 3].tolist()}"
+    if bool((upper[_UPPER[0] == _UPPER[1]] < 0).any()):
+        return "the covariance must not be negative on its diagonal"
+    return ""
+
+
+def _sealed(data: bytes) -> bytes:
+    return data + _CRC.pack(zlib.crc32(data))
+
+
+def _cut(text: str, size: int) -> bytes:
+    """UTF-8 without zeros, cut between characters."""
+    return text.replace("\0", " ").encode("utf-8", "replace")[:size].decode("utf-8", "ignore").encode()
