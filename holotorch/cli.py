@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 from holotorch import __version__
+from holotorch.experiments.tracking_commands import add_tracking
 
 OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -193,7 +194,7 @@ def _parser() -> argparse.ArgumentParser:
     report.set_defaults(action=_report)
 
     chart = commands.add_parser("chart", help="speed against accuracy of every method, drawn and tabled")
-    chart.add_argument("subject", help="what to chart: eye, pec, propagation, volume")
+    chart.add_argument("subject", help="what to chart: eye, pec, propagation, tracking, volume")
     chart.add_argument("--out", type=Path, help="folder for the chart (default: scripts/charts/SUBJECT)")
     chart.set_defaults(action=_chart)
 
@@ -208,6 +209,7 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--format", default="png", help="png (default), bmp, or exr for phases instead of levels")
     export.set_defaults(action=_export_slm)
 
+    add_tracking(commands)
     doctor = commands.add_parser("doctor", help="check the installation and print what repairs it")
     doctor.set_defaults(action=_doctor)
     return parser

@@ -1,0 +1,289 @@
+"""Tracking a catheter through a video, pictures or a camera: poses, overlay, timing, and a recording to replay."""
+
+import csv
+import io
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import IO
+
+import torch
+import yaml
+from torch import Tensor
+from tqdm import tqdm
+
+from holotorch.experiments.config_tracking import (
+    CameraSettings,
+    build_camera,
+    build_catheter,
+    load_camera,
+    load_catheter,
+)
+from holotorch.experiments.environment import environment
+from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.run import claim, deferred, interruptible
+from holotorch.experiments.track_report import COLUMNS, Log, Tracked, row, summarised, verdict, write_page
+from holotorch.io.bundled import find_config
+from holotorch.io.files import replacing, write_bytes, write_json, write_text
+from holotorch.io.recording import Recorder, free_bytes, is_recording, open_recording, recording_bytes
+from holotorch.io.video import Frame, Frames, open_frames, replacing_video
+from holotorch.tracking import Camera, Catheter, Pose, Status
+from holotorch.tracking.overlay import overlay
+from holotorch.tracking.packet import now
+
+METHODS = ("ours", "thesis")
+_OFF_CENTRE = 0.15  # of a side; two thirds of the resolution, as 720 to 1080 lines, shift the centre by a sixth
+Tracker = Callable[[Tensor, Sequence[Pose] | None], list[Pose]]
+
+
+def follow(frames: Iterable[Frame], tracker: Tracker) -> Iterator[Tracked]:
+    """Track frame by frame, each with the pose of the frame before; with none after a refusal.
+
+    ``tracker`` is called as ``tracker(frames [1, 3, H, W], previous)``. A dict ``times`` of the tracker is taken as the
+    seconds of each stage of its last call.
+    """
+    previous: list[Pose] | None = None
+    for number, frame in enumerate(frames):
+        if frame.pixels is None:
+            previous = None
+            yield Tracked(number, frame, Pose.refused(Status.BAD_FRAME, frame.problem), 0.0, {})
+            continue
+        started = time.perf_counter()
+        pose = tracker(frame.pixels[None], previous)[0]
+        seconds = time.perf_counter() - started
+        previous = [pose] if pose.answered else None
+        yield Tracked(number, frame, pose, seconds, dict(getattr(tracker, "times", {})))
+
+
+def run_tracking(
+    source: str | Path,
+    camera: Path | None = None,
+    catheter: Path | None = None,
+    out: Path | None = None,
+    *,
+    method: str = "ours",
+    record: bool = False,
+    video: bool = True,
+    still: bool = False,
+    rate: float | None = None,
+) -> tuple[Path, bool]:
+    """Track a source and fill a folder: ``out``, or the next free ``runs/track-001``.
+
+    The folder gets ``poses.csv`` (a line per frame, ``COLUMNS``), ``overlay.mp4``, ``report.html``, copies of the two
+    YAML files, ``recording`` if asked for, and ``summary.json`` last. Ctrl-C saves what there is, and is the ordinary
+    end of a camera.
+
+    Args:
+        source: A video, a folder of pictures, a folder of a recording, or the number of a camera.
+        camera: YAML file; that of the recording by default.
+        catheter: The same.
+        out: New or empty folder.
+        method: One of ``METHODS``.
+        record: Keep every frame, losslessly.
+        video: Write the overlay.
+        still: The catheter is held still; measure its stability, Eq. 3.13.
+        rate: Frames per second where the source has no times.
+
+    Returns:
+        The folder, and whether the source was tracked to its end.
+
+    Raises:
+        ConfigError: A source, file or method that cannot be used, a folder in use, or no room for the recording.
+    """
+    if method not in METHODS:
+        raise ConfigError([f"expected one of {', '.join(METHODS)} as the method, got {method!r}"])
+    replayed = is_recording(Path(source))
+    files = {"camera.yaml": camera, "catheter.yaml": catheter}
+    for name in files:
+        if files[name] is None and replayed and (Path(source) / name).is_file():
+            files[name] = Path(source) / name
+    missing = [f"no {name}: say which with --{name[:-5]}" for name, path in files.items() if path is None]
+    if missing:
+        raise ConfigError(missing)
+    paths = {name: find_config(path) or path for name, path in files.items() if path is not None}
+    lens, tool = load_camera(paths["camera.yaml"]), build_catheter(load_catheter(paths["catheter.yaml"]))
+    try:
+        frames = open_recording(Path(source)) if replayed else open_frames(source, rate)
+    except ValueError as error:
+        raise ConfigError([str(error)]) from None
+    with frames:
+        _same_size(lens, frames)
+        for line in [*_announced(frames, out, record), *frames.notes]:
+            print(line, flush=True)
+        folder = claim(out, "track")
+        for name, path in paths.items():
+            write_bytes(folder / name, path.read_bytes())
+        settings = {
+            "experiment": "track",
+            "source": str(source),
+            "method": method,
+            "record": record,
+            "video": video,
+            "still": still,
+            "rate_hz": rate,
+        }
+        write_text(folder / "config.yaml", yaml.safe_dump(settings, sort_keys=False))
+        write_json(folder / "env.json", environment(0, torch.device("cpu")))
+        return _fill(folder, frames, build_camera(lens), tool, method, paths if record else None, video, still)
+
+
+def live(sources: Sequence[str], camera: Path | None, catheter: Path | None) -> Iterator[tuple[float, Pose]]:
+    """Times on the packets' clock and poses of one source, as its frames come; a file's at the pace of its times."""
+    if len(sources) != 1 or camera is None or catheter is None:
+        raise ConfigError(["to track and stream, give one source, --camera FILE and --catheter FILE"])
+    paths = [find_config(path) or path for path in (camera, catheter)]
+    lens, tool = load_camera(paths[0]), build_catheter(load_catheter(paths[1]))
+    source = Path(sources[0])
+    try:
+        frames = open_recording(source) if is_recording(source) else open_frames(sources[0])
+    except ValueError as error:
+        raise ConfigError([str(error)]) from None
+    with frames:
+        _same_size(lens, frames)
+        began = None
+        for item in follow(frames, _tracker("ours", build_camera(lens), tool)):
+            began = now() - item.frame.seconds if began is None else began
+            if not frames.live:
+                time.sleep(max(0.0, began + item.frame.seconds - now()))
+            yield (now() if frames.live else began + item.frame.seconds), item.pose
+
+
+def _fill(
+    folder: Path,
+    frames: Frames,
+    camera: Camera,
+    catheter: Catheter,
+    method: str,
+    recorded: dict[str, Path] | None,
+    video: bool,
+    still: bool,
+) -> tuple[Path, bool]:
+    log, failure = Log(folder / "images"), None
+    (folder / "images").mkdir(exist_ok=True)
+    said = len(frames.notes)
+    with interruptible() as pressed:
+        stack = ExitStack()
+        try:
+            table = stack.enter_context(replacing(folder / "poses.csv"))
+            _append(table, COLUMNS)
+            movie, came = None, iter(frames)
+            if video:
+                movie = stack.enter_context(replacing_video(folder / "overlay.mp4", frames.shape, frames.rate))
+            if recorded is not None:
+                recorder = Recorder(folder / "recording", frames.shape, frames.rate, frames.name, recorded)
+                came = _recorded(came, stack.enter_context(recorder), pressed)
+            bar = stack.enter_context(tqdm(total=frames.total, unit="frame", desc="tracking", dynamic_ncols=True))
+            for item in follow(came, _tracker(method, camera, catheter)):
+                with deferred(pressed):
+                    _append(table, row(item))
+                    drawn = _drawn(item, frames.shape, camera, catheter) if movie or log.wants(item) else None
+                    if movie and drawn is not None:
+                        movie.write(drawn)
+                    log.take(item, drawn)
+                    bar.set_postfix_str(f"{item.status.name}, {1e3 * item.seconds:.1f} ms", refresh=False)
+                    bar.update()
+                if pressed:
+                    break
+        except KeyboardInterrupt:
+            pass
+        except Exception as error:  # what was found until now is kept
+            failure = error
+        with deferred(pressed):
+            try:
+                stack.close()
+            except OSError as error:
+                failure = failure or error
+            if not log.statuses:
+                if recorded is None:
+                    shutil.rmtree(folder)  # claimed empty a moment ago: only this run's own files are in it
+                raise failure or KeyboardInterrupt
+            complete = failure is None and (not pressed or frames.live)
+            summary = summarised(log, frames, method, still)
+            summary["status"] = "complete" if complete else "interrupted"
+            if failure is not None:
+                summary["failure"] = f"{type(failure).__name__}: {failure}"
+            write_page(folder, summary, log)
+            write_json(folder / ("summary.json" if complete else "interrupted.json"), summary)
+    print("\n".join([verdict(summary), *frames.notes[said:]]), flush=True)
+    if failure is not None:
+        print(f"failed; what was found until then is in {folder}", file=sys.stderr)
+        raise failure
+    return folder, complete
+
+
+def _recorded(frames: Iterator[Frame], recorder: Recorder, pressed: list[int]) -> Iterator[Frame]:
+    """The frames, each kept before anything is done with it."""
+    for frame in frames:
+        with deferred(pressed):
+            recorder.write(frame)
+        yield frame
+
+
+def _tracker(method: str, camera: Camera, catheter: Catheter) -> Tracker:
+    if method == "thesis":
+        from holotorch.tracking.thesis import ThesisTracker
+
+        return _Cold(ThesisTracker(camera, catheter))
+    from holotorch.tracking.tracker import CatheterTracker
+
+    return CatheterTracker(camera, catheter)
+
+
+class _Cold:
+    """A tracker that makes no use of the pose before."""
+
+    def __init__(self, tracker: Callable[[Tensor], list[Pose]]):
+        self._tracker = tracker
+
+    def __call__(self, frames: Tensor, previous: Sequence[Pose] | None = None) -> list[Pose]:
+        return self._tracker(frames)
+
+    @property
+    def times(self) -> dict[str, float]:
+        return getattr(self._tracker, "times", {})
+
+
+def _drawn(item: Tracked, shape: tuple[int, int], camera: Camera, catheter: Catheter) -> Tensor:
+    pixels = item.frame.pixels
+    return overlay(torch.zeros(3, *shape, dtype=torch.uint8) if pixels is None else pixels, item.pose, camera, catheter)
+
+
+def _append(table: IO[bytes], cells: Sequence[str]) -> None:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerow(cells)
+    table.write(text.getvalue().encode("utf-8", "replace"))
+    table.flush()
+
+
+def _announced(frames: Frames, out: Path | None, record: bool) -> list[str]:
+    """What will be done, in words; ConfigError where there is no room for it."""
+    height, width = frames.shape
+    count = "an unknown number of frames" if frames.total is None else f"{frames.total} frames"
+    count = "without end; Ctrl-C ends it" if frames.live else count
+    lines = [f"Source     {frames.name}: {width} x {height} px, {frames.rate:g} per second, {count}"]
+    if not record:
+        return lines
+    free = free_bytes(out or Path())
+    if frames.total is None:
+        size = recording_bytes(frames.shape, 1) * frames.rate
+        return [*lines, f"Recording  {size / 1e6:.1f} MB per second; {free / 1e9:.1f} GB free, {free / size:.0f} s"]
+    size = recording_bytes(frames.shape, frames.total)
+    if size > free:
+        raise ConfigError([f"the recording takes {size / 1e9:.2f} GB and {free / 1e9:.2f} GB are free; choose --out"])
+    return [*lines, f"Recording  {size / 1e9:.3f} GB; {free / 1e9:.1f} GB free"]
+
+
+def _same_size(lens: CameraSettings, frames: Frames) -> None:
+    """ConfigError, or a doubt noted, for intrinsics of another resolution: poses would be wrong, and plausible."""
+    height, width = frames.shape
+    if lens.size is not None and tuple(lens.size) != frames.shape:
+        held = f"{lens.size[1]} x {lens.size[0]}"
+        raise ConfigError([f"the camera's file holds for frames of {held} px, and these have {width} x {height} px"])
+    if lens.size is None and max(abs(lens.cx / width - 0.5), abs(lens.cy / height - 0.5)) > _OFF_CENTRE:
+        frames.notes.append(
+            f"the principal point ({lens.cx:.0f}, {lens.cy:.0f}) is far from the middle of frames of {width} x "
+            f"{height} px: was the camera calibrated at another resolution?"
+        )

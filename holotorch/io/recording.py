@@ -1,0 +1,220 @@
+"""Lossless recording of frames as they came, and its replay to the bit.
+
+A recording is a folder::
+
+    recording.json   format, frame size, rate, source, files beside; written first
+    camera.yaml ...  copies of the files that the recording was made with, byte for byte
+    frames.rgb       the frames one after another, 8-bit, H rows of W pixels of red, green, blue; nothing between them
+    times.csv        frame,seconds,crc32,problem: a line per frame, written after the frame; a frame that could not be
+                     read has a problem and no checksum, and no bytes in frames.rgb
+
+Both are only ever appended to, so that what was recorded before a crash of the program can be replayed. The bytes are
+raw, since compressing a 1080p frame to PNG takes longer than a camera's period. ``ffplay -f rawvideo -pixel_format
+rgb24 -video_size WxH frames.rgb`` shows them.
+"""
+
+import csv
+import json
+import math
+import shutil
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+from holotorch.io.files import write_bytes, write_json
+from holotorch.io.video import Frame, Frames
+
+_FORMAT = 1
+_COLUMNS = ("frame", "seconds", "crc32", "problem")
+
+
+def recording_bytes(shape: tuple[int, int], frames: int) -> int:
+    """Size of ``frames`` frames of ``shape`` (H, W) in a recording, in bytes."""
+    return 3 * shape[0] * shape[1] * frames
+
+
+def is_recording(path: Path) -> bool:
+    """Whether ``path`` is the folder of a recording."""
+    return (path / "recording.json").is_file() and (path / "times.csv").is_file()
+
+
+class Recorder:
+    """Appends frames to a new recording; a context that closes it."""
+
+    def __init__(
+        self, folder: Path, shape: tuple[int, int], rate: float, source: str, copies: Mapping[str, Path] | None = None
+    ):
+        """Begin a recording.
+
+        Args:
+            folder: New or empty.
+            shape: (H, W) of every frame.
+            rate: Frames per second that the source states.
+            source: Name of the source.
+            copies: Files to keep beside the frames, by the name they get there, such as ``camera.yaml``.
+
+        Raises:
+            ValueError: A folder with something in it, or an impossible shape or rate.
+            OSError: It cannot be written, or a copy not read.
+        """
+        for side in shape:
+            checks.whole("side of a frame", side, 1)
+        checks.positive("rate", rate, "frames per second")
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise ValueError(f"{folder} holds files already; a recording needs a new folder")
+        self.folder, self.shape, self.frames = folder, tuple(shape), 0
+        for name, path in (copies or {}).items():
+            write_bytes(folder / name, path.read_bytes())
+        facts = {
+            "format": _FORMAT,
+            "height": shape[0],
+            "width": shape[1],
+            "rate_hz": rate,
+            "source": source,
+            "copies": sorted(copies or {}),
+        }
+        write_json(folder / "recording.json", facts)
+        self._pixels = open(folder / "frames.rgb", "ab", buffering=0)  # noqa: SIM115
+        self._times = open(folder / "times.csv", "a", encoding="utf-8", errors="replace", newline="")  # noqa: SIM115
+        self._row(_COLUMNS)
+
+    def write(self, frame: Frame) -> None:
+        """Append a frame: its pixels first, then its line. ValueError for pixels of another shape or kind."""
+        checks.finite("time of a frame", frame.seconds, "seconds")
+        # repr of a float is read back to the same bits.
+        if frame.pixels is None:
+            problem = " ".join(frame.problem.split())  # a line is a line
+            self._row((str(self.frames), repr(float(frame.seconds)), "", problem or "not readable"))
+        else:
+            if frame.pixels.dtype != torch.uint8 or tuple(frame.pixels.shape) != (3, *self.shape):
+                raise ValueError(
+                    f"frames of this recording are uint8 {[3, *self.shape]}, got {frame.pixels.dtype} "
+                    f"{list(frame.pixels.shape)}"
+                )
+            data = _interleaved(frame.pixels).data.cast("B")
+            done = 0
+            while done < len(data):  # a single call may write less
+                done += self._pixels.write(data[done:]) or 0
+            self._row((str(self.frames), repr(float(frame.seconds)), f"{zlib.crc32(data):08x}", ""))
+        self.frames += 1
+
+    def close(self) -> None:
+        """Close the files."""
+        self._pixels.close()
+        self._times.close()
+
+    def __enter__(self) -> "Recorder":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _row(self, cells: tuple[str, ...]) -> None:
+        csv.writer(self._times, lineterminator="\n").writerow(cells)
+        self._times.flush()
+
+
+def open_recording(folder: Path) -> Frames:
+    """Frames of a recording, as they were, with their times.
+
+    Of a recording that was cut off, all frames that are whole, and ``notes`` says so. A frame whose bytes have changed
+    since is a frame with a problem.
+
+    Raises:
+        ValueError: No recording, of a later format, damaged, or without a whole frame.
+    """
+    if not is_recording(folder):
+        raise ValueError(f"{folder} holds no recording: recording.json and times.csv are not both there")
+    facts = _facts(folder)
+    shape = (facts["height"], facts["width"])
+    size = recording_bytes(shape, 1)
+    rows = _rows(folder)
+    present = (folder / "frames.rgb").stat().st_size if (folder / "frames.rgb").is_file() else 0
+    # A line is written after its frame, so that a cut leaves at most pixels without a line.
+    kept, place = [], 0
+    for seconds, crc, problem in rows:
+        if crc is not None and place + size > present:
+            break
+        kept.append((seconds, crc, problem, place))
+        place += size if crc is not None else 0
+    if not any(crc is not None for _, crc, _, _ in kept):
+        raise ValueError(f"{folder} holds no whole frame; the recording was cut off before its first")
+    notes = []
+    if len(kept) < len(rows):
+        notes.append(f"frames.rgb is cut off: {len(kept)} of {len(rows)} frames are there")
+    elif present > place:
+        notes.append(f"the recording was cut off while a frame was written; the {len(kept)} before it are there")
+
+    def frames() -> Iterator[Frame]:
+        with open(folder / "frames.rgb", "rb") as stream:
+            for seconds, crc, problem, place in kept:
+                if crc is None:
+                    yield Frame(seconds, None, problem)
+                    continue
+                stream.seek(place)
+                data = bytearray(stream.read(size))
+                if zlib.crc32(data) != crc:
+                    yield Frame(seconds, None, "its bytes have changed since it was recorded")
+                    continue
+                pixels = np.frombuffer(data, np.uint8).reshape(*shape, 3)
+                yield Frame(seconds, torch.from_numpy(pixels).permute(2, 0, 1).contiguous())
+
+    return Frames(folder.name, shape, len(kept), facts["rate_hz"], frames(), notes)
+
+
+def free_bytes(folder: Path) -> int:
+    """Room on the disk that ``folder``, or the nearest folder above it that exists, lies on."""
+    folder = folder.resolve()
+    while not folder.exists():
+        folder = folder.parent
+    return shutil.disk_usage(folder).free
+
+
+def _facts(folder: Path) -> dict[str, Any]:
+    path = folder / "recording.json"
+    try:
+        facts = json.loads(path.read_text(encoding="utf-8"))
+        version = checks.whole("format", facts["format"], 1)
+        for name in ("height", "width"):
+            checks.whole(name, facts[name], 1)
+        checks.positive("rate_hz", facts["rate_hz"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is damaged: {type(error).__name__} {error}") from None
+    if version > _FORMAT:
+        raise ValueError(f"{path} is of format {version}; this version reads up to {_FORMAT}: use a newer one")
+    return facts
+
+
+def _rows(folder: Path) -> list[tuple[float, int | None, str]]:
+    """Time, checksum and problem of each line; a last line without its end was being written when it was cut off."""
+    path = folder / "times.csv"
+    text = path.read_bytes().decode("utf-8", "replace")
+    lines = list(csv.reader(text[: text.rfind("\n") + 1].split("\n")[:-1]))
+    if not lines or tuple(lines[0]) != _COLUMNS:
+        raise ValueError(
+            f"{path} must begin with {','.join(_COLUMNS)}, got {','.join(lines[0]) if lines else 'nothing'}"
+        )
+    rows: list[tuple[float, int | None, str]] = []
+    for number, cells in enumerate(lines[1:]):
+        try:
+            index, seconds, crc, problem = cells
+            row = float(seconds), int(crc, 16) if crc else None, problem
+            if int(index) != number or not math.isfinite(row[0]):
+                raise ValueError
+        except ValueError:
+            raise ValueError(f"{path}:{number + 2} is damaged: {','.join(cells)!r}") from None
+        rows.append(row)
+    return rows
+
+
+def _interleaved(pixels: Tensor) -> np.ndarray:
+    import cv2
+
+    return cv2.merge(list(pixels.cpu().numpy()))

@@ -1,0 +1,279 @@
+"""Frames and their times from a video file, a folder of pictures or a camera; videos written whole or not at all."""
+
+import math
+import os
+import re
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+_CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
+_ASSUMED_RATE = 30.0  # Hz, where nothing states one
+
+
+class Frame(NamedTuple):
+    """One frame: ``seconds`` and ``pixels``, uint8 [3, H, W] RGB, or None and the ``problem`` that it has."""
+
+    seconds: float
+    pixels: Tensor | None
+    problem: str = ""
+
+
+class Frames:
+    """Frames of a source, once through, in their order; a context that closes what it has opened.
+
+    Attributes:
+        name: Of the source.
+        shape: (H, W).
+        total: Number of frames that the source states, or None where it states none, as a camera.
+        rate: Frames per second that the source states, or that were assumed.
+        live: Whether it is a camera, which never ends.
+        notes: What the user should know of the source, such as an assumed rate; complete when the frames are read.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        shape: tuple[int, int],
+        total: int | None,
+        rate: float,
+        frames: Iterator[Frame],
+        notes: list[str],
+        *,
+        live: bool = False,
+    ):
+        self.name, self.shape, self.total, self.rate, self.notes, self.live = name, shape, total, rate, notes, live
+        self._frames = frames
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self._frames
+
+    def __enter__(self) -> "Frames":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        close = getattr(self._frames, "close", None)
+        if close is not None:
+            close()
+
+
+def open_frames(source: str | Path, rate: float | None = None) -> Frames:
+    """Frames of a video file, of the pictures in a folder in natural order, or of the camera with a number as name.
+
+    Times are those of the file, or of the camera's driver; where there are none, as for pictures, frames count at
+    ``rate`` per second, 30 by default, and ``notes`` says so. A frame that cannot be read is a frame with a problem.
+
+    Raises:
+        ValueError: No such file, folder or camera, nothing in it that can be decoded, or a rate that is no rate.
+    """
+    if rate is not None:
+        checks.positive("rate", rate, "frames per second")
+    path = Path(source)
+    if path.is_dir():
+        return _folder(path, rate)
+    if path.is_file():
+        return _video(path, rate)
+    if str(source).isdecimal():
+        return _camera(int(str(source)), rate)
+    raise ValueError(f"no such video, folder or camera: {source}; a camera is given by its number, such as 0")
+
+
+def _video(path: Path, rate: float | None) -> Frames:
+    import cv2
+
+    capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        capture.release()
+        raise ValueError(f"{path} is not a video that OpenCV can open: damaged, cut off, or of another format")
+    stated = capture.get(cv2.CAP_PROP_FPS)
+    announced = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    notes: list[str] = []
+    if not (math.isfinite(stated) and stated > 0):
+        stated = _ASSUMED_RATE if rate is None else rate
+        notes.append(f"{path.name} states no rate; {stated:g} frames per second assumed")
+    fine, first = capture.read()
+    if not fine:
+        code = int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
+        codec = code.to_bytes(4, "little").decode("ascii", "replace").strip("\0 ") or "unknown"
+        capture.release()
+        raise ValueError(
+            f"{path}: no frame could be decoded (codec {codec}); it is empty or damaged, or OpenCV lacks the codec: "
+            "convert it, for example with ffmpeg -i IN -c:v ffv1 OUT.avi"
+        )
+
+    def frames() -> Iterator[Frame]:
+        picture, seconds, count, guessed = first, 0.0, 0, 0
+        try:
+            while True:
+                now = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
+                if count and not now > seconds:  # the stream has no time for this frame
+                    now, guessed = seconds + 1 / stated, guessed + 1
+                seconds, count = now, count + 1
+                yield Frame(seconds, _rgb(picture)) if picture is not None else Frame(seconds, None, "not decodable")
+                if not capture.grab():
+                    break
+                fine, picture = capture.retrieve()
+                picture = picture if fine else None
+            if guessed:
+                notes.append(f"{guessed} of {count} frames have no time of their own; counted at {stated:g} per second")
+            if count < announced:
+                notes.append(f"{path.name} announces {announced} frames and {count} could be read")
+        finally:
+            capture.release()
+
+    return Frames(path.name, first.shape[:2], announced if announced > 0 else None, stated, frames(), notes)
+
+
+def _folder(folder: Path, rate: float | None) -> Frames:
+    paths = sorted((p for p in folder.iterdir() if p.suffix.lower() in PICTURES), key=lambda p: _natural(p.name))
+    if not paths:
+        raise ValueError(f"{folder} holds no pictures ({', '.join(PICTURES)})")
+    readable = (pixels for pixels in map(_picture, paths) if pixels is not None)
+    first = next(readable, None)
+    if first is None:
+        raise ValueError(f"none of the {len(paths)} pictures in {folder} could be decoded")
+    shape = first.shape[:2]
+    notes = [] if rate else [f"pictures have no times; {_ASSUMED_RATE:g} frames per second assumed"]
+    stated = rate or _ASSUMED_RATE
+
+    def frames() -> Iterator[Frame]:
+        for index, path in enumerate(paths):
+            pixels = _picture(path)
+            if pixels is None:
+                yield Frame(index / stated, None, f"{path.name} is not a readable picture, or is cut off")
+            elif pixels.shape[:2] != shape:
+                found = f"{pixels.shape[1]} x {pixels.shape[0]}"
+                yield Frame(index / stated, None, f"{path.name} is {found} px and the first {shape[1]} x {shape[0]} px")
+            else:
+                yield Frame(index / stated, _rgb(pixels))
+
+    return Frames(folder.name, shape, len(paths), stated, frames(), notes)
+
+
+def _camera(index: int, rate: float | None) -> Frames:
+    import cv2
+
+    capture = cv2.VideoCapture(index)
+    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest frame, not the oldest that waits
+    if rate is not None:
+        capture.set(cv2.CAP_PROP_FPS, rate)
+    fine, first = capture.read() if capture.isOpened() else (False, None)
+    if not fine or first is None:
+        capture.release()
+        raise ValueError(f"no frame from camera {index}; is it plugged in, free, and may this user read it?")
+    stated = capture.get(cv2.CAP_PROP_FPS)
+    stated = stated if math.isfinite(stated) and stated > 0 else _ASSUMED_RATE
+    # Video4Linux gives the driver's time of each frame; other systems nothing.
+    driver = capture.get(cv2.CAP_PROP_POS_MSEC) > 0
+    notes = [] if driver else ["times are those of arrival in this program, the camera's driver gives none"]
+
+    def now() -> float:
+        return capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3 if driver else time.monotonic()
+
+    def frames() -> Iterator[Frame]:
+        try:
+            yield Frame(now(), _rgb(first))
+            while capture.grab():
+                seconds = now()
+                fine, picture = capture.retrieve()
+                yield Frame(seconds, _rgb(picture)) if fine else Frame(seconds, None, "not decodable")
+            notes.append("the camera stopped giving frames")
+        finally:
+            capture.release()
+
+    return Frames(f"camera {index}", first.shape[:2], None, stated, frames(), notes, live=True)
+
+
+class VideoWriter:
+    """Frames one by one into an ``.mp4`` (MPEG-4) or ``.avi`` (motion JPEG); see :func:`replacing_video`."""
+
+    def __init__(self, path: Path, shape: tuple[int, int], rate: float):
+        import cv2
+
+        self.path, self.shape = path, shape
+        codec = cv2.VideoWriter.fourcc(*_CODECS[path.suffix.lower()])
+        self._writer = cv2.VideoWriter(str(path), codec, rate, (shape[1], shape[0]))
+        if not self._writer.isOpened():
+            raise OSError(0, f"OpenCV cannot write a video of {shape[1]} x {shape[0]} px at {rate:g} Hz", str(path))
+
+    def write(self, pixels: Tensor) -> None:
+        """Append one frame, uint8 [3, H, W] RGB. OSError where the disk takes no more."""
+        import cv2
+
+        if pixels.dtype != torch.uint8 or tuple(pixels.shape) != (3, *self.shape):
+            raise ValueError(
+                f"frames of this video are uint8 {[3, *self.shape]}, got {pixels.dtype} {list(pixels.shape)}"
+            )
+        red, green, blue = pixels.cpu().numpy()
+        if self._writer.write(cv2.merge([blue, green, red])) is False:
+            raise OSError(0, "OpenCV could not write a frame; is the disk full?", str(self.path))
+
+    def close(self) -> None:
+        """Write what the file needs at its end."""
+        self._writer.release()
+
+
+@contextmanager
+def replacing_video(path: Path, shape: tuple[int, int], rate: float) -> Iterator[VideoWriter]:
+    """Open a video under a temporary name that becomes ``path`` when the block ends without an error.
+
+    Args:
+        path: Ends in ``.mp4`` or ``.avi``.
+        shape: (H, W) of the frames; an odd side loses its last line, as the codecs want.
+        rate: Frames per second; a video has one rate, also where frames came irregularly.
+
+    Raises:
+        ValueError: Another ending, or an impossible rate or shape.
+        OSError: The file cannot be written.
+    """
+    if path.suffix.lower() not in _CODECS:
+        raise ValueError(f"{path}: videos are written as {' or '.join(_CODECS)}, got {path.suffix or 'no ending'}")
+    checks.positive("rate", rate, "frames per second")
+    for side in shape:
+        checks.whole("side of a frame", side, 2)
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")  # the ending chooses the container
+    try:
+        try:
+            writer = VideoWriter(partial, shape, rate)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(path)) from None
+        try:
+            yield writer
+        finally:
+            writer.close()
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _picture(path: Path) -> np.ndarray | None:
+    """BGR [H, W, 3], turned upright as its tag says; None where it cannot be decoded."""
+    import cv2
+
+    try:
+        data = np.fromfile(path, np.uint8)
+        return cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    except (OSError, cv2.error):
+        return None
+
+
+def _rgb(pixels: np.ndarray) -> Tensor:
+    import cv2
+
+    planes = np.empty((3, *pixels.shape[:2]), np.uint8)
+    cv2.split(pixels, [planes[2], planes[1], planes[0]])  # many times faster than numpy's transposition
+    return torch.from_numpy(planes)
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Key that puts frame2 before frame10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
