@@ -1,4 +1,4 @@
-"""The commands track, calibrate and stream: their arguments, and what they call. Nothing is loaded before it is used."""
+"""The commands track, calibrate and stream: their arguments, and what they call. Nothing loads before it is used."""
 
 import argparse
 from pathlib import Path

@@ -43,7 +43,7 @@ class EdgeFit:
 
 
 def fit_edges(light: Tensor, weight: Tensor, blur: float = 0.9) -> EdgeFit:
-    """Error functions of one place and one blur for each edge, with levels of their own in each row and channel.
+    """Error functions of a place for each edge and one blur, with levels of their own in each row and channel.
 
     Args:
         light: [E, T, U, C] samples; T odd, the edge near the middle.
@@ -65,11 +65,24 @@ def fit_edges(light: Tensor, weight: Tensor, blur: float = 0.9) -> EdgeFit:
         sigma = (sigma + step[:, 1]).clamp(_SHARPEST, _BLUNTEST)
         if float(step.abs().max()) < 1e-3:
             break
+    # One lens blurs all edges alike. Where one side is dark and so has little noise, place and blur are hard to tell
+    # apart, edge by edge; together they are not.
+    normal = _edge_terms(t, place, sigma, centred, weight, total)[0]
+    sure = 1 / torch.linalg.inv_ex(normal + 1e-300 * torch.eye(2, dtype=torch.float64)).inverse[:, 1, 1].clamp(
+        min=1e-12
+    )
+    common = (sure * sigma).sum() / sure.sum().clamp(min=1e-300)
+    alike = (sigma / common - 1).abs() < 0.5
+    sigma = torch.where(alike, (sure * alike * sigma).sum() / (sure * alike).sum().clamp(min=1e-300), sigma)
+    for _ in range(2):
+        normal, slope, rest, amplitude, middle = _edge_terms(t, place, sigma, centred, weight, total)
+        place = place + (slope[:, 0] / normal[:, 0, 0].clamp(min=1e-300)).nan_to_num(0).clamp(-0.5, 0.5)
+    place = place.clamp(-(count - 1) / 2, (count - 1) / 2)
     normal, _, rest, amplitude, middle = _edge_terms(t, place, sigma, centred, weight, total)
     free = (weight > 0).sum((1, 2, 3)) - 2 * (total > 0).sum((1, 2)) - 2
     noise = (rest / free.clamp(min=1)).sqrt()
-    inverse = torch.linalg.inv_ex(normal + 1e-300 * torch.eye(2, dtype=torch.float64)).inverse
-    variance = inverse[:, 0, 0]
+    tilt = normal[:, 0, 1] / normal[:, 0, 0]
+    variance = 1 / normal[:, 0, 0] + tilt.square() / torch.where(alike, (sure * alike).sum(), sure).clamp(min=1e-12)
     z = (t - place[:, None]) / sigma[:, None]
     left = centred - amplitude[:, None] * (0.5 * torch.erfc(-z / math.sqrt(2))[:, :, None, None] - middle[:, None])
     # What varies from sample to sample is noise; what does not is something else that the edge is mixed with.

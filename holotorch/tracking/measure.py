@@ -19,10 +19,10 @@ _LEVEL_SD = 2.5 / 255  # of a pixel's level; fits correct it by what they leave
 _ONE_SIDED = 0.15  # contrast to one side over that to the other
 _NARROWEST = 2.6  # pixels: below it no pixel shows one band alone
 _WIDEST = 120.0
-_WINDOW = 9  # samples to either side of an edge
+_WINDOW = 11  # samples to either side of an edge
 _STATIONS = 40
 _SAMPLES = 4  # for each station
-_LINE_FLOOR = 0.015  # pixels
+_LINE_FLOOR = 0.008  # of the width: what gloss and shadow, which repeat along the tube, may move its middle
 _ALIKE = 0.2  # of the brightest channel: colours nearer than this are one
 _BESIDE = 14.0  # pixels from the mid-line, beside the widest catheters
 _SIDE_STEP = 0.25  # light that changes beside an edge, over what changes on it: something lies across the tube
@@ -64,11 +64,12 @@ class Axis:
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """Of the band edges [N] on a line: t in pixels (NaN where not seen), its deviation, blur, and why some fail."""
+    """Of the band edges [N] on a line, in pixels: t (NaN where not seen), its deviation, blur, bulge, and failures."""
 
     t: Tensor
     deviation: Tensor
     blur: float
+    bulge: float
     hidden: tuple[int, ...]
     outside: tuple[int, ...]
 
@@ -123,7 +124,9 @@ def measure_axis(sampler: Sampler, camera: Camera, line: Line, stretches: Stretc
     device = sampler.frame.device
     every = max(1.0, sum(b - a for a, b, _ in spans) / (_SAMPLES * _STATIONS))
     # Several samples for each station: along the tube neighbours differ in nothing but noise.
-    parts = [torch.arange(a, b - (_SAMPLES - 1) * every, _SAMPLES * every, dtype=torch.float64) for a, b, _ in spans]
+    parts = [
+        torch.arange(a, max(a, b - (_SAMPLES - 1) * every), _SAMPLES * every, dtype=torch.float64) for a, b, _ in spans
+    ]
     band = torch.cat([torch.full((len(part),), k) for k, part in enumerate(parts)]).to(device)
     t = (torch.cat(parts)[:, None] + every * torch.arange(_SAMPLES)).to(device)
     if len(t) < 6:
@@ -145,15 +148,15 @@ def measure_axis(sampler: Sampler, camera: Camera, line: Line, stretches: Stretc
         raise Refusal(Status.TOO_NARROW, f"the catheter is {float(wide):.1f} px wide; {_NARROWEST:g} px are needed")
     variance, cross, other = fit.covariance[0, 0], fit.covariance[0, 1], fit.covariance[1, 1].clamp(min=1e-18)
     centre = -cross / other
-    # What repeats along the tube (pixels, gloss) does not average out; it is added once.
+    floor = _LINE_FLOOR * float(wide)
     extent = max(20.0, float(t.max() - t.min()))
     return Axis(
         line.moved(offset, slope),
         float(wide),
         float(taper),
         width_sd,
-        math.hypot(float((variance - cross * cross / other).clamp(min=0).sqrt()), _LINE_FLOOR),
-        math.hypot(float(other.sqrt()), 2 * _LINE_FLOOR / extent),
+        math.hypot(float((variance - cross * cross / other).clamp(min=0).sqrt()), floor),
+        math.hypot(float(other.sqrt()), 2 * floor / extent),
         float(centre),
     )
 
@@ -204,13 +207,13 @@ def measure_edges(
     t, deviation = torch.full_like(guess, torch.nan), torch.full_like(guess, torch.inf)
     hidden, outside = [], []
     if not len(chosen):
-        return Edges(t, deviation, blur, (), ())
+        return Edges(t, deviation, blur, 0.0, (), ())
     near = guess[chosen]
     gaps = guess[torch.isfinite(guess)].diff().abs()
     window = int(min(_WINDOW + 2 * blur, max(4.0, 0.45 * float(gaps.min()) if len(gaps) else _WINDOW)))
     along = torch.arange(2 * window + 1, dtype=torch.float64, device=device) - window
     widths = torch.tensor([axis.width_at(float(value)) for value in near], dtype=torch.float64, device=device)
-    half = math.ceil(float(widths.max()) / 2 + 0.3)
+    half = math.ceil(float(widths.max()) / 2 + 0.5)
     u = torch.arange(2 * half + 1, dtype=torch.float64, device=device) - half
     bulge = torch.zeros_like(near) if curve is None else curve[chosen]
     round_ = (1 - (2 * u / widths[:, None]).square()).clamp(min=0).sqrt()  # [E, U]
@@ -221,7 +224,7 @@ def measure_edges(
         light = sampler(pixels).permute(1, 2, 3, 0)  # [E, T, U, C]
         inside = sampler.inside(pixels)
         # A row that is mostly surroundings tells little of the edge, and what it tells may be of something else.
-        row = (widths[:, None] / 2 + 1 - u.abs()).clamp(0, 1)
+        row = (widths[:, None] / 2 + 1.2 - u.abs()).clamp(0, 1)
         weight = row[:, None, :, None] / _variance(light)
         fit = fit_edges(light, weight, blur)
         near = near + fit.place
@@ -242,7 +245,14 @@ def measure_edges(
             hidden.append(index)  # an edge between two bands shows by its colours what it is; an outer one does not
         elif clear[j]:
             t[index], deviation[index] = near[j], fit.deviation[j]
-    return Edges(t, deviation, float(blurs.median()) if len(blurs) else blur, tuple(hidden), tuple(outside))
+    return Edges(
+        t,
+        deviation,
+        float(blurs.median()) if len(blurs) else blur,
+        float(bulge.abs().max()),
+        tuple(hidden),
+        tuple(outside),
+    )
 
 
 def _across(sampler: Sampler, camera: Camera, line: Line, near: Tensor, along: Tensor, widths: Tensor, fit: EdgeFit):

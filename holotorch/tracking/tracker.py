@@ -19,7 +19,8 @@ from holotorch.tracking.pose import closed_form, solve_pose
 from holotorch.tracking.status import Pose, Status
 from holotorch.tracking.strips import Line, Sampler
 
-_FLOOR = 0.02  # pixels: what model and pixels leave in an edge, however little noise there is
+_FLOOR = 0.015  # pixels: what model and pixels leave in an edge, however little noise there is;
+_ROUND = 0.025  # and of what a ring's front bulges
 _UNLIKELY = {1: 10.83, 2: 13.82, 3: 16.27, 4: 18.47, 5: 20.52, 6: 22.46, 7: 24.32, 8: 26.12, 9: 27.88}  # 0.1 % of chi^2
 _MOVED = 30.0  # pixels that a catheter may move between two frames
 
@@ -165,7 +166,7 @@ class CatheterTracker:
         known = self._known(edges)
         count, t = int(known.sum()), edges.t[known]
         pixels = self.camera.distort(axis.line.plane(t, torch.zeros_like(t)))
-        along = (edges.deviation[known].square() + _FLOOR**2).sqrt()
+        along = (edges.deviation[known].square() + _FLOOR**2 + (_ROUND * edges.bulge) ** 2).sqrt()
         # All edges lie on one fitted line; this deviation gives the pose the line's own covariance.
         spread = float((t - t.mean()).square().sum())
         about = math.hypot(axis.offset_sd, axis.slope_sd * (float(t.mean()) - axis.centre))
