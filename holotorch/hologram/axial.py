@@ -90,6 +90,10 @@ class AxialHologram(LayerHologram):
 
         ``phase`` [h, w] in rad is common to all, and then costs nothing per plane. Depths must rise or fall.
         """
+        if isinstance(planes, Tensor) and len(planes):
+            total = self.accumulator((planes.shape[-2], planes.shape[-1]), phase)
+            total.add_stack(planes)
+            return total.finish()
         total = None
         for j, plane in enumerate(planes):
             total = total or self.accumulator((plane.shape[-2], plane.shape[-1]), phase)
@@ -190,12 +194,29 @@ class Accumulator:
     def _spread(self) -> None:
         """Add the pending planes to the nodes around them, once the nodes that none of them touches are taken."""
         planes, self.pending = self.pending, []
-        if not planes:
+        if planes:
+            self._gather(_side_by_side([plane for _, plane in planes]), [j for j, _ in planes])
+
+    def add_stack(self, planes: Tensor) -> None:
+        """Add all planes [D, h, w], number j at ``depths[j]``; the depths must rise or fall."""
+        steps = np.diff(self.operator.depths)
+        if self.nodes.width == 1 or not planes.is_contiguous() or not ((steps > 0).all() or (steps < 0).all()):
+            for j, plane in enumerate(planes):
+                self.add(j, plane)
             return
-        stack = _side_by_side([plane for _, plane in planes])
+        self.rising = bool(steps[0] > 0) if len(steps) else None
+        flat, start, spare = planes.detach().flatten(1), 0, self.rows - self.nodes.width
+        while start < len(flat):
+            end = start + 1
+            while end < min(start + _GROUP, len(flat)) and abs(self.begins[end] - self.begins[start]) <= spare:
+                end += 1
+            self._gather(flat[start:end], list(range(start, end)))
+            start = end
+
+    def _gather(self, stack: Tensor, order: list[int]) -> None:
+        """Add planes [J, h w] of numbers ``order``."""
         if not lit(stack):
             return
-        order = [j for j, _ in planes]
         begins = np.asarray([self.begins[j] for j in order])
         touched = {*range(begins.min(), begins.max() + self.nodes.width)}
         self._close(self.open - touched)

@@ -16,8 +16,7 @@ _STRANGE = 1.5  # what is left, over its white part: above it the model misses s
 _SLICES = 8
 _SHADINGS = (torch.ones_like, lambda q: q, lambda q: (1 - q * q).sqrt(), lambda q: q**3)
 _MEANS = (1.0, 0.0, math.pi / 4, 0.0)  # of the shadings over the tube
-_SHARES = (1e3, 2.0, 2.0, 2.0)  # of a band's light: what each shading may amount to; the even one is free
-_WIDTH = 0.35  # of the width: how well it is known beforehand
+_SHARES = (1e3, 1.5, 1.5, 1.0)  # of a band's light: what each shading may amount to; the even one is free
 _SHARPEST, _BLUNTEST = 0.35, 6.0  # pixels, standard deviation of an edge
 
 
@@ -141,7 +140,14 @@ class AxisFit:
 
 
 def fit_axis(
-    light: Tensor, weight: Tensor, t: Tensor, band: Tensor, level: Tensor, width: float, blur: float
+    light: Tensor,
+    weight: Tensor,
+    t: Tensor,
+    band: Tensor,
+    level: Tensor,
+    width: tuple[float, float],
+    blur: float,
+    known: float = 0.35,
 ) -> AxisFit:
     """Blurred boxes whose two sides are straight lines along the tube, all stations at once.
 
@@ -155,8 +161,10 @@ def fit_axis(
         t: [S] places along, in samples.
         band: [S] which band a station is on, from 0.
         level: [bands] light of each band, as ``light``.
-        width: Of the tube to begin with, in samples; known to a third.
+        width: Of the tube at t = 0 in samples, and its taper per sample, to begin with.
         blur: Standard deviation to begin with, in samples.
+        known: Share of the width to which it and the taper are known beforehand. Shading and width are hard to tell
+            apart; whoever knows the width finds the middle better.
     """
     light, root = light.to(torch.float64), weight.to(torch.float64).sqrt()
     count, bands, kinds = light.shape[1], len(level), len(_SHADINGS)
@@ -164,7 +172,8 @@ def fit_axis(
     reach = t.abs().max().clamp(min=1.0)
     lever = torch.stack([torch.ones_like(t), t / reach], -1)  # [S, 2]
     middle = torch.zeros(2, dtype=torch.float64, device=light.device)
-    wide = torch.tensor([width, 0.0], dtype=torch.float64, device=light.device)
+    expected = torch.tensor([width[0], width[1] * float(reach)], dtype=torch.float64, device=light.device)
+    wide = expected.clone()
     softness = torch.tensor(blur, dtype=torch.float64, device=light.device)
     member = torch.nn.functional.one_hot(band, bands).to(torch.float64)
     share = torch.tensor(_SHARES, dtype=torch.float64, device=light.device)
@@ -205,8 +214,8 @@ def fit_axis(
         normal = torch.einsum("sui,suj->ij", weighted, design)
         slope = torch.einsum("sui,su->i", weighted, rest)
         ridge = torch.cat([torch.zeros(5, dtype=torch.float64), (prior * max(noise, 0.5) ** 2).flatten()])
-        ridge[2] = (max(noise, 0.5) / (_WIDTH * width)) ** 2  # where the blur is wider than the tube
-        slope[2] -= ridge[2] * (wide[0] - width)
+        ridge[2:4] = (max(noise, 0.5) / (known * width[0])) ** 2
+        slope[2:4] -= ridge[2:4] * (wide - expected)
         slope[5:] -= ridge[5:] * amount.flatten()
         normal = normal + torch.diag(ridge + 1e-12 * normal.diagonal())
         step = torch.linalg.solve_ex(normal, slope).result.nan_to_num(0.0, 0.0, 0.0)

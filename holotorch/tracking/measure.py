@@ -9,15 +9,14 @@ from torch import Tensor
 
 from holotorch.tracking.bands import Stretches, find_axis, find_stretches
 from holotorch.tracking.camera import Camera
-from holotorch.tracking.catheter import Catheter
 from holotorch.tracking.colours import ColourTable
 from holotorch.tracking.fits import EdgeFit, fit_axis, fit_edges
-from holotorch.tracking.status import Pose, Status
+from holotorch.tracking.status import Status
 from holotorch.tracking.strips import Line, Sampler
 
 _LEVEL_SD = 2.5 / 255  # of a pixel's level; fits correct it by what they leave
 _ONE_SIDED = 0.15  # contrast to one side over that to the other
-_NARROWEST = 2.6  # pixels: below it no pixel shows one band alone
+_NARROWEST = 2.4  # pixels: below it no pixel shows one band alone
 _WIDEST = 120.0
 _WINDOW = 11  # samples to either side of an edge
 _STATIONS = 40
@@ -109,8 +108,17 @@ def _labels(sampler: Sampler, camera: Camera, line: Line, table: ColourTable, t:
     return table.labels(*levels) * inside
 
 
-def measure_axis(sampler: Sampler, camera: Camera, line: Line, stretches: Stretches, guess: float, blur: float) -> Axis:
-    """Mid-line and width from stations within the bands that are seen; ``guess`` is the width in pixels."""
+def measure_axis(
+    sampler: Sampler,
+    camera: Camera,
+    line: Line,
+    stretches: Stretches,
+    width: tuple[float, float],
+    known: float,
+    blur: float,
+) -> Axis:
+    """Mid-line and width from stations within the bands that are seen; ``width`` and ``known`` as for ``fit_axis``."""
+    guess = width[0]
     edges = stretches.edges.tolist()
     spans = [
         (a + 3, b - 3, j)
@@ -135,7 +143,7 @@ def measure_axis(sampler: Sampler, camera: Camera, line: Line, stretches: Stretc
     u = torch.arange(2 * half + 1, dtype=torch.float64, device=device) - half
     light = sampler(camera.distort(line.plane(t[..., None], u.expand(*t.shape, -1)))).mean(2)
     signal, weight, level = _contrast(light, u, guess, band, len(spans))
-    fit = fit_axis(signal, weight, t.mean(-1), band, level, guess, blur)
+    fit = fit_axis(signal, weight, t.mean(-1), band, level, width, blur, known)
     offset, slope, wide, taper = fit.sides
     if not bool(torch.isfinite(fit.covariance).all()) or float(wide) > 2 * guess + 3:
         raise Refusal(Status.NO_AXIS, "the bands have no clear sides")
@@ -274,13 +282,3 @@ def _across(sampler: Sampler, camera: Camera, line: Line, near: Tensor, along: T
     middle = fit.steps.shape[1] // 2
     own = fit.steps[:, middle - 1 : middle + 2].mean(1).norm(dim=-1)
     return ((size > _SIDE_STEP * own[:, None]) & (size > _CLEAR * sd.norm(dim=-1))).all(-1)
-
-
-def bulge_px(pose: Pose, catheter: Catheter, line: Line) -> Tensor:
-    """How far along the line [N], in pixels, the front of each ring's image lies from that of its centre."""
-    toward = (pose.tip @ pose.direction) * pose.direction - pose.tip
-    normal = toward / toward.norm()
-    centres = pose.tip + catheter.positions.to(pose.tip.device)[:, None] * pose.direction
-    fronts = centres + catheter.radius * normal
-    (a, _), (b, _) = (line.place(points[:, :2] / points[:, 2:]) for points in (centres, fronts))
-    return b - a

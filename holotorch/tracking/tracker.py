@@ -14,14 +14,16 @@ from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import Catheter
 from holotorch.tracking.coarse import find_segments
 from holotorch.tracking.colours import ColourTable
-from holotorch.tracking.measure import Axis, Edges, Refusal, bulge_px, find_bands, measure_axis, measure_edges
+from holotorch.tracking.footprint import bulge_px, width_px
+from holotorch.tracking.measure import Axis, Edges, Refusal, find_bands, measure_axis, measure_edges
 from holotorch.tracking.pose import closed_form, solve_pose
 from holotorch.tracking.status import Pose, Status
 from holotorch.tracking.strips import Line, Sampler
 
 _FLOOR = 0.015  # pixels: what model and pixels leave in an edge, however little noise there is;
-_ROUND = 0.025  # and of what a ring's front bulges
+_ROUND = 0.018  # and of what a ring's front bulges
 _UNLIKELY = {1: 10.83, 2: 13.82, 3: 16.27, 4: 18.47, 5: 20.52, 6: 22.46, 7: 24.32, 8: 26.12, 9: 27.88}  # 0.1 % of chi^2
+_THIRD, _EXACT = 0.35, 0.003  # how well the width is known before there is a pose, and after
 _MOVED = 30.0  # pixels that a catheter may move between two frames
 
 
@@ -110,8 +112,13 @@ class CatheterTracker:
             if stretches.known < 3:
                 few = "a band hides, is drowned by its surroundings or leaves the frame"
                 raise Refusal(Status.BANDS_MISSING, f"{stretches.known} edges of bands are seen, 3 are needed: {few}")
-            axis = measure_axis(sampler, self.camera, line, stretches, self._width(stretches, before), 0.9)
+            if before is None:
+                axis = measure_axis(sampler, self.camera, line, stretches, self._width(stretches), _THIRD, 0.9)
+            else:
+                wide = width_px(before, self.catheter, line)
+                axis = measure_axis(sampler, self.camera, line, stretches, wide, _EXACT, 0.9)
         guess, _ = axis.line.place(line.plane(stretches.edges, torch.zeros_like(stretches.edges)))
+        width = axis
         if before is not None:
             with self._timed("edges"):
                 curve = bulge_px(before, self.catheter, axis.line)
@@ -120,26 +127,29 @@ class CatheterTracker:
                 pose = self._solved(axis, edges)
                 again = bulge_px(pose, self.catheter, axis.line)
             if float((again - curve).abs().max()) < 0.05:
-                return self._judged(pose, axis, edges)
+                return self._judged(pose, width, edges)
         else:
             with self._timed("edges"):
                 edges = measure_edges(sampler, self.camera, axis, guess, stretches.doubtful, 0.9)
             pose = self._sketched(axis, edges)
+        with self._timed("axis"):
+            # Once more, with the width that the pose and the radius give; what was found without them is the check.
+            wide = width_px(pose, self.catheter, line)
+            found = axis.line.plane(edges.t, torch.zeros_like(edges.t))
+            axis = measure_axis(sampler, self.camera, line, stretches, wide, _EXACT, edges.blur)
         with self._timed("edges"):
             curve = bulge_px(pose, self.catheter, axis.line)
-            edges = measure_edges(sampler, self.camera, axis, edges.t, stretches.doubtful, edges.blur, curve)
+            again, _ = axis.line.place(found)
+            edges = measure_edges(sampler, self.camera, axis, again, stretches.doubtful, edges.blur, curve)
         with self._timed("pose"):
-            return self._judged(self._solved(axis, edges), axis, edges)
+            return self._judged(self._solved(axis, edges), width, edges)
 
-    def _width(self, stretches: Stretches, before: Pose | None) -> float:
-        """Of the tube's image in pixels, roughly: from the pose before, or from the bands' lengths at a slight tilt."""
-        if before is not None:
-            scale = float(self.camera.matrix[0, 0]) / float(before.point(self.catheter.edges[1])[2])
-        else:
-            seen = torch.isfinite(stretches.edges)
-            ends = stretches.edges[seen][[0, -1]], self.catheter.positions.to(seen.device)[seen][[0, -1]]
-            scale = 1.15 * float((ends[0][1] - ends[0][0]) / (ends[1][1] - ends[1][0]))
-        return min(max(2 * self.catheter.radius * scale, 2.0), 120.0)
+    def _width(self, stretches: Stretches) -> tuple[float, float]:
+        """Of the tube's image in pixels, roughly: from the bands' lengths at a slight tilt; and no taper."""
+        seen = torch.isfinite(stretches.edges)
+        ends = stretches.edges[seen][[0, -1]], self.catheter.positions.to(seen.device)[seen][[0, -1]]
+        scale = 1.15 * float((ends[0][1] - ends[0][0]) / (ends[1][1] - ends[1][0]))
+        return min(max(2 * self.catheter.radius * scale, 2.0), 120.0), 0.0
 
     def _sketched(self, axis: Axis, edges: Edges) -> Pose:
         """Near enough to tell how much the rings' fronts bulge."""

@@ -1,0 +1,27 @@
+"""What a pose makes of the catheter on a line of its image: how wide it is there, and how its rings bulge."""
+
+from torch import Tensor
+
+from holotorch.tracking.catheter import Catheter
+from holotorch.tracking.status import Pose
+from holotorch.tracking.strips import Line
+
+
+def width_px(pose: Pose, catheter: Catheter, line: Line) -> tuple[float, float]:
+    """Of the tube's image at t = 0 in pixels, and its change per pixel."""
+    ends = pose.tip + catheter.positions.to(pose.tip.device)[[0, -1], None] * pose.direction
+    t, _ = line.place(ends[:, :2] / ends[:, 2:])
+    # An angle, seen on the plane z = 1: wider by 1 / cos off the axis.
+    near, far = (2 * catheter.radius * line.scale / ends[:, 2]).tolist()
+    taper = (far - near) / float(t[1] - t[0])
+    return near - taper * float(t[0]), taper
+
+
+def bulge_px(pose: Pose, catheter: Catheter, line: Line) -> Tensor:
+    """How far along the line [N], in pixels, the front of each ring's image lies from that of its centre."""
+    toward = (pose.tip @ pose.direction) * pose.direction - pose.tip
+    normal = toward / toward.norm()
+    centres = pose.tip + catheter.positions.to(pose.tip.device)[:, None] * pose.direction
+    fronts = centres + catheter.radius * normal
+    (a, _), (b, _) = (line.place(points[:, :2] / points[:, 2:]) for points in (centres, fronts))
+    return b - a

@@ -1,0 +1,101 @@
+"""Coarse lines on frames that are drawn by distance from a line."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from holotorch.tracking.catheter import THESIS
+from holotorch.tracking.coarse import Segment, find_segments
+from holotorch.tracking.colours import ColourTable
+from holotorch.tracking.world import synthetic_camera
+
+SIZE = (360, 640)
+TABLE = ColourTable(synthetic_camera(), THESIS)
+
+
+def drawn(middle, angle, length=240.0, width=6.0, ground=120, order=(0, 1, 2), noise=0.0, seed=8) -> torch.Tensor:
+    """Frame of three bands in a row around ``middle``, the first of them at the beginning."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]].astype(float)
+    t = (x - middle[0]) * math.cos(angle) + (y - middle[1]) * math.sin(angle)
+    u = -(x - middle[0]) * math.sin(angle) + (y - middle[1]) * math.cos(angle)
+    cover = np.clip(width / 2 + 0.5 - np.abs(u), 0, 1) * np.clip(length / 2 + 0.5 - np.abs(t), 0, 1)
+    band = np.clip((t + length / 2) * 3 / length, 0, 2).astype(int)
+    colour = np.array([THESIS.colours[i] for i in order], float)[band]
+    frame = ground + cover[..., None] * (colour - ground) + noise * rng.normal(size=(*SIZE, 3))
+    return torch.from_numpy(np.clip(np.round(frame), 0, 255).astype(np.uint8)).permute(2, 0, 1).contiguous()
+
+
+def missed(segment: Segment, middle, angle) -> float:
+    """How far the segment's ends lie beside the line, in pixels."""
+    ends = np.array([segment.start, segment.end]) - middle
+    return float(np.abs(ends @ [-math.sin(angle), math.cos(angle)]).max())
+
+
+@pytest.mark.parametrize("degrees", range(0, 360, 15))
+def test_lines_are_found_in_all_directions(degrees):
+    """Every second pixel of a tube 6 px wide: within 2 px, as the search that follows needs."""
+    angle, middle = math.radians(degrees), (300.0 + degrees / 10, 170.0)
+    found = find_segments(drawn(middle, angle, noise=2.5), TABLE)
+    assert 1 <= len(found) <= 3
+    assert missed(found[0], middle, angle) < 2
+    # It reaches over the bands, to a tile or two.
+    along = (np.array([found[0].start, found[0].end]) - middle) @ [math.cos(angle), math.sin(angle)]
+    assert abs(along.min() + 120) < 48 and abs(along.max() - 120) < 48
+
+
+@pytest.mark.parametrize("width", [3.5, 10, 16])
+def test_thin_and_thick_tubes_are_found(width):
+    found = find_segments(drawn((320, 180), 0.5, width=width, noise=2.5), TABLE)
+    assert missed(found[0], (320, 180), 0.5) < 2
+
+
+@pytest.mark.parametrize("ground", [0, 20, 235])
+def test_dark_and_bright_surroundings(ground):
+    found = find_segments(drawn((320, 180), 2.2, ground=ground, noise=2.5), TABLE)
+    assert missed(found[0], (320, 180), 2.2) < 2
+
+
+def test_frames_without_colour_have_no_lines():
+    zeros = torch.zeros(3, *SIZE, dtype=torch.uint8)
+    assert find_segments(zeros, TABLE) == []
+    assert find_segments(zeros + 255, TABLE) == []
+    grey = (128 + 12 * torch.randn(1, *SIZE)).clamp(0, 255).to(torch.uint8).expand(3, -1, -1)
+    assert find_segments(grey, TABLE) == []
+    for colour in THESIS.colours:  # cloth: coloured, but nothing thin
+        assert find_segments(zeros + torch.tensor(colour, dtype=torch.uint8)[:, None, None], TABLE) == []
+
+
+def test_noise_and_clutter_give_few_lines():
+    rng = torch.Generator().manual_seed(9)
+    noise = torch.randint(0, 256, (3, *SIZE), dtype=torch.uint8, generator=rng)
+    assert len(find_segments(noise, TABLE)) <= 3
+    clutter = torch.full((3, *SIZE), 120, dtype=torch.uint8)
+    for i in range(300):
+        x, y = (int(torch.randint(0, side - 12, (1,), generator=rng)) for side in SIZE[::-1])
+        clutter[:, y : y + 4, x : x + 12] = torch.tensor(THESIS.colours[i % 3], dtype=torch.uint8)[:, None, None]
+    assert len(find_segments(clutter, TABLE)) <= 3
+
+
+def test_the_tube_comes_first_among_sheets_of_its_colours():
+    frame = drawn((320, 180), 0.35, noise=2.5)
+    for i, colour in enumerate(THESIS.colours):
+        frame[:, 20 + 110 * i : 90 + 110 * i, 20:110] = torch.tensor(colour, dtype=torch.uint8)[:, None, None]
+    assert missed(find_segments(frame, TABLE)[0], (320, 180), 0.35) < 2
+
+
+def test_the_right_order_comes_before_the_wrong_one():
+    right, wrong = drawn((320, 90), 0.0), drawn((320, 270), 0.0, order=(1, 0, 2))
+    both = torch.where(torch.arange(SIZE[0])[:, None] < 180, right, wrong)
+    assert missed(find_segments(both, TABLE)[0], (320, 90), 0.0) < 2
+
+
+def test_one_colour_alone_is_no_line():
+    assert find_segments(drawn((320, 180), 0.4, order=(1, 1, 1)), TABLE) == []
+
+
+def test_it_is_the_same_each_time():
+    frame = drawn((320, 180), 0.4, noise=5.0)
+    assert find_segments(frame, TABLE) == find_segments(frame, TABLE)
