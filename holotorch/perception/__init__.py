@@ -1,0 +1,62 @@
+"""Far-periphery perception (thesis chapter 2): how large, where, and on which display.
+
+Angles are in degrees and say so in their names, times are in seconds. Needs torch alone.
+"""
+
+from holotorch.perception.cortical import (
+    COWEY_ROLLS,
+    DOUGHERTY,
+    HORTON_HOYT,
+    INFERIOR,
+    NASAL,
+    SUPERIOR,
+    TEMPORAL,
+    LinearMagnification,
+    LinearSize,
+    RovamoVirsu,
+    StrasburgerLetters,
+    TolhurstLing,
+    cortical_scale,
+    peripheral_weight,
+)
+from holotorch.perception.display import TABLE_2_1, DisplayCheck, WideDisplay, check_display
+from holotorch.perception.geometry import CurvedScreen, FlatScreen, Headset, eccentricity_of, separation
+from holotorch.perception.layout import ScaledLayout, overlaps, scale_layout
+from holotorch.perception.scale import FITTED_DEG, TESTED_DEG, EqualEfficiencyScale
+from holotorch.perception.table import TABLE_2_2, EqualEfficiencyRow
+from holotorch.perception.time import PerceptionTime
+
+__all__ = [
+    "COWEY_ROLLS",
+    "DOUGHERTY",
+    "FITTED_DEG",
+    "HORTON_HOYT",
+    "INFERIOR",
+    "NASAL",
+    "SUPERIOR",
+    "TABLE_2_1",
+    "TABLE_2_2",
+    "TEMPORAL",
+    "TESTED_DEG",
+    "CurvedScreen",
+    "DisplayCheck",
+    "EqualEfficiencyRow",
+    "EqualEfficiencyScale",
+    "FlatScreen",
+    "Headset",
+    "LinearMagnification",
+    "LinearSize",
+    "PerceptionTime",
+    "RovamoVirsu",
+    "ScaledLayout",
+    "StrasburgerLetters",
+    "TolhurstLing",
+    "WideDisplay",
+    "check_display",
+    "cortical_scale",
+    "eccentricity_of",
+    "overlaps",
+    "peripheral_weight",
+    "scale_layout",
+    "separation",
+]

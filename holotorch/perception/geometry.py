@@ -1,0 +1,278 @@
+"""Where things on a display are seen: degrees, metres and pixels, exactly, for flat, curved and headset displays.
+
+The eye is at the origin and fixates straight ahead. A direction is (elevation, azimuth) in degrees: the elevation above
+the horizontal plane, positive upwards, and the azimuth within that plane, positive to the right. Pixels and metres on a
+screen are (y, x) with y downwards; the centre of the top left pixel is (0, 0), and 0 m is in the middle of the display.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+from holotorch.perception import angles
+
+
+def eccentricity_of(elevation_deg: Any, azimuth_deg: Any) -> Tensor:
+    """Angle in degrees between a direction and the fixation point, exact to both sides and near 0."""
+    return separation(elevation_deg, azimuth_deg, 0.0, 0.0)
+
+
+def separation(elevation_deg: Any, azimuth_deg: Any, other_elevation_deg: Any, other_azimuth_deg: Any) -> Tensor:
+    """Angle in degrees between two directions; they broadcast. Its gradient at 0 is 0.
+
+    Half-angle formula: the arc cosine of cos cos would lose half of the digits near 0.
+    """
+    given = (elevation_deg, azimuth_deg, other_elevation_deg, other_azimuth_deg)
+    e1, a1, e2, a2 = (angles.as_tensor("angles", value).deg2rad() for value in given)
+    half = torch.sin((e1 - e2) / 2).square() + e1.cos() * e2.cos() * torch.sin((a1 - a2) / 2).square()
+    # Masked before the roots, whose gradients are infinite at 0 and at 1.
+    inside = (half > 0) & (half < 1)
+    safe = torch.where(inside, half, 0.5)
+    angle = 2 * torch.atan2(safe.sqrt(), (1 - safe).sqrt())
+    return torch.where(inside, angle, (half > 0).to(angle) * math.pi).rad2deg()
+
+
+@dataclass(frozen=True)
+class Display:
+    """What all displays share. ``shape`` is (H, W) in pixels.
+
+    Subclasses say where a direction meets the display and the other way round, and how fast the direction turns.
+    """
+
+    shape: tuple[int, int]
+
+    def __post_init__(self):
+        if not isinstance(self.shape, tuple) or len(self.shape) != 2:
+            raise TypeError(f"shape must be (H, W) in pixels, got {self.shape!r}")
+        for side in self.shape:
+            checks.whole("shape", side, 1)
+
+    def angles(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
+        """(elevation, azimuth) in degrees of points of the display, which may lie beyond its edge."""
+        raise NotImplementedError
+
+    def pixels(self, elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
+        """(y, x) in pixels of directions, also beyond the edge; NaN for those that meet no point of the surface."""
+        raise NotImplementedError
+
+    def pixels_per_degree(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
+        """Pixels per degree of turn of the eye along (y, x) at points of the display: exact derivatives."""
+        raise NotImplementedError
+
+    def eccentricity(self, y_px: Any, x_px: Any) -> Tensor:
+        """Angle in degrees between the fixation point and points of the display."""
+        return eccentricity_of(*self.angles(y_px, x_px))
+
+    def eccentricity_map(self, *, dtype: torch.dtype = torch.float64) -> Tensor:
+        """That of every pixel's centre, [H, W] in degrees."""
+        y, x = (torch.arange(side, dtype=torch.float64) for side in self.shape)
+        return self.eccentricity(y[:, None], x[None, :]).to(dtype)
+
+    def shows(self, elevation_deg: Any, azimuth_deg: Any) -> Tensor:
+        """Whether a direction meets a pixel; bool."""
+        y, x = self.pixels(elevation_deg, azimuth_deg)
+        return (y >= -0.5) & (y <= self.shape[0] - 0.5) & (x >= -0.5) & (x <= self.shape[1] - 0.5)
+
+    def width_px(self, azimuth_deg: Any, size_deg: Any) -> Tensor:
+        """Pixels in x that a pattern of ``size_deg`` centred at this azimuth, on the horizon, spans."""
+        middle, half = angles.as_tensor("azimuth_deg", azimuth_deg), angles.size(size_deg) / 2
+        level = torch.zeros_like(middle)
+        return self.pixels(level, middle + half)[1] - self.pixels(level, middle - half)[1]
+
+    @property
+    def field_deg(self) -> tuple[float, float]:
+        """Field of view through the middle of the display, vertical and horizontal, edge to edge."""
+        height, width = self.shape
+        middle = (height - 1) / 2, (width - 1) / 2
+        top, bottom = self.angles([-0.5, height - 0.5], middle[1])[0].tolist()
+        left, right = self.angles(middle[0], [-0.5, width - 0.5])[1].tolist()
+        return top - bottom, right - left
+
+    def _middle(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
+        y, x = angles.as_tensor("y_px", y_px, "pixels"), angles.as_tensor("x_px", x_px, "pixels")
+        return torch.broadcast_tensors(y - (self.shape[0] - 1) / 2, x - (self.shape[1] - 1) / 2)
+
+    def _placed(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        return y + (self.shape[0] - 1) / 2, x + (self.shape[1] - 1) / 2
+
+
+@dataclass(frozen=True)
+class _Screen(Display):
+    """A screen with a size in metres, (height, width) along its surface, and the eye ``distance`` before its middle."""
+
+    size: tuple[float, float]
+    distance: float
+
+    def __post_init__(self):
+        super().__post_init__()
+        for side in checks.pair("size", self.size, "metres"):
+            checks.positive("size", side, "metres")
+        checks.positive("distance", self.distance, "metres")
+
+    @property
+    def pitch(self) -> tuple[float, float]:
+        """Of the pixels in metres, (y, x)."""
+        return self.size[0] / self.shape[0], self.size[1] / self.shape[1]
+
+    def metres(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
+        """(y, x) in metres from the middle, along the surface."""
+        y, x = self._middle(y_px, x_px)
+        return y * self.pitch[0], x * self.pitch[1]
+
+    def pixels_at(self, y_m: Any, x_m: Any) -> tuple[Tensor, Tensor]:
+        """(y, x) in pixels of points in metres from the middle, along the surface."""
+        y, x = angles.as_tensor("y_m", y_m, "metres"), angles.as_tensor("x_m", x_m, "metres")
+        return self._placed(*torch.broadcast_tensors(y / self.pitch[0], x / self.pitch[1]))
+
+    def _turn(self, point: Tensor, tangent: Tensor, pitch: float) -> Tensor:
+        """Pixels per degree along a unit tangent [..., 3] at a point [..., 3]: d(p/|p|) = (t - (t.u) u) ds / |p|."""
+        far = point.square().sum(-1)
+        across = torch.linalg.cross(point, tangent.expand_as(point)).square().sum(-1).sqrt()
+        return math.radians(1) * far / (across * pitch)
+
+
+@dataclass(frozen=True)
+class FlatScreen(_Screen):
+    """A monitor, or a headset whose image is rectilinear (as seen through an ideal lens), at its virtual distance."""
+
+    @classmethod
+    def spanning(cls, shape: tuple[int, int], field_deg: tuple[float, float], distance: float = 1.0) -> "FlatScreen":
+        """The flat screen that covers a field of view (vertical, horizontal), each below 180 deg."""
+        for side in checks.pair("field_deg", field_deg, "degrees"):
+            if not 0 < side < 180:
+                raise ValueError(f"field_deg must be within 0 .. 180 degrees for a flat screen, got {side:g}")
+        height, width = (2 * distance * math.tan(math.radians(side) / 2) for side in field_deg)
+        return cls(shape, (height, width), distance)
+
+    def angles(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
+        """See :class:`Display`."""
+        y, x = self.metres(y_px, x_px)
+        ahead = torch.full_like(x, self.distance)
+        return torch.atan2(-y, torch.hypot(x, ahead)).rad2deg(), torch.atan2(x, ahead).rad2deg()
+
+    def pixels(self, elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
+        """See :class:`Display`; NaN at the side of the eye and behind it."""
+        up, side = _directions(elevation_deg, azimuth_deg)
+        seen = (side.abs() < math.pi / 2) & (up.abs() < math.pi / 2)
+        up, side = torch.where(seen, up, 0), torch.where(seen, side, 0)
+        y, x = -self.distance * up.tan() / side.cos(), self.distance * side.tan()
+        return tuple(torch.where(seen, part, math.nan) for part in self.pixels_at(y, x))  # type: ignore[return-value]
+
+    def pixels_per_degree(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
+        """See :class:`Display`."""
+        y, x = self.metres(y_px, x_px)
+        point = torch.stack([x, y, torch.full_like(x, self.distance)], -1)
+        down, right = point.new_tensor([0.0, 1.0, 0.0]), point.new_tensor([1.0, 0.0, 0.0])
+        return self._turn(point, down, self.pitch[0]), self._turn(point, right, self.pitch[1])
+
+
+@dataclass(frozen=True)
+class CurvedScreen(_Screen):
+    """Part of an upright cylinder of ``radius`` in metres, concave towards the eye, which sees its middle ahead.
+
+    ``size`` is (height, arc). The eye need not be on the axis, as that of the thesis's study is not required to be.
+    """
+
+    radius: float
+
+    def __post_init__(self):
+        super().__post_init__()
+        checks.positive("radius", self.radius, "metres")
+        if self.size[1] > 2 * math.pi * self.radius * (1 + 1e-12):
+            raise ValueError(f"the arc must be at most a full turn of {self.radius:g} m radius, got {self.size[1]:g} m")
+
+    def angles(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
+        """See :class:`Display`."""
+        x, y, z = self._point(*self.metres(y_px, x_px)).unbind(-1)
+        return torch.atan2(-y, torch.hypot(x, z)).rad2deg(), torch.atan2(x, z).rad2deg()
+
+    def pixels(self, elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
+        """See :class:`Display`; of two points on one ray, the farther. NaN where the ray misses the cylinder."""
+        up, side = _directions(elevation_deg, azimuth_deg)
+        offset = self.distance - self.radius  # of the axis, ahead of the eye
+        root = self.radius**2 - offset**2 * side.sin().square()
+        seen = (root > 0) & (up.abs() < math.pi / 2)
+        reach = offset * side.cos() + torch.where(seen, root, 1).sqrt()
+        seen = seen & (reach > 0)
+        x, y = reach * side.sin(), -reach * torch.where(seen, up, 0).tan()
+        arc = self.radius * torch.atan2(x, reach * side.cos() - offset)
+        return tuple(torch.where(seen, part, math.nan) for part in self.pixels_at(y, arc))  # type: ignore[return-value]
+
+    def pixels_per_degree(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
+        """See :class:`Display`."""
+        y, arc = self.metres(y_px, x_px)
+        point, turn = self._point(y, arc), arc / self.radius
+        along = torch.stack([turn.cos(), torch.zeros_like(turn), -turn.sin()], -1)
+        down = point.new_tensor([0.0, 1.0, 0.0])
+        return self._turn(point, down, self.pitch[0]), self._turn(point, along, self.pitch[1])
+
+    def _point(self, y: Tensor, arc: Tensor) -> Tensor:
+        turn = arc / self.radius
+        ahead = self.distance - self.radius + self.radius * turn.cos()
+        return torch.stack([self.radius * turn.sin(), y, ahead], -1)
+
+
+@dataclass(frozen=True)
+class Headset(Display):
+    """A headset with equal angles per pixel from its middle outwards (f-theta); for rectilinear ones, FlatScreen.
+
+    Attributes:
+        resolution: Pixels per degree, outwards from the middle.
+    """
+
+    resolution: float
+
+    def __post_init__(self):
+        super().__post_init__()
+        checks.positive("resolution", self.resolution, "pixels per degree")
+
+    def angles(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
+        """See :class:`Display`."""
+        y, x = self._middle(y_px, x_px)
+        radius = _norm(y, x)
+        angle = (radius / self.resolution).deg2rad()
+        share = torch.where(radius > 0, angle.sin() / radius, math.radians(1 / self.resolution))
+        up = (-y * share).clamp(-1, 1).asin()
+        return up.rad2deg(), torch.atan2(x * share, angle.cos()).rad2deg()
+
+    def pixels(self, elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
+        """See :class:`Display`; NaN straight behind, which is a whole circle of the image."""
+        up, side = _directions(elevation_deg, azimuth_deg)
+        x, y = up.cos() * side.sin(), -up.sin()
+        sine = _norm(y, x)
+        angle = torch.atan2(sine, up.cos() * side.cos()).rad2deg()
+        share = torch.where(sine > 0, angle * self.resolution / sine, self.resolution * math.degrees(1))
+        share = torch.where((sine < 1e-12) & (angle > 90), math.nan, share)
+        return self._placed(y * share, x * share)
+
+    def pixels_per_degree(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
+        """See :class:`Display`: ``resolution`` outwards, r / sin r as many around (r the eccentricity in radians)."""
+        y, x = self._middle(y_px, x_px)
+        radius = _norm(y, x)
+        angle = (radius / self.resolution).deg2rad()
+        around = torch.where(radius > 0, angle.sin() / torch.where(radius > 0, angle, 1), 1)
+        safe = torch.where(radius > 0, radius, 1)
+        cosine, sine = torch.where(radius > 0, x / safe, 1), y / safe
+        turn_x = torch.hypot(cosine, sine * around)  # of the direction per outward angle
+        turn_y = torch.hypot(sine, cosine * around)
+        return self.resolution / turn_y, self.resolution / turn_x
+
+
+def _directions(elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
+    up, side = angles.as_tensor("elevation_deg", elevation_deg), angles.as_tensor("azimuth_deg", azimuth_deg)
+    if (bad := up.abs() > 90).any():
+        raise ValueError(f"elevation_deg must be within -90 .. 90 degrees, got {angles.first(up, bad):g}")
+    if (bad := side.abs() > 180).any():
+        raise ValueError(f"azimuth_deg must be within -180 .. 180 degrees, got {angles.first(side, bad):g}")
+    up, side = torch.broadcast_tensors(up.deg2rad(), side.deg2rad())
+    return up, side
+
+
+def _norm(y: Tensor, x: Tensor) -> Tensor:
+    """Length of (y, x) with gradient 0 at 0."""
+    square = y.square() + x.square()
+    return torch.where(square > 0, torch.where(square > 0, square, 1).sqrt(), 0)

@@ -1,0 +1,40 @@
+"""Thesis Table 2.2 as data: the lines of equal perception time, and how sure the study was of them."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class EqualEfficiencyRow:
+    """One row: a target pattern, the line S(E) = alpha E + beta, and the one-way ANOVA over the eccentricities.
+
+    Attributes:
+        size_deg: Size of the target pattern.
+        eccentricity_deg: Where the target pattern is seen.
+        alpha: Slope, degrees of size per degree of eccentricity.
+        beta: Intercept in degrees.
+        freedom: Degrees of freedom between the groups, four eccentricities less one.
+        f: The statistic F. It takes the participants' sizes at different eccentricities as independent.
+        p: Its p-value.
+    """
+
+    size_deg: float
+    eccentricity_deg: float
+    alpha: float
+    beta: float
+    freedom: int
+    f: float
+    p: float
+
+
+TABLE_2_2 = (
+    EqualEfficiencyRow(5, 10, 0.47, -11.04, 3, 7.02, 0.0002),
+    EqualEfficiencyRow(5, 20, 0.55, -16.3, 3, 11.96, 4.46e-7),
+    EqualEfficiencyRow(5, 30, 0.54, -15.08, 3, 7.96, 5.75e-5),
+    EqualEfficiencyRow(5, 40, 0.54, -17.64, 3, 12.48, 2.45e-7),
+    EqualEfficiencyRow(10, 10, 0.52, -13.11, 3, 4.78, 0.0033),
+    EqualEfficiencyRow(10, 20, 0.58, -14.8, 3, 9.3, 1.13e-5),
+    EqualEfficiencyRow(10, 30, 0.65, -16.52, 3, 7.04, 0.0002),
+    EqualEfficiencyRow(15, 10, 0.65, -18.49, 3, 4.22, 0.0067),
+    EqualEfficiencyRow(15, 20, 0.51, -6.67, 3, 5.32, 0.0017),
+    EqualEfficiencyRow(15, 30, 0.67, -18.74, 3, 5.31, 0.0017),
+)
