@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 from holotorch import __version__
+from holotorch.experiments.study_commands import add_study
 from holotorch.experiments.tracking_commands import add_tracking
 
 OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -52,6 +53,14 @@ def _run(options: argparse.Namespace) -> int:
         from holotorch.experiments.eye_run import run_observer
 
         return _finish(*run_observer(settings, options.out, name))
+    if settings.experiment == "perception_layout":
+        from holotorch.experiments.perception_layout import run_layout
+
+        return _finish(*run_layout(settings, options.out, name))
+    if settings.experiment == "perception_analysis":
+        from holotorch.experiments.perception_analysis_run import run_analysis
+
+        return _finish(*run_analysis(settings, options.out, name))
     from holotorch.experiments.run import run
 
     return _finish(*run(settings, options.out, name))
@@ -105,6 +114,17 @@ def _check(options: argparse.Namespace) -> int:
         from holotorch.experiments.eye_run import scene_settings
 
         print(looked_at(observer(settings, scene_settings(settings)))[0])
+        return OK
+    if settings.experiment == "perception_layout":
+        from holotorch.experiments.perception_layout import layout_text
+
+        print(layout_text(settings))
+        return OK
+    if settings.experiment == "perception_analysis":
+        source = (
+            f"{len(settings.logs)} logs" if settings.logs else f"{settings.simulation.participants} simulated people"
+        )
+        print("Analysis   of {}, lines over {:g} .. {:g} deg".format(source, *settings.range_deg))
         return OK
     from holotorch.experiments.plan import shortage
 
@@ -210,6 +230,7 @@ def _parser() -> argparse.ArgumentParser:
     export.set_defaults(action=_export_slm)
 
     add_tracking(commands)
+    add_study(commands)
     doctor = commands.add_parser("doctor", help="check the installation and print what repairs it")
     doctor.set_defaults(action=_doctor)
     return parser

@@ -19,7 +19,7 @@ class PECProblem(nn.Module):
             a unitary one does (Parseval), so that no scale between U and I is left open. The image is [H, W], or
             [D, H, W] for a propagator to several depths, such as ``DepthStack``.
         mask: Weights >= 0 that broadcast to the target, 0 where anything may be: beside a signal region, or out of
-            focus at a depth.
+            focus at a depth. They multiply U - I, so that the root of a weight map weighs the squared error.
         scale_free: Compare s U with I instead, s = <U, I> / <U, U> the best scale of each hologram and colour. For
             light that may leave the window or the mask; report the efficiency beside the result.
         amplitude: Compare sqrt(U) with sqrt(I) instead, whose gradient does not vanish where U is dark.

@@ -6,7 +6,9 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
+from holotorch.experiments.config_analysis import AnalysisSettings
 from holotorch.experiments.config_eye import ObserverSettings
+from holotorch.experiments.config_perception import LayoutSettings
 from holotorch.experiments.config_volume import VolumeSettings, contradictions
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.messages import describe, nearest, position
@@ -43,18 +45,34 @@ def _picture(value: Any) -> Any:
 Start = Literal["hot", "cool", "flat", "quadratic", "retrieved"]
 
 
+class PeripheralWeightSettings(Settings):
+    """Squared errors weighed by what the eye can use of them: (1 + E / e2_deg)^-2 at the eccentricity E.
+
+    ``field_deg``: what the picture spans from left to right, at equal angles per pixel; ``gaze_deg``: elevation and
+    azimuth of the point that is looked at; ``least``: lower limit, relative to the weight at that point.
+    """
+
+    kind: Literal["peripheral"]
+    field_deg: Annotated[Number, Field(gt=0, le=360)]
+    gaze_deg: tuple[Annotated[Number, Field(ge=-90, le=90)], Annotated[Number, Field(ge=-180, le=180)]] = (0.0, 0.0)
+    e2_deg: Annotated[Number, Field(gt=0, le=180)] = 1.746  # Cowey and Rolls
+    least: Annotated[Number, Field(ge=0, le=1)] = 0.0
+
+
 class TargetSettings(Settings):
     """A bundled photograph or a picture file, and how it is brought to the grid's aspect, or to that of a region of it.
 
     ``region``: size in pixels of the middle of the image in which the picture is wanted; the rest is free (thesis
     Eqs. 4.7, 4.8). ``depths``: with several distances, ``bands`` puts as many vertical bands of the picture in focus,
-    one at each, and leaves them free elsewhere; ``full`` wants the whole picture at every distance.
+    one at each, and leaves them free elsewhere; ``full`` wants the whole picture at every distance. ``weight``: how
+    much an error counts where.
     """
 
     image: Annotated[str, BeforeValidator(_picture)]
     fit: Literal["crop", "pad"] = "crop"
     region: Annotated[tuple[Side, Side], BeforeValidator(pair)] | None = None
     depths: Literal["bands", "full"] = "bands"
+    weight: PeripheralWeightSettings | None = None
 
 
 class ModulatorSettings(Settings):
@@ -124,7 +142,8 @@ class LBFGSSettings(Settings):
     start: Start | None = None
 
 
-Baseline = Literal["none", "basic_ipec", "ipec", "chopping", "shifting", "nonnegative"]
+# "unweighted": the run's own solver without target.weight.
+Baseline = Literal["none", "basic_ipec", "ipec", "chopping", "shifting", "nonnegative", "unweighted"]
 
 
 class ReportSettings(Settings):
@@ -168,11 +187,13 @@ class StudySettings(Settings):
     seed: Annotated[int, BeforeValidator(number), Field(ge=0, lt=2**63)] = 7
 
 
-KINDS: dict[str, type[PECSettings] | type[StudySettings] | type[VolumeSettings] | type[ObserverSettings]] = {
+KINDS: dict[str, type[Settings]] = {
     "pec": PECSettings,
     "pec_study": StudySettings,
     "volume": VolumeSettings,
     "eye": ObserverSettings,
+    "perception_layout": LayoutSettings,
+    "perception_analysis": AnalysisSettings,
 }
 
 
@@ -192,9 +213,12 @@ def load_config(path: Path | str, overrides: list[str] | None = None) -> Any:
     except ValidationError as error:
         mistakes = {describe(source, KINDS[kind], entry): None for entry in error.errors()}
         raise ConfigError(sorted(mistakes, key=position)) from None
-    if isinstance(settings, StudySettings | ObserverSettings):
+    if isinstance(settings, VolumeSettings):
+        found = contradictions(settings)
+    elif isinstance(settings, PECSettings):
+        found = _contradictions(settings)
+    else:
         return settings
-    found = contradictions(settings) if isinstance(settings, VolumeSettings) else _contradictions(settings)
     mistakes = [source.mistake(key, message) for key, message in found]
     if mistakes:
         raise ConfigError(mistakes)
@@ -232,4 +256,8 @@ def _contradictions(settings: PECSettings) -> list[tuple[Key, str]]:
     several = isinstance(light, NearFieldSettings) and len(light.distance) > 1
     if several and smaller:
         found.append((("target", "region"), "expected one distance beside a region"))
+    if settings.target.weight and (several or smaller):
+        found.append((("target", "weight"), "expected one distance and no region beside a weight"))
+    if "unweighted" in settings.report.baselines and not settings.target.weight:
+        found.append((("report", "baselines"), "unweighted asks for a target.weight that can be left out"))
     return found

@@ -10,6 +10,7 @@ from torch import Tensor
 from holotorch.core.complex import intensity
 from holotorch.correction.problem import best_scale
 from holotorch.experiments.pec import PECExperiment
+from holotorch.experiments.perception_weight import zone_scores
 from holotorch.metrics import SSIM_WINDOW, psnr, ssim
 from holotorch.optics import CroppedKernel
 
@@ -67,6 +68,8 @@ def judge(experiment: PECExperiment, phase: Tensor) -> Result:
         if experiment.scale_free:
             between = between * best_scale(seen, experiment.wanted)[:, None, None]
     numbers["between_samples"] = _between_scores(experiment, between)
+    if weight := experiment.settings.target.weight:
+        numbers["zones"] = zone_scores(weight, picture, experiment.image, experiment.lit)
     return Result(_all_colours(experiment, phase.cpu()), picture, alone, numbers)
 
 

@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -30,6 +30,7 @@ from holotorch.correction import (
 from holotorch.correction.run import State
 from holotorch.experiments.config import APGSettings, LBFGSSettings, NearFieldSettings, PECSettings
 from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.perception_weight import weight_map
 from holotorch.io.images import fit_image, frame_image, load_image, with_channels
 from holotorch.modulator import PhasedArray, ThermalCrosstalk, quantised
 from holotorch.optics import AngularSpectrum, CroppedKernel, DepthStack, Fraunhofer, Fresnel
@@ -136,6 +137,19 @@ class PECExperiment:
             mask[:, depth, :, depth * width // depths : (depth + 1) * width // depths] = 1
         return mask
 
+    @property
+    def weights(self) -> Tensor | None:
+        """What multiplies the error: the mask, and the root of the weight of its square. None for 1 everywhere."""
+        if self.settings.target.weight is None:
+            return self.mask
+        return weight_map(self.settings.target.weight, self.grid.shape).sqrt()[None]
+
+    @property
+    def unweighted(self) -> "PECExperiment":
+        """The same work with all errors alike."""
+        target = self.settings.target.model_copy(update={"weight": None})
+        return replace(self, settings=self.settings.model_copy(update={"target": target}))
+
     def seen(self, formed: Tensor) -> Tensor:
         """The picture in an intensity [..., C, *image]: its region, or what is in focus, [..., C, h, w]."""
         if len(self.distances) < 2:
@@ -162,7 +176,7 @@ class PECExperiment:
 
     def problem(self, dtype: torch.dtype = torch.float32, **options) -> PECProblem:
         """The objective over the lit colours."""
-        target, mask = (None if part is None else part.to(self.device, dtype) for part in (self.target, self.mask))
+        target, mask = (None if part is None else part.to(self.device, dtype) for part in (self.target, self.weights))
         assert target is not None
         return PECProblem(
             self.array.crosstalk,

@@ -90,6 +90,11 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
         lines.append(f"Planned    one propagation over this distance: {planned['reason']}; {planned['runner_up']}")
     if region := settings.target.region:
         lines.append(f"Region     the middle {region[0]} x {region[1]} px hold the picture; light elsewhere is free")
+    if weight := settings.target.weight:
+        lines.append(
+            f"Weight     squared errors count (1 + E / {weight.e2_deg:g} deg)^-2 at E from the gaze; the picture spans "
+            f"{weight.field_deg:g} deg"
+        )
     if settings.frames > 1:
         how = "solved for together" if experiment.joint else "solved for one by one"
         lines.append(f"Frames     {settings.frames}, shown in turn and {how}; the eye sees their mean")

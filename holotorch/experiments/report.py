@@ -10,6 +10,7 @@ from typing import Any
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.markup import figure, plain, table
 from holotorch.experiments.volume_report import volume_section
+from holotorch.experiments.zone_table import zone_rows
 from holotorch.io.files import write_text
 
 _PICTURES = {
@@ -20,6 +21,7 @@ _PICTURES = {
     "nonnegative": "Non-negative deconvolution",
     "basic_ipec": "Basic iterative correction",
     "ipec": "Iterative correction",
+    "unweighted": "Corrected, all errors alike",
     "corrected": "Corrected",
     "isolated": "Corrected, on a chip that stands alone",
 }
@@ -27,8 +29,14 @@ _FIGURES = {
     "phase": "Heater phases, before the heat spreads",
     "temperature": "Temperature of the chip above ambient, after the heat has spread",
     "convergence": "Convergence of the solver",
+    "weight": "Weight of the squared error, mean 1",
 }
-_METHOD_NAMES = {"none": "no correction", "basic_ipec": "basic IPEC", "ipec": "IPEC"}
+_METHOD_NAMES = {
+    "none": "no correction",
+    "basic_ipec": "basic IPEC",
+    "ipec": "IPEC",
+    "unweighted": "corrected, all errors alike",
+}
 
 
 def write_report(folders: Sequence[Path], path: Path) -> None:
@@ -38,8 +46,12 @@ def write_report(folders: Sequence[Path], path: Path) -> None:
     body = [_comparison(corrected)] if len(corrected) > 1 else []
     body += [run.section for run in runs]
     title = "holotorch: " + (runs[0].title if len(runs) == 1 else f"{len(runs)} runs")
-    text = _PAGE.format(title=html.escape(title), style=_STYLE, body="\n".join(body))
-    write_text(path, text)
+    write_text(path, page(title, "\n".join(body)))
+
+
+def page(title: str, body: str) -> str:
+    """The page around a body of HTML."""
+    return _PAGE.format(title=html.escape(title), style=_STYLE, body=body)
 
 
 class _Run:
@@ -82,6 +94,9 @@ def _section(run: _Run) -> list[str]:
         table(["method", *_COLUMNS], [[_METHOD_NAMES.get(n, n), *_numbers(m)] for n, m in run.methods.items()])
     )
     parts.append(f"<p>{_verdict(run)}</p>")
+    head, rows = zone_rows(run.methods)
+    if rows:
+        parts.append("<h2>By eccentricity</h2>" + table(head, rows))
     parts.append('<div class="row">')
     for name, caption in _PICTURES.items():
         if source := run.picture(name):

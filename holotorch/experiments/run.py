@@ -23,6 +23,7 @@ from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.judge import Result, judge
 from holotorch.experiments.memory import peak_memory
 from holotorch.experiments.pec import PECExperiment, build
+from holotorch.experiments.perception_weight import weight_map
 from holotorch.experiments.plan import plan, plan_text, shortage
 from holotorch.experiments.progress import Log
 from holotorch.experiments.report import write_report
@@ -36,6 +37,7 @@ _CAPTIONS = {
     "nonnegative": "Non-negative deconvolution",
     "basic_ipec": "Basic iterative correction",
     "ipec": "Iterative correction",
+    "unweighted": "Corrected, all errors alike",
     "corrected": "Corrected",
 }
 
@@ -150,8 +152,9 @@ def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
             try:
                 if not pressed:
                     started = time.perf_counter()
-                    found = baseline(experiment, name)
-                    results[name] = _result(experiment, found, time.perf_counter() - started, single=True)
+                    alike = name == "unweighted"
+                    found = experiment.unweighted.solve() if alike else baseline(experiment, name)
+                    results[name] = _result(experiment, found, time.perf_counter() - started, single=not alike)
             except KeyboardInterrupt:
                 pressed.append(signal.SIGINT)
             except ValueError as error:
@@ -248,6 +251,9 @@ def _write_results(
         "temperature": pictures.channel_maps(warm, names, "temperature rise (degC)", "inferno", (0, None)),
         "convergence": pictures.convergence(_per_colour(solution.losses, len(names)), names, log.checked, log.metric),
     }
+    if weight := experiment.settings.target.weight:
+        shares = weight_map(weight, experiment.grid.shape)[None]
+        figures["weight"] = pictures.channel_maps(shares, [f"looked at {weight.gaze_deg} deg"], "weight", "magma")
     for name, data in figures.items():
         write_bytes(out / "images" / f"{name}.png", data)
 

@@ -1,6 +1,6 @@
 """Image quality and speckle."""
 
-from holotorch.metrics.quality import SSIM_WINDOW, PerceptualSimilarity, psnr, ssim
+from holotorch.metrics.quality import SSIM_WINDOW, PerceptualSimilarity, psnr, ssim, ssim_map
 from holotorch.metrics.seeds import SeedStatistics, seed_statistics, squared_blur, squared_error
 from holotorch.metrics.speckle import anisotropy, grain_size, power_spectrum, sharpness, speckle_contrast
 
@@ -18,4 +18,5 @@ __all__ = [
     "squared_blur",
     "squared_error",
     "ssim",
+    "ssim_map",
 ]

@@ -29,7 +29,13 @@ def ssim(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
         TypeError: Images that are not real floating-point tensors.
         ValueError: Unequal shapes, a side below 11 px, or a range that is not positive.
     """
-    from kornia.metrics import ssim as ssim_map
+    scores = ssim_map(image, reference, data_range=data_range)
+    return scores.reshape(-1, 1, *scores.shape[-2:]).mean((-3, -2, -1)).reshape(image.shape[:-2])
+
+
+def ssim_map(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
+    """:func:`ssim` before its mean, [..., H - 10, W - 10]: the value of each window that lies within the image."""
+    from kornia.metrics import ssim as kornia_ssim
 
     _check_pair(image, reference, data_range)
     height, width = image.shape[-2:]
@@ -39,8 +45,8 @@ def ssim(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
             "psnr has no such limit"
         )
     images, references = (tensor.reshape(-1, 1, height, width) for tensor in (image, reference))
-    scores = ssim_map(images, references, SSIM_WINDOW, float(data_range), eps=0.0, padding="valid")
-    return scores.mean((-3, -2, -1)).reshape(image.shape[:-2])
+    scores = kornia_ssim(images, references, SSIM_WINDOW, float(data_range), eps=0.0, padding="valid")
+    return scores.reshape(*image.shape[:-2], *scores.shape[-2:])
 
 
 class PerceptualSimilarity(nn.Module):

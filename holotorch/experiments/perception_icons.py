@@ -1,0 +1,156 @@
+"""A notional theme park: its ground, and icons as plain shapes in a unit square. Our own drawings, of no real place."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.patches import Ellipse, FancyBboxPatch, Polygon, Rectangle
+
+Place = Callable[[float, float], tuple[float, float]]
+
+
+def draw_ground(axes: Axes, field_deg: tuple[float, float]) -> None:
+    """Sky, hills, paths and a pond behind the icons, over (vertical, horizontal) degrees."""
+    high, wide = field_deg[0] / 2, field_deg[1] / 2
+    axes.add_patch(Rectangle((-wide, -high), 2 * wide, 2 * high, color="#cfe4f2", zorder=0))
+    steps = [wide * (i / 60 - 1) for i in range(121)]
+    hills = [high * (0.24 + 0.10 * math.sin(x / 13) + 0.05 * math.sin(x / 5.1 + 2)) for x in steps]
+    axes.add_patch(Polygon([(-wide, -high), *zip(steps, hills, strict=True), (wide, -high)], color="#b9d3ac", zorder=1))
+    near = [high * (-0.02 + 0.06 * math.sin(x / 21 + 1)) for x in steps]
+    axes.add_patch(Polygon([(-wide, -high), *zip(steps, near, strict=True), (wide, -high)], color="#9fc08f", zorder=2))
+    axes.add_patch(Ellipse((0.48 * wide, -0.62 * high), 0.5 * wide, 0.3 * high, color="#8fbdd6", zorder=3))
+    for end in (-0.9, -0.35, 0.2, 0.95):
+        path = [(-0.02 * wide, -high), (0.02 * wide, -high), (end * wide, -0.02 * high)]
+        axes.add_patch(Polygon(path, color="#e3d9bd", zorder=4))
+
+
+def draw_icon(axes: Axes, name: str, centre: tuple[float, float], size: tuple[float, float], zorder: float) -> None:
+    """An icon on its plate, (x, y) and (height, width) in the axes' units."""
+    height, width = size
+    left, bottom = centre[0] - width / 2, centre[1] - height / 2
+
+    def at(x: float, y: float) -> tuple[float, float]:
+        return left + x * width, bottom + y * height
+
+    plate = FancyBboxPatch(
+        at(0.04, 0.04),
+        0.92 * width,
+        0.92 * height,
+        boxstyle=f"round,pad=0,rounding_size={0.16 * min(size)}",
+        facecolor=_PLATES[name],
+        edgecolor="white",
+        linewidth=0.8,
+        zorder=zorder,
+    )
+    axes.add_patch(plate)
+    _ICONS[name](_Pen(axes, at, width, height, zorder + 0.1))
+
+
+class _Pen:
+    """Draws white (or coloured) shapes in the unit square of an icon."""
+
+    def __init__(self, axes: Axes, at: Place, width: float, height: float, zorder: float):
+        self.axes, self.at, self.width, self.height, self.zorder = axes, at, width, height, zorder
+
+    def line(self, *points: tuple[float, float], thick: float = 0.05, **options: Any) -> None:
+        # As polygons: a line's width would be in points, and not grow with the icon.
+        for (x0, y0), (x1, y1) in zip(points, points[1:], strict=False):
+            length = math.hypot(x1 - x0, y1 - y0) or 1.0
+            dx, dy = (x1 - x0) / length * thick / 2, (y1 - y0) / length * thick / 2
+            corners = [(x0 - dx - dy, y0 - dy + dx), (x0 - dx + dy, y0 - dy - dx)]
+            self.shape(*corners, (x1 + dx + dy, y1 + dy - dx), (x1 + dx - dy, y1 + dy + dx), **options)
+
+    def shape(self, *points: tuple[float, float], color: str = "white") -> None:
+        self.axes.add_patch(Polygon([self.at(*p) for p in points], color=color, linewidth=0, zorder=self.zorder))
+
+    def disc(self, x: float, y: float, radius: float, color: str = "white") -> None:
+        middle, size = self.at(x, y), 2 * radius
+        self.axes.add_patch(
+            Ellipse(middle, size * self.width, size * self.height, color=color, linewidth=0, zorder=self.zorder)
+        )
+
+
+def _wheel(pen: _Pen) -> None:
+    pen.line((0.5, 0.54), (0.3, 0.12))
+    pen.line((0.5, 0.54), (0.7, 0.12))
+    rim = [(0.5 + 0.29 * math.cos(t * math.pi / 16), 0.54 + 0.29 * math.sin(t * math.pi / 16)) for t in range(33)]
+    pen.line(*rim, thick=0.04)
+    for k in range(8):
+        x, y = 0.5 + 0.29 * math.cos(k * math.pi / 4), 0.54 + 0.29 * math.sin(k * math.pi / 4)
+        pen.line((0.5, 0.54), (x, y), thick=0.02)
+        pen.disc(x, y, 0.055, "#ffe08a")
+
+
+def _coaster(pen: _Pen) -> None:
+    track = [(x / 40, 0.47 + 0.25 * math.cos(2 * math.pi * (x / 40 - 0.24) / 0.56)) for x in range(5, 36)]
+    pen.line(*track, thick=0.05)
+    for x, y in track[::5]:
+        pen.line((x, 0.14), (x, y), thick=0.025)
+    for x, y in (track[5], track[7], track[9]):
+        pen.disc(x, y + 0.07, 0.06, "#ffe08a")
+
+
+def _castle(pen: _Pen) -> None:
+    for x, top in ((0.2, 0.6), (0.5, 0.72), (0.8, 0.6)):
+        pen.shape((x - 0.09, 0.16), (x - 0.09, top), (x + 0.09, top), (x + 0.09, 0.16))
+        pen.shape((x - 0.12, top), (x, top + 0.2), (x + 0.12, top), color="#ffe08a")
+    pen.shape((0.2, 0.16), (0.2, 0.44), (0.8, 0.44), (0.8, 0.16))
+    pen.disc(0.5, 0.26, 0.08, _PLATES["castle"])
+    pen.shape((0.42, 0.16), (0.42, 0.26), (0.58, 0.26), (0.58, 0.16), color=_PLATES["castle"])
+
+
+def _boat(pen: _Pen) -> None:
+    pen.shape((0.14, 0.38), (0.86, 0.38), (0.72, 0.2), (0.28, 0.2))
+    pen.line((0.48, 0.38), (0.48, 0.86), thick=0.035)
+    pen.shape((0.52, 0.44), (0.52, 0.84), (0.8, 0.44), color="#ffe08a")
+    pen.shape((0.44, 0.44), (0.44, 0.76), (0.2, 0.44))
+
+
+def _tent(pen: _Pen) -> None:
+    pen.shape((0.5, 0.8), (0.14, 0.5), (0.86, 0.5))
+    for k in range(5):
+        x = 0.2 + 0.12 * k
+        pen.shape((x, 0.16), (x, 0.5), (x + 0.12, 0.5), (x + 0.12, 0.16), color=("white", "#ffe08a")[k % 2])
+    pen.line((0.5, 0.8), (0.5, 0.92), thick=0.03)
+
+
+def _carousel(pen: _Pen) -> None:
+    pen.shape((0.5, 0.88), (0.14, 0.62), (0.86, 0.62))
+    pen.shape((0.16, 0.14), (0.16, 0.22), (0.84, 0.22), (0.84, 0.14))
+    for x in (0.24, 0.5, 0.76):
+        pen.line((x, 0.22), (x, 0.62), thick=0.03)
+        pen.disc(x, 0.42 + 0.06 * math.cos(12 * x), 0.07, "#ffe08a")
+
+
+def _food(pen: _Pen) -> None:
+    pen.shape((0.5, 0.14), (0.34, 0.54), (0.66, 0.54), color="#ffe08a")
+    for x, y in ((0.39, 0.6), (0.61, 0.6), (0.5, 0.73)):
+        pen.disc(x, y, 0.13)
+
+
+def _first_aid(pen: _Pen) -> None:
+    pen.line((0.5, 0.18), (0.5, 0.82), thick=0.2)
+    pen.line((0.2, 0.5), (0.8, 0.5), thick=0.2)
+
+
+_PLATES = {
+    "wheel": "#2f5d8a",
+    "coaster": "#a23b3b",
+    "castle": "#6b4a8f",
+    "boat": "#21737d",
+    "tent": "#b3592a",
+    "carousel": "#94386e",
+    "food": "#7d5a2b",
+    "first_aid": "#2c7a4b",
+}
+_ICONS = {
+    "wheel": _wheel,
+    "coaster": _coaster,
+    "castle": _castle,
+    "boat": _boat,
+    "tent": _tent,
+    "carousel": _carousel,
+    "food": _food,
+    "first_aid": _first_aid,
+}
