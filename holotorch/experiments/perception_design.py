@@ -1,0 +1,211 @@
+"""The plan of a study of perception time: which pattern appears where, how large, on which side and in which order.
+
+After Sec. 2.3: crosses and circles at nine eccentricities; every pair of eccentricity and size comes five times for
+each pattern as the target and twice for each as the distraction; four rounds, two of them with the cross as the target.
+"""
+
+import hashlib
+import json
+import random
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+Pattern = Literal["cross", "circle"]
+Side = Literal["left", "right"]
+_Appearance = tuple[float, float, Side, Pattern, bool]  # eccentricity, size, side, pattern, target
+ORDERS = ("thesis", "williams")
+# The thesis: nine eccentricities, three sizes at the inner four and eight at the outer five. Degrees.
+THESIS_CONDITIONS = tuple((float(e), float(s)) for e in (0, 10, 20, 30) for s in (5, 10, 15)) + tuple(
+    (float(e), float(s)) for e in (40, 50, 60, 70, 80) for s in (5, 8, 11, 14, 17, 20, 23, 26)
+)
+_ROUNDS: tuple[tuple[Pattern, int], ...] = (("cross", 1), ("circle", 1), ("cross", 2), ("circle", 2))
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One appearance of a pattern.
+
+    Attributes:
+        round: 1 to 4; 0 is the practice round.
+        trial: 1, 2, ... within the round.
+        eccentricity_deg: Angle between the fixation point and the pattern's centre, >= 0.
+        size_deg: Angle that the pattern subtends.
+        side: Of the fixation point.
+        pattern: What appears.
+        target: Whether it is to be answered.
+        wait_s: From the end of the trial before to the appearance, in seconds.
+    """
+
+    round: int
+    trial: int
+    eccentricity_deg: float
+    size_deg: float
+    side: Side
+    pattern: Pattern
+    target: bool
+    wait_s: float
+
+    @property
+    def practice(self) -> bool:
+        """Whether it belongs to the practice round."""
+        return self.round == 0
+
+    @property
+    def goal(self) -> Pattern:
+        """The pattern to answer in this round."""
+        return self.pattern if self.target else "circle" if self.pattern == "cross" else "cross"
+
+
+@dataclass(frozen=True)
+class Design:
+    """All trials of one participant, in order."""
+
+    participant: int
+    trials: tuple[Trial, ...]
+
+    @property
+    def name(self) -> str:
+        """A short fingerprint of the trials: equal only where every one of them is."""
+        text = json.dumps([asdict(trial) for trial in self.trials], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data that ``from_json`` reads back."""
+        return {
+            "format": "holotorch-design",
+            "version": 1,
+            "participant": self.participant,
+            "name": self.name,
+            "trials": [asdict(trial) for trial in self.trials],
+        }
+
+    @staticmethod
+    def from_json(data: dict[str, Any]) -> "Design":
+        """The design that was written; ValueError for other data, and where a trial was changed since."""
+        if not isinstance(data, dict) or data.get("format") != "holotorch-design" or data.get("version") != 1:
+            raise ValueError("expected a design of format holotorch-design, version 1")
+        try:
+            design = Design(data["participant"], tuple(Trial(**trial) for trial in data["trials"]))
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"a design that cannot be read: {error}") from None
+        if design.name != data.get("name"):
+            raise ValueError(f"a design that was changed: it says {data.get('name')}, but its trials are {design.name}")
+        return design
+
+
+def williams(n: int) -> tuple[tuple[int, ...], ...]:
+    """Orders of 0 ... n - 1 balanced for carry-over (Williams 1949).
+
+    Every item stands equally often at every place and directly after every other item: n orders where n is even, 2 n
+    where it is odd.
+    """
+    if n < 1:
+        raise ValueError(f"expected at least one item to order, got {n}")
+    first = [(k + 1) // 2 if k % 2 else (n - k // 2) % n for k in range(n)]  # 0, 1, n - 1, 2, n - 2, ...
+    rows = [tuple((item + shift) % n for item in first) for shift in range(n)]
+    return tuple(rows + [row[::-1] for row in rows] if n % 2 and n > 1 else rows)
+
+
+def round_orders(order: str) -> tuple[tuple[int, ...], ...]:
+    """Orders of the rounds cross 1, circle 1, cross 2, circle 2 that participants take in turn."""
+    if order not in ORDERS:
+        raise ValueError(f"order: expected one of {', '.join(ORDERS)}, got {order!r}")
+    return ((0, 1, 2, 3), (1, 0, 3, 2)) if order == "thesis" else williams(4)
+
+
+def make_design(
+    participant: int,
+    conditions: Sequence[tuple[float, float]] = THESIS_CONDITIONS,
+    *,
+    target_repeats: int = 5,
+    distraction_repeats: int = 2,
+    order: str = "thesis",
+    sides: str = "both",
+    practice: int = 14,
+    wait_s: tuple[float, float] = (0.8, 1.6),
+    seed: int = 0,
+) -> Design:
+    """Plan the trials of one participant; the same arguments give the same trials.
+
+    Args:
+        participant: 1, 2, ...; chooses the order of the rounds.
+        conditions: (eccentricity, size) in degrees.
+        target_repeats: Of each condition for each pattern as the target.
+        distraction_repeats: Of each condition for each pattern as the distraction.
+        order: "thesis": the four rounds are the same for everybody; odd numbers take them as cross, circle, cross,
+            circle and even ones as circle, cross, circle, cross. "williams": the four orders of a Williams square in
+            turn, and the trials shuffled anew for each participant.
+        sides: "left", "right", or "both": then in each condition, role and pattern the sides differ by one at most (the
+            thesis does not state its sides).
+        practice: Trials of the practice round, which has the first round's target.
+        wait_s: Bounds of the time before each appearance, drawn evenly between them.
+        seed: Of everything drawn.
+
+    Raises:
+        ValueError: A participant below 1, no condition, the same one twice, negative or impossible angles, counts or
+            times.
+    """
+    if isinstance(participant, bool) or participant < 1:
+        raise ValueError(f"participant: expected a number from 1, got {participant}")
+    _check(conditions, target_repeats, distraction_repeats, practice, wait_s)
+    if sides not in ("left", "right", "both"):
+        raise ValueError(f"sides: expected left, right or both, got {sides!r}")
+    orders = round_orders(order)
+    shared = order == "thesis"
+    rng = random.Random(f"holotorch {seed}" if shared else f"holotorch {seed} {participant}")
+    blocks: dict[tuple[Pattern, int], list[_Appearance]] = {}
+    for goal in ("cross", "circle"):
+        drawn = _shuffled(rng, conditions, goal, target_repeats, distraction_repeats, sides)
+        half = (len(drawn) + 1) // 2
+        blocks[goal, 1], blocks[goal, 2] = drawn[:half], drawn[half:]
+    waits = {name: [_wait(rng, wait_s) for _ in block] for name, block in blocks.items()}
+    turn = orders[(participant - 1) % len(orders)]
+    sequence = [_ROUNDS[i] for i in turn]
+    exercise = random.Random(f"holotorch practice {seed} {participant}")
+    pool = _shuffled(exercise, conditions, sequence[0][0], target_repeats, distraction_repeats, sides)
+    trials = [Trial(0, i, *item, _wait(exercise, wait_s)) for i, item in enumerate(pool[:practice], 1)]
+    for number, name in enumerate(sequence, 1):
+        timed = zip(blocks[name], waits[name], strict=True)
+        trials += [Trial(number, i, *item, wait) for i, (item, wait) in enumerate(timed, 1)]
+    return Design(participant, tuple(trials))
+
+
+def _shuffled(
+    rng: random.Random, conditions, goal: Pattern, targets: int, distractions: int, sides: str
+) -> list[_Appearance]:
+    other: Pattern = "circle" if goal == "cross" else "cross"
+    roles: tuple[tuple[Pattern, int], ...] = ((goal, targets), (other, distractions))
+    found: list[_Appearance] = []
+    for eccentricity, size in conditions:
+        for pattern, count in roles:
+            start = rng.randrange(2)
+            for i in range(count):
+                turn: Side = "right" if (start + i) % 2 else "left"
+                side: Side = turn if sides == "both" else "left" if sides == "left" else "right"
+                found.append((float(eccentricity), float(size), side, pattern, pattern == goal))
+    rng.shuffle(found)
+    return found
+
+
+def _wait(rng: random.Random, bounds: tuple[float, float]) -> float:
+    return round(rng.uniform(*bounds), 4)
+
+
+def _check(conditions, targets: int, distractions: int, practice: int, wait_s: tuple[float, float]) -> None:
+    if not conditions:
+        raise ValueError("conditions: expected at least one pair of eccentricity and size, got none")
+    if len(set(conditions)) < len(conditions):
+        twice = next(pair for pair in conditions if list(conditions).count(pair) > 1)
+        raise ValueError(f"conditions: {twice[0]:g} deg with size {twice[1]:g} deg is there twice; raise the repeats")
+    for eccentricity, size in conditions:
+        if not (0 <= eccentricity < 180 and 0 < size < 90):
+            raise ValueError(
+                "conditions: expected eccentricities from 0 to below 180 deg and sizes between 0 and 90 deg, got "
+                f"{eccentricity:g} deg with size {size:g} deg"
+            )
+    for name, count, least in (("target", targets, 1), ("distraction", distractions, 0), ("practice", practice, 0)):
+        if isinstance(count, bool) or count < least:
+            raise ValueError(f"{name}: expected a whole number from {least}, got {count}")
+    if not 0 <= wait_s[0] <= wait_s[1] < 60:
+        raise ValueError(f"wait_s: expected a least and a most wait between 0 and 60 s, got {list(wait_s)}")
