@@ -1,0 +1,299 @@
+"""A run of the analysis: logs, or simulated participants, to tables, pictures and a page."""
+
+import html
+import math
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from pydantic import ValidationError
+from tqdm import tqdm
+
+from holotorch.experiments import perception_figures as figures
+from holotorch.experiments.chart import write_table
+from holotorch.experiments.config_analysis import AnalysisSettings
+from holotorch.experiments.environment import environment
+from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.markup import figure, table
+from holotorch.experiments.perception_analysis import (
+    Curves,
+    Responses,
+    Scales,
+    Times,
+    equal_efficiency,
+    fit_curves,
+    perception_times,
+    read_responses,
+)
+from holotorch.experiments.perception_log import Quantisation, quantisation
+from holotorch.experiments.perception_power import needed, power_rows, with_slope
+from holotorch.experiments.perception_simulation import simulate, true_line
+from holotorch.experiments.perception_statistics import (
+    Anova,
+    Line,
+    Mixed,
+    fit_line,
+    mixed_model,
+    need_statsmodels,
+    one_way,
+    repeated_measures,
+)
+from holotorch.experiments.run import claim
+from holotorch.io.files import save_array, write_bytes, write_json, write_text
+
+_CAPTIONS = {
+    "time_surface": "Fig. 2.3: quartiles of the perception time",
+    "time_map": "Fig. 2.4: median perception time of all conditions",
+    "participant": "Fig. 2.5: times of one participant",
+    "time_slices": "Fig. 2.6: perception time over eccentricity",
+    "scale_lines": "Fig. 2.7: equal-efficiency scales",
+    "power": "Power of the study",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """What was found for one target time."""
+
+    name: str
+    scales: Scales
+    line: Line
+    thesis: Anova
+    repeated: Anova | None
+    mixed: Mixed | None
+    undefined: int
+    limited: int
+    missing: int
+
+    def row(self, truth: tuple[float, float] | None) -> dict[str, Any]:
+        """A line of metrics.csv."""
+        line = self.line
+        row: dict[str, Any] = {"target": self.name, "alpha": line.alpha, "beta": line.beta}
+        row |= dict(zip(("alpha_low", "alpha_high"), line.alpha_interval, strict=True))
+        row |= dict(zip(("beta_low", "beta_high"), line.beta_interval, strict=True))
+        if truth is not None:
+            row |= {"true_alpha": truth[0], "true_beta": truth[1]}
+        row |= _anova("one_way", self.thesis)
+        if self.repeated is not None:
+            row |= _anova("repeated", self.repeated)
+            row |= {"epsilon": self.repeated.epsilon, "repeated_p_corrected": self.repeated.p_corrected}
+            row |= {"repeated_left_out": self.repeated.left_out}
+            mixed = self.mixed
+            row |= {"mixed_alpha": mixed.alpha if mixed else math.nan, "mixed_beta": mixed.beta if mixed else math.nan}
+            low, high = mixed.alpha_interval if mixed else (math.nan, math.nan)
+            row |= {"mixed_alpha_low": low, "mixed_alpha_high": high, "mixed_p": mixed.p if mixed else math.nan}
+            row |= {"mixed_effects": mixed.effects if mixed else "not fitted"}
+        row |= {"undefined": self.undefined, "at_limits": self.limited, "missing": self.missing}
+        return {key: _json(value) for key, value in row.items()} | {"refused": line.refused}
+
+
+def find(settings: AnalysisSettings, times: Times, curves: Curves) -> list[Finding]:
+    """Analyse all target times. ConfigError for a target that was not shown, or where statsmodels is missing."""
+    low, high = settings.range_deg
+    inside = (curves.eccentricities >= low) & (curves.eccentricities <= high)
+    found = []
+    for k, target in enumerate(settings.targets):
+        scales = equal_efficiency(curves, times.of(target), settings.limits_deg)
+        line = fit_line(
+            curves.eccentricities,
+            scales.degrees,
+            np.random.default_rng([settings.seed, 2, k]),
+            inside=inside,
+            limits=settings.limits_deg,
+            resamples=settings.resamples,
+            confidence=settings.confidence,
+        )
+        known, there = scales.known[:, inside], np.isfinite(scales.degrees[:, inside])
+        beside = settings.repeated_measures
+        found.append(
+            Finding(
+                str(target),
+                scales,
+                line,
+                one_way(known),
+                repeated_measures(known) if beside else None,
+                mixed_model(curves.eccentricities[inside], known, settings.confidence) if beside else None,
+                int((there & ~scales.defined[:, inside]).sum()),
+                int(scales.limited[:, inside].sum()),
+                int((~there).sum()),
+            )
+        )
+    return found
+
+
+def on_frames(responses: Responses) -> float:
+    """Share of the reaction times within a tenth of a frame of a whole number of frames; 0.2 by chance."""
+    answered = np.isfinite(responses.reaction_s)
+    frames = responses.reaction_s[answered] / responses.frame_s[answered]
+    return float((np.abs(frames - np.round(frames)) <= 0.1).mean()) if len(frames) else math.nan
+
+
+def run_analysis(settings: AnalysisSettings, out: Path | None, name: str) -> tuple[Path, bool]:
+    """Carry an analysis out and fill a folder; returns and raises as :func:`holotorch.experiments.run.run`."""
+    started = time.perf_counter()
+    if settings.repeated_measures:
+        need_statsmodels()
+    if settings.power:
+        for alpha in settings.power.slopes:
+            try:
+                with_slope(settings.simulation, alpha, sum(settings.range_deg) / 2)
+            except ValidationError as error:
+                raise ConfigError([f"power.slopes: {alpha:g}: {error.errors()[0]['msg']}"]) from None
+    if settings.logs:
+        responses = read_responses(settings.logs)
+    else:
+        responses = simulate(settings.simulation, np.random.default_rng([settings.seed, 0]))
+    times = perception_times(responses, settings.cleaning)
+    curves = fit_curves(times, settings.range_deg[0], settings.cleaning.sizes)
+    shown = int(times.participants[0]) if settings.shown is None else settings.shown
+    if shown not in times.participants:
+        raise ConfigError([f"shown: no participant {shown}; there are {', '.join(map(str, times.participants))}"])
+    found = find(settings, times, curves)
+    frames = quantisation({"frame_s": frame} for frame in responses.frame_s.tolist())
+    assert frames is not None  # as there are trials
+    truths = [true_line(settings.simulation, target) if not settings.logs else None for target in settings.targets]
+    rows = [finding.row(truth) for finding, truth in zip(found, truths, strict=True)]
+    text = _words(settings, times, curves, found, frames, on_frames(responses))
+    print(text, flush=True)
+    folder = claim(out, name)
+    for part in ("arrays", "images"):
+        (folder / part).mkdir(exist_ok=True)
+    write_text(folder / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
+    write_json(folder / "plan.json", {"rule": settings.cleaning.model_dump(), "counts": times.counts})
+    write_json(folder / "env.json", environment(settings.seed, torch.device("cpu")))
+    save_array(folder / "arrays" / "times.npy", torch.from_numpy(times.seconds))
+    save_array(folder / "arrays" / "scales.npy", torch.from_numpy(np.stack([f.scales.degrees for f in found])))
+    write_table(folder / "metrics.csv", rows)
+    write_table(folder / "conditions.csv", _conditions(times))
+    write_table(folder / "curves.csv", _curves(times, curves))
+    drawn = [figures.Shown(f.name, curves.eccentricities, f.line) for f in found]
+    place = int(np.flatnonzero(times.participants == shown)[0])
+    images = {
+        "time_surface": figures.time_surface(times),
+        "time_map": figures.time_map(times, drawn, settings.range_deg, settings.tested_deg),
+        "participant": figures.single_participant(times, curves, place),
+        "time_slices": figures.time_slices(times),
+        "scale_lines": figures.scale_lines(times, drawn, settings.range_deg, settings.tested_deg, settings.confidence),
+    }
+    power: list[dict[str, Any]] = []
+    if settings.power:
+        total = len(settings.power.slopes) * len(settings.power.participants)
+        power = list(tqdm(power_rows(settings, settings.power), total=total, desc="power", dynamic_ncols=True))
+        write_table(folder / "power.csv", power)
+        images["power"] = figures.power_curves(power, settings.confidence)
+        said = needed(power)
+        text += "\n" + "\n".join(f"Power      {line}" for line in said)
+        print("\n".join(said), flush=True)
+    for key, data in images.items():
+        write_bytes(folder / "images" / f"{key}.png", data)
+    body = "<h1>Perception in the far periphery</h1>" + f"<pre>{html.escape(text)}</pre>" + _table(rows)
+    body += "".join(figure(f"images/{key}.png", _CAPTIONS[key], "wide") for key in images)
+    body += _table(power) if power else ""
+    write_text(folder / "report.html", f"<!DOCTYPE html><meta charset='utf-8'><title>perception</title>{body}")
+    summary = {
+        "experiment": "perception_analysis",
+        "status": "complete",
+        "simulated": times.simulated,
+        "participants": len(times.participants),
+        "counts": times.counts,
+        "quantisation": asdict(frames) | {"on_frames": _json(on_frames(responses))},
+        "rows": rows,
+        "power": power,
+        "seconds": round(time.perf_counter() - started, 2),
+    }
+    write_json(folder / "summary.json", summary)
+    return folder, True
+
+
+def _words(
+    settings: AnalysisSettings, times: Times, curves: Curves, found: list[Finding], frames: Quantisation, on: float
+) -> str:
+    who = "simulated participants" if times.simulated else "participants"
+    some = np.isfinite(curves.a)
+    lines = [
+        f"Study      {len(times.participants)} {who}",
+        "Answers    " + ", ".join(f"{number} {key}" for key, number in times.counts.items()),
+        f"Frames     {frames}; {100 * on:.0f} % of the times are whole frames",
+        f"Curves     T = a ln S + b: {int((curves.a[some] >= 0).sum())} of {int(some.sum())} do not fall with the size"
+        f", {int((~some).sum())} have too few sizes",
+    ]
+    for f in found:
+        line = f.line
+        if line.refused:
+            lines.append(f"Scale      as fast as {f.name}: no line, as {line.refused}")
+            continue
+        (a, b), (c, d) = line.alpha_interval, line.beta_interval
+        lines.append(
+            f"Scale      as fast as {f.name}: {line.alpha:.3g} [{a:.3g}, {b:.3g}] E {line.beta:+.3g} [{c:.3g}, {d:.3g}]"
+            f" deg; {100 * settings.confidence:g} % intervals; {f.undefined} scales undefined, {f.limited} at limits"
+        )
+        lines.append(_tested("one-way ANOVA, as in the thesis", f.thesis, f.thesis.p))
+        if f.repeated is not None:
+            lines.append(_tested("repeated measures, Greenhouse-Geisser", f.repeated, f.repeated.p_corrected))
+        if f.mixed is not None:
+            a, b = f.mixed.alpha_interval
+            lines.append(f"             mixed model: alpha {f.mixed.alpha:.3g} [{a:.3g}, {b:.3g}], p = {f.mixed.p:.3g}")
+    return "\n".join(lines)
+
+
+def _tested(name: str, found: Anova, p: float) -> str:
+    return f"             {name}: F({found.freedom[0]}, {found.freedom[1]}) = {found.f:.3g}, p = {p:.3g}"
+
+
+def _anova(name: str, found: Anova) -> dict[str, Any]:
+    return {
+        f"{name}_f": found.f,
+        f"{name}_p": found.p,
+        f"{name}_df": found.freedom[0],
+        f"{name}_error_df": found.freedom[1],
+    }
+
+
+def _conditions(times: Times) -> list[dict[str, Any]]:
+    rows = []
+    for e, s in zip(*np.nonzero(np.isfinite(times.seconds).any(0)), strict=True):
+        low, middle, high = np.nanquantile(times.seconds[:, e, s], (0.25, 0.5, 0.75))
+        rows.append(
+            {
+                "eccentricity_deg": times.eccentricities[e],
+                "size_deg": times.sizes[s],
+                "participants": int(np.isfinite(times.seconds[:, e, s]).sum()),
+                "answers": int(times.kept[:, e, s].sum()),
+                "quartile_25_s": low,
+                "median_s": middle,
+                "quartile_75_s": high,
+            }
+        )
+    return rows
+
+
+def _curves(times: Times, curves: Curves) -> list[dict[str, Any]]:
+    return [
+        {
+            "participant": int(times.participants[p]),
+            "eccentricity_deg": float(curves.eccentricities[k]),
+            "a_s": _json(curves.a[p, k]),
+            "a_deviation_s": _json(curves.a_deviation[p, k]),
+            "b_s": _json(curves.b[p, k]),
+        }
+        for p in range(len(times.participants))
+        for k in range(len(curves.eccentricities))
+    ]
+
+
+def _table(rows: list[dict[str, Any]]) -> str:
+    def cell(value: Any) -> str:
+        return "" if value is None else f"{value:.4g}" if isinstance(value, float) else html.escape(str(value))
+
+    return table([key.replace("_", " ") for key in rows[0]], [[cell(value) for value in row.values()] for row in rows])
+
+
+def _json(value: Any) -> Any:
+    """Numbers that JSON has; None for NaN and infinity."""
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    return value
