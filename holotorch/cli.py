@@ -74,13 +74,17 @@ def _resume(options: argparse.Namespace) -> int:
 
 def _demo(options: argparse.Namespace) -> int:
     from holotorch.experiments.config import load_config
+    from holotorch.experiments.perception_layout import run_layout
     from holotorch.experiments.report import write_report
     from holotorch.experiments.run import claim, run
+    from holotorch.experiments.synthetic import write_synthetic
+    from holotorch.experiments.track import run_tracking
     from holotorch.experiments.volume_run import run_volume
     from holotorch.io.bundled import find_config
 
-    paths = [find_config(f"configs/{name}.yaml") for name in ("demo", "demo_volume")]
-    image, scene = (load_config(path) for path in paths if path is not None)
+    names = ("demo", "demo_volume", "perception/layout")
+    paths = [find_config(f"configs/{name}.yaml") for name in names]
+    image, scene, layout = (load_config(path) for path in paths if path is not None)
     folder = claim(options.out, "demo")
     if (folder / "images").is_dir():
         (folder / "images").rmdir()  # the claim's; each run has a folder of its own
@@ -90,7 +94,14 @@ def _demo(options: argparse.Namespace) -> int:
         parts.append(part)
         if not complete:
             break
-    write_report(parts, folder / "report.html")
+    more = {}
+    if complete:
+        recording = write_synthetic(folder / "recording", 10)
+        _, complete = run_tracking(recording, out=folder / "tracking")
+        run_layout(layout, folder / "layout", "layout")
+        more["Catheter tracking, in a synthetic recording"] = "tracking/report.html"
+        more["Icons over a wide field, as large as they must be"] = "layout/report.html"
+    write_report(parts, folder / "report.html", more)
     return _finish(folder, len(parts) == 2 and complete)
 
 
@@ -191,7 +202,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"holotorch {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    demo = commands.add_parser("demo", help="a small real run on a bundled photograph, under a minute")
+    demo = commands.add_parser("demo", help="a small real run of each system on bundled data, under a minute")
     demo.add_argument("--out", type=Path, help="folder of the run (default: runs/demo-001, ...)")
     demo.set_defaults(action=_demo)
 

@@ -1,5 +1,6 @@
 """The command as a user meets it: exit statuses, messages without tracebacks, nothing imported needlessly."""
 
+import json
 import os
 import signal
 import subprocess
@@ -70,7 +71,12 @@ def test_demo_runs_on_bundled_data(capsys):
     assert capsys.readouterr().out.splitlines()[-1] == "here/report.html"
     page = Path("here/report.html").read_text()
     assert "Corrected" in page and "Direct volume rendering" in page and "Synthetic volume" in page
-    assert {path.name for path in Path("here").iterdir()} == {"correction", "volume", "report.html"}
+    parts = {"correction", "volume", "recording", "tracking", "layout"}
+    assert {path.name for path in Path("here").iterdir()} == {*parts, "report.html"}
+    for part in ("tracking", "layout"):
+        assert f'href="{part}/report.html"' in Path("here/report.html").read_text()
+        assert Path(f"here/{part}/report.html").is_file()
+    assert json.loads(Path("here/tracking/summary.json").read_text())["statuses"] == {"OK": 10}
 
 
 def test_doctor(capsys):

@@ -3,7 +3,7 @@
 import base64
 import html
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,12 +39,17 @@ _METHOD_NAMES = {
 }
 
 
-def write_report(folders: Sequence[Path], path: Path) -> None:
-    """Write the page of ``folders`` to ``path``. ConfigError for a folder that holds no run."""
+def write_report(folders: Sequence[Path], path: Path, more: Mapping[str, str] | None = None) -> None:
+    """Write the page of ``folders`` to ``path``. ConfigError for a folder that holds no run.
+
+    ``more``: pages to point to, where each lies seen from ``path``, by what they show.
+    """
     runs = [_Run(folder) for folder in folders]
     corrected = [run for run in runs if run.methods]
     body = [_comparison(corrected)] if len(corrected) > 1 else []
     body += [run.section for run in runs]
+    links = [f'<li><a href="{html.escape(place)}">{html.escape(what)}</a></li>' for what, place in (more or {}).items()]
+    body += ["<h2>More</h2>", "<ul>", *links, "</ul>"] if links else []
     title = "holotorch: " + (runs[0].title if len(runs) == 1 else f"{len(runs)} runs")
     write_text(path, page(title, "\n".join(body)))
 
