@@ -17,7 +17,6 @@ from holotorch.tracking.strips import Line, Sampler
 _LEVEL_SD = 2.5 / 255  # of a pixel's level; fits correct it by what they leave
 _ONE_SIDED = 0.15  # contrast to one side over that to the other
 _NARROWEST = 2.4  # pixels: below it no pixel shows one band alone
-_WIDEST = 120.0
 _WINDOW = 11  # samples to either side of an edge
 _STATIONS = 40
 _SAMPLES = 4  # for each station

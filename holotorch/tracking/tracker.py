@@ -24,6 +24,7 @@ _FLOOR = 0.015  # pixels: what model and pixels leave in an edge, however little
 _ROUND = 0.018  # and of what a ring's front bulges
 _UNLIKELY = {1: 10.83, 2: 13.82, 3: 16.27, 4: 18.47, 5: 20.52, 6: 22.46, 7: 24.32, 8: 26.12, 9: 27.88}  # 0.1 % of chi^2
 _THIRD, _EXACT = 0.35, 0.003  # how well the width is known before there is a pose, and after
+_WIDEST = 120.0  # pixels
 _MOVED = 30.0  # pixels that a catheter may move between two frames
 
 
@@ -115,7 +116,7 @@ class CatheterTracker:
             if before is None:
                 axis = measure_axis(sampler, self.camera, line, stretches, self._width(stretches), _THIRD, 0.9)
             else:
-                wide = width_px(before, self.catheter, line)
+                wide = self._wide(before, line)
                 axis = measure_axis(sampler, self.camera, line, stretches, wide, _EXACT, 0.9)
         guess, _ = axis.line.place(line.plane(stretches.edges, torch.zeros_like(stretches.edges)))
         width = axis
@@ -134,7 +135,7 @@ class CatheterTracker:
             pose = self._sketched(axis, edges)
         with self._timed("axis"):
             # Once more, with the width that the pose and the radius give; what was found without them is the check.
-            wide = width_px(pose, self.catheter, line)
+            wide = self._wide(pose, line)
             found = axis.line.plane(edges.t, torch.zeros_like(edges.t))
             axis = measure_axis(sampler, self.camera, line, stretches, wide, _EXACT, edges.blur)
         with self._timed("edges"):
@@ -144,12 +145,19 @@ class CatheterTracker:
         with self._timed("pose"):
             return self._judged(self._solved(axis, edges), width, edges)
 
+    def _wide(self, pose: Pose, line: Line) -> tuple[float, float]:
+        """Of the tube's image in pixels and its taper, as the pose gives them; a Refusal where no camera sees such."""
+        width, taper = width_px(pose, self.catheter, line)
+        if not 1.0 < width < _WIDEST or not abs(taper) < 1:
+            raise Refusal(Status.INCONSISTENT, "no pose in front of the camera explains the edges")
+        return width, taper
+
     def _width(self, stretches: Stretches) -> tuple[float, float]:
         """Of the tube's image in pixels, roughly: from the bands' lengths at a slight tilt; and no taper."""
         seen = torch.isfinite(stretches.edges)
         ends = stretches.edges[seen][[0, -1]], self.catheter.positions.to(seen.device)[seen][[0, -1]]
         scale = 1.15 * float((ends[0][1] - ends[0][0]) / (ends[1][1] - ends[1][0]))
-        return min(max(2 * self.catheter.radius * scale, 2.0), 120.0), 0.0
+        return min(max(2 * self.catheter.radius * scale, 2.0), _WIDEST), 0.0
 
     def _sketched(self, axis: Axis, edges: Edges) -> Pose:
         """Near enough to tell how much the rings' fronts bulge."""
