@@ -1,0 +1,38 @@
+"""Frames without the catheter get no pose, whatever they show; `holotorch chart tracking` asks a thousand."""
+
+import math
+
+import pytest
+
+from holotorch.tracking.catheter import THESIS
+from holotorch.tracking.tracker import CatheterTracker
+from holotorch.tracking.trials import negatives, occlusions
+from holotorch.tracking.world import World
+
+TRACKER = CatheterTracker(World().camera, THESIS)
+
+
+def test_nothing_is_found_where_nothing_is():
+    world = World((540, 960), seed=5)
+    tracker = CatheterTracker(world.camera, THESIS)
+    for case in negatives(world, 30):
+        pose = tracker(case.frame()[None])[0]
+        assert not pose.answered and pose.reason, case.name
+        assert math.isnan(float(pose.tip[0]))
+
+
+@pytest.mark.parametrize("number", [205, 415])
+def test_sketches_behind_the_camera_are_refused(number):
+    """Clutter whose edges a first, rough pose explains only with a width that is no width."""
+    case = negatives(World(), number + 1)[number]
+    assert not TRACKER(case.frame()[None])[0].answered
+
+
+def test_fingers_are_no_obstacle_and_no_lie():
+    """One pose, every occlusion: where three edges are left the tip is right, and where not there is no pose."""
+    for case in occlusions(World(seed=3)):
+        pose = TRACKER(case.frame()[None])[0]
+        assert pose.answered or not case.answerable, (case.name, pose.reason)
+        if pose.answered:
+            assert case.tip is not None
+            assert float((pose.tip - case.tip).norm()) < min(5e-3, 5 * float(pose.tip_sd)), case.name
