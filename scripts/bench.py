@@ -101,7 +101,26 @@ def peer() -> Iterator[tuple[str, Contenders]]:
             yield case, {"planned": lambda m=module: m(field[None]), "torchoptics": theirs}
 
 
-SUBJECTS = {"crosstalk": crosstalk, "propagation": propagation, "distances": distances, "peer": peer}
+def tracking() -> Iterator[tuple[str, Contenders]]:
+    """Catheters on synthetic 1080p frames; the thesis's pipeline in OpenCV is the baseline."""
+    from holotorch.experiments.tracking_methods import as_camera, methods
+    from holotorch.tracking.trials import conditions
+    from holotorch.tracking.world import World
+
+    world = World()
+    trackers = methods(world)
+    for case in (case for case in conditions(world) if case.name in ("plain", "cloth as band 3", "heavy clutter")):
+        frame = as_camera(case.frame())
+        yield case.name, {name: lambda t=track, f=frame, c=case: t(f, c) for name, track in trackers.items()}
+
+
+SUBJECTS = {
+    "crosstalk": crosstalk,
+    "propagation": propagation,
+    "distances": distances,
+    "peer": peer,
+    "tracking": tracking,
+}
 
 
 def measure(contenders: Contenders) -> dict[str, float]:

@@ -1,0 +1,194 @@
+"""What catheter trackers are held to, on synthetic frames: each part streams over its frames and returns rows."""
+
+import itertools
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from holotorch.experiments.tracking_bound import tip_bound
+from holotorch.experiments.tracking_methods import Answer, Method, answers, tips_of, truth_of
+from holotorch.tracking import protocols
+from holotorch.tracking.status import Status
+from holotorch.tracking.trials import conditions, negatives, occlusions
+from holotorch.tracking.world import World
+
+Row = dict[str, Any]
+
+# Distance of the bands' middle in mm and tilt in degrees: what S_RMS may be in mm, or where efficiency is asked for.
+STILL: dict[tuple[int, int], float | None] = {
+    (450, 20): 0.05,
+    (520, 5): 0.12,
+    (700, 30): 1.1,
+    (350, 20): None,
+    (520, 0): None,
+    (520, 20): None,
+}
+# What a refusal may say of scenes that cannot be answered, by what their names begin with.
+_UNSEEN = frozenset({Status.NO_CATHETER, Status.BANDS_MISSING, Status.NO_AXIS})
+_SAYS: dict[str, frozenset[Status]] = {
+    "motion across": _UNSEEN | {Status.TOO_NARROW, Status.EDGES_UNCLEAR, Status.INCONSISTENT},
+    "tilt": frozenset({Status.UNCERTAIN, Status.EDGES_UNCLEAR, Status.TOO_NARROW}),
+    "1200 mm away": frozenset({Status.TOO_NARROW, Status.UNCERTAIN}),
+    "rear out": frozenset({Status.OUT_OF_FRAME, Status.BANDS_MISSING}),
+    "tip out": frozenset({Status.OUT_OF_FRAME, Status.BANDS_MISSING}),
+    "line of sight": _UNSEEN,
+    "over": frozenset({Status.BANDS_MISSING, Status.EDGES_UNCLEAR}),
+}
+
+
+def still(world: World, trackers: dict[str, Method], count: int) -> tuple[list[Row], list[Answer]]:
+    """Catheters at rest, ``count`` frames at each pose of ``STILL``: stability, bias, coverage, efficiency."""
+    rows, said = [], []
+    for (depth, tilt), goal in STILL.items():
+        place = (1e-3 * depth, math.radians(tilt))
+        bound = 1e3 * math.sqrt(tip_bound(world, world.pose(*place)).trace())
+        found = list(answers(world.still(*place, count), trackers, f"still, {depth} mm, {tilt} deg"))
+        said += found
+        for name, own in _by(found, lambda answer: answer.method).items():
+            tips, truth = tips_of(own), truth_of(own)
+            row: Row = {"depth_mm": depth, "tilt_deg": tilt, "method": name, "frames": len(own)}
+            row |= {
+                "answered": sum(answer.pose.answered for answer in own),
+                "s_rms_mm": "",
+                "s_rms_goal_mm": goal or "",
+            }
+            row |= {"sd_mm": "", "bias_mm": "", "bound_mm": round(bound, 4), "efficiency": "", "coverage": ""}
+            if row["answered"] >= 2 and any(a.pose.answered and b.pose.answered for a, b in itertools.pairwise(own)):
+                seen = protocols.s_rms(tips)
+                bias = float((tips - truth).nanmean(0).norm())
+                row |= {"s_rms_mm": _mm(seen.s_rms), "sd_mm": _mm(seen.sd), "bias_mm": _mm(bias)}
+                row |= {"efficiency": round((bound / (1e3 * seen.sd)) ** 2, 3), "coverage": covered(own)}
+            rows.append(row)
+    return rows, said
+
+
+def grids(world: World, trackers: dict[str, Method], share: float = 1.0) -> tuple[list[Row], list[Answer]]:
+    """Tips over the sheet and the three faces of Sec. 3.5.2 and 3.5.3: absolute, after a rigid fit, and Acc."""
+    parts = {"2D": world.grid_2d()} | {f"3D {face}": cases for face, cases in world.grid_3d().items()}
+    every = max(1, round(1 / share))
+    said = {part: list(answers(cases[::every], trackers, f"grid {part}")) for part, cases in parts.items()}
+    rows = []
+    for name in trackers:
+        own = {part: [answer for answer in found if answer.method == name] for part, found in said.items()}
+        faces = [_grid_row(part, name, answers_) for part, answers_ in own.items()]
+        whole = _grid_row("3D", name, [answer for part, found in own.items() if part != "2D" for answer in found])
+        seen = [row["acc_mm"] for row in faces[1:] if row["acc_mm"] != ""]
+        whole["acc_mm"] = round(sum(seen) / len(seen), 4) if seen else ""  # the thesis's is the mean of its faces, too
+        rows += [*faces, whole]
+    return rows, [answer for found in said.values() for answer in found]
+
+
+def scenes(
+    world: World, trackers: dict[str, Method], count: int, kind: str, share: float = 1.0
+) -> tuple[list[Row], list[Answer]]:
+    """``kind`` "conditions" (from as many seeds) or "occlusions" (at as many poses), a row for each name and method.
+
+    Each seed has three of the world's photographs behind the catheter.
+    """
+    if kind == "conditions":
+        worlds = [_seeded(world, i) for i in range(count)]
+        cases = [replace(case, name=f"{case.name}, seed {one.seed}") for one in worlds for case in conditions(one)]
+    else:
+        cases = occlusions(world, count)
+    found = list(answers(cases[:: max(1, round(1 / share))], trackers, kind))
+    rows = []
+    for (name, method), own in _by(found, lambda answer: (_plain(answer.case.name), answer.method)).items():
+        errors = sorted(answer.error for answer in own if answer.pose.answered)
+        refused = [answer for answer in own if not answer.pose.answered]
+        fitting: Any = ""
+        if not own[0].case.answerable:
+            right = next(says for start, says in _SAYS.items() if name.startswith(start))
+            fitting = sum(answer.status in right for answer in refused)
+        rows.append(
+            {
+                "scene": name,
+                "method": method,
+                "answerable": own[0].case.answerable,
+                "frames": len(own),
+                "right": sum(answer.right for answer in own),
+                "wrong": sum(answer.wrong for answer in own),
+                "refused": len(refused),
+                "reason_fits": fitting,
+                "median_error_mm": _mm(errors[len(errors) // 2]) if errors else "",
+                "worst_error_mm": _mm(errors[-1]) if errors else "",
+                "statuses": told(answer.status for answer in own),
+                "reason": next((answer.pose.reason for answer in refused), ""),
+            }
+        )
+    return rows, found
+
+
+def empty(world: World, trackers: dict[str, Method], count: int) -> tuple[list[Row], list[Answer]]:
+    """``count`` frames without the catheter, a row for each kind and method, with the names of those answered."""
+    found = list(answers(negatives(world, count), trackers, "negatives"))
+    rows = []
+    for (kind, method), own in _by(found, lambda answer: (_kind(answer.case.name), answer.method)).items():
+        false = [answer.case.name.split(",")[0].split()[-1] for answer in own if answer.pose.answered]
+        row: Row = {"kind": kind, "method": method, "frames": len(own), "false": len(false)}
+        row["statuses"] = told(answer.status for answer in own)
+        rows.append(row | {"seed": world.seed, "numbers_of_false": " ".join(false)})
+    return rows, found
+
+
+def covered(own: Sequence[Answer]) -> float | str:
+    """Share of answers whose 95 % ellipsoid holds the truth; "" without any."""
+    seen = [answer for answer in own if answer.pose.answered and answer.case.tip is not None]
+    if not seen:
+        return ""
+    covariance = torch.stack([answer.pose.covariance[:3, :3] for answer in seen])
+    return round(protocols.coverage(tips_of(seen), covariance, truth_of(seen))[0], 3)
+
+
+def told(statuses: Iterable[Status]) -> str:
+    """Statuses and how often, the most frequent first."""
+    return ", ".join(f"{status.name} {times}" for status, times in Counter(statuses).most_common())
+
+
+def _grid_row(part: str, name: str, own: list[Answer]) -> Row:
+    tips, truth = tips_of(own), truth_of(own)
+    row: Row = {"grid": part, "method": name, "points": len(own), "refused": int(tips.isnan().any(-1).sum())}
+    row |= dict.fromkeys(
+        ("median_mm", "p95_mm", "worst_mm", "acc_mm", "in_plane_mm", "rigid_median_mm", "rigid_p95_mm"), ""
+    )
+    row["coverage"] = covered(own)
+    known = tips.isfinite().all(-1).nonzero()[:, 0].tolist()
+    right, down, _ = torch.eye(3, dtype=torch.float64)
+    if len(known) >= 3:
+        # The point in the middle, or the nearest to it that was answered, is the one that all others refer to.
+        reference = min(known, key=lambda i: abs(i - len(own) // 2))
+        seen = protocols.grid_accuracy(tips, truth, reference, truth)
+        row |= dict(zip(("median_mm", "p95_mm", "worst_mm"), map(_mm, seen.absolute), strict=True))
+        if part == "2D":
+            row["in_plane_mm"] = _mm(protocols.planar_accuracy(tips, truth[:, :2], right, down, reference).in_plane)
+        row |= {"acc_mm": _mm(seen.acc), "rigid_median_mm": _mm(seen.rigid[0]), "rigid_p95_mm": _mm(seen.rigid[1])}
+    return row
+
+
+def _by(found: Iterable[Answer], key: Callable[[Answer], Any]) -> dict[Any, list[Answer]]:
+    groups: dict[Any, list[Answer]] = {}
+    for answer in found:
+        groups.setdefault(key(answer), []).append(answer)
+    return groups
+
+
+def _seeded(world: World, i: int) -> World:
+    """The same with another seed and the next three photographs."""
+    images = [world.photographs[(3 * i + k) % len(world.photographs)] for k in range(min(3, len(world.photographs)))]
+    return replace(world, photographs=tuple(images), seed=world.seed + i)
+
+
+def _plain(name: str) -> str:
+    """A scene's name without the number of its pose; of photographs, which are many, one name."""
+    return "photograph" if name.startswith("photograph") else name.split(",")[0]
+
+
+def _kind(name: str) -> str:
+    return name.split(", ")[1]
+
+
+def _mm(metres: float) -> float:
+    return round(1e3 * metres, 4)

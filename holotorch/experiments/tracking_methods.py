@@ -1,0 +1,119 @@
+"""Trackers side by side on synthetic frames with exact truth: what each says of each frame, and how long it takes."""
+
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+from unittest import mock
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from holotorch.experiments.thesis_opencv import ThesisOpenCV
+from holotorch.io.images import load_image
+from holotorch.tracking import measure
+from holotorch.tracking.status import Pose, Status
+from holotorch.tracking.tracker import CatheterTracker
+from holotorch.tracking.world import Case, World
+
+BASE, COLD, PRIOR, FEWER = "thesis, OpenCV", "ours, cold", "ours, prior", "ours, fewer stations"
+STATIONS = 24  # of the last one
+WRONG = 5e-3  # metres from the truth
+# Photographs for backgrounds: a folder beside the checkout, or else those that scikit-image brings.
+PHOTOGRAPHS = Path(__file__).parents[3] / "shared" / "data" / "images"
+_BUNDLED = ("astronaut", "coffee", "chelsea")
+
+Method = Callable[[Tensor, Case], Pose]
+
+
+class Answer(NamedTuple):
+    """What one method said of one frame, and in how many seconds."""
+
+    method: str
+    case: Case
+    pose: Pose
+    seconds: float
+
+    @property
+    def status(self) -> Status:
+        """Of the pose, which is one and no batch."""
+        assert isinstance(self.pose.status, Status)
+        return self.pose.status
+
+    @property
+    def error(self) -> float:
+        """Of the tip in metres; NaN where refused or without a catheter."""
+        return math.nan if self.case.tip is None else float((self.pose.tip - self.case.tip).norm())
+
+    @property
+    def right(self) -> bool:
+        """Answered, a catheter there, and near enough."""
+        return self.error <= WRONG
+
+    @property
+    def wrong(self) -> bool:
+        """Answered, and too far away or with no catheter there."""
+        return self.pose.answered and not self.right
+
+
+def photographs() -> tuple[Tensor, ...]:
+    """Photographs uint8 [3, h, w] for the world's backgrounds."""
+    found: list[Any] = sorted(path for path in PHOTOGRAPHS.glob("*") if path.suffix in (".png", ".jpg"))
+    images = [load_image(source) for source in found or _BUNDLED]
+    return tuple((255 * image).round().to(torch.uint8) for image in images if len(image) == 3)
+
+
+def methods(world: World, names: Sequence[str] = (BASE, COLD, PRIOR, FEWER)) -> dict[str, Method]:
+    """Trackers by name, each as a function of one frame [3, H, W] and its case (whose truth only the prior reads)."""
+    camera, catheter = world.camera, world.catheter
+    thesis, ours = ThesisOpenCV(camera, catheter), CatheterTracker(camera, catheter)
+
+    def fewer(frame: Tensor, _: Case) -> Pose:
+        # The tracker has no option for this: nothing but this comparison wants it.
+        with mock.patch.object(measure, "_STATIONS", STATIONS):
+            return ours(frame[None])[0]
+
+    known: dict[str, Method] = {
+        BASE: lambda frame, _: thesis(frame[None])[0],
+        COLD: lambda frame, _: ours(frame[None])[0],
+        PRIOR: lambda frame, case: ours(frame[None], [before(case)])[0],
+        FEWER: fewer,
+    }
+    return {name: known[name] for name in names}
+
+
+def before(case: Case, moved: tuple[float, float, float] = (2e-3, -1.5e-3, 3e-3), turned: float = 0.01) -> Pose:
+    """The pose that a tracker may have found 1/30 s earlier: 4 mm off, at 120 mm/s, and turned by 0.6 degrees."""
+    if case.tip is None or case.direction is None:
+        return Pose.refused(Status.NO_CATHETER, "no catheter was there")
+    direction = case.direction + turned * torch.tensor([0.6, -0.6, 0.5], dtype=torch.float64)
+    zero = torch.zeros((), dtype=torch.float64)
+    tip = case.tip + torch.tensor(moved, dtype=torch.float64)
+    return Pose(tip, direction / direction.norm(), 1e-6 * torch.eye(6, dtype=torch.float64), zero, zero + 1, Status.OK)
+
+
+def answers(cases: Iterable[Case], trackers: dict[str, Method], label: str = "frames") -> Iterator[Answer]:
+    """What each method says of each frame, with a bar; a frame lives only as long as it is looked at."""
+    for case in tqdm(list(cases), desc=label, unit="frame", dynamic_ncols=True):
+        frame = as_camera(case.frame())
+        for name, track in trackers.items():
+            started = time.perf_counter()
+            pose = track(frame, case)
+            yield Answer(name, case, pose, time.perf_counter() - started)
+
+
+def as_camera(frame: Tensor) -> Tensor:
+    """The same frame [3, H, W] with the memory of a camera's, [H, W, 3]."""
+    return frame.permute(1, 2, 0).contiguous().permute(2, 0, 1)
+
+
+def tips_of(own: Sequence[Answer]) -> Tensor:
+    """[n, 3] in metres; NaN where refused."""
+    return torch.stack([answer.pose.tip.cpu() for answer in own])
+
+
+def truth_of(own: Sequence[Answer]) -> Tensor:
+    """[n, 3] in metres, of frames with a catheter."""
+    return torch.stack([answer.case.tip for answer in own if answer.case.tip is not None])

@@ -1,0 +1,130 @@
+"""How long trackers take on the same synthetic frames, turn by turn in one process, and where their time goes."""
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+from torch import Tensor
+from tqdm import tqdm
+
+from holotorch.experiments.chart import interleaved
+from holotorch.experiments.thesis_opencv import ThesisOpenCV
+from holotorch.experiments.tracking_bench import Row
+from holotorch.experiments.tracking_methods import BASE, COLD, PRIOR, Method, as_camera, before, methods
+from holotorch.tracking.status import Pose, Status
+from holotorch.tracking.thesis import ThesisTracker
+from holotorch.tracking.tracker import CatheterTracker
+from holotorch.tracking.trials import conditions, negatives, occlusions
+from holotorch.tracking.world import Case, World
+
+KORNIA = "thesis, kornia"
+# What is timed, by the names of the world's conditions; the last ones need a photograph or make do without.
+_FRAMES = {"plain desk": ("plain",), "clutter": ("heavy clutter",), "drape": ("cloth as band 3",)}
+_PHOTOGRAPH = ("photograph 0", "texture")
+_REPEATS = 3
+
+
+def timing(world: World, rounds: int) -> list[Row]:
+    """Milliseconds of each method on each kind of frame, medians over rounds, and their ratio to the baseline's."""
+    kornia = ThesisTracker(world.camera, world.catheter)
+    trackers: dict[str, Method] = methods(world) | {KORNIA: lambda frame, _: kornia(frame[None])[0]}
+    known = {case.name: case for case in conditions(world)}
+    rows = []
+    for kind, names in tqdm((_FRAMES | {"photograph": _PHOTOGRAPH}).items(), desc="times", unit="frame"):
+        case = known[next(name for name in names if name in known)]
+        frame = as_camera(case.frame())
+        seconds = interleaved({name: partial(track, frame, case) for name, track in trackers.items()}, rounds)
+        rows += [
+            {
+                "frame": kind,
+                "method": name,
+                "milliseconds": round(1e3 * value, 2),
+                "ratio": round(value / seconds[BASE], 3),
+                "status": Status(trackers[name](frame, case).status).name,
+            }
+            for name, value in seconds.items()
+        ]
+    return rows
+
+
+def stages(world: World, rounds: int) -> list[Row]:
+    """Mean time of each stage and its share of the whole, in the form of Table 3.1; a catheter on the plain desk."""
+    case = next(case for case in conditions(world) if case.name == "plain")
+    frames = as_camera(case.frame())[None]
+    expected = [before(case)]
+    ours = CatheterTracker(world.camera, world.catheter)
+    thesis, kornia = ThesisOpenCV(world.camera, world.catheter), ThesisTracker(world.camera, world.catheter)
+    calls: dict[str, tuple[ThesisOpenCV | ThesisTracker | CatheterTracker, Callable[[], list[Pose]]]] = {
+        BASE: (thesis, lambda: thesis(frames)),
+        KORNIA: (kornia, lambda: kornia(frames)),
+        COLD: (ours, lambda: ours(frames)),
+        PRIOR: (ours, lambda: ours(frames, expected)),
+    }
+    rows = []
+    for name, (tracker, call) in calls.items():
+        call()
+        spent: dict[str, float] = {}
+        for _ in range(rounds):
+            started = time.perf_counter()
+            call()
+            whole = time.perf_counter() - started
+            own = dict(tracker.times)
+            own["Other"] = own.get("Other", 0.0) + whole - sum(own.values())
+            spent = {stage: spent.get(stage, 0.0) + value for stage, value in own.items()}
+        total = sum(spent.values())
+        spent["Total"] = total
+        rows += [
+            {
+                "method": name,
+                "stage": stage,
+                "milliseconds": round(1e3 * value / rounds, 3),
+                "percent": round(100 * value / total, 2),
+            }
+            for stage, value in spent.items()
+        ]
+    return rows
+
+
+def spread(world: World, share: float = 1.0) -> list[Row]:
+    """Slowest frame over the median one of each method: conditions, occlusions and one negative of each kind.
+
+    Each frame counts with the median of a few calls, so that what the machine does meanwhile is not the frame's.
+    """
+    some = replace(world, photographs=world.photographs[:2])
+    cases = [*conditions(some), *occlusions(some), *negatives(some, 10)][:: max(1, round(1 / share))]
+    trackers = methods(world, (BASE, COLD, PRIOR))
+    taken: dict[str, list[tuple[float, str]]] = {name: [] for name in trackers}
+    for case in tqdm(cases, desc="slowest frames", unit="frame", dynamic_ncols=True):
+        frame = as_camera(case.frame())
+        for name, track in trackers.items():
+            if name == PRIOR and case.tip is None:
+                continue  # nothing was there before
+            taken[name].append((_seconds(track, frame, case), case.name))
+    rows = []
+    for name, values in taken.items():
+        if not values:
+            continue
+        middle, (slowest, which) = statistics.median(seconds for seconds, _ in values), max(values)
+        rows.append(
+            {
+                "method": name,
+                "frames": len(values),
+                "median_ms": round(1e3 * middle, 2),
+                "slowest_ms": round(1e3 * slowest, 2),
+                "ratio": round(slowest / middle, 2),
+                "slowest": which,
+            }
+        )
+    return rows
+
+
+def _seconds(track: Method, frame: Tensor, case: Case) -> float:
+    track(frame, case)
+    times = []
+    for _ in range(_REPEATS):
+        started = time.perf_counter()
+        track(frame, case)
+        times.append(time.perf_counter() - started)
+    return statistics.median(times)
