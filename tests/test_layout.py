@@ -97,12 +97,14 @@ def test_public_names():
     from holotorch.metrics import psnr, ssim
     from holotorch.modulator import PhasedArray, ThermalCrosstalk
     from holotorch.optics import AngularSpectrum, Fraunhofer, Fresnel
+    from holotorch.perception import EqualEfficiencyScale, PerceptionTime, cortical_scale
     from holotorch.scene import DVRSampler, SourceLayers, TransferFunction, Volume
 
     names = [Grid, APG, PECProblem, ProjectedAdam, Solution, gerchberg_saxton, psnr, ssim, PhasedArray]
     names += [AxialHologram, ConvolutionHologram, DirectHologram, plan_hologram]
     names += [DVRSampler, SourceLayers, TransferFunction, Volume]
     names += [ThermalCrosstalk, AngularSpectrum, Fraunhofer, Fresnel]
+    names += [EqualEfficiencyScale, PerceptionTime, cortical_scale]
     assert all(name.__doc__ for name in names)
     assert re.fullmatch(r"\d+\.\d+\.\d+", __version__)
     with pytest.raises(AttributeError, match="no attribute 'Gird'"):
@@ -116,7 +118,7 @@ def blocks(language: str) -> list[str]:
 
 
 def test_readme_example_runs_and_is_short():
-    (code,) = blocks("python")
+    code = blocks("python")[0]
     steps = [line for line in code.splitlines() if line and not line.startswith(("import", "from"))]
     assert len(steps) <= 10
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
@@ -124,6 +126,12 @@ def test_readme_example_runs_and_is_short():
     before, after = re.findall(r"tensor\(\[([^]]+)\]", done.stdout)
     losses = [[float(word) for word in text.split(",")] for text in (before, after)]
     assert all(small < 0.1 * large for small, large in zip(*losses, strict=True))
+
+
+def test_readme_example_of_tracking_runs():
+    done = subprocess.run([sys.executable, "-c", blocks("python")[1]], capture_output=True, text=True)
+    status, off = re.findall(r"^(\w+) ([\d.]+) mm off", done.stdout)[0]
+    assert status == "OK" and float(off) < 0.5, done.stderr
 
 
 def test_readme_names_files_that_exist_and_commands_that_parse():

@@ -212,9 +212,9 @@ class CatheterTracker:
         points = pose.tip + self.catheter.positions.to(pose.tip.device)[seen, None] * pose.direction
         wide = 2 * self.catheter.radius * axis.line.scale / points.norm(dim=-1) * _obliquity(points)
         ratio = axis.width_at(float(edges.t[seen].mean())) / float(wide.mean())
-        most = (0.25 if freedom else 0.12) + (0.4 + 2 * axis.width_sd) / float(wide.mean())
-        if not freedom and axis.width_sd > 0.08 * axis.width:
-            raise Refusal(Status.INCONSISTENT, "three edges, and a width too unclear to check them with")
+        most = min(0.45, (0.25 if freedom else 0.12) + (0.4 + 2 * axis.width_sd) / float(wide.mean()))
+        if axis.width_sd > (0.12 if freedom else 0.08) * float(wide.mean()):
+            raise Refusal(Status.INCONSISTENT, f"{count} edges, and a width too unclear to check them with")
         if abs(ratio - 1) > most:
             raise Refusal(
                 Status.INCONSISTENT, f"{ratio:.2f} times as wide as it should be at {float(points[:, 2].mean()):.2f} m"
