@@ -1,4 +1,8 @@
-"""Simulated participants of the perception study, whose equal-efficiency scales are known."""
+"""Simulated participants of the perception study, whose equal-efficiency scales are known.
+
+Their spread was fitted to what the thesis prints: F = 7.02 for 5 deg at 10 deg in Table 2.2, and how often a scale is
+undefined. A perception time is the expected median as a screen records it, half a frame late.
+"""
 
 import math
 from collections.abc import Sequence
