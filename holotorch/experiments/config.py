@@ -258,6 +258,11 @@ def _contradictions(settings: PECSettings) -> list[tuple[Key, str]]:
         found.append((("target", "region"), "expected one distance beside a region"))
     if settings.target.weight and (several or smaller):
         found.append((("target", "weight"), "expected one distance and no region beside a weight"))
+    if settings.target.weight:
+        rows, columns = settings.grid.shape
+        if (high := settings.target.weight.field_deg * rows / columns) > 360:
+            field = f"expected a picture of at most 360 deg in height as well, got {high:g}"
+            found.append((("target", "weight", "field_deg"), field))
     if "unweighted" in settings.report.baselines and not settings.target.weight:
         found.append((("report", "baselines"), "unweighted asks for a target.weight that can be left out"))
     return found

@@ -40,7 +40,8 @@ def separation(elevation_deg: Any, azimuth_deg: Any, other_elevation_deg: Any, o
 class Display:
     """What all displays share. ``shape`` is (H, W) in pixels.
 
-    Subclasses say where a direction meets the display and the other way round, and how fast the direction turns.
+    Subclasses say where a direction meets the display and the other way round, and how fast the direction turns. Their
+    functions take numbers or tensors that broadcast against each other, [...], and return two tensors [...].
     """
 
     shape: tuple[int, int]
@@ -56,7 +57,10 @@ class Display:
         raise NotImplementedError
 
     def pixels(self, elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
-        """(y, x) in pixels of directions, also beyond the edge; NaN for those that meet no point of the surface."""
+        """(y, x) in pixels of directions, also beyond the edge; NaN for those that meet no point of the surface.
+
+        ValueError for elevations beyond 90 or azimuths beyond 180 deg.
+        """
         raise NotImplementedError
 
     def pixels_per_degree(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
@@ -229,6 +233,13 @@ class Headset(Display):
     def __post_init__(self):
         super().__post_init__()
         checks.positive("resolution", self.resolution, "pixels per degree")
+        if max(self.field_deg) > 360 * (1 + 1e-12):
+            raise ValueError(f"a headset's field must be at most 360 degrees, got {max(self.field_deg):g}")
+
+    @property
+    def field_deg(self) -> tuple[float, float]:
+        """See :class:`Display`; at more than 180 deg in height, elevations do not tell it."""
+        return self.shape[0] / self.resolution, self.shape[1] / self.resolution
 
     def angles(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
         """See :class:`Display`."""
@@ -245,7 +256,9 @@ class Headset(Display):
         x, y = up.cos() * side.sin(), -up.sin()
         sine = _norm(y, x)
         angle = torch.atan2(sine, up.cos() * side.cos()).rad2deg()
-        share = torch.where(sine > 0, angle * self.resolution / sine, self.resolution * math.degrees(1))
+        # Masked before the division, whose gradient at 0 is NaN.
+        share = angle * self.resolution / torch.where(sine > 0, sine, 1)
+        share = torch.where(sine > 0, share, self.resolution * math.degrees(1))
         share = torch.where((sine < 1e-12) & (angle > 90), math.nan, share)
         return self._placed(y * share, x * share)
 

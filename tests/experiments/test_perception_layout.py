@@ -137,6 +137,7 @@ def test_without_a_weight_nothing_is_said_of_zones():
         (["report.baselines=[unweighted]"], "unweighted asks for a target.weight"),
         (["target.weight={kind: peripheral, field_deg: 90}", "target.region=[11,11]"], "no region beside a weight"),
         (["target.weight={kind: peripheral, field_deg: 400}"], "target.weight.field_deg"),
+        (["target.weight={kind: peripheral, field_deg: 300}", "grid.shape=[32,16]"], "360 deg in height.*, got 600"),
     ):
         with pytest.raises(ConfigError, match=text):
             load_config(CONFIGS / "pec" / "fourier.yaml", ["grid.shape=[16,16]", *words])

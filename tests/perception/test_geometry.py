@@ -60,6 +60,8 @@ def test_pixels_and_angles_are_inverse(screen):
     assert torch.allclose(y, Y, atol=1e-10, rtol=0) and torch.allclose(x, X, atol=1e-10, rtol=0)
     assert screen.shows(*screen.angles(Y, X)).all() and not screen.shows(*screen.angles(-0.6, 3.0))
     point = torch.tensor([3.2, 7.9], dtype=torch.float64, requires_grad=True)
+    ahead = torch.zeros(2, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda p: screen.pixels(p[0], p[1]), ahead)
     for way in (screen.angles, screen.pixels, screen.pixels_per_degree):
         assert torch.autograd.gradcheck(lambda p, w=way: w(p[0], p[1]), point)
         assert way(torch.tensor(1.0), torch.tensor(2.0))[0].dtype == torch.float32
@@ -73,6 +75,7 @@ def test_metres_fields_and_widths_by_hand():
     assert FlatScreen.spanning(SHAPE, (60, 100)).field_deg == pytest.approx((60, 100))
     assert CURVED[1].field_deg[1] == pytest.approx(math.degrees(5.0 / 2.0))  # from the axis: arc over radius
     assert HEADSET.field_deg == pytest.approx((12 / 0.14, 17 / 0.14))
+    assert Headset((200, 360), 1.0).field_deg == (200, 360)  # its top is 10 deg beyond the zenith
     # 10 deg at 30 deg on a flat screen of 85 px/m... here 17 px on 1.4 m: from 25 to 35 deg.
     wanted = 0.6 * (math.tan(math.radians(35)) - math.tan(math.radians(25))) * 17 / 1.4
     assert FLAT.width_px(30, 10).item() == pytest.approx(wanted)
@@ -118,5 +121,7 @@ def test_impossible_displays():
         FlatScreen.spanning(SHAPE, (60, 180))
     with pytest.raises(TypeError, match=r"shape must be \(H, W\)"):
         Headset(12, 1.0)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="field must be at most 360 degrees, got 400"):
+        Headset((10, 400), 1.0)
     with pytest.raises(ValueError, match="resolution must be above zero"):
         Headset(SHAPE, -1.0)
