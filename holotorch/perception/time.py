@@ -59,10 +59,11 @@ class PerceptionTime:
                 raise TypeError(f"seen must be a bool tensor, got {seen.dtype}")
             times = torch.where(seen, times, torch.ones_like(times))
         times = angles.as_tensor("seconds", times, "seconds").double()
+        known = times.detach() if seen is None else times.detach()[seen.expand_as(times)]
         if times.ndim == 0 or (times <= 0).any():
             raise ValueError("seconds must be times above zero with the patterns on their last axis")
-        if times.detach().median() > 30:
-            raise ValueError(f"seconds must be in seconds, got a median of {times.detach().median():g}; 450 ms is 0.45")
+        if known.median() > 30:
+            raise ValueError(f"seconds must be in seconds, got a median of {known.median():g}; 450 ms is 0.45")
         x, times = torch.broadcast_tensors(angles.size(size_deg).to(times).log(), times)
         weight = torch.ones_like(times) if seen is None else seen.to(times).expand_as(times)
         count = weight.sum(-1)

@@ -99,6 +99,8 @@ def test_one_size_only_and_other_bad_data():
         PerceptionTime.fit([5.0], [0.4])
     with pytest.raises(ValueError, match="450 ms is 0.45"):
         PerceptionTime.fit(SIZES, noisy() * 1000)
+    with pytest.raises(ValueError, match="450 ms is 0.45"):  # also where most were missed
+        PerceptionTime.fit(SIZES, noisy() * 1000, seen=torch.arange(8) < 3)
     with pytest.raises(ValueError, match="times above zero"):
         PerceptionTime.fit(SIZES, -noisy())
     with pytest.raises(ValueError, match="size_deg must be above zero"):
