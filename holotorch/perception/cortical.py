@@ -184,6 +184,9 @@ def peripheral_weight(eccentricity_deg: Any, law: Law, *, least: float = 0.0) ->
 
     Returns:
         Real [..., H, W] with mean 1 over the last two axes, dtype and device of the eccentricities.
+
+    Raises:
+        ValueError: As :func:`cortical_scale`; eccentricities without two axes; ``least`` outside 0 .. 1.
     """
     least = checks.finite("least", least)
     if not 0 <= least <= 1:

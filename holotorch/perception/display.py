@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import torch
 from torch import Tensor
 
 from holotorch.core import checks
@@ -119,5 +118,4 @@ def check_display(
     have = display.pixels_per_degree
     resolved = None if have is None else needed <= have
     covered = where + sizes / 2 <= display.half_field_deg
-    tested = scale.tested(where)
-    return DisplayCheck(sizes, covered, needed, resolved, display.half_field_deg, torch.as_tensor(tested))
+    return DisplayCheck(sizes, covered, needed, resolved, display.half_field_deg, scale.tested(where))
