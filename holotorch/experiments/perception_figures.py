@@ -1,4 +1,4 @@
-"""Figures 2.3 to 2.7 of the thesis from the answers of a study, and the power of such studies."""
+"""Figures 2.3 to 2.7 of the thesis from the answers of a study, and the power of such studies: bytes of PNG files."""
 
 import io
 from collections.abc import Sequence
@@ -194,15 +194,16 @@ def _points(axes: Axes, target: Shown, fitted: tuple[float, float], confidence: 
         if not part.any():
             continue
         ends = np.stack([line.medians - below, above - line.medians])[:, part]
+        interval = f" and {100 * confidence:g} % interval" if np.isfinite(ends).any() else ""  # too few people for one
         axes.errorbar(
             where[part],
             line.medians[part],
-            np.nan_to_num(np.maximum(ends, 0)),
+            np.maximum(ends, 0),
             fmt="o",
             color=colour,
             ms=4,
             capsize=3,
-            label=f"median and {100 * confidence:g} % interval{words}",
+            label=f"median{interval}{words}",
         )
     if line.refused:
         return

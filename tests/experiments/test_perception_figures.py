@@ -3,6 +3,7 @@ import math
 
 import numpy as np
 import pytest
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from holotorch.experiments import perception_figures as figures
@@ -59,6 +60,30 @@ def test_every_picture_of_simulated_people_says_so(titles):
     titles.clear()
     assert figures.time_slices(dataclasses.replace(times, simulated=False))
     assert titles == ["Perception time over eccentricity"]
+
+
+def test_no_interval_is_drawn_of_too_few_people():
+    """Four of them: bars of no length would claim to know the medians."""
+    _, curves, _ = made()
+    scales = np.exp(np.random.default_rng(2).normal(2.5, 0.2, (5, len(curves.eccentricities))))
+    inside = np.ones(len(curves.eccentricities), dtype=bool)
+    for people, words in ((4, "median"), (5, "median and 90 % interval")):
+        line = fit_line(
+            curves.eccentricities,
+            scales[:people],
+            np.random.default_rng(0),
+            inside=inside,
+            limits=(1, 60),
+            resamples=100,
+            confidence=0.9,
+        )
+        axes = Figure().add_subplot()
+        figures._points(axes, figures.Shown("450 ms", curves.eccentricities, line), (40, 80), 0.9)
+        assert words in axes.get_legend_handles_labels()[1]
+        (bars,) = [part for part in axes.collections if isinstance(part, LineCollection)]
+        lengths = [np.ptp(bar[:, 1]) for bar in bars.get_segments() if bar.size and np.isfinite(bar).all()]
+        assert len([length for length in lengths if length > 0]) == (0 if people < 5 else len(inside))
+        assert 0 not in lengths
 
 
 def test_the_surface_goes_through_the_medians_and_not_beyond_the_sizes():
