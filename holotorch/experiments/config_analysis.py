@@ -23,6 +23,7 @@ def _rising(pair: tuple[float, float]) -> tuple[float, float]:
 
 
 Range = Annotated[tuple[Angle, Angle], AfterValidator(_rising)]
+Sizes = Annotated[tuple[Size, Size], AfterValidator(_rising)]
 
 
 class TargetTimeSettings(Settings):
@@ -134,8 +135,8 @@ class AnalysisSettings(Settings):
     cleaning: CleaningSettings = CleaningSettings()
     targets: Annotated[tuple[TargetTimeSettings, ...], BeforeValidator(several), Field(min_length=1)]
     range_deg: Range = (40.0, 70.0)
-    tested_deg: Range = (5.0, 26.0)
-    limits_deg: Range = (1.0, 60.0)
+    tested_deg: Sizes = (5.0, 26.0)
+    limits_deg: Sizes = (1.0, 60.0)
     resamples: Resamples = 2000
     confidence: Annotated[Number, Field(ge=0.5, lt=1)] = 0.95
     repeated_measures: bool = True

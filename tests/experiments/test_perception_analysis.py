@@ -225,8 +225,9 @@ def test_settings_refuse_what_contradicts():
             TargetTimeSettings.model_validate(wrong)
     with pytest.raises(ValidationError, match="fastest below slowest"):
         CleaningSettings(fastest=3)
-    with pytest.raises(ValidationError, match="smaller one first"):
-        settings(range_deg=(70, 40))
+    for change, words in (({"range_deg": (70, 40)}, "smaller one first"), ({"limits_deg": (0, 60)}, "greater than 0")):
+        with pytest.raises(ValidationError, match=words):
+            settings(**change)
 
 
 def test_frames_show_in_the_times():
