@@ -34,8 +34,8 @@ def power_rows(settings: AnalysisSettings, power: PowerSettings) -> Iterator[dic
     """A row per slope and number of participants: in what share of simulated studies the interval of alpha excludes 0.
 
     That share, ``power``, has a binomial ``error`` of one deviation. ``refused`` is the share of studies without a
-    line, which see nothing; of the others, ``covered`` is the share whose interval holds the slope. Smaller studies
-    are parts of the largest. The target is a 5 deg pattern at 10 deg.
+    line or its interval, which see nothing; of the others, ``covered`` is the share whose interval holds the slope.
+    Smaller studies are parts of the largest. The target is a 5 deg pattern at 10 deg.
     """
     low, high = settings.range_deg
     pattern = (_TARGET.eccentricity_deg, _TARGET.size_deg)
@@ -61,7 +61,7 @@ def power_rows(settings: AnalysisSettings, power: PowerSettings) -> Iterator[dic
                     resamples=power.resamples,
                     confidence=settings.confidence,
                 )
-                if not line.refused:
+                if math.isfinite(line.alpha_interval[0]):
                     ends.append(line.alpha_interval)
         for people, ends in intervals.items():
             share = sum(below > 0 or above < 0 for below, above in ends) / power.studies

@@ -20,9 +20,9 @@ class Line:
     """S(E) = alpha E + beta through the medians over participants, and intervals.
 
     Attributes:
-        alpha: Degrees per degree; NaN where a median is missing or at a limit.
+        alpha: Degrees per degree; NaN where a median is missing, or half the scales or more are at a limit.
         beta: Degrees.
-        alpha_interval: Lower and upper end; NaN with fewer than ``LEAST`` participants.
+        alpha_interval: Lower and upper end; NaN with fewer than ``LEAST`` participants who have a scale.
         beta_interval: As above.
         medians: Degrees [K].
         quartiles: 25 % and 75 % of the participants, [2, K].
@@ -57,15 +57,18 @@ def fit_line(
     percentiles are too narrow for few participants, the levels are those at which they equal a t interval for a mean
     (Hesterberg 2015, "expanded" percentiles).
     """
-    people = len(degrees)
+    some = degrees[np.isfinite(degrees).any(1)]  # who has no scale at all is no participant of this line
+    people, number = len(some), np.isfinite(degrees).sum(0)
     medians, quartiles = _median(degrees), _quantiles(degrees, [0.25, 0.75])
+    # Half of them are enough: the mean of two in the middle, one of them at a limit, would say what the limit is.
+    at_limit = np.maximum((degrees <= limits[0]).sum(0), (degrees >= limits[1]).sum(0))
     refused = ""
     if inside.sum() < 2:
         refused = f"a line needs two eccentricities in its range, got {int(inside.sum())}"
     elif not np.isfinite(medians[inside]).all():
         where = ", ".join(f"{e:g}" for e in eccentricities[inside & ~np.isfinite(medians)])
         refused = f"no participant has a scale at {where} deg"
-    elif (beyond := inside & ((medians <= limits[0]) | (medians >= limits[1]))).any():
+    elif (beyond := inside & (2 * at_limit >= number)).any():
         where = ", ".join(f"{e:g}" for e in eccentricities[beyond])
         refused = (
             f"half the participants or more have no scale within {limits[0]:g} .. {limits[1]:g} deg at {where} deg"
@@ -73,7 +76,7 @@ def fit_line(
     nowhere, wide = (math.nan, math.nan), np.full((2, len(medians)), np.nan)
     level = _expanded(people, confidence) if people >= LEAST else None
     if level is not None:
-        drawn = _median(degrees[generator.integers(people, size=(resamples, people))], 1)
+        drawn = _median(some[generator.integers(people, size=(resamples, people))], 1)
         wide = _quantiles(drawn, [level, 1 - level])
     else:
         drawn = np.empty((0, len(medians)))
@@ -130,7 +133,7 @@ class Anova:
     """An analysis of variance.
 
     Attributes:
-        f: The statistic; NaN where there is too little to compare.
+        f: The statistic; NaN where there is too little to compare, or nothing to compare it with.
         p: Its p-value.
         freedom: Degrees of freedom between, and within or of the error.
         participants: How many were used.
@@ -188,10 +191,12 @@ def repeated_measures(values: Array) -> Anova:
         return Anova(math.nan, math.nan, freedom, people, len(values) - people, math.nan)
     person, column = np.indices(whole.shape)
     frame = pandas.DataFrame({"scale": whole.ravel(), "participant": person.ravel(), "place": column.ravel()})
-    row = AnovaRM(frame, "scale", "participant", within=["place"]).fit().anova_table.iloc[0]
-    f, p = float(row["F Value"]), float(row["Pr > F"])
     centred = np.eye(columns) - 1 / columns
     spread = centred @ np.cov(whole.T) @ centred
+    if np.trace(spread) <= 1e-24 * np.square(whole).mean():  # all alike but for rounding, which F would be made of
+        return Anova(math.nan, math.nan, freedom, people, len(values) - people, math.nan)
+    row = AnovaRM(frame, "scale", "participant", within=["place"]).fit().anova_table.iloc[0]
+    f, p = float(row["F Value"]), float(row["Pr > F"])
     epsilon = float(np.trace(spread) ** 2 / ((columns - 1) * np.trace(spread @ spread)))
     corrected = float(stats.f.sf(f, epsilon * freedom[0], epsilon * freedom[1]))
     return Anova(f, p, freedom, people, len(values) - people, epsilon, corrected)

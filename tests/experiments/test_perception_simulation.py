@@ -136,6 +136,10 @@ def test_power_grows_with_the_slope_and_with_people():
     narrow = settings.model_copy(update={"limits_deg": (100.0, 101.0)})
     (none,) = power_rows(narrow, PowerSettings(slopes=(0.47,), participants=(6,), studies=10, resamples=100))
     assert (none["refused"], none["power"], none["covered"]) == (1, 0, None)
+    # Of five, some have no time for the target: too few are left for an interval.
+    missing = settings.model_copy(update={"simulation": SimulationSettings(miss=0.55, trial=0.1)})
+    (some,) = power_rows(missing, PowerSettings(slopes=(0.47,), participants=(5,), studies=10, resamples=100))
+    assert 0.1 < some["refused"] < 1 and math.isfinite(some["mean_interval_width"])
 
 
 def test_how_many_are_needed_in_words():

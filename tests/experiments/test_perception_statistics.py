@@ -98,6 +98,8 @@ def test_missing_values_are_left_out_and_counted():
 
 def test_too_little_to_compare_is_said_not_raised():
     needs_statsmodels()
+    alike = np.tile([1.0, 2, 3, 4], (6, 1)) + 0.1  # nothing differs between people
+    assert math.isnan(repeated_measures(alike).f) and math.isnan(repeated_measures(alike).p_corrected)
     for values in (np.full((3, 4), np.nan), TABLE[:1], TABLE[:, :1]):
         assert math.isnan(one_way(values).f) and math.isnan(repeated_measures(values).f)
         assert mixed_model(PLACES[: values.shape[1]], values) is None
@@ -156,11 +158,25 @@ def test_a_line_is_refused_where_medians_are_no_scales():
     beyond[:6, 3] = 60
     found = line(beyond)
     assert math.isnan(found.alpha) and "70 deg" in found.refused and "60 deg" in found.refused
+    half = people(6, 6)
+    half[:3, 3] = 60
+    assert np.median(half[:, 3]) < 60 and "70 deg" in line(half).refused
     empty = values.copy()
     empty[:, 1] = np.nan
     assert "50 deg" in line(empty).refused
     assert "two eccentricities" in line(values, inside=np.array([True, False, False, False])).refused
     few = line(values[:4])
+    assert math.isfinite(few.alpha) and math.isnan(few.alpha_interval[0])
+
+
+def test_people_without_any_scale_change_nothing():
+    values = people(7, 9)
+    holed = np.concatenate([np.full((3, 4), np.nan), values])
+    assert (line(holed).alpha_interval, line(holed).medians.tolist()) == (
+        line(values).alpha_interval,
+        line(values).medians.tolist(),
+    )
+    few = line(holed[:7])
     assert math.isfinite(few.alpha) and math.isnan(few.alpha_interval[0])
 
 
