@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
 from holotorch.experiments.config_analysis import AnalysisSettings
@@ -11,7 +11,7 @@ from holotorch.experiments.config_eye import ObserverSettings
 from holotorch.experiments.config_perception import LayoutSettings
 from holotorch.experiments.config_volume import VolumeSettings, contradictions
 from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.messages import describe, nearest, position
+from holotorch.experiments.messages import nearest, validated
 from holotorch.experiments.settings import (
     Count,
     GridSettings,
@@ -208,11 +208,7 @@ def load_config(path: Path | str, overrides: list[str] | None = None) -> Any:
     if not isinstance(kind, str) or kind not in KINDS:
         got = f"got {kind!r}" + nearest(str(kind), list(KINDS)) if "experiment" in source.data else "it is missing"
         raise ConfigError([source.mistake(("experiment",), f"expected one of {', '.join(KINDS)}, {got}")])
-    try:
-        settings = KINDS[kind].model_validate(source.data)
-    except ValidationError as error:
-        mistakes = {describe(source, KINDS[kind], entry): None for entry in error.errors()}
-        raise ConfigError(sorted(mistakes, key=position)) from None
+    settings = validated(source, KINDS[kind])
     if isinstance(settings, VolumeSettings):
         found = contradictions(settings)
     elif isinstance(settings, PECSettings):

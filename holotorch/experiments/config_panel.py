@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import torch
-from pydantic import AfterValidator, Field, ValidationError
+from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
 from holotorch.core.grid import Grid
 from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.messages import describe, position
+from holotorch.experiments.messages import validated
 from holotorch.experiments.settings import Count, GridSettings, Number, Settings, Wavelength
 from holotorch.experiments.source import Key, read_source
 from holotorch.modulator.dispersion import Birefringence, BirefringenceTable, Cauchy, phase_scale
@@ -72,11 +72,7 @@ def load_panel(path: Path | str, overrides: Sequence[str] = ()) -> PanelSettings
         ConfigError: Everything that is wrong with it, one line per mistake with its file, line and column.
     """
     source = read_source(Path(path), list(overrides))
-    try:
-        settings = PanelSettings.model_validate(source.data)
-    except ValidationError as error:
-        mistakes = {describe(source, PanelSettings, entry): None for entry in error.errors()}
-        raise ConfigError(sorted(mistakes, key=position)) from None
+    settings = validated(source, PanelSettings)
     found: list[tuple[Key, str]] = []
     tables: list[CalibrationSettings] = []
     for i, row in enumerate(settings.calibration):

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import torch
-from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field
 from pydantic_core import PydanticCustomError
 from torch import Tensor
 
 from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.messages import describe, position
+from holotorch.experiments.messages import validated
 from holotorch.experiments.perception_design import Design, make_design
 from holotorch.experiments.settings import Count, Length, Number, Settings, Side, number, several, within
 from holotorch.experiments.source import Key, read_source
@@ -132,11 +132,7 @@ def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudySettings
         ConfigError: Everything that is wrong with it, one line per mistake with its file, line and column.
     """
     source = read_source(Path(path), list(overrides))
-    try:
-        settings = StudySettings.model_validate(source.data)
-    except ValidationError as error:
-        mistakes = {describe(source, StudySettings, entry): None for entry in error.errors()}
-        raise ConfigError(sorted(mistakes, key=position)) from None
+    settings = validated(source, StudySettings)
     found: list[tuple[Key, str]] = []
     screen = settings.screen
     if isinstance(screen, CurvedSettings):

@@ -6,11 +6,11 @@ from typing import Annotated, Any, TypeVar
 
 import torch
 import yaml
-from pydantic import BeforeValidator, Field, ValidationError
+from pydantic import BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
 from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.messages import describe, position
+from holotorch.experiments.messages import validated
 from holotorch.experiments.settings import Count, Length, Number, Settings, Side, number, within
 from holotorch.experiments.source import Source, read_source
 from holotorch.io.files import write_text
@@ -196,11 +196,7 @@ def save_headset(path: Path, alignment: Alignment) -> None:
 
 def _read(model: type[AnySettings], path: Path | str, overrides: Sequence[str]) -> tuple[Source, AnySettings]:
     source = read_source(Path(path), list(overrides))
-    try:
-        return source, model.model_validate(source.data)
-    except ValidationError as error:
-        mistakes = {describe(source, model, entry): None for entry in error.errors()}
-        raise ConfigError(sorted(mistakes, key=position)) from None
+    return source, validated(source, model)
 
 
 def _tried(source: Source, build: Any, settings: Settings) -> None:

@@ -3,11 +3,14 @@
 import difflib
 import math
 import re
-from typing import Any
+from typing import Any, TypeVar
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
+from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.source import Key, Source
+
+Model = TypeVar("Model", bound=BaseModel)
 
 _EXPECTED = {
     "int_": "a whole number",
@@ -18,6 +21,19 @@ _EXPECTED = {
     "model_": "settings, as in {key: value}",
     "dict_": "settings, as in {key: value}",
 }
+
+
+def validated(source: Source, model: type[Model]) -> Model:
+    """The settings that a file holds.
+
+    Raises:
+        ConfigError: All mistakes, each a line once, in the order of the file.
+    """
+    try:
+        return model.model_validate(source.data)
+    except ValidationError as error:
+        mistakes = dict.fromkeys(describe(source, model, entry) for entry in error.errors())
+        raise ConfigError(sorted(mistakes, key=position)) from None
 
 
 def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
