@@ -158,7 +158,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _local(self) -> bool:
         """Whether the page was asked for by this machine's name: a foreign name that points here is refused."""
-        name = self.headers.get("Host", "").rpartition(":")[0]
+        name = self.headers.get("Host", "").partition(":")[0]  # browsers leave out the port 80
         if name in ("127.0.0.1", "localhost"):
             return True
         self.close_connection = True
