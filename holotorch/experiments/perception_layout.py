@@ -56,7 +56,8 @@ def layout_text(settings: LayoutSettings) -> str:
     """What the layouts ask for, in words."""
     lines = []
     for name, layout in scaled(settings):
-        sizes = layout.size_deg.amax(-1)[~layout.kept].tolist() or [float("nan")]
+        sizes = layout.size_deg.amax(-1)[~layout.kept].tolist()
+        span = f"{min(sizes):.1f} to {max(sizes):.1f} deg; " if sizes else ""
         parts = [f"{int(layout.fitted.sum())} icons on the line", f"{int(layout.kept.sum())} keep their size"]
         if layout.extrapolated.any():
             parts.append(f"{int(layout.extrapolated.sum())} extrapolated")
@@ -64,7 +65,7 @@ def layout_text(settings: LayoutSettings) -> str:
             parts.append(f"{untested} of a size that was not tested")
         pairs = len(overlaps(_centres(settings), layout.size_deg)[0])
         parts.append(f"{pairs} pairs overlap" if pairs else "none overlap")
-        lines.append(f"As soon as {name}: {min(sizes):.1f} to {max(sizes):.1f} deg; {', '.join(parts)}")
+        lines.append(f"As soon as {name}: {span}{', '.join(parts)}")
     return "\n".join(lines)
 
 

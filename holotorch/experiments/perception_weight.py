@@ -40,7 +40,7 @@ def zone_scores(
     """
     picture, image = picture[lit].clamp(0, 1), image[lit]
     where = eccentricities(settings, (image.shape[-2], image.shape[-1]))
-    square = (picture - image).square().mean(0)
+    square = (picture - image).double().square().mean(0)
     edge = SSIM_WINDOW // 2
     middles = where[edge:-edge, edge:-edge]
     windows = square[:0]

@@ -51,6 +51,8 @@ def test_extrapolation_and_small_lines_are_flagged(capsys):
     assert main(["check", str(LAYOUT), "extrapolate=true"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert "1 extrapolated, 1 of a size that was not tested" in lines[0] and "to 26.6 deg" in lines[0]
+    assert main(["check", str(LAYOUT), "items=[{icon: boat, azimuth_deg: 10}]"]) == 0
+    assert "As soon as 5 deg at 10 deg: 0 icons on the line, 1 keep their size, none" in capsys.readouterr().out
     with pytest.raises(ConfigError, match=r"targets\.0: Table 2\.2 has no target of 7"):
         from holotorch.experiments.perception_layout import scaled
 
@@ -110,8 +112,10 @@ def test_zones_are_scored_by_their_own_pixels():
     assert rows[1]["ssim"] == pytest.approx(
         wanted, abs=1e-4
     )  # skimage's window is 11 px too, its tail differs a little
-    perfect = zone_scores(settings.target.weight, image, image, lit)
-    assert all(row["psnr"] is None and row["ssim"] == pytest.approx(1) for row in perfect)
+    for picture in (image, image.float()):
+        perfect = zone_scores(settings.target.weight, picture, picture, lit)
+        assert all(row["psnr"] is None and row["error"] == 0 for row in perfect)
+        assert all(row["ssim"] == pytest.approx(1) for row in perfect)
 
 
 def test_error_moves_from_the_middle_to_the_far_periphery(tmp_path, tiny):
