@@ -171,8 +171,9 @@ def beyond_screen(settings: StudySettings) -> list[Cut]:
     for eccentricity, size in settings.conditions:
         y, x = screen.pixels(*_outline(eccentricity, size))
         # Centres of pixels count from 0, so the screen ends half a pixel beyond the last; half a pixel more is no loss.
-        wide = (x - (columns - 1) / 2).abs().nan_to_num(math.inf).max().item() <= columns / 2 + _SLACK_PX
-        high = (y - (rows - 1) / 2).abs().nan_to_num(math.inf).max().item()
+        # NaN, in both, where a direction meets no point of the screen: nothing is within a limit there.
+        wide = ((x - (columns - 1) / 2).abs() <= columns / 2 + _SLACK_PX).all()
+        high = (y - (rows - 1) / 2).abs().max().item()
         name = f"{size:g} deg at {eccentricity:g} deg"
         if not wide:
             reach, covered = eccentricity + size / 2, screen.field_deg[1] / 2
