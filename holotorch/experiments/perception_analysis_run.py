@@ -29,7 +29,7 @@ from holotorch.experiments.perception_analysis import (
     perception_times,
     read_responses,
 )
-from holotorch.experiments.perception_log import Quantisation, quantisation
+from holotorch.experiments.perception_frames import Quantisation, quantisation
 from holotorch.experiments.perception_power import needed, power_rows, with_slope
 from holotorch.experiments.perception_simulation import simulate, true_line
 from holotorch.experiments.perception_statistics import (
@@ -153,11 +153,12 @@ def run_analysis(settings: AnalysisSettings, out: Path | None, name: str) -> tup
     if shown not in times.participants:
         raise ConfigError([f"shown: no participant {shown}; there are {', '.join(map(str, times.participants))}"])
     found = find(settings, times, curves)
-    frames = quantisation({"frame_s": frame} for frame in responses.frame_s.tolist())
+    frames = quantisation(responses.frame_s.tolist())
     assert frames is not None  # as there are trials
     truths = [true_line(settings.simulation, target) if not settings.logs else None for target in settings.targets]
     rows = [finding.row(truth) for finding, truth in zip(found, truths, strict=True)]
-    text = _words(settings, times, curves, found, frames, on_frames(responses))
+    whole = on_frames(responses)
+    text = _words(settings, times, curves, found, frames, whole)
     print(text, flush=True)
     folder = claim(out, name)
     for part in ("arrays", "images"):
@@ -200,7 +201,7 @@ def run_analysis(settings: AnalysisSettings, out: Path | None, name: str) -> tup
         "simulated": times.simulated,
         "participants": len(times.participants),
         "counts": times.counts,
-        "quantisation": asdict(frames) | {"on_frames": _json(on_frames(responses))},
+        "quantisation": asdict(frames) | {"on_frames": _json(whole)},
         "rows": rows,
         "power": power,
         "seconds": round(time.perf_counter() - started, 2),

@@ -5,10 +5,9 @@ only ever appended, each in one write followed by fsync, so that whatever ends t
 at most. What a crash leaves of a line has no line end; readers leave it out and say so, and ``TrialLog`` cuts it off.
 """
 
+import contextlib
 import json
-import math
 import os
-import statistics
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -62,8 +61,11 @@ def read_log(path: Path) -> Trials:
     found = [_parse(path, number, line, mistakes) for number, line in enumerate(lines, 1)]
     header = found[0]
     if header is not None and (header.get("format") != FORMAT or header.get("version") != VERSION):
-        mistakes.insert(0, f"{path}:1:1: not a log of a study: expected a header of format {FORMAT}, version {VERSION}")
-        raise ConfigError(mistakes[:1])
+        raise ConfigError(
+            [f"{path}:1:1: not a log of a study: expected a header of format {FORMAT}, version {VERSION}"]
+        )
+    if header is not None and not _is_whole(header.get("participant")):
+        mistakes.append(f"{path}:1:1: participant: expected a whole number, got {_short(header.get('participant'))}")
     seen: dict[tuple[int, int], int] = {}
     for number, trial in enumerate(found[1:], 2):
         if trial is None:
@@ -74,10 +76,8 @@ def read_log(path: Path) -> Trials:
         key = (trial["round"], trial["trial"])
         if key in seen:
             mistakes.append(f"{path}:{number}:1: round {key[0]}, trial {key[1]} stands in line {seen[key]} already")
-        elif header is not None and trial["participant"] != header.get("participant"):
-            mistakes.append(
-                f"{path}:{number}:1: participant {trial['participant']} in the log of {header.get('participant')}"
-            )
+        elif header is not None and trial["participant"] != (owner := header.get("participant")):
+            mistakes.append(f"{path}:{number}:1: participant {trial['participant']} in the log of {_short(owner)}")
         seen.setdefault(key, number)
     if mistakes:
         raise ConfigError(sorted(mistakes, key=position))
@@ -129,6 +129,7 @@ class TrialLog:
         # As it reads back: tuples become lists.
         self.header = json.loads(json.dumps({"format": FORMAT, "version": VERSION, **header}, allow_nan=False))
         self.trials: list[dict[str, Any]] = []
+        self._size = 0  # of the whole lines, in bytes
         self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
         try:
             self._lock()
@@ -136,7 +137,6 @@ class TrialLog:
             if b"\n" in path.read_bytes():
                 self._continue()
             else:
-                os.ftruncate(self._file, 0)
                 self._write(self.header)
                 _sync_folder(path.parent)
         except BaseException:
@@ -185,59 +185,22 @@ class TrialLog:
                         "or another folder"
                     ]
                 )
-        if log.torn:
-            os.ftruncate(self._file, log.size)
-        self.trials = log.trials
+        os.ftruncate(self._file, log.size)
+        self.trials, self._size = log.trials, log.size
 
     def _write(self, value: dict[str, Any]) -> None:
         line = memoryview(json.dumps(value, allow_nan=False, ensure_ascii=False).encode() + b"\n")
-        size = None
+        end = self._size + len(line)
         try:
-            size = os.fstat(self._file).st_size
+            os.ftruncate(self._file, self._size)  # what a failure left of a line, and could not cut off
             while line:  # a single call may write less
                 line = line[os.write(self._file, line) :]
             os.fsync(self._file)
         except OSError as error:  # a full disk: leave whole lines only
-            if size is not None:
-                os.ftruncate(self._file, size)
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._file, self._size)
             raise OSError(error.errno, error.strerror, str(self.path)) from None
-
-
-@dataclass(frozen=True)
-class Quantisation:
-    """How finely reaction times are known, from the frame intervals that the browser measured.
-
-    Attributes:
-        trials: Trials that it is taken from.
-        frame_s: Median frame interval in seconds: patterns appear in steps of this.
-        least_s: The shortest.
-        most_s: The longest.
-        deviation_s: Standard deviation that the steps add to a reaction time, frame / sqrt(12).
-    """
-
-    trials: int
-    frame_s: float
-    least_s: float
-    most_s: float
-    deviation_s: float
-
-    def __str__(self) -> str:
-        text = (
-            f"frames of {1e3 * self.frame_s:.1f} ms ({1 / self.frame_s:.0f} Hz) over {self.trials} trials: reaction "
-            f"times are known to one frame, which adds a deviation of {1e3 * self.deviation_s:.1f} ms to each"
-        )
-        if self.most_s > 1.5 * self.least_s:
-            text += f"; the interval went from {1e3 * self.least_s:.1f} to {1e3 * self.most_s:.1f} ms"
-        return text
-
-
-def quantisation(trials: Iterable[dict[str, Any]]) -> Quantisation | None:
-    """The quantisation of reaction times in these trials; None where there are none."""
-    frames = [trial["frame_s"] for trial in trials]
-    if not frames:
-        return None
-    median = statistics.median(frames)
-    return Quantisation(len(frames), median, min(frames), max(frames), median / math.sqrt(12))
+        self._size = end
 
 
 def _parse(path: Path, number: int, line: bytes, mistakes: list[str]) -> dict[str, Any] | None:
@@ -260,7 +223,7 @@ def _problem(trial: dict[str, Any]) -> str:
     """What is wrong with a trial, or nothing."""
     wanted = {
         **{name: (is_number, "a finite number") for name in _NUMBERS},
-        **{name: (lambda v: isinstance(v, int) and not isinstance(v, bool), "a whole number") for name in _COUNTS},
+        **{name: (_is_whole, "a whole number") for name in _COUNTS},
         **{name: (lambda v: isinstance(v, bool), "true or false") for name in _FLAGS},
         **{name: (lambda v: isinstance(v, str), "text") for name in _TEXTS},
         "pattern": (lambda v: v in ("cross", "circle"), "cross or circle"),
@@ -281,6 +244,10 @@ def _problem(trial: dict[str, Any]) -> str:
 def is_number(value: Any) -> TypeGuard[float]:
     """Whether it is a finite number, as true and false are not."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
 
 
 def _short(value: Any) -> str:

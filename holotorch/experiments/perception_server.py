@@ -23,7 +23,8 @@ from typing import Any
 from holotorch.experiments.config_study import StudySettings, beyond_screen, build_screen, load_study
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.perception_design import Design
-from holotorch.experiments.perception_log import TrialLog, is_number, quantisation
+from holotorch.experiments.perception_frames import quantisation
+from holotorch.experiments.perception_log import TrialLog, is_number
 from holotorch.io.files import write_json
 
 _LARGEST = 10_000  # bytes of a request; a result has about 200
@@ -254,7 +255,7 @@ def _summary(path: Path, log: TrialLog, total: int) -> str:
     trials = [trial for trial in log.trials if not trial["practice"]]
     right = sum(trial["responded"] == trial["target"] for trial in trials)
     lines = [f"{len(log.trials)} of {total} trials in {path}; without practice {right} of {len(trials)} right"]
-    steps = quantisation(log.trials)
+    steps = quantisation([trial["frame_s"] for trial in log.trials])
     return "\n".join(lines + ([str(steps)] if steps else []))
 
 

@@ -7,7 +7,8 @@ import sys
 import pytest
 
 from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.perception_log import TrialLog, quantisation, read_log, read_logs
+from holotorch.experiments.perception_frames import quantisation
+from holotorch.experiments.perception_log import TrialLog, read_log, read_logs
 
 HEADER = {"participant": 4, "design": "abc", "screen": {"shape": (600, 800)}}
 
@@ -108,6 +109,7 @@ def test_broken_lines_are_all_named_with_their_place(path):
         ("", "the log is empty"),
         ('{"format": "other"}\n', "not a log of a study"),
         ('{"format": "holotorch-trials", "version": 2}\n', "version 1"),
+        ('{"format": "holotorch-trials", "version": 1, "participant": [4]}\n', "expected a whole number, got \\[4\\]"),
         ("a,b\n1,2\n", ":1:1: not a line of JSON"),
     ],
 )
@@ -149,14 +151,37 @@ def test_only_trials_are_appended(path):
     assert read_log(path).trials == []
 
 
+def test_a_line_that_could_not_be_cut_off_is_cut_off_later(path, monkeypatch):
+    with TrialLog(path, HEADER) as log:
+        log.append(trial(1))
+        with monkeypatch.context() as broken:
+
+            def write(handle, data):
+                real(handle, bytes(data[:20]))
+                raise OSError(5, "Input/output error")
+
+            def cut(handle, size):
+                if size < os.fstat(handle).st_size:
+                    raise OSError(5, "Input/output error")
+
+            real = os.write
+            broken.setattr(os, "write", write)
+            broken.setattr(os, "ftruncate", cut)
+            with pytest.raises(OSError, match=path.name):
+                log.append(trial(2))
+        assert read_log(path).torn
+        log.append(trial(2))
+    assert read_log(path).trials == [trial(1), trial(2)]
+
+
 def test_quantisation_of_60_hz():
-    found = quantisation([trial(i, frame_s=1 / 60) for i in range(5)])
+    found = quantisation([1 / 60] * 5)
     assert found is not None
     # A step of 16.67 ms has a deviation of 16.67 / sqrt(12) = 4.81 ms.
     assert found.frame_s == pytest.approx(0.0166667, abs=1e-7) and found.deviation_s == pytest.approx(
         4.811e-3, abs=1e-6
     )
     assert "16.7 ms (60 Hz) over 5 trials" in str(found) and "4.8 ms" in str(found)
-    uneven = quantisation([trial(1, frame_s=0.01), trial(2, frame_s=0.02), trial(3, frame_s=0.01)])
+    uneven = quantisation([0.01, 0.02, 0.01])
     assert "went from 10.0 to 20.0 ms" in str(uneven)
     assert quantisation([]) is None
