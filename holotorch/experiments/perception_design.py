@@ -138,7 +138,8 @@ def make_design(
             turn, and the trials shuffled anew for each participant.
         sides: "left", "right", or "both": then in each condition, role and pattern the sides differ by one at most (the
             thesis does not state its sides).
-        practice: Trials of the practice round, which has the first round's target.
+        practice: Trials of the practice round, which has the first round's target; at most as many as the two rounds
+            with that target have together.
         wait_s: Bounds of the time before each appearance, drawn evenly between them.
         seed: Of everything drawn.
 
