@@ -97,7 +97,7 @@ def surface() -> tuple[PerceptionTime, list[float]]:
     slopes = [-0.05, -0.06, -0.07, -0.08, -0.09, 0.01]
     sizes = [5.0, 8.0, 13.0, 18.0, 23.0, 28.0]
     parts = [0.45 - a * math.log(s) for a, s in zip(slopes, sizes, strict=True)]
-    return PerceptionTime(torch.tensor(slopes).double(), torch.tensor(parts).double()), where
+    return PerceptionTime(torch.tensor(slopes, dtype=torch.float64), torch.tensor(parts, dtype=torch.float64)), where
 
 
 def test_a_surface_gives_the_line_by_time_and_by_target():
@@ -106,8 +106,8 @@ def test_a_surface_gives_the_line_by_time_and_by_target():
         EqualEfficiencyScale.from_time(0.45, times, where),
         EqualEfficiencyScale.from_surface(5, 20, times, where),
     ):
-        # Slopes are float32 numbers here: the rounding cancels between b and a.
-        assert [float(found.alpha), float(found.beta)] == pytest.approx([0.5, -12], abs=1e-5)
+        # Rounding of T - b, 1e-16 s, over a, -0.05 s, times sizes of 23 deg, and of a line at 40 deg from its middle.
+        assert [float(found.alpha), float(found.beta)] == pytest.approx([0.5, -12], abs=1e-11)
     with pytest.raises(ValueError, match="one law at 25 degrees"):
         EqualEfficiencyScale.from_surface(5, 25, times, where)
     with pytest.raises(ValueError, match="one law per eccentricity"):
