@@ -1,6 +1,5 @@
 """From the answers of a perception study to times, curves and equal-efficiency scales per participant (Sec. 2.4)."""
 
-import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -207,10 +206,6 @@ class Curves:
     b: Array
     middle_size: Array
     a_deviation: Array
-
-    def at(self, places: NDArray[np.bool_]) -> "Curves":
-        """Those of some eccentricities."""
-        return Curves(*(getattr(self, field.name)[..., places] for field in dataclasses.fields(self)))
 
 
 def fit_curves(times: Times, from_deg: float, least_sizes: int) -> Curves:
