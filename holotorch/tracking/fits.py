@@ -5,7 +5,7 @@ projection (Golub and Pereyra 1973). Rows and channels weigh by their noise.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from torch import Tensor
 _STEPS = 8
 _SHARED = 1.2  # neighbours share pixels: how much larger deviations are than of samples that do not, measured
 _STRANGE = 1.5  # what is left, over its white part: above it the model misses something, and averaging does not help
+_OTHER = 4.0  # standard deviations of an edge's own blur
 _SLICES = 8
 _SHADINGS = (torch.ones_like, lambda q: q, lambda q: (1 - q * q).sqrt(), lambda q: q**3)
 _MEANS = (1.0, 0.0, math.pi / 4, 0.0)  # of the shadings over the tube
@@ -39,6 +40,12 @@ class EdgeFit:
     noise: Tensor
     steps: Tensor
     levels: Tensor
+
+    def or_better(self, other: "EdgeFit") -> "EdgeFit":
+        """Of each edge the fit with the smaller deviation."""
+        better = other.deviation < self.deviation
+        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
+        return EdgeFit(*(torch.where(better.view(-1, *[1] * (a.ndim - 1)), b, a) for a, b in pairs))
 
 
 def fit_edges(light: Tensor, weight: Tensor, blur: float = 0.9) -> EdgeFit:
@@ -72,6 +79,7 @@ def fit_edges(light: Tensor, weight: Tensor, blur: float = 0.9) -> EdgeFit:
     )
     common = (sure * sigma).sum() / sure.sum().clamp(min=1e-300)
     alike = (sigma / common - 1).abs() < 0.5
+    other = ~alike & ((sigma - common).abs() > _OTHER * sure.rsqrt())  # surely not blurred by that lens
     sigma = torch.where(alike, (sure * alike * sigma).sum() / (sure * alike).sum().clamp(min=1e-300), sigma)
     for _ in range(2):
         normal, slope, rest, amplitude, middle = _edge_terms(t, place, sigma, centred, weight, total)
@@ -88,7 +96,7 @@ def fit_edges(light: Tensor, weight: Tensor, blur: float = 0.9) -> EdgeFit:
     rough = (weight[:, 1:-1] * left.diff(n=2, dim=1).square()).sum((1, 2, 3)) / (weight[:, 1:-1] > 0).sum((1, 2, 3)) / 6
     strange = noise / rough.sqrt().clamp(min=1e-9)
     doubt = (strange / _STRANGE).clamp(min=1).square()
-    good = torch.isfinite(variance) & (variance > 0) & (free > 0)
+    good = torch.isfinite(variance) & (variance > 0) & (free > 0) & ~other
     deviation = torch.where(good, _SHARED * variance.clamp(min=0).sqrt() * noise.clamp(min=0.5) * doubt, torch.inf)
     return EdgeFit(place, sigma, deviation, noise, amplitude, mean - amplitude * middle)
 

@@ -1,5 +1,6 @@
 """What a pose makes of the catheter on a line of its image: how wide it is there, and how its rings bulge."""
 
+import torch
 from torch import Tensor
 
 from holotorch.tracking.catheter import Catheter
@@ -8,11 +9,16 @@ from holotorch.tracking.strips import Line
 
 
 def width_px(pose: Pose, catheter: Catheter, line: Line) -> tuple[float, float]:
-    """Of the tube's image at t = 0 in pixels, and its change per pixel."""
+    """Of the tube's image at t = 0 in pixels across the line, and its change per pixel.
+
+    2 r / (z sqrt(1 - n_z^2)) on the plane z = 1, n the unit normal of the plane through axis and camera: what is
+    seen aside of the image's middle is seen at a slant.
+    """
     ends = pose.tip + catheter.positions.to(pose.tip.device)[[0, -1], None] * pose.direction
     t, _ = line.place(ends[:, :2] / ends[:, 2:])
-    # An angle, seen on the plane z = 1: wider by 1 / cos off the axis.
-    near, far = (2 * catheter.radius * line.scale / ends[:, 2]).tolist()
+    normal = torch.linalg.cross(pose.tip, pose.direction)
+    slant = normal.norm() / normal[:2].norm()
+    near, far = (2 * catheter.radius * line.scale * slant / ends[:, 2]).tolist()
     taper = (far - near) / float(t[1] - t[0])
     return near - taper * float(t[0]), taper
 

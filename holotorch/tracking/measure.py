@@ -21,6 +21,7 @@ _WINDOW = 11  # samples to either side of an edge
 _STATIONS = 40
 _SAMPLES = 4  # for each station
 _LINE_FLOOR = 0.008  # of the width: what gloss and shadow, which repeat along the tube, may move its middle
+_UNSURE = 0.1  # pixels: a clear edge is known to a few hundredths
 _ALIKE = 0.2  # of the brightest channel: colours nearer than this are one
 _BESIDE = 14.0  # pixels from the mid-line, beside the widest catheters
 _SIDE_STEP = 0.25  # light that changes beside an edge, over what changes on it: something lies across the tube
@@ -234,6 +235,10 @@ def measure_edges(
         row = (widths[:, None] / 2 + 1.2 - u.abs()).clamp(0, 1)
         weight = row[:, None, :, None] / _variance(light)
         fit = fit_edges(light, weight, blur)
+        if bool((fit.deviation > _UNSURE).any()):
+            # Surroundings that are not even leak into the outer rows; those in the middle may tell all the same.
+            core = (widths[:, None] / 2 - 0.5 - u.abs()).clamp(0, 1)
+            fit = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur))
         near = near + fit.place
         if float(fit.place.abs().max()) < 0.7:
             break

@@ -98,6 +98,25 @@ def test_another_edge_nearby_makes_the_place_doubtful():
     assert fit_edges(light + noise, weight).deviation > 5 * alone.deviation
 
 
+def test_an_edge_that_another_blur_made_is_none():
+    """One lens blurs all edges of a frame: a soft step among sharp ones is something else, a dim one only unsure."""
+    sharp, soft = edges([0.2, -0.3, 0.1], 0.9), edges([0.0], 3.0)
+    light = torch.cat([sharp, soft, 0.3 + 0.01 * (soft - 0.3)])
+    noise = 0.004 * torch.randn(light.shape, generator=torch.Generator().manual_seed(0), dtype=light.dtype)
+    deviation = fit_edges(light + noise, torch.full_like(light, 0.004**-2)).deviation
+    assert deviation[:3].max() < 0.02 and deviation[3].isinf() and float(deviation[4]) > 0.02
+
+
+def test_of_two_fits_the_surer_one_is_taken_edge_by_edge():
+    light = edges([0.3, -0.4], 0.9)
+    weight = torch.full_like(light, 1e4)
+    weight[0, :, 1:] = 0
+    one, other = fit_edges(light, weight), fit_edges(light, weight.flip(0))
+    both = one.or_better(other)
+    assert both.deviation.tolist() == [float(other.deviation[0]), float(one.deviation[1])]
+    assert torch.equal(both.steps[1], one.steps[1]) and torch.equal(both.levels[0], other.levels[0])
+
+
 def tube(width, blur, shade=None, noise=0.0, seed=0, offset=0.3, slope=0.004, taper=0.002, left=0.05, right=0.08):
     """Light [S, U] of a tube on a line, and its true sides."""
     count = 2 * math.ceil(0.6 * width + 4 + 2 * blur) + 1
