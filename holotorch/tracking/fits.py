@@ -56,16 +56,18 @@ def fit_edges(light: Tensor, weight: Tensor, blur: float = 0.9) -> EdgeFit:
         weight: Inverse variances, of the same shape; 0 leaves a sample out.
         blur: To begin with, in samples.
     """
-    light, weight = light.to(torch.float64), weight.to(torch.float64)
+    rows = light.shape[2:]
+    light, weight = (given.to(torch.float64).flatten(2) for given in (light, weight))  # [E, T, U C]
     count = light.shape[1]
     t = torch.arange(count, dtype=torch.float64, device=light.device) - (count - 1) / 2
     place = torch.zeros(len(light), dtype=torch.float64, device=light.device)
     sigma = torch.full_like(place, blur)
-    total = weight.sum(1)
-    mean = (weight * light).sum(1) / total.clamp(min=1e-300)
+    total = weight.sum(1).clamp(min=1e-300)
+    mean = (weight * light).sum(1) / total
     centred = light - mean[:, None]
+    given = weight, weight * centred, total
     for _ in range(_STEPS):
-        normal, slope, *_ = _edge_terms(t, place, sigma, centred, weight, total)
+        normal, slope, *_ = _edge_terms(t, place, sigma, *given)
         step = _solved(normal, slope).clamp(-1.5, 1.5)
         place = (place + step[:, 0]).clamp(-(count - 1) / 2, (count - 1) / 2)
         sigma = (sigma + step[:, 1]).clamp(_SHARPEST, _BLUNTEST)
@@ -73,7 +75,7 @@ def fit_edges(light: Tensor, weight: Tensor, blur: float = 0.9) -> EdgeFit:
             break
     # One lens blurs all edges alike. Where one side is dark and so has little noise, place and blur are hard to tell
     # apart, edge by edge; together they are not.
-    normal = _edge_terms(t, place, sigma, centred, weight, total)[0]
+    normal = _edge_terms(t, place, sigma, *given)[0]
     sure = 1 / torch.linalg.inv_ex(normal + 1e-300 * torch.eye(2, dtype=torch.float64)).inverse[:, 1, 1].clamp(
         min=1e-12
     )
@@ -82,45 +84,48 @@ def fit_edges(light: Tensor, weight: Tensor, blur: float = 0.9) -> EdgeFit:
     other = ~alike & ((sigma - common).abs() > _OTHER * sure.rsqrt())  # surely not blurred by that lens
     sigma = torch.where(alike, (sure * alike * sigma).sum() / (sure * alike).sum().clamp(min=1e-300), sigma)
     for _ in range(2):
-        normal, slope, rest, amplitude, middle = _edge_terms(t, place, sigma, centred, weight, total)
+        normal, slope, *_ = _edge_terms(t, place, sigma, *given)
         place = place + (slope[:, 0] / normal[:, 0, 0].clamp(min=1e-300)).nan_to_num(0).clamp(-0.5, 0.5)
     place = place.clamp(-(count - 1) / 2, (count - 1) / 2)
-    normal, _, rest, amplitude, middle = _edge_terms(t, place, sigma, centred, weight, total)
-    free = (weight > 0).sum((1, 2, 3)) - 2 * (total > 0).sum((1, 2)) - 2
-    noise = (rest / free.clamp(min=1)).sqrt()
+    normal, _, amplitude, middle = _edge_terms(t, place, sigma, *given)
+    z = (t - place[:, None]) / sigma[:, None]
+    left = centred - amplitude[:, None] * (0.5 * torch.erfc(-z / math.sqrt(2))[..., None] - middle[:, None])
+    free = (weight > 0).sum((1, 2)) - 2 * (weight > 0).any(1).sum(1) - 2
+    noise = ((weight * left.square()).sum((1, 2)) / free.clamp(min=1)).sqrt()
     tilt = normal[:, 0, 1] / normal[:, 0, 0]
     variance = 1 / normal[:, 0, 0] + tilt.square() / torch.where(alike, (sure * alike).sum(), sure).clamp(min=1e-12)
-    z = (t - place[:, None]) / sigma[:, None]
-    left = centred - amplitude[:, None] * (0.5 * torch.erfc(-z / math.sqrt(2))[:, :, None, None] - middle[:, None])
     # What varies from sample to sample is noise; what does not is something else that the edge is mixed with.
-    rough = (weight[:, 1:-1] * left.diff(n=2, dim=1).square()).sum((1, 2, 3)) / (weight[:, 1:-1] > 0).sum((1, 2, 3)) / 6
+    rough = (weight[:, 1:-1] * left.diff(n=2, dim=1).square()).sum((1, 2)) / (weight[:, 1:-1] > 0).sum((1, 2)) / 6
     strange = noise / rough.sqrt().clamp(min=1e-9)
     doubt = (strange / _STRANGE).clamp(min=1).square()
     good = torch.isfinite(variance) & (variance > 0) & (free > 0) & ~other
     deviation = torch.where(good, _SHARED * variance.clamp(min=0).sqrt() * noise.clamp(min=0.5) * doubt, torch.inf)
-    return EdgeFit(place, sigma, deviation, noise, amplitude, mean - amplitude * middle)
+    steps, levels = (value.unflatten(1, rows) for value in (amplitude, mean - amplitude * middle))
+    return EdgeFit(place, sigma, deviation, noise, steps, levels)
 
 
-def _edge_terms(t: Tensor, place: Tensor, sigma: Tensor, centred: Tensor, weight: Tensor, total: Tensor):
-    """Normal matrix [E, 2, 2] and slope [E, 2] for (place, blur), squared rest [E], amplitudes and basis means."""
+def _edge_terms(t: Tensor, place: Tensor, sigma: Tensor, weight: Tensor, weighted: Tensor, total: Tensor):
+    """Normal matrix [E, 2, 2] and slope [E, 2] for (place, blur), amplitudes and basis means [E, U C].
+
+    ``weight`` and ``weighted`` (light times it) are [E, T, U C], their ``total`` over T [E, U C].
+    """
     z = (t - place[:, None]) / sigma[:, None]
     rise = 0.5 * torch.erfc(-z / math.sqrt(2))
     bell = torch.exp(-0.5 * z * z) / (math.sqrt(2 * math.pi) * sigma[:, None])
-    basis = torch.stack([rise, -bell, -bell * z], -1)  # the rise, and its slopes to place and blur: [E, T, 3]
+    basis = torch.stack([rise, -bell, -bell * z], 1)  # the rise, and its slopes to place and blur: [E, 3, T]
     # Weighted moments of the three over T, for each row and channel.
-    first = torch.einsum("etk,etuc->eukc", basis, weight) / total.clamp(min=1e-300)[:, :, None]
-    second = torch.einsum("etk,etl,etuc->euklc", basis, basis, weight)
-    second = second - total[:, :, None, None] * first[:, :, :, None] * first[:, :, None]
-    with_light = torch.einsum("etk,etuc,etuc->eukc", basis, weight, centred)
-    power = second[:, :, 0, 0].clamp(min=1e-300)
-    amplitude = with_light[:, :, 0] / power
+    moments = torch.cat([basis, (basis[:, :, None] * basis[:, None]).flatten(1, 2)], 1) @ weight
+    first, second = moments[:, :3] / total[:, None], moments[:, 3:].unflatten(1, (3, 3))
+    second = second - moments[:, :3, None] * first[:, None]
+    with_light = basis @ weighted
+    power = second[:, 0, 0].clamp(min=1e-300)
+    amplitude = with_light[:, 0] / power
     # What the rise itself explains is taken out of its slopes (Kaufman's form).
-    left = with_light[:, :, 1:] - second[:, :, 0, 1:] * amplitude[:, :, None]
-    matrix = second[:, :, 1:, 1:] - second[:, :, 1:, :1] * second[:, :, :1, 1:] / power[:, :, None, None]
-    normal = (matrix * amplitude.square()[:, :, None, None]).sum((1, 4))
-    slope = (left * amplitude[:, :, None]).sum((1, 3))
-    rest = (weight * centred.square()).sum((1, 2, 3)) - (amplitude * with_light[:, :, 0]).sum((1, 2))
-    return normal, slope, rest.clamp(min=0), amplitude, first[:, :, 0]
+    left = with_light[:, 1:] - second[:, 0, 1:] * amplitude[:, None]
+    matrix = second[:, 1:, 1:] - second[:, 1:, :1] * second[:, :1, 1:] / power[:, None, None]
+    normal = (matrix @ amplitude.square()[:, None, :, None])[..., 0]
+    slope = (left @ amplitude[..., None])[..., 0]
+    return normal, slope, amplitude, first[:, 0]
 
 
 def _solved(normal: Tensor, slope: Tensor) -> Tensor:

@@ -240,7 +240,7 @@ def measure_edges(
             core = (widths[:, None] / 2 - 0.5 - u.abs()).clamp(0, 1)
             fit = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur))
         near = near + fit.place
-        if float(fit.place.abs().max()) < 0.7:
+        if float(fit.place.abs().max()) < 1.0:
             break
     assert fit is not None and inside is not None
     blurs = fit.blur[torch.isfinite(fit.deviation)]
