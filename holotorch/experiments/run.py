@@ -182,12 +182,16 @@ def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
 
 @contextmanager
 def interruptible() -> Iterator[list[int]]:
-    """Let SIGTERM act as Ctrl-C, and note in the list that either has come."""
+    """Let SIGTERM act as Ctrl-C, and note in the list that either has come; only the first raises KeyboardInterrupt.
+
+    Another would come while what was found is being saved, and end that.
+    """
     pressed: list[int] = []
 
     def note(number: int, _: Any) -> None:
         pressed.append(number)
-        raise KeyboardInterrupt
+        if len(pressed) == 1:
+            raise KeyboardInterrupt
 
     with _handling(note):
         yield pressed

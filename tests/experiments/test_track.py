@@ -14,6 +14,7 @@ import torch
 from holotorch.experiments import track
 from holotorch.experiments.config_tracking import save_camera, save_catheter
 from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.run import deferred
 from holotorch.experiments.track import follow, run_tracking
 from holotorch.experiments.track_report import COLUMNS
 from holotorch.io.files import write_bytes
@@ -172,6 +173,25 @@ def test_interrupted_tracking_keeps_what_was_found(tmp_path, tracker, monkeypatc
     with open_frames(folder / "overlay.mp4") as drawn:
         assert len(list(drawn)) == 2
     assert not list(folder.glob(".*"))
+
+
+def test_a_second_signal_loses_nothing(tmp_path, tracker, monkeypatch):
+    """It comes after the first has ended the loop and before signals are held back for saving."""
+
+    def pressed(frames, previous=None):
+        if int(frames[0, 0, 0, 0]) == 15:
+            signal.raise_signal(signal.SIGINT)
+        return tracker(frames, previous)
+
+    def late(noted):
+        if len(noted) == 1:
+            signal.raise_signal(signal.SIGTERM)
+        return deferred(noted)
+
+    monkeypatch.setattr(track, "_tracker", lambda *_: pressed)
+    monkeypatch.setattr(track, "deferred", late)
+    folder, complete = tracked(tmp_path, pictures(tmp_path / "in", [9, 12, 15, 18]))
+    assert not complete and len(read(folder)) == 2 and summary(folder, "interrupted.json")["frames"] == 2
 
 
 def test_a_tracker_that_fails_loses_nothing(tmp_path, tracker, monkeypatch):
