@@ -73,8 +73,10 @@ def run_tracking(
     """Track a source and fill a folder: ``out``, or the next free ``runs/track-001``.
 
     The folder gets ``poses.csv`` (a line per frame, ``COLUMNS``), ``overlay.mp4``, ``report.html``, copies of the two
-    YAML files, ``recording`` if asked for, and ``summary.json`` last. Ctrl-C saves what there is, and is the ordinary
-    end of a camera.
+    YAML files, ``recording`` if asked for, and ``summary.json`` last. Ctrl-C saves what there is, as SIGTERM and a closed
+    terminal do, and is the ordinary end of a camera. A process that is killed (``kill -9``) leaves what it had written
+    under hidden names: ``.poses.csv.PID.partial`` with a line per frame, and an overlay that no player may open; the
+    recording is readable.
 
     Args:
         source: A video, a folder of pictures, a folder of a recording, or the number of a camera.

@@ -156,13 +156,40 @@ def test_a_recording_replays_to_the_same_poses(tmp_path, tracker, capsys):
     assert first == second
 
 
-def test_interrupted_tracking_keeps_what_was_found(tmp_path, tracker, monkeypatch):
+@pytest.fixture
+def hangup():
+    """SIGHUP, handled as in a program that a terminal has started, whatever this test was started by."""
+    number = getattr(signal, "SIGHUP", None)
+    if number is None:
+        pytest.skip("this system has no terminals that hang up")
+
+    def died(*_):
+        raise AssertionError("SIGHUP would have ended the process")
+
+    before = signal.signal(number, died)
+    yield number
+    signal.signal(number, before)
+
+
+def test_a_run_under_nohup_outlives_its_terminal(tmp_path, tracker, monkeypatch, hangup):
+    def pressed(frames, previous=None):
+        signal.raise_signal(hangup)
+        return tracker(frames, previous)
+
+    monkeypatch.setattr(track, "_tracker", lambda *_: pressed)
+    signal.signal(hangup, signal.SIG_IGN)
+    folder, complete = tracked(tmp_path, pictures(tmp_path / "in", [9, 12]), video=False)
+    assert complete and len(read(folder)) == 2 and signal.getsignal(hangup) is signal.SIG_IGN
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_interrupted_tracking_keeps_what_was_found(tmp_path, tracker, monkeypatch, hangup, name):
     calls = []
 
     def pressed(frames, previous=None):
         calls.append(1)
         if len(calls) == 3:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(getattr(signal, name))
         return tracker(frames, previous)
 
     monkeypatch.setattr(track, "_tracker", lambda *_: pressed)
