@@ -6,9 +6,9 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
-from typing import IO
+from typing import IO, TypeVar
 
 import torch
 import yaml
@@ -27,7 +27,7 @@ from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.run import claim, deferred, interruptible
 from holotorch.experiments.track_report import COLUMNS, Log, Tracked, row, summarised, verdict, write_page
 from holotorch.io.bundled import find_config
-from holotorch.io.files import replacing, write_bytes, write_json, write_text
+from holotorch.io.files import append, replacing, write_bytes, write_json, write_text
 from holotorch.io.recording import Recorder, free_bytes, is_recording, open_recording, recording_bytes
 from holotorch.io.video import Frame, Frames, open_frames, replacing_video
 from holotorch.tracking import Camera, Catheter, Pose, Status
@@ -36,6 +36,7 @@ from holotorch.tracking.packet import now
 
 METHODS = ("ours", "thesis")
 _OFF_CENTRE = 0.15  # of a side; two thirds of the resolution, as 720 to 1080 lines, shift the centre by a sixth
+Entered = TypeVar("Entered")
 Tracker = Callable[[Tensor, Sequence[Pose] | None], list[Pose]]
 
 
@@ -73,10 +74,10 @@ def run_tracking(
     """Track a source and fill a folder: ``out``, or the next free ``runs/track-001``.
 
     The folder gets ``poses.csv`` (a line per frame, ``COLUMNS``), ``overlay.mp4``, ``report.html``, copies of the two
-    YAML files, ``recording`` if asked for, and ``summary.json`` last. Ctrl-C saves what there is, as SIGTERM and a closed
-    terminal do, and is the ordinary end of a camera. A process that is killed (``kill -9``) leaves what it had written
-    under hidden names: ``.poses.csv.PID.partial`` with a line per frame, and an overlay that no player may open; the
-    recording is readable.
+    YAML files, ``recording`` if asked for, and ``summary.json`` last. Ctrl-C, as SIGTERM and a closed terminal, saves
+    what there is, and is the ordinary end of a camera. A killed process (``kill -9``) leaves what it had written
+    under hidden names: ``.poses.csv.PID.partial``, whole but for its last line, and an overlay that no player may open;
+    its recording can be tracked.
 
     Args:
         source: A video, a folder of pictures, a folder of a recording, or the number of a camera.
@@ -167,17 +168,17 @@ def _fill(
     (folder / "images").mkdir(exist_ok=True)
     said = len(frames.notes)
     with interruptible() as pressed:
-        stack = ExitStack()
+        parts: list[ExitStack] = []  # each to be closed, whatever happens to the others
         try:
-            table = stack.enter_context(replacing(folder / "poses.csv"))
+            table = _entered(parts, replacing(folder / "poses.csv", buffering=0))
             _append(table, COLUMNS)
             movie, came = None, iter(frames)
             if video:
-                movie = stack.enter_context(replacing_video(folder / "overlay.mp4", frames.shape, frames.rate))
+                movie = _entered(parts, replacing_video(folder / "overlay.mp4", frames.shape, frames.rate))
             if recorded is not None:
                 recorder = Recorder(folder / "recording", frames.shape, frames.rate, frames.name, recorded)
-                came = _recorded(came, stack.enter_context(recorder), pressed)
-            bar = stack.enter_context(tqdm(total=frames.total, unit="frame", desc="tracking", dynamic_ncols=True))
+                came = _recorded(came, _entered(parts, recorder), pressed)
+            bar = _entered(parts, tqdm(total=frames.total, unit="frame", desc="tracking", dynamic_ncols=True))
             for item in follow(came, _tracker(method, camera, catheter)):
                 with deferred(pressed):
                     _append(table, row(item))
@@ -194,10 +195,11 @@ def _fill(
         except Exception as error:  # what was found until now is kept
             failure = error
         with deferred(pressed):
-            try:
-                stack.close()
-            except OSError as error:
-                failure = failure or error
+            for part in reversed(parts):
+                try:
+                    part.close()
+                except OSError as error:
+                    failure = failure or error
             if not log.statuses:
                 if recorded is None:
                     shutil.rmtree(folder)  # claimed empty a moment ago: only this run's own files are in it
@@ -214,6 +216,12 @@ def _fill(
         print(f"failed; what was found until then is in {folder}", file=sys.stderr)
         raise failure
     return folder, complete
+
+
+def _entered(parts: list[ExitStack], context: AbstractContextManager[Entered]) -> Entered:
+    """Enter a context of its own, to be closed with ``parts``."""
+    parts.append(ExitStack())
+    return parts[-1].enter_context(context)
 
 
 def _recorded(frames: Iterator[Frame], recorder: Recorder, pressed: list[int]) -> Iterator[Frame]:
@@ -256,8 +264,7 @@ def _drawn(item: Tracked, shape: tuple[int, int], camera: Camera, catheter: Cath
 def _append(table: IO[bytes], cells: Sequence[str]) -> None:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerow(cells)
-    table.write(text.getvalue().encode("utf-8", "replace"))
-    table.flush()
+    append(table, text.getvalue().encode("utf-8", "replace"))
 
 
 def _announced(frames: Frames, out: Path | None, record: bool) -> list[str]:

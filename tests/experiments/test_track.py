@@ -237,6 +237,28 @@ def test_a_tracker_that_fails_loses_nothing(tmp_path, tracker, monkeypatch):
     assert not (tmp_path / "none").exists()
 
 
+def test_a_full_disk_leaves_the_poses_before_it(tmp_path, tracker, full_disk):
+    source = pictures(tmp_path / "in", [9] * 60)
+    with pytest.raises(OSError), full_disk(8000):
+        tracked(tmp_path, source, video=False)
+    rows = read(tmp_path / "out")
+    assert 10 < len(rows) < 60 and [int(row["frame"]) for row in rows] == list(range(len(rows)))
+    assert all(row["milliseconds"] for row in rows)
+    assert not list((tmp_path / "out").glob(".*"))
+
+
+def test_a_part_that_cannot_be_closed_takes_no_other_along(tmp_path, tracker, monkeypatch):
+    def broken(self):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(track.Recorder, "close", broken)
+    with pytest.raises(OSError, match="No space left"):
+        tracked(tmp_path, pictures(tmp_path / "in", [9, 12]), record=True)
+    assert len(read(tmp_path / "out")) == 2 and summary(tmp_path / "out", "interrupted.json")["frames"] == 2
+    with open_frames(tmp_path / "out" / "overlay.mp4") as drawn:
+        assert len(list(drawn)) == 2
+
+
 def test_ctrl_c_is_the_ordinary_end_of_a_camera(tmp_path, tracker, monkeypatch):
     class Device:
         """A camera that never ends, and a user who ends it."""
