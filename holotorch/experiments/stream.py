@@ -4,7 +4,6 @@ import asyncio
 import csv
 import math
 import socket
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AsyncExitStack, suppress
 from pathlib import Path
@@ -67,12 +66,10 @@ def _pose(row: dict[str, str]) -> tuple[float, Pose]:
 
 
 def replay(poses: Sequence[tuple[float, Pose]], rate: float | None = None) -> Iterator[tuple[float, Pose]]:
-    """Give recorded poses when they are due, with capture times moved to now; ``rate`` in Hz replaces their pace."""
+    """Give recorded poses with capture times moved to now, when they are due; ``rate`` in Hz replaces their pace."""
     start, first = now(), poses[0][0]
     for i, (captured, pose) in enumerate(poses):
-        due = start + (captured - first if rate is None else i / rate)
-        time.sleep(max(0.0, due - now()))
-        yield due, pose
+        yield start + (captured - first if rate is None else i / rate), pose
 
 
 def stream(
@@ -93,7 +90,8 @@ def stream(
         igtl: Port for OpenIGTLink, where Slicer connects; None for no such server.
         rate: Poses per second of a poses.csv, instead of the recorded pace.
         smooth: Pass them through :class:`OneEuro`; packets then tell the lag.
-        track: From sources to capture times (by ``packet.now``) and poses, one after the other as frames come.
+        track: From sources to capture times (by ``packet.now``) and poses, one after the other as frames come. One with
+            a time that is still to come is sent then.
         show: Takes the lines to print.
 
     Raises:
@@ -145,6 +143,7 @@ async def _send(
             # In a thread: a frame takes its time, and clock requests must not wait for it.
             while (item := await asyncio.to_thread(next, poses, None)) is not None:
                 captured, pose = item
+                await asyncio.sleep(max(0.0, captured - now()))  # here Ctrl-C ends it; a thread would be waited for
                 pose = smoother(pose, captured) if smoother else pose
                 if sender:
                     sender.send(pose, captured, lag=smoother.lag if smoother else 0.0)

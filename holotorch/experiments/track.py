@@ -134,7 +134,7 @@ def run_tracking(
 
 
 def live(sources: Sequence[str], camera: Path | None, catheter: Path | None) -> Iterator[tuple[float, Pose]]:
-    """Times on the packets' clock and poses of one source, as its frames come; a file's at the pace of its times."""
+    """Times on the packets' clock and poses of one source, as its frames come; a file's are still to come at its pace."""
     if len(sources) != 1 or camera is None or catheter is None:
         raise ConfigError(["to track and stream, give one source, --camera FILE and --catheter FILE"])
     paths = [find_config(path) or path for path in (camera, catheter)]
@@ -149,8 +149,6 @@ def live(sources: Sequence[str], camera: Path | None, catheter: Path | None) -> 
         began = None
         for item in follow(frames, _tracker("ours", build_camera(lens), tool)):
             began = now() - item.frame.seconds if began is None else began
-            if not frames.live:
-                time.sleep(max(0.0, began + item.frame.seconds - now()))
             yield (now() if frames.live else began + item.frame.seconds), item.pose
 
 
