@@ -30,7 +30,7 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     stream.add_argument("sources", nargs="*", metavar="SOURCE", help="a poses.csv, or what track takes")
     stream.add_argument("--to", action="append", metavar="HOST[:PORT]", help="receiver; may be given again")
     stream.add_argument("--igtl", type=int, metavar="PORT", help="serve OpenIGTLink, such as on 18944")
-    stream.add_argument("--rate", type=float, metavar="HZ", help="poses per second of a poses.csv")
+    stream.add_argument("--rate", type=float, metavar="HZ", help="poses per second of a poses.csv, or of pictures")
     stream.add_argument("--smooth", action="store_true", help="One-Euro filter; packets tell its lag")
     stream.add_argument("--view", action="store_true", help="show what arrives")
     stream.add_argument("--check", action="store_true", help="send to this machine itself, also with losses, and count")
@@ -97,6 +97,6 @@ def _stream(options: argparse.Namespace) -> int:
         igtl=options.igtl,
         rate=options.rate,
         smooth=options.smooth,
-        track=lambda sources: live(sources, options.camera, options.catheter),
+        track=lambda sources: live(sources, options.camera, options.catheter, options.rate),
     )
     return OK

@@ -37,8 +37,8 @@ def write(path, poses=POSES):
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)
-    for i, (time, each) in enumerate(poses):
-        table.writerow(row(Tracked(i, Frame(time, None, ""), each, 0.0, {})))
+    for i, (seconds, each) in enumerate(poses):
+        table.writerow(row(Tracked(i, Frame(seconds, None, ""), each, 0.0, {})))
     path.write_text(text.getvalue())
     return path
 

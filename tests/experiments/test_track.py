@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 import torch
 
-from holotorch.experiments import track
+from holotorch.experiments import track, track_source
 from holotorch.experiments.config_tracking import save_camera, save_catheter
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.run import deferred
-from holotorch.experiments.track import follow, run_tracking
-from holotorch.experiments.track_report import COLUMNS
+from holotorch.experiments.track import follow, live, run_tracking
+from holotorch.experiments.track_report import COLUMNS, Tracked
 from holotorch.io.files import write_bytes
 from holotorch.io.images import encode_png
 from holotorch.io.recording import is_recording, open_recording
-from holotorch.io.video import Frame, open_frames
-from holotorch.tracking import THESIS, Camera, Pose, Status
+from holotorch.io.video import Frame, Frames, open_frames
+from holotorch.tracking import THESIS, Camera, Catheter, Pose, Status
 from holotorch.tracking.world import World
 
 SIZE = (48, 64)
@@ -58,7 +58,7 @@ def tracker(monkeypatch, tmp_path):
     made = StandIn()
     save_camera(tmp_path / "camera.yaml", CAMERA, SIZE)
     save_catheter(tmp_path / "catheter.yaml", THESIS)
-    monkeypatch.setattr(track, "_tracker", lambda *_: made)
+    monkeypatch.setattr(track_source, "make_tracker", lambda *_: made)
     return made
 
 
@@ -176,7 +176,7 @@ def test_a_run_under_nohup_outlives_its_terminal(tmp_path, tracker, monkeypatch,
         signal.raise_signal(hangup)
         return tracker(frames, previous)
 
-    monkeypatch.setattr(track, "_tracker", lambda *_: pressed)
+    monkeypatch.setattr(track_source, "make_tracker", lambda *_: pressed)
     signal.signal(hangup, signal.SIG_IGN)
     folder, complete = tracked(tmp_path, pictures(tmp_path / "in", [9, 12]), video=False)
     assert complete and len(read(folder)) == 2 and signal.getsignal(hangup) is signal.SIG_IGN
@@ -192,7 +192,7 @@ def test_interrupted_tracking_keeps_what_was_found(tmp_path, tracker, monkeypatc
             signal.raise_signal(getattr(signal, name))
         return tracker(frames, previous)
 
-    monkeypatch.setattr(track, "_tracker", lambda *_: pressed)
+    monkeypatch.setattr(track_source, "make_tracker", lambda *_: pressed)
     folder, complete = tracked(tmp_path, pictures(tmp_path / "in", [9, 12, 15, 18]), record=True)
     assert not complete and len(read(folder)) == 2 and not (folder / "summary.json").exists()
     assert summary(folder, "interrupted.json")["frames"] == 2
@@ -215,7 +215,7 @@ def test_a_second_signal_loses_nothing(tmp_path, tracker, monkeypatch):
             signal.raise_signal(signal.SIGTERM)
         return deferred(noted)
 
-    monkeypatch.setattr(track, "_tracker", lambda *_: pressed)
+    monkeypatch.setattr(track_source, "make_tracker", lambda *_: pressed)
     monkeypatch.setattr(track, "deferred", late)
     folder, complete = tracked(tmp_path, pictures(tmp_path / "in", [9, 12, 15, 18]))
     assert not complete and len(read(folder)) == 2 and summary(folder, "interrupted.json")["frames"] == 2
@@ -227,7 +227,7 @@ def test_a_tracker_that_fails_loses_nothing(tmp_path, tracker, monkeypatch):
             raise RuntimeError("no convergence")
         return tracker(frames, previous)
 
-    monkeypatch.setattr(track, "_tracker", lambda *_: failing)
+    monkeypatch.setattr(track_source, "make_tracker", lambda *_: failing)
     with pytest.raises(RuntimeError, match="no convergence"):
         tracked(tmp_path, pictures(tmp_path / "in", [9, 99, 12]))
     assert len(read(tmp_path / "out")) == 1
@@ -315,6 +315,59 @@ def test_bad_input_is_refused_before_anything_is_written(tmp_path, tracker, opti
     with pytest.raises(ConfigError, match=message):
         run_tracking(**given)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(("method", "message"), [("ours", "colours"), ("thesis", "use CatheterTracker")])
+def test_a_catheter_that_no_tracker_sees_is_refused_before_anything_is_written(tmp_path, method, message):
+    greys = ((30, 30, 30), (128, 128, 128), (230, 230, 230))
+    save_camera(tmp_path / "camera.yaml", CAMERA, SIZE)
+    save_catheter(tmp_path / "catheter.yaml", Catheter(THESIS.edges, greys, THESIS.radius, THESIS.length))
+    source = pictures(tmp_path / "in", [9])
+    with pytest.raises(ConfigError, match=message):
+        tracked(tmp_path, source, method=method)
+    assert not (tmp_path / "out").exists()
+    if method == "ours":
+        with pytest.raises(ConfigError, match=message):
+            list(live([str(source)], tmp_path / "camera.yaml", tmp_path / "catheter.yaml"))
+
+
+def test_ctrl_c_before_the_first_frame_leaves_nothing(tmp_path, tracker, monkeypatch):
+    monkeypatch.setattr(track, "environment", lambda *_: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        tracked(tmp_path, pictures(tmp_path / "in", [9]), record=True)
+    assert not (tmp_path / "out").exists()
+
+
+def test_live_poses_of_a_folder_come_with_its_notes_and_at_the_rate_asked_for(tmp_path, tracker, capsys):
+    source = pictures(tmp_path / "in", [9, 0, 12])
+    double = Camera(torch.tensor([[120.0, 0, 64], [0, 120, 48], [0, 0, 1]]), torch.zeros(5))
+    save_camera(tmp_path / "double.yaml", double)  # says no size
+    files = tmp_path / "double.yaml", tmp_path / "catheter.yaml"
+    found = list(live([str(source)], *files, 4.0))
+    # Multiples of 2.4e-7 s, the spacing of numbers near 1.7e9.
+    assert [time - found[0][0] for time, _ in found] == pytest.approx([0, 0.25, 0.5], abs=1e-6)
+    assert [pose.status.name for _, pose in found if isinstance(pose.status, Status)] == ["OK", "NO_CATHETER", "OK"]
+    assert "calibrated at another resolution" in capsys.readouterr().out
+    with pytest.raises(ConfigError, match="expected one source to track and stream, got 2"):
+        list(live(["a.mp4", "b.mp4"], *files))
+
+
+def test_live_poses_of_a_recording_need_no_other_files(tmp_path, tracker):
+    folder, _ = tracked(tmp_path, pictures(tmp_path / "in", [9, 12]), record=True, video=False)
+    assert [float(pose.tip[0]) for _, pose in live([str(folder / "recording")], None, None)] == [9 / 3e3, 12 / 3e3]
+
+
+def test_a_live_pose_has_the_time_of_its_frame_not_of_its_tracking(tmp_path, tracker, monkeypatch):
+    camera = Frames("camera 0", SIZE, None, 30.0, iter([Frame(7.0, grey(9)), Frame(7.5, grey(12))]), [], live=True)
+    monkeypatch.setattr(track_source, "open_frames", lambda *_: camera)
+    monkeypatch.setattr(track, "now", lambda: 100.0)
+
+    def slow(frames, tracker):
+        return (Tracked(i, frame, tracker(frame.pixels[None])[0], 0.25 + i, {}) for i, frame in enumerate(frames))
+
+    monkeypatch.setattr(track, "follow", slow)
+    found = list(live(["0"], tmp_path / "camera.yaml", tmp_path / "catheter.yaml"))
+    assert [captured for captured, _ in found] == [99.75, 98.75]
 
 
 def test_intrinsics_of_another_resolution_are_noticed(tmp_path, tracker):
