@@ -12,7 +12,7 @@ import torch
 
 from holotorch.experiments.errors import ConfigError
 from holotorch.tracking.igtl import TransformServer
-from holotorch.tracking.packet import now
+from holotorch.tracking.packet import PosePacket, encode, now
 from holotorch.tracking.smoothing import OneEuro
 from holotorch.tracking.status import Pose, Status
 from holotorch.tracking.stream import PORT, PoseReceiver, PoseSender
@@ -28,7 +28,7 @@ def read_poses(path: Path) -> list[tuple[float, Pose]]:
     The table has no covariance of the direction. It becomes 1 along each axis: a unit vector that is not known at all.
 
     Raises:
-        ConfigError: Not such a file, a line that cannot be read, or times that do not rise.
+        ConfigError: Not such a file, a line that cannot be read or sent, or times that do not rise.
     """
     try:
         with open(path, newline="", encoding="utf-8") as stream:
@@ -51,6 +51,8 @@ def read_poses(path: Path) -> list[tuple[float, Pose]]:
 
 
 def _pose(row: dict[str, str]) -> tuple[float, Pose]:
+    if None in row.values():
+        raise ValueError("the line is cut off")
     captured, status, reason = float(row["time_s"]), Status[row["status"]], row["reason"]
     if not math.isfinite(captured):
         raise ValueError(f"time_s is {captured}")
@@ -62,7 +64,9 @@ def _pose(row: dict[str, str]) -> tuple[float, Pose]:
     covariance, upper = torch.eye(6, dtype=torch.float64), torch.triu_indices(3, 3)
     covariance[upper[0], upper[1]] = covariance[upper[1], upper[0]] = values[6:]
     chi, freedom = torch.tensor([float(row[name]) for name in _COLUMNS[-2:]], dtype=torch.float64)
-    return captured, Pose(values[:3], values[3:6], covariance, chi, freedom, status, reason)
+    pose = Pose(values[:3], values[3:6], covariance, chi, freedom, status, reason)
+    encode(PosePacket(pose, 0.0, 0.0, 0))  # what cannot be sent is said now, with its line
+    return captured, pose
 
 
 def replay(poses: Sequence[tuple[float, Pose]], rate: float | None = None) -> Iterator[tuple[float, Pose]]:

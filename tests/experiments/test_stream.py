@@ -73,6 +73,9 @@ def test_what_is_wrong_in_a_file_is_said_with_its_line(tmp_path):
     refused("poses.csv:2: .* could not convert", lines[0], lines[1].replace("0.6", "left"))
     refused("poses.csv:2: .* not all its numbers are finite", lines[0], lines[1].replace("0.6", "nan"))
     refused("poses.csv:2: cannot be read", lines[0], "10.0,OK,1")
+    refused("poses.csv:3: .* the line is cut off", *lines[:2], lines[2][: lines[2].index("bands")])
+    refused("poses.csv:2: .* a unit direction", lines[0], lines[1].replace("0.6", "0.5"))
+    refused("poses.csv:2: .* within 100 m", lines[0], lines[1].replace(",0.1,", ",100.1,"))
     with pytest.raises(ConfigError, match="No such file"):
         read_poses(tmp_path / "none.csv")
     path.write_bytes(b"\xff\xfe\x00")
