@@ -71,6 +71,7 @@ class TransformServer:
 
     Raises:
         ImportError: pyigtl is not installed.
+        OSError: The port is in use; when it is opened.
     """
 
     def __init__(self, port: int = PORT, *, host: str = "0.0.0.0", name: str = "ToolToCamera"):

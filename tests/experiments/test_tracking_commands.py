@@ -193,6 +193,12 @@ def test_stream_with_nobody_and_nothing_to_send(capsys):
     assert "expected HOST:PORT" in said(capsys, "stream", "poses.csv", "--to", "127.0.0.1:99999")
 
 
+def test_ports_that_are_none(capsys):
+    for words in (["--view", "--port", "65536"], ["--check", "--port", "-1"], ["poses.csv", "--igtl", "99999"]):
+        error = wrong(capsys, "stream", *words)
+        assert f"expected a port from 0 (any that is free) to 65535, got '{words[-1]}'" in error
+
+
 def test_stream_of_a_video_takes_a_camera_and_a_catheter(capsys):
     cv2.imwrite("0.png", np.zeros((1080, 1920, 3), np.uint8))
     to = ["--to", "127.0.0.1:1"]
