@@ -57,6 +57,7 @@ _LENGTHS = {
 }
 _UPPER = torch.triu_indices(6, 6)
 _FARTHEST = 100.0  # metres; a tip farther off was given in another unit
+_LONGEST = torch.finfo(torch.float32).max  # seconds of lag
 _START = time.time() - time.perf_counter()
 
 
@@ -116,6 +117,7 @@ class Echo:
 def encode(packet: PosePacket | Echo) -> bytes:
     """Bytes of a packet; ValueError for what :func:`decode` would refuse, TypeError for a batch of poses."""
     if isinstance(packet, Echo):
+        _fits(64, stream=packet.stream, number=packet.number)
         head = _HEAD.pack(_MAGIC, VERSION, REPLY if packet.reply else ASK, 0, packet.stream, packet.number)
         return _sealed(head + _STAMPS.pack(packet.asked, packet.heard, packet.answered))
     pose = packet.pose
@@ -136,6 +138,10 @@ def encode(packet: PosePacket | Echo) -> bytes:
     frame = packet.frame.encode("ascii", "replace")
     if not 1 <= len(frame) <= 32 or not packet.frame.isascii() or not packet.frame.isprintable():
         raise ValueError(f"frame must be 1 to 32 printable ASCII characters, got {packet.frame!r}")
+    _fits(64, stream=packet.stream, sequence=packet.sequence)
+    _fits(16, freedom=freedom)
+    if not abs(packet.lag) <= _LONGEST:
+        raise ValueError(f"lag must be finite and not negative, in seconds, got {packet.lag}")
     wrong = _mistake(status, matrix, covariance, chi_square, freedom, (packet.captured, packet.sent, packet.lag))
     if wrong:
         raise ValueError(wrong)
@@ -218,6 +224,12 @@ def _mistake(status: Status, matrix: Tensor, upper: Tensor, chi: float, freedom:
     if bool((upper[_UPPER[0] == _UPPER[1]] < 0).any()):
         return "the covariance must not be negative on its diagonal"
     return ""
+
+
+def _fits(bits: int, **fields: int) -> None:
+    for name, value in fields.items():
+        if not 0 <= value < 2**bits:
+            raise ValueError(f"{name} must be a whole number from 0 to {2**bits - 1}, got {value}")
 
 
 def _sealed(data: bytes) -> bytes:

@@ -167,6 +167,18 @@ def test_what_cannot_be_sent_is_refused_before():
         encode(packet(pose(tip=(10.0, 20.0, 520.0))))
     with pytest.raises(ValueError, match="finite matrix"):
         encode(packet(pose(tip=(math.nan, 0.0, 0.5))))
+    for wrong, name in (
+        (packet(sequence=-1), "sequence"),
+        (packet(stream=2**64), "stream"),
+        (packet(lag=1e39), "lag"),
+        (packet(lag=math.nan), "lag"),
+        (packet(replace(pose(), freedom=torch.tensor(-1.0))), "freedom"),
+        (packet(replace(pose(), freedom=torch.tensor(70000.0))), "freedom"),
+        (Echo(1, -1, 0.0), "number"),
+        (Echo(2**64, 1, 0.0), "stream"),
+    ):
+        with pytest.raises(ValueError, match=f"^{name} must be"):
+            encode(wrong)
     both = replace(pose(), tip=torch.zeros(2, 3, dtype=torch.float64))
     with pytest.raises(TypeError, match="index the batch"):
         encode(packet(both))
