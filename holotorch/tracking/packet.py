@@ -25,7 +25,7 @@ offset bytes type     meaning
 216    168   float64  covariance of (tip, direction) in m^2, m and 1: upper triangle of 6 x 6, row by row, 21 numbers;
                       NaN where refused
 384    8     float64  chi-square
-392    64    bytes    reason, UTF-8, cut at 64 bytes, filled with zeros; empty when OK
+392    64    bytes    reason, UTF-8, printable characters, cut at 64 bytes, filled with zeros; empty when OK
 456    4     uint32   CRC-32 (IEEE 802.3, zlib's) of all bytes before it
 ====== ===== ======== =================================================================================================
 
@@ -153,11 +153,11 @@ def encode(packet: PosePacket | Echo) -> bytes:
 
 
 def decode(data: bytes) -> PosePacket | Echo:
-    """What :func:`encode` was given, float64 on the CPU; a reason longer than 64 bytes comes back cut.
+    """What :func:`encode` was given, float64 on the CPU; a reason comes back cut at 64 bytes, with spaces for controls.
 
     Raises:
         PacketError: Another magic, version, kind, length or CRC, other axes, unit or order, an unknown status, a pose
-            that is NaN or impossible, or a refusal that carries a pose.
+            that is NaN or impossible, a refusal that carries a pose, or a reason that would command a terminal.
     """
     if len(data) < _HEAD.size or data[:4] != _MAGIC:
         raise PacketError(f"not a pose packet: {len(data)} bytes beginning with {bytes(data[:4])!r}, not {_MAGIC!r}")
@@ -190,8 +190,8 @@ def _pose_packet(fields: tuple, flags: int, stream: int, sequence: int) -> PoseP
         reason = fields[47].rstrip(b"\0").decode("utf-8")
     except ValueError as error:
         raise PacketError(f"status, frame name or reason cannot be read: {error}") from None
-    if not name or not name.isprintable():
-        raise PacketError(f"the frame name must be printable, got {name!r}")
+    if not name or not name.isprintable() or not reason.isprintable():
+        raise PacketError(f"frame name and reason must be printable, got {name!r} and {reason!r}")
     if bool(flags & 1) != status.answered:
         raise PacketError(f"flags {flags} do not fit the status {status.name}")
     matrix = torch.tensor(fields[9:25], dtype=torch.float64).reshape(4, 4)
@@ -237,5 +237,6 @@ def _sealed(data: bytes) -> bytes:
 
 
 def _cut(text: str, size: int) -> bytes:
-    """UTF-8 without zeros, cut between characters."""
-    return text.replace("\0", " ").encode("utf-8", "replace")[:size].decode("utf-8", "ignore").encode()
+    """UTF-8 that can be printed, cut between characters."""
+    printable = "".join(each if each.isprintable() else " " for each in text)
+    return printable.encode()[:size].decode("utf-8", "ignore").encode()
