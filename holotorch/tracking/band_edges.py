@@ -205,7 +205,8 @@ def _constraints(known: Sequence[int | tuple[int, int]], positions: Tensor, rest
     rows = positions.new_zeros(len(known), count)
     for row, entry in zip(rows, known, strict=True):
         ends = entry if isinstance(entry, tuple) else (entry,)
-        if len(ends) > 2 or len(set(ends)) < len(ends) or not all(isinstance(i, int) and 0 <= i < count for i in ends):
+        fitting = len(ends) in (1, 2) and len(set(ends)) == len(ends)
+        if not fitting or not all(isinstance(i, int) and 0 <= i < count for i in ends):
             raise ValueError(f"known must hold edges 0 to {count - 1} or pairs of different ones, got {entry!r}")
         row[ends[-1]] = 1.0
         if len(ends) == 2:
