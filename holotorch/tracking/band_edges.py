@@ -9,7 +9,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.tracking.camera import Camera
-from holotorch.tracking.pose import solve_pose
+from holotorch.tracking.pose import _weights, solve_pose
 
 _FEWEST = 5  # frames
 _SAME_DIRECTION = math.radians(10)
@@ -86,7 +86,10 @@ def fit_band_edges(
         raise ValueError(f"no pose found in the frames {lost[:10]}: leave them out, or correct the nominal positions")
     _check_directions(poses.direction)
     plane = camera.undistort(pixels).detach()
-    problem = _Problem(plane, _weights(plane, along_px, across_px, camera), free, resting_tip, offset)
+    seen = torch.ones_like(plane[..., 0], dtype=torch.bool)
+    deviations = plane.new_tensor([along_px, across_px]).expand_as(plane)
+    weights = _weights(pixels, plane, seen, deviations, camera).detach()
+    problem = _Problem(plane, weights, free, resting_tip, offset)
     tip = poses.tip.mean(0).expand_as(poses.tip) if resting_tip else poses.tip
     state, chi_square, information = problem.solve((tip.detach(), poses.direction.detach(), start))
     freedom = 2 * plane.shape[0] * plane.shape[1] - problem.unknowns
@@ -239,12 +242,3 @@ def _check_directions(directions: Tensor) -> None:
             f"the catheter is parallel to itself within {math.degrees(spread):.1f} degrees in all frames, so that "
             "every frame has the same faults; tilt it toward the camera and away from it by 20 to 45 degrees"
         )
-
-
-def _weights(plane: Tensor, along_px: float, across_px: float, camera: Camera) -> Tensor:
-    """[F, N, 2, 2]: differences on the plane z = 1 to (along, across) over their deviations."""
-    sizes = [checks.positive(name, v, "pixels") for name, v in (("along_px", along_px), ("across_px", across_px))]
-    offsets = plane - plane.mean(1, keepdim=True)
-    frame = torch.linalg.eigh(offsets.mT @ offsets).eigenvectors.flip(-1).mT
-    scale = camera.matrix.detach().diagonal()[:2].mean().to(plane.device)
-    return (scale / plane.new_tensor(sizes)[:, None] * frame)[:, None].expand(*plane.shape[:2], 2, 2)
