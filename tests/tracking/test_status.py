@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -62,7 +64,7 @@ def test_points_deviations_and_members():
     torch.testing.assert_close(pose.point(0.1)[1], torch.tensor([0.2, -0.2, 0.5]).double())
     torch.testing.assert_close(pose.point(torch.tensor([0.1, 0.2]))[0], torch.tensor([0.1, -0.2, 0.6]).double())
     assert float(pose.point(0.1)[0, 2]) == 0.6  # 0.1 in float64, not in float32
-    elsewhere = Pose(*(value.to("meta") for value in (pose.tip, pose.direction, *[pose.covariance] * 3)), pose.status)
+    elsewhere = replace(pose, tip=pose.tip.to("meta"), direction=pose.direction.to("meta"))
     assert elsewhere.point(0.1).device == elsewhere.point(torch.tensor([0.1, 0.2])).device == torch.device("meta")
     assert len(pose) == 2 and len(pose[0]) == 1 and pose[1].answered
     assert list(pose[0])[0].tip.tolist() == pose[0].tip.tolist() and len(list(pose[0])) == 1
