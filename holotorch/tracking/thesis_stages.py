@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from holotorch.tracking.catheter import Catheter
-from holotorch.tracking.status import Status
+from holotorch.tracking.status import Pose, Status
 
 # The rows of Table 3.1, in its order and words. The median belongs to "Gradient", the binary image to "Connected
 # components"; "Other" is what the call takes beyond the stages.
@@ -52,7 +52,7 @@ REFUSED_AT = {
     Status.INCONSISTENT: "Calculate catheter position",
 }
 
-
+Box = tuple[int, int, int, int]  # left, top, right, bottom; the last two are not part of it
 Endpoints = list[tuple[float, float] | None]
 
 
@@ -196,6 +196,40 @@ def endpoints(axis: Axis, centroids: Sequence[tuple[float, float]]) -> Endpoints
 def triples(found: Endpoints) -> list[int]:
     """First edges of the pairs of neighbouring bands whose three endpoints were found."""
     return [i for i in range(len(found) - 2) if None not in found[i : i + 3]]
+
+
+def box(first: Sequence[int], last: Sequence[int], size: tuple[int, int]) -> Box:
+    """Box around the pixels from ``first`` (x, y) to ``last`` with its margin, within a frame of ``size`` (W, H)."""
+    left, top = (max(low - MARGIN_PX, 0) for low in first)
+    right, bottom = (min(high + MARGIN_PX + 1, side) for high, side in zip(last, size, strict=True))
+    return left, top, right, bottom
+
+
+def nudged(found: Endpoints) -> np.ndarray:
+    """Endpoints as float64 [1 + 2 n, n, 2], NaN for None: as they are, then with each number moved by ``NUDGE_PX``."""
+    edges = np.array([spot or (np.nan, np.nan) for spot in found])
+    nudges = np.concatenate([np.zeros((1, edges.size)), NUDGE_PX * np.eye(edges.size)])
+    return edges + nudges.reshape(-1, *edges.shape)
+
+
+def answer(found: Endpoints, tip: np.ndarray, direction: np.ndarray, device: torch.device | None = None) -> Pose:
+    """Pose from the tips and directions [1 + 2 n, 3] of the :func:`nudged` endpoints; refuses what is none."""
+    both = np.concatenate([tip, direction], -1)
+    slopes = (both[1:] - both[0]).T / NUDGE_PX
+    covariance = DEVIATION_PX**2 * slopes @ slopes.T
+    if not np.isfinite(covariance).all() or not np.isfinite(both).all() or tip[0, 2] <= 0:
+        raise Refused(Status.INCONSISTENT, NO_POSE)
+    missing = [str(edge + 1) for edge, spot in enumerate(found) if spot is None]
+    zero = torch.zeros((), dtype=torch.float64, device=device)
+    return Pose(
+        tip=torch.from_numpy(tip[0].copy()).to(device),
+        direction=torch.from_numpy(direction[0].copy()).to(device),
+        covariance=torch.from_numpy(covariance).to(device),
+        chi_square=zero,
+        freedom=zero,
+        status=Status.UNVERIFIED if missing else Status.OK,
+        reason=missing_edges(missing),
+    )
 
 
 class Stopwatch:
