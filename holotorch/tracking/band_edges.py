@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.tracking.alignment import widest_angle
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.pose import _weights, solve_pose
 
@@ -235,8 +236,7 @@ def _constraints(known: Sequence[int | tuple[int, int]], positions: Tensor, rest
 
 
 def _check_directions(directions: Tensor) -> None:
-    crossed = torch.linalg.cross(*torch.broadcast_tensors(directions[:, None], directions[None])).norm(dim=-1)
-    spread = float(torch.atan2(crossed, (directions @ directions.mT).abs()).max())
+    spread = widest_angle(directions)
     if spread < _SAME_DIRECTION:
         raise ValueError(
             f"the catheter is parallel to itself within {math.degrees(spread):.1f} degrees in all frames, so that "
