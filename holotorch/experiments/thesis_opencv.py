@@ -9,8 +9,9 @@ from torch import Tensor
 from holotorch.tracking import thesis_stages as stages
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import Catheter
+from holotorch.tracking.measure import Refusal
 from holotorch.tracking.status import Pose
-from holotorch.tracking.thesis_stages import Axis, Box, Endpoints, Refused, Stopwatch
+from holotorch.tracking.thesis_stages import Axis, Box, Endpoints, Stopwatch
 
 
 class ThesisOpenCV:
@@ -62,7 +63,7 @@ class ThesisOpenCV:
             self.endpoints.append([])
             try:
                 poses.append(self._track(frame, watch))
-            except Refused as refused:
+            except Refusal as refused:
                 watch.lap(stages.REFUSED_AT.get(refused.status, "Get axis"))
                 poses.append(Pose.refused(refused.status, refused.reason))
         self.times = watch.stop()

@@ -11,9 +11,10 @@ from torch import Tensor
 from holotorch.tracking import thesis_stages as stages
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import Catheter
+from holotorch.tracking.measure import Refusal
 from holotorch.tracking.pose import closed_form
 from holotorch.tracking.status import Pose
-from holotorch.tracking.thesis_stages import Axis, Box, Endpoints, Refused, Stopwatch
+from holotorch.tracking.thesis_stages import Axis, Box, Endpoints, Stopwatch
 
 
 class ThesisTracker:
@@ -71,7 +72,7 @@ class ThesisTracker:
         for item in range(len(frames)):
             try:
                 axes[item] = self._axis(solid[item, 0], bands[item, 0])
-            except Refused as refused:
+            except Refusal as refused:
                 poses[item] = Pose.refused(refused.status, refused.reason)
         watch.lap("Get axis")
         if axes:
@@ -87,7 +88,7 @@ class ThesisTracker:
                 try:
                     self.endpoints[item] = stages.endpoints(axis, found[item])
                     poses[item] = self._pose(self.endpoints[item], frames.device)
-                except Refused as refused:
+                except Refusal as refused:
                     poses[item] = Pose.refused(refused.status, refused.reason)
             watch.lap("Calculate catheter position")
         self.times = watch.stop()

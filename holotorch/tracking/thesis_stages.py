@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from holotorch.tracking.catheter import Catheter
+from holotorch.tracking.measure import Refusal
 from holotorch.tracking.status import Pose, Status
 
 # The rows of Table 3.1, in its order and words. The median belongs to "Gradient", the binary image to "Connected
@@ -54,14 +55,6 @@ REFUSED_AT = {
 
 Box = tuple[int, int, int, int]  # left, top, right, bottom; the last two are not part of it
 Endpoints = list[tuple[float, float] | None]
-
-
-class Refused(Exception):
-    """Ends the work on one frame; holds the status and the sentence that its pose will carry."""
-
-    def __init__(self, status: Status, reason: str):
-        super().__init__(reason)
-        self.status, self.reason = status, reason
 
 
 @dataclass(frozen=True)
@@ -145,13 +138,13 @@ def missing_edges(names: Sequence[str]) -> str:
 def need_pixels(count: int) -> None:
     """Refuse a frame with fewer pixels of the bands' colours than a line can be fitted to."""
     if count < LEAST_PIXELS:
-        raise Refused(Status.NO_CATHETER, f"{count} pixels have a band's colour after the erosion, not {LEAST_PIXELS}")
+        raise Refusal(Status.NO_CATHETER, f"{count} pixels have a band's colour after the erosion, not {LEAST_PIXELS}")
 
 
 def need_line(count: int, kept: int, rms_px: float) -> None:
     """Refuse pixels that are no line: ``kept`` of ``count`` near the axis, ``rms_px`` from it."""
     if kept < max(LEAST_PIXELS, AXIS_SHARE * count) or not rms_px <= AXIS_RMS_PX:
-        raise Refused(
+        raise Refusal(
             Status.NO_AXIS,
             f"the pixels of the bands' colours are no line: {kept} of {count} near the axis, {rms_px:.1f} px rms",
         )
@@ -162,9 +155,9 @@ def need_order(axis: Axis) -> None:
     seen = [(i, extent[0] + extent[1]) for i, extent in enumerate(axis.extents) if extent is not None]
     names = ", ".join(str(i + 1) for i, _ in seen) or "none"
     if not any(b[0] == a[0] + 1 for a, b in zip(seen, seen[1:], strict=False)):
-        raise Refused(Status.BANDS_MISSING, f"two neighbouring bands are needed, of {len(axis.extents)} seen: {names}")
+        raise Refusal(Status.BANDS_MISSING, f"two neighbouring bands are needed, of {len(axis.extents)} seen: {names}")
     if len({b[1] > a[1] for a, b in zip(seen, seen[1:], strict=False)}) == 2:
-        raise Refused(Status.BANDS_MISSING, "the colours along the axis are not in the catheter's order")
+        raise Refusal(Status.BANDS_MISSING, "the colours along the axis are not in the catheter's order")
 
 
 def endpoints(axis: Axis, centroids: Sequence[tuple[float, float]]) -> Endpoints:
@@ -189,7 +182,7 @@ def endpoints(axis: Axis, centroids: Sequence[tuple[float, float]]) -> Endpoints
                 found[-1] = spot
     if not triples(found):
         names = ", ".join(str(i + 1) for i, spot in enumerate(found) if spot is not None) or "none"
-        raise Refused(Status.EDGES_UNCLEAR, f"three neighbouring edges of the bands are needed, found: {names}")
+        raise Refusal(Status.EDGES_UNCLEAR, f"three neighbouring edges of the bands are needed, found: {names}")
     return found
 
 
@@ -218,7 +211,7 @@ def answer(found: Endpoints, tip: np.ndarray, direction: np.ndarray, device: tor
     slopes = (both[1:] - both[0]).T / NUDGE_PX
     covariance = DEVIATION_PX**2 * slopes @ slopes.T
     if not np.isfinite(covariance).all() or not np.isfinite(both).all() or tip[0, 2] <= 0:
-        raise Refused(Status.INCONSISTENT, NO_POSE)
+        raise Refusal(Status.INCONSISTENT, NO_POSE)
     missing = [str(edge + 1) for edge, spot in enumerate(found) if spot is None]
     zero = torch.zeros((), dtype=torch.float64, device=device)
     return Pose(
