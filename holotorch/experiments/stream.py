@@ -11,14 +11,14 @@ from pathlib import Path
 import torch
 
 from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.track_report import COLUMNS
 from holotorch.tracking.igtl import TransformServer
 from holotorch.tracking.packet import PosePacket, encode, now
 from holotorch.tracking.smoothing import OneEuro
 from holotorch.tracking.status import Pose, Status
 from holotorch.tracking.stream import PORT, PoseReceiver, PoseSender
 
-_PLACE = ("tip_x_m", "tip_y_m", "tip_z_m", "direction_x", "direction_y", "direction_z")
-_SPREAD = ("cov_xx_m2", "cov_xy_m2", "cov_xz_m2", "cov_yy_m2", "cov_yz_m2", "cov_zz_m2")
+_PLACE, _SPREAD = COLUMNS[5:11], COLUMNS[11:17]  # tip and direction; covariance of the tip
 _COLUMNS = ("time_s", "status", "reason", *_PLACE, *_SPREAD, "chi_square", "freedom")
 
 
