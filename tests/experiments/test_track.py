@@ -1,91 +1,22 @@
-"""Tracking a source with a stand-in tracker, which knows the tip from the grey level of a frame."""
+"""Tracking a source with a stand-in tracker, as a run and live."""
 
-import csv
-import json
 import math
-import signal
-from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 import torch
+from stand_in import CAMERA, SIZE, StandIn, grey, pictures, read, summary, tracked
 
 from holotorch.experiments import track, track_source
 from holotorch.experiments.config_tracking import save_camera, save_catheter
 from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.run import deferred
 from holotorch.experiments.track import follow, live, run_tracking
 from holotorch.experiments.track_report import COLUMNS, Tracked
 from holotorch.io.files import write_bytes
 from holotorch.io.images import encode_png
 from holotorch.io.recording import is_recording, open_recording
 from holotorch.io.video import Frame, Frames, open_frames
-from holotorch.tracking import THESIS, Camera, Catheter, Pose, Status
+from holotorch.tracking import THESIS, Camera, Catheter, Status
 from holotorch.tracking.world import World
-
-SIZE = (48, 64)
-CAMERA = Camera(torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), torch.zeros(5))
-DIRECTION = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
-
-
-def grey(level: int) -> torch.Tensor:
-    return torch.full((3, *SIZE), level, dtype=torch.uint8)
-
-
-class StandIn:
-    """Refuses black frames; the tip of others lies ``level`` / 3 mm to the right."""
-
-    def __init__(self):
-        self.previous: list = []
-        self.times = {"colour": 2e-3, "edges": 6e-3}
-
-    def __call__(self, frames, previous=None):
-        assert frames.shape == (1, 3, *SIZE) and frames.dtype == torch.uint8
-        self.previous.append(previous)
-        level = int(frames[0, 0, 0, 0])
-        if level == 0:
-            return [Pose.refused(Status.NO_CATHETER, "nothing of the bands' colours, thin and long")]
-        tip = torch.tensor([level / 3e3, 0.0, 0.5], dtype=torch.float64)
-        covariance = torch.diag(torch.tensor([1.0, 2, 3, 4, 5, 6], dtype=torch.float64)) * 1e-8
-        covariance[0, 2] = covariance[2, 0] = 1e-9 / 3
-        one = torch.ones((), dtype=torch.float64)
-        return [Pose(tip, DIRECTION, covariance, one / 7, one, Status.OK)]
-
-
-@pytest.fixture
-def tracker(monkeypatch, tmp_path):
-    made = StandIn()
-    save_camera(tmp_path / "camera.yaml", CAMERA, SIZE)
-    save_catheter(tmp_path / "catheter.yaml", THESIS)
-    monkeypatch.setattr(track_source, "make_tracker", lambda *_: made)
-    return made
-
-
-def pictures(folder: Path, levels: list[int | None]) -> Path:
-    """A folder of pictures; None is one that cannot be read."""
-    folder.mkdir()
-    for number, level in enumerate(levels):
-        path = folder / f"{number}.png"
-        if level is None:
-            path.write_bytes(b"\x89PNG cut off")
-        else:
-            cv2.imwrite(str(path), np.full((*SIZE, 3), level, np.uint8))
-    return folder
-
-
-def tracked(tmp_path: Path, source, name: str = "out", **options) -> tuple[Path, bool]:
-    files = tmp_path / "camera.yaml", tmp_path / "catheter.yaml"
-    return run_tracking(source, *files, tmp_path / name, **options)
-
-
-def read(folder: Path) -> list[dict[str, str]]:
-    with open(folder / "poses.csv", newline="", encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))
-
-
-def summary(folder: Path, name: str = "summary.json"):
-    return json.loads((folder / name).read_text())
 
 
 def test_every_frame_gets_a_pose_or_a_reason(tmp_path, tracker):
@@ -156,145 +87,6 @@ def test_a_recording_replays_to_the_same_poses(tmp_path, tracker, capsys):
     assert first == second
 
 
-@pytest.fixture
-def hangup():
-    """SIGHUP, handled as in a program that a terminal has started, whatever this test was started by."""
-    number = getattr(signal, "SIGHUP", None)
-    if number is None:
-        pytest.skip("this system has no terminals that hang up")
-
-    def died(*_):
-        raise AssertionError("SIGHUP would have ended the process")
-
-    before = signal.signal(number, died)
-    yield number
-    signal.signal(number, before)
-
-
-def test_a_run_under_nohup_outlives_its_terminal(tmp_path, tracker, monkeypatch, hangup):
-    def pressed(frames, previous=None):
-        signal.raise_signal(hangup)
-        return tracker(frames, previous)
-
-    monkeypatch.setattr(track_source, "make_tracker", lambda *_: pressed)
-    signal.signal(hangup, signal.SIG_IGN)
-    folder, complete = tracked(tmp_path, pictures(tmp_path / "in", [9, 12]), video=False)
-    assert complete and len(read(folder)) == 2 and signal.getsignal(hangup) is signal.SIG_IGN
-
-
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
-def test_interrupted_tracking_keeps_what_was_found(tmp_path, tracker, monkeypatch, hangup, name):
-    calls = []
-
-    def pressed(frames, previous=None):
-        calls.append(1)
-        if len(calls) == 3:
-            signal.raise_signal(getattr(signal, name))
-        return tracker(frames, previous)
-
-    monkeypatch.setattr(track_source, "make_tracker", lambda *_: pressed)
-    folder, complete = tracked(tmp_path, pictures(tmp_path / "in", [9, 12, 15, 18]), record=True)
-    assert not complete and len(read(folder)) == 2 and not (folder / "summary.json").exists()
-    assert summary(folder, "interrupted.json")["frames"] == 2
-    assert len(list(open_recording(folder / "recording"))) == 3  # kept before it is looked at
-    with open_frames(folder / "overlay.mp4") as drawn:
-        assert len(list(drawn)) == 2
-    assert not list(folder.glob(".*"))
-
-
-def test_a_second_signal_loses_nothing(tmp_path, tracker, monkeypatch):
-    """It comes after the first has ended the loop and before signals are held back for saving."""
-
-    def pressed(frames, previous=None):
-        if int(frames[0, 0, 0, 0]) == 15:
-            signal.raise_signal(signal.SIGINT)
-        return tracker(frames, previous)
-
-    def late(noted):
-        if len(noted) == 1:
-            signal.raise_signal(signal.SIGTERM)
-        return deferred(noted)
-
-    monkeypatch.setattr(track_source, "make_tracker", lambda *_: pressed)
-    monkeypatch.setattr(track, "deferred", late)
-    folder, complete = tracked(tmp_path, pictures(tmp_path / "in", [9, 12, 15, 18]))
-    assert not complete and len(read(folder)) == 2 and summary(folder, "interrupted.json")["frames"] == 2
-
-
-def test_a_tracker_that_fails_loses_nothing(tmp_path, tracker, monkeypatch):
-    def failing(frames, previous=None):
-        if int(frames[0, 0, 0, 0]) == 99:
-            raise RuntimeError("no convergence")
-        return tracker(frames, previous)
-
-    monkeypatch.setattr(track_source, "make_tracker", lambda *_: failing)
-    with pytest.raises(RuntimeError, match="no convergence"):
-        tracked(tmp_path, pictures(tmp_path / "in", [9, 99, 12]))
-    assert len(read(tmp_path / "out")) == 1
-    assert summary(tmp_path / "out", "interrupted.json")["failure"] == "RuntimeError: no convergence"
-    with pytest.raises(RuntimeError, match="no convergence"):
-        tracked(tmp_path, pictures(tmp_path / "in2", [99, 12]), "none")
-    assert not (tmp_path / "none").exists()
-
-
-def test_a_full_disk_leaves_the_poses_before_it(tmp_path, tracker, full_disk):
-    source = pictures(tmp_path / "in", [9] * 60)
-    with pytest.raises(OSError), full_disk(8000):
-        tracked(tmp_path, source, video=False)
-    rows = read(tmp_path / "out")
-    assert 10 < len(rows) < 60 and [int(row["frame"]) for row in rows] == list(range(len(rows)))
-    assert all(row["milliseconds"] for row in rows)
-    assert not list((tmp_path / "out").glob(".*"))
-
-
-def test_a_part_that_cannot_be_closed_takes_no_other_along(tmp_path, tracker, monkeypatch):
-    def broken(self):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(track.Recorder, "close", broken)
-    with pytest.raises(OSError, match="No space left"):
-        tracked(tmp_path, pictures(tmp_path / "in", [9, 12]), record=True)
-    assert len(read(tmp_path / "out")) == 2 and summary(tmp_path / "out", "interrupted.json")["frames"] == 2
-    with open_frames(tmp_path / "out" / "overlay.mp4") as drawn:
-        assert len(list(drawn)) == 2
-
-
-def test_ctrl_c_is_the_ordinary_end_of_a_camera(tmp_path, tracker, monkeypatch):
-    class Device:
-        """A camera that never ends, and a user who ends it."""
-
-        count = 0
-
-        def isOpened(self):  # noqa: N802
-            return True
-
-        def get(self, what):
-            return 1e3 + 33.0 * self.count if what == cv2.CAP_PROP_POS_MSEC else 0.0
-
-        def set(self, *_):
-            return True
-
-        def grab(self):
-            self.count += 1
-            if self.count == 5:
-                signal.raise_signal(signal.SIGINT)
-            return True
-
-        def retrieve(self):
-            return True, np.full((*SIZE, 3), self.count, np.uint8)
-
-        def read(self):
-            return self.retrieve() if self.grab() else (False, None)
-
-        def release(self):
-            pass
-
-    monkeypatch.setattr(cv2, "VideoCapture", lambda _: Device())
-    folder, complete = tracked(tmp_path, "0", video=False)
-    assert complete and summary(folder)["status"] == "complete"
-    assert [float(row["time_s"]) for row in read(folder)] == pytest.approx([1.033, 1.066, 1.099, 1.132])
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -329,13 +121,6 @@ def test_a_catheter_that_no_tracker_sees_is_refused_before_anything_is_written(t
     if method == "ours":
         with pytest.raises(ConfigError, match=message):
             list(live([str(source)], tmp_path / "camera.yaml", tmp_path / "catheter.yaml"))
-
-
-def test_ctrl_c_before_the_first_frame_leaves_nothing(tmp_path, tracker, monkeypatch):
-    monkeypatch.setattr(track, "environment", lambda *_: signal.raise_signal(signal.SIGINT))
-    with pytest.raises(KeyboardInterrupt):
-        tracked(tmp_path, pictures(tmp_path / "in", [9]), record=True)
-    assert not (tmp_path / "out").exists()
 
 
 def test_live_poses_of_a_folder_come_with_its_notes_and_at_the_rate_asked_for(tmp_path, tracker, capsys):
