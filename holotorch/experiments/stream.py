@@ -142,7 +142,7 @@ async def _send(
         server = await stack.enter_async_context(TransformServer(igtl)) if igtl is not None else None
         show(f"Sending    to {', '.join(f'{host}:{port}' for host, port in receivers) or 'OpenIGTLink clients'}")
         if server:
-            show(f"Slicer     connects to {' or '.join(own_addresses())}, port {server.port}")
+            show(f"Slicer     connects to {own_address()}, port {server.port}")
         try:
             # In a thread: a frame takes its time, and clock requests must not wait for it.
             while (item := await asyncio.to_thread(next, poses, None)) is not None:
@@ -177,7 +177,7 @@ def view(port: int = PORT, *, seconds: float = math.inf, show: Callable[[str], N
 async def _view(port: int, seconds: float, show: Callable[[str], None], state: list[PoseReceiver]) -> None:
     async with PoseReceiver(port) as receiver:
         state.append(receiver)
-        show(f"Listening  at {' or '.join(own_addresses())}, UDP port {receiver.port}")
+        show(f"Listening  at {own_address()}, UDP port {receiver.port}")
         end = now() + seconds
         while (left := end - now()) > 0:
             await asyncio.sleep(min(1.0, left))
@@ -228,12 +228,12 @@ def address(text: str) -> tuple[str, int]:
     return host, number if colon else PORT
 
 
-def own_addresses() -> list[str]:
-    """IPv4 addresses by which others may reach this computer; 127.0.0.1, for itself only, if there is no network."""
+def own_address() -> str:
+    """IPv4 address by which others may reach this computer; 127.0.0.1, for itself only, if there is no network."""
     with socket.socket(type=socket.SOCK_DGRAM) as probe:
         try:
             # Sends nothing: it asks which way a packet to elsewhere would leave (RFC 5737 keeps this address unused).
             probe.connect(("192.0.2.1", 9))
-            return [probe.getsockname()[0]]
+            return probe.getsockname()[0]
         except OSError:
-            return ["127.0.0.1"]
+            return "127.0.0.1"

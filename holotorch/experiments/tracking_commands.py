@@ -50,7 +50,7 @@ def _port(text: str) -> int:
 def _track(options: argparse.Namespace) -> int:
     from holotorch.experiments.track import run_tracking
 
-    source, truth = options.source, None
+    source = options.source
     if source == "synthetic":
         from holotorch.experiments.synthetic import write_synthetic
 
