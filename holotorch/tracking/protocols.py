@@ -39,8 +39,8 @@ class GridAccuracy(NamedTuple):
     """Errors in metres at the points of a grid; NaN where a number cannot be had.
 
     Attributes:
-        acc: Acc_f of Sec. 3.5.3: mean difference between the distances to the reference point, found and designed.
-            It does not see a constant bias, nor an error across the direction to the reference.
+        acc: Acc_f of Sec. 3.5.3: mean absolute difference between the distances to the reference point, found and
+            designed. It does not see a constant bias, nor an error across the direction to the reference.
         absolute: Median, 95th percentile and maximum of the distance from the true tip; NaN without the truth.
         rigid: The same after the rigid motion that fits the found points to the grid best.
         answered, refused: Points.
