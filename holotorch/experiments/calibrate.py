@@ -12,12 +12,12 @@ from holotorch.experiments.config_tracking import save_camera
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.settings import metres
 from holotorch.io.images import load_image, with_channels
+from holotorch.io.video import PICTURES
 from holotorch.tracking.boards import Charuco, Chessboard, View, describe_board, find_board
 from holotorch.tracking.calibration import PARAMETERS, Calibration, calibrate, enough
 
 BOARD = ("chessboard", "9x6", "25mm")
 _KINDS = "chessboard 9x6 25mm (inner corners, square) or charuco 5x7 40mm 20mm DICT_6X6_250 (squares, square, marker)"
-_PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 
 
 def calibrate_photographs(
@@ -129,15 +129,16 @@ def _listed(files: Sequence[Path]) -> list[Path]:
     paths: list[Path] = []
     for path in files:
         if path.is_dir():
-            inside = sorted(item for item in path.iterdir() if item.suffix.lower() in _PICTURES)
+            inside = sorted(item for item in path.iterdir() if item.suffix.lower() in PICTURES)
             if not inside:
-                raise ConfigError([f"{path}: no pictures in this folder ({', '.join(_PICTURES)})"])
+                raise ConfigError([f"{path}: no pictures in this folder ({', '.join(PICTURES)})"])
             paths += inside
         else:
             paths.append(path)
     if not paths:
         raise ConfigError(["no photographs given; expected files or folders of them"])
-    twice = {str(path) for path in paths if paths.count(path) > 1}
+    places = [path.resolve() for path in paths]
+    twice = {str(path) for path, place in zip(paths, places, strict=True) if places.count(place) > 1}
     if twice:
         # The same view again would lower the stated deviations without making the camera any surer.
         raise ConfigError([f"{path}: given twice" for path in sorted(twice)])

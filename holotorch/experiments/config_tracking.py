@@ -210,6 +210,6 @@ def _tried(source: Source, build: Any, settings: Settings) -> None:
 
 
 def _write(path: Path, words: str, settings: Settings) -> None:
-    data = settings.model_dump(mode="json", exclude_none=True, exclude_defaults=False)
+    data = settings.model_dump(mode="json", exclude_none=True)
     text = yaml.safe_dump(data, sort_keys=False, width=110, allow_unicode=True, default_flow_style=None)
     write_text(path, f"# {words}\n{text}")

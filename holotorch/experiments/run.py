@@ -182,12 +182,16 @@ def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
 
 @contextmanager
 def interruptible() -> Iterator[list[int]]:
-    """Let SIGTERM act as Ctrl-C, and note in the list that either has come."""
+    """Let SIGTERM and SIGHUP (a closed terminal) act as Ctrl-C, and note in the list which have come.
+
+    Only the first raises KeyboardInterrupt: another would come while what was found is being saved, and end that.
+    """
     pressed: list[int] = []
 
     def note(number: int, _: Any) -> None:
         pressed.append(number)
-        raise KeyboardInterrupt
+        if len(pressed) == 1:
+            raise KeyboardInterrupt
 
     with _handling(note):
         yield pressed
@@ -195,14 +199,17 @@ def interruptible() -> Iterator[list[int]]:
 
 @contextmanager
 def deferred(pressed: list[int]) -> Iterator[None]:
-    """Only note that Ctrl-C or SIGTERM has come."""
+    """Only note that one of the signals has come."""
     with _handling(lambda number, _: pressed.append(number)):
         yield
 
 
 @contextmanager
 def _handling(handler) -> Iterator[None]:
-    numbers = (signal.SIGINT, signal.SIGTERM)
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    hangup = getattr(signal, "SIGHUP", None)  # not on Windows
+    if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:  # under nohup a run goes on
+        numbers.append(hangup)
     try:
         before = [signal.signal(number, handler) for number in numbers]
     except ValueError:  # signals reach the main thread only

@@ -4,7 +4,6 @@ import asyncio
 import csv
 import math
 import socket
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AsyncExitStack, suppress
 from pathlib import Path
@@ -12,14 +11,14 @@ from pathlib import Path
 import torch
 
 from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.track_report import COLUMNS
 from holotorch.tracking.igtl import TransformServer
-from holotorch.tracking.packet import now
+from holotorch.tracking.packet import PosePacket, encode, now
 from holotorch.tracking.smoothing import OneEuro
 from holotorch.tracking.status import Pose, Status
 from holotorch.tracking.stream import PORT, PoseReceiver, PoseSender
 
-_PLACE = ("tip_x_m", "tip_y_m", "tip_z_m", "direction_x", "direction_y", "direction_z")
-_SPREAD = ("cov_xx_m2", "cov_xy_m2", "cov_xz_m2", "cov_yy_m2", "cov_yz_m2", "cov_zz_m2")
+_PLACE, _SPREAD = COLUMNS[5:11], COLUMNS[11:17]  # tip and direction; covariance of the tip
 _COLUMNS = ("time_s", "status", "reason", *_PLACE, *_SPREAD, "chi_square", "freedom")
 
 
@@ -29,7 +28,7 @@ def read_poses(path: Path) -> list[tuple[float, Pose]]:
     The table has no covariance of the direction. It becomes 1 along each axis: a unit vector that is not known at all.
 
     Raises:
-        ConfigError: Not such a file, a line that cannot be read, or times that do not rise.
+        ConfigError: Not such a file, a line that cannot be read or sent, or times that do not rise.
     """
     try:
         with open(path, newline="", encoding="utf-8") as stream:
@@ -52,6 +51,8 @@ def read_poses(path: Path) -> list[tuple[float, Pose]]:
 
 
 def _pose(row: dict[str, str]) -> tuple[float, Pose]:
+    if None in row.values():
+        raise ValueError("the line is cut off")
     captured, status, reason = float(row["time_s"]), Status[row["status"]], row["reason"]
     if not math.isfinite(captured):
         raise ValueError(f"time_s is {captured}")
@@ -63,16 +64,16 @@ def _pose(row: dict[str, str]) -> tuple[float, Pose]:
     covariance, upper = torch.eye(6, dtype=torch.float64), torch.triu_indices(3, 3)
     covariance[upper[0], upper[1]] = covariance[upper[1], upper[0]] = values[6:]
     chi, freedom = torch.tensor([float(row[name]) for name in _COLUMNS[-2:]], dtype=torch.float64)
-    return captured, Pose(values[:3], values[3:6], covariance, chi, freedom, status, reason)
+    pose = Pose(values[:3], values[3:6], covariance, chi, freedom, status, reason)
+    encode(PosePacket(pose, 0.0, 0.0, 0))  # what cannot be sent is said now, with its line
+    return captured, pose
 
 
 def replay(poses: Sequence[tuple[float, Pose]], rate: float | None = None) -> Iterator[tuple[float, Pose]]:
-    """Give recorded poses when they are due, with capture times moved to now; ``rate`` in Hz replaces their pace."""
+    """Give recorded poses with capture times moved to now, when they are due; ``rate`` in Hz replaces their pace."""
     start, first = now(), poses[0][0]
     for i, (captured, pose) in enumerate(poses):
-        due = start + (captured - first if rate is None else i / rate)
-        time.sleep(max(0.0, due - now()))
-        yield due, pose
+        yield start + (captured - first if rate is None else i / rate), pose
 
 
 def stream(
@@ -93,7 +94,8 @@ def stream(
         igtl: Port for OpenIGTLink, where Slicer connects; None for no such server.
         rate: Poses per second of a poses.csv, instead of the recorded pace.
         smooth: Pass them through :class:`OneEuro`; packets then tell the lag.
-        track: From sources to capture times (by ``packet.now``) and poses, one after the other as frames come.
+        track: From sources to capture times (by ``packet.now``) and poses, one after the other as frames come. One with
+            a time that is still to come is sent then.
         show: Takes the lines to print.
 
     Raises:
@@ -140,11 +142,12 @@ async def _send(
         server = await stack.enter_async_context(TransformServer(igtl)) if igtl is not None else None
         show(f"Sending    to {', '.join(f'{host}:{port}' for host, port in receivers) or 'OpenIGTLink clients'}")
         if server:
-            show(f"Slicer     connects to {' or '.join(own_addresses())}, port {server.port}")
+            show(f"Slicer     connects to {own_address()}, port {server.port}")
         try:
             # In a thread: a frame takes its time, and clock requests must not wait for it.
             while (item := await asyncio.to_thread(next, poses, None)) is not None:
                 captured, pose = item
+                await asyncio.sleep(max(0.0, captured - now()))  # here Ctrl-C ends it; a thread would be waited for
                 pose = smoother(pose, captured) if smoother else pose
                 if sender:
                     sender.send(pose, captured, lag=smoother.lag if smoother else 0.0)
@@ -174,7 +177,7 @@ def view(port: int = PORT, *, seconds: float = math.inf, show: Callable[[str], N
 async def _view(port: int, seconds: float, show: Callable[[str], None], state: list[PoseReceiver]) -> None:
     async with PoseReceiver(port) as receiver:
         state.append(receiver)
-        show(f"Listening  at {' or '.join(own_addresses())}, UDP port {receiver.port}")
+        show(f"Listening  at {own_address()}, UDP port {receiver.port}")
         end = now() + seconds
         while (left := end - now()) > 0:
             await asyncio.sleep(min(1.0, left))
@@ -225,12 +228,12 @@ def address(text: str) -> tuple[str, int]:
     return host, number if colon else PORT
 
 
-def own_addresses() -> list[str]:
-    """IPv4 addresses by which others may reach this computer; 127.0.0.1, for itself only, if there is no network."""
+def own_address() -> str:
+    """IPv4 address by which others may reach this computer; 127.0.0.1, for itself only, if there is no network."""
     with socket.socket(type=socket.SOCK_DGRAM) as probe:
         try:
             # Sends nothing: it asks which way a packet to elsewhere would leave (RFC 5737 keeps this address unused).
             probe.connect(("192.0.2.1", 9))
-            return [probe.getsockname()[0]]
+            return probe.getsockname()[0]
         except OSError:
-            return ["127.0.0.1"]
+            return "127.0.0.1"

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from holotorch.experiments.stream import own_addresses
+from holotorch.experiments.stream import own_address
 from holotorch.tracking.packet import now
 from holotorch.tracking.status import Pose, Status
 from holotorch.tracking.stream import PORT, PoseReceiver, PoseSender
@@ -48,8 +48,8 @@ async def _rows(port: int, packets: int) -> list[tuple[bool, str]]:
         rows.append((True, "slicer: pyigtl not installed (optional); to add: pip install 'holotorch[slicer]'"))
     else:
         rows.append((True, "slicer: pyigtl installed; holotorch stream ... --igtl 18944"))
-    places = " or ".join(f"{each}:{port}" for each in own_addresses())
-    rows.append((True, f"address: senders reach this computer by --to {places}; its firewall must let UDP {port} in"))
+    place = f"{own_address()}:{port}"
+    rows.append((True, f"address: senders reach this computer by --to {place}; its firewall must let UDP {port} in"))
     return rows
 
 

@@ -4,16 +4,14 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import torch
 from torch import Tensor
 
 from holotorch.tracking import thesis_stages as stages
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import Catheter
-from holotorch.tracking.status import Pose, Status
-from holotorch.tracking.thesis_stages import Axis, Endpoints, Refused, Stopwatch
-
-Box = tuple[int, int, int, int]  # left, top, right, bottom; the last two are not part of it
+from holotorch.tracking.measure import Refusal
+from holotorch.tracking.status import Pose
+from holotorch.tracking.thesis_stages import Axis, Box, Endpoints, Stopwatch
 
 
 class ThesisOpenCV:
@@ -65,7 +63,7 @@ class ThesisOpenCV:
             self.endpoints.append([])
             try:
                 poses.append(self._track(frame, watch))
-            except Refused as refused:
+            except Refusal as refused:
                 watch.lap(stages.REFUSED_AT.get(refused.status, "Get axis"))
                 poses.append(Pose.refused(refused.status, refused.reason))
         self.times = watch.stop()
@@ -142,40 +140,15 @@ class ThesisOpenCV:
             extents.append((float(of_band.min()), float(of_band.max())) if seen else None)
         axis = Axis((x, y), (dx, dy), tuple(extents))
         stages.need_order(axis)
-        (left, top), (right, bottom) = kept.min(0).tolist(), kept.max(0).tolist()
-        margin = stages.MARGIN_PX
-        return axis, (
-            max(left - margin, 0),
-            max(top - margin, 0),
-            min(right + margin + 1, solid.shape[1]),
-            min(bottom + margin + 1, solid.shape[0]),
-        )
+        return axis, stages.box(kept.min(0).tolist(), kept.max(0).tolist(), (solid.shape[1], solid.shape[0]))
 
     def _pose(self, found: Endpoints) -> Pose:
         """Mean of the closed-form poses of each pair of neighbouring bands whose three endpoints were found."""
-        edges = np.array([spot or (np.nan, np.nan) for spot in found])
-        nudges = np.concatenate([np.zeros((1, edges.size)), stages.NUDGE_PX * np.eye(edges.size)])
-        edges = edges + nudges.reshape(-1, *edges.shape)
+        edges = stages.nudged(found)
         rays = np.ones((*edges.shape[:2], 3))
         rays[..., :2] = (edges - self._matrix[:2, 2]) / self._matrix.diagonal()[:2]
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        tip, direction = _closed_form(rays, self._positions, stages.triples(found))
-        both = np.concatenate([tip, direction], -1)
-        slopes = (both[1:] - both[0]).T / stages.NUDGE_PX
-        covariance = stages.DEVIATION_PX**2 * slopes @ slopes.T
-        if not np.isfinite(covariance).all() or not np.isfinite(both).all() or tip[0, 2] <= 0:
-            raise Refused(Status.INCONSISTENT, stages.NO_POSE)
-        missing = [str(edge + 1) for edge, spot in enumerate(found) if spot is None]
-        zero = torch.zeros((), dtype=torch.float64)
-        return Pose(
-            tip=torch.from_numpy(tip[0].copy()),
-            direction=torch.from_numpy(direction[0].copy()),
-            covariance=torch.from_numpy(covariance),
-            chi_square=zero,
-            freedom=zero,
-            status=Status.UNVERIFIED if missing else Status.OK,
-            reason=stages.missing_edges(missing),
-        )
+        return stages.answer(found, *_closed_form(rays, self._positions, stages.triples(found)))
 
 
 _SQUARE = np.ones((3, 3), dtype=np.uint8)
@@ -202,6 +175,7 @@ def _closed_form(rays: np.ndarray, positions: np.ndarray, first: Sequence[int]) 
     """Mean tip and direction [B, 3] over the triples of edges that begin at ``first``, from unit rays [B, N, 3].
 
     The sine rule in the triangles of the camera and each band, Eqs. 3.5 to 3.12 as corrected; bands of any length.
+    That is :func:`holotorch.tracking.pose.closed_form` once more, in numpy: other times are held to this one's.
     """
     tips, directions = [], []
     for i in first:

@@ -5,38 +5,29 @@ import io
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
-from typing import IO
+from typing import IO, Any, TypeVar
 
 import torch
 import yaml
 from torch import Tensor
 from tqdm import tqdm
 
-from holotorch.experiments.config_tracking import (
-    CameraSettings,
-    build_camera,
-    build_catheter,
-    load_camera,
-    load_catheter,
-)
 from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.run import claim, deferred, interruptible
 from holotorch.experiments.track_report import COLUMNS, Log, Tracked, row, summarised, verdict, write_page
-from holotorch.io.bundled import find_config
-from holotorch.io.files import replacing, write_bytes, write_json, write_text
-from holotorch.io.recording import Recorder, free_bytes, is_recording, open_recording, recording_bytes
-from holotorch.io.video import Frame, Frames, open_frames, replacing_video
-from holotorch.tracking import Camera, Catheter, Pose, Status
+from holotorch.experiments.track_source import Given, Tracker, opened
+from holotorch.io.files import append, replacing, write_bytes, write_json, write_text
+from holotorch.io.recording import Recorder, free_bytes, recording_bytes
+from holotorch.io.video import Frame, Frames, replacing_video
+from holotorch.tracking import Pose, Status
 from holotorch.tracking.overlay import overlay
 from holotorch.tracking.packet import now
 
-METHODS = ("ours", "thesis")
-_OFF_CENTRE = 0.15  # of a side; two thirds of the resolution, as 720 to 1080 lines, shift the centre by a sixth
-Tracker = Callable[[Tensor, Sequence[Pose] | None], list[Pose]]
+Entered = TypeVar("Entered")
 
 
 def follow(frames: Iterable[Frame], tracker: Tracker) -> Iterator[Tracked]:
@@ -73,15 +64,17 @@ def run_tracking(
     """Track a source and fill a folder: ``out``, or the next free ``runs/track-001``.
 
     The folder gets ``poses.csv`` (a line per frame, ``COLUMNS``), ``overlay.mp4``, ``report.html``, copies of the two
-    YAML files, ``recording`` if asked for, and ``summary.json`` last. Ctrl-C saves what there is, and is the ordinary
-    end of a camera.
+    YAML files, ``recording`` if asked for, and ``summary.json`` last. Ctrl-C, as SIGTERM and a closed terminal, saves
+    what there is, and is the ordinary end of a camera. A killed process (``kill -9``) leaves what it had written
+    under hidden names: ``.poses.csv.PID.partial``, whole but for its last line, and an overlay that no player may open;
+    its recording can be tracked.
 
     Args:
         source: A video, a folder of pictures, a folder of a recording, or the number of a camera.
         camera: YAML file; that of the recording by default.
         catheter: The same.
         out: New or empty folder.
-        method: One of ``METHODS``.
+        method: ours or thesis.
         record: Keep every frame, losslessly.
         video: Write the overlay.
         still: The catheter is held still; measure its stability, Eq. 3.13.
@@ -93,29 +86,9 @@ def run_tracking(
     Raises:
         ConfigError: A source, file or method that cannot be used, a folder in use, or no room for the recording.
     """
-    if method not in METHODS:
-        raise ConfigError([f"expected one of {', '.join(METHODS)} as the method, got {method!r}"])
-    replayed = is_recording(Path(source))
-    files = {"camera.yaml": camera, "catheter.yaml": catheter}
-    for name in files:
-        if files[name] is None and replayed and (Path(source) / name).is_file():
-            files[name] = Path(source) / name
-    missing = [f"no {name}: say which with --{name[:-5]}" for name, path in files.items() if path is None]
-    if missing:
-        raise ConfigError(missing)
-    paths = {name: find_config(path) or path for name, path in files.items() if path is not None}
-    lens, tool = load_camera(paths["camera.yaml"]), build_catheter(load_catheter(paths["catheter.yaml"]))
-    try:
-        frames = open_recording(Path(source)) if replayed else open_frames(source, rate)
-    except ValueError as error:
-        raise ConfigError([str(error)]) from None
-    with frames:
-        _same_size(lens, frames)
-        for line in [*_announced(frames, out, record), *frames.notes]:
+    with opened(source, camera, catheter, method, rate) as given:
+        for line in [*_announced(given.frames, out, record), *given.frames.notes]:
             print(line, flush=True)
-        folder = claim(out, "track")
-        for name, path in paths.items():
-            write_bytes(folder / name, path.read_bytes())
         settings = {
             "experiment": "track",
             "source": str(source),
@@ -125,61 +98,54 @@ def run_tracking(
             "still": still,
             "rate_hz": rate,
         }
-        write_text(folder / "config.yaml", yaml.safe_dump(settings, sort_keys=False))
-        write_json(folder / "env.json", environment(0, torch.device("cpu")))
-        return _fill(folder, frames, build_camera(lens), tool, method, paths if record else None, video, still)
+        return _fill(claim(out, "track"), given, settings)
 
 
-def live(sources: Sequence[str], camera: Path | None, catheter: Path | None) -> Iterator[tuple[float, Pose]]:
-    """Times on the packets' clock and poses of one source, as its frames come; a file's at the pace of its times."""
-    if len(sources) != 1 or camera is None or catheter is None:
-        raise ConfigError(["to track and stream, give one source, --camera FILE and --catheter FILE"])
-    paths = [find_config(path) or path for path in (camera, catheter)]
-    lens, tool = load_camera(paths[0]), build_catheter(load_catheter(paths[1]))
-    source = Path(sources[0])
-    try:
-        frames = open_recording(source) if is_recording(source) else open_frames(sources[0])
-    except ValueError as error:
-        raise ConfigError([str(error)]) from None
-    with frames:
-        _same_size(lens, frames)
-        began = None
-        for item in follow(frames, _tracker("ours", build_camera(lens), tool)):
+def live(
+    sources: Sequence[str], camera: Path | None, catheter: Path | None, rate: float | None = None
+) -> Iterator[tuple[float, Pose]]:
+    """Times on the packets' clock and poses of one source, as its frames come; see :func:`run_tracking`.
+
+    Frames of a file come at the pace of its times: those of their poses are when each is due, and may be still to come.
+    """
+    if len(sources) != 1:
+        raise ConfigError([f"expected one source to track and stream, got {len(sources)}"])
+    with opened(sources[0], camera, catheter, "ours", rate) as (frames, _, _, tracker, _):
+        for note in frames.notes:
+            print(note, flush=True)
+        said, began = len(frames.notes), None
+        for item in follow(frames, tracker):
             began = now() - item.frame.seconds if began is None else began
-            if not frames.live:
-                time.sleep(max(0.0, began + item.frame.seconds - now()))
-            yield (now() if frames.live else began + item.frame.seconds), item.pose
+            # The camera took the frame before the tracker's time.
+            yield (now() - item.seconds if frames.live else began + item.frame.seconds), item.pose
+        for note in frames.notes[said:]:
+            print(note, flush=True)
 
 
-def _fill(
-    folder: Path,
-    frames: Frames,
-    camera: Camera,
-    catheter: Catheter,
-    method: str,
-    recorded: dict[str, Path] | None,
-    video: bool,
-    still: bool,
-) -> tuple[Path, bool]:
-    log, failure = Log(folder / "images"), None
-    (folder / "images").mkdir(exist_ok=True)
+def _fill(folder: Path, given: Given, settings: dict[str, Any]) -> tuple[Path, bool]:
+    frames, log, failure, recorder = given.frames, Log(folder / "images"), None, None
     said = len(frames.notes)
     with interruptible() as pressed:
-        stack = ExitStack()
+        parts: list[ExitStack] = []  # each to be closed, whatever happens to the others
         try:
-            table = stack.enter_context(replacing(folder / "poses.csv"))
+            for name, path in given.paths.items():
+                write_bytes(folder / name, path.read_bytes())
+            write_text(folder / "config.yaml", yaml.safe_dump(settings, sort_keys=False))
+            write_json(folder / "env.json", environment(0, torch.device("cpu")))
+            (folder / "images").mkdir(exist_ok=True)
+            table = _entered(parts, replacing(folder / "poses.csv", buffering=0))
             _append(table, COLUMNS)
             movie, came = None, iter(frames)
-            if video:
-                movie = stack.enter_context(replacing_video(folder / "overlay.mp4", frames.shape, frames.rate))
-            if recorded is not None:
-                recorder = Recorder(folder / "recording", frames.shape, frames.rate, frames.name, recorded)
-                came = _recorded(came, stack.enter_context(recorder), pressed)
-            bar = stack.enter_context(tqdm(total=frames.total, unit="frame", desc="tracking", dynamic_ncols=True))
-            for item in follow(came, _tracker(method, camera, catheter)):
+            if settings["video"]:
+                movie = _entered(parts, replacing_video(folder / "overlay.mp4", frames.shape, frames.rate))
+            if settings["record"]:
+                recorder = Recorder(folder / "recording", frames.shape, frames.rate, frames.name, given.paths)
+                came = _recorded(came, _entered(parts, recorder), pressed)
+            bar = _entered(parts, tqdm(total=frames.total, unit="frame", desc="tracking", dynamic_ncols=True))
+            for item in follow(came, given.tracker):
                 with deferred(pressed):
                     _append(table, row(item))
-                    drawn = _drawn(item, frames.shape, camera, catheter) if movie or log.wants(item) else None
+                    drawn = _drawn(item, given) if movie or log.wants(item) else None
                     if movie and drawn is not None:
                         movie.write(drawn)
                     log.take(item, drawn)
@@ -192,16 +158,17 @@ def _fill(
         except Exception as error:  # what was found until now is kept
             failure = error
         with deferred(pressed):
-            try:
-                stack.close()
-            except OSError as error:
-                failure = failure or error
+            for part in reversed(parts):
+                try:
+                    part.close()
+                except OSError as error:
+                    failure = failure or error
             if not log.statuses:
-                if recorded is None:
+                if recorder is None or not recorder.frames:
                     shutil.rmtree(folder)  # claimed empty a moment ago: only this run's own files are in it
                 raise failure or KeyboardInterrupt
             complete = failure is None and (not pressed or frames.live)
-            summary = summarised(log, frames, method, still)
+            summary = summarised(log, frames, settings["method"], settings["still"])
             summary["status"] = "complete" if complete else "interrupted"
             if failure is not None:
                 summary["failure"] = f"{type(failure).__name__}: {failure}"
@@ -214,6 +181,12 @@ def _fill(
     return folder, complete
 
 
+def _entered(parts: list[ExitStack], context: AbstractContextManager[Entered]) -> Entered:
+    """Enter a context of its own, to be closed with ``parts``."""
+    parts.append(ExitStack())
+    return parts[-1].enter_context(context)
+
+
 def _recorded(frames: Iterator[Frame], recorder: Recorder, pressed: list[int]) -> Iterator[Frame]:
     """The frames, each kept before anything is done with it."""
     for frame in frames:
@@ -222,40 +195,17 @@ def _recorded(frames: Iterator[Frame], recorder: Recorder, pressed: list[int]) -
         yield frame
 
 
-def _tracker(method: str, camera: Camera, catheter: Catheter) -> Tracker:
-    if method == "thesis":
-        from holotorch.tracking.thesis import ThesisTracker
-
-        return _Cold(ThesisTracker(camera, catheter))
-    from holotorch.tracking.tracker import CatheterTracker
-
-    return CatheterTracker(camera, catheter)
-
-
-class _Cold:
-    """A tracker that makes no use of the pose before."""
-
-    def __init__(self, tracker: Callable[[Tensor], list[Pose]]):
-        self._tracker = tracker
-
-    def __call__(self, frames: Tensor, previous: Sequence[Pose] | None = None) -> list[Pose]:
-        return self._tracker(frames)
-
-    @property
-    def times(self) -> dict[str, float]:
-        return getattr(self._tracker, "times", {})
-
-
-def _drawn(item: Tracked, shape: tuple[int, int], camera: Camera, catheter: Catheter) -> Tensor:
+def _drawn(item: Tracked, given: Given) -> Tensor:
     pixels = item.frame.pixels
-    return overlay(torch.zeros(3, *shape, dtype=torch.uint8) if pixels is None else pixels, item.pose, camera, catheter)
+    if pixels is None:
+        pixels = torch.zeros(3, *given.frames.shape, dtype=torch.uint8)
+    return overlay(pixels, item.pose, given.camera, given.catheter)
 
 
 def _append(table: IO[bytes], cells: Sequence[str]) -> None:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerow(cells)
-    table.write(text.getvalue().encode("utf-8", "replace"))
-    table.flush()
+    append(table, text.getvalue().encode("utf-8", "replace"))
 
 
 def _announced(frames: Frames, out: Path | None, record: bool) -> list[str]:
@@ -274,16 +224,3 @@ def _announced(frames: Frames, out: Path | None, record: bool) -> list[str]:
     if size > free:
         raise ConfigError([f"the recording takes {size / 1e9:.2f} GB and {free / 1e9:.2f} GB are free; choose --out"])
     return [*lines, f"Recording  {size / 1e9:.3f} GB; {free / 1e9:.1f} GB free"]
-
-
-def _same_size(lens: CameraSettings, frames: Frames) -> None:
-    """ConfigError, or a doubt noted, for intrinsics of another resolution: poses would be wrong, and plausible."""
-    height, width = frames.shape
-    if lens.size is not None and tuple(lens.size) != frames.shape:
-        held = f"{lens.size[1]} x {lens.size[0]}"
-        raise ConfigError([f"the camera's file holds for frames of {held} px, and these have {width} x {height} px"])
-    if lens.size is None and max(abs(lens.cx / width - 0.5), abs(lens.cy / height - 0.5)) > _OFF_CENTRE:
-        frames.notes.append(
-            f"the principal point ({lens.cx:.0f}, {lens.cy:.0f}) is far from the middle of frames of {width} x "
-            f"{height} px: was the camera calibrated at another resolution?"
-        )

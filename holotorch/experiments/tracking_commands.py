@@ -29,22 +29,28 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     stream = commands.add_parser("stream", help="send poses to headsets and 3D Slicer, or see what arrives")
     stream.add_argument("sources", nargs="*", metavar="SOURCE", help="a poses.csv, or what track takes")
     stream.add_argument("--to", action="append", metavar="HOST[:PORT]", help="receiver; may be given again")
-    stream.add_argument("--igtl", type=int, metavar="PORT", help="serve OpenIGTLink, such as on 18944")
-    stream.add_argument("--rate", type=float, metavar="HZ", help="poses per second of a poses.csv")
+    stream.add_argument("--igtl", type=_port, metavar="PORT", help="serve OpenIGTLink, such as on 18944")
+    stream.add_argument("--rate", type=float, metavar="HZ", help="poses per second of a poses.csv, or of pictures")
     stream.add_argument("--smooth", action="store_true", help="One-Euro filter; packets tell its lag")
     stream.add_argument("--view", action="store_true", help="show what arrives")
     stream.add_argument("--check", action="store_true", help="send to this machine itself, also with losses, and count")
-    stream.add_argument("--port", type=int, default=18950, help="where --view and --check listen (default: 18950)")
+    stream.add_argument("--port", type=_port, default=18950, help="where --view and --check listen (default: 18950)")
     stream.set_defaults(action=_stream)
     for command in (track, stream):
         command.add_argument("--camera", type=Path, help="its intrinsics: a YAML file, as calibrate writes it")
         command.add_argument("--catheter", type=Path, help="YAML file, such as configs/tracking/catheter.yaml")
 
 
+def _port(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and int(text) < 65536):
+        raise argparse.ArgumentTypeError(f"expected a port from 0 (any that is free) to 65535, got {text!r}")
+    return int(text)
+
+
 def _track(options: argparse.Namespace) -> int:
     from holotorch.experiments.track import run_tracking
 
-    source, truth = options.source, None
+    source = options.source
     if source == "synthetic":
         from holotorch.experiments.synthetic import write_synthetic
 
@@ -97,6 +103,6 @@ def _stream(options: argparse.Namespace) -> int:
         igtl=options.igtl,
         rate=options.rate,
         smooth=options.smooth,
-        track=lambda sources: live(sources, options.camera, options.catheter),
+        track=lambda sources: live(sources, options.camera, options.catheter, options.rate),
     )
     return OK

@@ -13,11 +13,15 @@ from torch import Tensor
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[IO[bytes]]:
-    """Open a temporary file beside ``path`` that takes its name when the block ends without an error."""
+def replacing(path: Path, *, buffering: int = -1) -> Iterator[IO[bytes]]:
+    """Open a temporary file beside ``path`` that takes its name when the block ends without an error.
+
+    With ``buffering`` 0 and :func:`append` a block that caught the error of a full disk can end so too: nothing is left
+    in a buffer that could fail once more.
+    """
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        with open(partial, "wb") as stream:
+        with open(partial, "wb", buffering=buffering) as stream:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
@@ -27,6 +31,18 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
         raise OSError(error.errno, error.strerror, str(path)) from None
     finally:
         partial.unlink(missing_ok=True)
+
+
+def append(stream: IO[bytes], data: bytes | memoryview) -> None:
+    """Write ``data`` at the end of an unbuffered file, or nothing: after an OSError it is as long as before."""
+    start, done = stream.tell(), 0
+    try:
+        while done < len(data):  # a single call may write less
+            done += stream.write(data[done:]) or 0
+    except OSError:
+        stream.seek(start)
+        stream.truncate()
+        raise
 
 
 def write_bytes(path: Path, data: bytes) -> None:

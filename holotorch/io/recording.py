@@ -8,12 +8,14 @@ A recording is a folder::
     times.csv        frame,seconds,crc32,problem: a line per frame, written after the frame; a frame that could not be
                      read has a problem and no checksum, and no bytes in frames.rgb
 
-Both are only ever appended to, so that what was recorded before a crash of the program can be replayed. The bytes are
-raw, since compressing a 1080p frame to PNG takes longer than a camera's period. ``ffplay -f rawvideo -pixel_format
-rgb24 -video_size WxH frames.rgb`` shows them.
+Both are only ever appended to, so that what was recorded before a crash of the program can be replayed; where the disk
+is full, what there is of the frame that did not fit is taken away again. The bytes are raw, since compressing a 1080p
+frame to PNG takes longer than a camera's period. ``ffplay -f rawvideo -pixel_format rgb24 -video_size WxH frames.rgb``
+shows them.
 """
 
 import csv
+import io
 import json
 import math
 import shutil
@@ -27,7 +29,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
-from holotorch.io.files import write_bytes, write_json
+from holotorch.io.files import append, write_bytes, write_json
 from holotorch.io.video import Frame, Frames
 
 _FORMAT = 1
@@ -82,11 +84,16 @@ class Recorder:
         }
         write_json(folder / "recording.json", facts)
         self._pixels = open(folder / "frames.rgb", "ab", buffering=0)  # noqa: SIM115
-        self._times = open(folder / "times.csv", "a", encoding="utf-8", errors="replace", newline="")  # noqa: SIM115
+        self._times = open(folder / "times.csv", "ab", buffering=0)  # noqa: SIM115
         self._row(_COLUMNS)
 
     def write(self, frame: Frame) -> None:
-        """Append a frame: its pixels first, then its line. ValueError for pixels of another shape or kind."""
+        """Append a frame: its pixels first, then its line.
+
+        Raises:
+            ValueError: Pixels of another shape or kind.
+            OSError: The disk takes no more; the recording is as it was before.
+        """
         checks.finite("time of a frame", frame.seconds, "seconds")
         # repr of a float is read back to the same bits.
         if frame.pixels is None:
@@ -99,10 +106,14 @@ class Recorder:
                     f"{list(frame.pixels.shape)}"
                 )
             data = _interleaved(frame.pixels).data.cast("B")
-            done = 0
-            while done < len(data):  # a single call may write less
-                done += self._pixels.write(data[done:]) or 0
-            self._row((str(self.frames), repr(float(frame.seconds)), f"{zlib.crc32(data):08x}", ""))
+            start = self._pixels.tell()
+            append(self._pixels, data)
+            try:
+                self._row((str(self.frames), repr(float(frame.seconds)), f"{zlib.crc32(data):08x}", ""))
+            except OSError:
+                self._pixels.seek(start)
+                self._pixels.truncate()
+                raise
         self.frames += 1
 
     def close(self) -> None:
@@ -117,8 +128,9 @@ class Recorder:
         self.close()
 
     def _row(self, cells: tuple[str, ...]) -> None:
-        csv.writer(self._times, lineterminator="\n").writerow(cells)
-        self._times.flush()
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerow(cells)
+        append(self._times, text.getvalue().encode("utf-8", "replace"))
 
 
 def open_recording(folder: Path) -> Frames:

@@ -4,7 +4,7 @@ import math
 import os
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -50,9 +50,10 @@ class Frames:
         notes: list[str],
         *,
         live: bool = False,
+        close: Callable[[], None] | None = None,
     ):
         self.name, self.shape, self.total, self.rate, self.notes, self.live = name, shape, total, rate, notes, live
-        self._frames = frames
+        self._frames, self._close = frames, close
 
     def __iter__(self) -> Iterator[Frame]:
         return self._frames
@@ -64,6 +65,8 @@ class Frames:
         close = getattr(self._frames, "close", None)
         if close is not None:
             close()
+        if self._close is not None:
+            self._close()  # closing a generator that was never begun runs nothing of it
 
 
 def open_frames(source: str | Path, rate: float | None = None) -> Frames:
@@ -112,25 +115,23 @@ def _video(path: Path, rate: float | None) -> Frames:
 
     def frames() -> Iterator[Frame]:
         picture, seconds, count, guessed = first, 0.0, 0, 0
-        try:
-            while True:
-                now = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
-                if count and not now > seconds:  # the stream has no time for this frame
-                    now, guessed = seconds + 1 / stated, guessed + 1
-                seconds, count = now, count + 1
-                yield Frame(seconds, _rgb(picture)) if picture is not None else Frame(seconds, None, "not decodable")
-                if not capture.grab():
-                    break
-                fine, picture = capture.retrieve()
-                picture = picture if fine else None
-            if guessed:
-                notes.append(f"{guessed} of {count} frames have no time of their own; counted at {stated:g} per second")
-            if count < announced:
-                notes.append(f"{path.name} announces {announced} frames and {count} could be read")
-        finally:
-            capture.release()
+        while True:
+            now = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
+            if count and not now > seconds:  # the stream has no time for this frame
+                now, guessed = seconds + 1 / stated, guessed + 1
+            seconds, count = now, count + 1
+            yield Frame(seconds, _rgb(picture)) if picture is not None else Frame(seconds, None, "not decodable")
+            if not capture.grab():
+                break
+            fine, picture = capture.retrieve()
+            picture = picture if fine else None
+        if guessed:
+            notes.append(f"{guessed} of {count} frames have no time of their own; counted at {stated:g} per second")
+        if count < announced:
+            notes.append(f"{path.name} announces {announced} frames and {count} could be read")
 
-    return Frames(path.name, first.shape[:2], announced if announced > 0 else None, stated, frames(), notes)
+    total = announced if announced > 0 else None
+    return Frames(path.name, first.shape[:2], total, stated, frames(), notes, close=capture.release)
 
 
 def _folder(folder: Path, rate: float | None) -> Frames:
@@ -179,18 +180,17 @@ def _camera(index: int, rate: float | None) -> Frames:
     def now() -> float:
         return capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3 if driver else time.monotonic()
 
-    def frames() -> Iterator[Frame]:
-        try:
-            yield Frame(now(), _rgb(first))
-            while capture.grab():
-                seconds = now()
-                fine, picture = capture.retrieve()
-                yield Frame(seconds, _rgb(picture)) if fine else Frame(seconds, None, "not decodable")
-            notes.append("the camera stopped giving frames")
-        finally:
-            capture.release()
+    began = now()
 
-    return Frames(f"camera {index}", first.shape[:2], None, stated, frames(), notes, live=True)
+    def frames() -> Iterator[Frame]:
+        yield Frame(began, _rgb(first))
+        while capture.grab():
+            seconds = now()
+            fine, picture = capture.retrieve()
+            yield Frame(seconds, _rgb(picture)) if fine else Frame(seconds, None, "not decodable")
+        notes.append("the camera stopped giving frames")
+
+    return Frames(f"camera {index}", first.shape[:2], None, stated, frames(), notes, live=True, close=capture.release)
 
 
 class VideoWriter:

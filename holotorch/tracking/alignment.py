@@ -94,10 +94,10 @@ def headset_from_camera(camera: Tensor, headset: Tensor) -> Alignment:
                 "which leaves the turn about the tool nearly open; hold the tool in different directions, 45 degrees "
                 "apart or more"
             )
-    fitted = _rigid(source, target)
+    fitted = rigid_map(source, target)
     residuals = _residuals(fitted, source, target)
     rms = residuals.detach().square().mean().sqrt()
-    mirrored = _residuals(_rigid(source, target, -1.0), source, target).detach().square().mean().sqrt()
+    mirrored = _residuals(rigid_map(source, target, -1.0), source, target).detach().square().mean().sqrt()
     if rms > 5e-3 and mirrored < 0.5 * rms:
         raise ValueError(
             "the headset's points are mirror images of the camera's: its frame is left-handed (as Unity's is); change "
@@ -109,20 +109,23 @@ def headset_from_camera(camera: Tensor, headset: Tensor) -> Alignment:
         if _spread(source[rest].detach()) < _SAME_DIRECTION:
             alone.append(source.new_tensor(math.inf))
             continue
-        alone.append(_residuals(_rigid(source[rest], target[rest]), source[i : i + 1], target[i : i + 1])[0])
+        alone.append(_residuals(rigid_map(source[rest], target[rest]), source[i : i + 1], target[i : i + 1])[0])
     return Alignment(fitted, residuals, torch.stack(alone))
 
 
 def _spread(points: Tensor) -> float:
     """Largest angle between two of the tools, as lines."""
-    along = torch.nn.functional.normalize(points[:, 1] - points[:, 0], dim=-1)
-    n = len(along)
-    crossed = torch.linalg.cross(along[:, None].expand(n, n, 3), along[None].expand(n, n, 3)).norm(dim=-1)
-    return float(torch.atan2(crossed, (along @ along.mT).abs()).max())
+    return widest_angle(torch.nn.functional.normalize(points[:, 1] - points[:, 0], dim=-1))
 
 
-def _rigid(source: Tensor, target: Tensor, sign: float = 1.0) -> Tensor:
-    """[4, 4] rigid map of points [n, 2, 3]; with ``sign`` -1 the best mirroring one."""
+def widest_angle(directions: Tensor) -> float:
+    """Largest angle in radians between two of the lines along unit vectors [n, 3]: at most a right angle."""
+    crossed = torch.linalg.cross(*torch.broadcast_tensors(directions[:, None], directions[None])).norm(dim=-1)
+    return float(torch.atan2(crossed, (directions @ directions.mT).abs()).max())
+
+
+def rigid_map(source: Tensor, target: Tensor, sign: float = 1.0) -> Tensor:
+    """[4, 4] rigid map of points [..., 3] with least squares (Kabsch 1976); with ``sign`` -1 the best mirroring one."""
     a, b = source.reshape(-1, 3), target.reshape(-1, 3)
     u, _, vh = torch.linalg.svd((b - b.mean(0)).mT @ (a - a.mean(0)))
     turned = sign * torch.linalg.det(u.detach() @ vh.detach()).sign()

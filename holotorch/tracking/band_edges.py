@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.tracking.alignment import widest_angle
 from holotorch.tracking.camera import Camera
-from holotorch.tracking.pose import solve_pose
+from holotorch.tracking.pose import _weights, solve_pose
 
 _FEWEST = 5  # frames
 _SAME_DIRECTION = math.radians(10)
@@ -86,7 +87,10 @@ def fit_band_edges(
         raise ValueError(f"no pose found in the frames {lost[:10]}: leave them out, or correct the nominal positions")
     _check_directions(poses.direction)
     plane = camera.undistort(pixels).detach()
-    problem = _Problem(plane, _weights(plane, along_px, across_px, camera), free, resting_tip, offset)
+    seen = torch.ones_like(plane[..., 0], dtype=torch.bool)
+    deviations = plane.new_tensor([along_px, across_px]).expand_as(plane)
+    weights = _weights(pixels, plane, seen, deviations, camera).detach()
+    problem = _Problem(plane, weights, free, resting_tip, offset)
     tip = poses.tip.mean(0).expand_as(poses.tip) if resting_tip else poses.tip
     state, chi_square, information = problem.solve((tip.detach(), poses.direction.detach(), start))
     freedom = 2 * plane.shape[0] * plane.shape[1] - problem.unknowns
@@ -205,7 +209,8 @@ def _constraints(known: Sequence[int | tuple[int, int]], positions: Tensor, rest
     rows = positions.new_zeros(len(known), count)
     for row, entry in zip(rows, known, strict=True):
         ends = entry if isinstance(entry, tuple) else (entry,)
-        if len(ends) > 2 or len(set(ends)) < len(ends) or not all(isinstance(i, int) and 0 <= i < count for i in ends):
+        fitting = len(ends) in (1, 2) and len(set(ends)) == len(ends)
+        if not fitting or not all(isinstance(i, int) and 0 <= i < count for i in ends):
             raise ValueError(f"known must hold edges 0 to {count - 1} or pairs of different ones, got {entry!r}")
         row[ends[-1]] = 1.0
         if len(ends) == 2:
@@ -231,19 +236,9 @@ def _constraints(known: Sequence[int | tuple[int, int]], positions: Tensor, rest
 
 
 def _check_directions(directions: Tensor) -> None:
-    crossed = torch.linalg.cross(*torch.broadcast_tensors(directions[:, None], directions[None])).norm(dim=-1)
-    spread = float(torch.atan2(crossed, (directions @ directions.mT).abs()).max())
+    spread = widest_angle(directions)
     if spread < _SAME_DIRECTION:
         raise ValueError(
             f"the catheter is parallel to itself within {math.degrees(spread):.1f} degrees in all frames, so that "
             "every frame has the same faults; tilt it toward the camera and away from it by 20 to 45 degrees"
         )
-
-
-def _weights(plane: Tensor, along_px: float, across_px: float, camera: Camera) -> Tensor:
-    """[F, N, 2, 2]: differences on the plane z = 1 to (along, across) over their deviations."""
-    sizes = [checks.positive(name, v, "pixels") for name, v in (("along_px", along_px), ("across_px", across_px))]
-    offsets = plane - plane.mean(1, keepdim=True)
-    frame = torch.linalg.eigh(offsets.mT @ offsets).eigenvectors.flip(-1).mT
-    scale = camera.matrix.detach().diagonal()[:2].mean().to(plane.device)
-    return (scale / plane.new_tensor(sizes)[:, None] * frame)[:, None].expand(*plane.shape[:2], 2, 2)

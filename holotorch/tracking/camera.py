@@ -163,7 +163,7 @@ class Camera:
         share = levels / 255
         if self.tone == "linear":
             return share
-        return torch.where(share <= 0.04045, share / 12.92, ((share.clamp(min=0.04) + 0.055) / 1.055) ** 2.4)
+        return srgb_to_light(share)
 
     def levels(self, light: Tensor) -> Tensor:
         """Levels from 0 to 255, not rounded, of light that is clipped to 0 to 1; the inverse of ``linear``."""
@@ -180,3 +180,8 @@ class Camera:
     def table(self, device: torch.device | None = None) -> Tensor:
         """Light of each of the 256 levels, float32 [256]."""
         return self.linear(torch.arange(256, dtype=torch.float64)).to(device, torch.float32)
+
+
+def srgb_to_light(share: Tensor) -> Tensor:
+    """Linear light of sRGB values, both from 0 to 1 and of any shape; IEC 61966-2-1."""
+    return torch.where(share <= 0.04045, share / 12.92, ((share.clamp(min=0.04) + 0.055) / 1.055) ** 2.4)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
-from holotorch.tracking.camera import Camera
+from holotorch.tracking.camera import Camera, srgb_to_light
 from holotorch.tracking.catheter import Catheter
 
 # A lattice of 8 points in the unit square: each axis meets 8 different values, where a 3 x 3 grid would offer 3.
@@ -18,9 +18,8 @@ _TURN = np.array([0.7548776662466927, 0.5698402909980532])  # shifts it from one
 
 
 def light_of(colour: tuple[int, int, int]) -> np.ndarray:
-    """Linear light [3], 0 to 1, of an 8-bit sRGB triple; IEC 61966-2-1."""
-    share = np.asarray(colour, dtype=np.float64) / 255
-    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    """Linear light [3], 0 to 1, of an 8-bit sRGB triple."""
+    return srgb_to_light(torch.tensor(colour, dtype=torch.float64) / 255).numpy()
 
 
 @dataclass(frozen=True, eq=False)

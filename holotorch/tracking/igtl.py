@@ -20,6 +20,7 @@ from typing import Any
 from holotorch.core import checks
 from holotorch.tracking.packet import now
 from holotorch.tracking.status import Pose, Status
+from holotorch.tracking.stream import Newest
 
 PORT = 18944
 
@@ -71,6 +72,7 @@ class TransformServer:
 
     Raises:
         ImportError: pyigtl is not installed.
+        OSError: The port is in use; when it is opened.
     """
 
     def __init__(self, port: int = PORT, *, host: str = "0.0.0.0", name: str = "ToolToCamera"):
@@ -104,38 +106,22 @@ class TransformServer:
             client.offer(data)
 
 
-class _Client(asyncio.Protocol):
-    transport: asyncio.Transport
-
+class _Client(Newest, asyncio.Protocol):
     def __init__(self, clients: set["_Client"]):
-        self._clients, self._waiting, self._paused = clients, b"", False
+        super().__init__()
+        self._clients = clients
 
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        self.transport = transport
-        transport.set_write_buffer_limits(high=0)
-        connection = transport.get_extra_info("socket")
+    def connection_made(self, transport: Any) -> None:
+        super().connection_made(transport)
         # Old frames must not queue in the system either; asyncio has set TCP_NODELAY.
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
         self._clients.add(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._clients.discard(self)
 
-    def pause_writing(self) -> None:
-        self._paused = True
-
-    def resume_writing(self) -> None:
-        self._paused = False
-        data, self._waiting = self._waiting, b""
-        if data:
-            self.offer(data)
-
-    def offer(self, data: bytes) -> None:
-        if self._paused:
-            self._waiting = data
-        else:
-            self.transport.write(data)
+    def _write(self, data: bytes) -> None:
+        self.transport.write(data)
 
 
 def _pyigtl() -> Any:

@@ -25,7 +25,7 @@ offset bytes type     meaning
 216    168   float64  covariance of (tip, direction) in m^2, m and 1: upper triangle of 6 x 6, row by row, 21 numbers;
                       NaN where refused
 384    8     float64  chi-square
-392    64    bytes    reason, UTF-8, cut at 64 bytes, filled with zeros; empty when OK
+392    64    bytes    reason, UTF-8, printable characters, cut at 64 bytes, filled with zeros; empty when OK
 456    4     uint32   CRC-32 (IEEE 802.3, zlib's) of all bytes before it
 ====== ===== ======== =================================================================================================
 
@@ -57,6 +57,7 @@ _LENGTHS = {
 }
 _UPPER = torch.triu_indices(6, 6)
 _FARTHEST = 100.0  # metres; a tip farther off was given in another unit
+_LONGEST = torch.finfo(torch.float32).max  # seconds of lag
 _START = time.time() - time.perf_counter()
 
 
@@ -116,6 +117,7 @@ class Echo:
 def encode(packet: PosePacket | Echo) -> bytes:
     """Bytes of a packet; ValueError for what :func:`decode` would refuse, TypeError for a batch of poses."""
     if isinstance(packet, Echo):
+        _fits(64, stream=packet.stream, number=packet.number)
         head = _HEAD.pack(_MAGIC, VERSION, REPLY if packet.reply else ASK, 0, packet.stream, packet.number)
         return _sealed(head + _STAMPS.pack(packet.asked, packet.heard, packet.answered))
     pose = packet.pose
@@ -136,6 +138,10 @@ def encode(packet: PosePacket | Echo) -> bytes:
     frame = packet.frame.encode("ascii", "replace")
     if not 1 <= len(frame) <= 32 or not packet.frame.isascii() or not packet.frame.isprintable():
         raise ValueError(f"frame must be 1 to 32 printable ASCII characters, got {packet.frame!r}")
+    _fits(64, stream=packet.stream, sequence=packet.sequence)
+    _fits(16, freedom=freedom)
+    if not abs(packet.lag) <= _LONGEST:
+        raise ValueError(f"lag must be finite and not negative, in seconds, got {packet.lag}")
     wrong = _mistake(status, matrix, covariance, chi_square, freedom, (packet.captured, packet.sent, packet.lag))
     if wrong:
         raise ValueError(wrong)
@@ -147,11 +153,11 @@ def encode(packet: PosePacket | Echo) -> bytes:
 
 
 def decode(data: bytes) -> PosePacket | Echo:
-    """What :func:`encode` was given, float64 on the CPU; a reason longer than 64 bytes comes back cut.
+    """What :func:`encode` was given, float64 on the CPU; a reason comes back cut at 64 bytes, with spaces for controls.
 
     Raises:
         PacketError: Another magic, version, kind, length or CRC, other axes, unit or order, an unknown status, a pose
-            that is NaN or impossible, or a refusal that carries a pose.
+            that is NaN or impossible, a refusal that carries a pose, or a reason that would command a terminal.
     """
     if len(data) < _HEAD.size or data[:4] != _MAGIC:
         raise PacketError(f"not a pose packet: {len(data)} bytes beginning with {bytes(data[:4])!r}, not {_MAGIC!r}")
@@ -184,8 +190,8 @@ def _pose_packet(fields: tuple, flags: int, stream: int, sequence: int) -> PoseP
         reason = fields[47].rstrip(b"\0").decode("utf-8")
     except ValueError as error:
         raise PacketError(f"status, frame name or reason cannot be read: {error}") from None
-    if not name or not name.isprintable():
-        raise PacketError(f"the frame name must be printable, got {name!r}")
+    if not name or not name.isprintable() or not reason.isprintable():
+        raise PacketError(f"frame name and reason must be printable, got {name!r} and {reason!r}")
     if bool(flags & 1) != status.answered:
         raise PacketError(f"flags {flags} do not fit the status {status.name}")
     matrix = torch.tensor(fields[9:25], dtype=torch.float64).reshape(4, 4)
@@ -220,10 +226,17 @@ def _mistake(status: Status, matrix: Tensor, upper: Tensor, chi: float, freedom:
     return ""
 
 
+def _fits(bits: int, **fields: int) -> None:
+    for name, value in fields.items():
+        if not 0 <= value < 2**bits:
+            raise ValueError(f"{name} must be a whole number from 0 to {2**bits - 1}, got {value}")
+
+
 def _sealed(data: bytes) -> bytes:
     return data + _CRC.pack(zlib.crc32(data))
 
 
 def _cut(text: str, size: int) -> bytes:
-    """UTF-8 without zeros, cut between characters."""
-    return text.replace("\0", " ").encode("utf-8", "replace")[:size].decode("utf-8", "ignore").encode()
+    """UTF-8 that can be printed, cut between characters."""
+    printable = "".join(each if each.isprintable() else " " for each in text)
+    return printable.encode()[:size].decode("utf-8", "ignore").encode()

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.tracking.alignment import rigid_map
 
 _UNKNOWN = (math.nan, math.nan, math.nan)
 
@@ -38,8 +39,8 @@ class GridAccuracy(NamedTuple):
     """Errors in metres at the points of a grid; NaN where a number cannot be had.
 
     Attributes:
-        acc: Acc_f of Sec. 3.5.3: mean difference between the distances to the reference point, found and designed.
-            It does not see a constant bias, nor an error across the direction to the reference.
+        acc: Acc_f of Sec. 3.5.3: mean absolute difference between the distances to the reference point, found and
+            designed. It does not see a constant bias, nor an error across the direction to the reference.
         absolute: Median, 95th percentile and maximum of the distance from the true tip; NaN without the truth.
         rigid: The same after the rigid motion that fits the found points to the grid best.
         answered, refused: Points.
@@ -128,7 +129,8 @@ def grid_accuracy(found: Tensor, grid: Tensor, reference: int, truth: Tensor | N
         checks.all_finite("truth", truth)
         absolute = _summed((found - truth)[known].norm(dim=-1))
     if int(known.sum()) >= 3:  # fewer points always fit
-        rigid = _summed(_fitted(found[known], grid[known]).norm(dim=-1))
+        fitted = rigid_map(found[known], grid[known])
+        rigid = _summed((found[known] @ fitted[:3, :3].mT + fitted[:3, 3] - grid[known]).norm(dim=-1))
     count = int(known.sum())
     return GridAccuracy(float(acc.mean()), absolute, rigid, count, len(found) - count)
 
@@ -247,15 +249,6 @@ def _others(found: Tensor, reference: int) -> tuple[Tensor, Tensor]:
     if not bool(others.any()):
         raise ValueError(f"of {len(found)} points only the reference was answered; accuracy needs another")
     return others, known
-
-
-def _fitted(points: Tensor, target: Tensor) -> Tensor:
-    """What a rigid motion of ``points`` [n, 3] leaves to ``target`` [n, 3]. Kabsch (1976)."""
-    moved, wanted = points - points.mean(0), target - target.mean(0)
-    u, _, vh = torch.linalg.svd(moved.T @ wanted)
-    signs = torch.ones(3, dtype=moved.dtype, device=moved.device)
-    signs[2] = torch.linalg.det(u @ vh).sign()  # a turn, never a mirror
-    return moved @ (u * signs) @ vh - wanted
 
 
 def _summed(errors: Tensor) -> tuple[float, float, float]:

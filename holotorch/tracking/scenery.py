@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
-from holotorch.tracking.render import Occluder
+from holotorch.tracking.render import Colour, Occluder
 
-Colour = tuple[int, int, int]
 SKIN, WHITE_GLOVE, BLUE_GLOVE = (205, 150, 120), (226, 228, 230), (70, 130, 200)
 _CLUTTER = 260  # things on a cluttered table of 1920 x 1080
 _ROW = (0.9, 2.5)  # a paper is this many times as long as wide; bands are far thinner

@@ -23,8 +23,8 @@ class OneEuro:
     is exact for any steps and ends at tau: 1 / (2 pi cutoff), 80 ms at 2 Hz and 8 ms at 20 Hz. With the
     defaults and 60 frames per second: a third of white jitter at rest, 13 ms late at 50 mm/s.
 
-    Nothing is carried across a refusal, a gap above ``longest_gap`` or a turn of more than 90 degrees from frame to
-    frame: the next pose passes unchanged, as the first.
+    Nothing is carried across a refusal, a gap above ``longest_gap`` or a turn of 90 degrees or more from the smoothed
+    pose to the next, as when tip and rear are exchanged: the next pose passes unchanged, as the first.
 
     Args:
         min_cutoff: In Hz, at rest.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -115,10 +116,14 @@ class Pose:
 
     def point(self, along: float | Tensor) -> Tensor:
         """Point [..., 3] ``along`` metres from the tip."""
-        return self.tip + torch.as_tensor(along, dtype=self.tip.dtype)[..., None] * self.direction
+        where = torch.as_tensor(along, dtype=self.tip.dtype, device=self.tip.device)
+        return self.tip + where[..., None] * self.direction
 
     def __len__(self) -> int:
         return len(self.tip) if self.tip.ndim > 1 else 1
+
+    def __iter__(self) -> Iterator[Pose]:
+        return iter((self,)) if isinstance(self.status, Status) else map(self.__getitem__, range(len(self)))
 
     def __getitem__(self, index: int) -> Pose:
         """One of a batch."""

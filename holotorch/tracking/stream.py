@@ -72,29 +72,31 @@ class PoseSender:
         return number
 
 
-class Link(asyncio.DatagramProtocol):
-    """One receiver as its sender sees it: counts of packets ``sent``, ``dropped`` for newer ones, and ``errors``."""
+class Newest(asyncio.BaseProtocol):
+    """Writes at once, and keeps only the newest bytes while the system's buffer is full; ``dropped`` counts the others.
 
-    def __init__(self, host: str, port: int):
-        self.host, self.port, self.transport = host, port, None
-        self.sent, self.dropped, self.errors, self.last_error = 0, 0, 0, ""
+    A subclass says in ``_write`` how its transport takes bytes.
+    """
+
+    def __init__(self):
+        self.transport: Any = None
+        self.dropped = 0
         self._waiting, self._paused = b"", False
 
     def connection_made(self, transport: Any) -> None:
         """Called by asyncio."""
         self.transport = transport
-        transport.set_write_buffer_limits(high=0)  # to be told as soon as one packet waits
+        transport.set_write_buffer_limits(high=0)  # to be told as soon as something waits
 
     def offer(self, data: bytes) -> None:
-        """Send ``data`` now, or when the system takes packets again if none newer has come."""
+        """Write ``data`` now, or when the system takes bytes again if none newer have come."""
         if self.transport is None or self.transport.is_closing():
             return
         if self._paused:
             self.dropped += bool(self._waiting)
             self._waiting = data
-            return
-        self.sent += 1
-        self.transport.sendto(data)
+        else:
+            self._write(data)
 
     def pause_writing(self) -> None:
         """Called by asyncio."""
@@ -106,6 +108,22 @@ class Link(asyncio.DatagramProtocol):
         data, self._waiting = self._waiting, b""
         if data:
             self.offer(data)
+
+    def _write(self, data: bytes) -> None:
+        raise NotImplementedError
+
+
+class Link(Newest, asyncio.DatagramProtocol):
+    """One receiver as its sender sees it: counts of packets ``sent``, ``dropped`` for newer ones, and ``errors``."""
+
+    def __init__(self, host: str, port: int):
+        super().__init__()
+        self.host, self.port = host, port
+        self.sent, self.errors, self.last_error = 0, 0, ""
+
+    def _write(self, data: bytes) -> None:
+        self.sent += 1
+        self.transport.sendto(data)
 
     def error_received(self, exc: Exception) -> None:
         """Called by asyncio: nobody listens there, or the network is gone; both may pass."""

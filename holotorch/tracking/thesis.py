@@ -11,11 +11,10 @@ from torch import Tensor
 from holotorch.tracking import thesis_stages as stages
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import Catheter
+from holotorch.tracking.measure import Refusal
 from holotorch.tracking.pose import closed_form
-from holotorch.tracking.status import Pose, Status
-from holotorch.tracking.thesis_stages import Axis, Endpoints, Refused, Stopwatch
-
-Box = tuple[int, int, int, int]  # left, top, right, bottom; the last two are not part of it
+from holotorch.tracking.status import Pose
+from holotorch.tracking.thesis_stages import Axis, Box, Endpoints, Stopwatch
 
 
 class ThesisTracker:
@@ -73,7 +72,7 @@ class ThesisTracker:
         for item in range(len(frames)):
             try:
                 axes[item] = self._axis(solid[item, 0], bands[item, 0])
-            except Refused as refused:
+            except Refusal as refused:
                 poses[item] = Pose.refused(refused.status, refused.reason)
         watch.lap("Get axis")
         if axes:
@@ -89,7 +88,7 @@ class ThesisTracker:
                 try:
                     self.endpoints[item] = stages.endpoints(axis, found[item])
                     poses[item] = self._pose(self.endpoints[item], frames.device)
-                except Refused as refused:
+                except Refusal as refused:
                     poses[item] = Pose.refused(refused.status, refused.reason)
             watch.lap("Calculate catheter position")
         self.times = watch.stop()
@@ -147,15 +146,8 @@ class ThesisTracker:
         (x, y), (dx, dy) = origin.tolist(), direction.tolist()
         axis = Axis((x, y), (dx, dy), tuple(extents))
         stages.need_order(axis)
-        (left, top), (right, bottom) = points.amin(0).long().tolist(), points.amax(0).long().tolist()
-        height, width = solid.shape
-        margin = stages.MARGIN_PX
-        return axis, (
-            max(left - margin, 0),
-            max(top - margin, 0),
-            min(right + margin + 1, width),
-            min(bottom + margin + 1, height),
-        )
+        first, last = points.amin(0).long().tolist(), points.amax(0).long().tolist()
+        return axis, stages.box(first, last, (solid.shape[1], solid.shape[0]))
 
     def _gradient(self, image: Tensor, axes: dict[int, tuple[Axis, Box]]) -> tuple[Tensor, list[tuple[int, int]]]:
         """Greatest change of the three colours along each axis in levels, [n, 1, h, w], and each crop's left and top.
@@ -182,33 +174,14 @@ class ThesisTracker:
 
     def _pose(self, found: Endpoints, device: torch.device) -> Pose:
         """Mean of the closed-form poses of each pair of neighbouring bands whose three endpoints were found."""
-        first = stages.triples(found)
-        edges = torch.tensor([spot or (torch.nan, torch.nan) for spot in found], dtype=torch.float64)
-        nudges = torch.cat([torch.zeros(1, edges.numel()), stages.NUDGE_PX * torch.eye(edges.numel())]).to(edges)
-        edges = edges + nudges.reshape(-1, *edges.shape)
+        edges = torch.from_numpy(stages.nudged(found))
         tips, directions = [], []
-        for i in first:
+        for i in stages.triples(found):
             tip, direction = closed_form(edges[:, i : i + 3], self.catheter.positions[i : i + 3], self._pinhole)
             tips.append(tip)
             directions.append(direction)
-        tip = torch.stack(tips).mean(0)
         direction = torch.nn.functional.normalize(torch.stack(directions).mean(0), dim=-1)
-        both = torch.cat([tip, direction], -1)
-        slopes = ((both[1:] - both[0]) / stages.NUDGE_PX).T
-        covariance = stages.DEVIATION_PX**2 * slopes @ slopes.T
-        if not bool(torch.isfinite(covariance).all()) or not bool(torch.isfinite(both).all()) or tip[0, 2] <= 0:
-            raise Refused(Status.INCONSISTENT, stages.NO_POSE)
-        missing = [str(edge + 1) for edge, spot in enumerate(found) if spot is None]
-        zero = torch.zeros((), dtype=torch.float64, device=device)
-        return Pose(
-            tip=tip[0].to(device),
-            direction=direction[0].to(device),
-            covariance=covariance.to(device),
-            chi_square=zero,
-            freedom=zero,
-            status=Status.UNVERIFIED if missing else Status.OK,
-            reason=stages.missing_edges(missing),
-        )
+        return stages.answer(found, torch.stack(tips).mean(0).numpy(), direction.numpy(), device)
 
 
 def _line(points: Tensor) -> tuple[Tensor, Tensor]:

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from holotorch.tracking.catheter import Catheter
-from holotorch.tracking.status import Status
+from holotorch.tracking.measure import Refusal
+from holotorch.tracking.status import Pose, Status
 
 # The rows of Table 3.1, in its order and words. The median belongs to "Gradient", the binary image to "Connected
 # components"; "Other" is what the call takes beyond the stages.
@@ -52,16 +53,8 @@ REFUSED_AT = {
     Status.INCONSISTENT: "Calculate catheter position",
 }
 
-
+Box = tuple[int, int, int, int]  # left, top, right, bottom; the last two are not part of it
 Endpoints = list[tuple[float, float] | None]
-
-
-class Refused(Exception):
-    """Ends the work on one frame; holds the status and the sentence that its pose will carry."""
-
-    def __init__(self, status: Status, reason: str):
-        super().__init__(reason)
-        self.status, self.reason = status, reason
 
 
 @dataclass(frozen=True)
@@ -145,13 +138,13 @@ def missing_edges(names: Sequence[str]) -> str:
 def need_pixels(count: int) -> None:
     """Refuse a frame with fewer pixels of the bands' colours than a line can be fitted to."""
     if count < LEAST_PIXELS:
-        raise Refused(Status.NO_CATHETER, f"{count} pixels have a band's colour after the erosion, not {LEAST_PIXELS}")
+        raise Refusal(Status.NO_CATHETER, f"{count} pixels have a band's colour after the erosion, not {LEAST_PIXELS}")
 
 
 def need_line(count: int, kept: int, rms_px: float) -> None:
     """Refuse pixels that are no line: ``kept`` of ``count`` near the axis, ``rms_px`` from it."""
     if kept < max(LEAST_PIXELS, AXIS_SHARE * count) or not rms_px <= AXIS_RMS_PX:
-        raise Refused(
+        raise Refusal(
             Status.NO_AXIS,
             f"the pixels of the bands' colours are no line: {kept} of {count} near the axis, {rms_px:.1f} px rms",
         )
@@ -162,9 +155,9 @@ def need_order(axis: Axis) -> None:
     seen = [(i, extent[0] + extent[1]) for i, extent in enumerate(axis.extents) if extent is not None]
     names = ", ".join(str(i + 1) for i, _ in seen) or "none"
     if not any(b[0] == a[0] + 1 for a, b in zip(seen, seen[1:], strict=False)):
-        raise Refused(Status.BANDS_MISSING, f"two neighbouring bands are needed, of {len(axis.extents)} seen: {names}")
+        raise Refusal(Status.BANDS_MISSING, f"two neighbouring bands are needed, of {len(axis.extents)} seen: {names}")
     if len({b[1] > a[1] for a, b in zip(seen, seen[1:], strict=False)}) == 2:
-        raise Refused(Status.BANDS_MISSING, "the colours along the axis are not in the catheter's order")
+        raise Refusal(Status.BANDS_MISSING, "the colours along the axis are not in the catheter's order")
 
 
 def endpoints(axis: Axis, centroids: Sequence[tuple[float, float]]) -> Endpoints:
@@ -189,13 +182,47 @@ def endpoints(axis: Axis, centroids: Sequence[tuple[float, float]]) -> Endpoints
                 found[-1] = spot
     if not triples(found):
         names = ", ".join(str(i + 1) for i, spot in enumerate(found) if spot is not None) or "none"
-        raise Refused(Status.EDGES_UNCLEAR, f"three neighbouring edges of the bands are needed, found: {names}")
+        raise Refusal(Status.EDGES_UNCLEAR, f"three neighbouring edges of the bands are needed, found: {names}")
     return found
 
 
 def triples(found: Endpoints) -> list[int]:
     """First edges of the pairs of neighbouring bands whose three endpoints were found."""
     return [i for i in range(len(found) - 2) if None not in found[i : i + 3]]
+
+
+def box(first: Sequence[int], last: Sequence[int], size: tuple[int, int]) -> Box:
+    """Box around the pixels from ``first`` (x, y) to ``last`` with its margin, within a frame of ``size`` (W, H)."""
+    left, top = (max(low - MARGIN_PX, 0) for low in first)
+    right, bottom = (min(high + MARGIN_PX + 1, side) for high, side in zip(last, size, strict=True))
+    return left, top, right, bottom
+
+
+def nudged(found: Endpoints) -> np.ndarray:
+    """Endpoints as float64 [1 + 2 n, n, 2], NaN for None: as they are, then with each number moved by ``NUDGE_PX``."""
+    edges = np.array([spot or (np.nan, np.nan) for spot in found])
+    nudges = np.concatenate([np.zeros((1, edges.size)), NUDGE_PX * np.eye(edges.size)])
+    return edges + nudges.reshape(-1, *edges.shape)
+
+
+def answer(found: Endpoints, tip: np.ndarray, direction: np.ndarray, device: torch.device | None = None) -> Pose:
+    """Pose from the tips and directions [1 + 2 n, 3] of the :func:`nudged` endpoints; refuses what is none."""
+    both = np.concatenate([tip, direction], -1)
+    slopes = (both[1:] - both[0]).T / NUDGE_PX
+    covariance = DEVIATION_PX**2 * slopes @ slopes.T
+    if not np.isfinite(covariance).all() or not np.isfinite(both).all() or tip[0, 2] <= 0:
+        raise Refusal(Status.INCONSISTENT, NO_POSE)
+    missing = [str(edge + 1) for edge, spot in enumerate(found) if spot is None]
+    zero = torch.zeros((), dtype=torch.float64, device=device)
+    return Pose(
+        tip=torch.from_numpy(tip[0].copy()).to(device),
+        direction=torch.from_numpy(direction[0].copy()).to(device),
+        covariance=torch.from_numpy(covariance).to(device),
+        chi_square=zero,
+        freedom=zero,
+        status=Status.UNVERIFIED if missing else Status.OK,
+        reason=missing_edges(missing),
+    )
 
 
 class Stopwatch:

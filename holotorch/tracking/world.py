@@ -43,7 +43,10 @@ class Case:
 
 
 def synthetic_camera(size: tuple[int, int] = (1080, 1920), tone: str = "srgb") -> Camera:
-    """Camera of the synthetic frames: 1400 pixels of focal length at a width of 1920, a little distortion."""
+    """Camera of the synthetic frames: 1400 pixels of focal length at a width of 1920, a little distortion.
+
+    Its axis meets the frame at (W / 2, H / 2): half a pixel right of and below the middle, ((W - 1) / 2, (H - 1) / 2).
+    """
     height, width = size
     focal = 1400 * width / 1920
     matrix = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)

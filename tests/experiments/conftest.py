@@ -1,7 +1,10 @@
 import pytest
 import torch
+from stand_in import CAMERA, SIZE, StandIn
 
-from holotorch.experiments import pictures
+from holotorch.experiments import pictures, track_source
+from holotorch.experiments.config_tracking import save_camera, save_catheter
+from holotorch.tracking import THESIS
 
 
 @pytest.fixture(scope="module")
@@ -14,3 +17,13 @@ def tiny():
             patch.setattr(pictures, name, lambda *_, **__: b"")
         yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def tracker(monkeypatch, tmp_path):
+    """The stand-in, in place of whatever tracker a run asks for, with a camera's and a catheter's file."""
+    made = StandIn()
+    save_camera(tmp_path / "camera.yaml", CAMERA, SIZE)
+    save_catheter(tmp_path / "catheter.yaml", THESIS)
+    monkeypatch.setattr(track_source, "make_tracker", lambda *_: made)
+    return made

@@ -21,6 +21,7 @@ from holotorch.experiments.config_tracking import (
     save_headset,
 )
 from holotorch.experiments.errors import ConfigError
+from holotorch.io.video import PICTURES
 from holotorch.tracking import THESIS, Camera
 from holotorch.tracking.alignment import headset_from_camera, tool_points
 from holotorch.tracking.boards import Charuco, Chessboard
@@ -32,7 +33,8 @@ TAKEN = oracle.Camera([[430.0, 0, 205], [0, 434, 146], [0, 0, 1]], [-0.2, 0.08, 
 
 @pytest.fixture(scope="module")
 def photographs(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("photographs")
+    folder = tmp_path_factory.mktemp("made") / "photographs"
+    folder.mkdir()
     printed, origin = oracle.charuco_print(8, 6, "DICT_4X4_50", 0.7)
     for i, (turned, at) in enumerate(oracle.handheld(8, (0.112, 0.084))):
         image = TAKEN.photograph(printed, origin, 0.028, turned, at, seed=i)
@@ -80,6 +82,7 @@ def test_bad_photographs_are_all_named(photographs, tmp_path):
         ([], WORDS, "no photographs"),
         (["0.png", "1.png", "2.png"], WORDS, "at least 4 photographs"),
         (["0.png", "0.png"], WORDS, "given twice"),
+        (["0.png", "../photographs/0.png", "1.png"], WORDS, "photographs/0.png: given twice"),
         (["0.png"], ("chessboard", "9x6", "25mm"), r"at least 4 .*got 0\n0.png: no chessboard of 9 x 6 inner corners"),
     ],
 )
@@ -99,6 +102,14 @@ def test_shared_charuco_alone_is_refused(tmp_path):
     words = ("charuco", "5x7", "40mm", "20mm", "DICT_6X6_250")
     with pytest.raises(ConfigError, match="at least 4 photographs that show the board.*got 1"):
         calibrate_photographs([SHARED / "charuco_choriginal.jpg"], tmp_path / "camera.yaml", words)
+
+
+def test_pictures_of_every_kind_are_looked_for_in_a_folder(tmp_path):
+    for i, ending in enumerate(PICTURES):
+        cv2.imwrite(str(tmp_path / f"{i}{ending}"), 128 * torch.ones(60, 80, dtype=torch.uint8).numpy())
+    with pytest.raises(ConfigError, match="at least 4 photographs that show the board") as caught:
+        calibrate_photographs([tmp_path], tmp_path / "camera.yaml")
+    assert all(f"{i}{ending}: no chessboard" in str(caught.value) for i, ending in enumerate(PICTURES))
 
 
 def test_boards_by_their_words():

@@ -1,90 +1,22 @@
-"""Tracking a source with a stand-in tracker, which knows the tip from the grey level of a frame."""
+"""Tracking a source with a stand-in tracker, as a run and live."""
 
-import csv
-import json
 import math
-import signal
-from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 import torch
+from stand_in import CAMERA, SIZE, StandIn, grey, pictures, read, summary, tracked
 
-from holotorch.experiments import track
+from holotorch.experiments import track, track_source
 from holotorch.experiments.config_tracking import save_camera, save_catheter
 from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.track import follow, run_tracking
-from holotorch.experiments.track_report import COLUMNS
+from holotorch.experiments.track import follow, live, run_tracking
+from holotorch.experiments.track_report import COLUMNS, Tracked
 from holotorch.io.files import write_bytes
 from holotorch.io.images import encode_png
 from holotorch.io.recording import is_recording, open_recording
-from holotorch.io.video import Frame, open_frames
-from holotorch.tracking import THESIS, Camera, Pose, Status
+from holotorch.io.video import Frame, Frames, open_frames
+from holotorch.tracking import THESIS, Camera, Catheter, Status
 from holotorch.tracking.world import World
-
-SIZE = (48, 64)
-CAMERA = Camera(torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), torch.zeros(5))
-DIRECTION = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
-
-
-def grey(level: int) -> torch.Tensor:
-    return torch.full((3, *SIZE), level, dtype=torch.uint8)
-
-
-class StandIn:
-    """Refuses black frames; the tip of others lies ``level`` / 3 mm to the right."""
-
-    def __init__(self):
-        self.previous: list = []
-        self.times = {"colour": 2e-3, "edges": 6e-3}
-
-    def __call__(self, frames, previous=None):
-        assert frames.shape == (1, 3, *SIZE) and frames.dtype == torch.uint8
-        self.previous.append(previous)
-        level = int(frames[0, 0, 0, 0])
-        if level == 0:
-            return [Pose.refused(Status.NO_CATHETER, "nothing of the bands' colours, thin and long")]
-        tip = torch.tensor([level / 3e3, 0.0, 0.5], dtype=torch.float64)
-        covariance = torch.diag(torch.tensor([1.0, 2, 3, 4, 5, 6], dtype=torch.float64)) * 1e-8
-        covariance[0, 2] = covariance[2, 0] = 1e-9 / 3
-        one = torch.ones((), dtype=torch.float64)
-        return [Pose(tip, DIRECTION, covariance, one / 7, one, Status.OK)]
-
-
-@pytest.fixture
-def tracker(monkeypatch, tmp_path):
-    made = StandIn()
-    save_camera(tmp_path / "camera.yaml", CAMERA, SIZE)
-    save_catheter(tmp_path / "catheter.yaml", THESIS)
-    monkeypatch.setattr(track, "_tracker", lambda *_: made)
-    return made
-
-
-def pictures(folder: Path, levels: list[int | None]) -> Path:
-    """A folder of pictures; None is one that cannot be read."""
-    folder.mkdir()
-    for number, level in enumerate(levels):
-        path = folder / f"{number}.png"
-        if level is None:
-            path.write_bytes(b"\x89PNG cut off")
-        else:
-            cv2.imwrite(str(path), np.full((*SIZE, 3), level, np.uint8))
-    return folder
-
-
-def tracked(tmp_path: Path, source, name: str = "out", **options) -> tuple[Path, bool]:
-    files = tmp_path / "camera.yaml", tmp_path / "catheter.yaml"
-    return run_tracking(source, *files, tmp_path / name, **options)
-
-
-def read(folder: Path) -> list[dict[str, str]]:
-    with open(folder / "poses.csv", newline="", encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))
-
-
-def summary(folder: Path, name: str = "summary.json"):
-    return json.loads((folder / name).read_text())
 
 
 def test_every_frame_gets_a_pose_or_a_reason(tmp_path, tracker):
@@ -155,77 +87,6 @@ def test_a_recording_replays_to_the_same_poses(tmp_path, tracker, capsys):
     assert first == second
 
 
-def test_interrupted_tracking_keeps_what_was_found(tmp_path, tracker, monkeypatch):
-    calls = []
-
-    def pressed(frames, previous=None):
-        calls.append(1)
-        if len(calls) == 3:
-            signal.raise_signal(signal.SIGINT)
-        return tracker(frames, previous)
-
-    monkeypatch.setattr(track, "_tracker", lambda *_: pressed)
-    folder, complete = tracked(tmp_path, pictures(tmp_path / "in", [9, 12, 15, 18]), record=True)
-    assert not complete and len(read(folder)) == 2 and not (folder / "summary.json").exists()
-    assert summary(folder, "interrupted.json")["frames"] == 2
-    assert len(list(open_recording(folder / "recording"))) == 3  # kept before it is looked at
-    with open_frames(folder / "overlay.mp4") as drawn:
-        assert len(list(drawn)) == 2
-    assert not list(folder.glob(".*"))
-
-
-def test_a_tracker_that_fails_loses_nothing(tmp_path, tracker, monkeypatch):
-    def failing(frames, previous=None):
-        if int(frames[0, 0, 0, 0]) == 99:
-            raise RuntimeError("no convergence")
-        return tracker(frames, previous)
-
-    monkeypatch.setattr(track, "_tracker", lambda *_: failing)
-    with pytest.raises(RuntimeError, match="no convergence"):
-        tracked(tmp_path, pictures(tmp_path / "in", [9, 99, 12]))
-    assert len(read(tmp_path / "out")) == 1
-    assert summary(tmp_path / "out", "interrupted.json")["failure"] == "RuntimeError: no convergence"
-    with pytest.raises(RuntimeError, match="no convergence"):
-        tracked(tmp_path, pictures(tmp_path / "in2", [99, 12]), "none")
-    assert not (tmp_path / "none").exists()
-
-
-def test_ctrl_c_is_the_ordinary_end_of_a_camera(tmp_path, tracker, monkeypatch):
-    class Device:
-        """A camera that never ends, and a user who ends it."""
-
-        count = 0
-
-        def isOpened(self):  # noqa: N802
-            return True
-
-        def get(self, what):
-            return 1e3 + 33.0 * self.count if what == cv2.CAP_PROP_POS_MSEC else 0.0
-
-        def set(self, *_):
-            return True
-
-        def grab(self):
-            self.count += 1
-            if self.count == 5:
-                signal.raise_signal(signal.SIGINT)
-            return True
-
-        def retrieve(self):
-            return True, np.full((*SIZE, 3), self.count, np.uint8)
-
-        def read(self):
-            return self.retrieve() if self.grab() else (False, None)
-
-        def release(self):
-            pass
-
-    monkeypatch.setattr(cv2, "VideoCapture", lambda _: Device())
-    folder, complete = tracked(tmp_path, "0", video=False)
-    assert complete and summary(folder)["status"] == "complete"
-    assert [float(row["time_s"]) for row in read(folder)] == pytest.approx([1.033, 1.066, 1.099, 1.132])
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -246,6 +107,52 @@ def test_bad_input_is_refused_before_anything_is_written(tmp_path, tracker, opti
     with pytest.raises(ConfigError, match=message):
         run_tracking(**given)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(("method", "message"), [("ours", "colours"), ("thesis", "use CatheterTracker")])
+def test_a_catheter_that_no_tracker_sees_is_refused_before_anything_is_written(tmp_path, method, message):
+    greys = ((30, 30, 30), (128, 128, 128), (230, 230, 230))
+    save_camera(tmp_path / "camera.yaml", CAMERA, SIZE)
+    save_catheter(tmp_path / "catheter.yaml", Catheter(THESIS.edges, greys, THESIS.radius, THESIS.length))
+    source = pictures(tmp_path / "in", [9])
+    with pytest.raises(ConfigError, match=message):
+        tracked(tmp_path, source, method=method)
+    assert not (tmp_path / "out").exists()
+    if method == "ours":
+        with pytest.raises(ConfigError, match=message):
+            list(live([str(source)], tmp_path / "camera.yaml", tmp_path / "catheter.yaml"))
+
+
+def test_live_poses_of_a_folder_come_with_its_notes_and_at_the_rate_asked_for(tmp_path, tracker, capsys):
+    source = pictures(tmp_path / "in", [9, 0, 12])
+    double = Camera(torch.tensor([[120.0, 0, 64], [0, 120, 48], [0, 0, 1]]), torch.zeros(5))
+    save_camera(tmp_path / "double.yaml", double)  # says no size
+    files = tmp_path / "double.yaml", tmp_path / "catheter.yaml"
+    found = list(live([str(source)], *files, 4.0))
+    # Multiples of 2.4e-7 s, the spacing of numbers near 1.7e9.
+    assert [time - found[0][0] for time, _ in found] == pytest.approx([0, 0.25, 0.5], abs=1e-6)
+    assert [pose.status.name for _, pose in found if isinstance(pose.status, Status)] == ["OK", "NO_CATHETER", "OK"]
+    assert "calibrated at another resolution" in capsys.readouterr().out
+    with pytest.raises(ConfigError, match="expected one source to track and stream, got 2"):
+        list(live(["a.mp4", "b.mp4"], *files))
+
+
+def test_live_poses_of_a_recording_need_no_other_files(tmp_path, tracker):
+    folder, _ = tracked(tmp_path, pictures(tmp_path / "in", [9, 12]), record=True, video=False)
+    assert [float(pose.tip[0]) for _, pose in live([str(folder / "recording")], None, None)] == [9 / 3e3, 12 / 3e3]
+
+
+def test_a_live_pose_has_the_time_of_its_frame_not_of_its_tracking(tmp_path, tracker, monkeypatch):
+    camera = Frames("camera 0", SIZE, None, 30.0, iter([Frame(7.0, grey(9)), Frame(7.5, grey(12))]), [], live=True)
+    monkeypatch.setattr(track_source, "open_frames", lambda *_: camera)
+    monkeypatch.setattr(track, "now", lambda: 100.0)
+
+    def slow(frames, tracker):
+        return (Tracked(i, frame, tracker(frame.pixels[None])[0], 0.25 + i, {}) for i, frame in enumerate(frames))
+
+    monkeypatch.setattr(track, "follow", slow)
+    found = list(live(["0"], tmp_path / "camera.yaml", tmp_path / "catheter.yaml"))
+    assert [captured for captured, _ in found] == [99.75, 98.75]
 
 
 def test_intrinsics_of_another_resolution_are_noticed(tmp_path, tracker):

@@ -193,23 +193,27 @@ def test_stream_with_nobody_and_nothing_to_send(capsys):
     assert "expected HOST:PORT" in said(capsys, "stream", "poses.csv", "--to", "127.0.0.1:99999")
 
 
+def test_ports_that_are_none(capsys):
+    for words in (["--view", "--port", "65536"], ["--check", "--port", "-1"], ["poses.csv", "--igtl", "99999"]):
+        error = wrong(capsys, "stream", *words)
+        assert f"expected a port from 0 (any that is free) to 65535, got '{words[-1]}'" in error
+
+
 def test_stream_of_a_video_takes_a_camera_and_a_catheter(capsys):
     cv2.imwrite("0.png", np.zeros((1080, 1920, 3), np.uint8))
     to = ["--to", "127.0.0.1:1"]
-    wanted = "give one source, --camera FILE and --catheter FILE"
-    assert wanted in said(capsys, "stream", ".", *to)
-    assert wanted in said(capsys, "stream", ".", *FILES[:2], *to)
-    assert wanted in said(capsys, "stream", "a.mp4", "b.mp4", *FILES, *to)
+    assert "no camera.yaml: say which with --camera" in said(capsys, "stream", ".", *to)
+    assert "no catheter.yaml: say which with --catheter" in said(capsys, "stream", ".", *FILES[:2], *to)
+    assert "expected one source to track and stream, got 2" in said(capsys, "stream", "a.mp4", "b.mp4", *FILES, *to)
     assert "nowhere.mp4" in said(capsys, "stream", "nowhere.mp4", *FILES, *to)
     assert "none.yaml" in said(capsys, "stream", ".", "--camera", "none.yaml", *FILES[2:], *to)
 
 
 def test_stream_tracks_a_recording(recording, capsys):
-    files = ["--camera", str(recording / "camera.yaml"), "--catheter", str(recording / "catheter.yaml")]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(5)
-        assert main(["stream", str(recording), *files, "--to", f"127.0.0.1:{receiver.getsockname()[1]}"]) == 0
+        assert main(["stream", str(recording), "--to", f"127.0.0.1:{receiver.getsockname()[1]}"]) == 0
         packets = [decode(receiver.recv(4096)) for _ in range(2)]
     poses = [packet for packet in packets if isinstance(packet, PosePacket)]
     assert [packet.pose.status for packet in poses] == [Status.OK, Status.OK]

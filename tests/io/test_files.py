@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from holotorch.io.files import replacing, save_array, write_json, write_text
+from holotorch.io.files import append, replacing, save_array, write_json, write_text
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path):
@@ -22,6 +22,17 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path):
     with pytest.raises(Cut):
         write_half()
     assert path.read_text() == "old"
+    assert [item.name for item in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_what_was_written_whole_outlives_a_full_disk(tmp_path, full_disk):
+    path = tmp_path / "a.txt"
+    with replacing(path, buffering=0) as stream:
+        with pytest.raises(OSError), full_disk(1000):
+            for _ in range(1000):
+                append(stream, b"a line\n" * 9)
+        append(stream, b"room again\n")
+    assert path.read_bytes() == b"a line\n" * (9 * (1000 // 63)) + b"room again\n"
     assert [item.name for item in tmp_path.iterdir()] == ["a.txt"]
 
 

@@ -82,6 +82,38 @@ def test_a_killed_recording_is_readable(tmp_path):
         assert bool((frame.pixels == index % 256).all())
 
 
+@pytest.mark.parametrize(("size", "left"), [(recording_bytes(SHAPE, 5) + 99, 5), (recording_bytes(SHAPE, 1), 1)])
+def test_a_full_disk_leaves_whole_frames_and_the_recording_can_go_on(tmp_path, full_disk, size, left):
+    pictures = noise(9)
+    with Recorder(tmp_path / "a", SHAPE, 30.0, "test") as recorder:
+        with pytest.raises(OSError), full_disk(size):
+            for index, pixels in enumerate(pictures):
+                recorder.write(Frame(index / 30, pixels))
+        assert recorder.frames == left
+        assert (tmp_path / "a" / "frames.rgb").stat().st_size == recording_bytes(SHAPE, left)
+        recorder.write(Frame(1.0, pictures[-1]))
+    frames = open_recording(tmp_path / "a")
+    assert not frames.notes
+    *first, last = frames
+    assert all(same(frame, pixels) for frame, pixels in zip(first, pictures[:left], strict=True))
+    assert same(last, pictures[-1]) and last.seconds == 1.0
+
+
+def test_a_line_that_does_not_fit_takes_its_frame_with_it(tmp_path, monkeypatch):
+    first, second = noise(2)
+    with Recorder(tmp_path / "a", SHAPE, 30.0, "test") as recorder:
+        recorder.write(Frame(0.0, first))
+
+        def full(_):
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(recorder, "_row", full)
+        with pytest.raises(OSError, match="No space left"):
+            recorder.write(Frame(1 / 30, second))
+    frames = open_recording(tmp_path / "a")
+    assert not frames.notes and [same(frame, first) for frame in frames] == [True]
+
+
 @pytest.mark.parametrize(
     ("pixels_cut", "line_cut", "left", "note"),
     [(0, 0, 4, ""), (0, 7, 3, "cut off while a frame was written"), (100, 0, 3, "3 of 4 frames are there")]

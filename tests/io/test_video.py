@@ -1,4 +1,5 @@
 import math
+import time
 
 import cv2
 import numpy as np
@@ -175,6 +176,24 @@ def test_a_camera_gives_the_drivers_times_or_says_that_it_has_none(monkeypatch):
     device = StandIn([], [])
     with pytest.raises(ValueError, match="no frame from camera 0"):
         open_frames("0")
+
+
+def test_a_source_that_was_not_read_is_closed_too(tmp_path, monkeypatch):
+    (tmp_path / "a.mkv").write_bytes(b"stand-in")
+    for source in ("0", tmp_path / "a.mkv"):
+        device = StandIn([bgr(1), bgr(2)], [5000.0, 5033.0], rate=30.0)
+        monkeypatch.setattr(cv2, "VideoCapture", lambda _, device=device: device)
+        with open_frames(source):
+            assert not device.released
+        assert device.released
+
+
+def test_the_first_frame_of_a_camera_has_the_time_at_which_it_was_read(monkeypatch):
+    monkeypatch.setattr(cv2, "VideoCapture", lambda _: StandIn([bgr(1), bgr(2)], [0.0, 0.0]))
+    with open_frames("0") as frames:
+        opened = time.monotonic()
+        first, second = frames
+    assert first.seconds <= opened <= second.seconds
 
 
 def test_frames_without_times_of_their_own_are_counted_and_that_is_said(tmp_path, monkeypatch):

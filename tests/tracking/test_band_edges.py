@@ -16,11 +16,13 @@ TRUE = NOMINAL + torch.tensor([0.3e-3, -0.2e-3, 0.25e-3, -0.4e-3])
 OFFSET = 0.9e-3
 
 
-def frames(count, positions=TRUE, *, resting=False, noise=0.1, spread=1.0, wobble=0.0, seed=0):
+def frames(
+    count, positions=TRUE, *, resting=False, noise=0.1, spread=1.0, wobble=0.0, seed=0, camera=CAMERA, aside=0.0
+):
     """Edges in pixels [F, N, 2] by the definition: on the ring's side that faces the camera."""
     generator = torch.Generator().manual_seed(seed)
     a, b, c, azimuth, tilt = torch.rand(5, count, dtype=torch.float64, generator=generator)
-    tip = torch.stack([0.1 * a - 0.1, 0.1 * b - 0.05, 0.42 + 0.2 * c], -1)
+    tip = torch.stack([0.1 * a - 0.1 + aside, 0.1 * b - 0.05, 0.42 + 0.2 * c], -1)
     if resting:
         tip = torch.tensor([-0.06, 0.03, 0.5], dtype=torch.float64).expand(count, 3)
     tip = tip + wobble * torch.randn(count, 3, dtype=torch.float64, generator=generator)
@@ -28,7 +30,7 @@ def frames(count, positions=TRUE, *, resting=False, noise=0.1, spread=1.0, wobbl
     along = torch.stack([tilt.cos() * azimuth.cos(), tilt.cos() * azimuth.sin(), -tilt.sin()], -1)
     toward = torch.nn.functional.normalize((tip * along).sum(-1, keepdim=True) * along - tip, dim=-1)
     points = tip[:, None] + positions[:, None] * along[:, None] + OFFSET * toward[:, None]
-    pixels = CAMERA.project(points)
+    pixels = camera.project(points)
     return pixels + noise * torch.randn(pixels.shape, dtype=torch.float64, generator=generator)
 
 
@@ -41,6 +43,21 @@ def given(known):
         else:
             nominal[entry] = TRUE[entry]
     return nominal
+
+
+def test_edges_count_by_their_pixels_in_any_camera():
+    """Chi-square of known errors in pixels, where a pixel is not the same angle in x, in y and from place to place.
+
+    Toward the right border, at 0.5 focal lengths, the distortion draws the image together by 3 * 0.3 * 0.5^2 = 23 %.
+    """
+    camera = Camera(torch.tensor([[1500.0, 0, 960], [0, 1200, 540], [0, 0, 1]]), torch.tensor([-0.3, 0.05, 0, 0, 0]))
+    chi, freedom = 0.0, 0
+    for seed in range(6):
+        pixels = frames(40, seed=seed, camera=camera, aside=0.18)
+        found = fit_band_edges(pixels, given([0, 1, 3]), camera, [0, 1, 3], offset=OFFSET)
+        chi, freedom = chi + found.chi_square, freedom + found.freedom
+    # A chi-square of n degrees has a deviation sqrt(2 n): four of them.
+    assert abs(chi - freedom) < 4 * math.sqrt(2 * freedom)
 
 
 CASES = [(False, [0, 1, 3]), (False, [0, (0, 1), (0, 3)]), (True, [3]), (True, [(0, 3)])]
@@ -135,6 +152,7 @@ def test_tip_that_moved_shows_in_chi_square():
         (frames(6), NOMINAL[:3], [0, 1, 3], r"shape \[4\]"),
         (frames(6), NOMINAL, [0, 1, 4], "edges 0 to 3"),
         (frames(6), NOMINAL, [0, 1, (2, 2)], "different"),
+        (frames(6), NOMINAL, [()], r"pairs of different ones, got \(\)"),
         (frames(6), NOMINAL, [0, 1, 2, 3], "nothing is left"),
         (frames(6)[0], NOMINAL, [0, 1, 3], r"\[F, N, 2\]"),
     ],

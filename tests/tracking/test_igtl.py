@@ -119,11 +119,14 @@ def test_a_waiting_transform_is_replaced_by_a_refusal():
     class Transport:
         taken: list[bytes] = []
 
+        def is_closing(self):
+            return False
+
         def write(self, data):
             self.taken.append(data)
 
     client = _Client(set())
-    client.transport = Transport()  # type: ignore[assignment]
+    client.transport = Transport()
     client.pause_writing()
     client.offer(b"transform")
     client.offer(b"refusal")

@@ -87,8 +87,9 @@ def test_what_goes_in_comes_out(tip, direction, status, reason, sequence, captur
     assert back.frame == "headset_from_tool" and back.pose.status is status
     for name in ("tip", "direction", "covariance", "chi_square", "freedom"):
         assert torch.equal(getattr(back.pose, name), getattr(given, name)), name
-    # Characters end whole, and zeros would end a text.
-    assert back.pose.reason == reason.replace("\0", " ").encode("utf-8", "replace")[:64].decode("utf-8", "ignore")
+    # Characters end whole; zeros would end a text, and other controls command the terminal that shows it.
+    shown = "".join(each if each.isprintable() else " " for each in reason)
+    assert back.pose.reason == shown.encode()[:64].decode("utf-8", "ignore")
 
 
 @pytest.mark.parametrize("status", REFUSALS)
@@ -132,7 +133,7 @@ def test_impossible_contents_are_named():
         (put(data, 32, "<d", -1.0), "not negative"),
         (put(data, 40, "<4s", b"RUB\0"), "expected axes"),
         (put(data, 48, "<B", 200), "cannot be read"),
-        (put(data, 48, "<32s", b""), "must be printable"),
+        (put(data, 48, "<32s", b""), "name and reason must be printable"),
         (put(data, 80, "<H", 999), "999 is not a valid Status"),
         (put(data, 84, "<f", math.inf), "lag must be finite"),
         (put(data, 88, "<d", math.nan), "finite matrix"),
@@ -143,6 +144,8 @@ def test_impossible_contents_are_named():
         (put(data, 216, "<d", math.inf), "finite matrix, covariance"),
         (put(data, 384, "<d", math.nan), "chi-square"),
         (put(data, 392, "<B", 255), "cannot be read"),
+        (put(data, 392, "<4s", b"\x1b[2J"), r"frame name and reason must be printable, .*'\\x1b\[2J'"),
+        (put(data, 392, "<4s", "\N{RIGHT-TO-LEFT OVERRIDE}a".encode()), "must be printable"),
     ]
     for bad, message in cases:
         with pytest.raises(PacketError, match=message):
@@ -167,6 +170,18 @@ def test_what_cannot_be_sent_is_refused_before():
         encode(packet(pose(tip=(10.0, 20.0, 520.0))))
     with pytest.raises(ValueError, match="finite matrix"):
         encode(packet(pose(tip=(math.nan, 0.0, 0.5))))
+    for wrong, name in (
+        (packet(sequence=-1), "sequence"),
+        (packet(stream=2**64), "stream"),
+        (packet(lag=1e39), "lag"),
+        (packet(lag=math.nan), "lag"),
+        (packet(replace(pose(), freedom=torch.tensor(-1.0))), "freedom"),
+        (packet(replace(pose(), freedom=torch.tensor(70000.0))), "freedom"),
+        (Echo(1, -1, 0.0), "number"),
+        (Echo(2**64, 1, 0.0), "stream"),
+    ):
+        with pytest.raises(ValueError, match=f"^{name} must be"):
+            encode(wrong)
     both = replace(pose(), tip=torch.zeros(2, 3, dtype=torch.float64))
     with pytest.raises(TypeError, match="index the batch"):
         encode(packet(both))

@@ -125,6 +125,14 @@ def test_nothing_crosses_a_refusal_a_gap_or_a_flip():
         assert torch.equal(filtered.predict(at + 2 / 60).tip, new.tip)
 
 
+def test_a_fast_turn_is_not_lost_behind_a_slow_filter():
+    """Half a turn behind, the shorter way would lead back: 4 rad/s at 0.8 s of lag would end at 183 degrees."""
+    filtered = OneEuro(0.2, 0.0)
+    for i in range(240):
+        found = filtered(pose([0, 0, 0.5], 4 * i / 60), i / 60)
+        assert float(found.direction @ pose([0, 0, 0.5], 4 * i / 60).direction) > 0
+
+
 def test_steady_motion_is_predicted_without_error():
     filtered, rate = OneEuro(), 60
     for i in range(2 * rate):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -61,7 +63,12 @@ def test_points_deviations_and_members():
     torch.testing.assert_close(pose.tip_sd, torch.full((2,), 3e-4, dtype=torch.float64))
     torch.testing.assert_close(pose.point(0.1)[1], torch.tensor([0.2, -0.2, 0.5]).double())
     torch.testing.assert_close(pose.point(torch.tensor([0.1, 0.2]))[0], torch.tensor([0.1, -0.2, 0.6]).double())
+    assert float(pose.point(0.1)[0, 2]) == 0.6  # 0.1 in float64, not in float32
+    elsewhere = replace(pose, tip=pose.tip.to("meta"), direction=pose.direction.to("meta"))
+    assert elsewhere.point(0.1).device == elsewhere.point(torch.tensor([0.1, 0.2])).device == torch.device("meta")
     assert len(pose) == 2 and len(pose[0]) == 1 and pose[1].answered
+    assert list(pose[0])[0].tip.tolist() == pose[0].tip.tolist() and len(list(pose[0])) == 1
+    assert [float(one.direction[0]) for one in pose] == [0, 1]
     assert pose[1].tip.shape == (3,) and pose[1].covariance.shape == (6, 6) and pose[1].status is Status.OK
     assert pose[1].camera_from_tool.shape == (4, 4)
     with pytest.raises(ValueError, match=r"ask pose\[i\].answered"):

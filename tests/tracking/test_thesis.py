@@ -188,5 +188,5 @@ def test_endpoints_are_the_spots_where_colours_change():
     assert stages.endpoints(forward, spots) == expected
     backward = stages.Axis((0.0, 10.0), (1.0, 0.0), extents[::-1])
     assert stages.endpoints(backward, spots) == expected[::-1]
-    with pytest.raises(stages.Refused, match="three neighbouring edges"):
+    with pytest.raises(stages.Refusal, match="three neighbouring edges"):
         stages.endpoints(stages.Axis((0.0, 10.0), (1.0, 0.0), ((2.0, 90.0), (110.0, 190.0), (210.0, 290.0))), spots)

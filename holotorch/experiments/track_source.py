@@ -1,0 +1,112 @@
+"""What a tracking run is made from: a source of frames, its camera, the catheter, and the tracker."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from torch import Tensor
+
+from holotorch.experiments.config_tracking import (
+    CameraSettings,
+    build_camera,
+    build_catheter,
+    load_camera,
+    load_catheter,
+)
+from holotorch.experiments.errors import ConfigError
+from holotorch.io.bundled import find_config
+from holotorch.io.recording import is_recording, open_recording
+from holotorch.io.video import Frames, open_frames
+from holotorch.tracking import Camera, Catheter, Pose
+
+METHODS = ("ours", "thesis")
+_OFF_CENTRE = 0.15  # of a side; two thirds of the resolution, as 720 to 1080 lines, shift the centre by a sixth
+Tracker = Callable[[Tensor, Sequence[Pose] | None], list[Pose]]
+
+
+class Given(NamedTuple):
+    """What a run is made from; ``paths`` of the two YAML files by the names that their copies get."""
+
+    frames: Frames
+    camera: Camera
+    catheter: Catheter
+    tracker: Tracker
+    paths: dict[str, Path]
+
+
+@contextmanager
+def opened(
+    source: str | Path, camera: Path | None, catheter: Path | None, method: str, rate: float | None
+) -> Iterator[Given]:
+    """Open a source with its files, and make a tracker for it.
+
+    Args:
+        source: A video, a folder of pictures, a folder of a recording, or the number of a camera.
+        camera: YAML file; that of the recording by default.
+        catheter: The same.
+        method: One of ``METHODS``.
+        rate: Frames per second where the source has no times.
+
+    Raises:
+        ConfigError: One of them cannot be used, or not with the others.
+    """
+    if method not in METHODS:
+        raise ConfigError([f"expected one of {', '.join(METHODS)} as the method, got {method!r}"])
+    replayed = is_recording(Path(source))
+    files = {"camera.yaml": camera, "catheter.yaml": catheter}
+    for name in files:
+        if files[name] is None and replayed and (Path(source) / name).is_file():
+            files[name] = Path(source) / name
+    missing = [f"no {name}: say which with --{name[:-5]}" for name, path in files.items() if path is None]
+    if missing:
+        raise ConfigError(missing)
+    paths = {name: find_config(path) or path for name, path in files.items() if path is not None}
+    lens, tool = load_camera(paths["camera.yaml"]), build_catheter(load_catheter(paths["catheter.yaml"]))
+    seen = build_camera(lens)
+    try:
+        tracker = make_tracker(method, seen, tool)
+        frames = open_recording(Path(source)) if replayed else open_frames(source, rate)
+    except ValueError as error:
+        raise ConfigError([str(error)]) from None
+    with frames:
+        _same_size(lens, frames)
+        yield Given(frames, seen, tool, tracker, paths)
+
+
+def make_tracker(method: str, camera: Camera, catheter: Catheter) -> Tracker:
+    """The tracker of a method; ValueError for a catheter that it cannot see."""
+    if method == "thesis":
+        from holotorch.tracking.thesis import ThesisTracker
+
+        return _Cold(ThesisTracker(camera, catheter))
+    from holotorch.tracking.tracker import CatheterTracker
+
+    return CatheterTracker(camera, catheter)
+
+
+class _Cold:
+    """A tracker that makes no use of the pose before."""
+
+    def __init__(self, tracker: Callable[[Tensor], list[Pose]]):
+        self._tracker = tracker
+
+    def __call__(self, frames: Tensor, previous: Sequence[Pose] | None = None) -> list[Pose]:
+        return self._tracker(frames)
+
+    @property
+    def times(self) -> dict[str, float]:
+        return getattr(self._tracker, "times", {})
+
+
+def _same_size(lens: CameraSettings, frames: Frames) -> None:
+    """ConfigError, or a doubt noted, for intrinsics of another resolution: poses would be wrong, and plausible."""
+    height, width = frames.shape
+    if lens.size is not None and tuple(lens.size) != frames.shape:
+        held = f"{lens.size[1]} x {lens.size[0]}"
+        raise ConfigError([f"the camera's file holds for frames of {held} px, and these have {width} x {height} px"])
+    if lens.size is None and max(abs(lens.cx / width - 0.5), abs(lens.cy / height - 0.5)) > _OFF_CENTRE:
+        frames.notes.append(
+            f"the principal point ({lens.cx:.0f}, {lens.cy:.0f}) is far from the middle of frames of {width} x "
+            f"{height} px: was the camera calibrated at another resolution?"
+        )
