@@ -76,11 +76,20 @@ class LightSettings(Settings):
     tolerance: Annotated[Number, Field(gt=0, lt=1)] = 0.02
 
 
+class SweepSettings(Settings):
+    """Focus swept over the scene in ``steps``, whose surface is cut into ``bands`` of depth."""
+
+    bands: Annotated[Count, Field(le=64)] = 5
+    steps: Annotated[Count, Field(ge=3, le=256)] = 11
+    realisations: Annotated[Count, Field(le=256)] = 6
+
+
 class ObserverSettings(Settings):
     """What an observer sees of a volume's hologram, for several light sources and depths of focus.
 
     ``focus``: depths of the scene in which the eye is focused; a tenth, half and nine tenths of it by default.
     ``seeds``: realisations of the phases, which are compared with the mean of eight times as many others.
+    ``sweep``: the eye's focus is swept over the scene as well, to see where each part of it looks sharpest.
     ``tradeoff``: distances at which the best spectral width is looked for as well, colour by colour.
     """
 
@@ -92,4 +101,5 @@ class ObserverSettings(Settings):
     light: LightSettings = LightSettings()
     focus: Annotated[tuple[Positive, ...], BeforeValidator(several)] | None = None
     seeds: Annotated[Count, Field(le=64)] = 2
+    sweep: SweepSettings | None = None
     tradeoff: Annotated[tuple[Positive, ...], BeforeValidator(several)] = ()

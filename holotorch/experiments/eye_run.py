@@ -18,6 +18,8 @@ from holotorch.experiments.config_volume import VolumeSettings
 from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.eye import Observer, observer, realisations
+from holotorch.experiments.eye_focus import draw, focus_sweep
+from holotorch.experiments.eye_focus import in_words as sweep_in_words
 from holotorch.experiments.eye_tradeoff import fitted_prefactor, in_words, tradeoff
 from holotorch.experiments.markup import figure, plain, table
 from holotorch.experiments.memory import peak_memory
@@ -126,6 +128,11 @@ def run_observer(settings: ObserverSettings, out: Path | None, name: str) -> tup
                 raise
         with deferred(pressed):
             _write(folder, eye, reference, torch.stack(seen), values, time.perf_counter() - started, not pressed)
+    if settings.sweep and not pressed:
+        sweep = focus_sweep(eye, settings.sweep)
+        write_table(folder / "focus.csv", [band.row for band in sweep.bands])
+        write_bytes(folder / "images" / "focus.png", draw(sweep))
+        print("\n".join(sweep_in_words(sweep)))
     if settings.tradeoff and not pressed:
         cases = tradeoff(settings, scene_settings(settings), settings.tradeoff)
         write_table(folder / "tradeoff.csv", [case.row(fitted_prefactor(cases)) for case in cases])
