@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from kornia.filters import gaussian_blur2d
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from skimage.filters import gaussian
 from torch import Tensor
 from tqdm import tqdm
 
@@ -94,7 +94,7 @@ def focus_sweep(eye: Observer, settings: SweepSettings) -> FocusSweep:
                 total[f] += eye.seen(hologram, None, place)
                 bar.update()
     pictures, wave = total / settings.realisations, eye.reference_wavelength
-    fine, wanted = _detail(pictures), _detail(rendering[None])[0]
+    fine, wanted = _detail(pictures), _detail(rendering[None].float())[0]
     bands = []
     ends = torch.linspace(low, high, settings.bands + 1).tolist()
     for near, far in zip(ends, ends[1:], strict=False):
@@ -111,8 +111,8 @@ def focus_sweep(eye: Observer, settings: SweepSettings) -> FocusSweep:
 def in_words(sweep: FocusSweep) -> list[str]:
     """A line for each band."""
     return [
-        f"Focus      what lies at {1e3 * band.depth:.3f} mm looks sharpest with the eye at {1e3 * band.sharpest:.3f} mm "
-        f"(depth of focus {1e3 * band.depth_of_focus:.3f} mm)"
+        f"Focus      what lies at {1e3 * band.depth:.3f} mm looks sharpest with the eye at {1e3 * band.sharpest:.3f} "
+        f"mm (depth of focus {1e3 * band.depth_of_focus:.3f} mm)"
         for band in sweep.bands
     ]
 
@@ -144,7 +144,7 @@ def draw(sweep: FocusSweep) -> bytes:
 
 def _detail(pictures: Tensor) -> Tensor:
     """Pictures [F, 3, h, w] less their blur."""
-    return pictures - gaussian_blur2d(pictures, (37, 37), (_DETAIL, _DETAIL))
+    return pictures - torch.from_numpy(gaussian(pictures.numpy(), sigma=(0, 0, _DETAIL, _DETAIL)))
 
 
 def _likeness(first: Tensor, second: Tensor) -> float:
