@@ -144,7 +144,8 @@ def draw(sweep: FocusSweep) -> bytes:
 
 def _detail(pictures: Tensor) -> Tensor:
     """Pictures [F, 3, h, w] less their blur."""
-    return pictures - torch.from_numpy(gaussian(pictures.numpy(), sigma=(0, 0, _DETAIL, _DETAIL)))
+    blur: Any = (0, 0, _DETAIL, _DETAIL)
+    return pictures - torch.from_numpy(gaussian(pictures.numpy(), sigma=blur))
 
 
 def _likeness(first: Tensor, second: Tensor) -> float:
