@@ -74,6 +74,7 @@ def run_layout(settings: LayoutSettings, out: Path | None, name: str) -> tuple[P
     layouts = scaled(settings)
     text = layout_text(settings)
     folder = claim(out, name)
+    (folder / "images").mkdir(exist_ok=True)
     write_text(folder / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
     write_json(folder / "env.json", environment(0, torch.device("cpu")))
     rows = [row for title, layout in layouts for row in _rows(settings, title, layout)]
