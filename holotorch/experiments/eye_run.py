@@ -18,6 +18,7 @@ from holotorch.experiments.config_volume import VolumeSettings
 from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.eye import Observer, observer, realisations
+from holotorch.experiments.eye_plan import plan, plan_text, too_large
 from holotorch.experiments.eye_tradeoff import fitted_prefactor, in_words, tradeoff
 from holotorch.experiments.markup import figure, plain, table
 from holotorch.experiments.memory import peak_memory
@@ -28,10 +29,6 @@ from holotorch.io.files import save_array, write_bytes, write_json, write_text
 from holotorch.io.images import encode_png
 from holotorch.optics.colour import desaturated, linear_srgb
 from holotorch.optics.exposure import equal_power, exposed
-from holotorch.optics.geometry import diffraction_angle
-from holotorch.optics.imaging import retinal_scale
-from holotorch.optics.retina import plan_retina
-from holotorch.optics.viewing import scene_fov
 
 _BRIGHT = 0.995  # of the reference's pixels are at most as bright as what is shown white
 
@@ -46,60 +43,13 @@ def scene_settings(settings: ObserverSettings) -> VolumeSettings:
     return found
 
 
-def plan_text(eye: Observer) -> tuple[str, dict[str, Any]]:
-    """What will be done, in words and as JSON values."""
-    settings, scene, display = eye.settings, eye.scene, eye.display
-    depths = [depth * 1e3 for depth in eye.focus]
-    waves = scene.settings.wavelengths
-    middle = eye.focus[len(eye.focus) // 2]
-    way = plan_retina(scene.grid, waves, display, eye.eye(middle), plane=middle, reach=scene.width / 2, registered=True)
-    counts = {
-        source: [len(eye.samples(source, wave, max(eye.focus))[0]) for wave in waves]
-        for source in settings.light.sources
-    }
-    angles = [2 * diffraction_angle(scene.grid, wave)[1] for wave in waves]
-    magnifying = settings.display.kind == "magnifying"
-    before = float(display.lens_distance) - scene.distance
-    across = (
-        scene_fov(scene.width, before, float(display.focal_length), float(display.eye_distance)) if magnifying else None
-    )
-    values = {
-        "scene": settings.scene.config,
-        "synthetic": scene.synthetic,
-        "display": {
-            "kind": settings.display.kind,
-            "lens_distance_mm": float(display.lens_distance) * 1e3,
-            "eye_distance_mm": float(display.eye_distance) * 1e3,
-        },
-        "focus_mm": depths,
-        "accommodation_mm": [eye.accommodation(depth) * 1e3 for depth in eye.focus],
-        "retinal_scale": [float(retinal_scale(display, eye.eye(depth), depth)) for depth in eye.focus],
-        "aperture": [eye.aperture(depth) for depth in eye.focus],
-        "retina": {"method": way.method, "predicted_error": way.predicted_error, "reason": way.reason},
-        "wavelengths": counts,
-        "hologram_fov_deg": [angle * 57.29577951308232 for angle in angles],
-        "scene_fov_deg": None if across is None else across * 57.29577951308232,
-    }
-    lines = [
-        f"Scene      {settings.scene.config}" + (f" (synthetic: {scene.synthetic})" if scene.synthetic else ""),
-        f"Display    {settings.display.kind}; eyepiece {values['display']['lens_distance_mm']:.4g} mm from the "
-        f"hologram, eye {values['display']['eye_distance_mm']:.4g} mm behind it"
-        + ("" if across is None else f"; the scene spans {values['scene_fov_deg']:.3g} deg"),
-        f"Focus      at {', '.join(f'{depth:.4g}' for depth in depths)} mm, seen at "
-        f"{', '.join(f'{far:.4g}' for far in values['accommodation_mm'])} mm; aperture "
-        f"{', '.join(f'{sine:.3g}' for sine in values['aperture'])}",
-        f"Retina     {way.reason}; next: {way.runner_up}",
-        "Light      " + "; ".join(f"{source}: {plain(count)} wavelengths" for source, count in counts.items()),
-        f"Phases     {settings.seeds} realisation(s), compared with the mean of {8 * settings.seeds} others",
-    ]
-    return "\n".join(lines), values
-
-
 def run_observer(settings: ObserverSettings, out: Path | None, name: str) -> tuple[Path, bool]:
     """Carry a run out and fill a folder; returns and raises as :func:`holotorch.experiments.run.run`."""
     eye = observer(settings, scene_settings(settings))
-    text, values = plan_text(eye)
-    print(text, flush=True)
+    values = plan(eye)
+    print(plan_text(eye, values), flush=True)
+    if text := too_large(values):
+        raise ConfigError([text])
     folder = claim(out, name)
     for part in ("arrays", "images"):
         (folder / part).mkdir(exist_ok=True)
@@ -189,7 +139,7 @@ def _write(
     body += "".join(
         figure(f"images/comparison_{f}.png", f"focus {z * 1e3:.4g} mm", "wide") for f, z in enumerate(focus)
     )
-    body += table(names, cells) + f"<pre>{html.escape(plan_text(eye)[0])}</pre>"
+    body += table(names, cells) + f"<pre>{html.escape(plan_text(eye, values))}</pre>"
     write_text(out / "report.html", f"<!DOCTYPE html><meta charset='utf-8'><title>observer</title>{body}")
     summary = {
         "experiment": "eye",

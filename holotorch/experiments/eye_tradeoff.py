@@ -83,7 +83,10 @@ class Case:
 def tradeoff(
     settings: ObserverSettings, scene: VolumeSettings, distances: tuple[float, ...], *, seeds: int = 2, others: int = 12
 ) -> list[Case]:
-    """Cases for every distance and colour; the eye is focused on the middle of the scene."""
+    """Cases for every distance and colour; the eye is focused on the middle of the scene.
+
+    By the collapse throughout, as every hologram is looked at in 41 wavelengths of each colour.
+    """
     cases = []
     for distance in tqdm(distances, desc="speckle against sharpness", unit="distance"):
         moved = scene.model_copy(update={"hologram": scene.hologram.model_copy(update={"distance": distance})})

@@ -11,17 +11,29 @@ import torch
 
 from holotorch.cli import main
 from holotorch.experiments import eye as eye_module
+from holotorch.experiments import eye_plan
 from holotorch.experiments.config import load_config
+from holotorch.experiments.config_eye import ObserverSettings
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.eye import observer
-from holotorch.experiments.eye_run import plan_text, run_observer, scene_settings
+from holotorch.experiments.eye_plan import plan, plan_text
+from holotorch.experiments.eye_run import run_observer, scene_settings
 
 CONFIG = Path(__file__).parents[2] / "configs" / "eye" / "teapot.yaml"
 SCENE = (
     "scene={config: configs/volume/c60.yaml, change: ['volume={phantom: c60, samples: 32}', "
     "'hologram={shape: [128, 128], pitch: 3.74 um, distance: 12 mm, depths: 12, rays: 64}']}"
 )
-SMALL = [SCENE, "seeds=1", "light={sources: [laser, led]}", "focus=[12 mm]"]
+# 128 px see so little of the pupil that the collapse is off by more than the default allows, by a rule of thumb.
+SMALL = [SCENE, "seeds=1", "light={sources: [laser, led]}", "focus=[12 mm]", "tolerance=0.1"]
+# A display so small that both ways are quick: the collapse is predicted to be off by 4 %, the elements by 3 %. The
+# pupil takes no more than the pitch carries, a sine of 0.05 where that is 0.057 at the blue end.
+TINY = [
+    "scene={config: configs/volume/c60.yaml, change: ['volume={phantom: c60, samples: 16}', "
+    "'hologram={shape: [64, 64], pitch: 3.74 um, distance: 2 mm, depths: 4, rays: 32}']}",
+    *("display={kind: planar, distance: 4 mm}", "eye={pupil_radius: 0.1 mm, axial_length: 2 mm}"),
+    *("seeds=1", "light={sources: [laser]}", "focus=[2 mm]"),
+]
 
 
 def settings(*overrides: str):
@@ -80,10 +92,61 @@ def test_the_eye_sees_sharply_where_it_is_focused():
 
 
 def test_the_plan_says_how_the_scene_is_seen():
-    text, values = plan_text(observer(settings(), scene_settings(settings())))
+    found = observer(settings(), scene_settings(settings()))
+    values = plan(found)
+    text = plan_text(found, values)
     assert "synthetic: a phantom was asked for" in text and "laser: " in text
     assert values["accommodation_mm"][0] == pytest.approx(120, rel=1e-6)  # the middle, where the display puts it
     assert main(["check", str(CONFIG), *SMALL]) == 0
+
+
+@pytest.mark.parametrize(("tolerance", "method"), [(0.05, "collapse"), (0.03, "elements")])
+def test_the_run_goes_the_way_that_its_plan_says(tolerance, method, tmp_path, monkeypatch):
+    called = []
+    collapse = eye_module.imaged
+    for name, way in (("collapse", "imaged"), ("elements", "through_elements")):
+        # Elements in fact are tried below; here it counts which way is called.
+        monkeypatch.setattr(
+            eye_module, way, lambda *words, name=name, **more: called.append(name) or collapse(*words, **more)
+        )
+    given = load_config(CONFIG, [*TINY, f"tolerance={tolerance}"])
+    folder, _ = run_observer(given, tmp_path / "a", "a")
+    planned = json.loads((folder / "plan.json").read_text())
+    assert [way["method"] for way in planned["retina"]] == [method] and planned["tolerance"] == tolerance
+    assert set(called) == {method} and len(called) == planned["images"]
+    assert f"Retina     {method} at" in (folder / "report.html").read_text()
+
+
+def test_both_ways_show_the_same_and_the_plan_tells_their_costs():
+    given = [load_config(CONFIG, [*TINY, f"tolerance={tolerance}"]) for tolerance in (0.05, 0.03)]
+    short, long = (observer(each, scene_settings(each)) for each in given)
+    hologram, _ = short.scene.hologram(0)
+    seen = [found.seen(hologram, None, 2e-3) for found in (short, long)]
+    error = (seen[0] - seen[1]).norm() / seen[1].norm()
+    ways = [found.retina(2e-3) for found in (short, long)]
+    assert [way.method for way in ways] == ["collapse", "elements"]
+    assert error < sum(way.predicted_error for way in ways)
+    predicted = [plan(found)["predicted_seconds"] for found in (short, long)]
+    assert predicted[1] > 2 * predicted[0]
+
+
+def test_a_way_that_does_not_fit_is_refused_before_it_starts(capsys, monkeypatch):
+    assert main(["check", str(CONFIG), *TINY, "tolerance=0.05"]) == 0
+    monkeypatch.setattr(eye_plan, "_BASE_BYTES", 1e18)
+    assert main(["check", str(CONFIG), *TINY, "tolerance=0.05"]) == 2
+    assert "GB are free; use a smaller grid" in capsys.readouterr().err
+    assert main(["check", str(CONFIG), *TINY]) == 2
+    assert "use a smaller grid, or a larger tolerance" in capsys.readouterr().err
+
+
+def test_the_teapot_of_the_thesis_is_collapsed():
+    """Its configuration, its pixels; only the voxels are fewer."""
+    change = "'volume={phantom: c60, samples: 16}', 'hologram={shape: [512, 512], pitch: 3.74 um, distance: 30 mm}'"
+    given = load_config(CONFIG, [f"scene={{config: configs/volume/teapot.yaml, change: [{change}]}}"])
+    assert given.tolerance == ObserverSettings.model_fields["tolerance"].default == 0.03
+    found = observer(given, scene_settings(given))
+    ways = [found.retina(depth) for depth in found.focus]
+    assert {way.method for way in ways} == {"collapse"} and all(way.predicted_error < 0.03 for way in ways)
 
 
 def test_interrupted_runs_keep_what_was_seen(tmp_path, monkeypatch):
