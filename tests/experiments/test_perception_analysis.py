@@ -1,4 +1,6 @@
 import csv
+import html
+import importlib.util
 import json
 import math
 
@@ -272,6 +274,23 @@ def test_a_run_of_simulated_people_fills_its_folder(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "12 simulated participants" in said and "16.7 ms" in said and "one-way ANOVA, as in the thesis" in said
     assert AnalysisSettings.model_validate(yaml.safe_load((folder / "config.yaml").read_text())) == chosen
+
+
+def test_without_statsmodels_the_rest_runs_and_says_what_is_left_out(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    few = {"simulation": {"participants": 6}, "targets": [{"seconds": 0.45}], "resamples": 100}
+    given = AnalysisSettings.model_validate({"experiment": "perception_analysis", **few})
+    folder, complete = run_analysis(given, tmp_path / "a", "a")
+    words = "repeated measures and the mixed model, which need statsmodels: pip install 'holotorch[stats]'"
+    assert complete and words in capsys.readouterr().out
+    assert words in html.unescape((folder / "report.html").read_text())
+    summary = json.loads((folder / "summary.json").read_text())
+    assert not summary["repeated_measures"] and "repeated_f" not in summary["rows"][0]
+    # Asked for in so many words, it is refused; not wanted, nothing is missed.
+    with pytest.raises(ConfigError, match=r"statsmodels is missing: pip install 'holotorch\[stats\]', or leave it out"):
+        run_analysis(settings(repeated_measures=True, **few), tmp_path / "b", "b")
+    run_analysis(settings(repeated_measures=False, **few), tmp_path / "c", "c")
+    assert "Left out" not in capsys.readouterr().out
 
 
 def test_a_run_of_logs(tmp_path):
