@@ -73,15 +73,19 @@ def in_words(
         )
         lines.append(_tested("one-way ANOVA, as in the thesis", f.thesis, f.thesis.p))
         if f.repeated is not None:
-            lines.append(_tested("repeated measures, Greenhouse-Geisser", f.repeated, f.repeated.p_corrected))
+            share = f.repeated.epsilon
+            words = _tested("repeated measures, Greenhouse-Geisser", f.repeated, f.repeated.p_corrected, share)
+            lines.append(f"{words}, epsilon {share:.3g}")
         if f.mixed is not None:
             a, b = f.mixed.alpha_interval
             lines.append(f"             mixed model: alpha {f.mixed.alpha:.3g} [{a:.3g}, {b:.3g}], p = {f.mixed.p:.3g}")
     return "\n".join(lines)
 
 
-def _tested(name: str, found: Anova, p: float) -> str:
-    return f"             {name}: F({found.freedom[0]}, {found.freedom[1]}) = {found.f:.3g}, p = {p:.3g}"
+def _tested(name: str, found: Anova, p: float, share: float = 1.0) -> str:
+    """``share``: of the degrees of freedom with which ``p`` was found."""
+    first, second = (f"{share * freedom:.4g}" for freedom in found.freedom)
+    return f"             {name}: F({first}, {second}) = {found.f:.3g}, p = {p:.3g}"
 
 
 def _anova(name: str, found: Anova) -> dict[str, Any]:

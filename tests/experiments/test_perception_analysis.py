@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from pydantic import ValidationError
+from scipy import stats
 
 from holotorch.experiments.config_analysis import (
     AnalysisSettings,
@@ -272,6 +273,12 @@ def test_a_run_of_simulated_people_fills_its_folder(tmp_path, capsys):
     assert [row["target"] for row in rows] == ["5 deg at 10 deg", "450 ms"] and rows[0]["true_alpha"] == "0.47"
     assert float(rows[0]["one_way_f"]) > 0 and float(rows[0]["repeated_p_corrected"]) <= 1
     said = capsys.readouterr().out
+    # The degrees of freedom that belong to the corrected p: epsilon times 3 and 3 (n - 1).
+    for row in rows:
+        share, p, f = (float(row[key]) for key in ("epsilon", "repeated_p_corrected", "repeated_f"))
+        first, second = share * int(row["repeated_df"]), share * int(row["repeated_error_df"])
+        assert p == pytest.approx(stats.f.sf(f, first, second)) and share < 1
+        assert f"F({first:.4g}, {second:.4g}) = {f:.3g}, p = {p:.3g}, epsilon {share:.3g}" in said
     assert "12 simulated participants" in said and "16.7 ms" in said and "one-way ANOVA, as in the thesis" in said
     assert AnalysisSettings.model_validate(yaml.safe_load((folder / "config.yaml").read_text())) == chosen
 
