@@ -25,16 +25,26 @@ def channel_maps(values: Tensor, names: Sequence[str], label: str, colormap: str
 
 
 def comparison(images: Sequence[Tensor], captions: Sequence[str]) -> bytes:
-    """PNG of pictures [C, H, W] in [0, 1] side by side with their captions."""
+    """PNG of pictures [C, H, W] in [0, 1] side by side with their captions, a score on a line of its own."""
     height, width = images[0].shape[-2:]
-    figure = Figure(figsize=(3.2 * len(images), 3.2 * height / width + 0.55), layout="constrained", dpi=120)
-    for i, (image, caption) in enumerate(zip(images, captions, strict=True)):
-        axes = figure.add_subplot(1, len(images), i + 1)
+    titles = [_title(caption) for caption in captions]
+    wide, gap, top = 3.1, 0.1, 0.14 + 0.18 * max(title.count("\n") + 1 for title in titles)  # inches
+    tall = wide * height / width
+    whole = (wide + gap) * len(images) + gap, tall + gap + top
+    figure = Figure(figsize=whole, dpi=120)
+    for i, (image, title) in enumerate(zip(images, titles, strict=True)):
+        left = gap + i * (wide + gap)
+        axes = figure.add_axes((left / whole[0], gap / whole[1], wide / whole[0], tall / whole[1]))
         shown = image.clamp(0, 1).permute(1, 2, 0).squeeze(-1).numpy()
         axes.imshow(shown, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
-        axes.set_title(textwrap.fill(caption, 34), fontsize=10)
+        axes.set_title(title, fontsize=10)
         axes.set_axis_off()
     return _png(figure)
+
+
+def _title(caption: str) -> str:
+    what, _, score = caption.partition(", SSIM ")
+    return textwrap.fill(what, 38) + (f"\nSSIM {score}" if score else "")
 
 
 def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[int, float]], metric: str) -> bytes:
