@@ -49,25 +49,42 @@ def _title(caption: str) -> str:
 
 def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[int, float]], metric: str) -> bytes:
     """PNG of the loss per colour [steps + 1, C] (left axis, relative to the start) and of a metric (right axis)."""
-    figure = Figure(figsize=(7.2, 3.2), layout="constrained")
+    figure = Figure(figsize=(7.2, 3.4), layout="constrained")
     axes = figure.add_subplot()
-    relative = (losses / losses[0].clamp(min=1e-30)).cpu().numpy()
+    relative = np.maximum((losses / losses[0].clamp(min=1e-30)).cpu().numpy(), 1e-16)
+    stage, steps = _next_stage(relative), np.arange(len(relative))
     for i, name in enumerate(names):
-        axes.semilogy(np.maximum(relative[:, i], 1e-16), label=name, linewidth=1.2, color=_LINES[i % len(_LINES)])
+        style = {"linewidth": 1.2, "color": _LINES[i % len(_LINES)]}
+        axes.semilogy(steps[:stage], relative[:stage, i], label=name, **style)
+        if stage:
+            axes.semilogy(steps[stage:], relative[stage:, i], **style)
+    if stage:
+        axes.axvline(stage - 0.5, color="0.4", linewidth=1, linestyle=":")
+        words = "the error of the amplitude; from there on that of the intensity, and what a limit adds"
+        axes.set_title(f"The loss up to step {stage - 1} (dotted) is {words}", fontsize=8)
     axes.set_xlabel("step")
     axes.set_ylabel("loss / loss at the start")
     axes.grid(alpha=0.3)
-    handles, labels = axes.get_legend_handles_labels()
     if checked:
         right = axes.twinx()
         right.plot(*zip(*checked, strict=True), "k--", linewidth=1.2, label=metric.upper())
         right.set_ylabel(f"mean {metric.upper()}")
         if metric == "ssim":
             right.set_ylim(0, 1.02)
-        more = right.get_legend_handles_labels()
-        handles, labels = handles + more[0], labels + more[1]
-    axes.legend(handles, labels, fontsize=8, loc="center right")
+    figure.legend(loc="outside upper center", ncols=len(names) + 1, fontsize=8, frameon=False)
     return _png(figure)
+
+
+def _next_stage(losses: np.ndarray) -> int | None:
+    """First step whose losses [steps + 1, C] are those of another objective, or None.
+
+    L-BFGS begins with the amplitude's loss and goes on with the intensity's, where all colours jump up at once that had
+    only fallen before. The momentum of Adam lets single colours rise from the start.
+    """
+    change = losses[1:] / losses[:-1]
+    jumps = np.flatnonzero((change > 1.5).all(1))
+    fell = len(jumps) > 0 and jumps[0] > 4 and bool((change[: jumps[0]] < 1.01).all())
+    return int(jumps[0]) + 1 if fell else None
 
 
 def curves(rows: Sequence[dict[str, Any]], title: str) -> bytes:
