@@ -1,6 +1,5 @@
 """A run of the observer: holograms once, then every source and focus, pictures, a table and a page."""
 
-import html
 import time
 from pathlib import Path
 from typing import Any
@@ -20,8 +19,9 @@ from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.eye import Observer, observer, realisations
 from holotorch.experiments.eye_plan import plan, plan_text, too_large
 from holotorch.experiments.eye_tradeoff import fitted_prefactor, in_words, tradeoff
-from holotorch.experiments.markup import figure, plain, table
+from holotorch.experiments.markup import plain
 from holotorch.experiments.memory import peak_memory
+from holotorch.experiments.report import write_report
 from holotorch.experiments.run import claim, deferred, interruptible
 from holotorch.io.bundled import find_config
 from holotorch.io.colour_tables import srgb_matrix, white_balance
@@ -47,7 +47,8 @@ def run_observer(settings: ObserverSettings, out: Path | None, name: str) -> tup
     """Carry a run out and fill a folder; returns and raises as :func:`holotorch.experiments.run.run`."""
     eye = observer(settings, scene_settings(settings))
     values = plan(eye)
-    print(plan_text(eye, values), flush=True)
+    values["text"] = plan_text(eye, values)
+    print(values["text"], flush=True)
     if text := too_large(values):
         raise ConfigError([text])
     folder = claim(out, name)
@@ -129,18 +130,7 @@ def _write(
         for s, source in enumerate(sources)
         for f, depth in enumerate(focus)
     ]
-    flat = [{key: plain(value) for key, value in row.items()} for row in found]
-    write_table(out / "table.csv", flat)
-    cells = [[html.escape(value) for value in row.values()] for row in flat]
-    names = [key.replace("_", " ") for key in flat[0]]
-    body = "<h1>What the observer sees</h1>"
-    if values["synthetic"]:
-        body += f"<p>Synthetic volume: {html.escape(values['synthetic'])}.</p>"
-    body += "".join(
-        figure(f"images/comparison_{f}.png", f"focus {z * 1e3:.4g} mm", "wide") for f, z in enumerate(focus)
-    )
-    body += table(names, cells) + f"<pre>{html.escape(plan_text(eye, values))}</pre>"
-    write_text(out / "report.html", f"<!DOCTYPE html><meta charset='utf-8'><title>observer</title>{body}")
+    write_table(out / "table.csv", [{key: plain(value) for key, value in row.items()} for row in found])
     summary = {
         "experiment": "eye",
         "status": "complete" if complete else "interrupted",
@@ -151,3 +141,4 @@ def _write(
         "peak_memory_bytes": peak_memory(),
     }
     write_json(out / ("summary.json" if complete else "interrupted.json"), summary)
+    write_report([out], out / "report.html")

@@ -117,6 +117,26 @@ def test_the_run_goes_the_way_that_its_plan_says(tolerance, method, tmp_path, mo
     assert f"Retina     {method} at" in (folder / "report.html").read_text()
 
 
+def test_what_observers_see_is_put_on_one_page(tmp_path, tiny):
+    names = ("one", "two")
+    for name, source in zip(names, ("laser", "led"), strict=True):
+        words = [*TINY, f"light={{sources: [{source}]}}", "tolerance=0.1"]
+        run_observer(load_config(CONFIG, words), tmp_path / name, name)
+    assert main(["report", *(str(tmp_path / name) for name in names), "--out", str(tmp_path / "both.html")]) == 0
+    page = (tmp_path / "both.html").read_text()
+    for words in (
+        "<h1>one</h1>",
+        "<h1>two</h1>",
+        "<td>laser</td>",
+        "<td>led</td>",
+        "contrast",
+        "sharpness",
+        "Retina  ",
+    ):
+        assert words in page
+    assert page.count("data:image/png;base64,") == 2 and page.count("How to repeat") == 2
+
+
 def test_both_ways_show_the_same_and_the_plan_tells_their_costs():
     given = [load_config(CONFIG, [*TINY, f"tolerance={tolerance}"]) for tolerance in (0.05, 0.03)]
     short, long = (observer(each, scene_settings(each)) for each in given)
