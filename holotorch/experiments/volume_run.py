@@ -162,7 +162,10 @@ def _write(out: Path, experiment: VolumeExperiment, judge: VolumeJudge, state: _
     captions += [f"Hologram refocused at {depth * 1e3:.4g} mm" for depth in judge.depths]
     write_bytes(out / "images" / "comparison.png", pictures.comparison([*images.values()], captions))
     depth = torch.where(judge.opacity > 0.05, judge.depth * 1e3, torch.nan)
-    write_bytes(out / "images" / "depth.png", pictures.channel_maps(depth[None], ["what a ray sees"], "mm", "viridis"))
+    write_bytes(
+        out / "images" / "depth.png",
+        pictures.channel_maps(depth[None], ["what a ray sees"], "mean depth behind the hologram (mm)", "viridis"),
+    )
     summary = {
         "experiment": "volume",
         "status": "complete" if complete else "interrupted",

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from holotorch.cli import main
-from holotorch.experiments import volume_run
+from holotorch.experiments import pictures, volume_run
 from holotorch.experiments.config import load_config
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.volume import Part, build
@@ -61,6 +61,13 @@ def test_a_run_is_what_its_parts_give(tmp_path):
     assert np.load(folder / "arrays" / "refocused.npy").shape == (3, 3, 32, 32)
     page = (folder / "report.html").read_text()
     assert "Synthetic volume" in page and "Direct volume rendering" in page and "axial nodes" in page
+
+
+def test_the_map_of_depths_says_what_it_is_of(tmp_path, monkeypatch, tiny):
+    labels = []
+    monkeypatch.setattr(pictures, "channel_maps", lambda values, names, label, colours: labels.append(label) or b"")
+    run_volume(settings(), tmp_path / "a", "a")
+    assert labels == ["mean depth behind the hologram (mm)"]
 
 
 def test_more_realisations_have_less_speckle(tmp_path):
