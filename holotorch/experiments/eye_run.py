@@ -18,6 +18,7 @@ from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.eye import Observer, observer, realisations
 from holotorch.experiments.eye_plan import plan, plan_text, too_large
+from holotorch.experiments.eye_report import by_wavelength
 from holotorch.experiments.eye_tradeoff import fitted_prefactor, in_words, tradeoff
 from holotorch.experiments.markup import plain
 from holotorch.experiments.memory import peak_memory
@@ -118,7 +119,8 @@ def _write(
             picture = exposed(desaturated(linear_srgb(light, matrix)), peak=peak)
             write_bytes(out / "images" / f"{source}_{f}.png", encode_png(picture))
             shown.append(picture)
-            captions.append(f"{source.replace('_', ' ')}, focus {depth * 1e3:.4g} mm")
+            kind = ", synthetic" if values["synthetic"] else ""
+            captions.append(f"{source.replace('_', ' ')}, focus {depth * 1e3:.4g} mm{kind}")
     columns = len(sources) + 1
     rows = [
         pictures.comparison(shown[k : k + columns], captions[k : k + columns]) for k in range(0, len(shown), columns)
@@ -130,11 +132,14 @@ def _write(
         for s, source in enumerate(sources)
         for f, depth in enumerate(focus)
     ]
-    write_table(out / "table.csv", [{key: plain(value) for key, value in row.items()} for row in found])
+    lengths = [wave * 1e9 for wave in waves]
+    flat = [by_wavelength(row, lengths) for row in found]
+    write_table(out / "table.csv", [{key: plain(value) for key, value in row.items()} for row in flat])
     summary = {
         "experiment": "eye",
         "status": "complete" if complete else "interrupted",
         "synthetic": values["synthetic"],
+        "wavelengths_nm": lengths,
         "realisations": len(seen),
         "rows": found,
         "seconds": round(seconds, 2),

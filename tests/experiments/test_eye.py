@@ -11,7 +11,7 @@ import torch
 
 from holotorch.cli import main
 from holotorch.experiments import eye as eye_module
-from holotorch.experiments import eye_plan
+from holotorch.experiments import eye_plan, pictures
 from holotorch.experiments.config import load_config
 from holotorch.experiments.config_eye import ObserverSettings
 from holotorch.experiments.errors import ConfigError
@@ -40,7 +40,9 @@ def settings(*overrides: str):
     return load_config(CONFIG, [*SMALL, *overrides])
 
 
-def test_a_run_shows_less_speckle_under_wider_sources(tmp_path):
+def test_a_run_shows_less_speckle_under_wider_sources(tmp_path, monkeypatch):
+    captions = []
+    monkeypatch.setattr(pictures, "comparison", lambda images, words: captions.extend(words) or b"")
     folder, complete = run_observer(settings(), tmp_path / "a", "a")
     names = {path.name for path in folder.iterdir()}
     assert complete and names == {
@@ -55,8 +57,28 @@ def test_a_run_shows_less_speckle_under_wider_sources(tmp_path):
         assert led["contrast_predicted"][colour] < laser["contrast_predicted"][colour] <= 1
         assert led["wavelengths"][colour] >= laser["wavelengths"][colour]
     with open(folder / "table.csv", newline="") as stream:
-        assert len(list(csv.DictReader(stream))) == 2
-    assert "Synthetic volume" in (folder / "report.html").read_text()
+        table = list(csv.DictReader(stream))
+    each = ("wavelengths", "contrast", "contrast_predicted", "ssim", "sharpness", "best_fwhm_nm_by_formula")
+    assert len(table) == 2 and list(table[0]) == [
+        *("source", "focus_mm"),
+        *(f"{name}_{wave}nm" for name in each for wave in (636, 520, 455)),
+    ]
+    assert [float(table[0][f"contrast_{wave}nm"]) for wave in (636, 520, 455)] == pytest.approx(
+        laser["contrast"], rel=1e-4
+    )
+    page = (folder / "report.html").read_text()
+    for words in (
+        "contrast at 636 / 520 / 455 nm",
+        "evenly filled round pupil and fully developed speckle",
+        "and measures lower",
+    ):
+        assert words in page
+    assert "Synthetic volume" in page and "focus 12 mm, synthetic volume</figcaption>" in page
+    assert captions == [
+        "reference, focus 12 mm, synthetic",
+        "laser, focus 12 mm, synthetic",
+        "led, focus 12 mm, synthetic",
+    ]
 
 
 def test_few_wavelengths_are_as_good_as_many():
