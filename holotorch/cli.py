@@ -120,11 +120,15 @@ def _check(options: argparse.Namespace) -> int:
         print(f"Sweep      {', '.join(f'{value:g}' for value in settings.sweep)}; {settings.max_steps} steps at most")
         return OK
     if settings.experiment == "eye":
+        from holotorch.experiments import eye_plan
         from holotorch.experiments.eye import observer
-        from holotorch.experiments.eye_run import plan_text as looked_at
         from holotorch.experiments.eye_run import scene_settings
 
-        print(looked_at(observer(settings, scene_settings(settings)))[0])
+        looking = observer(settings, scene_settings(settings))
+        values = eye_plan.plan(looking)
+        print(eye_plan.plan_text(looking, values))
+        if text := eye_plan.too_large(values):
+            raise ConfigError([text])
         return OK
     if settings.experiment == "perception_layout":
         from holotorch.experiments.perception_layout import layout_text

@@ -125,7 +125,8 @@ class AnalysisSettings(Settings):
 
     ``range_deg``: eccentricities of the lines. ``limits_deg``: scales outside count as being at these limits.
     ``tested_deg``: sizes within which scales are more than an extrapolation. ``confidence``: of intervals.
-    ``shown``: the participant of Fig. 2.5, the first by default. ``repeated_measures``: needs statsmodels.
+    ``shown``: the participant of Fig. 2.5, the first by default. ``repeated_measures``: and a mixed model beside the
+    one-way analysis, which need statsmodels; where nothing is said, they are made if it is installed.
     """
 
     experiment: Literal["perception_analysis"]
@@ -139,6 +140,6 @@ class AnalysisSettings(Settings):
     limits_deg: Sizes = (1.0, 60.0)
     resamples: Resamples = 2000
     confidence: Annotated[Number, Field(ge=0.5, lt=1)] = 0.95
-    repeated_measures: bool = True
+    repeated_measures: bool | None = None
     shown: Count | None = None
     power: PowerSettings | None = None

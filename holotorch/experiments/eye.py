@@ -17,9 +17,11 @@ from holotorch.experiments.volume_judge import pooled
 from holotorch.metrics import sharpness, speckle_contrast, ssim
 from holotorch.optics.coherence import optimum_fwhm, path_difference, predicted_contrast
 from holotorch.optics.display import Display
+from holotorch.optics.elements import through_elements
 from holotorch.optics.exposure import equal_power
 from holotorch.optics.eye import Eye
 from holotorch.optics.imaging import imaged
+from holotorch.optics.retina import RetinaPlan, plan_retina
 from holotorch.optics.spectrum import Spectrum
 from holotorch.optics.viewing import eyepiece_distance, image_distance
 
@@ -103,14 +105,48 @@ class Observer:
     def _rules(self) -> dict[tuple[str, float, float], tuple[Tensor, Tensor]]:
         return {}  # choosing wavelengths may take a second
 
+    def retina(self, depth: float) -> RetinaPlan:
+        """The way to the retina of an eye that is focused at the depth: one for all sources, which are compared.
+
+        Planned for the ends of all their bands, between which the error and the sampling are less. ConfigError where
+        there is none.
+        """
+        if depth not in self._ways:
+            waves = self.scene.settings.wavelengths
+            bands = [
+                end for source in self.settings.light.sources for wave in waves for end in PRESETS[source](wave).band()
+            ]
+            try:
+                self._ways[depth] = plan_retina(
+                    self.scene.grid,
+                    (min(bands), max(bands)),
+                    self.display,
+                    self.eye(depth),
+                    tolerance=self.settings.tolerance,
+                    plane=depth,
+                    reach=self.scene.width / 2,
+                    registered=True,
+                )
+            except ValueError as error:
+                raise ConfigError([f"display: {error}"]) from error
+        return self._ways[depth]
+
+    @cached_property
+    def _ways(self) -> dict[float, RetinaPlan]:
+        return {}
+
     def seen(self, hologram: Tensor, source: str | None, depth: float) -> Tensor:
-        """Picture on the retina, referred back to the scene, real [3, h, w] on the rays; None: one wavelength each."""
+        """Picture on the retina, referred back to the scene, real [3, h, w] on the rays; None: one wavelength each.
+
+        Goes the way of :meth:`retina`, every wavelength with the least sampling that it needs there.
+        """
         eye, grid, pictures = self.eye(depth), self.scene.grid, []
+        way = imaged if self.retina(depth).method == "collapse" else through_elements
         for field, wave in zip(hologram.conj(), self.scene.settings.wavelengths, strict=True):
             places, weights = ([wave], [1.0]) if source is None else self.samples(source, wave, depth)
             total = torch.zeros(grid.shape, dtype=field.real.dtype, device=field.device)
             for place, weight in zip(places, weights, strict=True):
-                image = imaged(field[None], grid, [float(place)], self.display, eye, plane=depth)
+                image = way(field[None], grid, [float(place)], self.display, eye, plane=depth)
                 total += float(weight) * intensity(image[0])
             pictures.append(pooled(total, self.scene.stride))
         return torch.stack(pictures).cpu()

@@ -1,6 +1,5 @@
 """A run of the observer: holograms once, then every source and focus, pictures, a table and a page."""
 
-import html
 import time
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ import yaml
 from torch import Tensor
 from tqdm import tqdm
 
-from holotorch.experiments import pictures
+from holotorch.experiments import eye_focus, eye_geometry, pictures
 from holotorch.experiments.chart import write_table
 from holotorch.experiments.config import load_config
 from holotorch.experiments.config_eye import ObserverSettings
@@ -18,11 +17,12 @@ from holotorch.experiments.config_volume import VolumeSettings
 from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.eye import Observer, observer, realisations
-from holotorch.experiments.eye_focus import draw, focus_sweep
-from holotorch.experiments.eye_focus import in_words as sweep_in_words
+from holotorch.experiments.eye_plan import plan, plan_text, too_large
+from holotorch.experiments.eye_report import by_wavelength
 from holotorch.experiments.eye_tradeoff import fitted_prefactor, in_words, tradeoff
-from holotorch.experiments.markup import figure, plain, table
+from holotorch.experiments.markup import plain
 from holotorch.experiments.memory import peak_memory
+from holotorch.experiments.report import write_report
 from holotorch.experiments.run import claim, deferred, interruptible
 from holotorch.io.bundled import find_config
 from holotorch.io.colour_tables import srgb_matrix, white_balance
@@ -30,10 +30,6 @@ from holotorch.io.files import save_array, write_bytes, write_json, write_text
 from holotorch.io.images import encode_png
 from holotorch.optics.colour import desaturated, linear_srgb
 from holotorch.optics.exposure import equal_power, exposed
-from holotorch.optics.geometry import diffraction_angle
-from holotorch.optics.imaging import retinal_scale
-from holotorch.optics.retina import plan_retina
-from holotorch.optics.viewing import scene_fov
 
 _BRIGHT = 0.995  # of the reference's pixels are at most as bright as what is shown white
 
@@ -48,65 +44,20 @@ def scene_settings(settings: ObserverSettings) -> VolumeSettings:
     return found
 
 
-def plan_text(eye: Observer) -> tuple[str, dict[str, Any]]:
-    """What will be done, in words and as JSON values."""
-    settings, scene, display = eye.settings, eye.scene, eye.display
-    depths = [depth * 1e3 for depth in eye.focus]
-    waves = scene.settings.wavelengths
-    middle = eye.focus[len(eye.focus) // 2]
-    way = plan_retina(scene.grid, waves, display, eye.eye(middle), plane=middle, reach=scene.width / 2, registered=True)
-    counts = {
-        source: [len(eye.samples(source, wave, max(eye.focus))[0]) for wave in waves]
-        for source in settings.light.sources
-    }
-    angles = [2 * diffraction_angle(scene.grid, wave)[1] for wave in waves]
-    magnifying = settings.display.kind == "magnifying"
-    before = float(display.lens_distance) - scene.distance
-    across = (
-        scene_fov(scene.width, before, float(display.focal_length), float(display.eye_distance)) if magnifying else None
-    )
-    values = {
-        "scene": settings.scene.config,
-        "synthetic": scene.synthetic,
-        "display": {
-            "kind": settings.display.kind,
-            "lens_distance_mm": float(display.lens_distance) * 1e3,
-            "eye_distance_mm": float(display.eye_distance) * 1e3,
-        },
-        "focus_mm": depths,
-        "accommodation_mm": [eye.accommodation(depth) * 1e3 for depth in eye.focus],
-        "retinal_scale": [float(retinal_scale(display, eye.eye(depth), depth)) for depth in eye.focus],
-        "aperture": [eye.aperture(depth) for depth in eye.focus],
-        "retina": {"method": way.method, "predicted_error": way.predicted_error, "reason": way.reason},
-        "wavelengths": counts,
-        "hologram_fov_deg": [angle * 57.29577951308232 for angle in angles],
-        "scene_fov_deg": None if across is None else across * 57.29577951308232,
-    }
-    lines = [
-        f"Scene      {settings.scene.config}" + (f" (synthetic: {scene.synthetic})" if scene.synthetic else ""),
-        f"Display    {settings.display.kind}; eyepiece {values['display']['lens_distance_mm']:.4g} mm from the "
-        f"hologram, eye {values['display']['eye_distance_mm']:.4g} mm behind it"
-        + ("" if across is None else f"; the scene spans {values['scene_fov_deg']:.3g} deg"),
-        f"Focus      at {', '.join(f'{depth:.4g}' for depth in depths)} mm, seen at "
-        f"{', '.join(f'{far:.4g}' for far in values['accommodation_mm'])} mm; aperture "
-        f"{', '.join(f'{sine:.3g}' for sine in values['aperture'])}",
-        f"Retina     {way.reason}; next: {way.runner_up}",
-        "Light      " + "; ".join(f"{source}: {plain(count)} wavelengths" for source, count in counts.items()),
-        f"Phases     {settings.seeds} realisation(s), compared with the mean of {8 * settings.seeds} others",
-    ]
-    return "\n".join(lines), values
-
-
 def run_observer(settings: ObserverSettings, out: Path | None, name: str) -> tuple[Path, bool]:
     """Carry a run out and fill a folder; returns and raises as :func:`holotorch.experiments.run.run`."""
     eye = observer(settings, scene_settings(settings))
-    text, values = plan_text(eye)
-    print(text, flush=True)
+    values = plan(eye)
+    values["text"] = plan_text(eye, values)
+    print(values["text"], flush=True)
+    if text := too_large(values):
+        raise ConfigError([text])
     folder = claim(out, name)
     for part in ("arrays", "images"):
         (folder / part).mkdir(exist_ok=True)
     write_text(folder / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
     write_json(folder / "plan.json", values)
+    write_bytes(folder / "images" / "geometry.png", eye_geometry.draw(eye))
     write_json(folder / "env.json", environment(settings.seed, eye.scene.device))
     started = time.perf_counter()
     references, own = realisations(8 * settings.seeds, reference=True), realisations(settings.seeds, reference=False)
@@ -129,10 +80,11 @@ def run_observer(settings: ObserverSettings, out: Path | None, name: str) -> tup
         with deferred(pressed):
             _write(folder, eye, reference, torch.stack(seen), values, time.perf_counter() - started, not pressed)
     if settings.sweep and not pressed:
-        sweep = focus_sweep(eye, settings.sweep)
+        sweep = eye_focus.focus_sweep(eye, settings.sweep)
         write_table(folder / "focus.csv", [band.row for band in sweep.bands])
-        write_bytes(folder / "images" / "focus.png", draw(sweep))
-        print("\n".join(sweep_in_words(sweep)))
+        write_bytes(folder / "images" / "focus.png", eye_focus.draw(sweep))
+        print("\n".join(eye_focus.in_words(sweep)))
+        write_report([folder], folder / "report.html")
     if settings.tradeoff and not pressed:
         cases = tradeoff(settings, scene_settings(settings), settings.tradeoff)
         write_table(folder / "tradeoff.csv", [case.row(fitted_prefactor(cases)) for case in cases])
@@ -174,7 +126,8 @@ def _write(
             picture = exposed(desaturated(linear_srgb(light, matrix)), peak=peak)
             write_bytes(out / "images" / f"{source}_{f}.png", encode_png(picture))
             shown.append(picture)
-            captions.append(f"{source.replace('_', ' ')}, focus {depth * 1e3:.4g} mm")
+            kind = ", synthetic" if values["synthetic"] else ""
+            captions.append(f"{source.replace('_', ' ')}, focus {depth * 1e3:.4g} mm{kind}")
     columns = len(sources) + 1
     rows = [
         pictures.comparison(shown[k : k + columns], captions[k : k + columns]) for k in range(0, len(shown), columns)
@@ -186,25 +139,18 @@ def _write(
         for s, source in enumerate(sources)
         for f, depth in enumerate(focus)
     ]
-    flat = [{key: plain(value) for key, value in row.items()} for row in found]
-    write_table(out / "table.csv", flat)
-    cells = [[html.escape(value) for value in row.values()] for row in flat]
-    names = [key.replace("_", " ") for key in flat[0]]
-    body = "<h1>What the observer sees</h1>"
-    if values["synthetic"]:
-        body += f"<p>Synthetic volume: {html.escape(values['synthetic'])}.</p>"
-    body += "".join(
-        figure(f"images/comparison_{f}.png", f"focus {z * 1e3:.4g} mm", "wide") for f, z in enumerate(focus)
-    )
-    body += table(names, cells) + f"<pre>{html.escape(plan_text(eye)[0])}</pre>"
-    write_text(out / "report.html", f"<!DOCTYPE html><meta charset='utf-8'><title>observer</title>{body}")
+    lengths = [wave * 1e9 for wave in waves]
+    flat = [by_wavelength(row, lengths) for row in found]
+    write_table(out / "table.csv", [{key: plain(value) for key, value in row.items()} for row in flat])
     summary = {
         "experiment": "eye",
         "status": "complete" if complete else "interrupted",
         "synthetic": values["synthetic"],
+        "wavelengths_nm": lengths,
         "realisations": len(seen),
         "rows": found,
         "seconds": round(seconds, 2),
         "peak_memory_bytes": peak_memory(),
     }
     write_json(out / ("summary.json" if complete else "interrupted.json"), summary)
+    write_report([out], out / "report.html")

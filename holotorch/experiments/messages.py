@@ -32,8 +32,16 @@ def validated(source: Source, model: type[Model]) -> Model:
     try:
         return model.model_validate(source.data)
     except ValidationError as error:
-        mistakes = dict.fromkeys(describe(source, model, entry) for entry in error.errors())
+        entries = error.errors()
+        mistakes = dict.fromkeys(describe(source, model, e) for e in entries if not _follows(e, entries))
         raise ConfigError(sorted(mistakes, key=position)) from None
+
+
+def _follows(entry: Any, others: list[Any]) -> bool:
+    """Whether a list is too short only for pydantic, which does not count the entries that are wrong themselves."""
+    place = entry["loc"]
+    inside = (len(other["loc"]) > len(place) and other["loc"][: len(place)] == place for other in others)
+    return entry["type"] == "too_short" and any(inside)
 
 
 def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
@@ -53,6 +61,10 @@ def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
         return source.mistake((*key, "kind"), f"expected one of {', '.join(options)}, got {got!r}{hint}")
     if kind == "picture":
         return source.mistake(key, entry["msg"])
+    if kind in ("too_short", "too_long"):
+        bound, name = ("least", "min_length") if kind == "too_short" else ("most", "max_length")
+        number, got = entry["ctx"][name], entry["ctx"]["actual_length"]
+        return source.mistake(key, f"expected at {bound} {number} {'entry' if number == 1 else 'entries'}, got {got}")
     wanted = next((text for start, text in _EXPECTED.items() if kind.startswith(start)), None)
     wanted = wanted or entry["msg"].replace("Input should be ", "").removeprefix("expected ")
     near = difflib.get_close_matches(str(given), re.findall(r"'([^']+)'", wanted), 1)

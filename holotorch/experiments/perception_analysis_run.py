@@ -3,7 +3,7 @@
 import html
 import math
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,21 +22,19 @@ from holotorch.experiments.markup import figure, table
 from holotorch.experiments.perception_analysis import (
     Curves,
     Responses,
-    Scales,
     Times,
     equal_efficiency,
     fit_curves,
     perception_times,
     read_responses,
 )
-from holotorch.experiments.perception_frames import Quantisation, quantisation
+from holotorch.experiments.perception_finding import Finding, in_json, in_words
+from holotorch.experiments.perception_frames import quantisation
 from holotorch.experiments.perception_power import needed, power_rows, with_slope
 from holotorch.experiments.perception_simulation import simulate, true_line
 from holotorch.experiments.perception_statistics import (
-    Anova,
-    Line,
-    Mixed,
     fit_line,
+    has_statsmodels,
     mixed_model,
     need_statsmodels,
     one_way,
@@ -45,6 +43,10 @@ from holotorch.experiments.perception_statistics import (
 from holotorch.experiments.run import claim
 from holotorch.io.files import save_array, write_bytes, write_json, write_text
 
+LEFT_OUT = (
+    "repeated measures and the mixed model, which need statsmodels: pip install 'holotorch[stats]' and run it again; "
+    "the one-way ANOVA takes the answers of one participant as independent"
+)
 _CAPTIONS = {
     "time_surface": "Fig. 2.3: quartiles of the perception time",
     "time_map": "Fig. 2.4: median perception time of all conditions",
@@ -55,47 +57,12 @@ _CAPTIONS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Finding:
-    """What was found for one target time."""
-
-    name: str
-    scales: Scales
-    line: Line
-    thesis: Anova
-    repeated: Anova | None
-    mixed: Mixed | None
-    undefined: int
-    limited: int
-    missing: int
-
-    def row(self, truth: tuple[float, float] | None) -> dict[str, Any]:
-        """A line of metrics.csv."""
-        line = self.line
-        row: dict[str, Any] = {"target": self.name, "alpha": line.alpha, "beta": line.beta}
-        row |= dict(zip(("alpha_low", "alpha_high"), line.alpha_interval, strict=True))
-        row |= dict(zip(("beta_low", "beta_high"), line.beta_interval, strict=True))
-        if truth is not None:
-            row |= {"true_alpha": truth[0], "true_beta": truth[1]}
-        row |= _anova("one_way", self.thesis)
-        if self.repeated is not None:
-            row |= _anova("repeated", self.repeated)
-            row |= {"epsilon": self.repeated.epsilon, "repeated_p_corrected": self.repeated.p_corrected}
-            row |= {"repeated_left_out": self.repeated.left_out}
-            mixed = self.mixed
-            row |= {"mixed_alpha": mixed.alpha if mixed else math.nan, "mixed_beta": mixed.beta if mixed else math.nan}
-            low, high = mixed.alpha_interval if mixed else (math.nan, math.nan)
-            row |= {"mixed_alpha_low": low, "mixed_alpha_high": high, "mixed_p": mixed.p if mixed else math.nan}
-            row |= {"mixed_effects": mixed.effects if mixed else "not fitted"}
-        row |= {"undefined": self.undefined, "at_limits": self.limited, "missing": self.missing}
-        return {key: _json(value) for key, value in row.items()} | {"refused": line.refused}
-
-
 def find(settings: AnalysisSettings, times: Times, curves: Curves) -> list[Finding]:
-    """Analyse all target times. ConfigError for a target that was not shown, or where statsmodels is missing."""
+    """Analyse all target times. ConfigError for a target that was not shown, or where statsmodels is asked for."""
     low, high = settings.range_deg
     inside = (curves.eccentricities >= low) & (curves.eccentricities <= high)
     found = []
+    beside = _beside(settings)
     for k, target in enumerate(settings.targets):
         scales = equal_efficiency(curves, times.of(target), settings.limits_deg)
         line = fit_line(
@@ -108,7 +75,6 @@ def find(settings: AnalysisSettings, times: Times, curves: Curves) -> list[Findi
             confidence=settings.confidence,
         )
         known, there = scales.known[:, inside], np.isfinite(scales.degrees[:, inside])
-        beside = settings.repeated_measures
         found.append(
             Finding(
                 str(target),
@@ -123,6 +89,11 @@ def find(settings: AnalysisSettings, times: Times, curves: Curves) -> list[Findi
             )
         )
     return found
+
+
+def _beside(settings: AnalysisSettings) -> bool:
+    """Whether a repeated-measures analysis and a mixed model stand beside the line."""
+    return has_statsmodels() if settings.repeated_measures is None else settings.repeated_measures
 
 
 def on_frames(responses: Responses) -> float:
@@ -158,7 +129,9 @@ def run_analysis(settings: AnalysisSettings, out: Path | None, name: str) -> tup
     truths = [true_line(settings.simulation, target) if not settings.logs else None for target in settings.targets]
     rows = [finding.row(truth) for finding, truth in zip(found, truths, strict=True)]
     whole = on_frames(responses)
-    text = _words(settings, times, curves, found, frames, whole)
+    text = in_words(settings, times, curves, found, frames, whole)
+    if settings.repeated_measures is None and not _beside(settings):
+        text += f"\nLeft out   {LEFT_OUT}"
     print(text, flush=True)
     folder = claim(out, name)
     for part in ("arrays", "images"):
@@ -199,59 +172,16 @@ def run_analysis(settings: AnalysisSettings, out: Path | None, name: str) -> tup
         "experiment": "perception_analysis",
         "status": "complete",
         "simulated": times.simulated,
+        "repeated_measures": _beside(settings),
         "participants": len(times.participants),
         "counts": times.counts,
-        "quantisation": asdict(frames) | {"on_frames": _json(whole)},
+        "quantisation": asdict(frames) | {"on_frames": in_json(whole)},
         "rows": rows,
         "power": power,
         "seconds": round(time.perf_counter() - started, 2),
     }
     write_json(folder / "summary.json", summary)
     return folder, True
-
-
-def _words(
-    settings: AnalysisSettings, times: Times, curves: Curves, found: list[Finding], frames: Quantisation, on: float
-) -> str:
-    who = "simulated participants" if times.simulated else "participants"
-    some = np.isfinite(curves.a)
-    lines = [
-        f"Study      {len(times.participants)} {who}",
-        "Answers    " + ", ".join(f"{number} {key}" for key, number in times.counts.items()),
-        f"Frames     {frames}; {100 * on:.0f} % of the times are whole frames",
-        f"Curves     T = a ln S + b: {int((curves.a[some] >= 0).sum())} of {int(some.sum())} do not fall with the size"
-        f", {int((~some).sum())} have too few sizes",
-    ]
-    for f in found:
-        line = f.line
-        if line.refused:
-            lines.append(f"Scale      as fast as {f.name}: no line, as {line.refused}")
-            continue
-        (a, b), (c, d) = line.alpha_interval, line.beta_interval
-        lines.append(
-            f"Scale      as fast as {f.name}: {line.alpha:.3g} [{a:.3g}, {b:.3g}] E {line.beta:+.3g} [{c:.3g}, {d:.3g}]"
-            f" deg; {100 * settings.confidence:g} % intervals; {f.undefined} scales undefined, {f.limited} at limits"
-        )
-        lines.append(_tested("one-way ANOVA, as in the thesis", f.thesis, f.thesis.p))
-        if f.repeated is not None:
-            lines.append(_tested("repeated measures, Greenhouse-Geisser", f.repeated, f.repeated.p_corrected))
-        if f.mixed is not None:
-            a, b = f.mixed.alpha_interval
-            lines.append(f"             mixed model: alpha {f.mixed.alpha:.3g} [{a:.3g}, {b:.3g}], p = {f.mixed.p:.3g}")
-    return "\n".join(lines)
-
-
-def _tested(name: str, found: Anova, p: float) -> str:
-    return f"             {name}: F({found.freedom[0]}, {found.freedom[1]}) = {found.f:.3g}, p = {p:.3g}"
-
-
-def _anova(name: str, found: Anova) -> dict[str, Any]:
-    return {
-        f"{name}_f": found.f,
-        f"{name}_p": found.p,
-        f"{name}_df": found.freedom[0],
-        f"{name}_error_df": found.freedom[1],
-    }
 
 
 def _conditions(times: Times) -> list[dict[str, Any]]:
@@ -277,9 +207,9 @@ def _curves(times: Times, curves: Curves) -> list[dict[str, Any]]:
         {
             "participant": int(times.participants[p]),
             "eccentricity_deg": float(curves.eccentricities[k]),
-            "a_s": _json(curves.a[p, k]),
-            "a_deviation_s": _json(curves.a_deviation[p, k]),
-            "b_s": _json(curves.b[p, k]),
+            "a_s": in_json(curves.a[p, k]),
+            "a_deviation_s": in_json(curves.a_deviation[p, k]),
+            "b_s": in_json(curves.b[p, k]),
         }
         for p in range(len(times.participants))
         for k in range(len(curves.eccentricities))
@@ -291,10 +221,3 @@ def _table(rows: list[dict[str, Any]]) -> str:
         return "" if value is None else f"{value:.4g}" if isinstance(value, float) else html.escape(str(value))
 
     return table([key.replace("_", " ") for key in rows[0]], [[cell(value) for value in row.values()] for row in rows])
-
-
-def _json(value: Any) -> Any:
-    """Numbers that JSON has; None for NaN and infinity."""
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    return value

@@ -9,14 +9,16 @@ from typing import Any
 
 import torch
 import yaml
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from torch import Tensor
 
 from holotorch.experiments.chart import write_table
-from holotorch.experiments.config_perception import LayoutSettings
+from holotorch.experiments.config_perception import ItemSettings, LayoutSettings
 from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.markup import figure, table
@@ -35,7 +37,13 @@ from holotorch.perception import (
 )
 
 _HALO = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.7}
-_FITTED, _KEPT, _BEYOND, _UNTESTED = "#1b5e20", "#555555", "#d35400", "#b000b0"
+_FITTED, _KEPT, _BEYOND, _UNTESTED, _ENDS = "#1b5e20", "#555555", "#d35400", "#b000b0", "#1a4a8a"
+_STYLES = {
+    (_FITTED, "-"): "scaled by Table 2.2, 40 to 70 deg",
+    (_UNTESTED, "-"): "the same, size outside the tested 5 to 26 deg",
+    (_KEPT, ":"): "not scaled: beyond the line's ends (size of the target)",
+    (_BEYOND, "--"): "* extrapolated beyond 70 deg",
+}
 
 
 def scaled(settings: LayoutSettings) -> list[tuple[str, ScaledLayout]]:
@@ -74,6 +82,7 @@ def run_layout(settings: LayoutSettings, out: Path | None, name: str) -> tuple[P
     layouts = scaled(settings)
     text = layout_text(settings)
     folder = claim(out, name)
+    (folder / "images").mkdir(exist_ok=True)
     write_text(folder / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
     write_json(folder / "env.json", environment(0, torch.device("cpu")))
     rows = [row for title, layout in layouts for row in _rows(settings, title, layout)]
@@ -158,18 +167,19 @@ def _displays(settings: LayoutSettings) -> list[dict[str, Any]]:
 
 def _picture(settings: LayoutSettings, layouts: list[tuple[str, ScaledLayout]]) -> bytes:
     high, wide = settings.field_deg[0] / 2, settings.field_deg[1] / 2
-    panels = Figure(figsize=(13, 13 * high / wide * len(layouts) + 1.0), layout="constrained", dpi=110)
+    panels = Figure(figsize=(13, 13 * high / wide * len(layouts) + 1.2), dpi=110)
+    panels.set_layout_engine("constrained", h_pad=0.1)
     for k, ((name, layout), target) in enumerate(zip(layouts, settings.targets, strict=True)):
         axes = panels.add_subplot(len(layouts), 1, k + 1)
         draw_ground(axes, settings.field_deg)
         for edge in FITTED_DEG:
             for side in (-edge, edge):
-                axes.axvline(side, color="white", linewidth=1, linestyle=":", zorder=5)
+                axes.axvline(side, color=_ENDS, linewidth=1.2, linestyle=":", zorder=5)
         for i, item in enumerate(settings.items):
             size: tuple[float, float] = tuple(layout.size_deg[i].tolist())  # type: ignore[assignment]
             centre = item.azimuth_deg, item.elevation_deg
             draw_icon(axes, item.icon, centre, size, 10 + i)
-            _frame(axes, centre, size, layout, i)
+            _frame(axes, item, size, layout, i)
             if abs(layout.eccentricity_deg[i].item() - target.eccentricity_deg) < 0.05:
                 # Drawn a little around the target; at 40 deg the line, which is a fit, gives a smaller size than it.
                 _box(axes, centre, (target.size_deg + 0.8, target.size_deg + 0.8), "#d00000", "--")
@@ -182,38 +192,41 @@ def _picture(settings: LayoutSettings, layouts: list[tuple[str, ScaledLayout]]) 
         ticks = range(-int(wide // 10) * 10, int(wide) + 1, 10)
         axes.set_xticks(ticks, [str(abs(tick)) for tick in ticks])
     panels.axes[-1].set_xlabel("eccentricity to the left and to the right (deg); + is fixated")
-    panels.axes[-1].legend(
-        handles=[
-            Rectangle((0, 0), 1, 1, fill=False, edgecolor=colour, linestyle=style, label=words)
-            for colour, style, words in (
-                (_FITTED, "-", "scaled by Table 2.2, 40 to 70 deg"),
-                (_UNTESTED, "-", "the same, size outside the tested 5 to 26 deg"),
-                (_KEPT, ":", "not scaled: beyond the line's ends (size of the target)"),
-                (_BEYOND, "--", "extrapolated beyond 70 deg"),
-            )
-        ],
-        loc="upper center",
-        bbox_to_anchor=(0.5, -0.2),
-        ncols=4,
-        fontsize=8,
-        frameon=False,
-    )
+    panels.legend(handles=_legend(layouts), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     buffer = io.BytesIO()
     FigureCanvasAgg(panels).print_png(buffer)
     return buffer.getvalue()
 
 
-def _frame(axes: Axes, centre: tuple[float, float], size: tuple[float, float], layout: ScaledLayout, i: int) -> None:
-    if layout.extrapolated[i]:
-        colour, style = _BEYOND, "--"
-    elif layout.kept[i]:
-        colour, style = _KEPT, ":"
-    else:
-        colour, style = (_FITTED if layout.tested[i] else _UNTESTED), "-"
+def _frame(axes: Axes, item: ItemSettings, size: tuple[float, float], layout: ScaledLayout, i: int) -> None:
+    centre = item.azimuth_deg, item.elevation_deg
+    colour, style = _style(layout, i)
     _box(axes, centre, size, colour, style)
     words = f"{max(size):.1f} deg" + (" *" if layout.extrapolated[i] else "")
     place = centre[0], centre[1] - max(size[0] / 2, 3.0) - 0.4  # below the target's box
-    axes.text(*place, words, ha="center", va="top", fontsize=7.5, color=colour, zorder=301, bbox=_HALO)
+    label = f"{item.label or item.icon.replace('_', ' ')}\n{words}"
+    axes.text(*place, label, ha="center", va="top", fontsize=7.5, color=colour, zorder=301, bbox=_HALO)
+
+
+def _style(layout: ScaledLayout, i: int) -> tuple[str, str]:
+    """Colour and line of an icon's frame."""
+    if layout.extrapolated[i]:
+        return _BEYOND, "--"
+    if layout.kept[i]:
+        return _KEPT, ":"
+    return (_FITTED if layout.tested[i] else _UNTESTED), "-"
+
+
+def _legend(layouts: list[tuple[str, ScaledLayout]]) -> list[Artist]:
+    """What is drawn, and nothing else."""
+    used = {_style(layout, i) for _, layout in layouts for i in range(len(layout.kept))}
+    frames = [
+        Rectangle((0, 0), 1, 1, fill=False, edgecolor=key[0], linestyle=key[1], label=words)
+        for key, words in _STYLES.items()
+        if key in used
+    ]
+    ends = f"{FITTED_DEG[0]:g} and {FITTED_DEG[1]:g} deg: where the lines of Table 2.2 begin and end"
+    return [*frames, Line2D([], [], color=_ENDS, linestyle=":", label=ends)]
 
 
 def _box(axes: Axes, centre: tuple[float, float], size: tuple[float, float], colour: str, style: str) -> None:
@@ -228,7 +241,8 @@ def _report(
     name: str, text: str, picture: bytes, rows: list[dict[str, Any]], displays: list[dict[str, Any]], folder: Path
 ) -> str:
     source = "data:image/png;base64," + base64.b64encode(picture).decode()
-    caption = "Icons of a notional theme park. Sizes in degrees; * extrapolated. Icons framed in grey are not scaled."
+    caption = "Icons of a notional theme park with their sizes. Those framed in grey are not scaled"
+    caption += "; * extrapolated." if any(row["note"].startswith("extrapolated") for row in rows) else "."
     body = [f"<h1>{html.escape(name)}</h1>", figure(source, caption, "wide"), f"<pre>{html.escape(text)}</pre>"]
     for heading, lines in (
         ("Sizes", rows),

@@ -277,9 +277,14 @@ def mixed_model(eccentricities: Array, values: Array, confidence: float = 0.95) 
     return None
 
 
+def has_statsmodels() -> bool:
+    """Whether the extra is installed."""
+    return importlib.util.find_spec("statsmodels") is not None
+
+
 def need_statsmodels() -> None:
     """ConfigError with the line that installs it where it is missing."""
-    if importlib.util.find_spec("statsmodels") is None:
+    if not has_statsmodels():
         raise ConfigError(
             ["statsmodels is missing: pip install 'holotorch[stats]', or leave it out with repeated_measures=false"]
         )

@@ -25,39 +25,66 @@ def channel_maps(values: Tensor, names: Sequence[str], label: str, colormap: str
 
 
 def comparison(images: Sequence[Tensor], captions: Sequence[str]) -> bytes:
-    """PNG of pictures [C, H, W] in [0, 1] side by side with their captions."""
+    """PNG of pictures [C, H, W] in [0, 1] side by side with their captions, a score on a line of its own."""
     height, width = images[0].shape[-2:]
-    figure = Figure(figsize=(3.2 * len(images), 3.2 * height / width + 0.55), layout="constrained", dpi=120)
-    for i, (image, caption) in enumerate(zip(images, captions, strict=True)):
-        axes = figure.add_subplot(1, len(images), i + 1)
+    titles = [_title(caption) for caption in captions]
+    wide, gap, top = 3.1, 0.1, 0.14 + 0.18 * max(title.count("\n") + 1 for title in titles)  # inches
+    tall = wide * height / width
+    whole = (wide + gap) * len(images) + gap, tall + gap + top
+    figure = Figure(figsize=whole, dpi=120)
+    for i, (image, title) in enumerate(zip(images, titles, strict=True)):
+        left = gap + i * (wide + gap)
+        axes = figure.add_axes((left / whole[0], gap / whole[1], wide / whole[0], tall / whole[1]))
         shown = image.clamp(0, 1).permute(1, 2, 0).squeeze(-1).numpy()
         axes.imshow(shown, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
-        axes.set_title(textwrap.fill(caption, 34), fontsize=10)
+        axes.set_title(title, fontsize=10)
         axes.set_axis_off()
     return _png(figure)
 
 
+def _title(caption: str) -> str:
+    what, _, score = caption.partition(", SSIM ")
+    return textwrap.fill(what, 38) + (f"\nSSIM {score}" if score else "")
+
+
 def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[int, float]], metric: str) -> bytes:
     """PNG of the loss per colour [steps + 1, C] (left axis, relative to the start) and of a metric (right axis)."""
-    figure = Figure(figsize=(7.2, 3.2), layout="constrained")
+    figure = Figure(figsize=(7.2, 3.4), layout="constrained")
     axes = figure.add_subplot()
-    relative = (losses / losses[0].clamp(min=1e-30)).cpu().numpy()
+    relative = np.maximum((losses / losses[0].clamp(min=1e-30)).cpu().numpy(), 1e-16)
+    stage, steps = _next_stage(relative), np.arange(len(relative))
     for i, name in enumerate(names):
-        axes.semilogy(np.maximum(relative[:, i], 1e-16), label=name, linewidth=1.2, color=_LINES[i % len(_LINES)])
+        style = {"linewidth": 1.2, "color": _LINES[i % len(_LINES)]}
+        axes.semilogy(steps[:stage], relative[:stage, i], label=name, **style)
+        if stage:
+            axes.semilogy(steps[stage:], relative[stage:, i], **style)
+    if stage:
+        axes.axvline(stage - 0.5, color="0.4", linewidth=1, linestyle=":")
+        words = "the error of the amplitude; from there on that of the intensity, and what a limit adds"
+        axes.set_title(f"The loss up to step {stage - 1} (dotted) is {words}", fontsize=8)
     axes.set_xlabel("step")
     axes.set_ylabel("loss / loss at the start")
     axes.grid(alpha=0.3)
-    handles, labels = axes.get_legend_handles_labels()
     if checked:
         right = axes.twinx()
         right.plot(*zip(*checked, strict=True), "k--", linewidth=1.2, label=metric.upper())
         right.set_ylabel(f"mean {metric.upper()}")
         if metric == "ssim":
             right.set_ylim(0, 1.02)
-        more = right.get_legend_handles_labels()
-        handles, labels = handles + more[0], labels + more[1]
-    axes.legend(handles, labels, fontsize=8, loc="center right")
+    figure.legend(loc="outside upper center", ncols=len(names) + 1, fontsize=8, frameon=False)
     return _png(figure)
+
+
+def _next_stage(losses: np.ndarray) -> int | None:
+    """First step whose losses [steps + 1, C] are those of another objective, or None.
+
+    L-BFGS begins with the amplitude's loss and goes on with the intensity's, where all colours jump up at once that had
+    only fallen before. The momentum of Adam lets single colours rise from the start.
+    """
+    change = losses[1:] / losses[:-1]
+    jumps = np.flatnonzero((change > 1.5).all(1))
+    fell = len(jumps) > 0 and jumps[0] > 4 and bool((change[: jumps[0]] < 1.01).all())
+    return int(jumps[0]) + 1 if fell else None
 
 
 def curves(rows: Sequence[dict[str, Any]], title: str) -> bytes:

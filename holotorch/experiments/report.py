@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.eye_report import eye_section
 from holotorch.experiments.markup import figure, plain, table
 from holotorch.experiments.volume_report import volume_section
 from holotorch.experiments.zone_table import zone_rows
@@ -31,6 +32,7 @@ _FIGURES = {
     "convergence": "Convergence of the solver",
     "weight": "Weight of the squared error, mean 1",
 }
+_KINDS = ("pec", "volume", "eye")
 _METHOD_NAMES = {
     "none": "no correction",
     "basic_ipec": "basic IPEC",
@@ -70,13 +72,21 @@ class _Run:
             raise ConfigError([f"{folder} holds no run: neither summary.json nor interrupted.json is there{cure}"])
         try:
             self.summary = json.loads((folder / names[0]).read_text())
+            kind = str(self.summary["experiment"])
+            if kind not in _KINDS:
+                raise ConfigError([_other(folder, kind)])
             self.plan = json.loads((folder / "plan.json").read_text())
             self.env = json.loads((folder / "env.json").read_text())
             self.config = (folder / "config.yaml").read_text()
-            volume = self.summary["experiment"] == "volume"
-            self.methods: dict[str, dict[str, Any]] = {} if volume else self.summary["methods"]
-            parts = volume_section(self.title, self.summary, self.plan, self.picture) if volume else _section(self)
+            self.methods: dict[str, dict[str, Any]] = self.summary["methods"] if kind == "pec" else {}
+            if kind == "pec":
+                parts = _section(self)
+            else:
+                section = volume_section if kind == "volume" else eye_section
+                parts = section(self.title, self.summary, self.plan, self.picture)
             self.section = "\n".join(parts + _repeat(self))
+        except ConfigError:
+            raise
         except (OSError, KeyError, IndexError, ValueError, TypeError, AttributeError) as error:
             raise ConfigError([f"{folder} holds a run that cannot be read: {type(error).__name__} {error}"]) from None
 
@@ -85,6 +95,12 @@ class _Run:
         if not path.is_file():
             return ""
         return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
+
+
+def _other(folder: Path, kind: str) -> str:
+    page = folder / "report.html"
+    own = f"; its own page is {page}" if page.is_file() else ""
+    return f"{folder} holds a run of kind {kind}, and only those of {', '.join(_KINDS)} can be shown together{own}"
 
 
 def _comparison(runs: list[_Run]) -> str:

@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -13,11 +14,16 @@ from holotorch.experiments.run import claim
 from holotorch.io.files import write_text
 from holotorch.io.recording import Recorder
 from holotorch.io.video import Frame
+from holotorch.tracking.protocols import coverage
 from holotorch.tracking.scenery import SKIN, drape, finger
 from holotorch.tracking.world import World
 
 RATE = 30.0  # frames per second
-_COLUMNS = ("frame", "time_s", "tip_x_m", "tip_y_m", "tip_z_m", "direction_x", "direction_y", "direction_z")
+_TIP = ("tip_x_m", "tip_y_m", "tip_z_m")
+_COVARIANCE = ("cov_xx_m2", "cov_xy_m2", "cov_xz_m2", "cov_yy_m2", "cov_yz_m2", "cov_zz_m2")
+_SHARES = {"median": 0.5, "p95": 0.95, "worst": 1.0}
+_WRONG = 5.0  # mm
+_COLUMNS = ("frame", "time_s", *_TIP, "direction_x", "direction_y", "direction_z")
 
 
 def write_synthetic(out: Path | None, frames: int = 45, size: tuple[int, int] = (1080, 1920)) -> Path:
@@ -63,23 +69,46 @@ def write_synthetic(out: Path | None, frames: int = 45, size: tuple[int, int] = 
     return folder
 
 
-def compared(poses: Path, truth: Path) -> str:
-    """How far the tips of a poses.csv lie from a truth.csv, in words."""
+def errors(poses: Path, truth: Path) -> dict[str, float]:
+    """How far the tips of a poses.csv lie from a truth.csv, as plain JSON values in mm; nothing where there is none.
+
+    ``coverage``: share of the answered frames whose truth lies in the 95 % ellipsoid of the stated covariance.
+    ``wrong``: frames off by more than 5 mm.
+    """
+    if not (poses.is_file() and truth.is_file()):
+        return {}
     with open(truth, newline="") as stream:
-        true = {int(row["frame"]): row for row in csv.DictReader(stream)}
-    names = _COLUMNS[2:5]
-    away, refused = [], 0
+        table = csv.DictReader(stream)
+        if not {"frame", *_TIP} <= set(table.fieldnames or ()):
+            return {}  # another table of that name
+        true = {row["frame"]: [row[name] for name in _TIP] for row in table}
     with open(poses, newline="") as stream:
-        for row in csv.DictReader(stream):
-            if row["tip_x_m"] in ("", "nan"):
-                refused += 1
-                continue
-            other = true[int(row["frame"])]
-            away.append(1e3 * math.dist([float(row[n]) for n in names], [float(other[n]) for n in names]))
-    if not away:
-        return f"Truth      no frame answered of {refused} (synthetic)"
-    away.sort()
+        known = [row for row in csv.DictReader(stream) if row["frame"] in true]
+    rows = [row for row in known if row["tip_x_m"] not in ("", "nan")]
+    found: dict[str, float] = {"frames": len(rows), "refused": len(known) - len(rows)}
+    if not rows:
+        return found
+    tips, places = (
+        torch.tensor([[float(value) for value in values] for values in part], dtype=torch.float64)
+        for part in ([[row[name] for name in _TIP] for row in rows], [true[row["frame"]] for row in rows])
+    )
+    away = (1e3 * (tips - places).norm(dim=-1)).sort().values
+    last = len(away) - 1
+    found |= {f"{name}_mm": float(away[round(share * last)]) for name, share in _SHARES.items()}
+    found["wrong"] = int((away > _WRONG).sum())
+    if all(rows[0].get(name) for name in _COVARIANCE):
+        upper = torch.tensor([[float(row[name]) for name in _COVARIANCE] for row in rows], dtype=torch.float64)
+        with suppress(ValueError):  # a covariance that is none has no ellipsoid
+            found["coverage"] = coverage(tips, upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3), places)[0]
+    return found
+
+
+def compared(poses: Path, truth: Path) -> str:
+    """The same in words."""
+    found = errors(poses, truth)
+    if not found.get("frames"):
+        return f"Truth      no frame answered of {found.get('refused', 0)} (synthetic)"
     return (
-        f"Truth      the tip is {away[len(away) // 2]:.2f} mm off (median), {away[-1]:.2f} at most, "
-        f"in {len(away)} frames; {refused} refused (synthetic)"
+        f"Truth      the tip is {found['median_mm']:.2f} mm off (median), {found['worst_mm']:.2f} at most, "
+        f"in {found['frames']} frames; {found['refused']} refused (synthetic)"
     )

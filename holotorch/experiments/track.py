@@ -18,6 +18,7 @@ from tqdm import tqdm
 from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.run import claim, deferred, interruptible
+from holotorch.experiments.synthetic import errors
 from holotorch.experiments.track_report import COLUMNS, Log, Tracked, row, summarised, verdict, write_page
 from holotorch.experiments.track_source import Given, Tracker, opened
 from holotorch.io.files import append, replacing, write_bytes, write_json, write_text
@@ -169,6 +170,8 @@ def _fill(folder: Path, given: Given, settings: dict[str, Any]) -> tuple[Path, b
                 raise failure or KeyboardInterrupt
             complete = failure is None and (not pressed or frames.live)
             summary = summarised(log, frames, settings["method"], settings["still"])
+            if truth := errors(folder / "poses.csv", Path(settings["source"]) / "truth.csv"):
+                summary["truth"] = truth
             summary["status"] = "complete" if complete else "interrupted"
             if failure is not None:
                 summary["failure"] = f"{type(failure).__name__}: {failure}"

@@ -174,12 +174,14 @@ def write_page(folder: Path, summary: dict[str, Any], log: Log) -> None:
         body += f"<p><b>{summary['status']} {html.escape(summary.get('failure', ''))}</b></p>"
     share = 100 * summary["answered"] / summary["frames"]
     body += f"<p>{summary['answered']} of {summary['frames']} frames have a pose ({share:.1f} %); every other says why "
-    body += "it has none. Errors against the truth are not known here: deviations are the tracker's own estimate.</p>"
+    body += "it has none. " + ("" if "truth" in summary else "Errors against the truth are not known here. ")
+    body += "Deviations (sd) are the tracker's own estimate.</p>"
+    body += _truth(summary["truth"]) if "truth" in summary else ""
     body += "".join(f"<p>Note: {html.escape(note)}.</p>" for note in summary["notes"])
     rows = [[name, str(count)] for name, count in summary["statuses"].items()]
     body += table(["status", "frames"], rows)
-    shown = ("tip_sd_mm", "stability", "milliseconds")
-    body += table(["", ""], [[name.replace("_", " "), plain(summary.get(name, ""))] for name in shown], head=False)
+    shown = [name for name in ("tip_sd_mm", "stability", "milliseconds") if name in summary]
+    body += table(["", ""], [[name.replace("_", " "), plain(summary[name])] for name in shown], head=False)
     if "stages" in summary:
         cells = [
             [html.escape(each["stage"]), f"{each['milliseconds']:.2f}", f"{each['percent']:.2f}"]
@@ -192,6 +194,20 @@ def write_page(folder: Path, summary: dict[str, Any], log: Log) -> None:
     body += "".join(figure(_inline(folder, name), caption, "wide") for name, caption in log.pictures.items())
     style = "<style>img { max-width: 100% }</style>"
     write_text(folder / "report.html", f"<!DOCTYPE html><meta charset='utf-8'><title>track</title>{style}{body}")
+
+
+def _truth(found: dict[str, float]) -> str:
+    """HTML of how far the tips lie from where a synthetic recording has them."""
+    text = (
+        f"<p>The recording is synthetic, and where the tip truly is is known. Of {found['frames']} frames with a pose "
+    )
+    text += f"{found.get('wrong', 0)} are wrong by more than 5 mm.</p>"
+    shares = [
+        (f"{name} (mm)", f"{found[f'{name}_mm']:.3f}") for name in ("median", "p95", "worst") if f"{name}_mm" in found
+    ]
+    if "coverage" in found:
+        shares.append(("truth within the stated 95 % ellipsoid", f"{100 * found['coverage']:.1f} % of the frames"))
+    return text + table(["tip's distance from the truth", ""], [list(pair) for pair in shares])
 
 
 def _smaller(drawn: Tensor) -> Tensor:

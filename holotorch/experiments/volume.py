@@ -1,7 +1,6 @@
 """The volume experiment: a configuration made into a volume, its renderer and a hologram per colour."""
 
 import math
-import textwrap
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -229,11 +228,12 @@ def _volume(source: VolumeSource) -> tuple[Volume, str]:
                 try:
                     return fetch_volume(name, source.directory), ""
                 except (OSError, ValueError) as error:
-                    why = f"{source.scene} could not be fetched ({textwrap.shorten(str(error), 70)})"
+                    cause = " ".join(str(error).split())
+                    why = f"{source.scene} could not be fetched ({cause}); give its file as volume.path=FILE"
             else:
-                why = f"no checksum of {source.scene} is published; give its file as volume.path"
+                why = f"no checksum of {source.scene} is published; give its file as volume.path=FILE"
             if not source.phantom:
-                raise ConfigError([f"volume.scene: {why}; give volume.path, or volume.phantom to stand in for it"])
+                raise ConfigError([f"volume.scene: {why}, or volume.phantom to stand in for it"])
     except ValueError as error:
         raise ConfigError([f"volume: {error}"]) from error
     except OSError as error:

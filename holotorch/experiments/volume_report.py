@@ -26,7 +26,7 @@ def volume_section(
     captions |= {f"focus_{f}": f"Refocused at {depth * 1e3:.4g} mm" for f, depth in enumerate(depths)}
     for name, caption in captions.items():
         if source := picture(name):
-            parts.append(figure(source, caption, "picture"))
+            parts.append(figure(source, caption + (", synthetic" if summary["synthetic"] else ""), "picture"))
     parts.append("</div>")
     if source := picture("depth"):
         parts.append(figure(source, "Mean depth of what a ray sees", "wide"))

@@ -160,9 +160,13 @@ def _write(out: Path, experiment: VolumeExperiment, judge: VolumeJudge, state: _
         write_bytes(out / "images" / f"{name}.png", encode_png(picture.clamp(0, 1)))
     captions = ["Direct volume rendering", "Hologram, every ray at its depth"]
     captions += [f"Hologram refocused at {depth * 1e3:.4g} mm" for depth in judge.depths]
+    captions = [caption + (", synthetic" if experiment.synthetic else "") for caption in captions]
     write_bytes(out / "images" / "comparison.png", pictures.comparison([*images.values()], captions))
     depth = torch.where(judge.opacity > 0.05, judge.depth * 1e3, torch.nan)
-    write_bytes(out / "images" / "depth.png", pictures.channel_maps(depth[None], ["what a ray sees"], "mm", "viridis"))
+    write_bytes(
+        out / "images" / "depth.png",
+        pictures.channel_maps(depth[None], ["what a ray sees"], "mean depth behind the hologram (mm)", "viridis"),
+    )
     summary = {
         "experiment": "volume",
         "status": "complete" if complete else "interrupted",

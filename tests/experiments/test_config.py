@@ -220,6 +220,30 @@ def test_a_region_goes_with_one_distance_and_may_be_small_without_ssim(written):
     assert load_config(written(GOOD), ["target.region=12"]).target.region == (12, 12)
 
 
+@pytest.mark.parametrize(
+    ("override", "wanted"),
+    [
+        (
+            "items=[{icon: dog, azimuth_deg: 10}]",
+            ["items.0.icon: expected 'wheel', 'coaster', 'castle', 'boat', 'tent', "],
+        ),
+        (
+            "items=[{icon: dog, azimuth_deg: 10}, {icon: boat, azimuth_deg: 200}]",
+            ["items.0.icon: expected", "items.1.azimuth_deg: expected less than or equal to 180, got 200"],
+        ),
+        ("items=[]", ["items: expected at least 1 entry, got 0"]),
+        (
+            "targets=[" + ", ".join(7 * ["{size_deg: 5, eccentricity_deg: 10}"]) + "]",
+            ["targets: expected at most 6 entries, got 7"],
+        ),
+    ],
+)
+def test_a_list_is_too_short_or_too_long_in_plain_words_and_only_where_it_is(override, wanted):
+    found = mistakes(CONFIGS / "perception" / "layout.yaml", override)
+    assert len(found) == len(wanted)
+    assert all(words in line for words, line in zip(wanted, found, strict=True))
+
+
 def test_single_values_stand_for_lists(written):
     settings = load_config(written(GOOD), ["grid.shape=24", "report.metrics=psnr", "report.baselines=none"])
     assert settings.grid.shape == (24, 24)

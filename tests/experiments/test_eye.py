@@ -11,24 +11,38 @@ import torch
 
 from holotorch.cli import main
 from holotorch.experiments import eye as eye_module
+from holotorch.experiments import eye_plan, pictures
 from holotorch.experiments.config import load_config
+from holotorch.experiments.config_eye import ObserverSettings
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.eye import observer
-from holotorch.experiments.eye_run import plan_text, run_observer, scene_settings
+from holotorch.experiments.eye_plan import plan, plan_text
+from holotorch.experiments.eye_run import run_observer, scene_settings
 
 CONFIG = Path(__file__).parents[2] / "configs" / "eye" / "teapot.yaml"
 SCENE = (
     "scene={config: configs/volume/c60.yaml, change: ['volume={phantom: c60, samples: 32}', "
     "'hologram={shape: [128, 128], pitch: 3.74 um, distance: 12 mm, depths: 12, rays: 64}']}"
 )
-SMALL = [SCENE, "seeds=1", "light={sources: [laser, led]}", "focus=[12 mm]"]
+# 128 px see so little of the pupil that the collapse is off by more than the default allows, by a rule of thumb.
+SMALL = [SCENE, "seeds=1", "light={sources: [laser, led]}", "focus=[12 mm]", "tolerance=0.1"]
+# A display so small that both ways are quick: the collapse is predicted to be off by 4 %, the elements by 3 %. The
+# pupil takes no more than the pitch carries, a sine of 0.05 where that is 0.057 at the blue end.
+TINY = [
+    "scene={config: configs/volume/c60.yaml, change: ['volume={phantom: c60, samples: 16}', "
+    "'hologram={shape: [64, 64], pitch: 3.74 um, distance: 2 mm, depths: 4, rays: 32}']}",
+    *("display={kind: planar, distance: 4 mm}", "eye={pupil_radius: 0.1 mm, axial_length: 2 mm}"),
+    *("seeds=1", "light={sources: [laser]}", "focus=[2 mm]"),
+]
 
 
 def settings(*overrides: str):
     return load_config(CONFIG, [*SMALL, *overrides])
 
 
-def test_a_run_shows_less_speckle_under_wider_sources(tmp_path):
+def test_a_run_shows_less_speckle_under_wider_sources(tmp_path, monkeypatch):
+    captions = []
+    monkeypatch.setattr(pictures, "comparison", lambda images, words: captions.extend(words) or b"")
     folder, complete = run_observer(settings(), tmp_path / "a", "a")
     names = {path.name for path in folder.iterdir()}
     assert complete and names == {
@@ -43,8 +57,28 @@ def test_a_run_shows_less_speckle_under_wider_sources(tmp_path):
         assert led["contrast_predicted"][colour] < laser["contrast_predicted"][colour] <= 1
         assert led["wavelengths"][colour] >= laser["wavelengths"][colour]
     with open(folder / "table.csv", newline="") as stream:
-        assert len(list(csv.DictReader(stream))) == 2
-    assert "Synthetic volume" in (folder / "report.html").read_text()
+        table = list(csv.DictReader(stream))
+    each = ("wavelengths", "contrast", "contrast_predicted", "ssim", "sharpness", "best_fwhm_nm_by_formula")
+    assert len(table) == 2 and list(table[0]) == [
+        *("source", "focus_mm"),
+        *(f"{name}_{wave}nm" for name in each for wave in (636, 520, 455)),
+    ]
+    assert [float(table[0][f"contrast_{wave}nm"]) for wave in (636, 520, 455)] == pytest.approx(
+        laser["contrast"], rel=1e-4
+    )
+    page = (folder / "report.html").read_text()
+    for words in (
+        "contrast at 636 / 520 / 455 nm",
+        "evenly filled round pupil and fully developed speckle",
+        "and measures lower",
+    ):
+        assert words in page
+    assert "Synthetic volume" in page and "focus 12 mm, synthetic volume</figcaption>" in page
+    assert captions == [
+        "reference, focus 12 mm, synthetic",
+        "laser, focus 12 mm, synthetic",
+        "led, focus 12 mm, synthetic",
+    ]
 
 
 def test_few_wavelengths_are_as_good_as_many():
@@ -80,10 +114,81 @@ def test_the_eye_sees_sharply_where_it_is_focused():
 
 
 def test_the_plan_says_how_the_scene_is_seen():
-    text, values = plan_text(observer(settings(), scene_settings(settings())))
+    found = observer(settings(), scene_settings(settings()))
+    values = plan(found)
+    text = plan_text(found, values)
     assert "synthetic: a phantom was asked for" in text and "laser: " in text
     assert values["accommodation_mm"][0] == pytest.approx(120, rel=1e-6)  # the middle, where the display puts it
     assert main(["check", str(CONFIG), *SMALL]) == 0
+
+
+@pytest.mark.parametrize(("tolerance", "method"), [(0.05, "collapse"), (0.03, "elements")])
+def test_the_run_goes_the_way_that_its_plan_says(tolerance, method, tmp_path, monkeypatch):
+    called = []
+    collapse = eye_module.imaged
+    for name, way in (("collapse", "imaged"), ("elements", "through_elements")):
+        # Elements in fact are tried below; here it counts which way is called.
+        monkeypatch.setattr(
+            eye_module, way, lambda *words, name=name, **more: called.append(name) or collapse(*words, **more)
+        )
+    given = load_config(CONFIG, [*TINY, f"tolerance={tolerance}"])
+    folder, _ = run_observer(given, tmp_path / "a", "a")
+    planned = json.loads((folder / "plan.json").read_text())
+    assert [way["method"] for way in planned["retina"]] == [method] and planned["tolerance"] == tolerance
+    assert set(called) == {method} and len(called) == planned["images"]
+    assert f"Retina     {method} at" in (folder / "report.html").read_text()
+
+
+def test_what_observers_see_is_put_on_one_page(tmp_path, tiny):
+    names = ("one", "two")
+    for name, source in zip(names, ("laser", "led"), strict=True):
+        words = [*TINY, f"light={{sources: [{source}]}}", "tolerance=0.1"]
+        run_observer(load_config(CONFIG, words), tmp_path / name, name)
+    assert main(["report", *(str(tmp_path / name) for name in names), "--out", str(tmp_path / "both.html")]) == 0
+    page = (tmp_path / "both.html").read_text()
+    for words in (
+        "<h1>one</h1>",
+        "<h1>two</h1>",
+        "<td>laser</td>",
+        "<td>led</td>",
+        "contrast",
+        "sharpness",
+        "Retina  ",
+    ):
+        assert words in page
+    assert page.count("data:image/png;base64,") == 4 and page.count("How to repeat") == 2
+
+
+def test_both_ways_show_the_same_and_the_plan_tells_their_costs():
+    given = [load_config(CONFIG, [*TINY, f"tolerance={tolerance}"]) for tolerance in (0.05, 0.03)]
+    short, long = (observer(each, scene_settings(each)) for each in given)
+    hologram, _ = short.scene.hologram(0)
+    seen = [found.seen(hologram, None, 2e-3) for found in (short, long)]
+    error = (seen[0] - seen[1]).norm() / seen[1].norm()
+    ways = [found.retina(2e-3) for found in (short, long)]
+    assert [way.method for way in ways] == ["collapse", "elements"]
+    assert error < sum(way.predicted_error for way in ways)
+    predicted = [plan(found)["predicted_seconds"] for found in (short, long)]
+    assert predicted[1] > 2 * predicted[0]
+
+
+def test_a_way_that_does_not_fit_is_refused_before_it_starts(capsys, monkeypatch):
+    assert main(["check", str(CONFIG), *TINY, "tolerance=0.05"]) == 0
+    monkeypatch.setattr(eye_plan, "_BASE_BYTES", 1e18)
+    assert main(["check", str(CONFIG), *TINY, "tolerance=0.05"]) == 2
+    assert "GB are free; use a smaller grid" in capsys.readouterr().err
+    assert main(["check", str(CONFIG), *TINY]) == 2
+    assert "use a smaller grid, or a larger tolerance" in capsys.readouterr().err
+
+
+def test_the_teapot_of_the_thesis_is_collapsed():
+    """Its configuration, its pixels; only the voxels are fewer."""
+    change = "'volume={phantom: c60, samples: 16}', 'hologram={shape: [512, 512], pitch: 3.74 um, distance: 30 mm}'"
+    given = load_config(CONFIG, [f"scene={{config: configs/volume/teapot.yaml, change: [{change}]}}"])
+    assert given.tolerance == ObserverSettings.model_fields["tolerance"].default == 0.03
+    found = observer(given, scene_settings(given))
+    ways = [found.retina(depth) for depth in found.focus]
+    assert {way.method for way in ways} == {"collapse"} and all(way.predicted_error < 0.03 for way in ways)
 
 
 def test_interrupted_runs_keep_what_was_seen(tmp_path, monkeypatch):

@@ -1,10 +1,8 @@
-import csv
 import json
 import math
 
 import numpy as np
 import pytest
-import yaml
 from pydantic import ValidationError
 
 from holotorch.experiments.config_analysis import (
@@ -238,42 +236,6 @@ def test_frames_show_in_the_times():
     assert on_frames(free) == pytest.approx(0.2, abs=5 * math.sqrt(0.2 * 0.8 / 4000))
 
 
-def test_a_run_of_simulated_people_fills_its_folder(tmp_path, capsys):
-    pytest.importorskip("statsmodels", reason="pip install 'holotorch[stats]'")
-    chosen = settings(
-        repeated_measures=True,
-        simulation={"participants": 12},
-        targets=[{"size_deg": 5, "eccentricity_deg": 10}, {"seconds": 0.45}],
-        power={"slopes": [0.4], "participants": [6], "studies": 10, "resamples": 100},
-    )
-    folder, complete = run_analysis(chosen, tmp_path / "run", "analysis")
-    assert complete and folder == tmp_path / "run"
-    names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-    pictures = {"time_surface", "time_map", "participant", "time_slices", "scale_lines", "power"}
-    tables = {"metrics.csv", "conditions.csv", "curves.csv", "power.csv"}
-    rest = {
-        "config.yaml",
-        "plan.json",
-        "env.json",
-        "summary.json",
-        "report.html",
-        "arrays/times.npy",
-        "arrays/scales.npy",
-    }
-    assert names == {f"images/{name}.png" for name in pictures} | tables | rest
-    summary = json.loads((folder / "summary.json").read_text())
-    assert summary["simulated"] and summary["status"] == "complete" and summary["participants"] == 12
-    assert summary["counts"]["trials"] == 12 * 52 * 14 and len(summary["power"]) == 1
-    assert summary["quantisation"]["frame_s"] == pytest.approx(1 / 60) and summary["quantisation"]["on_frames"] == 1
-    with open(folder / "metrics.csv", newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    assert [row["target"] for row in rows] == ["5 deg at 10 deg", "450 ms"] and rows[0]["true_alpha"] == "0.47"
-    assert float(rows[0]["one_way_f"]) > 0 and float(rows[0]["repeated_p_corrected"]) <= 1
-    said = capsys.readouterr().out
-    assert "12 simulated participants" in said and "16.7 ms" in said and "one-way ANOVA, as in the thesis" in said
-    assert AnalysisSettings.model_validate(yaml.safe_load((folder / "config.yaml").read_text())) == chosen
-
-
 def test_a_run_of_logs(tmp_path):
     for person in (1, 2):
         cells = [(e, s) for e in (40.0, 50.0, 60.0, 70.0) for s in SIZES for _ in range(3)]
@@ -291,10 +253,3 @@ def test_a_run_of_logs(tmp_path):
     with pytest.raises(ConfigError, match="shown: no participant 9; there are 1, 2"):
         run_analysis(settings(logs=[str(tmp_path)], shown=9), tmp_path / "other", "analysis")
     assert not (tmp_path / "other").exists()
-
-
-def test_a_power_study_that_cannot_be_is_refused_before_the_folder(tmp_path):
-    chosen = settings(power={"slopes": [1.5], "participants": [6]})
-    with pytest.raises(ConfigError, match="power.slopes: 1.5: expected alpha and beta with sizes above zero"):
-        run_analysis(chosen, tmp_path / "run", "analysis")
-    assert not (tmp_path / "run").exists()

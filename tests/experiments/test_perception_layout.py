@@ -11,6 +11,7 @@ from skimage.metrics import structural_similarity
 
 from holotorch.cli import _parser, main
 from holotorch.correction import PECProblem
+from holotorch.experiments import perception_layout
 from holotorch.experiments.config import load_config
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.pec import build
@@ -59,6 +60,28 @@ def test_extrapolation_and_small_lines_are_flagged(capsys):
         scaled(load_config(LAYOUT, ["targets=[{size_deg: 7, eccentricity_deg: 10}]"]))
     with pytest.raises(ConfigError, match=r"items\.0\.azimuth_deg.*180"):
         load_config(LAYOUT, ["items=[{icon: boat, azimuth_deg: 200}]"])
+
+
+@pytest.mark.parametrize("extrapolate", [False, True])
+def test_the_legend_holds_what_is_drawn_and_items_have_their_names(extrapolate, monkeypatch, tmp_path):
+    drawn = []
+
+    def keep(figure):
+        drawn.append(figure)
+        return canvas(figure)
+
+    canvas = perception_layout.FigureCanvasAgg
+    monkeypatch.setattr(perception_layout, "FigureCanvasAgg", keep)
+    main(["run", str(LAYOUT), f"extrapolate={str(extrapolate).lower()}", "--out", str(tmp_path / "a")])
+    (figure,) = drawn
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert ("* extrapolated beyond 70 deg" in legend) == extrapolate
+    assert all(axes.title.get_window_extent().y1 < figure.bbox.y1 for axes in figure.axes)
+    assert legend[-1] == "40 and 70 deg: where the lines of Table 2.2 begin and end"
+    words = [text.get_text() for text in figure.axes[0].texts]
+    assert words[1] == "castle\n16.3 deg" and words[0] == ("pond\n26.6 deg *" if extrapolate else "pond\n5.0 deg")
+    page = (tmp_path / "a" / "report.html").read_text()
+    assert ("* extrapolated" in page) == extrapolate
 
 
 def test_weight_leads_to_the_loss_that_it_says():

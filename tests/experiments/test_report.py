@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from holotorch.cli import main
 from holotorch.experiments.config import load_config
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.report import write_report
@@ -73,3 +74,22 @@ def test_refuses_a_folder_without_a_run(folders, tmp_path):
         (tmp_path / "a" / "summary.json").write_text(text)
         with pytest.raises(ConfigError, match="cannot be read"):
             write_report([tmp_path / "a"], tmp_path / "report.html")
+
+
+def test_runs_with_pages_of_their_own_are_refused_in_one_line(tmp_path, capsys):
+    few = ["simulation.participants=6", "resamples=100", "power=null", "targets=[{seconds: 0.45}]"]
+    main(["run", str(CONFIGS / "perception" / "analysis.yaml"), *few, "--out", str(tmp_path / "a")])
+    (tmp_path / "t").mkdir()
+    (tmp_path / "t" / "summary.json").write_text('{"experiment": "track", "status": "complete"}')
+    own = (tmp_path / "a" / "report.html").read_text()
+    capsys.readouterr()
+    for name, kind, page in (
+        ("a", "perception_analysis", f"; its own page is {tmp_path}/a/report.html"),
+        ("t", "track", ""),
+    ):
+        assert main(["report", str(tmp_path / name)]) == 2
+        words = (
+            f"{tmp_path}/{name} holds a run of kind {kind}, and only those of pec, volume, eye can be shown together"
+        )
+        assert capsys.readouterr().err == f"{words}{page}\n"
+    assert (tmp_path / "a" / "report.html").read_text() == own

@@ -1,14 +1,17 @@
 """The synthetic recording: what it holds, and how a table of poses is compared with its truth."""
 
 import csv
+import json
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from holotorch.experiments.config_tracking import build_camera, build_catheter, load_camera, load_catheter
 from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.synthetic import RATE, compared, write_synthetic
+from holotorch.experiments.synthetic import RATE, compared, errors, write_synthetic
+from holotorch.experiments.track import run_tracking
 from holotorch.io.recording import is_recording, open_recording
 from holotorch.tracking.catheter import THESIS
 from holotorch.tracking.tracker import CatheterTracker
@@ -94,3 +97,32 @@ def test_poses_are_compared_with_the_truth_in_words(tmp_path):
     assert "the tip is 1.00 mm off (median), 5.00 at most, in 3 frames; 2 refused (synthetic)" in text
     nothing = compared(write(tmp_path / "poses.csv", rows[3:]), true)
     assert "no frame answered of 2 (synthetic)" in nothing
+
+
+def test_a_run_of_a_synthetic_recording_holds_its_errors(folder, tmp_path):
+    out, _ = run_tracking(str(folder), out=tmp_path / "run", video=False)
+    found = json.loads((out / "summary.json").read_text())["truth"]
+    with open(out / "poses.csv", newline="") as stream:
+        poses = list(csv.DictReader(stream))
+    away, inside = [], 0
+    for pose, true in zip(poses, truths(folder), strict=True):
+        off = np.array([float(pose[f"tip_{axis}_m"]) - float(true[f"tip_{axis}_m"]) for axis in "xyz"])
+        square = np.array([[float(pose[f"cov_{min(a, b)}{max(a, b)}_m2"]) for b in "xyz"] for a in "xyz"])
+        away.append(1e3 * np.linalg.norm(off))
+        inside += off @ np.linalg.solve(square, off) < 7.8147  # 95 % of chi-square with 3 degrees of freedom
+    names = [found[f"{name}_mm"] for name in ("median", "p95", "worst")]
+    assert names == pytest.approx([sorted(away)[1], max(away), max(away)]) and found["coverage"] == inside / 3
+    assert (found["frames"], found["refused"], found["wrong"]) == (3, 0, 0)
+    page = (out / "report.html").read_text()
+    assert "not known here" not in page and f"{found['p95_mm']:.3f}" in page and "95 % ellipsoid" in page
+    assert "<td>stability</td>" not in page
+
+
+def test_other_tables_of_that_name_and_frames_beyond_it_are_left_out(tmp_path):
+    poses = write(tmp_path / "poses.csv", [("0", "0.01", "0.02", "0.507"), ("7", "0.01", "0.02", "0.5")])
+    assert errors(poses, tmp_path / "truth.csv") == {}
+    (tmp_path / "truth.csv").write_text("name,value\na,1\n")
+    assert errors(poses, tmp_path / "truth.csv") == {}
+    true = write(tmp_path / "truth.csv", [("0", "0.01", "0.02", "0.5")])
+    found = errors(poses, true)
+    assert found["frames"] == found["wrong"] == 1 and found["worst_mm"] == pytest.approx(7) and "coverage" not in found

@@ -30,19 +30,18 @@ def test_the_prefactor_is_that_of_the_cases():
     assert math.isnan(fitted_prefactor([cases[-1]]))
 
 
-def test_weights_are_those_of_the_spectrum():
+@pytest.mark.parametrize("fwhm", [10e-9, 13e-9])
+def test_weights_are_those_of_the_spectrum(fwhm):
     places = 520e-9 + np.arange(-40, 41) * 1e-9
     stack = torch.from_numpy((places - 520e-9) ** 2)[:, None, None]
-    spectrum = Spectrum.lorentzian(520e-9, 10e-9)
+    spectrum = Spectrum.lorentzian(520e-9, fwhm)
     dense, weights = spectrum.measure()
     wanted = (weights * (dense - 520e-9).square()).sum().item()
     found = eye_tradeoff._weighted(stack, places, spectrum).item()
-    # Steps of 1 nm from -15 to 15 nm, the ends included, where p = 1 / (1 + (x / 5)^2) has fallen to a tenth. The ends
-    # count a whole step, not half: p x^2 = 22.5 more in 437.8, and p = 0.1 in 12.49, which makes 4.3 % in all. The rest
-    # of the trapezoidal rule's error is h^2 / 12 times the change of slope of p x^2, 2 * 0.3: 0.05 in 437.8.
-    angle = math.atan(3)
-    square, power = 25 * (30 - 10 * angle), 10 * angle
-    assert found == pytest.approx(wanted * (1 + 22.5 / square) / (1 + 0.1 / power), rel=1e-3)
+    # p = 1 / (1 + (x / 5)^2) in steps of 1 nm from -15 to 15 nm, where it has fallen to a tenth: h^2 / 12 times the
+    # change of slope of p x^2, 0.6, is 0.05 in 437.8; that of p, -0.024, is -0.002 in 12.49; 3e-4 in all. At 13 nm the
+    # ends, +-19.5 nm, lie between two samples: x^2 is 0.25 too large there, for a quarter of a step and p = 0.1: 1e-5.
+    assert found / wanted == pytest.approx(1, abs=5e-4)  # of 1: both are 1e-17 m^2, and approx allows 1e-12
 
 
 def test_a_small_scene_has_its_cases(monkeypatch):

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from holotorch.cli import main
-from holotorch.experiments import volume_run
+from holotorch.experiments import pictures, volume_run
 from holotorch.experiments.config import load_config
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.volume import Part, build
@@ -60,7 +60,14 @@ def test_a_run_is_what_its_parts_give(tmp_path):
     assert numbers["ssim_in_focus"] > 0.3 and numbers["peak_memory_bytes"] > 1e8
     assert np.load(folder / "arrays" / "refocused.npy").shape == (3, 3, 32, 32)
     page = (folder / "report.html").read_text()
-    assert "Synthetic volume" in page and "Direct volume rendering" in page and "axial nodes" in page
+    assert "Synthetic volume" in page and "Direct volume rendering, synthetic" in page and "axial nodes" in page
+
+
+def test_the_map_of_depths_says_what_it_is_of(tmp_path, monkeypatch, tiny):
+    labels = []
+    monkeypatch.setattr(pictures, "channel_maps", lambda values, names, label, colours: labels.append(label) or b"")
+    run_volume(settings(), tmp_path / "a", "a")
+    assert labels == ["mean depth behind the hologram (mm)"]
 
 
 def test_more_realisations_have_less_speckle(tmp_path):
@@ -147,12 +154,13 @@ def test_a_scene_that_cannot_be_had_is_said(monkeypatch):
     from holotorch.experiments import volume
 
     def unreachable(name, directory):
-        raise OSError("no network")
+        raise OSError("no network: " + "a long story of connections " * 9 + "\nput it at /cache/tooth.raw")
 
     monkeypatch.setattr(volume, "fetch_volume", unreachable)
     stand_in = build(load_config(CONFIGS / "tooth.yaml", ["scale=16"]))
-    assert stand_in.synthetic == "tooth could not be fetched (no network)"
-    with pytest.raises(ConfigError, match="tooth could not be fetched .*give volume.path, or volume.phantom"):
+    assert stand_in.synthetic.startswith("tooth could not be fetched (no network: a long story")
+    assert stand_in.synthetic.endswith("put it at /cache/tooth.raw); give its file as volume.path=FILE")
+    with pytest.raises(ConfigError, match="tooth could not be fetched .*volume.path=FILE, or volume.phantom to stand"):
         build(load_config(CONFIGS / "tooth.yaml", ["volume={scene: tooth}"]))
     with pytest.raises(ConfigError, match="no checksum of hand is published; give its file as volume.path"):
         build(load_config(CONFIGS / "hand.yaml", ["volume={scene: hand}"]))
