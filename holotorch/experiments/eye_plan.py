@@ -85,6 +85,11 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
         f"Cost       about {values['predicted_seconds']:.2g} s on two idle cores for {values['images']} images, "
         f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
     ]
+    if sweep := settings.sweep:
+        lines.append(
+            f"Sweep      {sweep.steps} depths of focus besides, {sweep.realisations} realisation(s) each, all three "
+            "colours; its cost is not in the above"
+        )
     if settings.tradeoff:
         where = ", ".join(f"{distance * 1e3:g}" for distance in settings.tradeoff)
         lines.append(f"Trade-off  at {where} mm besides, all of it by the collapse; its cost is not in the above")

@@ -122,6 +122,14 @@ def test_the_plan_says_how_the_scene_is_seen():
     assert main(["check", str(CONFIG), *SMALL]) == 0
 
 
+def test_the_plan_names_what_it_does_not_count(capsys):
+    words = [*TINY, "tolerance=0.1", "tradeoff=[2 mm, 3 mm]", "sweep={steps: 5, realisations: 2}"]
+    assert main(["check", str(CONFIG), *words]) == 0
+    lines = capsys.readouterr().out.splitlines()[-2:]
+    assert lines[0].startswith("Sweep      5 depths of focus besides, 2 realisation(s) each")
+    assert lines[1] == "Trade-off  at 2, 3 mm besides, all of it by the collapse; its cost is not in the above"
+
+
 @pytest.mark.parametrize(("tolerance", "method"), [(0.05, "collapse"), (0.03, "elements")])
 def test_the_run_goes_the_way_that_its_plan_says(tolerance, method, tmp_path, monkeypatch):
     called = []
