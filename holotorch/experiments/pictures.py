@@ -24,6 +24,28 @@ def channel_maps(values: Tensor, names: Sequence[str], label: str, colormap: str
     return _png(figure)
 
 
+def visual_field(values: Tensor, eccentricity: Tensor, field_deg: float, rings: Sequence[float], label: str) -> bytes:
+    """PNG of a map [H, W] over ``field_deg`` of width, and the rings (deg) that its eccentricities [H, W] reach."""
+    height, width = values.shape
+    x, y = field_deg / 2, field_deg / 2 * height / width
+    figure = Figure(figsize=(7.2, 1.0 + 6.0 * height / width), layout="constrained")
+    axes = figure.add_subplot()
+    drawn = axes.imshow(values.numpy(), cmap="magma", extent=(-x, x, -y, y), interpolation="nearest")
+    inside = [ring for ring in rings if eccentricity.min() < ring < eccentricity.max()]
+    if inside:
+        # At the middles of the pixels.
+        across, up = ((np.arange(n) + 0.5) / n * 2 - 1 for n in (width, height))
+        lines = axes.contour(
+            x * across, -y * up, eccentricity.numpy(), inside, colors="white", linewidths=1, linestyles=":"
+        )
+        axes.clabel(lines, fmt=lambda ring: f"{ring:g} deg", fontsize=8)
+    axes.set_xlabel("right of the middle (deg)")
+    axes.set_ylabel("above the middle (deg)")
+    axes.set_title("Dotted: eccentricities between which the report's zones lie", fontsize=9)
+    figure.colorbar(drawn, ax=axes, label=label, shrink=0.85)
+    return _png(figure)
+
+
 def comparison(images: Sequence[Tensor], captions: Sequence[str]) -> bytes:
     """PNG of pictures [C, H, W] in [0, 1] side by side with their captions, a score on a line of its own."""
     height, width = images[0].shape[-2:]

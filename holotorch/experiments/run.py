@@ -23,7 +23,7 @@ from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.judge import Result, judge
 from holotorch.experiments.memory import peak_memory
 from holotorch.experiments.pec import PECExperiment, build
-from holotorch.experiments.perception_weight import weight_map
+from holotorch.experiments.perception_weight import ZONES, eccentricities, weight_map
 from holotorch.experiments.plan import plan, plan_text, shortage
 from holotorch.experiments.progress import Log
 from holotorch.experiments.report import write_report
@@ -259,8 +259,9 @@ def _write_results(
         "convergence": pictures.convergence(_per_colour(solution.losses, len(names)), names, log.checked, log.metric),
     }
     if weight := experiment.settings.target.weight:
-        shares = weight_map(weight, experiment.grid.shape)[None]
-        figures["weight"] = pictures.channel_maps(shares, [f"looked at {weight.gaze_deg} deg"], "weight", "magma")
+        shape, rings = experiment.grid.shape, [zone[0] for zone in ZONES[1:]]
+        away = eccentricities(weight, shape)
+        figures["weight"] = pictures.visual_field(weight_map(weight, shape), away, weight.field_deg, rings, "weight")
     for name, data in figures.items():
         write_bytes(out / "images" / f"{name}.png", data)
 

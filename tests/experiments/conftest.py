@@ -13,7 +13,7 @@ def tiny():
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("comparison", "channel_maps", "convergence"):
+        for name in ("comparison", "channel_maps", "convergence", "visual_field"):
             patch.setattr(pictures, name, lambda *_, **__: b"")
         yield
     torch.set_num_threads(threads)

@@ -1,5 +1,8 @@
 """Figures of a run: what is written on them fits, covers nothing, and explains what a reader would stumble over."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -7,8 +10,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from holotorch import Grid
 from holotorch.correction import LBFGS, PECProblem, limited, run_stages
 from holotorch.experiments import pictures
+from holotorch.experiments.config import load_config
+from holotorch.experiments.perception_weight import eccentricities, weight_map
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import Fraunhofer
+
+PERIPHERAL = Path(__file__).parents[2] / "configs" / "pec" / "peripheral.yaml"
 
 
 @pytest.fixture
@@ -64,3 +71,16 @@ def test_a_second_stage_is_named_and_the_legend_covers_no_curve(drawn):
 def test_losses_that_only_waver_are_one_stage():
     wavering = torch.tensor([[1, 1], [2.3, 0.8], [0.3, 2], [0.9, 3.5], [0.2, 0.1]]).double().numpy()
     assert pictures._next_stage(wavering) is None
+
+
+def test_a_weight_is_drawn_in_degrees_with_the_rings_of_the_zones(drawn):
+    weight = load_config(PERIPHERAL, ["target.weight.gaze_deg=[10,-20]"]).target.weight
+    away = eccentricities(weight, (96, 192))
+    pictures.visual_field(weight_map(weight, (96, 192)), away, weight.field_deg, [8, 30, 60, 170], "weight")
+    (figure,) = drawn
+    axes = figure.axes[0]
+    assert (axes.get_xlim(), axes.get_ylim()) == ((-70, 70), (-35, 35))
+    assert {text.get_text() for text in axes.texts} == {"8 deg", "30 deg", "60 deg"}
+    # The smallest ring lies around the gaze, 10 deg up and 20 deg to the left.
+    near = axes.collections[0].get_paths()[0].vertices - (-20, 10)
+    assert np.hypot(*near.T) == pytest.approx(8, abs=0.5)
