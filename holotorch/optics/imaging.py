@@ -214,11 +214,14 @@ def _image(
     y, x = fine.coordinates(field.device)
     rate = torch.as_tensor(first / second, dtype=torch.float64, device=field.device) / (2 * wave)
     light = light * (turns_phasor(rate * y.square()) * turns_phasor(rate * x.square())).to(field.dtype)
-    spectrum = _centre(centred_fft2(light), window.shape)
-    # The same window, so the same frequencies: those of its centred spectrum.
+    # A pupil may take more than the band of the hologram's pitch: light beside the axis that comes in at a slant.
+    taken = (number(eye.pupil_radius) + 8 * eye.softness) / (wave * abs(number(second)))
+    bands = [2 * math.ceil(max(0.0, p * taken * _ROOM - 0.5)) + 1 for p in window.pitch]
+    spectrum = _centred(centred_fft2(light), [n * m for n, m in zip(window.shape, bands, strict=True)])
+    # The same window, so the same frequencies: those of its centred spectrum, and on.
     eta, xi = (
-        (torch.arange(n, dtype=torch.float64, device=field.device) - n // 2) / (n * p) * (wave * second)
-        for n, p in zip(window.shape, window.pitch, strict=True)
+        (torch.arange(n * m, dtype=torch.float64, device=field.device) - n * m // 2) / (n * p) * (wave * second)
+        for n, m, p in zip(window.shape, bands, window.pitch, strict=True)
     )
     eta, xi = eta[:, None], xi[None, :]
     square = eta.square() + xi.square()
@@ -228,14 +231,17 @@ def _image(
         turns = turns - legs / (8 * wave) * square.square()
     passed = eye.pupil_function(eta, xi, wave) * turns_phasor(turns)
     share = math.sqrt(math.prod(window.shape) / math.prod(fine.shape))
-    return _centre(centred_ifft2(spectrum * (passed * share).to(field.dtype)), grid.shape)
+    image = spectrum * (passed * share).to(field.dtype)
+    # Samples at the hologram's pitch have the sum of all bands for their spectrum.
+    image = image.unflatten(-1, (bands[1], -1)).sum(-2).unflatten(-2, (bands[0], -1)).sum(-3)
+    return _centred(centred_ifft2(image), grid.shape)
 
 
-def _centre(values: Tensor, shape: tuple[int, int]) -> Tensor:
-    """The middle ``shape`` samples, sample n // 2 staying the origin."""
+def _centred(values: Tensor, shape: Sequence[int]) -> Tensor:
+    """The middle ``shape`` samples, or the values amid zeros; sample n // 2 stays the origin."""
     (h, w), (height, width) = values.shape[-2:], shape
-    top, left = h // 2 - height // 2, w // 2 - width // 2
-    return values[..., top : top + height, left : left + width]
+    top, left = height // 2 - h // 2, width // 2 - w // 2
+    return torch.nn.functional.pad(values, (left, width - w - left, top, height - h - top))
 
 
 def _fft(count: int) -> float:

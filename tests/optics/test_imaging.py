@@ -67,6 +67,23 @@ def test_collapse_on_the_axis_equals_exact_legs():
     assert relative(got * (light > 0), light) < 5e-3
 
 
+@pytest.mark.parametrize("height", [0, 0.3e-3, 0.6e-3])
+def test_a_pupil_that_takes_more_than_the_pitch_carries(height):
+    """Close up, an eye sees the edge of a scene by light that comes in beyond the hologram's band around the axis."""
+    size, near, away = 512, 4e-3, 10e-3
+    grid, display, eye = Grid((1, size), PITCH), Display.planar(near + away), Eye(1.5e-3, 24e-3, away)
+    assert eye.pupil_radius / away > 1.7 * RED / (2 * PITCH)
+    hologram = oracle.point_hologram(size, PITCH, RED, near, height)
+    x = (np.arange(size) - size // 2) * PITCH
+    scale = retinal_scale(display, eye)
+    points, focal = x * scale, eye.focal_length
+    field = oracle.retina(hologram, PITCH, RED, (near, np.inf, away), (focal, 1.5e-3, 24e-3), points, 8, windows=5)
+    light = np.abs(field) ** 2 * abs(scale)
+    got = imaged(torch.from_numpy(hologram)[None, None], grid, RED, display, eye, paraxial=True)
+    # Light that leaves the window before the plane is left out: the tails of the spot, of 1e-2 of its norm.
+    assert relative(got[0, 0].abs().square().numpy(), light) < 2e-2
+
+
 def test_work_is_a_tenth():
     full = Grid(2048, PITCH)
     short = collapse_sampling(full, (RED,), DISPLAY, EYE, FAR)
