@@ -20,8 +20,8 @@ from holotorch.optics.exposure import equal_power, exposed
 from holotorch.optics.imaging import imaged
 from holotorch.optics.spectrum import Spectrum
 
-WIDTHS = tuple(1e-9 * width for width in (1.4, 2.5, 4, 6, 9, 13, 19, 28, 40))
-_AWAY = 1e-9 * np.array([0, 0.5, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 15, 18, 22, 26, 30, 36, 42, 50, 60])
+WIDTHS = tuple(1e-9 * width for width in (1.4, 2.5, 4, 6, 9, 13, 19, 28, 40, 56))
+_AWAY = 1e-9 * np.array([0, 0.5, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 15, 18, 22, 26, 30, 36, 42, 50, 60, 72, 84])
 _OTHERS = 1000  # seeds of the reference
 
 
@@ -85,7 +85,7 @@ def tradeoff(
 ) -> list[Case]:
     """Cases for every distance and colour; the eye is focused on the middle of the scene.
 
-    By the collapse throughout, as every hologram is looked at in 41 wavelengths of each colour.
+    By the collapse throughout, as every hologram is looked at in 45 wavelengths of each colour.
     """
     cases = []
     for distance in tqdm(distances, desc="speckle against sharpness", unit="distance"):
