@@ -10,7 +10,7 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.tracking.alignment import widest_angle
 from holotorch.tracking.camera import Camera
-from holotorch.tracking.pose import _weights, solve_pose
+from holotorch.tracking.pose import edge_weights, solve_pose
 
 _FEWEST = 5  # frames
 _SAME_DIRECTION = math.radians(10)
@@ -89,7 +89,7 @@ def fit_band_edges(
     plane = camera.undistort(pixels).detach()
     seen = torch.ones_like(plane[..., 0], dtype=torch.bool)
     deviations = plane.new_tensor([along_px, across_px]).expand_as(plane)
-    weights = _weights(pixels, plane, seen, deviations, camera).detach()
+    weights = edge_weights(pixels, plane, seen, deviations, camera).detach()
     problem = _Problem(plane, weights, free, resting_tip, offset)
     tip = poses.tip.mean(0).expand_as(poses.tip) if resting_tip else poses.tip
     state, chi_square, information = problem.solve((tip.detach(), poses.direction.detach(), start))

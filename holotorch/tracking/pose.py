@@ -8,7 +8,7 @@ from holotorch.tracking.camera import Camera
 from holotorch.tracking.status import Pose, Status
 
 _STEPS = 30
-_LEAST = 1e-9  # share of the edges' extent on the image below which they are one point
+_LEAST = 1e-9  # on the plane z = 1, or in radians: what lies nearer is one point
 
 
 def solve_pose(
@@ -42,8 +42,7 @@ def solve_pose(
     Raises:
         TypeError, ValueError: Wrong shapes or types, fewer than three positions, equal positions, deviations <= 0.
 
-    Source: the thesis's Sec. 3.4.2 asks for this; its Eqs. 3.8 to 3.11 have a double root where the tool is parallel to
-    the image. See :func:`closed_form` for what they become.
+    Source: Sec. 3.4.2 of the thesis asks for this; :func:`closed_form` is what its Eqs. 3.8 to 3.11 become.
     """
     pixels, positions = _checked(edges_px, positions_m)
     batch, count = pixels.shape[:2]
@@ -61,7 +60,9 @@ def solve_pose(
         if not bool((value.detach() > 0).all()):
             raise ValueError(f"{name} must be above zero, in pixels")
     plane = torch.where(known[..., None], plane, 0.0)
-    weights = _weights(torch.where(known[..., None], pixels, 0.0), plane, known, torch.stack(deviations, -1), camera)
+    weights = edge_weights(
+        torch.where(known[..., None], pixels, 0.0), plane, known, torch.stack(deviations, -1), camera
+    )
     with torch.no_grad():
         middle = (positions * known).sum(-1) / known.sum(-1).clamp(min=1)
         place = positions - middle[:, None]
@@ -103,6 +104,9 @@ def closed_form(edges_px: Tensor, positions_m: Tensor, camera: Camera) -> tuple[
 
     With more than three edges it is the mean over all triples of neighbours. ``edges_px`` [B, N, 2], ``positions_m``
     [N] in metres from the tip, rising. NaN where rays coincide or an edge is not seen.
+
+    Raises:
+        ValueError: Wrong shapes or types, fewer than three positions, equal positions.
 
     Source: Eqs. 3.3 to 3.12 of the thesis, with the angle by atan2, bands of any length, no quadratic (its double root
     where the tool is parallel to the image costs half the digits), and |AT| / |AB| in 3.12, which is printed inverted.
@@ -155,8 +159,8 @@ def _angle(a: Tensor, b: Tensor) -> Tensor:
     return torch.atan2(torch.linalg.cross(a, b).norm(dim=-1), (a * b).sum(-1))
 
 
-def _weights(pixels: Tensor, plane: Tensor, known: Tensor, deviations: Tensor, camera: Camera) -> Tensor:
-    """[B, N, 2, 2]: what turns a difference on the plane z = 1 into pixels (along, across) over their deviations."""
+def edge_weights(pixels: Tensor, plane: Tensor, known: Tensor, deviations: Tensor, camera: Camera) -> Tensor:
+    """[B, N, 2, 2]: from differences on the plane z = 1 to pixels (along, across) over ``deviations`` [B, N, 2]."""
     share = known[..., None].to(pixels.dtype)
     x, y = ((pixels - pixels.sum(1, True) / share.sum(1, True).clamp(min=1)) * share).unbind(-1)
     # The longest axis of the edges lies at half the angle of their moment about the middle.
