@@ -25,6 +25,7 @@ _UNSURE = 0.1  # pixels: a clear edge is known to a few hundredths
 _ALIKE = 0.2  # of the brightest channel: colours nearer than this are one
 _BESIDE = 14.0  # pixels from the mid-line, beside the widest catheters
 _SIDE_STEP = 0.25  # light that changes beside an edge, over what changes on it: something lies across the tube
+_SAME_STEP = 0.6  # the same, where the bands themselves go on there
 _CLEAR = 4.0  # standard deviations of that change
 
 
@@ -244,7 +245,9 @@ def measure_edges(
             break
     assert fit is not None and inside is not None
     blurs = fit.blur[torch.isfinite(fit.deviation)]
-    covered = _across(sampler, camera, line, near, along, widths, fit)
+    covered, beyond = _across(sampler, camera, line, near, along, widths, fit)
+    if beyond and curve is not None and len(near) > 2:
+        raise Refusal(Status.INCONSISTENT, "all bands go on beside the tube: this is thicker, seen in one part of it")
     margin = 2 + 2 * float(fit.blur.median())
     reached = near[:, None] + torch.tensor([-margin, margin], dtype=torch.float64, device=device)
     far = sampler.inside(camera.distort(line.plane(reached, torch.zeros_like(reached)))).all(-1)
@@ -267,8 +270,13 @@ def measure_edges(
     )
 
 
-def _across(sampler: Sampler, camera: Camera, line: Line, near: Tensor, along: Tensor, widths: Tensor, fit: EdgeFit):
-    """[E] whether the surroundings change on both sides where the edge is: something lies across the tube there."""
+def _across(
+    sampler: Sampler, camera: Camera, line: Line, near: Tensor, along: Tensor, widths: Tensor, fit: EdgeFit
+) -> tuple[Tensor, bool]:
+    """Whether the surroundings change where the edges are.
+
+    [E], on both sides of each: something lies across the tube there. And on one side of all, as much as on the tube.
+    """
     aside = torch.arange(3, dtype=torch.float64, device=near.device) + 2.0 + 2 * float(fit.blur.median())
     u = torch.cat([-aside, aside])
     across = torch.sign(u) * (widths[:, None] / 2) + u  # [E, 6]
@@ -285,4 +293,6 @@ def _across(sampler: Sampler, camera: Camera, line: Line, near: Tensor, along: T
     size = step.norm(dim=-1)
     middle = fit.steps.shape[1] // 2
     own = fit.steps[:, middle - 1 : middle + 2].mean(1).norm(dim=-1)
-    return ((size > _SIDE_STEP * own[:, None]) & (size > _CLEAR * sd.norm(dim=-1))).all(-1)
+    clear = size > _CLEAR * sd.norm(dim=-1)
+    across, beyond = (clear & (size > least * own[:, None]) for least in (_SIDE_STEP, _SAME_STEP))
+    return across.all(-1), bool(beyond.all(0).any())
