@@ -168,6 +168,8 @@ def _draw(ways: list[dict], counts: list[dict], cases: list[Case]) -> bytes:
         third.semilogx(
             widths, case.ssim, color=("C3", "C2", "C0")[k % 3], linestyle=("-", "--", ":")[k // 3 % 3], label=label
         )
+    third.set_xticks([1.4, 3, 6, 12, 25, 50], ["1.4", "3", "6", "12", "25", "50"], minor=False)
+    third.minorticks_off()
     third.set_xlabel("FWHM (nm)")
     third.set_ylabel("SSIM to the speckle-free mean")
     for axes in (first, second, third):

@@ -269,7 +269,8 @@ def _outcomes(axes: Axes, rows: list[Row]) -> None:
         axes.barh(range(len(rows)), shares, left=left, color=colour, label=label)
         left = [a + b for a, b in zip(left, shares, strict=True)]
     for i, row in enumerate(rows):
-        axes.text(99, i, f"{row['wrong']} wrong of {row['frames']}", ha="right", va="center", fontsize=7)
+        box = {"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1}
+        axes.text(99, i, f"{row['wrong']} wrong of {row['frames']}", ha="right", va="center", fontsize=7, bbox=box)
     axes.set_yticks(range(len(rows)), [f"{row['frames_of']}\n{row['method']}" for row in rows], fontsize=7)
     axes.set_xlabel("% of synthetic frames")
     axes.invert_yaxis()
