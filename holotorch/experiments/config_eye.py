@@ -65,6 +65,7 @@ class LightSettings(Settings):
     """Sources to compare, by name or by their FWHM.
 
     ``tolerance``: of the sum over wavelengths, relative to a picture's rms brightness.
+    ``extent``: sine of the half angle under which the hologram sees the sources, discs; 0 for points.
     """
 
     sources: Annotated[tuple[Source, ...], BeforeValidator(several), Field(min_length=1)] = (
@@ -74,6 +75,7 @@ class LightSettings(Settings):
         "led",
     )
     tolerance: Annotated[Number, Field(gt=0, lt=1)] = 0.02
+    extent: Annotated[Number, Field(ge=0, lt=0.1)] = 0.0
 
 
 class SweepSettings(Settings):

@@ -21,6 +21,7 @@ from holotorch.optics.elements import through_elements
 from holotorch.optics.exposure import equal_power
 from holotorch.optics.eye import Eye
 from holotorch.optics.imaging import imaged
+from holotorch.optics.incoherent import disc_source, tilted_wave
 from holotorch.optics.retina import RetinaPlan, plan_retina
 from holotorch.optics.spectrum import Spectrum
 from holotorch.optics.viewing import eyepiece_distance, image_distance
@@ -33,6 +34,7 @@ PRESETS: dict[str, Callable[[float], Spectrum]] = {
 }
 BEST = 0.46  # prefactor of the best FWHM for the CT of a teapot; smooth scenes want more, C60 0.8
 _OTHERS = 100_000  # seeds of the realisations that only make the reference
+_RINGS = 16  # of an extended source: what takes a thousand times a point's time
 _LIT = 0.05  # of the brightest of the reference: where speckle is measured
 
 
@@ -105,6 +107,24 @@ class Observer:
     def _rules(self) -> dict[tuple[str, float, float], tuple[Tensor, Tensor]]:
         return {}  # choosing wavelengths may take a second
 
+    def points(self, wave: float, depth: float) -> tuple[list[tuple[float, float]], list[float]]:
+        """Sines (y, x) of directions, and weights, that stand for the extent of the sources.
+
+        A tilt moves the picture by the depth times its sine: rings are half a spot apart there at most. ConfigError for
+        more than 16 of them, 1024 directions.
+        """
+        extent = self.settings.light.extent
+        if not extent:
+            return [(0.0, 0.0)], [1.0]
+        rings = max(1, math.ceil(2 * depth * extent * self.aperture(depth) / wave))
+        if rings > _RINGS:
+            most = extent * _RINGS / rings
+            raise ConfigError(
+                [f"light.extent: {extent:g} needs {4 * rings**2} directions; at most {most:.2g} is taken"]
+            )
+        tilts, shares = disc_source(extent, rings)
+        return tilts, shares.tolist()
+
     def retina(self, depth: float) -> RetinaPlan:
         """The way to the retina of an eye that is focused at the depth: one for all sources, which are compared.
 
@@ -144,10 +164,13 @@ class Observer:
         way = imaged if self.retina(depth).method == "collapse" else through_elements
         for field, wave in zip(hologram.conj(), self.scene.settings.wavelengths, strict=True):
             places, weights = ([wave], [1.0]) if source is None else self.samples(source, wave, depth)
+            tilts, shares = ([(0.0, 0.0)], [1.0]) if source is None else self.points(wave, depth)
             total = torch.zeros(grid.shape, dtype=field.real.dtype, device=field.device)
-            for place, weight in zip(places, weights, strict=True):
-                image = way(field[None], grid, [float(place)], self.display, eye, plane=depth)
-                total += float(weight) * intensity(image[0])
+            for tilt, share in zip(tilts, shares, strict=True):
+                lit = field * tilted_wave(grid, wave, tilt).to(field) if any(tilt) else field
+                for place, weight in zip(places, weights, strict=True):
+                    image = way(lit[None], grid, [float(place)], self.display, eye, plane=depth)
+                    total += float(share) * float(weight) * intensity(image[0])
             pictures.append(pooled(total, self.scene.stride))
         return torch.stack(pictures).cpu()
 

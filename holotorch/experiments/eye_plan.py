@@ -22,7 +22,10 @@ def plan(eye: Observer) -> dict[str, Any]:
         for source in settings.light.sources
     }
     others, own = 8 * settings.seeds, settings.seeds
-    images = others * len(waves) + own * sum(sum(count) for count in counts.values())
+    directions = [len(eye.points(wave, max(eye.focus))[0]) for wave in waves]
+    images = others * len(waves) + own * sum(
+        n * many for count in counts.values() for n, many in zip(count, directions, strict=True)
+    )
     ways = [eye.retina(depth) for depth in eye.focus]
     volume = volume_plan.plan(scene)
     seconds = volume["predicted_seconds"] / scene.settings.report.seeds * (others + own)
@@ -51,6 +54,7 @@ def plan(eye: Observer) -> dict[str, Any]:
             for way in ways
         ],
         "wavelengths": counts,
+        "directions": directions,
         "images": images * len(eye.focus),
         "predicted_seconds": round(seconds, 1),
         "predicted_peak_bytes": round(
@@ -80,7 +84,8 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
         lines.append(f"Retina     {worst['reason']}{where}{only}; next: {worst['runner_up']}")
     lines += [
         "Light      "
-        + "; ".join(f"{name}: {plain(count)} wavelengths" for name, count in values["wavelengths"].items()),
+        + "; ".join(f"{name}: {plain(count)} wavelengths" for name, count in values["wavelengths"].items())
+        + (f", each from {plain(values['directions'])} directions" if settings.light.extent else ""),
         f"Phases     {settings.seeds} realisation(s), compared with the mean of {8 * settings.seeds} others",
         f"Cost       about {values['predicted_seconds']:.2g} s on two idle cores for {values['images']} images, "
         f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
