@@ -126,18 +126,22 @@ class CatheterTracker:
                 curve = bulge_px(before, self.catheter, axis.line)
                 edges = measure_edges(sampler, self.camera, axis, guess, stretches.doubtful, 0.9, curve)
             with self._timed("pose"):
-                pose = self._solved(axis, edges)
-                again = bulge_px(pose, self.catheter, axis.line) - curve
-                if 0.01 < float(again.abs().max()) < 0.05:
-                    # Little enough to be set right without another look at the frame: the mean over a ring's front.
-                    edges = dataclasses.replace(edges, t=edges.t - math.pi / 4 * again)
-                    pose = self._solved(axis, edges)
-            if float(again.abs().max()) < 0.05:
+                # What the bulge has changed by is set right without another look at the frame: the mean over a front.
+                pose, bulge = self._sketched(axis, edges), curve
+                again = bulge_px(pose, self.catheter, axis.line)
+                for _ in range(2):
+                    edges = dataclasses.replace(edges, t=edges.t - math.pi / 4 * (again - bulge))
+                    pose, bulge = self._solved(axis, edges), again
+                    again = bulge_px(pose, self.catheter, axis.line)
+                    if float((again - bulge).abs().max()) < 0.01:
+                        break
+            if float((again - curve).abs().max()) < 0.05:
                 return self._judged(pose, width, edges)
         else:
             with self._timed("edges"):
                 edges = measure_edges(sampler, self.camera, axis, guess, stretches.doubtful, 0.9)
-            pose = self._sketched(axis, edges)
+            with self._timed("pose"):
+                pose = self._sketched(axis, edges)
         with self._timed("axis"):
             # Once more, with the width that the pose and the radius give; what was found without them is the check.
             wide = self._wide(pose, line)
@@ -167,12 +171,11 @@ class CatheterTracker:
     def _sketched(self, axis: Axis, edges: Edges) -> Pose:
         """Near enough to tell how much the rings' fronts bulge."""
         known = self._known(edges)
-        with self._timed("pose"):
-            t = edges.t[known]
-            pixels = self.camera.distort(axis.line.plane(t, torch.zeros_like(t)))
-            tip, direction = closed_form(pixels[None], self.catheter.positions.to(t.device)[known], self.camera)
-            none = torch.zeros((), dtype=t.dtype, device=t.device)
-            return Pose(tip[0], direction[0], none.expand(6, 6), none, none, Status.UNVERIFIED)
+        t = edges.t[known]
+        pixels = self.camera.distort(axis.line.plane(t, torch.zeros_like(t)))
+        tip, direction = closed_form(pixels[None], self.catheter.positions.to(t.device)[known], self.camera)
+        none = torch.zeros((), dtype=t.dtype, device=t.device)
+        return Pose(tip[0], direction[0], none.expand(6, 6), none, none, Status.UNVERIFIED)
 
     def _known(self, edges: Edges) -> Tensor:
         known = torch.isfinite(edges.t)
