@@ -135,7 +135,8 @@ def _draw_display(axes: Any, eye: Observer) -> None:
     for sign in (-1, 1):
         axes.plot([end, end], [sign * pupil, sign * max(2.5 * pupil, half)], "k", linewidth=2)
     axes.plot([end + retina] * 2, [-retina / 6, retina / 6], color="0.4", linewidth=3)
-    axes.text(end + retina, retina / 5, "eye", ha="right", va="bottom", fontsize=8)
+    share = axes.get_xaxis_transform()  # heights as a share of the axes
+    axes.text(end + retina, 0.97, "eye  ", ha="right", va="top", fontsize=8, transform=share)
     axes.set_xlabel("along the axis (mm from the hologram)")
     axes.set_ylabel("height (mm)")
     axes.set_title("display and eye: rays from the scene to the rim of the pupil", fontsize=10)
@@ -168,9 +169,9 @@ def _box(axes: Any, eye: Observer) -> None:
     near, far = 1e3 * min(scene.depths), 1e3 * max(scene.depths)
     corner = near, -1e3 * scene.width / 2
     axes.add_patch(Rectangle(corner, far - near, 1e3 * scene.width, fill=False, edgecolor="tab:red", linewidth=1.5))
-    axes.text(
-        (near + far) / 2, -1e3 * scene.width / 2 * 1.1, "scene", ha="center", va="top", fontsize=8, color="tab:red"
-    )
+    middle, below = (near + far) / 2, -1e3 * scene.width / 2 * 1.1
+    plate = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1}
+    axes.text(middle, below, "scene", ha="center", va="top", fontsize=8, color="tab:red", bbox=plate)
 
 
 def _span(values: list[float]) -> str:

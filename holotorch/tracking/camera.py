@@ -99,8 +99,9 @@ class Camera:
         identity = _IDENTITY.to(given.device)
         with torch.no_grad():
             plane = undistort_points(given, matrix[None], distortion[None], identity[None])
+            # kornia's fixed-point steps leave 1e-4 pixels, or NaN where they diverge; Newton's leave rounding, and what
+            # is no answer shows by not coming back.
             plane = plane.nan_to_num(torch.inf).clamp(-_STEEP, _STEEP)
-            # kornia's fixed-point steps leave 1e-4 pixels; Newton's leave rounding.
             plane, lost = self._settled(plane, given, 3)
             if bool(lost.any()):  # they diverge where the distortion is strong, though it can be inverted there
                 plane, lost = self._settled(torch.where(lost, self._radial(given), plane), given, 8)

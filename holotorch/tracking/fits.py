@@ -83,7 +83,7 @@ def fit_edges(light: Tensor, weight: Tensor, blur: float = 0.9) -> EdgeFit:
     alike = (sigma / common - 1).abs() < 0.5
     other = ~alike & ((sigma - common).abs() > _OTHER * sure.rsqrt())  # surely not blurred by that lens
     sigma = torch.where(alike, (sure * alike * sigma).sum() / (sure * alike).sum().clamp(min=1e-300), sigma)
-    for _ in range(2):
+    for _ in range(2):  # an edge without weight has 0 / 0: it stays where it is, of infinite deviation
         normal, slope, *_ = _edge_terms(t, place, sigma, *given)
         place = place + (slope[:, 0] / normal[:, 0, 0].clamp(min=1e-300)).nan_to_num(0).clamp(-0.5, 0.5)
     place = place.clamp(-(count - 1) / 2, (count - 1) / 2)

@@ -208,7 +208,8 @@ def measure_edges(
 ) -> Edges:
     """Places of the edges near ``guess`` [N] (NaN: not looked for); ``curve`` [N]: how far a ring's front bulges in t.
 
-    An edge fails that is hidden (the surroundings change where it does), unclear, or too near the frame's border.
+    An edge fails that is hidden (the surroundings change where it does), unclear, or too near the frame's border. With
+    ``curve``, a Refusal where all of them go on beside the tube.
     """
     device = sampler.frame.device
     line = axis.line

@@ -50,6 +50,7 @@ def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
     assert all(row["ratio"] == "1.0" for row in tables["times"] if row["method"] == BASE)
     for method in (BASE, KORNIA, COLD, PRIOR):
         shares = {row["stage"]: float(row["percent"]) for row in tables["stages"] if row["method"] == method}
+        # Up to ten stages, each rounded to 0.01.
         assert shares.pop("Total") == 100 and sum(shares.values()) == pytest.approx(100, abs=0.1)
     assert sum(int(row["frames"]) for row in tables["negatives"]) == 20
     for row in tables["reliability"]:
@@ -144,7 +145,8 @@ def test_the_bound_is_that_of_the_edges():
     ratio = float(found.trace().sqrt() / stated.tip_sd)
     assert 0.5 < ratio < 2
     louder = tip_bound(small(look=Look(highlight=0.0, noise_dn=5.0)), pose, 1)
-    # Twice the noise: 25.083 / 6.333 of the variance; each bound comes from renderings with noise of their own.
+    # Twice the noise: 25.083 / 6.333 of the variance. Each bound comes from renderings with noise of its own: over
+    # eight seeds it scatters by 3.5 %, so the ratio of two by 5 %; twice that.
     assert float(louder.trace() / found.trace()) == pytest.approx(25.083 / 6.333, rel=0.1)
     with pytest.raises(ValueError, match="within the frame"):
         tip_bound(world, world.pose(0.3, 0.0))

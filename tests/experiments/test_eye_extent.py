@@ -36,7 +36,8 @@ def test_an_extended_laser_has_less_speckle_and_less_detail():
     assert (seen[1] < 0.75 * seen[0]).all()
     assert (sharpness(disc, reference) < sharpness(point, reference)).all()
     power = (disc.sum((1, 2)) / point.sum((1, 2))).tolist()
-    assert power == pytest.approx([1, 1, 1], abs=0.05)  # what leaves the window is lost
+    # At most 24 of the 479 um of the window move out of it, to either side: 5 %.
+    assert power == pytest.approx([1, 1, 1], abs=0.05)
 
 
 def test_directions_are_half_a_spot_apart():
