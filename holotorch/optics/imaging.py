@@ -36,7 +36,7 @@ from holotorch.core.fourier import centred_fft2, centred_ifft2, good_length
 from holotorch.core.grid import Grid
 from holotorch.optics.display import Display, Length, inverse, number
 from holotorch.optics.eye import Eye
-from holotorch.optics.kernels import angular_spectrum_kernel, carrier, fresnel_kernel, turns_phasor
+from holotorch.optics.kernels import angular_spectrum_kernel, carrier, fresnel_kernel, turns_phasor, window_taper
 from holotorch.optics.rays import fringe
 from holotorch.optics.zoomed import chirps, zoomed
 
@@ -178,10 +178,10 @@ def collapse_sampling(
 
 
 def _padding(size: int, wide: int, pitch: float, wave: float, far: float) -> int:
-    """Length of a transform that wraps no light into the window, from which all that matters moves half of it."""
+    """Length of a transform that wraps no light into the window: all of it stays, or is tapered off beyond reach."""
     sine = wave / (2 * pitch)
     spread = abs(far) * sine / math.sqrt(1 - sine**2) if sine < 1 else math.inf
-    need = min((size + wide) / 2 + (spread + fringe(wave, far)) / pitch, size + wide)
+    need = min((size + wide) / 2 + (spread + fringe(wave, far)) / pitch, size + wide + fringe(wave, far) / pitch)
     return good_length(max(math.ceil(need), size))
 
 
@@ -204,11 +204,14 @@ def _image(
     if paraxial:
         kernel = fresnel_kernel(padded, wave, plane)
     else:
-        kernel = angular_spectrum_kernel(padded, wave, plane, band_limit=whole)
+        kernel = angular_spectrum_kernel(padded, wave, plane, band_limit=False)
         # On to the eyepiece exactly and back as the ray matrix has it.
         s0 = display.lens_distance - plane
         kernel = kernel * angular_spectrum_kernel(padded, wave, s0, band_limit=False)
         kernel = kernel * fresnel_kernel(padded, wave, s0).conj()
+    if whole:
+        reach = [(n + w) / 2 * p for n, w, p in zip(grid.shape, sizes.window, grid.pitch, strict=True)]
+        kernel = kernel * window_taper(padded, wave, number(plane), (reach[0], reach[1]), paraxial=paraxial)
     kernel = (kernel * carrier(wave, plane)).to(field.device, field.dtype)
     light = zoomed(field, kernel, chirps(grid, padded, fine, (0.0, 0.0), field.device))
     y, x = fine.coordinates(field.device)

@@ -68,6 +68,41 @@ def fresnel_kernel(grid: Grid, wavelength: Tensor | float, distance: Tensor | fl
     return turns_phasor(-product / 2 * fy.square()) * turns_phasor(-product / 2 * fx.square())
 
 
+def window_taper(
+    grid: Grid, wavelength: float, distance: float, reach: tuple[float, float], *, paraxial: bool = False
+) -> Tensor:
+    """Weights, float64 [H, W] in FFT order, that drop light which would wrap round into a window.
+
+    From within ``reach`` metres (y, x) of all of the window's points, light moves sideways by at most that, and keeps
+    weight 1. What moves by the padded extent less ``reach`` comes back into the window and gets 0; between them the
+    weight falls as cos^2. A step there would be an edge, whose diffraction spreads over the window: 10 % of the
+    intensity for a hologram of random phase, where a fall over two sqrt(wavelength distance) leaves 1e-4.
+
+    Args:
+        grid: Sampling of the padded field.
+        wavelength: In metres.
+        distance: In metres.
+        reach: Half of the window and half of the field, per axis.
+        paraxial: Sideways by the angle's sine, as Fresnel's model has it, or else by its tangent.
+
+    Raises:
+        ValueError: A padded extent below twice ``reach``.
+    """
+    weights = torch.ones((), dtype=torch.float64)
+    sines = [wavelength * each for each in grid.frequencies()]
+    cosine = 1.0 if paraxial else (1 - sines[0].square() - sines[1].square()).clamp_min(1e-12).sqrt()
+    for sine, extent, start, size in zip(sines, grid.extent, reach, grid.shape, strict=True):
+        if size == 1:
+            continue
+        if extent < 2 * start * (1 - 1e-9):
+            raise ValueError(
+                f"a window of {start:.3g} m to either side needs {2 * start:.3g} m, padded are {extent:.3g}"
+            )
+        part = ((abs(distance) * sine.abs() / cosine - start) / max(extent - 2 * start, 1e-9 * extent)).clamp(0, 1)
+        weights = weights * torch.cos(math.pi / 2 * part).square()
+    return weights
+
+
 def turns_phasor(turns: Tensor) -> Tensor:
     """exp(2 pi i turns), with whole turns taken off in float64; the gradient is that of the unreduced phase."""
     phase = 2 * math.pi * (turns - turns.detach().round())
