@@ -4,6 +4,7 @@ import io
 import math
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -21,10 +22,11 @@ from holotorch.experiments.config_volume import VolumeSettings
 from holotorch.experiments.eye import PRESETS, Observer, observer
 from holotorch.experiments.eye_tradeoff import WIDTHS, Case, fitted_prefactor, in_words, tradeoff
 from holotorch.io.bundled import find_config
-from holotorch.optics.coherence import path_difference
 from holotorch.optics.elements import ElementSampling, least_oversampling, through_elements
+from holotorch.optics.followed import neighbour_error, seen_light
 from holotorch.optics.imaging import imaged
 from holotorch.optics.retina import plan_retina
+from holotorch.optics.spectral import spectral_image
 
 SIDE, DISTANCES = 512, (10e-3, 20e-3, 30e-3)
 SCENE = "hologram={{shape: [{0}, {0}], pitch: 3.74 um, distance: 30 mm, depths: 58, rays: {1}}}"
@@ -103,33 +105,52 @@ def _finer(least: ElementSampling, factor: float) -> ElementSampling:
 
 
 def _counts(eye: Observer) -> list[dict]:
-    """Error of a picture in green light by the number of wavelengths, against one every nanometre."""
-    depth, wave = eye.focus[0], eye.scene.settings.wavelengths[1]
+    """Error of a picture in green light by the number of wavelengths, against one every nanometre.
+
+    Followed: all are in the sum, but only so many go through the optics. Alone: only so many are in the sum.
+    """
+    depth, wave, grid = eye.focus[0], eye.scene.settings.wavelengths[1], eye.scene.grid
     hologram, _ = eye.scene.hologram(0)
-    away = path_difference(depth, eye.aperture(depth))
+    field, looking = hologram[1].conj(), eye.eye(depth)
+    light = seen_light(grid, wave, eye.display, looking, reach=eye.scene.width / 2)
     rows = []
     for source, make in PRESETS.items():
         spectrum = make(wave)
-        dense, weights = spectrum.every(1e-9)
-        wanted = _sum(eye, hologram[1], dense, weights)
-        for count in sorted({1, 2, 3, 4, 6, 9, 14, 20} | {len(dense)}):
-            if count > len(dense):
+        places, weights = spectrum.every(1e-9)
+        wanted, slow = _timed(lambda p=places, w=weights: _sum(eye, field, p, w, len(p)))
+        rows.append(_row(source, f"{len(places)} of {len(places)} nm steps", seconds=f"{slow:.3f}", error="0"))
+        for count in sorted({1, 2, 3, 7, 15, len(places) // 4}):
+            if count > len(places) // 4 and count > 3:
                 continue
-            few = spectrum.samples(count, path_difference=away) if count < len(dense) else (dense, weights)
-            started = time.perf_counter()
-            seen = _sum(eye, hologram[1], *few)
-            seconds = time.perf_counter() - started
-            error = ((seen - wanted).square().mean() / wanted.square().mean()).sqrt().item()
-            rows.append(_row(source, f"{count} of {len(dense)}", seconds=f"{seconds:.3f}", error=f"{error:.1e}"))
+            seen, seconds = _timed(lambda p=places, w=weights, n=count: _sum(eye, field, p, w, n))
+            rows.append(
+                _row(source, f"{count} of {len(places)} followed", seconds=f"{seconds:.3f}", error=_error(seen, wanted),
+                     predicted=f"{neighbour_error(places, weights, count, light):.1e}")
+            )  # fmt: skip
+        for count in sorted({1, 2, 3, 4, 6, 9, 14, 20}):
+            if count < len(places):
+                few = spectrum.samples(count, path_difference=light.path_difference, iris=False, step=1e-9)
+                seen, seconds = _timed(lambda few=few: _sum(eye, field, *few, len(few[0])))
+                rows.append(
+                    _row(
+                        source, f"{count} of {len(places)} alone", seconds=f"{seconds:.3f}", error=_error(seen, wanted)
+                    )
+                )
     return rows
 
 
-def _sum(eye: Observer, field: Tensor, places: Tensor, weights: Tensor) -> Tensor:
-    depth, looking, total = eye.focus[0], eye.eye(eye.focus[0]), torch.zeros(())
-    for place, weight in zip(places.tolist(), weights.tolist(), strict=True):
-        image = imaged(field.conj()[None], eye.scene.grid, [place], eye.display, looking, plane=depth)
-        total = total + weight * intensity(image[0])
-    return total
+def _sum(eye: Observer, field: Tensor, places: Tensor, weights: Tensor, count: int) -> Tensor:
+    looking = eye.eye(eye.focus[0])
+    return spectral_image(field, eye.scene.grid, places, weights, eye.display, looking, count=count)
+
+
+def _timed(make: Callable[[], Tensor]) -> tuple[Tensor, float]:
+    started = time.perf_counter()
+    return make(), time.perf_counter() - started
+
+
+def _error(seen: Tensor, wanted: Tensor) -> str:
+    return f"{((seen - wanted).square().mean() / wanted.square().mean()).sqrt().item():.1e}"
 
 
 def _row(subject: str, what: str, **numbers: str) -> dict:
@@ -143,7 +164,14 @@ def _verdict(ways: list[dict], counts: list[dict], cases: list[Case]) -> list[st
         lines.append(f"{row['what']}: error {row['error']}{predicted}, {row['seconds']} s")
     for source in PRESETS:
         own = [row for row in counts if row["subject"] == source]
-        lines.append(f"{source}: " + "; ".join(f"{row['what']} nm steps {row['error']}" for row in own[:-1]))
+        full = float(own[0]["seconds"])
+        followed = [
+            f"{row['what']} {row['error']} (predicted {row['predicted']}), {full / float(row['seconds']):.1f} x as fast"
+            for row in own
+            if "followed" in row["what"]
+        ]
+        alone = [f"{row['what']} {row['error']}" for row in own if "alone" in row["what"]]
+        lines += [f"{source}: " + "; ".join(followed), f"{source}: " + "; ".join(alone)]
     lines += in_words(cases)
     return lines
 
@@ -155,12 +183,12 @@ def _draw(ways: list[dict], counts: list[dict], cases: list[Case]) -> bytes:
         first.loglog(float(row["seconds"]), max(float(row["error"]), 1e-6), "os^vDP"[k % 6], label=row["what"])
     first.set_xlabel("seconds")
     first.set_ylabel("relative L2 error of the retina's intensity")
-    for source in PRESETS:
-        own = [row for row in counts if row["subject"] == source][:-1]
-        second.semilogy(
-            [int(row["what"].split()[0]) for row in own], [float(row["error"]) for row in own], "o-", label=source
-        )
-    second.set_xlabel("wavelengths")
+    for k, source in enumerate(PRESETS):
+        for how, line in (("followed", "o-"), ("alone", "x:")):
+            own = [row for row in counts if row["subject"] == source and how in row["what"]]
+            numbers, errors = [int(row["what"].split()[0]) for row in own], [float(row["error"]) for row in own]
+            second.loglog(numbers, errors, line, color=f"C{k}", label=f"{source}, {how}")
+    second.set_xlabel("wavelengths through the optics")
     second.set_ylabel("relative L2 error against one every nm")
     for k, case in enumerate(cases):
         label = f"{case.distance * 1e3:g} mm, {case.wavelength * 1e9:.0f} nm"

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from holotorch.core.complex import intensity
 from holotorch.experiments.config_eye import ObserverSettings, PlanarSettings
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.volume import VolumeExperiment, build
@@ -17,12 +16,12 @@ from holotorch.experiments.volume_judge import pooled
 from holotorch.metrics import sharpness, speckle_contrast, ssim
 from holotorch.optics.coherence import optimum_fwhm, path_difference, predicted_contrast
 from holotorch.optics.display import Display
-from holotorch.optics.elements import through_elements
 from holotorch.optics.exposure import equal_power
 from holotorch.optics.eye import Eye
-from holotorch.optics.imaging import imaged
+from holotorch.optics.followed import least_followed, seen_light
 from holotorch.optics.incoherent import disc_source, tilted_wave
 from holotorch.optics.retina import RetinaPlan, plan_retina
+from holotorch.optics.spectral import spectral_image
 from holotorch.optics.spectrum import Spectrum
 from holotorch.optics.viewing import eyepiece_distance, image_distance
 
@@ -94,17 +93,20 @@ class Observer:
         """Sine of the half angle of light that carries detail: :meth:`aperture`, or that of the rays' own pitch."""
         return min(self.aperture(depth), wave / (2 * max(self.scene.rays.pitch)))
 
-    def samples(self, source: str, wave: float, depth: float) -> tuple[Tensor, Tensor]:
-        """Wavelengths and weights that stand for a source within the tolerance."""
+    def samples(self, source: str, wave: float, depth: float) -> tuple[Tensor, Tensor, int]:
+        """Wavelengths and weights that stand for a source within the tolerance, and how many of them to follow."""
         key = (source, wave, depth)
         if key not in self._rules:
-            away = path_difference(depth, self.aperture(depth))
-            tolerance = self.settings.light.tolerance
-            self._rules[key] = PRESETS[source](wave).samples(tolerance=tolerance, path_difference=away)
+            # Two errors that know nothing of each other: of the sum, and of making most of it from few wavelengths.
+            eye, tolerance, reach = self.eye(depth), self.settings.light.tolerance / math.sqrt(2), self.scene.width / 2
+            away = seen_light(self.scene.grid, wave, self.display, eye, reach=reach).path_difference
+            places, weights = PRESETS[source](wave).samples(tolerance=tolerance, path_difference=away, iris=False)
+            count = least_followed(places, weights, tolerance, self.scene.grid, self.display, eye, reach=reach)
+            self._rules[key] = places, weights, count
         return self._rules[key]
 
     @cached_property
-    def _rules(self) -> dict[tuple[str, float, float], tuple[Tensor, Tensor]]:
+    def _rules(self) -> dict[tuple[str, float, float], tuple[Tensor, Tensor, int]]:
         return {}  # choosing wavelengths may take a second
 
     def points(self, wave: float, depth: float) -> tuple[list[tuple[float, float]], list[float]]:
@@ -158,19 +160,19 @@ class Observer:
     def seen(self, hologram: Tensor, source: str | None, depth: float) -> Tensor:
         """Picture on the retina, referred back to the scene, real [3, h, w] on the rays; None: one wavelength each.
 
-        Goes the way of :meth:`retina`, every wavelength with the least sampling that it needs there.
+        Goes the way of :meth:`retina`, every wavelength followed with the least sampling that it needs there.
         """
         eye, grid, pictures = self.eye(depth), self.scene.grid, []
-        way = imaged if self.retina(depth).method == "collapse" else through_elements
+        elements = self.retina(depth).method == "elements"
         for field, wave in zip(hologram.conj(), self.scene.settings.wavelengths, strict=True):
-            places, weights = ([wave], [1.0]) if source is None else self.samples(source, wave, depth)
+            places, weights, count = ([wave], [1.0], 1) if source is None else self.samples(source, wave, depth)
             tilts, shares = ([(0.0, 0.0)], [1.0]) if source is None else self.points(wave, depth)
             total = torch.zeros(grid.shape, dtype=field.real.dtype, device=field.device)
             for tilt, share in zip(tilts, shares, strict=True):
                 lit = field * tilted_wave(grid, wave, tilt).to(field) if any(tilt) else field
-                for place, weight in zip(places, weights, strict=True):
-                    image = way(lit[None], grid, [float(place)], self.display, eye, plane=depth)
-                    total += float(share) * float(weight) * intensity(image[0])
+                total += share * spectral_image(
+                    lit, grid, places, weights, self.display, eye, count=count, elements=elements
+                )
             pictures.append(pooled(total, self.scene.stride))
         return torch.stack(pictures).cpu()
 
@@ -186,6 +188,7 @@ class Observer:
             "source": source,
             "focus_mm": depth * 1e3,
             "wavelengths": [len(self.samples(source, wave, depth)[0]) for wave in waves],
+            "followed": [self.samples(source, wave, depth)[2] for wave in waves],
             "contrast": speckle_contrast(shown, reference=reference, mask=mask).mean(0).tolist(),
             "contrast_predicted": [predicted_contrast(spectrum, away) for spectrum in spectra],
             "ssim": ssim((shown / scale).clamp(0, 1), (reference / scale).expand_as(shown), data_range=1.0)

@@ -1,5 +1,6 @@
 """What a run of the observer will do, by which way and at what cost, before it starts."""
 
+import math
 from typing import Any
 
 from holotorch.experiments import eye_geometry, volume_plan
@@ -10,6 +11,7 @@ from holotorch.optics.imaging import retinal_scale
 
 # Seconds per flop of the plan's own measure on two CPU cores.
 _FLOP_SECONDS = {"collapse": 2e-10, "elements": 4e-10}
+_NEIGHBOUR = 1e-9  # the same per sample and its logarithm, for a wavelength made from another
 _BASE_BYTES = 500e6
 
 
@@ -17,19 +19,23 @@ def plan(eye: Observer) -> dict[str, Any]:
     """Choices with their reasons, cost and physics, as plain JSON values."""
     settings, scene, display = eye.settings, eye.scene, eye.display
     waves = scene.settings.wavelengths
-    counts = {
-        source: [len(eye.samples(source, wave, max(eye.focus))[0]) for wave in waves]
-        for source in settings.light.sources
-    }
+    rules = {source: [eye.samples(source, wave, max(eye.focus)) for wave in waves] for source in settings.light.sources}
+    counts = {source: [len(places) for places, _, _ in rule] for source, rule in rules.items()}
+    followed = {source: [many for _, _, many in rule] for source, rule in rules.items()}
     others, own = 8 * settings.seeds, settings.seeds
     directions = [len(eye.points(wave, max(eye.focus))[0]) for wave in waves]
-    images = others * len(waves) + own * sum(
-        n * many for count in counts.values() for n, many in zip(count, directions, strict=True)
-    )
+
+    def pictures(each: dict[str, list[int]]) -> int:
+        return own * sum(n * many for count in each.values() for n, many in zip(count, directions, strict=True))
+
+    images = others * len(waves) + pictures(followed)
+    made = pictures(counts) - pictures(followed)
     ways = [eye.retina(depth) for depth in eye.focus]
     volume = volume_plan.plan(scene)
     seconds = volume["predicted_seconds"] / scene.settings.report.seeds * (others + own)
     seconds += images * sum(way.flops * _FLOP_SECONDS[way.method] for way in ways)
+    samples = math.prod(scene.grid.shape)
+    seconds += made * len(ways) * _NEIGHBOUR * samples * math.log2(samples)
     return {
         "scene": settings.scene.config,
         "synthetic": scene.synthetic,
@@ -54,6 +60,7 @@ def plan(eye: Observer) -> dict[str, Any]:
             for way in ways
         ],
         "wavelengths": counts,
+        "followed": followed,
         "directions": directions,
         "images": images * len(eye.focus),
         "predicted_seconds": round(seconds, 1),
@@ -84,7 +91,10 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
         lines.append(f"Retina     {worst['reason']}{where}{only}; next: {worst['runner_up']}")
     lines += [
         "Light      "
-        + "; ".join(f"{name}: {plain(count)} wavelengths" for name, count in values["wavelengths"].items())
+        + "; ".join(
+            f"{name}: {plain(values['followed'][name])} of {plain(count)} wavelengths followed"
+            for name, count in values["wavelengths"].items()
+        )
         + (f", each from {plain(values['directions'])} directions" if settings.light.extent else ""),
         f"Phases     {settings.seeds} realisation(s), compared with the mean of {8 * settings.seeds} others",
         f"Cost       about {values['predicted_seconds']:.2g} s on two idle cores for {values['images']} images, "

@@ -16,6 +16,7 @@ from holotorch.optics.display import Display
 from holotorch.optics.elements import least_oversampling, through_elements
 from holotorch.optics.exposure import equal_power, exposed
 from holotorch.optics.eye import Eye, EyeLens, chromatic_refraction, zernike
+from holotorch.optics.followed import least_followed, neighbour_error, seen_light
 from holotorch.optics.geometry import diffraction_angle, least_padding, unaliased_distance
 from holotorch.optics.imaging import imaged, retinal_scale
 from holotorch.optics.incoherent import disc_source, incoherent_sum, tilted_wave
@@ -29,6 +30,7 @@ from holotorch.optics.propagators import AngularSpectrum, Fraunhofer, Fresnel, S
 from holotorch.optics.rayleigh_sommerfeld import RayleighSommerfeld
 from holotorch.optics.resampled import ResampledKernel
 from holotorch.optics.retina import Retina, plan_retina, retinal_image
+from holotorch.optics.spectral import neighbours, spectral_image
 from holotorch.optics.spectrum import Spectrum
 from holotorch.optics.viewing import (
     accommodation_range,
@@ -93,12 +95,15 @@ __all__ = [
     "image_distance",
     "imaged",
     "incoherent_sum",
+    "least_followed",
     "least_oversampling",
     "least_padding",
     "lens_limit",
     "lens_phase",
     "linear_srgb",
     "magnified_fov",
+    "neighbour_error",
+    "neighbours",
     "object_distance",
     "optimum_fwhm",
     "order_efficiency",
@@ -117,7 +122,9 @@ __all__ = [
     "samples_needed",
     "scene_fov",
     "section",
+    "seen_light",
     "smallest_spot",
+    "spectral_image",
     "through_elements",
     "tilted_wave",
     "unaliased_distance",

@@ -80,7 +80,12 @@ class Eye:
         """
         square = y.square() + x.square()
         radius = torch.as_tensor(self.pupil_radius, dtype=torch.float64, device=square.device)
-        amplitude = opening(square, radius, self.softness)
+        return opening(square, radius, self.softness) * turns_phasor(self.path(y, x, wavelength) / wavelength)
+
+    def path(self, y: Tensor, x: Tensor, wavelength: Length) -> Tensor:
+        """Path in metres by which aberrations and colour error lengthen the ideal lens, arguments as above, float64."""
+        square = y.square() + x.square()
+        radius = torch.as_tensor(self.pupil_radius, dtype=torch.float64, device=square.device)
         path = torch.zeros_like(square)
         for index, coefficient in self.aberrations.items():
             path = path + coefficient * zernike(index, y / radius, x / radius)
@@ -88,7 +93,7 @@ class Eye:
             # A myopic refraction (below zero) is power in excess, and a path shorter towards the rim by P r^2 / 2.
             excess = chromatic_refraction(self.chromatic_reference) - chromatic_refraction(wavelength)
             path = path - excess * square / 2
-        return amplitude * turns_phasor(path / wavelength)
+        return path
 
 
 class EyeLens(Transmission):
