@@ -123,7 +123,7 @@ def _case(eye: Observer, colour: int, wave: float, holograms: list[Tensor], refe
             eye.eye(depth),
             count=min(_FOLLOWED, len(places)),
         )
-        shown.append(pooled(seen, eye.scene.stride))
+        shown.append(torch.stack([pooled(picture, eye.scene.stride) for picture in seen]))
     pictures = equal_power(torch.stack(shown), reference.expand(len(holograms), len(WIDTHS), *reference.shape))
     peak = reference.flatten().quantile(0.995)
     tone = exposed(pictures[..., None, :, :], peak=peak), exposed(reference[None], peak=peak)
