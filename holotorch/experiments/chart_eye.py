@@ -23,7 +23,7 @@ from holotorch.experiments.eye import PRESETS, Observer, observer
 from holotorch.experiments.eye_tradeoff import WIDTHS, Case, fitted_prefactor, in_words, tradeoff
 from holotorch.io.bundled import find_config
 from holotorch.optics.elements import ElementSampling, least_oversampling, through_elements
-from holotorch.optics.followed import neighbour_error, seen_light
+from holotorch.optics.followed import followed, neighbour_error, seen_light
 from holotorch.optics.imaging import imaged
 from holotorch.optics.retina import plan_retina
 from holotorch.optics.spectral import spectral_image
@@ -119,9 +119,9 @@ def _counts(eye: Observer) -> list[dict]:
         places, weights = spectrum.every(1e-9)
         wanted, slow = _timed(lambda p=places, w=weights: _sum(eye, field, p, w, len(p)))
         rows.append(_row(source, f"{len(places)} of {len(places)} nm steps", seconds=f"{slow:.3f}", error="0"))
-        for count in sorted({1, 2, 3, 7, 15, len(places) // 4}):
-            if count > len(places) // 4 and count > 3:
-                continue
+        # Where the power is in few wavelengths, no more than these are followed.
+        for count in sorted({len(followed(places, weights, many)[0]) for many in (1, 2, 3, 7, 15, len(places) // 4)
+                             if many <= max(3, len(places) // 4)}):  # fmt: skip
             seen, seconds = _timed(lambda p=places, w=weights, n=count: _sum(eye, field, p, w, n))
             rows.append(
                 _row(source, f"{count} of {len(places)} followed", seconds=f"{seconds:.3f}", error=_error(seen, wanted),
@@ -165,13 +165,13 @@ def _verdict(ways: list[dict], counts: list[dict], cases: list[Case]) -> list[st
     for source in PRESETS:
         own = [row for row in counts if row["subject"] == source]
         full = float(own[0]["seconds"])
-        followed = [
+        through = [
             f"{row['what']} {row['error']} (predicted {row['predicted']}), {full / float(row['seconds']):.1f} x as fast"
             for row in own
             if "followed" in row["what"]
         ]
         alone = [f"{row['what']} {row['error']}" for row in own if "alone" in row["what"]]
-        lines += [f"{source}: " + "; ".join(followed), f"{source}: " + "; ".join(alone)]
+        lines += [f"{source}: " + "; ".join(through), f"{source}: " + "; ".join(alone)]
     lines += in_words(cases)
     return lines
 
@@ -203,6 +203,8 @@ def _draw(ways: list[dict], counts: list[dict], cases: list[Case]) -> bytes:
     for axes in (first, second, third):
         axes.grid(alpha=0.3, which="both")
         axes.legend(fontsize=7)
+    second.set_ylim(bottom=1e-4)
+    second.legend(fontsize=7, ncols=2, loc="lower left")
     buffer = io.BytesIO()
     FigureCanvasAgg(figure).print_png(buffer)
     return buffer.getvalue()
