@@ -17,7 +17,7 @@ from holotorch.tracking.coarse import find_segments
 from holotorch.tracking.colours import ColourTable
 from holotorch.tracking.footprint import bulge_px, width_px
 from holotorch.tracking.measure import Axis, Edges, Refusal, find_bands, measure_axis, measure_edges
-from holotorch.tracking.pose import closed_form, solve_pose
+from holotorch.tracking.resection import pose_on_line
 from holotorch.tracking.status import Pose, Status
 from holotorch.tracking.strips import Line, Sampler
 
@@ -33,7 +33,7 @@ class CatheterTracker:
     """Finds the catheter's bands on frames, and from their edges the pose.
 
     Coarse detection by a table of colours on every second pixel, a few line hypotheses, one strip of the frame along
-    each in the lens's own coordinates, edges in linear light, five unknowns by :func:`solve_pose`. With a previous pose
+    each in the lens's own coordinates, edges in linear light, the pose by :func:`pose_on_line`. With a previous pose
     only the strip around it is read. The work for a frame is bounded.
 
     Args:
@@ -127,7 +127,7 @@ class CatheterTracker:
                 edges = measure_edges(sampler, self.camera, axis, guess, stretches.doubtful, 0.9, curve)
             with self._timed("pose"):
                 # What the bulge has changed by is set right without another look at the frame: the mean over a front.
-                pose, bulge = self._sketched(axis, edges), curve
+                pose, bulge = self._solved(axis, edges), curve
                 again = bulge_px(pose, self.catheter, axis.line)
                 for _ in range(2):
                     edges = dataclasses.replace(edges, t=edges.t - math.pi / 4 * (again - bulge))
@@ -141,7 +141,7 @@ class CatheterTracker:
             with self._timed("edges"):
                 edges = measure_edges(sampler, self.camera, axis, guess, stretches.doubtful, 0.9)
             with self._timed("pose"):
-                pose = self._sketched(axis, edges)
+                pose = self._solved(axis, edges)
         with self._timed("axis"):
             # Once more, with the width that the pose and the radius give; what was found without them is the check.
             wide = self._wide(pose, line)
@@ -168,44 +168,26 @@ class CatheterTracker:
         scale = 1.15 * float((ends[0][1] - ends[0][0]) / (ends[1][1] - ends[1][0]))
         return min(max(2 * self.catheter.radius * scale, 2.0), _WIDEST), 0.0
 
-    def _sketched(self, axis: Axis, edges: Edges) -> Pose:
-        """Near enough to tell how much the rings' fronts bulge."""
-        known = self._known(edges)
-        t = edges.t[known]
-        pixels = self.camera.distort(axis.line.plane(t, torch.zeros_like(t)))
-        tip, direction = closed_form(pixels[None], self.catheter.positions.to(t.device)[known], self.camera)
-        none = torch.zeros((), dtype=t.dtype, device=t.device)
-        return Pose(tip[0], direction[0], none.expand(6, 6), none, none, Status.UNVERIFIED)
-
-    def _known(self, edges: Edges) -> Tensor:
-        known = torch.isfinite(edges.t)
-        count = int(known.sum())
-        if count < 3:
-            if edges.hidden:
-                raise Refusal(Status.EDGES_UNCLEAR, f"{count} edges are clear, 3 are needed: something lies across")
-            if edges.outside:
-                raise Refusal(Status.OUT_OF_FRAME, f"{count} edges lie within the frame, 3 are needed")
-            raise Refusal(Status.EDGES_UNCLEAR, f"{count} edges are clear, 3 are needed")
-        return known
-
     def _solved(self, axis: Axis, edges: Edges) -> Pose:
-        known = self._known(edges)
-        count, t = int(known.sum()), edges.t[known]
-        pixels = self.camera.distort(axis.line.plane(t, torch.zeros_like(t)))
+        known = torch.isfinite(edges.t)
+        t = edges.t[known]
+        if len(t) < 3:
+            count = f"{len(t)} edges"
+            if edges.hidden:
+                raise Refusal(Status.EDGES_UNCLEAR, f"{count} are clear, 3 are needed: something lies across")
+            if edges.outside:
+                raise Refusal(Status.OUT_OF_FRAME, f"{count} lie within the frame, 3 are needed")
+            raise Refusal(Status.EDGES_UNCLEAR, f"{count} are clear, 3 are needed")
         along = (edges.deviation[known].square() + _FLOOR**2 + (_ROUND * edges.bulge) ** 2).sqrt()
-        # All edges lie on one fitted line; this deviation gives the pose the line's own covariance.
-        spread = float((t - t.mean()).square().sum())
+        positions = self.catheter.positions.to(t.device)[known]
+        # Shading, the same all along, moves and turns a line by more than its fit tells: over the edges both deviations
+        # amount to the larger of the two.
+        reach = float((t - t.mean()).square().mean().sqrt())
         about = math.hypot(axis.offset_sd, axis.slope_sd * (float(t.mean()) - axis.centre))
-        across = max(about * math.sqrt(count), axis.slope_sd * math.sqrt(spread))
-        pose = solve_pose(
-            pixels[None],
-            self.catheter.positions.to(pixels.device)[known],
-            self.camera,
-            along_px=along[None],
-            across_px=across,
-        )[0]
+        most = max(about, axis.slope_sd * reach)
+        pose = pose_on_line(axis.line, t, positions, along, most, most / reach)
         if not pose.answered:
-            raise Refusal(Status(pose.status), "no pose in front of the camera explains the edges")
+            raise Refusal(Status.INCONSISTENT, pose.reason)
         return pose
 
     def _judged(self, pose: Pose, axis: Axis, edges: Edges) -> Pose:
