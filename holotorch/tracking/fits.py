@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 _STEPS = 8
+_NEAR = 0.03  # samples: the next step is a twentieth, and of places two more follow
 _SETTLED = 0.01  # pixels: the step after is a third of it, of a middle that gloss and shadow move by five times as much
 _SHARED = 1.2  # neighbours share pixels: how much larger deviations are than of samples that do not, measured
 _STRANGE = 1.5  # what is left, over its white part: above it the model misses something, and averaging does not help
@@ -67,34 +68,35 @@ def fit_edges(light: Tensor, weight: Tensor, blur: float = 0.9) -> EdgeFit:
     mean = (weight * light).sum(1) / total
     centred = light - mean[:, None]
     given = weight, weight * centred, total
+    far, sure = (count - 1) / 2, place
     for _ in range(_STEPS):
-        normal, slope, *_ = _edge_terms(t, place, sigma, *given)
-        step = _solved(normal, slope).clamp(-1.5, 1.5)
-        place = (place + step[:, 0]).clamp(-(count - 1) / 2, (count - 1) / 2)
-        sigma = (sigma + step[:, 1]).clamp(_SHARPEST, _BLUNTEST)
-        if float(step.abs().max()) < 1e-3:
+        (pp, pb, bb), (p, b), *_ = _edge_terms(t, place, sigma, *given)
+        sure = (bb - pb * pb / pp.clamp(min=1e-300)).clamp(0, 1e12).nan_to_num(0)  # inverse variance of the blur
+        # An edge without weight has 0 / 0: it stays where it is, of infinite deviation.
+        whole = (1 + 1e-6) * pp * bb - pb * pb
+        step = torch.stack([bb * p - pb * b, pp * b - pb * p]).div(whole).nan_to_num(0, 0, 0).clamp(-1.5, 1.5)
+        place, sigma = (place + step[0]).clamp(-far, far), (sigma + step[1]).clamp(_SHARPEST, _BLUNTEST)
+        if float(step.abs().max()) < _NEAR:
             break
     # One lens blurs all edges alike. Where one side is dark and so has little noise, place and blur are hard to tell
     # apart, edge by edge; together they are not.
-    normal = _edge_terms(t, place, sigma, *given)[0]
-    sure = 1 / torch.linalg.inv_ex(normal + 1e-300 * torch.eye(2, dtype=torch.float64)).inverse[:, 1, 1].clamp(
-        min=1e-12
-    )
     common = (sure * sigma).sum() / sure.sum().clamp(min=1e-300)
     alike = (sigma / common - 1).abs() < 0.5
     other = ~alike & ((sigma - common).abs() > _OTHER * sure.rsqrt())  # surely not blurred by that lens
-    sigma = torch.where(alike, (sure * alike * sigma).sum() / (sure * alike).sum().clamp(min=1e-300), sigma)
-    for _ in range(2):  # an edge without weight has 0 / 0: it stays where it is, of infinite deviation
-        normal, slope, *_ = _edge_terms(t, place, sigma, *given)
-        place = place + (slope[:, 0] / normal[:, 0, 0].clamp(min=1e-300)).nan_to_num(0).clamp(-0.5, 0.5)
-    place = place.clamp(-(count - 1) / 2, (count - 1) / 2)
-    normal, _, amplitude, middle = _edge_terms(t, place, sigma, *given)
-    z = (t - place[:, None]) / sigma[:, None]
-    left = centred - amplitude[:, None] * (0.5 * torch.erfc(-z / math.sqrt(2))[..., None] - middle[:, None])
+    together = (sure * alike).sum().clamp(min=1e-300)
+    sigma = torch.where(alike, (sure * alike * sigma).sum() / together, sigma)
+
+    def moved(p: Tensor, pp: Tensor) -> Tensor:
+        return (place + (p / pp.clamp(min=1e-300)).nan_to_num(0).clamp(-0.5, 0.5)).clamp(-far, far)
+
+    (pp, *_), (p, _), *_ = _edge_terms(t, place, sigma, *given)
+    place = moved(p, pp)
+    (pp, pb, _), (p, _), amplitude, middle, rise = _edge_terms(t, place, sigma, *given)
+    place = moved(p, pp)
+    left = centred - amplitude[:, None] * (rise[..., None] - middle[:, None])
     free = (weight > 0).sum((1, 2)) - 2 * (weight > 0).any(1).sum(1) - 2
     noise = ((weight * left.square()).sum((1, 2)) / free.clamp(min=1)).sqrt()
-    tilt = normal[:, 0, 1] / normal[:, 0, 0]
-    variance = 1 / normal[:, 0, 0] + tilt.square() / torch.where(alike, (sure * alike).sum(), sure).clamp(min=1e-12)
+    variance = 1 / pp + (pb / pp).square() / torch.where(alike, together, sure).clamp(min=1e-12)
     # What varies from sample to sample is noise; what does not is something else that the edge is mixed with.
     rough = (weight[:, 1:-1] * left.diff(n=2, dim=1).square()).sum((1, 2)) / (weight[:, 1:-1] > 0).sum((1, 2)) / 6
     strange = noise / rough.sqrt().clamp(min=1e-9)
@@ -106,32 +108,30 @@ def fit_edges(light: Tensor, weight: Tensor, blur: float = 0.9) -> EdgeFit:
 
 
 def _edge_terms(t: Tensor, place: Tensor, sigma: Tensor, weight: Tensor, weighted: Tensor, total: Tensor):
-    """Normal matrix [E, 2, 2] and slope [E, 2] for (place, blur), amplitudes and basis means [E, U C].
+    """Normal matrix and slope for (place, blur) by entries [E], amplitudes and basis means [E, U C], the rise [E, T].
 
     ``weight`` and ``weighted`` (light times it) are [E, T, U C], their ``total`` over T [E, U C].
     """
     z = (t - place[:, None]) / sigma[:, None]
-    rise = 0.5 * torch.erfc(-z / math.sqrt(2))
-    bell = torch.exp(-0.5 * z * z) / (math.sqrt(2 * math.pi) * sigma[:, None])
-    basis = torch.stack([rise, -bell, -bell * z], 1)  # the rise, and its slopes to place and blur: [E, 3, T]
-    # Weighted moments of the three over T, for each row and channel.
-    moments = torch.cat([basis, (basis[:, :, None] * basis[:, None]).flatten(1, 2)], 1) @ weight
-    first, second = moments[:, :3] / total[:, None], moments[:, 3:].unflatten(1, (3, 3))
-    second = second - moments[:, :3, None] * first[:, None]
-    with_light = basis @ weighted
-    power = second[:, 0, 0].clamp(min=1e-300)
-    amplitude = with_light[:, 0] / power
-    # What the rise itself explains is taken out of its slopes (Kaufman's form).
-    left = with_light[:, 1:] - second[:, 0, 1:] * amplitude[:, None]
-    matrix = second[:, 1:, 1:] - second[:, 1:, :1] * second[:, :1, 1:] / power[:, None, None]
-    normal = (matrix @ amplitude.square()[:, None, :, None])[..., 0]
-    slope = (left @ amplitude[..., None])[..., 0]
-    return normal, slope, amplitude, first[:, 0]
-
-
-def _solved(normal: Tensor, slope: Tensor) -> Tensor:
-    damped = normal + torch.diag_embed(1e-6 * normal.diagonal(dim1=-2, dim2=-1) + 1e-300)
-    return torch.linalg.solve_ex(damped, slope[..., None]).result[..., 0].nan_to_num(0.0, 0.0, 0.0)
+    rise = 0.5 * torch.erfc(z * -math.sqrt(0.5))
+    bell = torch.exp(-0.5 * z * z) / (-math.sqrt(2 * math.pi) * sigma[:, None])
+    basis = torch.stack([rise, bell, bell * z], 1)  # the rise, and its slopes to place and blur: [E, 3, T]
+    # Weighted moments over T, for each row and channel.
+    moments = torch.cat([basis, basis * rise[:, None]], 1) @ weight
+    means, with_light = moments[:, :3] / total[:, None], basis @ weighted
+    second = moments[:, 3:] - moments[:, :1] * means
+    power = second[:, :1].clamp(min=1e-300)
+    amplitude = with_light[:, :1] / power
+    slopes = ((with_light[:, 1:] - second[:, 1:] * amplitude) * amplitude).sum(-1)
+    # What the rise itself, and the levels, explain is taken out of its slopes (Kaufman's form).
+    square = amplitude.square()
+    raw = (basis[:, 1:] * (weight @ square.mT).mT) @ basis[:, 1:].mT
+    taken = torch.cat(
+        [moments[:, 1:3] * (amplitude * total[:, None].rsqrt()), second[:, 1:] * (amplitude * power.rsqrt())], -1
+    )
+    normal = raw - taken @ taken.mT
+    entries = normal[:, 0, 0], normal[:, 0, 1], normal[:, 1, 1]
+    return entries, slopes.unbind(-1), amplitude[:, 0], means[:, 0], rise
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +247,7 @@ def _ridged(normal: Tensor) -> Tensor:
 
 
 def _slices() -> tuple[Tensor, Tensor]:
-    """Nodes [N] over the tube, -1 to 1, and what each column (left, right, shadings) takes of a rise there [N, 2 + K]."""
+    """Nodes [N] over the tube, -1 to 1, and what columns (left, right, shadings) take of a rise there [N, 2 + K]."""
     q = torch.linspace(-1, 1, _SLICES + 1, dtype=torch.float64)
     middle = (q[1:] + q[:-1]) / 2
     shadings = nn.functional.pad(torch.stack([f(middle) for f in _SHADINGS], -1), (0, 0, 1, 1))
