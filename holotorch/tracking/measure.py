@@ -21,6 +21,7 @@ _WINDOW = 11  # samples to either side of an edge
 _STATIONS = 40
 _SAMPLES = 4  # for each station
 _LINE_FLOOR = 0.008  # of the width: what gloss and shadow, which repeat along the tube, may move its middle
+_AWAY = 2.0  # pixels from where it was expected at which an edge is looked at once more
 _UNSURE = 0.1  # pixels: a clear edge is known to a few hundredths
 _ALIKE = 0.2  # of the brightest channel: colours nearer than this are one
 _BESIDE = 14.0  # pixels from the mid-line, beside the widest catheters
@@ -242,7 +243,7 @@ def measure_edges(
             core = (widths[:, None] / 2 - 0.5 - u.abs()).clamp(0, 1)
             fit = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur))
         near = near + fit.place
-        if float(fit.place.abs().max()) < 1.0:
+        if float(fit.place.abs().max()) < _AWAY:
             break
     assert fit is not None and inside is not None
     blurs = fit.blur[torch.isfinite(fit.deviation)]

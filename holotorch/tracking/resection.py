@@ -6,7 +6,7 @@ from torch import Tensor
 from holotorch.tracking.status import Pose, Status
 from holotorch.tracking.strips import Line
 
-_STEPS = 3  # after a linear start that is right but for the noise; each squares what is left
+_STEPS = 2  # after a linear start that is right but for the noise, a thousandth or less; each squares what is left
 
 
 def pose_on_line(
