@@ -85,7 +85,8 @@ class Camera:
         radial = 1 + square * (k1 + square * (k2 + square * k3))
         u = x * radial + p1 * xy + p2 * (square + 2 * xx)
         v = y * radial + p2 * xy + p1 * (square + 2 * yy)
-        return torch.stack([u * matrix[0, 0] + matrix[0, 2], v * matrix[1, 1] + matrix[1, 2]], -1)
+        # All x in a row in memory, then all y: what follows is quicker.
+        return torch.stack([u * matrix[0, 0] + matrix[0, 2], v * matrix[1, 1] + matrix[1, 2]]).movedim(0, -1)
 
     def undistort(self, pixels: Tensor) -> Tensor:
         """Points [..., 2] on the plane z = 1 of pixels [..., 2], in float64; NaN where there is none.

@@ -83,14 +83,15 @@ def find_bands(
     device = sampler.frame.device
     t = torch.arange(count, dtype=torch.float64, device=device) - (count - 1) / 2
     u = torch.arange(2 * math.ceil(aside) + 1, dtype=torch.float64, device=device) - math.ceil(aside)
-    labels = _labels(sampler, camera, line, table, t, u)
+    levels, inside = sampler.nearest(line.pixels(camera, t, u))
+    labels = table.labels(*levels) * inside
     found = find_axis(labels, u, reach)
     if found is None:
         raise Refusal(Status.NO_AXIS, "nothing thin and straight with the bands' colours")
     offset, slope = torch.tensor(found, dtype=torch.float64, device=device)
     line = line.moved(offset, slope)
     rows = torch.tensor([-1.0, 0.0, 1.0, -_BESIDE, _BESIDE], dtype=torch.float64, device=device)
-    levels, inside = sampler.nearest(camera.distort(line.plane(t[:, None], rows[None])))
+    levels, inside = sampler.nearest(line.pixels(camera, t, rows))
     near, levels = table.labels(*levels) * inside, levels.to(torch.float32)
     # What looks the same on both sides of the line is a drape, or cannot be told from one.
     gap = (levels[..., 3:] - levels[..., 1:2]).abs().amax(0)
@@ -103,11 +104,6 @@ def find_bands(
         stretches = dataclasses.replace(stretches, edges=-stretches.edges, flipped=False)
         return turned, stretches
     return line, stretches
-
-
-def _labels(sampler: Sampler, camera: Camera, line: Line, table: ColourTable, t: Tensor, u: Tensor) -> Tensor:
-    levels, inside = sampler.nearest(camera.distort(line.plane(t[:, None], u[None])))
-    return table.labels(*levels) * inside
 
 
 def measure_axis(
@@ -143,7 +139,7 @@ def measure_axis(
         raise Refusal(Status.TOO_NARROW, "the bands are a few pixels long")
     half = math.ceil(0.6 * guess + 4 + 2 * blur)
     u = torch.arange(2 * half + 1, dtype=torch.float64, device=device) - half
-    light = sampler(camera.distort(line.plane(t[..., None], u.expand(*t.shape, -1)))).mean(2)
+    light = sampler(camera.distort(line.plane(t[..., None], u))).mean(2)
     signal, weight, level = _contrast(light, u, guess, band, len(spans))
     fit = fit_axis(signal, weight, t.mean(-1), band, level, width, blur, known)
     offset, slope, wide, taper = fit.sides
@@ -231,7 +227,7 @@ def measure_edges(
     fit = inside = None
     for _ in range(2):
         place = near[:, None, None] + along[:, None] + (bulge[:, None] * round_)[:, None]
-        pixels = camera.distort(line.plane(place, u.expand_as(place)))
+        pixels = camera.distort(line.plane(place, u))
         light = sampler(pixels).permute(1, 2, 3, 0)  # [E, T, U, C]
         inside = sampler.inside(pixels)
         # A row that is mostly surroundings tells little of the edge, and what it tells may be of something else.
@@ -252,7 +248,7 @@ def measure_edges(
         raise Refusal(Status.INCONSISTENT, "all bands go on beside the tube: this is thicker, seen in one part of it")
     margin = 2 + 2 * float(fit.blur.median())
     reached = near[:, None] + torch.tensor([-margin, margin], dtype=torch.float64, device=device)
-    far = sampler.inside(camera.distort(line.plane(reached, torch.zeros_like(reached)))).all(-1)
+    far = sampler.inside(camera.distort(line.plane(reached))).all(-1)
     within = (far & inside.flatten(1).all(-1)).tolist()
     clear = ((fit.deviation < 0.6) & (fit.place.abs() < window / 2) & (fit.blur < 5.5)).tolist()
     for j, (index, hides) in enumerate(zip(chosen.tolist(), covered.tolist(), strict=True)):
@@ -282,8 +278,8 @@ def _across(
     aside = torch.arange(3, dtype=torch.float64, device=near.device) + 2.0 + 2 * float(fit.blur.median())
     u = torch.cat([-aside, aside])
     across = torch.sign(u) * (widths[:, None] / 2) + u  # [E, 6]
-    place = (near[:, None, None] + along[:, None]).expand(-1, -1, len(u))
-    light = sampler(camera.distort(line.plane(place, across[:, None].expand_as(place)))).permute(1, 2, 3, 0).double()
+    place = near[:, None, None] + along[:, None]
+    light = sampler(camera.distort(line.plane(place, across[:, None]))).permute(1, 2, 3, 0).double()
     rise = 0.5 * torch.erfc(-along / fit.blur[:, None] / math.sqrt(2))
     rise = rise - rise.mean(1, keepdim=True)
     side = light.unflatten(2, (2, 3)).mean(3)  # [E, T, 2, C]

@@ -119,7 +119,7 @@ class CatheterTracker:
             else:
                 wide = self._wide(before, line)
                 axis = measure_axis(sampler, self.camera, line, stretches, wide, _EXACT, 0.9)
-        guess, _ = axis.line.place(line.plane(stretches.edges, torch.zeros_like(stretches.edges)))
+        guess, _ = axis.line.place(line.plane(stretches.edges))
         width = axis
         if before is not None:
             with self._timed("edges"):
@@ -145,7 +145,7 @@ class CatheterTracker:
         with self._timed("axis"):
             # Once more, with the width that the pose and the radius give; what was found without them is the check.
             wide = self._wide(pose, line)
-            found = axis.line.plane(edges.t, torch.zeros_like(edges.t))
+            found = axis.line.plane(edges.t)
             axis = measure_axis(sampler, self.camera, line, stretches, wide, _EXACT, edges.blur)
         with self._timed("edges"):
             curve = bulge_px(pose, self.catheter, axis.line)
