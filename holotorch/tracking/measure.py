@@ -176,17 +176,15 @@ def _contrast(light: Tensor, u: Tensor, width: float, band: Tensor, bands: int) 
     outer = (u.abs() >= 0.5 * width + 1.5).to(light.dtype)
     inside = (light * inner).sum(-1) / inner.sum()
     beside = (light * outer).sum(-1) / outer.sum()
-    mixes, levels = [], []
-    for k in range(bands):
-        own, around = inside[:, band == k].mean(-1), beside[:, band == k].mean(-1)
-        mix = (own - around) / (_variance(own) + _variance(around))
-        mix = mix / mix.norm().clamp(min=1e-12)
-        mixes.append(mix)
-        levels.append((mix * own).sum())
-    mix = torch.stack(mixes)[band].T  # [3, S]
+    mean = torch.nn.functional.one_hot(band, bands).to(light.dtype)
+    mean = mean / mean.sum(0)
+    own, around = inside @ mean, beside @ mean  # [3, bands]
+    mixes = (own - around) / (_variance(own) + _variance(around))
+    mixes = mixes / mixes.norm(dim=0).clamp(min=1e-12)
+    mix = mixes[:, band]  # [3, S]
     signal = (light * mix[..., None]).sum(0)
     variance = (mix.square()[..., None] * _variance(light)).sum(0) / _SAMPLES
-    return signal, 1 / variance.clamp(min=1e-30), torch.stack(levels).to(torch.float64)
+    return signal, 1 / variance.clamp(min=1e-30), (mixes * own).sum(0).to(torch.float64)
 
 
 def _variance(light: Tensor) -> Tensor:
