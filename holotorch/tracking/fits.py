@@ -144,6 +144,7 @@ class AxisFit:
         blur: Of the sides, standard deviation in samples.
         contrast: [2], light of the tube less that on either side, over the larger of the two; medians.
         weight: [S], how much each station counts; near 0 where something else is seen.
+        unknown: All that was found, for a fit to begin at.
     """
 
     sides: Tensor
@@ -151,6 +152,7 @@ class AxisFit:
     blur: float
     contrast: Tensor
     weight: Tensor
+    unknown: Tensor
 
 
 def fit_axis(
@@ -162,6 +164,7 @@ def fit_axis(
     width: tuple[float, float],
     blur: float,
     known: float = 0.35,
+    start: Tensor | None = None,
 ) -> AxisFit:
     """Blurred boxes whose two sides are straight lines along the tube, all stations at once.
 
@@ -179,6 +182,7 @@ def fit_axis(
         blur: Standard deviation to begin with, in samples.
         known: Share of the width to which it and the taper are known beforehand. Shading and width are hard to tell
             apart; whoever knows the width finds the middle better.
+        start: ``unknown`` of an earlier fit to the same stations, for all but width and taper.
     """
     light, weight = light.to(torch.float64), weight.to(torch.float64)[..., None]
     count, bands, kinds = light.shape[1], len(level), len(_SHADINGS)
@@ -196,7 +200,10 @@ def fit_axis(
     expected = light.new_zeros(5 + bands * kinds)
     expected[2:5] = light.new_tensor([width[0], width[1] * reach, blur])
     unknown = expected.clone()
-    unknown[5::kinds] = level
+    if start is None:
+        unknown[5::kinds] = level
+    else:
+        unknown[:2], unknown[4:] = start[:2], start[4:]
     shares = level.abs().clamp(min=1e-9)[:, None] * light.new_tensor(_SHARES)
     known_to = light.new_tensor([math.inf, math.inf, known * width[0], known * width[0], math.inf])
     prior = torch.cat([known_to, shares.flatten()]).square().reciprocal()
@@ -231,7 +238,7 @@ def fit_axis(
         step = torch.linalg.solve_ex(normal, slope).result.nan_to_num(0.0, 0.0, 0.0)
         unknown = unknown + step.clamp(-farthest, farthest)
         unknown[4].clamp_(_SHARPEST, _BLUNTEST)
-        if k and float(step[:4].abs().max()) < _SETTLED:
+        if k and float(step[:4].abs().max()) < max(_SETTLED, 0.1 * known):
             break
     scale = light.new_tensor([1.0, 1.0 / reach, 1.0, 1.0 / reach])
     covariance = torch.linalg.inv_ex(normal).inverse[:4, :4] * max(noise, 0.5) ** 2
@@ -239,7 +246,7 @@ def fit_axis(
     apart = (tube[:, None] - beside).abs().median(0).values
     contrast = apart / apart.max().clamp(min=1e-300)
     covariance = covariance * scale * scale[:, None]
-    return AxisFit(unknown[:4] * scale, covariance, float(unknown[4]), contrast, station)
+    return AxisFit(unknown[:4] * scale, covariance, float(unknown[4]), contrast, station, unknown)
 
 
 def _ridged(normal: Tensor) -> Tensor:

@@ -16,9 +16,10 @@ from holotorch.tracking.catheter import Catheter
 from holotorch.tracking.coarse import find_segments
 from holotorch.tracking.colours import ColourTable
 from holotorch.tracking.footprint import bulge_px, width_px
-from holotorch.tracking.measure import Axis, Edges, Refusal, find_bands, measure_axis, measure_edges
+from holotorch.tracking.measure import Edges, find_bands, measure_edges
 from holotorch.tracking.resection import pose_on_line
-from holotorch.tracking.status import Pose, Status
+from holotorch.tracking.stations import Axis, look_across, measure_axis
+from holotorch.tracking.status import Pose, Refusal, Status
 from holotorch.tracking.strips import Line, Sampler
 
 _FLOOR = 0.015  # pixels: what model and pixels leave in an edge, however little noise there is;
@@ -114,11 +115,9 @@ class CatheterTracker:
             if stretches.known < 3:
                 few = "a band hides, is drowned by its surroundings or leaves the frame"
                 raise Refusal(Status.BANDS_MISSING, f"{stretches.known} edges of bands are seen, 3 are needed: {few}")
-            if before is None:
-                axis = measure_axis(sampler, self.camera, line, stretches, self._width(stretches), _THIRD, 0.9)
-            else:
-                wide = self._wide(before, line)
-                axis = measure_axis(sampler, self.camera, line, stretches, wide, _EXACT, 0.9)
+            wide, known = (self._width(stretches), _THIRD) if before is None else (self._wide(before, line), _EXACT)
+            stations = look_across(sampler, self.camera, line, stretches, wide[0], 0.9)
+            axis = measure_axis(stations, wide, known, 0.9)
         guess, _ = axis.line.place(line.plane(stretches.edges))
         width = axis
         if before is not None:
@@ -146,7 +145,9 @@ class CatheterTracker:
             # Once more, with the width that the pose and the radius give; what was found without them is the check.
             wide = self._wide(pose, line)
             found = axis.line.plane(edges.t)
-            axis = measure_axis(sampler, self.camera, line, stretches, wide, _EXACT, edges.blur)
+            if not stations.show(wide[0], edges.blur):
+                stations = look_across(sampler, self.camera, line, stretches, wide[0], edges.blur)
+            axis = measure_axis(stations, wide, _EXACT, edges.blur, axis)
         with self._timed("edges"):
             curve = bulge_px(pose, self.catheter, axis.line)
             again, _ = axis.line.place(found)
