@@ -16,7 +16,8 @@ from holotorch.tracking.status import Refusal, Status
 from holotorch.tracking.strips import Line, Sampler
 
 _WINDOW = 11  # samples to either side of an edge
-_AWAY = 2.0  # pixels from where it was expected at which an edge is looked at once more
+_HALFWAY, _SURE = 6, 3  # samples to either side of where labels change; the outermost of them that show one colour
+_AWAY = 1.0  # pixels from where it was expected at which an edge is looked at once more
 _UNSURE = 0.1  # pixels: a clear edge is known to a few hundredths
 _ALIKE = 0.2  # of the brightest channel: colours nearer than this are one
 _BESIDE = 14.0  # pixels from the mid-line, beside the widest catheters
@@ -39,8 +40,11 @@ class Edges:
 
 def find_bands(
     sampler: Sampler, camera: Camera, line: Line, table: ColourTable, half: float, aside: float, reach: float
-) -> tuple[Line, Stretches]:
-    """Line and stretches in a strip around a first line; ``half`` its length, ``aside`` half its width, in pixels."""
+) -> tuple[Line, Stretches, Tensor]:
+    """Line, stretches and edges' places in a strip around a first line, ``half`` its length, ``aside`` half its width.
+
+    All in pixels. The places [N] are better known than the stretches' own, and NaN where those are.
+    """
     count = 2 * math.ceil(half) + 1
     device = sampler.frame.device
     t = torch.arange(count, dtype=torch.float64, device=device) - (count - 1) / 2
@@ -54,18 +58,37 @@ def find_bands(
     line = line.moved(offset, slope)
     rows = torch.tensor([-1.0, 0.0, 1.0, -_BESIDE, _BESIDE], dtype=torch.float64, device=device)
     levels, inside = sampler.nearest(line.pixels(camera, t, rows))
-    near, levels = table.labels(*levels) * inside, levels.to(torch.float32)
+    near = table.labels(*levels) * inside
     # What looks the same on both sides of the line is a drape, or cannot be told from one.
-    gap = (levels[..., 3:] - levels[..., 1:2]).abs().amax(0)
-    same = (near[:, 3:] == near[:, 1:2]) & (gap < _ALIKE * levels[..., 1:2].amax(0))
+    shown = levels.to(torch.float32)
+    gap = (shown[..., 3:] - shown[..., 1:2]).abs().amax(0)
+    same = (near[:, 3:] == near[:, 1:2]) & (gap < _ALIKE * shown[..., 1:2].amax(0))
     stretches = find_stretches(near[:, :3], same.all(-1), table, (count - 1) / 2)
     if stretches is None:
         raise Refusal(Status.BANDS_MISSING, "no stretch of line shows the bands in their order")
+    profile = sampler.light[levels[..., :3].long()].mean(-1)
+    edges = _halfway(profile, stretches.edges)
     if stretches.flipped:  # from here on t rises from the tip to the rear
         turned = Line(line.origin, -line.along, line.scale)
         stretches = dataclasses.replace(stretches, edges=-stretches.edges, flipped=False)
-        return turned, stretches
-    return line, stretches
+        return turned, stretches, -edges
+    return line, stretches, edges
+
+
+def _halfway(profile: Tensor, edges: Tensor) -> Tensor:
+    """Edges [N], t in pixels, from where labels change to where the light [3, T] is halfway, where that is near.
+
+    Of a step at x among samples k from -n to n, from 0 to 1, the sum of 1 - step is x + n + 1/2, however blurred.
+    """
+    middle = (profile.shape[1] - 1) / 2
+    whole = (edges.nan_to_num(0) + middle).round()
+    k = torch.arange(-_HALFWAY, _HALFWAY + 1, device=edges.device)
+    seen = profile[:, (whole[:, None] + k).clamp(0, profile.shape[1] - 1).long()]  # [3, N, K]
+    before, after = seen[..., :_SURE].mean(-1, keepdim=True), seen[..., -_SURE:].mean(-1, keepdim=True)
+    step = after - before
+    share = ((seen - before) * step).sum(0) / step.square().sum(0).clamp(min=1e-9)
+    found = whole - middle + (1 - share).sum(-1) - _HALFWAY - 0.5
+    return torch.where((found - edges).abs() < _SURE, found, edges)
 
 
 def measure_edges(

@@ -111,19 +111,19 @@ class CatheterTracker:
         half = min(half, 1.5 * math.hypot(sampler.height, sampler.width))
         with self._timed("axis"):
             reach = min(0.15, 2 * aside / half) if before is not None else 0.06
-            line, stretches = find_bands(sampler, self.camera, line, self.table, half, aside, reach)
+            line, stretches, places = find_bands(sampler, self.camera, line, self.table, half, aside, reach)
             if stretches.known < 3:
                 few = "a band hides, is drowned by its surroundings or leaves the frame"
                 raise Refusal(Status.BANDS_MISSING, f"{stretches.known} edges of bands are seen, 3 are needed: {few}")
             wide, known = (self._width(stretches), _THIRD) if before is None else (self._wide(before, line), _EXACT)
             stations = look_across(sampler, self.camera, line, stretches, wide[0], 0.9)
             axis = measure_axis(stations, wide, known, 0.9)
-        guess, _ = axis.line.place(line.plane(stretches.edges))
+        guess, _ = axis.line.place(line.plane(places))
         width = axis
         if before is not None:
             with self._timed("edges"):
                 curve = bulge_px(before, self.catheter, axis.line)
-                edges = measure_edges(sampler, self.camera, axis, guess, stretches.doubtful, 0.9, curve)
+                edges = measure_edges(sampler, self.camera, axis, guess - curve, stretches.doubtful, 0.9, curve)
             with self._timed("pose"):
                 # What the bulge has changed by is set right without another look at the frame: the mean over a front.
                 pose, bulge = self._solved(axis, edges), curve
