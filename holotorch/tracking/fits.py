@@ -214,15 +214,15 @@ def fit_axis(
     for k in range(_STEPS):
         at, wide, softness, *_ = (seen := (flat @ unknown).view(len(t), -1)).unbind(-1)
         columns, slopes_of = _strip_terms(u, at, wide.clamp(min=1.0) / 2, softness[0])
-        rest = light[..., None] - columns[..., 2:] @ seen[:, 3:, None]
+        outer, inner = columns[..., :2], columns[..., 2:]
+        rest = light[..., None] - inner @ seen[:, 3:, None]
         # Levels beside the tube are projected out, station by station.
-        outer = columns[..., :2]
-        taken = torch.linalg.solve_ex(_ridged(outer.mT @ (outer * weight)), (outer * weight).mT).result  # [S, 2, U]
-        beside = (taken @ rest)[..., 0]
-        slopes = slopes_of(torch.cat([beside, seen[:, 3:]], -1))
-        design = torch.cat([slopes, columns[..., 2:], rest], -1)
-        design = design - outer @ (taken @ design)
-        gram = design.mT @ (design * weight)  # [S, 4 + kinds, 4 + kinds]
+        weighted = (outer * weight).mT
+        inverse = torch.linalg.inv_ex(_ridged(weighted @ outer)).inverse
+        beside = (inverse @ (weighted @ rest))[..., 0]
+        design = torch.cat([slopes_of(torch.cat([beside, seen[:, 3:]], -1)), inner, rest], -1)
+        both = weighted @ design
+        gram = design.mT @ (design * weight) - both.mT @ (inverse @ both)  # [S, 4 + kinds, 4 + kinds]
         if k:
             chi = gram[:, -1, -1] / count
             typical = chi.median().clamp(min=1e-12)
