@@ -182,7 +182,7 @@ def _across(
     side = light.unflatten(2, (2, 3)).mean(3)  # [E, T, 2, C]
     rest = side - side.mean(1, keepdim=True)
     power = rise.square().sum(1)
-    step = torch.einsum("et,etsc->esc", rise, rest) / power[:, None, None]
+    step = ((rise[:, None] @ rest.flatten(2)) / power[:, None, None]).view(len(near), 2, -1)
     left = rest - step[:, None] * rise[:, :, None, None]
     sd = (left.square().mean(1) / power[:, None, None]).sqrt()
     size = step.norm(dim=-1)

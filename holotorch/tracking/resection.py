@@ -1,5 +1,7 @@
 """The pose of a straight tool from where known points of it lie along one line of the image: three unknowns."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -33,45 +35,34 @@ def pose_on_line(
     far, long = t - middle, positions - mean
     reach, length = far.abs().max(), long.abs().max()
     x, s, weight = far / reach, long / length, reach / deviation
-    h, seen, depth = x.new_zeros(3), x, torch.ones_like(x)
-    rest = x * weight
+    ones, rest = torch.ones_like(x), x * weight
+    h, seen, depth = x.new_zeros(3), x, ones
     for _ in range(1 + _STEPS):
-        slopes = torch.stack([torch.ones_like(s), s, -s * seen], -1) * (weight / depth)[:, None]
+        slopes = torch.stack([ones, s, -s * seen], -1) * (weight / depth)[:, None]
         h = h + torch.linalg.solve_ex(slopes.mT @ slopes, slopes.mT @ rest).result
         depth = 1 + h[2] * s
         seen = (h[0] + h[1] * s) / depth
         rest = (x - seen) * weight
-    if not bool((depth > 0).all() & torch.isfinite(rest).all()):
+    chi_square = rest.square().sum()
+    if not (float(depth.min()) > 0 and math.isfinite(float(chi_square))):
         return Pose.refused(Status.INCONSISTENT, "no pose in front of the camera explains the edges")
-    slopes = torch.stack([torch.ones_like(s), s, -s * seen], -1) * (weight / depth)[:, None]
-    # Points of space are p e1 + q e2: of tip and direction, each row (p, q), up to one scale.
-    unit, start = 1 / length, -mean / length
-    zero = torch.zeros_like(unit)
-    aside = torch.cat([line.across / line.scale, zero[None]])
-    axes = torch.stack(
-        [
-            torch.cat([reach * line.along / line.scale, zero[None]]),
-            torch.cat([line.origin + middle * line.along / line.scale, torch.ones_like(zero)[None]]),
-        ]
-    )
-    p, q = torch.stack([h[0] + h[1] * start, h[1] * unit]), torch.stack([1 + h[2] * start, h[2] * unit])
-    raw = torch.stack([p, q], -1) @ axes  # [2, 3]: tip and direction
+    slopes = torch.stack([ones, s, -s * seen], -1) * (weight / depth)[:, None]
+    # Points of space are p e1 + q e2, up to one scale: tip and direction. A line that is not quite where it was found
+    # moves them to the side.
+    (h0, h1, h2), (x0, y0), (ax, ay) = h.tolist(), line.plane(middle).tolist(), (line.along / line.scale).tolist()
+    wide, unit, start = float(reach), 1 / float(length), -float(mean) / float(length)
+    axes = t.new_tensor([[wide * ax, wide * ay, 0.0], [x0, y0, 1.0], [-ay, ax, 0.0]])
+    (p, q), (along, deep) = (h0 + h1 * start, 1 + h2 * start), (h1 * unit, h2 * unit)
+    raw = t.new_tensor([[p, q, 0.0], [along, deep, 0.0]]) @ axes
     # How they move with h, and with the line's offset and slope.
-    levers = torch.stack([torch.stack([torch.ones_like(unit), start, start]), torch.stack([zero, unit, unit])])
-    moved = torch.cat(
-        [
-            levers[..., None] * axes[[0, 0, 1]],
-            torch.stack([q, p * reach], -1)[..., None] * aside,
-        ],
-        1,
-    )  # [2, 5, 3]
+    tip = [[1.0, 0.0, 0.0], [start, 0.0, 0.0], [0.0, start, 0.0], [0.0, 0.0, q], [0.0, 0.0, p * wide]]
+    direction = [[0.0, 0.0, 0.0], [unit, 0.0, 0.0], [0.0, unit, 0.0], [0.0, 0.0, deep], [0.0, 0.0, along * wide]]
+    moved = t.new_tensor([tip, direction]) @ axes  # [2, 5, 3]
     scale = raw[1].norm()
     pose = raw / scale
     moved = (moved - (moved[1] @ pose[1])[:, None] * pose[:, None]) / scale
-    spread = torch.linalg.inv_ex(slopes.mT @ slopes).inverse
-    own = torch.block_diag(spread, torch.diag(torch.tensor([offset_sd, slope_sd], dtype=t.dtype).square().to(t.device)))
-    lever = moved.transpose(1, 2).reshape(6, 5)
-    covariance = lever @ own @ lever.mT
-    freedom = len(t) - 3
-    status = Status.OK if freedom else Status.UNVERIFIED
-    return Pose(pose[0], pose[1], covariance, rest.square().sum(), zero + freedom, status)
+    own = torch.diag(t.new_tensor([0.0, 0.0, 0.0, offset_sd**2, slope_sd**2]))
+    own[:3, :3] = torch.linalg.inv_ex(slopes.mT @ slopes).inverse
+    lever = moved.mT.reshape(6, 5)
+    status = Status.OK if len(t) > 3 else Status.UNVERIFIED
+    return Pose(pose[0], pose[1], lever @ own @ lever.mT, chi_square, t.new_tensor(len(t) - 3.0), status)

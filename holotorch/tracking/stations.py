@@ -149,4 +149,4 @@ def _contrast(light: Tensor, u: Tensor, width: float, band: Tensor, bands: int) 
 
 def variance_of(light: Tensor) -> Tensor:
     """Of light, from the noise of levels: the slope of the sRGB curve's inverse, which rises about as light^0.58."""
-    return (_LEVEL_SD * (2.4 / 1.055) * (light.clamp(min=0.002) ** (1.4 / 2.4))).square()
+    return (_LEVEL_SD * 2.4 / 1.055) ** 2 * light.clamp(min=0.002) ** (2.8 / 2.4)
