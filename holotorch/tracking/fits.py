@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 _STEPS = 8
 _NEAR = 0.03  # samples: the next step is a twentieth, and of places two more follow
-_SETTLED = 0.01  # pixels: the step after is a third of it, of a middle that gloss and shadow move by five times as much
+_SETTLED = 0.03  # pixels: the step after is a third of it; gloss and shadow move a middle by 0.05
 _SHARED = 1.2  # neighbours share pixels: how much larger deviations are than of samples that do not, measured
 _STRANGE = 1.5  # what is left, over its white part: above it the model misses something, and averaging does not help
 _OTHER = 4.0  # standard deviations of an edge's own blur

@@ -144,16 +144,18 @@ def measure_edges(
     if beyond and curve is not None and len(near) > 2:
         raise Refusal(Status.INCONSISTENT, "all bands go on beside the tube: this is thicker, seen in one part of it")
     margin = 2 + 2 * float(fit.blur.median())
-    reached = near[:, None] + torch.tensor([-margin, margin], dtype=torch.float64, device=device)
-    far = sampler.inside(camera.distort(line.plane(reached))).all(-1)
-    within = (far & inside.flatten(1).all(-1)).tolist()
-    clear = ((fit.deviation < 0.6) & (fit.place.abs() < window / 2) & (fit.blur < 5.5)).tolist()
-    for j, (index, hides) in enumerate(zip(chosen.tolist(), covered.tolist(), strict=True)):
-        if not within[j]:
+    within = inside.flatten(1).all(-1)
+    if margin + _AWAY > window:  # else what was looked at reaches farther
+        reached = near[:, None] + torch.tensor([-margin, margin], dtype=torch.float64, device=device)
+        within &= sampler.inside(camera.distort(line.plane(reached))).all(-1)
+    clear = (fit.deviation < 0.6) & (fit.place.abs() < window / 2) & (fit.blur < 5.5)
+    found = torch.stack([within, covered, clear], -1).tolist()
+    for j, (index, (whole, hides, sure)) in enumerate(zip(chosen.tolist(), found, strict=True)):
+        if not whole:
             outside.append(index)
         elif doubtful[index] and hides:
             hidden.append(index)  # an edge between two bands shows by its colours what it is; an outer one does not
-        elif clear[j]:
+        elif sure:
             t[index], deviation[index] = near[j], fit.deviation[j]
     return Edges(
         t,

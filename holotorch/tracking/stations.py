@@ -90,7 +90,7 @@ def look_across(
         raise Refusal(Status.TOO_NARROW, "the bands are a few pixels long")
     half = math.ceil(0.6 * width + 4 + 2 * blur)
     u = torch.arange(2 * half + 1, dtype=torch.float64, device=device) - half
-    light = sampler(camera.distort(line.plane(t[..., None], u))).mean(2)
+    light = sampler(line.pixels(camera, t.flatten(), u).unflatten(0, t.shape)).mean(2)
     signal, weight, level = _contrast(light, u, width, band, len(spans))
     return Stations(line, float(t.max() - t.min()), signal, weight, t.mean(-1), band, level)
 
