@@ -66,8 +66,10 @@ def find_bands(
     stretches = find_stretches(near[:, :3], same.all(-1), table, (count - 1) / 2)
     if stretches is None:
         raise Refusal(Status.BANDS_MISSING, "no stretch of line shows the bands in their order")
-    profile = sampler.light[levels[..., :3].long()].mean(-1)
-    edges = _halfway(profile, stretches.edges)
+    k = torch.arange(-_HALFWAY, _HALFWAY + 1, dtype=torch.float64, device=device)
+    around = (stretches.edges[:, None] + k)[..., None]
+    light = sampler(camera.distort(line.plane(around, rows[:3]))).mean(-1)
+    edges = stretches.edges + _halfway(light)
     if stretches.flipped:  # from here on t rises from the tip to the rear
         turned = Line(line.origin, -line.along, line.scale)
         stretches = dataclasses.replace(stretches, edges=-stretches.edges, flipped=False)
@@ -75,20 +77,16 @@ def find_bands(
     return line, stretches, edges
 
 
-def _halfway(profile: Tensor, edges: Tensor) -> Tensor:
-    """Edges [N], t in pixels, from where labels change to where the light [3, T] is halfway, where that is near.
+def _halfway(light: Tensor) -> Tensor:
+    """Where light [3, N, K] is halfway between its ends, from the middle of its samples: [N]; 0 where that is not near.
 
     Of a step at x among samples k from -n to n, from 0 to 1, the sum of 1 - step is x + n + 1/2, however blurred.
     """
-    middle = (profile.shape[1] - 1) / 2
-    whole = (edges.nan_to_num(0) + middle).round()
-    k = torch.arange(-_HALFWAY, _HALFWAY + 1, device=edges.device)
-    seen = profile[:, (whole[:, None] + k).clamp(0, profile.shape[1] - 1).long()]  # [3, N, K]
-    before, after = seen[..., :_SURE].mean(-1, keepdim=True), seen[..., -_SURE:].mean(-1, keepdim=True)
+    before, after = light[..., :_SURE].mean(-1, keepdim=True), light[..., -_SURE:].mean(-1, keepdim=True)
     step = after - before
-    share = ((seen - before) * step).sum(0) / step.square().sum(0).clamp(min=1e-9)
-    found = whole - middle + (1 - share).sum(-1) - _HALFWAY - 0.5
-    return torch.where((found - edges).abs() < _SURE, found, edges)
+    share = ((light - before) * step).sum(0) / step.square().sum(0).clamp(min=1e-9)
+    found = (1 - share).sum(-1) - light.shape[-1] / 2
+    return torch.where(found.abs() < _SURE, found, 0.0)
 
 
 def measure_edges(

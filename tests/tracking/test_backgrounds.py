@@ -29,14 +29,11 @@ def test_all_edges_are_measured_over_a_photograph(astronaut):
 
 
 def test_a_previous_pose_that_is_a_little_off_leaves_no_trace():
-    """How far rings bulge is taken from it; what that was wrong by is set right, without a second look.
-
-    What is left is noise: other places between the same pixels are read, which moves edges by part of a deviation.
-    """
+    """How far rings bulge is taken from it; what that was wrong by is set right, without a second look."""
     world = World()
     case = next(case for case in conditions(world) if case.name == "plain")
     tracker, frame = CatheterTracker(world.camera, world.catheter), case.frame()[None]
     exact = tracker(frame, [before(case, (0.0, 0.0, 0.0), 0.0)])[0]
     for moved, turned in (((2e-3, -1.5e-3, 3e-3), 0.01), ((-2e-3, 1.5e-3, -3e-3), -0.01)):
         pose = tracker(frame, [before(case, moved, turned)])[0]
-        assert pose.answered and float((pose.tip - exact.tip).norm()) < 0.5 * float(exact.tip_sd)
+        assert pose.answered and float((pose.tip - exact.tip).norm()) < 0.2 * float(exact.tip_sd)
