@@ -53,14 +53,15 @@ class _Tiles:
 def _tiles(labels: Tensor, colours: int) -> _Tiles | None:
     height, width = labels.shape
     flat = torch.nn.functional.pad(labels.flatten(), (0, -labels.numel() % 8))
-    words = flat.view(torch.int64).nonzero()  # eight at once: nearly all are nought
-    place = (8 * words + torch.arange(8, device=labels.device)).flatten()
-    place = place[flat[place] > 0]
-    if len(place) < 8:
+    words = flat.view(torch.int64).nonzero()[:, 0]  # eight at once: nearly all are nought
+    flat = flat.view(-1, 8).index_select(0, words).flatten()
+    lit = flat.nonzero()[:, 0]
+    if len(lit) < 8:
         return None
-    share = -(-len(place) // _MOST)
-    place = place[::share]
-    label = flat[place].long() - 1
+    share = -(-len(lit) // _MOST)
+    lit = lit[::share]
+    label = flat.index_select(0, lit).int() - 1
+    place = (8 * words.index_select(0, lit >> 3) + (lit & 7)).int()
     y, x = place // width, place % width
     rows, columns = -(-height // _TILE), -(-width // _TILE)
     key = (label * rows + y // _TILE) * columns + x // _TILE
@@ -164,7 +165,7 @@ def _ranked(
     x, y = place.round().long().unbind(-1)
     inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
     index = y.clamp(0, height - 1) * width + x.clamp(0, width - 1)
-    found = labels.reshape(-1)[index.reshape(-1)].view(index.shape) * inside
+    found = labels.flatten().index_select(0, index.flatten()).view(index.shape) * inside
     drape = (found[..., 3:4] == found[..., 1:2]) & (found[..., 4:5] == found[..., 1:2])
     score = order_scores(found[..., :3] * ~drape, table)
     order = score.argsort(descending=True)[:_LINES]

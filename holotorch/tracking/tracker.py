@@ -86,10 +86,10 @@ class CatheterTracker:
         if not segments:
             return Pose.refused(Status.NO_CATHETER, "nothing thin in the bands' colours")
         first: Refusal | None = None
-        for segment in segments:
+        ends = torch.tensor([(segment.start, segment.end) for segment in segments], dtype=torch.float64)
+        for segment, plane in zip(segments, self.camera.undistort(ends.to(frame.device)), strict=True):
             try:
-                ends = torch.tensor([segment.start, segment.end], dtype=torch.float64, device=frame.device)
-                line = Line.through(self.camera, ends)
+                line = Line.between(self.camera, plane)
                 if not bool(torch.isfinite(line.origin).all()):
                     raise Refusal(Status.OUTSIDE_CAMERA, "it lies where the lens's distortion cannot be inverted")
                 length = math.dist(segment.start, segment.end)
