@@ -79,8 +79,10 @@ class CatheterTracker:
         if before is not None and before.answered:
             try:
                 return self._along(sampler, self._expected(before), _MOVED, before)
-            except Refusal:
-                pass  # it moved more, or something hides it: look everywhere
+            except Refusal as refusal:
+                if refusal.status is Status.UNCERTAIN:  # it is there; looking everywhere finds no more of it
+                    return Pose.refused(refusal.status, refusal.reason)
+                # It moved more, or something hides it: look everywhere.
         with self._timed("colour"):
             segments = find_segments(frame, self.table)
         if not segments:
