@@ -156,6 +156,8 @@ class CatheterTracker:
         with self._timed("edges"):
             curve = bulge_px(pose, self.catheter, axis.line)
             again, _ = axis.line.place(found)
+            if before is None:  # they were found as straight ones: at the mean over a front
+                again = again - math.pi / 4 * curve
             edges = measure_edges(sampler, self.camera, axis, again, stretches.doubtful, edges.blur, curve)
         with self._timed("pose"):
             return self._judged(self._solved(axis, edges), width, edges)
