@@ -36,7 +36,7 @@ class Line:
         """Pixels [T, U, 2] of places t [T], u [U] some tens of pixels from the line.
 
         Three lines along are distorted, and a parabola across laid through them. What it misses is odd in u and rises
-        with its third power: a thousandth of a pixel at 30, of a lens with k1 = -0.12 and a focal length of 1400 pixels.
+        with its third power: a thousandth of a pixel at 30, of a lens with k1 = -0.12 and a focal length of 1400.
         """
         far = u.abs().max().clamp(min=1.0)
         near, middle, other = camera.distort(self.plane(t, torch.stack([-far, 0 * far, far])[:, None]))  # [T, 2] each
