@@ -108,7 +108,7 @@ def fit_edges(light: Tensor, weight: Tensor, blur: float = 0.9) -> EdgeFit:
 
 
 def _edge_terms(t: Tensor, place: Tensor, sigma: Tensor, weight: Tensor, weighted: Tensor, total: Tensor):
-    """Normal matrix and slope for (place, blur) by entries [E], amplitudes and basis means [E, U C], the rise [E, T].
+    """Normal matrix (pp, pb, bb) and slope (p, b) [E] for place and blur, amplitudes and means [E, U C], rise [E, T].
 
     ``weight`` and ``weighted`` (light times it) are [E, T, U C], their ``total`` over T [E, U C].
     """
