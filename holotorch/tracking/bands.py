@@ -121,7 +121,7 @@ def _sweep(share: Tensor, bands: tuple[int, ...]) -> tuple[Tensor, list[Tensor],
     for i, band in enumerate(bands):
         gains[i + 1, band] += 2
     least = torch.tensor([0.0] + [-0.6] * len(bands) + [0.0], device=share.device)
-    sums = torch.nn.functional.pad((gains @ share + least[:, None]).transpose(0, 1).cumsum(-1), (1, 0))
+    sums = torch.nn.functional.pad((gains @ share + least[:, None]).cumsum(-1), (1, 0)).transpose(0, 1)
     value, cuts = sums[0], []
     for total in sums[1:]:
         reached, where = (value - total).cummax(-1)
