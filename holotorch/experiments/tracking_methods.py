@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from holotorch.experiments.thesis_opencv import ThesisOpenCV
 from holotorch.io.images import load_image
-from holotorch.tracking import measure
+from holotorch.tracking import stations
 from holotorch.tracking.status import Pose, Status
 from holotorch.tracking.tracker import CatheterTracker
 from holotorch.tracking.world import Case, World
@@ -72,7 +72,7 @@ def methods(world: World, names: Sequence[str] = (BASE, COLD, PRIOR, FEWER)) -> 
 
     def fewer(frame: Tensor, _: Case) -> Pose:
         # The tracker has no option for this: nothing but this comparison wants it.
-        with mock.patch.object(measure, "_STATIONS", STATIONS):
+        with mock.patch.object(stations, "_STATIONS", STATIONS):
             return ours(frame[None])[0]
 
     known: dict[str, Method] = {

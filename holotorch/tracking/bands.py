@@ -10,6 +10,7 @@ from holotorch.tracking.colours import ColourTable
 _SIDE = 6  # pixels beside an edge whose colours must be right,
 _MIXED = 2  # but for these next to it
 _RIGHT = 0.55  # share of them
+_VOTERS = 4096  # of coloured pixels, that choose among lines; all of them say where the chosen one lies
 
 
 @dataclass(frozen=True)
@@ -42,10 +43,10 @@ def find_axis(labels: Tensor, u: Tensor, reach: float) -> tuple[float, float] | 
     ``u`` [U] are places across in pixels; slopes to ``reach`` per pixel. The most coloured of a fan of lines, then
     weighted least squares among what lies on it.
     """
-    lit = torch.zeros_like(labels, dtype=torch.bool)
-    for label in range(1, int(labels.max()) + 1):
-        own = labels == label
-        lit |= own & (own.sum(-1) < 0.6 * labels.shape[1])[:, None]  # rows of one colour from side to side are not thin
+    lit = labels > 0
+    if float(lit.float().mean(-1).max()) >= 0.6:  # rows of one colour from side to side are not thin
+        each = labels == torch.arange(1, int(labels.max()) + 1, device=labels.device)[:, None, None]
+        lit = (each & (each.float().mean(-1, keepdim=True) < 0.6)).any(0)
     t, across = lit.nonzero().unbind(-1)
     if len(t) < 20:
         return None
@@ -53,26 +54,25 @@ def find_axis(labels: Tensor, u: Tensor, reach: float) -> tuple[float, float] | 
     place, offset = t.to(torch.float32) - middle, u.to(torch.float32)[across]
     steps = max(3, 2 * int(reach * labels.shape[0] / 3) + 1)
     slopes = torch.linspace(-reach, reach, min(steps, 81), device=labels.device)
-    low = float(u[0]) - reach * middle
+    low = float(u[0]) - reach * middle - 4
     bins = int(2 * (float(u[-1]) - low)) + 8
-    at = (offset - slopes[:, None] * place - low).round().long().clamp(0, bins - 1)
+    some = slice(None, None, -(-len(t) // _VOTERS))
+    at = (offset[some] - slopes[:, None] * place[some] - low).round().long().clamp(0, bins - 1)
     counts = torch.zeros(len(slopes), bins, device=labels.device)
     counts.scatter_add_(1, at, torch.ones_like(at, dtype=counts.dtype))
-    smooth = torch.nn.functional.avg_pool1d(counts[:, None], 5, stride=1, padding=2)[:, 0]
-    best = int(smooth.argmax())
-    slope, value = float(slopes[best // bins]), best % bins + low
+    sums = counts.cumsum(-1)  # of five neighbours is the difference of two
+    best = int((sums[:, 5:] - sums[:, :-5]).argmax())
+    slope, value = float(slopes[best // (bins - 5)]), best % (bins - 5) + 3 + low
+    moments = torch.stack([torch.ones_like(place), place, offset, place * place, place * offset])
     for width in (6.0, 4.0, 3.0, 3.0):
         away = offset - value - slope * place
         weight = (1 - (away / width).square()).clamp(min=0).square()
-        total = weight.sum()
-        if float(total) < 5:
+        total, mt, mu, tt, tu = (moments @ weight).tolist()
+        spread = tt - mt * mt / max(total, 1e-9)
+        if total < 5 or spread < 1:
             return None
-        mt, mu = (weight * place).sum() / total, (weight * offset).sum() / total
-        spread = (weight * (place - mt).square()).sum()
-        if float(spread) < 1:
-            return None
-        slope = float((weight * (place - mt) * (offset - mu)).sum() / spread)
-        value = float(mu) - slope * float(mt)
+        slope = (tu - mt * mu / total) / spread
+        value = (mu - slope * mt) / total
     return value, slope
 
 
@@ -84,7 +84,7 @@ def find_stretches(labels: Tensor, drape: Tensor, table: ColourTable, middle: fl
     Of all ways to cut the line into "before, band 1, ..., band n, after", in both directions, that which most colours
     agree with. Stretches that something hides count little, so that a finger within a band leaves it one band.
     """
-    raw = torch.stack([(labels == c + 1).to(torch.float32).mean(-1) for c in range(len(table.colours))])  # [C, T]
+    raw = _shares(labels, table)  # [C, T]
     share = raw * ~drape
     value, cuts, nothing = _sweep(torch.stack([share, share.flip(-1)]), table.bands)
     score = (value[:, -1] - nothing[:, -1]).tolist()
@@ -101,21 +101,27 @@ def find_stretches(labels: Tensor, drape: Tensor, table: ColourTable, middle: fl
 
 def order_scores(labels: Tensor, table: ColourTable) -> Tensor:
     """How well the bands in their order explain lines of labels [K, T, R], in either direction: [K], in pixels."""
-    share = torch.stack([(labels == c + 1).to(torch.float32).mean(-1) for c in range(len(table.colours))], 1)
+    share = _shares(labels, table).movedim(0, 1)
     both = torch.cat([share, share.flip(-1)])
     value, _, nothing = _sweep(both, table.bands)
     return (value[:, -1] - nothing[:, -1]).view(2, -1).amax(0)
 
 
+def _shares(labels: Tensor, table: ColourTable) -> Tensor:
+    """Share of the last axis that shows each colour, [C, ...] of labels [..., R]."""
+    each = torch.arange(1, len(table.colours) + 1, dtype=labels.dtype, device=labels.device)
+    return (labels == each.view(-1, *[1] * labels.ndim)).to(torch.float32).mean(-1)
+
+
 def _sweep(share: Tensor, bands: tuple[int, ...]) -> tuple[Tensor, list[Tensor], Tensor]:
     """Dynamic programming over the cuts: best value [K, T + 1], where each was cut, and the value of no band at all."""
-    others = share.sum(1)
     # Around the bands anything may lie; within, labels of another band speak against it, none at all less so: fingers.
-    gains = [-0.25 * others]
-    for band in bands:
-        gains.append(2 * share[:, band] - others - 0.6 * (1 - others))
-    gains.append(-0.25 * others)
-    sums = torch.nn.functional.pad(torch.stack(gains).cumsum(-1), (1, 0))
+    gains = torch.full((len(bands) + 2, share.shape[1]), -0.4, device=share.device)
+    gains[[0, -1]] = -0.25
+    for i, band in enumerate(bands):
+        gains[i + 1, band] += 2
+    least = torch.tensor([0.0] + [-0.6] * len(bands) + [0.0], device=share.device)
+    sums = torch.nn.functional.pad((gains @ share + least[:, None]).cumsum(-1), (1, 0)).transpose(0, 1)
     value, cuts = sums[0], []
     for total in sums[1:]:
         reached, where = (value - total).cummax(-1)
@@ -128,11 +134,11 @@ def _judged(
     share: Tensor, drape: Tensor, cuts: list[int], bands: tuple[int, ...], flipped: bool, middle: float
 ) -> Stretches:
     count = share.shape[1]
-    sums = torch.cat([torch.zeros_like(share[:, :1]), share.cumsum(1)], 1)
+    sums = torch.nn.functional.pad(share.cumsum(1), (1, 0)).tolist()
 
     def part(low: int, high: int) -> list[float]:
         low, high = max(0, low), min(count, high)
-        return ((sums[:, high] - sums[:, low]) / (high - low)).tolist() if high > low else [0.0] * len(share)
+        return [(row[high] - row[low]) / (high - low) if high > low else 0.0 for row in sums]
 
     edges, shown, whole, doubtful = [], [], [], []
     drowned = drape.tolist()
@@ -162,7 +168,7 @@ def _judged(
         edges.append((count - 1 - at if flipped else at) - middle if seen else torch.nan)
     for j, band in enumerate(bands):
         low, high = cuts[j], cuts[j + 1]
-        shown.append(float(sums[band, high] - sums[band, low]))
+        shown.append(sums[band][high] - sums[band][low])
         whole.append(float(high - low))
     device = share.device
     return Stretches(

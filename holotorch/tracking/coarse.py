@@ -52,12 +52,16 @@ class _Tiles:
 
 def _tiles(labels: Tensor, colours: int) -> _Tiles | None:
     height, width = labels.shape
-    place = labels.reshape(-1).nonzero()[:, 0]
-    if len(place) < 8:
+    flat = torch.nn.functional.pad(labels.flatten(), (0, -labels.numel() % 8))
+    words = flat.view(torch.int64).nonzero()[:, 0]  # eight at once: nearly all are nought
+    flat = flat.view(-1, 8).index_select(0, words).flatten()
+    lit = flat.nonzero()[:, 0]
+    if len(lit) < 8:
         return None
-    share = -(-len(place) // _MOST)
-    place = place[::share]
-    label = labels.reshape(-1)[place].long() - 1
+    share = -(-len(lit) // _MOST)
+    lit = lit[::share]
+    label = flat.index_select(0, lit).int() - 1
+    place = (8 * words.index_select(0, lit >> 3) + (lit & 7)).int()
     y, x = place // width, place % width
     rows, columns = -(-height // _TILE), -(-width // _TILE)
     key = (label * rows + y // _TILE) * columns + x // _TILE
@@ -65,7 +69,7 @@ def _tiles(labels: Tensor, colours: int) -> _Tiles | None:
     dy, dx = (y % _TILE).float(), (x % _TILE).float()
     sums = torch.zeros(6, total, device=labels.device)
     values = torch.stack([torch.ones_like(dx), dx, dy, dx * dx, dx * dy, dy * dy])
-    sums.index_add_(1, key, values)
+    sums.index_add_(1, key.long(), values)  # ten times as fast as by 32 bits
     count = sums[0]
     around = torch.nn.functional.avg_pool2d(
         count.view(colours, 1, rows, columns) * share / _TILE**2, 3, stride=1, padding=1
@@ -157,11 +161,11 @@ def _ranked(
     t = torch.arange(-half, half + 1, device=labels.device, dtype=mean.dtype)
     u = torch.tensor([-1.0, 0.0, 1.0, -7.0, 7.0], device=labels.device)
     across = torch.stack([-along[:, 1], along[:, 0]], -1)
-    place = mean[:, None, None] + t[:, None, None] * along[:, None, None] + u[:, None] * across[:, None, None]
-    x, y = place.round().long().unbind(-1)
+    middle, onward, aside = (value.T[..., None, None] for value in (mean, along, across))  # x before y in memory
+    x, y = (middle + t[:, None] * onward + u * aside).round().int()  # [K, T, 5] each
     inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
     index = y.clamp(0, height - 1) * width + x.clamp(0, width - 1)
-    found = labels.reshape(-1)[index.reshape(-1)].view(index.shape) * inside
+    found = labels.flatten().index_select(0, index.flatten()).view(index.shape) * inside
     drape = (found[..., 3:4] == found[..., 1:2]) & (found[..., 4:5] == found[..., 1:2])
     score = order_scores(found[..., :3] * ~drape, table)
     order = score.argsort(descending=True)[:_LINES]

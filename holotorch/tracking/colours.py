@@ -43,10 +43,10 @@ class ColourTable:
 
     def labels(self, red: Tensor, green: Tensor, blue: Tensor) -> Tensor:
         """uint8 [...] of the three channels, uint8 [...]."""
-        index = (red >> 3).to(torch.int32) << 10
-        index |= (green >> 3).to(torch.int32) << 5
-        index |= blue >> 3
-        return self.table.to(red.device).index_select(0, index.reshape(-1)).reshape(index.shape)
+        index = (red.to(torch.int16) & 0xF8) << 7
+        index |= (green.to(torch.int16) & 0xF8) << 2
+        index |= blue.to(torch.int16) >> 3
+        return self.table.to(red.device).index_select(0, index.flatten().int()).view(index.shape)
 
 
 def _chroma(light: Tensor) -> tuple[Tensor, Tensor]:

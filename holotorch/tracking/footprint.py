@@ -26,8 +26,7 @@ def width_px(pose: Pose, catheter: Catheter, line: Line) -> tuple[float, float]:
 def bulge_px(pose: Pose, catheter: Catheter, line: Line) -> Tensor:
     """How far along the line [N], in pixels, the front of each ring's image lies from that of its centre."""
     toward = (pose.tip @ pose.direction) * pose.direction - pose.tip
-    normal = toward / toward.norm()
     centres = pose.tip + catheter.positions.to(pose.tip.device)[:, None] * pose.direction
-    fronts = centres + catheter.radius * normal
-    (a, _), (b, _) = (line.place(points[:, :2] / points[:, 2:]) for points in (centres, fronts))
-    return b - a
+    points = torch.stack([centres, centres + catheter.radius * toward / toward.norm()])
+    t, _ = line.place(points[..., :2] / points[..., 2:])
+    return t[1] - t[0]

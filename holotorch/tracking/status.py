@@ -49,6 +49,14 @@ _STAGES = {
 }
 
 
+class Refusal(Exception):
+    """A stage that could not go on."""
+
+    def __init__(self, status: Status, reason: str):
+        super().__init__(reason)
+        self.status, self.reason = status, reason
+
+
 @dataclass(frozen=True, eq=False)
 class Pose:
     """Of one catheter or of many ([...]: leading axes, alike for all), in the camera's frame.

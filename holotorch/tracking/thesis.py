@@ -11,9 +11,8 @@ from torch import Tensor
 from holotorch.tracking import thesis_stages as stages
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import Catheter
-from holotorch.tracking.measure import Refusal
 from holotorch.tracking.pose import closed_form
-from holotorch.tracking.status import Pose
+from holotorch.tracking.status import Pose, Refusal
 from holotorch.tracking.thesis_stages import Axis, Box, Endpoints, Stopwatch
 
 

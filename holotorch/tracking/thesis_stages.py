@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from holotorch.tracking.catheter import Catheter
-from holotorch.tracking.measure import Refusal
-from holotorch.tracking.status import Pose, Status
+from holotorch.tracking.status import Pose, Refusal, Status
 
 # The rows of Table 3.1, in its order and words. The median belongs to "Gradient", the binary image to "Connected
 # components"; "Other" is what the call takes beyond the stages.

@@ -16,9 +16,10 @@ from holotorch.tracking.catheter import Catheter
 from holotorch.tracking.coarse import find_segments
 from holotorch.tracking.colours import ColourTable
 from holotorch.tracking.footprint import bulge_px, width_px
-from holotorch.tracking.measure import Axis, Edges, Refusal, find_bands, measure_axis, measure_edges
-from holotorch.tracking.pose import closed_form, solve_pose
-from holotorch.tracking.status import Pose, Status
+from holotorch.tracking.measure import Edges, find_bands, measure_edges
+from holotorch.tracking.resection import pose_on_line
+from holotorch.tracking.stations import Axis, look_across, measure_axis
+from holotorch.tracking.status import Pose, Refusal, Status
 from holotorch.tracking.strips import Line, Sampler
 
 _FLOOR = 0.015  # pixels: what model and pixels leave in an edge, however little noise there is;
@@ -33,7 +34,7 @@ class CatheterTracker:
     """Finds the catheter's bands on frames, and from their edges the pose.
 
     Coarse detection by a table of colours on every second pixel, a few line hypotheses, one strip of the frame along
-    each in the lens's own coordinates, edges in linear light, five unknowns by :func:`solve_pose`. With a previous pose
+    each in the lens's own coordinates, edges in linear light, the pose by :func:`pose_on_line`. With a previous pose
     only the strip around it is read. The work for a frame is bounded.
 
     Args:
@@ -64,8 +65,11 @@ class CatheterTracker:
         if previous is not None and len(previous) != len(frames):
             raise ValueError(f"{len(frames)} frames take {len(frames)} previous poses, got {len(previous)}")
         self.times = dict.fromkeys(("colour", "axis", "edges", "pose"), 0.0)
-        with torch.no_grad():
-            return [self._track(frame, previous[i] if previous else None) for i, frame in enumerate(frames)]
+        with torch.inference_mode():  # calls of a few microseconds, hundreds of them: a tenth of their time
+            poses = [self._track(frame, previous[i] if previous else None) for i, frame in enumerate(frames)]
+        names = ("tip", "direction", "covariance", "chi_square", "freedom")
+        # Its tensors may take part in no gradient; copies may.
+        return [dataclasses.replace(pose, **{name: getattr(pose, name).clone() for name in names}) for pose in poses]
 
     def _track(self, frame: Tensor, before: Pose | None) -> Pose:
         height, width = frame.shape[-2:]
@@ -75,17 +79,19 @@ class CatheterTracker:
         if before is not None and before.answered:
             try:
                 return self._along(sampler, self._expected(before), _MOVED, before)
-            except Refusal:
-                pass  # it moved more, or something hides it: look everywhere
+            except Refusal as refusal:
+                if refusal.status is Status.UNCERTAIN:  # it is there; looking everywhere finds no more of it
+                    return Pose.refused(refusal.status, refusal.reason)
+                # It moved more, or something hides it: look everywhere.
         with self._timed("colour"):
             segments = find_segments(frame, self.table)
         if not segments:
             return Pose.refused(Status.NO_CATHETER, "nothing thin in the bands' colours")
         first: Refusal | None = None
-        for segment in segments:
+        ends = torch.tensor([(segment.start, segment.end) for segment in segments], dtype=torch.float64)
+        for segment, plane in zip(segments, self.camera.undistort(ends.to(frame.device)), strict=True):
             try:
-                ends = torch.tensor([segment.start, segment.end], dtype=torch.float64, device=frame.device)
-                line = Line.through(self.camera, ends)
+                line = Line.between(self.camera, plane)
                 if not bool(torch.isfinite(line.origin).all()):
                     raise Refusal(Status.OUTSIDE_CAMERA, "it lies where the lens's distortion cannot be inverted")
                 length = math.dist(segment.start, segment.end)
@@ -110,24 +116,22 @@ class CatheterTracker:
         half = min(half, 1.5 * math.hypot(sampler.height, sampler.width))
         with self._timed("axis"):
             reach = min(0.15, 2 * aside / half) if before is not None else 0.06
-            line, stretches = find_bands(sampler, self.camera, line, self.table, half, aside, reach)
+            line, stretches, places = find_bands(sampler, self.camera, line, self.table, half, aside, reach)
             if stretches.known < 3:
                 few = "a band hides, is drowned by its surroundings or leaves the frame"
                 raise Refusal(Status.BANDS_MISSING, f"{stretches.known} edges of bands are seen, 3 are needed: {few}")
-            if before is None:
-                axis = measure_axis(sampler, self.camera, line, stretches, self._width(stretches), _THIRD, 0.9)
-            else:
-                wide = self._wide(before, line)
-                axis = measure_axis(sampler, self.camera, line, stretches, wide, _EXACT, 0.9)
-        guess, _ = axis.line.place(line.plane(stretches.edges, torch.zeros_like(stretches.edges)))
+            wide, known = (self._width(stretches), _THIRD) if before is None else (self._wide(before, line), _EXACT)
+            stations = look_across(sampler, self.camera, line, stretches, wide[0], 0.9)
+            axis = measure_axis(stations, wide, known, 0.9)
+        guess, _ = axis.line.place(line.plane(places))
         width = axis
         if before is not None:
             with self._timed("edges"):
                 curve = bulge_px(before, self.catheter, axis.line)
-                edges = measure_edges(sampler, self.camera, axis, guess, stretches.doubtful, 0.9, curve)
+                edges = measure_edges(sampler, self.camera, axis, guess - curve, stretches.doubtful, 0.9, curve)
             with self._timed("pose"):
                 # What the bulge has changed by is set right without another look at the frame: the mean over a front.
-                pose, bulge = self._sketched(axis, edges), curve
+                pose, bulge = self._solved(axis, edges), curve
                 again = bulge_px(pose, self.catheter, axis.line)
                 for _ in range(2):
                     edges = dataclasses.replace(edges, t=edges.t - math.pi / 4 * (again - bulge))
@@ -141,15 +145,19 @@ class CatheterTracker:
             with self._timed("edges"):
                 edges = measure_edges(sampler, self.camera, axis, guess, stretches.doubtful, 0.9)
             with self._timed("pose"):
-                pose = self._sketched(axis, edges)
+                pose = self._solved(axis, edges)
         with self._timed("axis"):
             # Once more, with the width that the pose and the radius give; what was found without them is the check.
             wide = self._wide(pose, line)
-            found = axis.line.plane(edges.t, torch.zeros_like(edges.t))
-            axis = measure_axis(sampler, self.camera, line, stretches, wide, _EXACT, edges.blur)
+            found = axis.line.plane(edges.t)
+            if not stations.show(wide[0], edges.blur):
+                stations = look_across(sampler, self.camera, line, stretches, wide[0], edges.blur)
+            axis = measure_axis(stations, wide, _EXACT, edges.blur, axis)
         with self._timed("edges"):
             curve = bulge_px(pose, self.catheter, axis.line)
             again, _ = axis.line.place(found)
+            if before is None:  # they were found as straight ones: at the mean over a front
+                again = again - math.pi / 4 * curve
             edges = measure_edges(sampler, self.camera, axis, again, stretches.doubtful, edges.blur, curve)
         with self._timed("pose"):
             return self._judged(self._solved(axis, edges), width, edges)
@@ -168,44 +176,26 @@ class CatheterTracker:
         scale = 1.15 * float((ends[0][1] - ends[0][0]) / (ends[1][1] - ends[1][0]))
         return min(max(2 * self.catheter.radius * scale, 2.0), _WIDEST), 0.0
 
-    def _sketched(self, axis: Axis, edges: Edges) -> Pose:
-        """Near enough to tell how much the rings' fronts bulge."""
-        known = self._known(edges)
-        t = edges.t[known]
-        pixels = self.camera.distort(axis.line.plane(t, torch.zeros_like(t)))
-        tip, direction = closed_form(pixels[None], self.catheter.positions.to(t.device)[known], self.camera)
-        none = torch.zeros((), dtype=t.dtype, device=t.device)
-        return Pose(tip[0], direction[0], none.expand(6, 6), none, none, Status.UNVERIFIED)
-
-    def _known(self, edges: Edges) -> Tensor:
-        known = torch.isfinite(edges.t)
-        count = int(known.sum())
-        if count < 3:
-            if edges.hidden:
-                raise Refusal(Status.EDGES_UNCLEAR, f"{count} edges are clear, 3 are needed: something lies across")
-            if edges.outside:
-                raise Refusal(Status.OUT_OF_FRAME, f"{count} edges lie within the frame, 3 are needed")
-            raise Refusal(Status.EDGES_UNCLEAR, f"{count} edges are clear, 3 are needed")
-        return known
-
     def _solved(self, axis: Axis, edges: Edges) -> Pose:
-        known = self._known(edges)
-        count, t = int(known.sum()), edges.t[known]
-        pixels = self.camera.distort(axis.line.plane(t, torch.zeros_like(t)))
+        known = torch.isfinite(edges.t)
+        t = edges.t[known]
+        if len(t) < 3:
+            count = f"{len(t)} edges"
+            if edges.hidden:
+                raise Refusal(Status.EDGES_UNCLEAR, f"{count} are clear, 3 are needed: something lies across")
+            if edges.outside:
+                raise Refusal(Status.OUT_OF_FRAME, f"{count} lie within the frame, 3 are needed")
+            raise Refusal(Status.EDGES_UNCLEAR, f"{count} are clear, 3 are needed")
         along = (edges.deviation[known].square() + _FLOOR**2 + (_ROUND * edges.bulge) ** 2).sqrt()
-        # All edges lie on one fitted line; this deviation gives the pose the line's own covariance.
-        spread = float((t - t.mean()).square().sum())
+        positions = self.catheter.positions.to(t.device)[known]
+        # Shading, the same all along, moves and turns a line by more than its fit tells: over the edges both deviations
+        # amount to the larger of the two.
+        reach = float((t - t.mean()).square().mean().sqrt())
         about = math.hypot(axis.offset_sd, axis.slope_sd * (float(t.mean()) - axis.centre))
-        across = max(about * math.sqrt(count), axis.slope_sd * math.sqrt(spread))
-        pose = solve_pose(
-            pixels[None],
-            self.catheter.positions.to(pixels.device)[known],
-            self.camera,
-            along_px=along[None],
-            across_px=across,
-        )[0]
+        most = max(about, axis.slope_sd * reach)
+        pose = pose_on_line(axis.line, t, positions, along, most, most / reach)
         if not pose.answered:
-            raise Refusal(Status(pose.status), "no pose in front of the camera explains the edges")
+            raise Refusal(Status.INCONSISTENT, pose.reason)
         return pose
 
     def _judged(self, pose: Pose, axis: Axis, edges: Edges) -> Pose:

@@ -123,7 +123,7 @@ def test_fewer_stations_are_fewer():
     some = methods(world, (COLD, FEWER))
     many, few = (track(case.frame(), case) for track in some.values())
     assert many.answered and few.answered and float((many.tip - few.tip).norm()) > 0
-    assert tracking_methods.measure._STATIONS > tracking_methods.STATIONS
+    assert tracking_methods.stations._STATIONS > tracking_methods.STATIONS
 
 
 def test_the_bound_is_that_of_the_edges():

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
-from kornia.geometry.calibration import undistort_points
+from kornia.geometry.calibration import distort_points, undistort_points
 from oracles import tracking as oracle
 
 from holotorch.tracking import Camera
@@ -32,6 +32,14 @@ def test_projects_as_the_formula_says(distortion):
     # Coordinates up to some thousands in float64: a few 1e-13.
     np.testing.assert_allclose(found, oracle.pixels(points, MATRIX.numpy(), distortion), rtol=0, atol=1e-11)
     assert camera(distortion).project(torch.tensor(points[:8], dtype=torch.float32).reshape(2, 4, 3)).shape == (2, 4, 2)
+
+
+@pytest.mark.parametrize("distortion", [MILD, (-0.3, 0.1, 2e-3, -1e-3, 0)])
+def test_kornia_and_ours_distort_alike(distortion):
+    plane = torch.tensor(np.random.default_rng(1).uniform(-0.6, 0.6, (4, 50, 2)))
+    given = torch.tensor(distortion, dtype=torch.float64)
+    theirs = distort_points(plane, MATRIX[None], given[None], torch.eye(3, dtype=torch.float64)[None])
+    torch.testing.assert_close(camera(distortion).distort(plane), theirs, rtol=0, atol=1e-11)  # rounding of 1e3 px
 
 
 def test_kornia_opencv_and_ours_undistort_alike():

@@ -22,12 +22,15 @@ def edges(place, blur, count=23):
 
 @pytest.mark.parametrize("blur", [0.4, 0.7, 1.0, 2.0, 3.0])
 def test_edges_without_noise_are_found(blur):
-    """Sums over samples a 32nd of a pixel wide have a variance of 1 / 12 / 32^2 more: a blur 2e-4 larger at most."""
+    """Sums over samples a 32nd of a pixel wide have a variance of 1 / 12 / 32^2 more: a blur 2e-4 larger at most.
+
+    Blurs are not sought on after a step below 0.03, which leaves a hundredth of it; places are.
+    """
     place = np.linspace(-1.4, 1.4, 15)
     light = edges(place, blur)
     fit = fit_edges(light, torch.full_like(light, 1e4))
     assert np.abs(fit.place.numpy() - place).max() < 1e-4
-    assert np.abs(fit.blur.numpy() - math.hypot(blur, 1 / 32 / math.sqrt(12))).max() < 3e-5
+    assert np.abs(fit.blur.numpy() - math.hypot(blur, 1 / 32 / math.sqrt(12))).max() < 3e-4
     torch.testing.assert_close(fit.levels, torch.from_numpy(BEFORE).expand_as(fit.levels), atol=1e-5, rtol=0)
     torch.testing.assert_close(fit.steps, torch.from_numpy(AFTER - BEFORE).expand_as(fit.steps), atol=2e-5, rtol=0)
 
