@@ -18,7 +18,7 @@ from holotorch.hologram.nodes import axial_range, choose_nodes
 from holotorch.hologram.raster import Raster, lit
 from holotorch.hologram.waves import AxialDesign, Waves
 
-_GROUP = 16  # planes that are spread at once, by one matrix product instead of a pass for each
+_GROUP = 16  # planes that are spread at once, by a matrix product per line instead of a pass for each
 
 
 class AxialHologram(LayerHologram):
@@ -147,7 +147,7 @@ class Accumulator:
         self.nodes = operator.design(shape).nodes
         self.begins, self.weights = self.nodes.weights(operator.depths)
         # Rows beyond a plane's own, so that a group holds several planes where they are sparse.
-        spare = math.ceil(_GROUP / 2 * self.nodes.count / len(operator.depths))
+        spare = round(_GROUP / 2 * self.nodes.count / len(operator.depths))
         self.rows = self.nodes.width + min(spare, self.nodes.width)
         self.waves: Waves | None = None
         self.total: Tensor | None = None
@@ -157,7 +157,7 @@ class Accumulator:
         self.rising: bool | None = None
         self.pending: list[tuple[int, Tensor]] = []
         self.open: set[int] = set()
-        self.block: Tensor | None = None  # [rows, h w] complex, or [rows, 2, h w] while all planes are real
+        self.block: Tensor | None = None  # [h, rows, w] complex, or [h, 2 rows, w] while all planes are real
 
     def add(self, j: int, plane: Tensor) -> None:
         """Add the plane of depth number ``j``, real or complex [h, w]; dark ones cost nothing."""
@@ -208,8 +208,10 @@ class Accumulator:
         flat, start, spare = planes.detach().flatten(1), 0, self.rows - self.nodes.width
         while start < len(flat):
             end = start + 1
-            while end < min(start + _GROUP, len(flat)) and abs(self.begins[end] - self.begins[start]) <= spare:
+            while end < len(flat) and abs(self.begins[end] - self.begins[start]) <= spare:
                 end += 1
+            # Groups of even sizes, where many planes touch the same nodes.
+            end = start + math.ceil((end - start) / math.ceil((end - start) / _GROUP))
             self._gather(flat[start:end], list(range(start, end)))
             start = end
 
@@ -226,24 +228,28 @@ class Accumulator:
         spread[slots, np.arange(len(order))] = self.weights[order].T
         matrix = torch.from_numpy(spread)
         dtype = torch.promote_types(stack.dtype, torch.complex64)
+        height, width = self.shape
         if self.block is None:
-            shape = (self.rows, stack.shape[1]) if stack.is_complex() else (self.rows, 2, stack.shape[1])
-            self.block = stack.new_zeros(shape, dtype=dtype if stack.is_complex() else dtype.to_real())
+            rows = self.rows if stack.is_complex() else 2 * self.rows
+            block = stack.new_zeros((height, rows, width), dtype=dtype if stack.is_complex() else dtype.to_real())
+            self.block = block
         elif stack.is_complex() and not self.block.is_complex():
-            self.block = torch.complex(self.block[:, 0], self.block[:, 1])
-        if self.block.is_complex():
-            self.block.addmm_(matrix.to(self.block), stack.to(self.block.dtype))
-        else:
+            self.block = torch.complex(self.block[:, ::2], self.block[:, 1::2])
+        if not self.block.is_complex():
             # Real planes: rows of real and imaginary parts in turn.
-            rows = torch.view_as_real(matrix).movedim(-1, 1).flatten(0, 1)
-            self.block.flatten(0, 1).addmm_(rows.to(self.block), stack.to(self.block.dtype))
+            matrix = torch.view_as_real(matrix).movedim(-1, 1).flatten(0, 1)
+        # A product for each line of the picture: so short a matrix takes a third less than one for all of it, which is
+        # copied into another order first.
+        lines = stack.to(self.block.dtype).view(len(order), height, width).transpose(0, 1)
+        self.block.baddbmm_(matrix.to(self.block).expand(height, -1, -1), lines)
 
     def _close(self, nodes: set[int]) -> None:
         """Take ``nodes``, that no later plane will touch, and make their rows free."""
         for index in sorted(nodes, reverse=self.rising is False):
             assert self.block is not None
-            row = self.block[index % self.rows]
-            self._take(index, row.clone() if row.is_complex() else torch.complex(row[0], row[1]))
+            k = index % self.rows
+            row = self.block[:, k] if self.block.is_complex() else self.block[:, 2 * k : 2 * k + 2]
+            self._take(index, row.clone() if row.is_complex() else torch.complex(row[:, 0], row[:, 1]))
             row.zero_()
         self.open = self.open - nodes
 
