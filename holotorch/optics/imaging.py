@@ -204,11 +204,9 @@ def _image(
     if paraxial:
         kernel = fresnel_kernel(padded, wave, plane)
     else:
-        kernel = angular_spectrum_kernel(padded, wave, plane, band_limit=False)
-        # On to the eyepiece exactly and back as the ray matrix has it.
-        s0 = display.lens_distance - plane
-        kernel = kernel * angular_spectrum_kernel(padded, wave, s0, band_limit=False)
-        kernel = kernel * fresnel_kernel(padded, wave, s0).conj()
+        # On to the eyepiece exactly, and back to the plane as the ray matrix has it.
+        kernel = angular_spectrum_kernel(padded, wave, display.lens_distance, band_limit=False)
+        kernel = kernel * fresnel_kernel(padded, wave, display.lens_distance - plane).conj()
     if whole:
         reach = [(n + w) / 2 * p for n, w, p in zip(grid.shape, sizes.window, grid.pitch, strict=True)]
         kernel = kernel * window_taper(padded, wave, number(plane), (reach[0], reach[1]), paraxial=paraxial)

@@ -6,6 +6,7 @@ import torch
 from holotorch import Grid
 from holotorch.core.fourier import filter_spectrum
 from holotorch.optics import angular_spectrum_kernel, carrier, fresnel_kernel
+from holotorch.optics.kernels import window_taper
 
 GRID = Grid((5, 6), (5e-6, 4e-6))
 FINE = Grid((5, 6), (0.2e-6, 0.24e-6))
@@ -102,3 +103,30 @@ def test_kernel_stays_finite_at_grazing_incidence():
     kernel = angular(Grid((1, 4), (1.0, 0.5e-6)), wavelength, 1e-6)
     (gradient,) = torch.autograd.grad(kernel.abs().sum() + kernel.real.sum(), wavelength)
     assert torch.isfinite(torch.view_as_real(kernel)).all() and torch.isfinite(gradient)
+
+
+@pytest.mark.parametrize("paraxial", [True, False])
+def test_a_window_keeps_what_can_reach_it_and_nothing_that_wraps(paraxial):
+    grid, wave, far, reach = Grid((400, 300), 4e-6), 520e-9, 20e-3, (0.5e-3, 0.4e-3)
+    weights = window_taper(grid, wave, far, reach, paraxial=paraxial)
+    fy, fx = (wave * each for each in grid.frequencies())
+    cosine = 1.0 if paraxial else torch.sqrt(1 - fy.square() - fx.square())
+    away = [far * sine.abs() / cosine + 0 * weights for sine in (fy, fx)]
+    ends = [extent - start for extent, start in zip(grid.extent, reach, strict=True)]
+    kept = (away[0] < 0.99 * reach[0]) & (away[1] < 0.99 * reach[1])
+    dropped = (away[0] > 1.01 * ends[0]) | (away[1] > 1.01 * ends[1])
+    assert kept.any() and dropped.any() and ((weights >= 0) & (weights <= 1)).all()
+    assert (weights[kept] == 1).all() and (weights[dropped] < 1e-30).all()
+    assert ((weights > 0) & (weights < 1)).any()
+    with pytest.raises(ValueError, match="a window of 0.0009 m to either side needs 0.0018 m, padded are 0.0016"):
+        window_taper(grid, wave, far, (0.9e-3, 0.4e-3))
+
+
+def test_a_window_of_one_line_and_steep_light():
+    line = window_taper(Grid((1, 64), 4e-6), 520e-9, 1e-3, (1e-9, 0.1e-3))
+    assert line.shape[-1] == 64 and (line == 1).all()  # 65 um at most
+    # Half a wavelength of pitch: the angle in the other plane counts.
+    steep = window_taper(Grid(64, 0.4e-6), 500e-9, 10e-6, (5e-6, 5e-6))
+    fy = torch.tensor(0.55 / 500e-9)
+    row, column = (int((each.flatten() - fy).abs().argmin()) for each in Grid(64, 0.4e-6).frequencies())
+    assert steep[row, 0] > steep[row, column]
