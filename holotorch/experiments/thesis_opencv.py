@@ -19,6 +19,11 @@ class ThesisOpenCV:
     Written to be a fair baseline: undistortion maps in fixed point, made once; 8-bit images throughout; filters within
     the box of the bands only. Frames whose memory is [H, W, 3], as cameras deliver them, are not copied.
 
+    Args:
+        camera: Whose frames come.
+        catheter: Its bands.
+        literal: Undistort each frame by ``cv2.undistort``, the function of that name, which makes its maps anew.
+
     Attributes:
         times: Seconds of each stage of the last call, by the names of Table 3.1; all frames of the batch together.
         endpoints: Of each frame of the last call, the bands' edges (x, y) in pixels of the undistorted frame, in the
@@ -30,8 +35,8 @@ class ThesisOpenCV:
     Source: Sec. 3.4 and Table 3.1 of the thesis, with its equations 3.5 to 3.12 corrected.
     """
 
-    def __init__(self, camera: Camera, catheter: Catheter):
-        self.camera, self.catheter = camera, catheter
+    def __init__(self, camera: Camera, catheter: Catheter, *, literal: bool = False):
+        self.camera, self.catheter, self.literal = camera, catheter, literal
         self.times: dict[str, float] = dict.fromkeys(stages.STAGES, 0.0)
         self.endpoints: list[Endpoints] = []
         windows = stages.windows(catheter)
@@ -86,7 +91,10 @@ class ThesisOpenCV:
             pixels = cv2.merge(list(frame))
         watch.lap("Other")
         assert self._maps is not None
-        image = cv2.remap(pixels, *self._maps, cv2.INTER_LINEAR)
+        if self.literal:
+            image = cv2.undistort(pixels, self._matrix, self._distortion)
+        else:
+            image = cv2.remap(pixels, *self._maps, cv2.INTER_LINEAR)
         watch.lap("Undistort")
         hsv = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)
         coloured = cv2.inRange(hsv, self._low, (180.0, 255.0, 255.0))  # type: ignore[call-overload]

@@ -19,7 +19,8 @@ from holotorch.tracking.tracker import CatheterTracker
 from holotorch.tracking.world import Case, World
 
 BASE, COLD, PRIOR, FEWER = "thesis, OpenCV", "ours, cold", "ours, prior", "ours, fewer stations"
-STATIONS = 24  # of the last one
+LITERAL = "thesis, OpenCV, maps anew"
+STATIONS = 24  # of the one with fewer
 WRONG = 5e-3  # metres from the truth
 # Photographs for backgrounds: a folder beside the checkout, or else those that scikit-image brings.
 PHOTOGRAPHS = Path(__file__).parents[3] / "shared" / "data" / "images"
@@ -65,10 +66,11 @@ def photographs() -> tuple[Tensor, ...]:
     return tuple((255 * image).round().to(torch.uint8) for image in images if len(image) == 3)
 
 
-def methods(world: World, names: Sequence[str] = (BASE, COLD, PRIOR, FEWER)) -> dict[str, Method]:
+def methods(world: World, names: Sequence[str] = (BASE, LITERAL, COLD, PRIOR, FEWER)) -> dict[str, Method]:
     """Trackers by name, each as a function of one frame [3, H, W] and its case (whose truth only the prior reads)."""
     camera, catheter = world.camera, world.catheter
     thesis, ours = ThesisOpenCV(camera, catheter), CatheterTracker(camera, catheter)
+    literal = ThesisOpenCV(camera, catheter, literal=True)
 
     def fewer(frame: Tensor, _: Case) -> Pose:
         # The tracker has no option for this: nothing but this comparison wants it.
@@ -77,6 +79,7 @@ def methods(world: World, names: Sequence[str] = (BASE, COLD, PRIOR, FEWER)) -> 
 
     known: dict[str, Method] = {
         BASE: lambda frame, _: thesis(frame[None])[0],
+        LITERAL: lambda frame, _: literal(frame[None])[0],
         COLD: lambda frame, _: ours(frame[None])[0],
         PRIOR: lambda frame, case: ours(frame[None], [before(case)])[0],
         FEWER: fewer,

@@ -113,6 +113,8 @@ def pooled(image: Tensor, stride: int) -> Tensor:
     if stride == 1:
         return image
     height, width = image.shape
-    # Rays lie on every stride-th pixel: cells are shifted so that each is in the middle of its own.
-    image = image.roll((stride // 2, stride // 2), (0, 1))
-    return image.reshape(height // stride, stride, width // stride, stride).mean((1, 3))
+    # Cells are shifted so that each ray is in the middle of its own; the first ones reach over the edge.
+    before = stride // 2
+    cells = torch.nn.functional.pad(torch.stack([image, torch.ones_like(image)]), (before, 0, before, 0))
+    cells = cells[:, :height, :width].reshape(2, height // stride, stride, width // stride, stride).sum((2, 4))
+    return cells[0] / cells[1]

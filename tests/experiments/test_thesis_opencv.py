@@ -46,6 +46,14 @@ def test_both_find_the_same_endpoints_and_poses():
         torch.testing.assert_close(one.covariance, other.covariance, rtol=0.05, atol=1e-2 * float(one.covariance.max()))
 
 
+def test_maps_made_anew_change_nothing_but_the_time():
+    """cv2.undistort keeps its maps in 1/32 pixel too."""
+    frames = torch.stack([scene(0.52, 20, 46), scene(0.4, 30, 120, seed=1)])
+    for literal, usual in zip(ThesisOpenCV(CAMERA, THESIS, literal=True)(frames), OPENCV(frames), strict=True):
+        assert literal.status == usual.status == Status.OK
+        assert (literal.tip - usual.tip).norm() < 0.2 * usual.tip_sd
+
+
 def test_both_refuse_alike():
     red, green, blue = THESIS.colours
     swapped = Catheter(THESIS.edges, (green, red, blue), THESIS.radius, THESIS.length)

@@ -17,6 +17,7 @@ from holotorch.experiments import pictures, volume_run
 from holotorch.experiments.config import load_config
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.volume import Part, build
+from holotorch.experiments.volume_judge import pooled
 from holotorch.experiments.volume_plan import plan, plan_text
 from holotorch.experiments.volume_run import run_volume
 from holotorch.hologram import ConvolutionHologram
@@ -230,3 +231,16 @@ def test_light_beside_the_rays_is_said(tmp_path):
     (note,) = (note for note in plan(wide)["notes"] if "beside the rays" in note)
     assert float(note.split(" %")[0]) == pytest.approx(50, abs=2)
     assert not any("beside" in note for note in plan(build(settings(source)))["notes"])
+
+
+def test_cells_around_rays_do_not_wrap():
+    """Rays on every fourth pixel: cells reach two pixels to either side, at the edges as far as there are any."""
+    picture = torch.zeros(8, 12, dtype=torch.float64)
+    picture[-1] = picture[:, -1] = 5.0
+    picture[1, 1], picture[3, 6] = 4.0, 16.0
+    cells = pooled(picture, 4)
+    assert cells.shape == (2, 3)
+    assert cells[0, 0] == 1.0  # 4 in 2 x 2 pixels, none of the far edges
+    assert cells[1, 1] == 0.0 and cells[1, 2] == 1.0  # rows 2..5, columns 2..5 and 6..9
+    assert torch.equal(pooled(picture, 1), picture)
+    assert torch.allclose(pooled(torch.ones(8, 12), 4), torch.ones(2, 3))
