@@ -64,7 +64,8 @@ class EyeSettings(Settings):
 class LightSettings(Settings):
     """Sources to compare, by name or by their FWHM.
 
-    ``tolerance``: of the sum over wavelengths, relative to a picture's rms brightness.
+    ``tolerance``: of the sum over wavelengths, and of making most of them from few, relative to a picture's rms
+    brightness.
     ``extent``: sine of the half angle under which the hologram sees the sources, discs; 0 for points.
     """
 

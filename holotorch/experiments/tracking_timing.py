@@ -23,7 +23,7 @@ KORNIA = "thesis, kornia"
 # What is timed, by the names of the world's conditions; the last ones need a photograph or make do without.
 _FRAMES = {"plain desk": ("plain",), "clutter": ("heavy clutter",), "drape": ("cloth as band 3",)}
 _PHOTOGRAPH = ("photograph 0", "texture")
-_REPEATS = 3
+_REPEATS = 9  # so many, since the machine sometimes stalls for 50 ms
 
 
 def timing(world: World, rounds: int) -> list[Row]:

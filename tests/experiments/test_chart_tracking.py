@@ -10,7 +10,7 @@ from holotorch.cli import main
 from holotorch.experiments import chart_tracking, tracking_bench, tracking_methods, tracking_timing
 from holotorch.experiments.chart_tracking import Amount
 from holotorch.experiments.tracking_bound import tip_bound
-from holotorch.experiments.tracking_methods import BASE, COLD, FEWER, PRIOR, Answer, before, methods
+from holotorch.experiments.tracking_methods import BASE, COLD, FEWER, LITERAL, PRIOR, Answer, before, methods
 from holotorch.experiments.tracking_timing import KORNIA
 from holotorch.io.images import encode_png
 from holotorch.tracking.camera import Camera
@@ -46,7 +46,7 @@ def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
             tables[name] = list(csv.DictReader(stream))
     assert [row["method"] for row in tables["chart"]] == [BASE, COLD, PRIOR, FEWER, "dissertation"]
     assert tables["chart"][-1]["3D_acc_mm"] == "0.85" and tables["chart"][-1]["data"].startswith("real camera")
-    assert {row["method"] for row in tables["times"]} == {BASE, COLD, PRIOR, FEWER, KORNIA}
+    assert {row["method"] for row in tables["times"]} == {BASE, LITERAL, COLD, PRIOR, FEWER, KORNIA}
     assert all(row["ratio"] == "1.0" for row in tables["times"] if row["method"] == BASE)
     for method in (BASE, KORNIA, COLD, PRIOR):
         shares = {row["stage"]: float(row["percent"]) for row in tables["stages"] if row["method"] == method}
