@@ -22,7 +22,7 @@ class Amount(NamedTuple):
     ``share`` of grids, conditions, occlusions and of the frames among which the slowest is sought.
     """
 
-    still: int = 50
+    still: int = 100
     seeds: int = 2
     poses: int = 4
     negatives: int = 1000

@@ -129,10 +129,11 @@ class World:
     def _desk(self) -> Tensor:
         return scenery.desk(self.size, self.seed)
 
-    def still(self, depth: float, tilt: float, count: int) -> list[Case]:
-        """``count`` frames of a catheter at rest, differing in noise only: Sec. 3.5.1. Metres, radians."""
-        place = self.pose(depth, tilt)
-        return [self.case(f"still {i}", place) for i in range(checks.whole("count", count, 1))]
+    def still(self, depth: float, tilt: float, count: int, at: Sequence[float] = (0.0, 0.0)) -> list[Case]:
+        """``count`` frames of a catheter at rest, differing in noise only: Sec. 3.5.1; in metres, radians."""
+        place = self.pose(depth, tilt, at=at)
+        where = f", {1e3 * at[0]:.3f} {1e3 * at[1]:.3f}" if any(at) else ""
+        return [self.case(f"still {i}{where}", place) for i in range(checks.whole("count", count, 1))]
 
     def grid_2d(self, depth: float = 0.52, tilt: float = math.radians(20)) -> list[Case]:
         """The sheet of Sec. 3.5.2: the tip at 9 x 9 places over 8.16 cm, row by row, always in the same direction.

@@ -65,17 +65,18 @@ def test_rows_of_a_catheter_at_rest(monkeypatch):
     """A method whose error is known: 1 and 3 mm along x in turn, with 2 mm of deviation stated."""
     monkeypatch.setattr(tracking_bench, "STILL", {(520, 20): 0.05})
     monkeypatch.setattr(tracking_bench, "tip_bound", lambda *_: torch.diag(torch.tensor([4e-8, 0, 0])))
-    turn = iter([1e-3, 3e-3] * 2)
+    turn = iter([1e-3, 3e-3] * 5)
 
     def known(_, case):
         pose = before(case, (next(turn), 0, 0), 0.0)
         return Pose(pose.tip, pose.direction, 4e-6 * torch.eye(6), pose.chi_square, pose.freedom, pose.status)
 
-    (row,), said = tracking_bench.still(small(), {"known": known}, 4)
-    # Changes of 2 mm; deviation sqrt(4 (1 mm)^2 / 3); bias 2 mm; 1 and 3 mm are within 2.8 deviations of 2 mm.
-    assert row["s_rms_mm"] == 2 and row["sd_mm"] == pytest.approx(math.sqrt(4 / 3), abs=1e-4) and row["bias_mm"] == 2
-    assert row["efficiency"] == pytest.approx(0.04 / (4 / 3), abs=1e-3) and row["coverage"] == 1
-    assert [answer.right for answer in said] == [True] * 4
+    (row,), said = tracking_bench.still(small(), {"known": known}, 10)
+    # Two frames at each of five places: changes of 2 mm, deviation sqrt(2 (1 mm)^2 / 1).
+    # Bias 2 mm; 1 and 3 mm are within 2.8 deviations of 2 mm.
+    assert row["s_rms_mm"] == 2 and row["sd_mm"] == pytest.approx(math.sqrt(2), abs=1e-4) and row["bias_mm"] == 2
+    assert row["efficiency"] == pytest.approx(0.04 / 2, abs=1e-3) and row["coverage"] == 1
+    assert [answer.right for answer in said] == [True] * 10
 
 
 def test_right_wrong_and_refused():
