@@ -2,8 +2,10 @@
 
 import itertools
 from dataclasses import dataclass
+from functools import lru_cache
 
-import torch
+import cv2
+import numpy as np
 from torch import Tensor
 
 from holotorch.tracking.bands import order_scores
@@ -14,164 +16,187 @@ _TILE = 12  # of those, along the side of a tile
 _DENSE = 0.35  # share of a tile and those around it that thin things never fill
 _MOST = 1 << 17  # coloured pixels that are looked at; of more, every second, third ...
 _TILES = 40  # for each colour
-_CANDIDATES = 32  # lines whose labels are read,
+_CANDIDATES = 16  # lines whose labels are read,
+_EVERY = 2  # coarse pixels along each,
 _LINES = 3  # and that are measured
 _ACROSS = 3.0  # coarse pixels beside a line that still count
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A line on the frame: two points (x, y) in pixels, where its coloured part begins and ends."""
+    """A line on the frame: two points x + i y in pixels, where its coloured part begins and ends."""
 
-    start: tuple[float, float]
-    end: tuple[float, float]
+    start: complex
+    end: complex
 
 
 def find_segments(frame: Tensor, table: ColourTable) -> list[Segment]:
     """The most promising lines on a frame uint8 [3, H, W], best first; empty where nothing thin is coloured."""
-    thin = frame[:, ::_STEP, ::_STEP]
-    labels = table.labels(thin[0], thin[1], thin[2])
+    labels = _labels(frame, table)
     tiles = _tiles(labels, len(table.colours))
     if tiles is None:
         return []
     lines = _lines(tiles, table)
     if lines is None:
         return []
-    return _ranked(labels, *lines, table)
+    mean, along, low, high = lines
+    return _ranked(labels, mean, along, low, high, table)
 
 
-@dataclass(frozen=True)
+def _labels(frame: Tensor, table: ColourTable) -> np.ndarray:
+    """uint8 [h, w] of every second pixel of every second row; the one step in which a frame is read as a whole."""
+    rows, aside = frame.movedim(0, -1)[::_STEP], _STEP
+    if frame.device.type != "cpu" or rows.stride()[1:] != (3, 1):
+        rows, aside = rows[:, ::_STEP].contiguous().cpu(), 1
+    # Five bits of each colour side by side, as the table wants them.
+    packed = cv2.cvtColor(rows.numpy(), cv2.COLOR_RGB2BGR555).view(np.uint16)[:, ::aside, 0]
+    return cv2.LUT(np.ascontiguousarray(packed), table.of_packed)
+
+
+@dataclass(frozen=True, eq=False)
 class _Tiles:
-    """Coloured parts of tiles [M]: label, pixels, centre [M, 2] and unit direction [M, 2] in coarse pixels."""
+    """Coloured parts of tiles [M]: label, pixels, centre [M] and unit direction [M], complex, in coarse pixels."""
 
-    label: Tensor
-    count: Tensor
-    centre: Tensor
-    along: Tensor
+    label: np.ndarray
+    count: np.ndarray
+    centre: np.ndarray
+    along: np.ndarray
 
 
-def _tiles(labels: Tensor, colours: int) -> _Tiles | None:
+def _tiles(labels: np.ndarray, colours: int) -> _Tiles | None:
     height, width = labels.shape
-    flat = torch.nn.functional.pad(labels.flatten(), (0, -labels.numel() % 8))
-    words = flat.view(torch.int64).nonzero()[:, 0]  # eight at once: nearly all are nought
-    flat = flat.view(-1, 8).index_select(0, words).flatten()
-    lit = flat.nonzero()[:, 0]
+    flat = labels.ravel()
+    if len(flat) % 8:
+        flat = np.pad(flat, (0, -len(flat) % 8))
+    words = flat.view(np.int64).nonzero()[0]  # eight at once: nearly all are nought
+    some = flat.reshape(-1, 8)[words].ravel()
+    lit = some.nonzero()[0]
     if len(lit) < 8:
         return None
     share = -(-len(lit) // _MOST)
     lit = lit[::share]
-    label = flat.index_select(0, lit).int() - 1
-    place = (8 * words.index_select(0, lit >> 3) + (lit & 7)).int()
-    y, x = place // width, place % width
+    place = 8 * words[lit >> 3] + (lit & 7)
     rows, columns = -(-height // _TILE), -(-width // _TILE)
-    key = (label * rows + y // _TILE) * columns + x // _TILE
-    total = colours * rows * columns
-    dy, dx = (y % _TILE).float(), (x % _TILE).float()
-    sums = torch.zeros(6, total, device=labels.device)
-    values = torch.stack([torch.ones_like(dx), dx, dy, dx * dx, dx * dy, dy * dy])
-    sums.index_add_(1, key.long(), values)  # ten times as fast as by 32 bits
-    count = sums[0]
-    around = torch.nn.functional.avg_pool2d(
-        count.view(colours, 1, rows, columns) * share / _TILE**2, 3, stride=1, padding=1
-    ).reshape(-1)
-    kept = ((count >= max(4, _TILE // (2 * share))) & (around < _DENSE)).nonzero()[:, 0]
+    total = rows * columns
+    tile, dx, dy = (of_place.take(place) for of_place in _places(height, width))
+    key = (some[lit].astype(np.intp) - 1) * total + tile
+    count = np.bincount(key, minlength=colours * total).astype(np.float32)
+    around = cv2.blur(
+        np.moveaxis(count.reshape(colours, rows, columns), 0, -1) * np.float32(share / _TILE**2),
+        (3, 3),
+        borderType=cv2.BORDER_CONSTANT,
+    ).reshape(rows, columns, colours)
+    thin = np.moveaxis(around, -1, 0).ravel() < _DENSE
+    kept = ((count >= max(4, _TILE // (2 * share))) & thin).nonzero()[0]
     if not len(kept):
         return None
-    n, sx, sy, xx, xy, yy = sums[:, kept]
+    among = np.full(len(count), len(kept))
+    among[kept] = np.arange(len(kept))
+    of = among[key]
+    some = of < len(kept)
+    of, dx, dy = of[some], dx[some], dy[some]
+    n = count[kept]
+    sx, sy, xx, xy, yy = (np.bincount(of, value, len(kept)) for value in (dx, dy, dx * dx, dx * dy, dy * dy))
     mx, my = sx / n, sy / n
     vx, vy, c = xx / n - mx * mx, yy / n - my * my, xy / n - mx * my
-    root = ((vx - vy).square() / 4 + c * c).sqrt()
+    root = np.sqrt((vx - vy) ** 2 / 4 + c * c)
     long, short = (vx + vy) / 2 + root, (vx + vy) / 2 - root
-    turn = 0.5 * torch.atan2(2 * c, vx - vy)
-    worth = (long / (short + 0.3)).clamp(max=20) * n.clamp(max=2 * _TILE)
-    chosen = []
-    of = kept // (rows * columns)
-    for colour in range(colours):
-        own = (of == colour).nonzero()[:, 0]
-        chosen.append(own[worth[own].topk(min(_TILES, len(own))).indices])
-    pick = torch.cat(chosen)
-    tile = kept[pick] % (rows * columns)
-    centre = torch.stack([mx[pick] + (tile % columns) * _TILE, my[pick] + (tile // columns) * _TILE], -1)
-    along = torch.stack([torch.cos(turn[pick]), torch.sin(turn[pick])], -1)
-    return _Tiles(of[pick], n[pick], centre, along)
+    worth = np.minimum(long / (short + 0.3), 20) * np.minimum(n, 2 * _TILE)
+    label, tile = np.divmod(kept, total)
+    pick = np.concatenate([_most(np.where(label == colour, worth, -1.0), _TILES, 0.0) for colour in range(colours)])
+    below, aside = np.divmod(tile[pick], columns)
+    centre = mx[pick] + aside * _TILE + 1j * (my[pick] + below * _TILE)
+    return _Tiles(label[pick], n[pick], centre, np.exp(0.5j * np.arctan2(2 * c, vx - vy)[pick]))
 
 
-def _lines(tiles: _Tiles, table: ColourTable) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
-    """Lines through two tiles of different bands: middle [K, 2], direction [K, 2], beginning and end [K] along it."""
-    starts, ends = [], []
+@lru_cache(maxsize=4)
+def _places(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each pixel: its tile, and where in it to the right and down. Dividing anew takes longer than looking it up."""
+    y, x = np.divmod(np.arange(height * width + 8), width)
+    (row, dy), (column, dx) = np.divmod(y, _TILE), np.divmod(x, _TILE)
+    return row * -(-width // _TILE) + column, dx.astype(np.float32), dy.astype(np.float32)
+
+
+def _most(worth: np.ndarray, count: int, least: float) -> np.ndarray:
+    """Places of the ``count`` largest values above ``least``, largest first."""
+    if len(worth) > 4 * count:
+        some = np.argpartition(-worth, count)[:count]
+        some = some[np.argsort(-worth[some], kind="stable")]
+    else:
+        some = np.argsort(-worth, kind="stable")[:count]
+    return some[worth[some] > least]
+
+
+def _lines(tiles: _Tiles, table: ColourTable) -> tuple[np.ndarray, ...] | None:
+    """Lines through two tiles of different bands: middle [K], direction [K], beginning and end [K] along it."""
+    pairs = []
     for one, other in itertools.combinations(range(len(table.colours)), 2):
-        i, j = (tiles.label == one).nonzero()[:, 0], (tiles.label == other).nonzero()[:, 0]
-        pairs = torch.cartesian_prod(i, j)
-        starts.append(pairs[:, 0])
-        ends.append(pairs[:, 1])
-    i, j = torch.cat(starts), torch.cat(ends)
-    if not len(i):
-        return None
+        i, j = (tiles.label == one).nonzero()[0], (tiles.label == other).nonzero()[0]
+        pairs.append((np.repeat(i, len(j)), np.tile(j, len(i))))
+    i, j = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
     gap = tiles.centre[j] - tiles.centre[i]
-    length = gap.norm(dim=-1)
-    along = gap / length.clamp(min=1e-3)[:, None]
-    agree = torch.minimum((along * tiles.along[i]).sum(-1).abs(), (along * tiles.along[j]).sum(-1).abs())
-    order = (agree * (length > 2)).topk(min(600, len(agree)))
-    good = order.indices[order.values > 0.85]
+    length = np.abs(gap)
+    along = gap / np.maximum(length, 1e-3)
+    back = along.conj()
+    agree = np.minimum(np.abs((back * tiles.along[i]).real), np.abs((back * tiles.along[j]).real))
+    good = _most(agree * (length > 2), 600, 0.85)
     if not len(good):
         return None
-    i, along = i[good], along[good]
-    normal = torch.stack([-along[:, 1], along[:, 0]], -1)
-    offsets = tiles.centre[None] - tiles.centre[i][:, None]
-    across, t = (offsets @ normal[..., None])[..., 0], (offsets @ along[..., None])[..., 0]
-    straight = (along @ tiles.along.T).abs() > 0.8
-    weight = tiles.count * ((across.abs() < _ACROSS) & straight)
+    i, back = i[good], back[good]
+    offsets = back[:, None] * (tiles.centre - tiles.centre[i, None])  # t + i u of all tiles on each line
+    t = offsets.real
+    straight = np.abs((back[:, None] * tiles.along).real) > 0.8
+    used = (np.abs(offsets.imag) < _ACROSS) & straight
+    weight = np.where(used, tiles.count, 0)
     colours = len(table.colours)
-    mine = torch.nn.functional.one_hot(tiles.label, colours).to(weight.dtype)
-    each = weight @ mine
+    each = weight @ (tiles.label[:, None] == np.arange(colours)).astype(weight.dtype)
     # Colours that are far from the others along the line are somebody else's.
-    middle = (weight * t).sum(-1) / weight.sum(-1).clamp(min=1e-6)
-    spread = ((weight * (t - middle[:, None]).square()).sum(-1) / weight.sum(-1).clamp(min=1e-6)).sqrt()
-    extent = 4 * spread + _TILE
-    filled = (each.sum(-1) / extent).clamp(max=3.0)
-    smallest = each.sort(-1, descending=True).values[:, : min(2, colours)].amin(-1)
-    score = (each.clamp(max=300).sum(-1) + 3 * smallest) * filled
-    best = score.topk(min(120, len(score))).indices
-    used = (weight[best] > 0).to(torch.float32)
-    shared = used @ used.T
-    alike = shared > 0.5 * torch.minimum(used.sum(-1)[:, None], used.sum(-1))
+    whole = np.maximum(weight.sum(-1), 1e-6)
+    middle = (weight * t).sum(-1) / whole
+    spread = np.sqrt((weight * (t - middle[:, None]) ** 2).sum(-1) / whole)
+    filled = np.minimum(each.sum(-1) / (4 * spread + _TILE), 3.0)
+    smallest = np.sort(each, -1)[:, -min(2, colours)]
+    score = (np.minimum(each, 300).sum(-1) + 3 * smallest) * filled
+    best = _most(score, 120, -1.0)
+    used = used[best].astype(np.float32)
+    shared, size = used @ used.T, used.sum(-1)
+    alike = shared > 0.5 * np.minimum(size[:, None], size)
     keep: list[int] = []
-    for k, row in enumerate(alike.tolist()):
-        if not any(row[other] for other in keep):
+    taken = np.zeros(len(best), dtype=bool)
+    for k, row in enumerate(alike):
+        if not taken[k]:
+            taken |= row
             keep.append(k)
             if len(keep) == _CANDIDATES:
                 break
     chosen = weight[best[keep]]
-    mean = chosen @ tiles.centre / chosen.sum(-1, keepdim=True)
-    offsets = tiles.centre[None] - mean[:, None]
-    moment = (offsets * chosen[..., None]).mT @ offsets
-    direction = torch.linalg.eigh(moment).eigenvectors[..., -1]
-    t = (offsets @ direction[..., None])[..., 0]
-    low = torch.where(chosen > 0, t, torch.inf).amin(-1) - _TILE / 2
-    high = torch.where(chosen > 0, t, -torch.inf).amax(-1) + _TILE / 2
-    return mean, direction, low, high
+    mean = chosen @ tiles.centre / chosen.sum(-1)
+    offsets = tiles.centre - mean[:, None]
+    # The longest axis of points lies at half the angle of their squares' sum.
+    onward = np.exp(0.5j * np.angle((chosen * offsets * offsets).sum(-1)))
+    t = (offsets * onward.conj()[:, None]).real
+    low = np.where(chosen > 0, t, np.inf).min(-1) - _TILE / 2
+    high = np.where(chosen > 0, t, -np.inf).max(-1) + _TILE / 2
+    return mean, onward, low, high
 
 
 def _ranked(
-    labels: Tensor, mean: Tensor, along: Tensor, low: Tensor, high: Tensor, table: ColourTable
+    labels: np.ndarray, mean: np.ndarray, along: np.ndarray, low: np.ndarray, high: np.ndarray, table: ColourTable
 ) -> list[Segment]:
     """The lines on which the bands' order explains most of the labels, best first."""
     height, width = labels.shape
     half = int(0.5 * max(height, width))
-    t = torch.arange(-half, half + 1, device=labels.device, dtype=mean.dtype)
-    u = torch.tensor([-1.0, 0.0, 1.0, -7.0, 7.0], device=labels.device)
-    across = torch.stack([-along[:, 1], along[:, 0]], -1)
-    middle, onward, aside = (value.T[..., None, None] for value in (mean, along, across))  # x before y in memory
-    x, y = (middle + t[:, None] * onward + u * aside).round().int()  # [K, T, 5] each
+    places = np.arange(-half, half + 1.0, _EVERY)[:, None] + 1j * np.array([-1.0, 0.0, 1.0, -7.0, 7.0])
+    points = mean[:, None, None] + along[:, None, None] * places  # [K, T, 5]
+    x, y = np.rint(points.real).astype(np.intp), np.rint(points.imag).astype(np.intp)
     inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    index = y.clamp(0, height - 1) * width + x.clamp(0, width - 1)
-    found = labels.flatten().index_select(0, index.flatten()).view(index.shape) * inside
+    found = labels.take(y * width + x, mode="clip") * inside
     drape = (found[..., 3:4] == found[..., 1:2]) & (found[..., 4:5] == found[..., 1:2])
     score = order_scores(found[..., :3] * ~drape, table)
-    order = score.argsort(descending=True)[:_LINES]
+    order = np.argsort(-score, kind="stable")[:_LINES]
     order = order[score[order] > 0]
-    starts, ends = mean + low[:, None] * along, mean + high[:, None] * along
-    segments = []
-    for start, end in zip((_STEP * starts[order]).tolist(), (_STEP * ends[order]).tolist(), strict=True):
-        segments.append(Segment((start[0], start[1]), (end[0], end[1])))
-    return segments
+    starts, ends = mean + low * along, mean + high * along
+    return [
+        Segment(start, end)
+        for start, end in zip((_STEP * starts[order]).tolist(), (_STEP * ends[order]).tolist(), strict=True)
+    ]

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,6 +21,8 @@ class ColourTable:
     Attributes:
         colours: The distinct colours of the catheter's bands.
         bands: For each band, which of ``colours`` it has.
+        table: uint8 [32768], by the upper five bits of red, green and blue.
+        of_packed: The same as OpenCV's look-up tables want it, [1, 65536].
 
     Raises:
         ValueError: Bands that are grey, or whose hues cannot be told apart.
@@ -39,14 +42,14 @@ class ColourTable:
             raise ValueError(f"hues of the bands must lie 25 degrees apart at least, got {self.colours}")
         like, label = (chroma @ wanted.T).max(-1)
         good = (like > math.cos(_TURN)) & (pure > _PURE * saturation[label]) & (cells.amax(-1) > 255 * _DARK)
-        self.table = torch.where(good, label + 1, 0).to(torch.uint8)
+        self.table = torch.where(good, label + 1, 0).to(torch.uint8).numpy()
+        self.of_packed = np.tile(self.table, 2)[None]  # the sixteenth bit says nothing
 
-    def labels(self, red: Tensor, green: Tensor, blue: Tensor) -> Tensor:
-        """uint8 [...] of the three channels, uint8 [...]."""
-        index = (red.to(torch.int16) & 0xF8) << 7
-        index |= (green.to(torch.int16) & 0xF8) << 2
-        index |= blue.to(torch.int16) >> 3
-        return self.table.to(red.device).index_select(0, index.flatten().int()).view(index.shape)
+    def labels(self, levels: np.ndarray) -> np.ndarray:
+        """uint8 [...] of levels uint8 [3, ...]."""
+        red, green, blue = levels >> (8 - _BITS)
+        index = (red.astype(np.intp) << 2 * _BITS) + (green.astype(np.intp) << _BITS) + blue
+        return self.table.take(index)
 
 
 def _chroma(light: Tensor) -> tuple[Tensor, Tensor]:

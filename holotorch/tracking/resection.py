@@ -1,19 +1,43 @@
 """The pose of a straight tool from where known points of it lie along one line of the image: three unknowns."""
 
 import math
+from dataclasses import dataclass
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from holotorch.tracking.status import Pose, Status
 from holotorch.tracking.strips import Line
 
 _STEPS = 2  # after a linear start that is right but for the noise, a thousandth or less; each squares what is left
 
 
+_Three = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A pose as :class:`holotorch.tracking.status.Pose` has it, in NumPy.
+
+    Attributes:
+        tip: [3] in metres.
+        direction: [3], unit vector.
+        covariance: [6, 6] of both.
+        chi_square: Of the points' places along the line.
+    """
+
+    tip: np.ndarray
+    direction: np.ndarray
+    covariance: np.ndarray
+    chi_square: float
+
+    @property
+    def tip_sd(self) -> float:
+        """In metres, over all three axes."""
+        return float(np.sqrt(self.covariance.diagonal()[:3].sum()))
+
+
 def pose_on_line(
-    line: Line, t: Tensor, positions: Tensor, deviation: Tensor, offset_sd: float, slope_sd: float
-) -> Pose:
+    line: Line, t: np.ndarray, positions: np.ndarray, deviation: np.ndarray, offset_sd: float, slope_sd: float
+) -> Found | None:
     """Pose of a tool whose image is ``line``; the part of :func:`solve_pose` that is left where the line is known.
 
     Tool and camera span a plane, whose image is the line. On it a point s from the tool's middle is seen at
@@ -29,40 +53,93 @@ def pose_on_line(
         slope_sd: Of the line, in radians; independent of the offset.
 
     Returns:
-        One pose; INCONSISTENT where none in front of the camera is near the points.
+        The pose, or None where none in front of the camera is near the points.
     """
-    middle, mean = t.mean(), positions.mean()
+    middle, mean = float(t.sum()) / len(t), float(positions.sum()) / len(t)
     far, long = t - middle, positions - mean
-    reach, length = far.abs().max(), long.abs().max()
-    x, s, weight = far / reach, long / length, reach / deviation
-    ones, rest = torch.ones_like(x), x * weight
-    h, seen, depth = x.new_zeros(3), x, ones
+    wide, length = float(np.abs(far).max()), float(np.abs(long).max())
+    if not wide > 0:
+        return None
+    points = list(zip((far / wide).tolist(), (long / length).tolist(), (wide / deviation).tolist(), strict=True))
+    h = (0.0, 0.0, 0.0)
     for _ in range(1 + _STEPS):
-        slopes = torch.stack([ones, s, -s * seen], -1) * (weight / depth)[:, None]
-        h = h + torch.linalg.solve_ex(slopes.mT @ slopes, slopes.mT @ rest).result
-        depth = 1 + h[2] * s
-        seen = (h[0] + h[1] * s) / depth
-        rest = (x - seen) * weight
-    chi_square = rest.square().sum()
-    if not (float(depth.min()) > 0 and math.isfinite(float(chi_square))):
-        return Pose.refused(Status.INCONSISTENT, "no pose in front of the camera explains the edges")
-    slopes = torch.stack([ones, s, -s * seen], -1) * (weight / depth)[:, None]
+        normal, slope, _, _ = _terms(points, h)
+        step = _solved(normal, slope)
+        h = (h[0] + step[0], h[1] + step[1], h[2] + step[2])
+    normal, _, chi_square, least = _terms(points, h)
+    if not (least > 0 and math.isfinite(chi_square)):
+        return None
     # Points of space are p e1 + q e2, up to one scale: tip and direction. A line that is not quite where it was found
     # moves them to the side.
-    (h0, h1, h2), (x0, y0), (ax, ay) = h.tolist(), line.plane(middle).tolist(), (line.along / line.scale).tolist()
-    wide, unit, start = float(reach), 1 / float(length), -float(mean) / float(length)
-    axes = t.new_tensor([[wide * ax, wide * ay, 0.0], [x0, y0, 1.0], [-ay, ax, 0.0]])
+    (h0, h1, h2), place, onward = h, complex(line.plane(middle)), line.along / line.scale
+    unit, start = 1 / length, -mean / length
+    axes = np.array(
+        [
+            [wide * onward.real, wide * onward.imag, 0.0],
+            [place.real, place.imag, 1.0],
+            [-onward.imag, onward.real, 0.0],
+        ]
+    )
     (p, q), (along, deep) = (h0 + h1 * start, 1 + h2 * start), (h1 * unit, h2 * unit)
-    raw = t.new_tensor([[p, q, 0.0], [along, deep, 0.0]]) @ axes
-    # How they move with h, and with the line's offset and slope.
-    tip = [[1.0, 0.0, 0.0], [start, 0.0, 0.0], [0.0, start, 0.0], [0.0, 0.0, q], [0.0, 0.0, p * wide]]
-    direction = [[0.0, 0.0, 0.0], [unit, 0.0, 0.0], [0.0, unit, 0.0], [0.0, 0.0, deep], [0.0, 0.0, along * wide]]
-    moved = t.new_tensor([tip, direction]) @ axes  # [2, 5, 3]
-    scale = raw[1].norm()
-    pose = raw / scale
-    moved = (moved - (moved[1] @ pose[1])[:, None] * pose[:, None]) / scale
-    own = torch.diag(t.new_tensor([0.0, 0.0, 0.0, offset_sd**2, slope_sd**2]))
-    own[:3, :3] = torch.linalg.inv_ex(slopes.mT @ slopes).inverse
-    lever = moved.mT.reshape(6, 5)
-    status = Status.OK if len(t) > 3 else Status.UNVERIFIED
-    return Pose(pose[0], pose[1], lever @ own @ lever.mT, chi_square, t.new_tensor(len(t) - 3.0), status)
+    # Tip and direction, how they move with h, and with the line's offset and slope.
+    tip = [[p, q, 0.0], [1.0, 0.0, 0.0], [start, 0.0, 0.0], [0.0, start, 0.0], [0.0, 0.0, q], [0.0, 0.0, p * wide]]
+    direction = [
+        [along, deep, 0.0],
+        [0.0, 0.0, 0.0],
+        [unit, 0.0, 0.0],
+        [0.0, unit, 0.0],
+        [0.0, 0.0, deep],
+        [0.0, 0.0, along * wide],
+    ]
+    raw = np.array([tip, direction]) @ axes  # [2, 6, 3]
+    raw /= np.sqrt(raw[1, 0] @ raw[1, 0])
+    pose, moved = raw[:, 0], raw[:, 1:]
+    moved = moved - (moved[1] @ pose[1])[:, None] * pose[:, None]
+    own = np.zeros((5, 5))
+    own[3, 3], own[4, 4] = offset_sd**2, slope_sd**2
+    for column, right in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))):
+        own[:3, column] = _solved(normal, right)
+    lever = moved.swapaxes(1, 2).reshape(6, 5)
+    covariance = lever @ own @ lever.T
+    return Found(pose[0], pose[1], covariance, chi_square) if np.isfinite(covariance).all() else None
+
+
+def _terms(points: list[tuple[float, float, float]], h: _Three) -> tuple[list[float], _Three, float, float]:
+    """Normal matrix (its six entries), slope, sum of weighted squares, and the least depth; x where h is nought.
+
+    In plain numbers: of so few points, the calls into NumPy would cost five times as much.
+    """
+    h0, h1, h2 = h
+    started = h1 != 0
+    a00 = a01 = a02 = a11 = a12 = a22 = b0 = b1 = b2 = chi = 0.0
+    least = math.inf
+    for x, s, weight in points:
+        depth = 1 + h2 * s
+        least = min(least, depth)
+        seen = (h0 + h1 * s) / depth if depth else math.inf
+        scaled = weight / depth if depth else math.inf
+        rest = (x - seen) * weight
+        one, two = scaled * s, -scaled * s * (seen if started else x)
+        a00 += scaled * scaled
+        a01 += scaled * one
+        a02 += scaled * two
+        a11 += one * one
+        a12 += one * two
+        a22 += two * two
+        b0 += scaled * rest
+        b1 += one * rest
+        b2 += two * rest
+        chi += rest * rest
+    return [a00, a01, a02, a11, a12, a22], (b0, b1, b2), chi, least
+
+
+def _solved(normal: list[float], right: _Three) -> _Three:
+    """Of a symmetric 3 x 3 system, by Cramer's rule; NaN where it has no one answer."""
+    a, b, c, d, e, f = normal
+    df, ce, be = d * f - e * e, c * e - b * f, b * e - c * d
+    whole = a * df + b * ce + c * be
+    if not whole > 0:
+        return (math.nan, math.nan, math.nan)
+    af, bc, ad = a * f - c * c, b * c - a * e, a * d - b * b
+    x, y, z = right
+    return (df * x + ce * y + be * z) / whole, (ce * x + af * y + bc * z) / whole, (be * x + bc * y + ad * z) / whole

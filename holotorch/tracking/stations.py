@@ -3,20 +3,20 @@
 import math
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
+import numpy as np
 
+from holotorch.tracking.axis_fit import AxisFit, fit_axis
 from holotorch.tracking.bands import Stretches
-from holotorch.tracking.camera import Camera
-from holotorch.tracking.fits import AxisFit, fit_axis
+from holotorch.tracking.lens import Lens
 from holotorch.tracking.status import Refusal, Status
 from holotorch.tracking.strips import Line, Sampler
 
 _LEVEL_SD = 2.5 / 255  # of a pixel's level; fits correct it by what they leave
 _ONE_SIDED = 0.15  # contrast to one side over that to the other
 _NARROWEST = 2.4  # pixels: below it no pixel shows one band alone
-_STATIONS = 40
-_SAMPLES = 4  # for each station
+_STATIONS = 24
+_SAMPLES = 3  # for each station
+_FOCUS = 0.1  # of a blur: how well edges and sides agree in it
 _LINE_FLOOR = 0.008  # of the width: what gloss and shadow, which repeat along the tube, may move its middle
 
 
@@ -42,9 +42,14 @@ class Axis:
     centre: float
     fit: AxisFit
 
-    def width_at(self, t: float) -> float:
+    @property
+    def blur(self) -> float:
+        """Of the sides, standard deviation in pixels."""
+        return float(self.fit.unknown[4])
+
+    def width_at(self, t: float | np.ndarray) -> np.ndarray:
         """Pixels."""
-        return self.width + self.taper * t
+        return self.width + self.taper * np.asarray(t)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,44 +58,37 @@ class Stations:
 
     line: Line
     extent: float
-    signal: Tensor
-    weight: Tensor
-    t: Tensor
-    band: Tensor
-    level: Tensor
+    signal: np.ndarray
+    weight: np.ndarray
+    t: np.ndarray
+    band: np.ndarray
+    level: np.ndarray
 
     def show(self, width: float, blur: float) -> bool:
         """Whether they reach beyond the sides of a tube so wide."""
         return self.signal.shape[1] > 2 * (0.6 * width + 3 + 2 * blur)
 
 
-def look_across(
-    sampler: Sampler, camera: Camera, line: Line, stretches: Stretches, width: float, blur: float
-) -> Stations:
+def look_across(sampler: Sampler, lens: Lens, line: Line, stretches: Stretches, width: float, blur: float) -> Stations:
     """Stations within the bands that are seen, of a tube some ``width`` pixels wide."""
     edges = stretches.edges.tolist()
     spans = [
-        (a + 3, b - 3, j)
-        for j, (a, b, shown, whole) in enumerate(
-            zip(edges, edges[1:], stretches.shown.tolist(), stretches.whole.tolist(), strict=False)
-        )
+        (a + 3, b - 3)
+        for a, b, shown, whole in zip(edges, edges[1:], stretches.shown, stretches.whole, strict=False)
         if math.isfinite(a) and math.isfinite(b) and b - a > 10 and shown > 0.3 * whole
     ]
     if not spans:
         raise Refusal(Status.BANDS_MISSING, "no band is seen from one end to the other")
-    device = sampler.frame.device
-    every = max(1.0, sum(b - a for a, b, _ in spans) / (_SAMPLES * _STATIONS))
+    every = max(1.0, sum(b - a for a, b in spans) / (_SAMPLES * _STATIONS))
     # Several samples for each station: along the tube neighbours differ in nothing but noise.
-    parts = [
-        torch.arange(a, max(a, b - (_SAMPLES - 1) * every), _SAMPLES * every, dtype=torch.float64) for a, b, _ in spans
-    ]
-    band = torch.cat([torch.full((len(part),), k) for k, part in enumerate(parts)]).to(device)
-    t = (torch.cat(parts)[:, None] + every * torch.arange(_SAMPLES)).to(device)
+    parts = [np.arange(a, max(a, b - (_SAMPLES - 1) * every), _SAMPLES * every) for a, b in spans]
+    band = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    t = np.concatenate(parts)[:, None] + every * np.arange(_SAMPLES)
     if len(t) < 6:
         raise Refusal(Status.TOO_NARROW, "the bands are a few pixels long")
     half = math.ceil(0.6 * width + 4 + 2 * blur)
-    u = torch.arange(2 * half + 1, dtype=torch.float64, device=device) - half
-    light = sampler(line.pixels(camera, t.flatten(), u).unflatten(0, t.shape)).mean(2)
+    u = np.arange(-half, half + 1.0)
+    light = sampler(line.pixels(lens, t.ravel(), u)).reshape(3, *t.shape, len(u)).sum(2) / np.float32(_SAMPLES)
     signal, weight, level = _contrast(light, u, width, band, len(spans))
     return Stations(line, float(t.max() - t.min()), signal, weight, t.mean(-1), band, level)
 
@@ -101,52 +99,63 @@ def measure_axis(
     """Mid-line and width; ``width`` and ``known`` as for ``fit_axis``, which begins at what was found ``before``."""
     given = stations.signal, stations.weight, stations.t, stations.band, stations.level
     fit = fit_axis(*given, width, blur, known, before.fit.unknown if before else None)
-    offset, slope, wide, taper = fit.sides
-    if not bool(torch.isfinite(fit.covariance).all()) or float(wide) > 2 * width[0] + 3:
+    axis = _axis(stations, fit)
+    if not np.isfinite(fit.covariance).all() or axis.width > 2 * width[0] + 3:
         raise Refusal(Status.NO_AXIS, "the bands have no clear sides")
-    if float(fit.contrast.min()) < _ONE_SIDED:
+    if min(fit.contrast) < _ONE_SIDED:
         raise Refusal(Status.NO_AXIS, "the bands' colours go on beside the line: too wide for the catheter")
-    if float((fit.weight > 0.2).double().mean()) < 0.5:
+    if 2 * np.count_nonzero(fit.weight > 0.2) < len(fit.weight):
         raise Refusal(Status.NO_AXIS, "the bands do not lie on one straight line: bent, or not a catheter")
-    width_sd = float(fit.covariance[2, 2].clamp(min=0).sqrt())
-    if float(wide) < _NARROWEST:
-        raise Refusal(Status.TOO_NARROW, f"the catheter is {float(wide):.1f} px wide; {_NARROWEST:g} px are needed")
-    variance, cross, other = fit.covariance[0, 0], fit.covariance[0, 1], fit.covariance[1, 1].clamp(min=1e-18)
-    centre = -cross / other
-    floor = _LINE_FLOOR * float(wide)
-    extent = max(20.0, stations.extent)
+    if axis.width + axis.width_sd < _NARROWEST:
+        raise Refusal(Status.TOO_NARROW, f"the catheter is {axis.width:.1f} px wide; {_NARROWEST:g} px are needed")
+    return axis
+
+
+def narrowed(stations: Stations, axis: Axis, width: tuple[float, float], known: float) -> Axis:
+    """The axis, where its width comes to be known."""
+    return _axis(stations, axis.fit.given(width, known))
+
+
+def focused(stations: Stations, axis: Axis, blur: float) -> Axis:
+    """The axis, where the blur of the lens comes to be known; where it is large, width and blur are hard to tell."""
+    return _axis(stations, axis.fit.blurred(blur, _FOCUS))
+
+
+def _axis(stations: Stations, fit: AxisFit) -> Axis:
+    offset, slope, wide, taper = fit.sides.tolist()
+    (variance, cross), (_, other) = fit.covariance[:2, :2].tolist()
+    other = max(other, 1e-18)
+    floor = _LINE_FLOOR * wide
     return Axis(
         stations.line.moved(offset, slope),
-        float(wide),
-        float(taper),
-        width_sd,
-        math.hypot(float((variance - cross * cross / other).clamp(min=0).sqrt()), floor),
-        math.hypot(float(other.sqrt()), 2 * floor / extent),
-        float(centre),
+        wide,
+        taper,
+        math.sqrt(max(float(fit.covariance[2, 2]), 0.0)),
+        math.hypot(math.sqrt(max(variance - cross * cross / other, 0.0)), floor),
+        math.hypot(math.sqrt(other), 2 * floor / max(20.0, stations.extent)),
+        -cross / other,
         fit,
     )
 
 
-def _contrast(light: Tensor, u: Tensor, width: float, band: Tensor, bands: int) -> tuple[Tensor, Tensor, Tensor]:
+def _contrast(light: np.ndarray, u: np.ndarray, width: float, band: np.ndarray, bands: int):
     """Light [3, S, U] as one signal [S, U], its inverse variances, and each band's own level in it [bands].
 
     The signal is the mix of channels, one for each band, in which tube and surroundings differ most over the noise.
     """
-    inner = (u.abs() <= max(0.6, 0.3 * width)).to(light.dtype)
-    outer = (u.abs() >= 0.5 * width + 1.5).to(light.dtype)
-    inside = (light * inner).sum(-1) / inner.sum()
-    beside = (light * outer).sum(-1) / outer.sum()
-    mean = torch.nn.functional.one_hot(band, bands).to(light.dtype)
-    mean = mean / mean.sum(0)
-    own, around = inside @ mean, beside @ mean  # [3, bands]
+    where = np.stack([np.abs(u) <= max(0.6, 0.3 * width), np.abs(u) >= 0.5 * width + 1.5], -1).astype(np.float32)
+    parts = light @ (where / where.sum(0))  # [3, S, 2]
+    member = (band[:, None] == np.arange(bands)).astype(np.float32)
+    own, around = np.moveaxis(parts, -1, 0) @ (member / np.maximum(member.sum(0), 1))  # [3, bands] each
     mixes = (own - around) / (variance_of(own) + variance_of(around))
-    mixes = mixes / mixes.norm(dim=0).clamp(min=1e-12)
-    mix = mixes[:, band]  # [3, S]
-    signal = (light * mix[..., None]).sum(0)
-    variance = (mix.square()[..., None] * variance_of(light)).sum(0) / _SAMPLES
-    return signal, 1 / variance.clamp(min=1e-30), (mixes * own).sum(0).to(torch.float64)
+    mixes = mixes / np.maximum(np.sqrt((mixes * mixes).sum(0)), 1e-12)
+    mix = mixes[:, band, None]  # [3, S, 1]
+    signal = (light * mix).sum(0)
+    variance = (mix * mix * variance_of(light)).sum(0) / _SAMPLES
+    return signal, 1 / np.maximum(variance, 1e-30), (mixes * own).sum(0).astype(np.float64)
 
 
-def variance_of(light: Tensor) -> Tensor:
+def variance_of(light: np.ndarray) -> np.ndarray:
     """Of light, from the noise of levels: the slope of the sRGB curve's inverse, which rises about as light^0.58."""
-    return (_LEVEL_SD * 2.4 / 1.055) ** 2 * light.clamp(min=0.002) ** (2.8 / 2.4)
+    # By logarithms, which NumPy has for vectors of the processor; its powers take ten times as long.
+    return np.exp(np.log(np.maximum(light, 0.002)) * (2.8 / 2.4) + 2 * math.log(_LEVEL_SD * 2.4 / 1.055))

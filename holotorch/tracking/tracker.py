@@ -1,33 +1,46 @@
 """CatheterTracker: frames in, for each a pose with its covariance or the reason why there is none."""
 
+import cmath
 import dataclasses
 import math
 import time
 from collections.abc import Sequence
 from contextlib import contextmanager
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from holotorch.core import checks
-from holotorch.tracking.bands import Stretches
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import Catheter
 from holotorch.tracking.coarse import find_segments
 from holotorch.tracking.colours import ColourTable
-from holotorch.tracking.footprint import bulge_px, width_px
-from holotorch.tracking.measure import Edges, find_bands, measure_edges
-from holotorch.tracking.resection import pose_on_line
-from holotorch.tracking.stations import Axis, look_across, measure_axis
+from holotorch.tracking.footprint import bulge_px, on_plane, width_px
+from holotorch.tracking.lens import Lens
+from holotorch.tracking.measure import Edges, find_bands, halfway, measure_edges
+from holotorch.tracking.resection import Found, pose_on_line
+from holotorch.tracking.stations import Axis, focused, look_across, measure_axis, narrowed
 from holotorch.tracking.status import Pose, Refusal, Status
 from holotorch.tracking.strips import Line, Sampler
 
-_FLOOR = 0.015  # pixels: what model and pixels leave in an edge, however little noise there is;
-_ROUND = 0.008  # and of what a ring's front bulges
+_FLOOR = 0.02  # pixels: what model, pixels and a table that shines through leave in an edge, however little noise;
+_ROUND = 0.008  # of what a ring's front bulges,
+_SOFT = 0.08  # of blur to all sides, since what lies beside the tube leaks into it,
+_SMEAR = 0.03  # and of blur along it, which is that of a lens or of a movement
 _UNLIKELY = {1: 10.83, 2: 13.82, 3: 16.27, 4: 18.47, 5: 20.52, 6: 22.46, 7: 24.32, 8: 26.12, 9: 27.88}  # 0.1 % of chi^2
-_THIRD, _EXACT = 0.35, 0.003  # how well the width is known before there is a pose, and after
+_SLANTED = 1.5  # times as wide as at a slight tilt, 55 degrees
+_PATH, _ALIKE = 2.5, 0.25  # longest way across, in widths, and how well the softness of the sides must agree with it,
+_CLEAR = 0.04  # where their distance is as clear as this
+_SLOW = 0.2  # of the width: a standard deviation that says that it may not have been reached yet
+_THIRD, _NEARLY, _EXACT = 0.35, 0.01, 0.002  # how well the width is known without a pose, from a rough one, and after
 _WIDEST = 120.0  # pixels
+_BLUR = 0.9  # pixels, to begin with,
+_SMEARED = 4.0  # and where it is larger,
+_BLURRED = 0.6  # from which edges that differ by more are looked at again,
+_BENT = 0.05  # as are those whose fronts bulge by so many pixels more or less than was thought
 _MOVED = 30.0  # pixels that a catheter may move between two frames
+_MEASURED = 2  # lines on a frame whose edges are looked at; those without bands cost little
 
 
 class CatheterTracker:
@@ -35,7 +48,11 @@ class CatheterTracker:
 
     Coarse detection by a table of colours on every second pixel, a few line hypotheses, one strip of the frame along
     each in the lens's own coordinates, edges in linear light, the pose by :func:`pose_on_line`. With a previous pose
-    only the strip around it is read. The work for a frame is bounded.
+    only the strip around it is read, 30 pixels to each side: what has left it is refused, and found again on a frame
+    that comes without one. The work for a frame is bounded.
+
+    Frames may be on any device; what is read of them, a few thousand pixels, is worked on by the host, where one of the
+    thousand small calls costs less than its start does elsewhere. Poses are the host's.
 
     Args:
         camera: Intrinsics and tone curve.
@@ -55,7 +72,8 @@ class CatheterTracker:
         self.camera, self.catheter = camera, catheter
         self.most_sd = checks.positive("most_sd", most_sd, "m")
         self.table = ColourTable(camera, catheter)
-        self.light = camera.table()
+        self.lens = Lens(camera)
+        self._positions = catheter.positions.numpy()
         self.times: dict[str, float] = {}
 
     def __call__(self, frames: Tensor, previous: Sequence[Pose] | None = None) -> list[Pose]:
@@ -65,119 +83,142 @@ class CatheterTracker:
         if previous is not None and len(previous) != len(frames):
             raise ValueError(f"{len(frames)} frames take {len(frames)} previous poses, got {len(previous)}")
         self.times = dict.fromkeys(("colour", "axis", "edges", "pose"), 0.0)
-        with torch.inference_mode():  # calls of a few microseconds, hundreds of them: a tenth of their time
-            poses = [self._track(frame, previous[i] if previous else None) for i, frame in enumerate(frames)]
-        names = ("tip", "direction", "covariance", "chi_square", "freedom")
-        # Its tensors may take part in no gradient; copies may.
-        return [dataclasses.replace(pose, **{name: getattr(pose, name).clone() for name in names}) for pose in poses]
+        return [self._track(frame, previous[i] if previous else None) for i, frame in enumerate(frames)]
 
     def _track(self, frame: Tensor, before: Pose | None) -> Pose:
         height, width = frame.shape[-2:]
         if height < 32 or width < 32:
             return Pose.refused(Status.BAD_FRAME, f"a frame of {height} x {width} px is too small")
-        sampler = Sampler(frame, self.light.to(frame.device))
-        if before is not None and before.answered:
-            try:
-                return self._along(sampler, self._expected(before), _MOVED, before)
-            except Refusal as refusal:
-                if refusal.status is Status.UNCERTAIN:  # it is there; looking everywhere finds no more of it
-                    return Pose.refused(refusal.status, refusal.reason)
-                # It moved more, or something hides it: look everywhere.
+        sampler = Sampler(frame, self.lens.light)
+        try:
+            if before is not None and before.answered:
+                found = _host(before)
+                return self._along(sampler, *self._expected(found), _MOVED, found)
+            return self._anywhere(sampler)
+        except Refusal as refusal:
+            return Pose.refused(refusal.status, refusal.reason)
+
+    def _anywhere(self, sampler: Sampler) -> Pose:
         with self._timed("colour"):
-            segments = find_segments(frame, self.table)
+            segments = find_segments(sampler.frame, self.table)
         if not segments:
-            return Pose.refused(Status.NO_CATHETER, "nothing thin in the bands' colours")
-        first: Refusal | None = None
-        ends = torch.tensor([(segment.start, segment.end) for segment in segments], dtype=torch.float64)
-        for segment, plane in zip(segments, self.camera.undistort(ends.to(frame.device)), strict=True):
+            raise Refusal(Status.NO_CATHETER, "nothing thin in the bands' colours")
+        first, measured = None, 0
+        planes = self.lens.undistort(np.array([(segment.start, segment.end) for segment in segments]).ravel())
+        for segment, (start, end) in zip(segments, planes.reshape(-1, 2).tolist(), strict=True):
             try:
-                line = Line.between(self.camera, plane)
-                if not bool(torch.isfinite(line.origin).all()):
+                line = Line.between(self.lens, start, end)
+                if not cmath.isfinite(line.origin + line.along):
                     raise Refusal(Status.OUTSIDE_CAMERA, "it lies where the lens's distortion cannot be inverted")
-                length = math.dist(segment.start, segment.end)
-                return self._along(sampler, (line, 0.5 * length + max(40.0, 0.7 * length)), 10.0, None)
+                length = abs(segment.end - segment.start)
+                return self._along(sampler, line, 0.5 * length + max(40.0, 0.7 * length), 10.0, None)
             except Refusal as refusal:
                 # What came nearest to a pose tells most.
                 if first is None or refusal.status > first.status:
                     first = refusal
+                measured += refusal.status is not Status.BANDS_MISSING
+                if measured == _MEASURED:
+                    break
         assert first is not None
-        return Pose.refused(first.status, first.reason)
+        raise first
 
-    def _expected(self, pose: Pose) -> tuple[Line, float]:
+    def _expected(self, found: Found) -> tuple[Line, float]:
         """Where the bands of a pose lie, and half their length with room to move."""
-        ends = pose.tip + self.catheter.positions[[0, -1], None] * pose.direction
-        line = Line.between(self.camera, ends[:, :2] / ends[:, 2:])
-        t, _ = line.place(ends[:, :2] / ends[:, 2:])
-        return line, float((t[1] - t[0]).abs()) / 2 + 1.5 * _MOVED
+        start, end = on_plane(found.tip + self._positions[[0, -1], None] * found.direction).tolist()
+        return Line.between(self.lens, start, end), abs(end - start) * self.lens.scale / 2 + 1.5 * _MOVED
 
-    def _along(self, sampler: Sampler, around: tuple[Line, float], aside: float, before: Pose | None) -> Pose:
-        """The pose on a line, or a Refusal."""
-        line, half = around
+    def _along(self, sampler: Sampler, line: Line, half: float, aside: float, before: Found | None) -> Pose:
+        """The pose on a line around which to look, ``half`` its length, or a Refusal."""
         half = min(half, 1.5 * math.hypot(sampler.height, sampler.width))
+        lens = self.lens
         with self._timed("axis"):
             reach = min(0.15, 2 * aside / half) if before is not None else 0.06
-            line, stretches, places = find_bands(sampler, self.camera, line, self.table, half, aside, reach)
+            line, stretches = find_bands(sampler, lens, line, self.table, half, aside, reach, onward=before is not None)
             if stretches.known < 3:
                 few = "a band hides, is drowned by its surroundings or leaves the frame"
                 raise Refusal(Status.BANDS_MISSING, f"{stretches.known} edges of bands are seen, 3 are needed: {few}")
-            wide, known = (self._width(stretches), _THIRD) if before is None else (self._wide(before, line), _EXACT)
-            stations = look_across(sampler, self.camera, line, stretches, wide[0], 0.9)
-            axis = measure_axis(stations, wide, known, 0.9)
-        guess, _ = axis.line.place(line.plane(places))
-        width = axis
-        if before is not None:
-            with self._timed("edges"):
-                curve = bulge_px(before, self.catheter, axis.line)
-                edges = measure_edges(sampler, self.camera, axis, guess - curve, stretches.doubtful, 0.9, curve)
-            with self._timed("pose"):
-                # What the bulge has changed by is set right without another look at the frame: the mean over a front.
-                pose, bulge = self._solved(axis, edges), curve
-                again = bulge_px(pose, self.catheter, axis.line)
-                for _ in range(2):
-                    edges = dataclasses.replace(edges, t=edges.t - math.pi / 4 * (again - bulge))
-                    pose, bulge = self._solved(axis, edges), again
-                    again = bulge_px(pose, self.catheter, axis.line)
-                    if float((again - bulge).abs().max()) < 0.01:
-                        break
-            if float((again - curve).abs().max()) < 0.05:
-                return self._judged(pose, width, edges)
-        else:
-            with self._timed("edges"):
-                edges = measure_edges(sampler, self.camera, axis, guess, stretches.doubtful, 0.9)
-            with self._timed("pose"):
-                pose = self._solved(axis, edges)
-        with self._timed("axis"):
-            # Once more, with the width that the pose and the radius give; what was found without them is the check.
-            wide = self._wide(pose, line)
-            found = axis.line.plane(edges.t)
-            if not stations.show(wide[0], edges.blur):
-                stations = look_across(sampler, self.camera, line, stretches, wide[0], edges.blur)
-            axis = measure_axis(stations, wide, _EXACT, edges.blur, axis)
+            places = halfway(sampler, lens, line, stretches.edges)
+            near = before or self._rough(line, places)
+            wide, known = (self._wide(near, line), _NEARLY) if near else (self._slight(places), _THIRD)
+            stations = look_across(sampler, lens, line, stretches, wide[0], _BLUR)
+            axis = width = measure_axis(stations, wide, known, _BLUR)
+            if before is None:
+                if (
+                    near
+                ):  # its own width is the check; beginning with one that is nearly right, gloss is not taken for it
+                    width = measure_axis(stations, wide, _THIRD, axis.blur, axis)
+                if not stations.show(width.width, width.blur):
+                    stations = look_across(sampler, lens, line, stretches, width.width, width.blur)
+                    other = abs(width.width - wide[0]) > 3 * width.width_sd
+                    axis = measure_axis(stations, wide, known, width.blur)
+                    own = (width.width, width.taper) if other else wide
+                    width = measure_axis(stations, own, _THIRD, width.blur, None if other else axis)
+                    if width.width_sd > _SLOW * wide[0]:  # width against blur: a long valley, and steps are small
+                        width = measure_axis(stations, (width.width, width.taper), _THIRD, width.blur)
         with self._timed("edges"):
-            curve = bulge_px(pose, self.catheter, axis.line)
-            again, _ = axis.line.place(found)
-            if before is None:  # they were found as straight ones: at the mean over a front
-                again = again - math.pi / 4 * curve
-            edges = measure_edges(sampler, self.camera, axis, again, stretches.doubtful, edges.blur, curve)
+            first = curve = self._bulge(near, axis.line) if near else np.zeros(len(places))
+            guess, _ = axis.line.place(line.plane(places))
+            blur = _BLUR
+            edges = measure_edges(sampler, lens, axis, guess - curve, stretches.doubtful, blur, curve)
+            if edges.blur > _SMEARED:  # it moved along itself: farther than what was looked at
+                blur = _SMEARED
+                edges = measure_edges(sampler, lens, axis, guess - curve, stretches.doubtful, blur, curve)
         with self._timed("pose"):
-            return self._judged(self._solved(axis, edges), width, edges)
+            # What the bulge has changed by is set right without another look at the frame: the mean over a front.
+            found = self._solved(axis, edges)
+            for _ in range(2):
+                bulge = self._bulge(found, axis.line)
+                if float(np.abs(bulge - curve).max()) < 0.01:
+                    break
+                edges = dataclasses.replace(edges, t=edges.t - math.pi / 4 * (bulge - curve))
+                found, curve = self._solved(axis, edges), bulge
+            plane, wide = axis.line.plane(edges.t), self._wide(found, line)
+        with self._timed("axis"):
+            # With the width that the pose and the radius give; what was found without them is the check.
+            if before is None and abs(edges.blur - _BLUR) > _BLURRED:
+                width = focused(stations, width, edges.blur)
+            if near:
+                axis = narrowed(stations, axis, wide, _EXACT)
+            else:
+                axis = measure_axis(stations, wide, _EXACT, axis.blur, axis)
+            edges = dataclasses.replace(edges, t=axis.line.place(plane)[0])
+        if float(np.abs(curve - first).max()) > _BENT or abs(edges.blur - blur) > _BLURRED:
+            with self._timed("edges"):
+                edges = measure_edges(sampler, lens, axis, edges.t, stretches.doubtful, edges.blur, curve)
+        with self._timed("pose"):
+            return self._judged(self._solved(axis, edges), width, axis.line, edges)
 
-    def _wide(self, pose: Pose, line: Line) -> tuple[float, float]:
+    def _rough(self, line: Line, places: np.ndarray) -> Found | None:
+        """A first pose, from where the colours change; None where one of these places may be no edge."""
+        known = np.isfinite(places)
+        count = int(known.sum())
+        if count < 4:
+            return None
+        found = pose_on_line(line, places[known], self._positions[known], np.ones(count), 1.0, 0.01)
+        wide, slight = (
+            width_px(found, self._positions, self.catheter.radius, line)[0] if found else 0.0,
+            self._slight(places)[0],
+        )
+        return found if slight / _SLANTED < wide < slight * _SLANTED else None
+
+    def _slight(self, places: np.ndarray) -> tuple[float, float]:
+        """Of the tube's image in pixels, roughly: from the bands' lengths at a slight tilt; and no taper."""
+        seen = np.isfinite(places).nonzero()[0][[0, -1]]
+        (a, b), (near, far) = places[seen].tolist(), self._positions[seen].tolist()
+        return min(max(2 * self.catheter.radius * 1.15 * (b - a) / (far - near), 2.0), _WIDEST), 0.0
+
+    def _bulge(self, found: Found, line: Line) -> np.ndarray:
+        return bulge_px(found, self._positions, self.catheter.radius, line)
+
+    def _wide(self, found: Found, line: Line) -> tuple[float, float]:
         """Of the tube's image in pixels and its taper, as the pose gives them; a Refusal where no camera sees such."""
-        width, taper = width_px(pose, self.catheter, line)
+        width, taper = width_px(found, self._positions, self.catheter.radius, line)
         if not 1.0 < width < _WIDEST or not abs(taper) < 1:
             raise Refusal(Status.INCONSISTENT, "no pose in front of the camera explains the edges")
         return width, taper
 
-    def _width(self, stretches: Stretches) -> tuple[float, float]:
-        """Of the tube's image in pixels, roughly: from the bands' lengths at a slight tilt; and no taper."""
-        seen = torch.isfinite(stretches.edges)
-        ends = stretches.edges[seen][[0, -1]], self.catheter.positions.to(seen.device)[seen][[0, -1]]
-        scale = 1.15 * float((ends[0][1] - ends[0][0]) / (ends[1][1] - ends[1][0]))
-        return min(max(2 * self.catheter.radius * scale, 2.0), _WIDEST), 0.0
-
-    def _solved(self, axis: Axis, edges: Edges) -> Pose:
-        known = torch.isfinite(edges.t)
+    def _solved(self, axis: Axis, edges: Edges) -> Found:
+        known = np.isfinite(edges.t)
         t = edges.t[known]
         if len(t) < 3:
             count = f"{len(t)} edges"
@@ -186,43 +227,54 @@ class CatheterTracker:
             if edges.outside:
                 raise Refusal(Status.OUT_OF_FRAME, f"{count} lie within the frame, 3 are needed")
             raise Refusal(Status.EDGES_UNCLEAR, f"{count} are clear, 3 are needed")
-        along = (edges.deviation[known].square() + _FLOOR**2 + (_ROUND * edges.bulge) ** 2).sqrt()
-        positions = self.catheter.positions.to(t.device)[known]
+        soft, smeared = (max(0.0, blur - _BLUR) for blur in (axis.blur, edges.blur))
+        floor = math.hypot(_FLOOR, _ROUND * edges.bulge, _SOFT * min(soft, smeared), _SMEAR * smeared)
+        along = np.hypot(edges.deviation[known], floor)
         # Shading, the same all along, moves and turns a line by more than its fit tells: over the edges both deviations
         # amount to the larger of the two.
-        reach = float((t - t.mean()).square().mean().sqrt())
-        about = math.hypot(axis.offset_sd, axis.slope_sd * (float(t.mean()) - axis.centre))
+        middle = float(t.sum()) / len(t)
+        reach = math.sqrt(float((t - middle) @ (t - middle)) / len(t))
+        about = math.hypot(axis.offset_sd, axis.slope_sd * (middle - axis.centre))
         most = max(about, axis.slope_sd * reach)
-        pose = pose_on_line(axis.line, t, positions, along, most, most / reach)
-        if not pose.answered:
-            raise Refusal(Status.INCONSISTENT, pose.reason)
-        return pose
+        found = pose_on_line(axis.line, t, self._positions[known], along, most, most / reach)
+        if found is None:
+            raise Refusal(Status.INCONSISTENT, "no pose in front of the camera explains the edges")
+        return found
 
-    def _judged(self, pose: Pose, axis: Axis, edges: Edges) -> Pose:
-        """The pose, if nothing speaks against it."""
-        count = int(torch.isfinite(edges.t).sum())
+    def _judged(self, found: Found, axis: Axis, line: Line, edges: Edges) -> Pose:
+        """The pose, if nothing speaks against it; ``axis`` is that with a width of its own."""
+        seen = edges.t[np.isfinite(edges.t)]
+        count = len(seen)
         freedom = count - 3  # the line is fitted by itself, so only places along it can disagree
         limit = _UNLIKELY.get(freedom, freedom + 4 * math.sqrt(2 * freedom) + 6) if freedom else math.inf
-        if float(pose.chi_square) > limit:
-            text = f"edges disagree with any pose: chi-square {float(pose.chi_square):.1f} of {freedom}"
+        if found.chi_square > limit:
+            text = f"edges disagree with any pose: chi-square {found.chi_square:.1f} of {freedom}"
             raise Refusal(Status.INCONSISTENT, text)
-        middle = float(edges.t.nanmean())
-        near, taper = width_px(pose, self.catheter, axis.line)
+        middle = float(seen.sum()) / count
+        near, taper = self._wide(found, axis.line)
         wide = near + taper * middle
-        ratio = axis.width_at(middle) / wide
-        most = min(0.45, (0.25 if freedom else 0.12) + (0.4 + 2 * axis.width_sd) / wide)
-        if axis.width_sd > (0.12 if freedom else 0.08) * wide:
+        ratio = float(axis.width_at(middle)) / wide
+        most = min(0.45, (0.25 if freedom else 0.12) + (0.4 + 2 * axis.width_sd + max(0.0, axis.blur - _BLUR)) / wide)
+        if axis.width_sd > (0.2 if freedom else 0.08) * wide:
             raise Refusal(Status.INCONSISTENT, f"{count} edges, and a width too unclear to check them with")
-        if abs(ratio - 1) > most:
-            away = float((pose.tip + self.catheter.positions.to(pose.tip.device).mean() * pose.direction)[2])
+        # What moves across by more than its width looks as wide as its path, with sides as soft as it is wide.
+        own = wide / math.sqrt(12)
+        due = math.hypot(edges.blur, own)
+        clear = axis.width_sd < _CLEAR * axis.width
+        moved = clear and 1 < ratio < _PATH and abs(axis.blur / due - 1) < _ALIKE
+        if min(axis.blur, edges.blur) > own:  # where blur is larger, the two are hard to tell apart; their sum is not
+            ratio = math.hypot(axis.blur, own * ratio) / due
+        if abs(ratio - 1) > most and not moved:
+            away = float((found.tip + self._positions.mean() * found.direction)[2])
             raise Refusal(Status.INCONSISTENT, f"{ratio:.2f} times as wide as it should be at {away:.2f} m")
-        if float(pose.tip_sd) > self.most_sd:
-            text = f"tip uncertain to {1e3 * float(pose.tip_sd):.1f} mm, above {1e3 * self.most_sd:g} mm"
+        if found.tip_sd > self.most_sd:
+            text = f"tip uncertain to {1e3 * found.tip_sd:.1f} mm, above {1e3 * self.most_sd:g} mm"
             raise Refusal(Status.UNCERTAIN, text)
         status = Status.OK if freedom else Status.UNVERIFIED
         reason = "" if freedom else "three edges determine a pose and leave nothing to check it with"
-        values = (pose.tip, pose.direction, pose.covariance, pose.chi_square)
-        return Pose(*values, pose.freedom.new_tensor(float(freedom)), status, reason)
+        tip, direction, covariance = map(torch.from_numpy, (found.tip, found.direction, found.covariance))
+        chi_square, degrees = torch.from_numpy(np.array([found.chi_square, freedom], dtype=np.float64))
+        return Pose(tip, direction, covariance, chi_square, degrees, status, reason)
 
     @contextmanager
     def _timed(self, stage: str):
@@ -231,3 +283,11 @@ class CatheterTracker:
             yield
         finally:
             self.times[stage] += time.perf_counter() - began
+
+
+def _host(pose: Pose) -> Found:
+    """The same in NumPy, whatever device it is on."""
+    tip, direction, covariance = (
+        value.detach().to("cpu", torch.float64).numpy() for value in (pose.tip, pose.direction, pose.covariance)
+    )
+    return Found(tip, direction, covariance, float(pose.chi_square))

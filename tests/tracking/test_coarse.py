@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from holotorch.tracking.catheter import THESIS
 from holotorch.tracking.coarse import Segment, find_segments
@@ -15,23 +16,29 @@ SIZE = (360, 640)
 TABLE = ColourTable(synthetic_camera(), THESIS)
 
 
-def drawn(middle, angle, length=240.0, width=6.0, ground=120, order=(0, 1, 2), noise=0.0, seed=8) -> torch.Tensor:
+def drawn(
+    middle, angle, length=240.0, width=6.0, ground=120, order=(0, 1, 2), noise=0.0, seed=8, size=SIZE
+) -> torch.Tensor:
     """Frame of three bands in a row around ``middle``, the first of them at the beginning."""
     rng = np.random.default_rng(seed)
-    y, x = np.mgrid[: SIZE[0], : SIZE[1]].astype(float)
+    y, x = np.mgrid[: size[0], : size[1]].astype(float)
     t = (x - middle[0]) * math.cos(angle) + (y - middle[1]) * math.sin(angle)
     u = -(x - middle[0]) * math.sin(angle) + (y - middle[1]) * math.cos(angle)
     cover = np.clip(width / 2 + 0.5 - np.abs(u), 0, 1) * np.clip(length / 2 + 0.5 - np.abs(t), 0, 1)
     band = np.clip((t + length / 2) * 3 / length, 0, 2).astype(int)
     colour = np.array([THESIS.colours[i] for i in order], float)[band]
-    frame = ground + cover[..., None] * (colour - ground) + noise * rng.normal(size=(*SIZE, 3))
+    frame = ground + cover[..., None] * (colour - ground) + noise * rng.normal(size=(*size, 3))
     return torch.from_numpy(np.clip(np.round(frame), 0, 255).astype(np.uint8)).permute(2, 0, 1).contiguous()
+
+
+def places(segment: Segment, middle, angle) -> NDArray[np.complex128]:
+    """Of the segment's ends, along the line from ``middle`` and beside it."""
+    return (np.array([segment.start, segment.end]) - complex(*middle)) * np.exp(-1j * angle)
 
 
 def missed(segment: Segment, middle, angle) -> float:
     """How far the segment's ends lie beside the line, in pixels."""
-    ends = np.array([segment.start, segment.end]) - middle
-    return float(np.abs(ends @ [-math.sin(angle), math.cos(angle)]).max())
+    return float(np.abs(places(segment, middle, angle).imag).max())
 
 
 @pytest.mark.parametrize("degrees", range(0, 360, 15))
@@ -42,7 +49,7 @@ def test_lines_are_found_in_all_directions(degrees):
     assert 1 <= len(found) <= 3
     assert missed(found[0], middle, angle) < 2
     # It reaches over the bands, to a tile or two.
-    along = (np.array([found[0].start, found[0].end]) - middle) @ [math.cos(angle), math.sin(angle)]
+    along = places(found[0], middle, angle).real
     assert abs(along.min() + 120) < 48 and abs(along.max() - 120) < 48
 
 
@@ -99,3 +106,27 @@ def test_one_colour_alone_is_no_line():
 def test_it_is_the_same_each_time():
     frame = drawn((320, 180), 0.4, noise=5.0)
     assert find_segments(frame, TABLE) == find_segments(frame, TABLE)
+
+
+@pytest.mark.parametrize("size", [(360, 640), (361, 640), (360, 641), (359, 637), (25, 203), (203, 27)])
+def test_memory_of_any_layout_gives_the_same_lines(size):
+    """Planes, a camera's colours side by side, a part of a larger frame, every second column: all to the last bit."""
+    middle = (size[1] / 2, size[0] / 2)
+    frame = drawn(middle, math.pi / 2 if size[0] > size[1] else 0.0, 150.0, noise=5.0, size=size)
+    wanted = find_segments(frame, TABLE)
+    assert len(wanted) >= 1 and missed(wanted[0], middle, math.pi / 2 if size[0] > size[1] else 0.0) < 2
+    camera = frame.permute(1, 2, 0).contiguous().permute(2, 0, 1)
+    part = torch.zeros(size[0] + 3, size[1] + 5, 3, dtype=torch.uint8)[1:-2, 3:-2].permute(2, 0, 1)
+    four = torch.zeros(*size, 4, dtype=torch.uint8)[..., :3].permute(2, 0, 1)
+    wide = torch.zeros(3, size[0], 2 * size[1], dtype=torch.uint8)[..., ::2]
+    for other in (part, four, wide):
+        other[:] = frame
+    for other in (camera, part, four, wide):
+        assert other.stride() != frame.stride() and find_segments(other, TABLE) == wanted
+
+
+@pytest.mark.parametrize("border", [0.0, 638.0])
+def test_lines_along_the_border_are_found(border):
+    """Half of the tube is on the frame, and of that every second pixel."""
+    found = find_segments(drawn((border, 180), math.pi / 2, width=8.0, noise=2.5), TABLE)
+    assert missed(found[0], (border, 180), math.pi / 2) < 4

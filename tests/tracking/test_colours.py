@@ -1,8 +1,8 @@
 """The table of colours against angles between chromas that are computed one by one."""
 
+import cv2
 import numpy as np
 import pytest
-import torch
 
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import THESIS, Catheter
@@ -19,14 +19,15 @@ def light_of(levels) -> np.ndarray:
     return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 
 
-def levels_of(light) -> torch.Tensor:
+def levels_of(light) -> np.ndarray:
     light = np.clip(light, 0, 1)
     share = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    return torch.from_numpy(np.round(255 * share).astype(np.uint8))
+    return np.round(255 * share).astype(np.uint8)
 
 
-def labels(levels: torch.Tensor, table: ColourTable = TABLE) -> list[int]:
-    return table.labels(*levels.unbind(-1)).tolist()
+def labels(levels: np.ndarray, table: ColourTable = TABLE) -> list[int]:
+    """Of levels [..., 3]."""
+    return table.labels(np.moveaxis(levels, -1, 0)).tolist()
 
 
 @pytest.mark.parametrize("band", range(3))
@@ -40,11 +41,11 @@ def test_bands_keep_their_label_in_light_and_shade(band):
 
 
 def test_what_is_grey_dark_or_of_another_hue_is_nothing():
-    greys = torch.arange(256, dtype=torch.uint8)[:, None].expand(-1, 3)
+    greys = np.arange(256, dtype=np.uint8)[:, None].repeat(3, 1)
     assert not any(labels(greys))
-    dark = torch.from_numpy(np.random.default_rng(1).integers(0, 24, (500, 3)).astype(np.uint8))
+    dark = np.random.default_rng(1).integers(0, 24, (500, 3)).astype(np.uint8)
     assert not any(labels(dark))
-    others = torch.tensor([[230, 220, 40], [200, 50, 190], [60, 190, 190]], dtype=torch.uint8)
+    others = np.array([[230, 220, 40], [200, 50, 190], [60, 190, 190]], dtype=np.uint8)
     assert not any(labels(others))  # yellow, magenta, cyan
 
 
@@ -66,7 +67,7 @@ def test_random_colours_are_judged_by_their_angle_in_linear_light():
     angle = np.degrees(np.arccos(np.clip(direction @ wanted.T, -1, 1)))
     nearest, least = angle.argmin(-1), angle.min(-1)
     share, bright = pure / saturation[nearest], levels.max(-1) > 60
-    found = np.array(labels(torch.from_numpy(levels)))
+    found = np.array(labels(levels))
     inside = bright & (least < 24) & (share > 0.5)
     outside = bright & ((least > 40) | (share < 0.2))
     assert inside.sum() > 1000 and outside.sum() > 1000
@@ -75,12 +76,24 @@ def test_random_colours_are_judged_by_their_angle_in_linear_light():
 
 
 def test_labels_keep_the_shape_and_take_any_strides():
-    frame = torch.zeros(3, 6, 8, dtype=torch.uint8)
-    frame[:, 2, 4] = torch.tensor(THESIS.colours[1], dtype=torch.uint8)
-    thin = frame[:, ::2, ::2]
-    found = TABLE.labels(*thin)
-    assert found.dtype == torch.uint8 and found.shape == (3, 4)
-    assert found.nonzero().tolist() == [[1, 2]] and found[1, 2] == 2
+    frame = np.zeros((3, 6, 8), dtype=np.uint8)
+    frame[:, 2, 4] = THESIS.colours[1]
+    found = TABLE.labels(frame[:, ::2, ::2])
+    assert found.dtype == np.uint8 and found.shape == (3, 4)
+    assert np.argwhere(found).tolist() == [[1, 2]] and found[1, 2] == 2
+    assert TABLE.labels(frame[:, 2, 4]).shape == () and TABLE.labels(frame[:, :0]).shape == (0, 8)
+
+
+def test_the_packed_table_is_the_same_one():
+    """Of all colours by OpenCV's 15 bits, whose sixteenth says nothing."""
+    levels = np.arange(32, dtype=np.uint8) * 8 + 5
+    cells = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), -1).reshape(1, -1, 3)
+    packed = cv2.cvtColor(cells, cv2.COLOR_RGB2BGR555).view(np.uint16)[..., 0]
+    wanted = TABLE.labels(np.moveaxis(cells, -1, 0))
+    assert TABLE.of_packed.shape == (1, 1 << 16) and len(set(wanted.ravel().tolist())) == 4
+    for bit in (0, 1 << 15):
+        assert np.array_equal(TABLE.of_packed[0, packed | bit], wanted)
+    assert np.array_equal(cv2.LUT(packed, TABLE.of_packed), wanted)
 
 
 def test_the_tone_curve_counts():
@@ -91,7 +104,7 @@ def test_the_tone_curve_counts():
     table = ColourTable(camera, catheter)
     for band, colour in enumerate(THESIS.colours):
         light = np.linspace(0.5, 1.5, 20)[:, None] * light_of(colour)
-        assert labels(torch.from_numpy(np.round(255 * np.clip(light, 0, 1)).astype(np.uint8)), table) == [band + 1] * 20
+        assert labels(np.round(255 * np.clip(light, 0, 1)).astype(np.uint8), table) == [band + 1] * 20
 
 
 def test_repeated_colours_are_one():
@@ -99,7 +112,7 @@ def test_repeated_colours_are_one():
     catheter = Catheter((0.01, 0.03, 0.05, 0.07, 0.09), (red, green, red, blue), 1e-3, 0.2)
     table = ColourTable(CAMERA, catheter)
     assert table.colours == (red, green, blue) and table.bands == (0, 1, 0, 2)
-    assert torch.equal(table.table, TABLE.table)
+    assert np.array_equal(table.table, TABLE.table) and np.array_equal(table.of_packed, TABLE.of_packed)
 
 
 @pytest.mark.parametrize(

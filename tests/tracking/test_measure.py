@@ -1,20 +1,55 @@
 """Edges of bands from the light along a line."""
 
 import math
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
-from holotorch.tracking.measure import _halfway
+from holotorch.tracking.camera import Camera
+from holotorch.tracking.lens import Lens
+from holotorch.tracking.measure import halfway
+from holotorch.tracking.strips import Line
+
+LENS = Lens(
+    Camera(torch.tensor([[700.0, 0, 480], [0, 700, 270], [0, 0, 1]]), torch.tensor([-0.3, 0.1, 2e-3, -1e-3, 0]))
+)
+LINE = Line.between(LENS, -0.1 + 0.02j, 0.12 + 0.05j)
+LEVELS = np.array([[0.1, 0.5, 0.2], [0.6, 0.1, 0.15], [0.2, 0.3, 0.7]])  # light of three bands
+
+
+def seen(places: list[float], blur: float) -> Any:
+    """Light at pixels, in the place of a frame's: ``LEVELS`` on the line, with edges at ``places`` along it."""
+
+    def light(pixels: np.ndarray) -> np.ndarray:
+        t, _ = LINE.place(LENS.undistort(pixels.ravel()))
+        found = np.broadcast_to(LEVELS[0][:, None], (3, len(t))).copy()
+        for i, place in enumerate(places):
+            rise = [0.5 * math.erfc((place - value) / blur / math.sqrt(2)) for value in t]
+            found += (LEVELS[i + 1] - LEVELS[i])[:, None] * np.array(rise)
+        return found.reshape(3, *pixels.shape).astype(np.float32)
+
+    return light
 
 
 @pytest.mark.parametrize("blur", [0.5, 0.9, 1.5])
 def test_edges_lie_where_the_light_is_halfway(blur):
     """Steps of an error function: samples a pixel apart miss 2 exp(-2 pi^2 blur^2) / 2 pi, wide ones reach the ends."""
-    t = torch.arange(-6, 7, dtype=torch.float64)
-    places = torch.tensor([0.3, -1.2], dtype=torch.float64)
-    rise = 0.5 * torch.erfc((places[:, None] - t) / blur / math.sqrt(2))
-    before, after = torch.tensor([[0.1, 0.5, 0.2], [0.6, 0.1, 0.15]], dtype=torch.float64)[..., None, None]
-    found = _halfway(before + (after - before) * rise)
-    assert float((found - places).abs().max()) < {0.5: 5e-3, 0.9: 0.02, 1.5: 0.15}[blur]
-    assert _halfway(torch.full((3, 2, 13), 0.2)).tolist() == [0, 0]
+    places, labels = [-39.7, 40.8], np.array([-40.0, 42.0])
+    found = halfway(seen(places, blur), LENS, LINE, labels)
+    assert np.abs(found - places).max() < {0.5: 5e-3, 0.9: 0.02, 1.5: 0.15}[blur]
+
+
+def test_where_no_light_changes_edges_stay_where_labels_changed():
+    labels = np.array([10.0, -12.5, math.nan])
+    found = halfway(seen([], 0.9), LENS, LINE, labels[:2])
+    assert found.tolist() == [10.0, -12.5]
+    # Nor do those that are not seen become any.
+    assert np.isnan(halfway(seen([10.3], 0.9), LENS, LINE, labels)[2])
+
+
+def test_edges_far_from_where_labels_changed_are_left_to_them():
+    """Beyond 3 px the light on one of both sides is no band's own."""
+    found = halfway(seen([5.5], 0.7), LENS, LINE, np.array([0.0]))
+    assert found.tolist() == [0.0]

@@ -1,20 +1,23 @@
 """Lines on the plane z = 1, and light between pixels, against direct formulas."""
 
+import cmath
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from holotorch.tracking.camera import Camera
+from holotorch.tracking.lens import Lens
 from holotorch.tracking.strips import Line, Sampler
 from holotorch.tracking.world import synthetic_camera
 
 CAMERA = Camera(
     torch.tensor([[700.0, 0, 480], [0, 700, 270], [0, 0, 1]]), torch.tensor([-0.3, 0.1, 2e-3, -1e-3, -0.02])
 )
-F64: Any = {"dtype": torch.float64}
+LENS = Lens(CAMERA)
+LIGHT = synthetic_camera().table().numpy()
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +27,18 @@ def frame():
 
 @pytest.fixture(scope="module")
 def sampler(frame):
-    return Sampler(frame, synthetic_camera().table())
+    return Sampler(frame, LIGHT)
+
+
+def through(lens: Lens, *pixels: complex) -> Line:
+    """The line through two pixels."""
+    return Line.between(lens, *lens.undistort(np.array(pixels)).tolist())
+
+
+def project(points: np.ndarray) -> np.ndarray:
+    """Pixels of points [N, 3], by the camera."""
+    x, y = CAMERA.project(torch.from_numpy(points)).numpy().T
+    return x + 1j * y
 
 
 def test_light_is_bilinear_in_linear_light(frame, sampler):
@@ -38,119 +52,152 @@ def test_light_is_bilinear_in_linear_light(frame, sampler):
         for row in range(24):
             for column in range(max(0, int(x) - 1), min(31, int(x) + 3)):
                 wanted[:, i] += light[:, row, column] * max(0, 1 - abs(x - column)) * max(0, 1 - abs(y - row))
-    found = sampler(torch.from_numpy(places).reshape(20, 10, 2))
-    assert found.dtype == torch.float32 and found.shape == (3, 20, 10)
-    np.testing.assert_allclose(found.reshape(3, 200).numpy(), wanted, atol=2e-6, rtol=0)
+    found = sampler((places[:, 0] + 1j * places[:, 1]).reshape(20, 10))
+    assert found.dtype == np.float32 and found.shape == (3, 20, 10)
+    np.testing.assert_allclose(found.reshape(3, 200), wanted, atol=2e-6, rtol=0)
 
 
 def test_whole_pixels_and_corners_are_exact(frame, sampler):
-    y, x = torch.meshgrid(torch.arange(24.0, **F64), torch.arange(31.0, **F64), indexing="ij")
-    pixels = torch.stack([x, y], -1)
-    assert torch.equal(sampler(pixels), synthetic_camera().table()[frame.long()])
+    """The last row and column are mixed as the whole of the later of two, a + (b - a): rounding, 6e-8 each way."""
+    pixels = np.arange(31.0) + 1j * np.arange(24.0)[:, None]
+    found, light = sampler(pixels), LIGHT[frame.numpy()]
+    assert np.array_equal(found[:, :-1, :-1], light[:, :-1, :-1])
+    np.testing.assert_allclose(found, light, rtol=0, atol=1.2e-7)
     levels, inside = sampler.nearest(pixels)
-    assert torch.equal(levels, frame) and inside.all()
+    assert levels.dtype == np.uint8 and np.array_equal(levels, frame.numpy()) and inside.all()
 
 
 def test_beyond_the_border_the_border_shows(frame, sampler):
-    outside = torch.tensor([[-5.0, 3], [1e6, 3], [4, -0.01], [4, 99], [-9, -9]], **F64)
-    border = torch.tensor([[0.0, 3], [30, 3], [4, 0], [4, 23], [0, 0]], **F64)
-    torch.testing.assert_close(sampler(outside), sampler(border), rtol=0, atol=0)
+    outside = np.array([-5.0 + 3j, 1e6 + 3j, 4 - 0.01j, 4 + 99j, -9 - 9j])
+    border = np.array([0.0 + 3j, 30 + 3j, 4, 4 + 23j, 0])
+    assert np.array_equal(sampler(outside), sampler(border))
     assert not sampler.inside(outside).any() and sampler.inside(border).all()
     levels, inside = sampler.nearest(outside)
     assert not inside.any()
-    assert torch.equal(
-        levels[:, :4], torch.stack([frame[:, 3, 0], frame[:, 3, 30], frame[:, 0, 4], frame[:, 23, 4]], 1)
-    )
+    wanted = frame.numpy()[:, [3, 3, 0, 23, 0], [0, 30, 4, 4, 0]]
+    assert np.array_equal(levels, wanted)
 
 
 def test_nan_is_outside_and_does_not_spread(sampler):
-    pixels = torch.tensor([[math.nan, 3.0], [4.0, math.nan], [5.0, 6.0]], **F64)
+    pixels = np.array([complex(math.nan, 3.0), complex(4.0, math.nan), 5.0 + 6j])
     assert sampler.inside(pixels).tolist() == [False, False, True]
     assert sampler.nearest(pixels)[1].tolist() == [False, False, True]
-    assert sampler(pixels).isfinite().all()
+    assert np.isfinite(sampler(pixels)).all()
 
 
 def test_nearest_rounds(frame, sampler):
-    pixels = torch.tensor([[3.4, 7.6], [3.6, 7.4]], **F64)
-    levels, _ = sampler.nearest(pixels)
-    assert torch.equal(levels[:, 0], frame[:, 8, 3]) and torch.equal(levels[:, 1], frame[:, 7, 4])
+    levels, _ = sampler.nearest(np.array([3.4 + 7.6j, 3.6 + 7.4j]))
+    assert np.array_equal(levels, frame.numpy()[:, [8, 7], [3, 4]])
 
 
 def test_a_line_goes_through_its_pixels_and_back():
-    ends = torch.tensor([[120.0, 80], [860, 500]], **F64)
-    line = Line.through(CAMERA, ends)
-    t, u = line.place(CAMERA.undistort(ends))
-    assert float(u.abs().max()) < 1e-9 and float(t.sum().abs()) < 1e-9 and t[1] > 0
+    ends = np.array([120.0 + 80j, 860 + 500j])
+    line = through(LENS, *ends)
+    t, u = line.place(LENS.undistort(ends))
+    assert np.abs(u).max() < 1e-9 and abs(t.sum()) < 1e-9 and t[1] > 0
     # undistort comes back to 1e-9 px.
-    torch.testing.assert_close(CAMERA.distort(line.plane(t, u)), ends, rtol=0, atol=1e-8)
-    assert float(line.along.norm()) == pytest.approx(1, abs=1e-15) and line.scale == 700
-    assert float(line.along @ line.across) == pytest.approx(0, abs=1e-15)
-    rng = torch.rand(7, 5, 2, **F64) * 200 - 100
-    there = line.plane(rng[..., 0], rng[..., 1])
-    assert there.shape == (7, 5, 2)
-    t, u = line.place(there)
-    torch.testing.assert_close(torch.stack([t, u], -1), rng, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(LENS.distort(line.plane(t, u)), ends, rtol=0, atol=1e-8)
+    assert abs(line.along) == pytest.approx(1, abs=1e-15) and line.scale == 700
+    rng = np.random.default_rng(5).random((2, 7, 5)) * 200 - 100
+    there = line.plane(rng[0], rng[1])
+    assert there.shape == (7, 5) and line.plane(rng[0, :, :1], rng[1, 0]).shape == (7, 5)
+    np.testing.assert_allclose(line.place(there), rng, rtol=0, atol=1e-10)
+    assert complex(line.plane(0.0)) == line.origin
 
 
 def test_steps_along_are_pixels_in_the_middle():
     """Near the principal point a step of 1 along or across moves the pixel by 1, but for 1e-4 of distortion there."""
-    plane = torch.tensor([[-0.01, -0.004], [0.01, 0.004]], **F64)
-    line = Line.between(CAMERA, plane)
-    base, one, side = (
-        CAMERA.distort(line.plane(torch.tensor(t, **F64), torch.tensor(u, **F64))) for t, u in ((0, 0), (1, 0), (0, 1))
-    )
-    assert float((one - base).norm()) == pytest.approx(1, abs=1e-3)
-    assert float((side - base).norm()) == pytest.approx(1, abs=1e-3)
-    assert float((one - base) @ (side - base)) == pytest.approx(0, abs=1e-2)
+    line = Line.between(LENS, -0.01 - 0.004j, 0.01 + 0.004j)
+    base, one, side = (complex(LENS.distort(line.plane(t, u))) for t, u in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
+    assert abs(one - base) == pytest.approx(1, abs=1e-3)
+    # Across is a quarter turn from x to y.
+    assert abs((side - base) - 1j * (one - base)) == pytest.approx(0, abs=1e-2)
 
 
 def test_a_straight_line_of_space_stays_on_its_line_however_the_lens_bends_it():
-    points = torch.tensor([[-0.2, -0.1, 0.5], [0.25, -0.12, 0.7]], **F64)
-    between = points[0] + torch.linspace(0, 1, 9, **F64)[:, None] * (points[1] - points[0])
-    line = Line.through(CAMERA, CAMERA.project(points))
-    _, u = line.place(CAMERA.undistort(CAMERA.project(between)))
-    assert float(u.abs().max()) < 1e-8
-    bent = CAMERA.project(between)
+    points = np.array([[-0.2, -0.1, 0.5], [0.25, -0.12, 0.7]])
+    between = points[0] + np.linspace(0, 1, 9)[:, None] * (points[1] - points[0])
+    line = through(LENS, *project(points))
+    bent = project(between)
+    _, u = line.place(LENS.undistort(bent))
+    assert np.abs(u).max() < 1e-8
     chord = bent[-1] - bent[0]
-    away = ((bent - bent[0]) @ torch.stack([-chord[1], chord[0]])) / chord.norm()
-    assert float(away.abs().max()) > 1  # on the frame it is not straight
+    away = ((bent - bent[0]) * chord.conjugate() / abs(chord)).imag
+    assert np.abs(away).max() > 1  # on the frame it is not straight
 
 
-@pytest.mark.parametrize("about", [0.0, 40.0])
-def test_moved_lines_pass_where_they_are_said_to(about):
-    line = Line.between(CAMERA, torch.tensor([[-0.1, 0.05], [0.2, 0.1]], **F64))
-    offset, slope = torch.tensor([3.0, 0.05], **F64)
-    moved = line.moved(offset, slope, about)
-    t, u = line.place(moved.plane(torch.tensor([0.0, 50, -30], **F64), torch.zeros(3, **F64)))
-    assert float(t[0]) == pytest.approx(about, abs=1e-10)
-    torch.testing.assert_close(u, offset + slope * (t - about), rtol=0, atol=1e-10)
-    assert float(moved.along.norm()) == pytest.approx(1, abs=1e-14) and moved.scale == line.scale
+@pytest.mark.parametrize("slope", [0.0, 0.05, -0.3])
+def test_moved_lines_pass_where_they_are_said_to(slope):
+    line = Line.between(LENS, -0.1 + 0.05j, 0.2 + 0.1j)
+    moved = line.moved(3.0, slope)
+    t, u = line.place(moved.plane(np.array([0.0, 50, -30])))
+    assert float(t[0]) == pytest.approx(0, abs=1e-10)
+    np.testing.assert_allclose(u, 3.0 + slope * t, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(np.hypot(t, u - 3.0), [0, 50, 30], rtol=0, atol=1e-10)
+    assert abs(moved.along) == pytest.approx(1, abs=1e-14) and moved.scale == line.scale
 
 
 def test_outside_the_lens_there_is_no_line():
-    narrow = Camera(CAMERA.matrix, torch.tensor([-0.6, 0.0, 0, 0, 0]))
-    line = Line.through(narrow, torch.tensor([[480.0, 270], [2000, 270]], **F64))
-    assert not line.origin.isfinite().all()
+    narrow = Lens(Camera(CAMERA.matrix, torch.tensor([-0.6, 0.0, 0, 0, 0])))
+    assert not cmath.isfinite(through(narrow, 480 + 270j, 2000 + 270j).origin)
+    assert not cmath.isfinite(Line.between(LENS, 0.1 + 0.2j, 0.1 + 0.2j).along)  # nor through one point
 
 
 def test_strips_are_parabolas_across_to_a_thousandth_of_a_pixel():
     """The third derivative of this lens across, 2 |k1| / 700^2 and some, times 30^3 / 16: what a parabola misses."""
-    line = Line.between(CAMERA, torch.tensor([[-0.35, 0.2], [0.3, 0.25]], **F64))
-    t, u = torch.linspace(-200, 200, 41, **F64), torch.linspace(-30, 30, 61, **F64)
-    found = line.pixels(CAMERA, t, u)
-    assert found.shape == (41, 61, 2)
-    exact = CAMERA.distort(line.plane(t[:, None], u))
-    assert float((found - exact).abs().max()) < 6 * 0.3 / 700**2 * 30**3 / 16
-    torch.testing.assert_close(found[:, [0, 30, 60]], exact[:, [0, 30, 60]], rtol=0, atol=1e-10)
+    line = Line.between(LENS, -0.35 + 0.2j, 0.3 + 0.25j)
+    t, u = np.linspace(-200, 200, 41), np.linspace(-30, 30, 61)
+    found = line.pixels(LENS, t, u)
+    assert found.shape == (41, 61)
+    exact = LENS.distort(line.plane(t[:, None], u))
+    missed: NDArray[np.complex128] = found - exact
+    assert max(np.abs(missed.real).max(), np.abs(missed.imag).max()) < 6 * 0.3 / 700**2 * 30**3 / 16
+    np.testing.assert_allclose(found[:, [0, 30, 60]], exact[:, [0, 30, 60]], rtol=0, atol=1e-10)
 
 
-def test_memory_of_any_layout_is_read_alike(frame, sampler):
-    places = torch.from_numpy(np.random.default_rng(6).uniform(0, 20, (9, 2)))
+def layouts(frame: torch.Tensor) -> dict[str, torch.Tensor]:
+    """The same picture, as memory may hold it."""
+    _, height, width = frame.shape
     camera = frame.permute(1, 2, 0).contiguous().permute(2, 0, 1)
-    part = torch.zeros(3, 30, 70, dtype=torch.uint8)[:, 3:27, 4:66:2]
-    part[:] = frame
-    for other in (camera, part):
-        again = Sampler(other, sampler.light)
-        assert torch.equal(again(places), sampler(places)) and torch.equal(
-            again.nearest(places)[0], sampler.nearest(places)[0]
-        )
+    part = torch.zeros(3, height + 6, 2 * width + 8, dtype=torch.uint8)[:, 3 : 3 + height, 4 : 4 + 2 * width : 2]
+    padded = torch.zeros(height, width + 5, 4, dtype=torch.uint8)[:, 2 : 2 + width, :3].permute(2, 0, 1)
+    turned = torch.zeros(3, width, height, dtype=torch.uint8).mT
+    rows = torch.zeros(height, 3, width, dtype=torch.uint8).transpose(0, 1)
+    for other in (part, padded, turned, rows):
+        other[:] = frame
+    return {"planar": frame, "camera": camera, "part": part, "padded": padded, "turned": turned, "rows": rows}
+
+
+@pytest.mark.parametrize("kind", ["camera", "part", "padded", "turned", "rows"])
+def test_memory_of_any_layout_is_read_alike(frame, sampler, kind):
+    """To the last bit, the last row and column included, where a step too far would leave the memory."""
+    other = layouts(frame)[kind]
+    assert other.stride() != frame.stride() and torch.equal(other, frame)
+    places = np.random.default_rng(6).uniform(-2, 33, (2, 90))
+    pixels = np.append(places[0] + 1j * places[1], [30 + 23j, 29.5 + 22.5j, 30 + 22.5j])
+    again = Sampler(other, LIGHT)
+    assert np.array_equal(again(pixels), sampler(pixels))
+    for one, two in zip(again.nearest(pixels), sampler.nearest(pixels), strict=True):
+        assert np.array_equal(one, two)
+
+
+def test_grey_frames_that_share_one_plane_are_read_as_three():
+    grey = torch.from_numpy(np.random.default_rng(8).integers(0, 256, (1, 9, 11)).astype(np.uint8))
+    pixels = np.array([0j, 3.3 + 4.1j, 10 + 8j])
+    found = Sampler(grey.expand(3, -1, -1), LIGHT)(pixels)
+    assert np.array_equal(found, Sampler(grey.repeat(3, 1, 1), LIGHT)(pixels)) and np.array_equal(found[0], found[2])
+
+
+def test_the_cubic_keeps_parabolas_and_the_border():
+    """Keys' kernel reproduces polynomials to the second degree; float32 sums of sixteen parts: 1e-6."""
+    y, x = np.mgrid[:16, :16]
+    levels = np.stack([x * x, y * y, x * y]).astype(np.uint8)
+    sampler = Sampler(torch.from_numpy(levels), np.arange(256, dtype=np.float32))
+    px, py = np.random.default_rng(2).uniform(1, 14, (2, 5, 7))
+    found = sampler.sharp(px + 1j * py)
+    assert found.shape == (3, 5, 7) and found.dtype == np.float32
+    np.testing.assert_allclose(found, [px * px, py * py, px * py], rtol=0, atol=225e-6)
+    whole = np.array([3 + 5j, 1 + 1j, 14 + 14j])
+    np.testing.assert_allclose(sampler.sharp(whole), sampler(whole), rtol=0, atol=1e-4)
+    beyond = sampler.sharp(np.array([complex(np.nan, 3), -40 + 2j, 1e6 + 1e6j]))
+    assert np.isfinite(beyond).all()

@@ -2,73 +2,18 @@
 
 import math
 from dataclasses import replace
-from functools import cache
 
 import pytest
 import torch
-from torch import Tensor
+from tracked import NEAR, SIZE, TRACKER, WORLD, at, refused, right, scenes, truth
 
-from holotorch.tracking.camera import Camera
-from holotorch.tracking.catheter import THESIS, Catheter
-from holotorch.tracking.render import Look, Occluder
+from holotorch.tracking.catheter import THESIS
+from holotorch.tracking.render import Occluder
 from holotorch.tracking.status import Pose, Status
 from holotorch.tracking.tracker import CatheterTracker
-from holotorch.tracking.world import Case, World, synthetic_camera
+from holotorch.tracking.world import Case
 
-SIZE = (540, 960)
-WORLD = World(SIZE)
-TRACKER = CatheterTracker(WORLD.camera, THESIS)
-NEAR = 0.27  # metres: as wide as at 0.54 m on 1080 lines
-RED, GREEN, BLUE = THESIS.colours
-SIX = Catheter((0.050, 0.062, 0.080, 0.090, 0.108, 0.120, 0.135), (RED, GREEN, BLUE) * 2, 1.5e-3, 0.3)
-STRONG = Camera(
-    torch.tensor([[700.0, 0, 480], [0, 700, 270], [0, 0, 1]]), torch.tensor([-0.35, 0.15, 2e-3, -1e-3, -0.02])
-)
-
-
-def at(depth=NEAR, tilt=12.0, roll=25.0, place=(0.0, 0.0), world=WORLD):
-    return world.pose(depth, math.radians(tilt), math.radians(roll), place)
-
-
-@cache
-def scenes() -> dict[str, tuple[Case, Tensor]]:
-    """Frames that several tests look at."""
-    poses = {f"roll {roll}": at(roll=roll) for roll in (0, 90, 135, 205, 300)}
-    poses |= {"near": at(0.19, 5, 10), "far": at(0.42, 20, 10), "slanted": at(0.26, 45, 25), "plain": at()}
-    poses["after"] = at(NEAR + 0.004, 13, 27, (0.01, -0.005))
-    cases = {name: WORLD.case(name, pose) for name, pose in poses.items()}
-    return {name: (case, case.frame()) for name, case in cases.items()}
-
-
-def truth(case: Case) -> tuple[Tensor, Tensor]:
-    assert case.tip is not None and case.direction is not None
-    return case.tip, case.direction
-
-
-def right(pose: Pose, case: Case) -> None:
-    """Within 4 stated deviations and half a millimetre, and a covariance that can be one."""
-    assert pose.answered, (case.name, pose.reason)
-    tip, direction = truth(case)
-    away = float((pose.tip - tip).norm())
-    assert away < min(5e-4, 4 * float(pose.tip_sd)), (case.name, away, float(pose.tip_sd))
-    assert float(pose.direction @ direction) > math.cos(math.radians(1)), case.name
-    assert float(pose.direction.norm()) == pytest.approx(1, abs=1e-12)
-    sane(pose)
-
-
-def sane(pose: Pose) -> None:
-    """Symmetric, of rank 5: the direction's length does not vary."""
-    covariance = pose.covariance
-    torch.testing.assert_close(covariance, covariance.mT, rtol=1e-9, atol=0)
-    values = torch.linalg.eigvalsh(covariance / torch.outer(scale := covariance.diagonal().sqrt(), scale))
-    assert values[0].abs() < 1e-6 and values[1] > 0
-    assert 1e-6 < float(pose.tip_sd) < 1.5e-3
-
-
-def refused(pose: Pose, *expected: Status) -> None:
-    assert not pose.answered and pose.reason
-    assert pose.status in expected, (pose.status, pose.reason)
-    assert pose.tip.isnan().all() and pose.covariance.isnan().all()
+RED = THESIS.colours[0]
 
 
 @pytest.mark.parametrize("name", ["roll 0", "roll 90", "roll 135", "roll 205", "roll 300", "near", "far", "slanted"])
@@ -120,12 +65,15 @@ def test_the_times_of_each_stage_are_kept():
 
 @pytest.mark.parametrize("name", ["roll 0", "roll 90", "roll 135", "roll 205", "far", "slanted"])
 def test_with_the_pose_before_the_answer_is_the_same(name):
-    """The same frame with its own pose: within a deviation; all that cold frames answer is answered."""
+    """The same frame with its own pose; all that cold frames answer is answered.
+
+    Over 40 other frames the difference was 0.57 deviations, root mean square; three and a half times that.
+    """
     case, frame = scenes()[name]
     cold = TRACKER(frame[None])[0]
     warm = TRACKER(frame[None], [cold])[0]
     right(warm, case)
-    assert float((warm.tip - cold.tip).norm()) < 1.5 * float(cold.tip_sd)
+    assert float((warm.tip - cold.tip).norm()) < 2.0 * float(cold.tip_sd)
     assert float(warm.tip_sd) == pytest.approx(float(cold.tip_sd), rel=0.3)
 
 
@@ -141,21 +89,45 @@ def test_the_catheter_may_move_between_frames():
 
 
 @pytest.mark.parametrize("other", ["roll 90", "near", "roll 205"])
-def test_a_pose_before_that_is_far_away_is_forgotten(other):
-    """Found everywhere instead: the cold answer, or a window's that is as right."""
+def test_a_pose_before_that_is_far_away_is_forgotten_after_one_frame(other):
+    """Only the window around it is looked at, in which there is no answer; the next frame is searched whole."""
     case, frame = scenes()["plain"]
     wrong = TRACKER(scenes()[other][1][None])[0]
     moved = replace(wrong, tip=wrong.tip + torch.tensor([0.03, 0.03, 0.05], dtype=torch.float64))
+    tracker = CatheterTracker(WORLD.camera, THESIS)
     for before in (wrong, moved):
-        right(TRACKER(frame[None], [before])[0], case)
+        lost = tracker(frame[None], [before])[0]
+        refused(lost, Status.NO_AXIS, Status.BANDS_MISSING, Status.EDGES_UNCLEAR, Status.INCONSISTENT)
+        assert tracker.times["colour"] == 0  # not looked for everywhere
+        right(tracker(frame[None], [lost])[0], case)
+        assert tracker.times["colour"] > 0
+
+
+def test_what_left_the_window_is_refused_and_found_again():
+    """As far as the catheter may move, 30 px, it is followed; three times as far it is lost for one frame."""
+    case, frame = scenes()["plain"]
+    tip, direction = truth(case)
+    sideways = torch.tensor([-direction[1], direction[0], 0.0], dtype=torch.float64)
+    sideways = sideways / sideways.norm()
+    cold = TRACKER(frame[None])[0]
+    for pixels, found in ((20, True), (-20, True), (90, False), (-90, False)):
+        before = replace(cold, tip=tip + pixels * NEAR / float(WORLD.camera.matrix[0, 0]) * sideways)
+        pose = TRACKER(frame[None], [before])[0]
+        if found:
+            right(pose, case)
+        else:
+            refused(pose, Status.NO_AXIS, Status.BANDS_MISSING)
+            right(TRACKER(frame[None], [pose])[0], case)
 
 
 def test_a_refusal_before_is_as_none():
-    case, frame = scenes()["plain"]
+    _, frame = scenes()["plain"]
     cold = TRACKER(frame[None])[0]
     after = TRACKER(frame[None], [Pose.refused(Status.NO_CATHETER, "nothing")])[0]
     torch.testing.assert_close(after.tip, cold.tip, rtol=0, atol=0)
-    refused(TRACKER(torch.zeros(1, 3, *SIZE, dtype=torch.uint8), [cold])[0], Status.NO_CATHETER)
+    dark = torch.zeros(1, 3, *SIZE, dtype=torch.uint8)
+    refused(TRACKER(dark, [cold])[0], Status.NO_AXIS)  # in the window
+    refused(TRACKER(dark)[0], Status.NO_CATHETER)
 
 
 def test_frames_without_a_catheter_are_refused():
@@ -237,63 +209,3 @@ def test_half_out_of_the_frame_it_is_right_or_refused(shift):
         right(pose, case)
     else:
         refused(pose, Status.OUT_OF_FRAME, Status.BANDS_MISSING, Status.NO_CATHETER)
-
-
-LOOK_ALIKES = {
-    "wrong order": replace(THESIS, colours=(GREEN, RED, BLUE)),
-    "longer middle": replace(THESIS, edges=(0.070, 0.108, 0.172, 0.210)),
-    "shorter middle": replace(THESIS, edges=(0.070, 0.108, 0.127, 0.165)),
-    "thick": replace(THESIS, radius=3.5e-3),
-    "other colours": replace(THESIS, colours=((220, 210, 40), (200, 50, 190), (60, 190, 190))),
-}
-
-
-@pytest.mark.parametrize("kind", LOOK_ALIKES)
-def test_look_alikes_are_refused(kind):
-    case = WORLD.case(kind, at(0.3), shown=LOOK_ALIKES[kind])
-    expected = {
-        "wrong order": (Status.BANDS_MISSING, Status.NO_CATHETER),
-        "thick": (Status.INCONSISTENT, Status.NO_AXIS),
-        "other colours": (Status.NO_CATHETER, Status.BANDS_MISSING),
-    }
-    refused(TRACKER(case.frame()[None])[0], *expected.get(kind, (Status.INCONSISTENT,)))
-
-
-def test_sheets_in_a_row_are_refused():
-    """Papers in the bands' colours and order: their lower side is one straight line, and so is an edge each."""
-    frame = WORLD.desk().clone()
-    wide = frame.clone()  # a strip far wider than the catheter would be
-    for i, colour in enumerate(THESIS.colours):
-        for sheet, rows in ((frame, slice(150, 270)), (wide, slice(240, 280))):
-            sheet[:, rows, 250 + 150 * i : 400 + 150 * i] = torch.tensor(colour, dtype=torch.uint8)[:, None, None]
-    assert not any(pose.answered for pose in TRACKER(torch.stack([frame, wide])))
-
-
-OTHERS = {
-    "six unequal bands": (World(SIZE, catheter=SIX), at(0.25, 15, world=World(SIZE, catheter=SIX))),
-    "six, reversed": (World(SIZE, catheter=SIX), at(0.25, 15, 205, world=World(SIZE, catheter=SIX))),
-    "linear tone": (World(SIZE, synthetic_camera(SIZE, "linear")), at()),
-    "strong distortion": (World(SIZE, STRONG), at(0.28, 12, 30, (0.1, 0.12))),
-    "noise and blur": (World(SIZE, look=Look(noise_dn=5.0, blur_px=1.5)), at(0.22)),
-}
-
-
-@pytest.mark.parametrize("name", OTHERS)
-def test_other_cameras_and_catheters(name):
-    world, pose = OTHERS[name]
-    case = world.case(name, pose)
-    found = CatheterTracker(world.camera, world.catheter)(case.frame()[None])[0]
-    right(found, case)
-    assert float(found.freedom) == len(world.catheter.edges) - 3
-
-
-def test_where_the_lens_turns_back_it_is_refused():
-    """A frame that shows the bands where no ray of this camera goes."""
-    _, frame = scenes()["roll 0"]
-    far = torch.full_like(frame, 120)
-    far[:, :120] = frame[:, 210:330]  # to the upper border, 0.7 of the focal length and more from the middle
-    # The distorted radius turns back at 0.41 of the focal length.
-    lens = torch.tensor([-0.9, 0.0, 0, 0, 0])
-    camera = Camera(torch.tensor([[300.0, 0, 480], [0, 300, 270], [0, 0, 1]]), lens)
-    pose = CatheterTracker(camera, THESIS)(far[None])[0]
-    refused(pose, Status.OUTSIDE_CAMERA, Status.OUT_OF_FRAME)
