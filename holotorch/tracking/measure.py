@@ -14,8 +14,7 @@ from holotorch.tracking.stations import Axis, variance_of
 from holotorch.tracking.status import Refusal, Status
 from holotorch.tracking.strips import Line, Sampler
 
-_EVERY = 2  # pixels along a line, whose colours say where it lies; and across, where the strip is wide,
-_WIDE = 15  # to either side
+_EVERY = 2  # pixels along a line, whose colours say where it lies
 _WINDOW, _CLOSE = 20, 4  # samples to either side of an edge, and where light changes fast
 _OUTSIDE = 10  # samples beyond the outermost edges
 _HALFWAY, _SURE = 6, 3  # samples to either side of where labels change; the outermost of them that show one colour
@@ -60,7 +59,7 @@ def find_bands(
     """
     end = math.ceil(half)
     t = np.arange(-end, end + 1.0)
-    u = np.arange(-math.ceil(aside), aside + 1, _EVERY if aside > _WIDE else 1)
+    u = np.arange(-math.ceil(aside), aside + 1.0)
     some = t[end % _EVERY :: _EVERY]
     levels, inside = sampler.nearest(line.pixels(lens, some, u))
     found = find_axis(table.labels(levels) * inside, some, u, reach)
