@@ -14,12 +14,12 @@ import torch
 from holotorch.tracking.fits import BLUNTEST, SHARPEST, median
 
 _STEPS = 8
-_SETTLED = 0.03  # pixels: the step after is a third of it; gloss and shadow move a middle by 0.05
+_SETTLED = 0.05  # pixels: the step after is a third of it; gloss and shadow move a middle by as much
 _LIKELY = 2.5  # standard deviations
 _SLICES = 8
 _SHADINGS = (np.ones_like, lambda q: q, lambda q: np.sqrt(1 - q * q), lambda q: q**3)
 _MEANS = (1.0, 0.0, math.pi / 4, 0.0)  # of the shadings over the tube
-_SHARES = (1e3, 1.5, 1.5, 1.0)  # of a band's light: what each shading may amount to; the even one is free
+_SHARES = (1e3, 1.0, 1.0, 0.7)  # of a band's light: what each shading may amount to; the even one is free
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +80,7 @@ def fit_axis(
     t: np.ndarray,
     band: np.ndarray,
     level: np.ndarray,
+    bright: np.ndarray,
     width: tuple[float, float],
     blur: float,
     known: float = 0.35,
@@ -97,6 +98,7 @@ def fit_axis(
         t: [S] places along, in samples.
         band: [S] which band a station is on, from 0.
         level: [bands] light of each band, as ``light``.
+        bright: [bands] the same, had channels of a mix not cancelled each other; gloss and shadow need not.
         width: Of the tube at t = 0 in samples, and its taper per sample, to begin with.
         blur: Standard deviation to begin with, in samples.
         known: Share of the width to which it and the taper are known beforehand. Shading and width are hard to tell
@@ -123,7 +125,7 @@ def fit_axis(
         unknown[5::kinds] = level
     else:
         unknown[:2], unknown[4:] = start[:2], start[4:]
-    shares = np.maximum(np.abs(level), 1e-9)[:, None] * np.array(_SHARES)
+    shares = np.maximum(bright, 1e-9)[:, None] * np.array(_SHARES)
     prior = np.concatenate([[0.0, 0.0, *2 * [(known * width[0]) ** -2], 0.0], shares.ravel() ** -2.0])
     farthest = np.full(len(prior), np.inf)
     farthest[:5] = 1.5, 1.5, 1.5, 1.5, 0.5
@@ -183,6 +185,12 @@ def _inverse(normal: np.ndarray) -> np.ndarray:
     return inverse / np.maximum(a * d - b * b, 1e-300)[:, None, None]
 
 
+def _erf(z: np.ndarray) -> np.ndarray:
+    """The error function. Above 2047 numbers torch divides the work among threads, and waits for those of others."""
+    parts = torch.from_numpy(z).view(-1).split(2047)
+    return torch.cat([torch.erf(part) for part in parts]).numpy().reshape(z.shape)
+
+
 def _slices() -> tuple[np.ndarray, np.ndarray]:
     """Nodes [N] over the tube, -1 to 1, and what columns (left, right, shadings) take of a rise there [N, 2 + K]."""
     q = np.linspace(-1, 1, _SLICES + 1)
@@ -204,7 +212,7 @@ def _strip_terms(u: np.ndarray, at: np.ndarray, half: np.ndarray, blur: float):
     scale = math.sqrt(2) * blur
     z = (u[:, None] - (at[:, None] + half[:, None] * _NODES)[:, None]) / scale  # [S, U, N]
     # A rise is (1 + erf z) / 2; what the tube takes of the 1 cancels.
-    columns = torch.erf(torch.from_numpy(z)).numpy() @ (_TAKES / 2)
+    columns = _erf(z) @ (_TAKES / 2)
     columns[..., :2] += 0.5
     bell = np.exp(-z * z)
 

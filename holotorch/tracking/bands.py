@@ -42,7 +42,7 @@ def find_axis(labels: np.ndarray, t: np.ndarray, u: np.ndarray, reach: float) ->
     ``t`` [T] and ``u`` [U] are places along and across in pixels, evenly spaced, t about 0; slopes to ``reach`` per
     pixel. The most coloured of a fan of lines, then weighted least squares among what lies on it.
     """
-    along, across = labels.nonzero()
+    along, across = np.divmod(np.flatnonzero(labels), labels.shape[1])
     if len(along) and int(np.bincount(along).max()) >= 0.6 * len(u):  # rows of one colour are not thin
         each = labels == np.arange(1, int(labels.max()) + 1)[:, None, None]
         along, across = (each & (each.mean(-1, keepdims=True) < 0.6)).any(0).nonzero()
@@ -82,7 +82,7 @@ def find_stretches(
     *,
     onward: bool = False,
 ) -> Stretches | None:
-    """Bands along labels [T, R] of a line's R central rows, or None where no order of them fits.
+    """Bands along labels [T, R] of a line's R central rows, or None where no order of them fits, or both ways do.
 
     Where ``drape`` [T] is true the surroundings look the same, so that labels do not say what is a band; where
     ``through`` [T] is, they shine through a tube that is none. ``middle`` is the index where t = 0. With ``onward`` the
@@ -96,7 +96,7 @@ def find_stretches(
     value, cuts, nothing = _sweep(share[None] if onward else np.stack([share, share[:, ::-1]]), table.bands)
     score = (value[:, -1] - nothing[:, -1]).tolist()
     flipped = score[-1] > score[0]
-    if score[int(flipped)] <= 0:
+    if score[int(flipped)] <= 0 or (not onward and abs(score[0] - score[1]) < _SIDE):
         return None
     at, edges = value.shape[-1] - 1, []
     for total, reached in reversed(cuts):
@@ -150,35 +150,35 @@ def _judged(
     flipped: bool,
     middle: float,
 ) -> Stretches:
-    count = share.shape[1]
-    sums = np.pad(share.cumsum(1), ((0, 0), (1, 0))).tolist()
-    own = np.pad((share * ~through).cumsum(1), ((0, 0), (1, 0))).tolist() if through.any() else sums
+    # In plain numbers: of so few edges, the calls into NumPy would cost several times as much.
+    count, last = share.shape[1], len(bands)
+    sums = _sums(share)
+    own = _sums(share * ~through) if through.any() else sums
+    drowned = _sums(drape[None])[0] if drape.any() else [0.0] * (count + 1)
 
-    def part(low: int, high: int, sums: list[list[float]] = sums) -> list[float]:
+    def mean(row: list[float], low: int, high: int) -> float:
         low, high = max(0, low), min(count, high)
-        return [(row[high] - row[low]) / (high - low) if high > low else 0.0 for row in sums]
+        return (row[high] - row[low]) / (high - low) if high > low else 0.0
 
     def clear(i: int, cut: int, mixed: int, side: int, longest: int) -> bool:
         """Whether the right colours lie to both sides of an edge, beyond what is mixed there."""
-        before, after = part(cut - mixed - side, cut - mixed), part(cut + mixed, cut + mixed + side)
-        seen = True
+        before, after = (cut - mixed - side, cut - mixed), (cut + mixed, cut + mixed + side)
         if i > 0:
-            seen &= before[bands[i - 1]] > _RIGHT
-            seen &= i == len(bands) or after[bands[i - 1]] < _RIGHT
-        if i < len(bands):
-            seen &= after[bands[i]] > _RIGHT
-            seen &= i == 0 or before[bands[i]] < _RIGHT
+            was = sums[bands[i - 1]]
+            if mean(was, *before) <= _RIGHT or mean(was, *after) >= (_RIGHT if i < last else 1 - _RIGHT):
+                return False
+        if i < last:
+            then = sums[bands[i]]
+            if mean(then, *after) <= _RIGHT or mean(then, *before) >= (_RIGHT if i else 1 - _RIGHT):
+                return False
         # Beyond an outer edge lies tube, not the same colour and not a thing as thin in a band's colour.
         if i == 0:
-            seen &= before[bands[0]] < 1 - _RIGHT and max(part(cut - longest // 2, cut - mixed, own)) < _RIGHT
-        if i == len(bands):
-            seen &= after[bands[-1]] < 1 - _RIGHT and max(part(cut + mixed, cut + longest // 2, own)) < _RIGHT
-        return seen
+            return all(mean(row, cut - longest // 2, before[1]) < _RIGHT for row in own)
+        return i < last or all(mean(row, after[0], cut + longest // 2) < _RIGHT for row in own)
 
     edges, doubtful = [], []
-    drowned = drape.tolist()
     for i, cut in enumerate(cuts):
-        length = [cuts[j + 1] - cuts[j] for j in (i - 1, i) if 0 <= j < len(bands)]
+        length = [cuts[j + 1] - cuts[j] for j in (i - 1, i) if 0 <= j < last]
         # A band that its surroundings drown has no length; the edge to it may be seen all the same.
         shortest = min((value for value in length if value > _MIXED), default=0)
         seen = False
@@ -186,11 +186,8 @@ def _judged(
             seen = clear(i, cut, _MIXED, max(1, min(_SIDE, shortest - _MIXED)), max(length))
             if not seen and shortest > 3 * _MOVED:
                 seen = clear(i, cut, _MOVED, _SIDE, max(length))
-        beside = (
-            drowned[max(0, cut - _MIXED - _SIDE) : max(0, cut - _MIXED)],
-            drowned[cut + _MIXED : cut + _MIXED + _SIDE],
-        )
-        doubtful.append(i in (0, len(bands)) or any(sum(part) > len(part) / 4 for part in beside))
+        near = mean(drowned, cut - _MIXED - _SIDE, cut - _MIXED), mean(drowned, cut + _MIXED, cut + _MIXED + _SIDE)
+        doubtful.append(i in (0, last) or max(near) > 0.25)
         at = cut - 0.5
         edges.append((count - 1 - at if flipped else at) - middle if seen else np.nan)
     spans = list(zip(bands, cuts, cuts[1:], strict=False))
@@ -201,3 +198,8 @@ def _judged(
         tuple(doubtful),
         flipped,
     )
+
+
+def _sums(values: np.ndarray) -> list[list[float]]:
+    """Of values [C, T], those before each place: [C][T + 1]."""
+    return [[0.0, *row] for row in values.cumsum(1).tolist()]

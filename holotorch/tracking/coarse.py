@@ -50,7 +50,7 @@ def _labels(frame: Tensor, table: ColourTable) -> np.ndarray:
         rows, aside = rows[:, ::_STEP].contiguous().cpu(), 1
     # Five bits of each colour side by side, as the table wants them.
     packed = cv2.cvtColor(rows.numpy(), cv2.COLOR_RGB2BGR555).view(np.uint16)[:, ::aside, 0]
-    return cv2.LUT(np.ascontiguousarray(packed), table.of_packed)
+    return cv2.LUT(np.ascontiguousarray(packed), table.table)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 import math
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -21,16 +22,20 @@ class ColourTable:
     Attributes:
         colours: The distinct colours of the catheter's bands.
         bands: For each band, which of ``colours`` it has.
-        table: uint8 [32768], by the upper five bits of red, green and blue.
-        of_packed: The same as OpenCV's look-up tables want it, [1, 65536].
+        table: uint8 [65536], by the upper five bits of red, green and blue, whatever the highest of the sixteen.
 
     Raises:
-        ValueError: Bands that are grey, or whose hues cannot be told apart.
+        ValueError: Bands that are grey, whose hues cannot be told apart, or whose colours read the same from both ends.
     """
 
     def __init__(self, camera: Camera, catheter: Catheter):
         self.colours = tuple(dict.fromkeys(catheter.colours))
         self.bands = tuple(self.colours.index(colour) for colour in catheter.colours)
+        if self.bands == self.bands[::-1]:
+            raise ValueError(
+                "bands must not read the same from both ends, or the tip cannot be told from the rear; "
+                f"got colours {catheter.colours}: change one"
+            )
         levels = torch.arange(1 << _BITS, dtype=torch.float64) * 8 + 3.5
         cells = torch.cartesian_prod(levels, levels, levels)
         chroma, pure = _chroma(camera.linear(cells))
@@ -42,14 +47,12 @@ class ColourTable:
             raise ValueError(f"hues of the bands must lie 25 degrees apart at least, got {self.colours}")
         like, label = (chroma @ wanted.T).max(-1)
         good = (like > math.cos(_TURN)) & (pure > _PURE * saturation[label]) & (cells.amax(-1) > 255 * _DARK)
-        self.table = torch.where(good, label + 1, 0).to(torch.uint8).numpy()
-        self.of_packed = np.tile(self.table, 2)[None]  # the sixteenth bit says nothing
+        self.table = np.tile(torch.where(good, label + 1, 0).to(torch.uint8).numpy(), 2)
 
     def labels(self, levels: np.ndarray) -> np.ndarray:
-        """uint8 [...] of levels uint8 [3, ...]."""
-        red, green, blue = levels >> (8 - _BITS)
-        index = (red.astype(np.intp) << 2 * _BITS) + (green.astype(np.intp) << _BITS) + blue
-        return self.table.take(index)
+        """uint8 [T, U] of levels uint8 [T, U, 3], neither of them nought."""
+        # Five bits of each colour side by side, as the table wants them.
+        return cv2.LUT(cv2.cvtColor(levels, cv2.COLOR_RGB2BGR555).view(np.uint16)[..., 0], self.table)
 
 
 def _chroma(light: Tensor) -> tuple[Tensor, Tensor]:

@@ -87,13 +87,13 @@ def fit_edges(light: np.ndarray, weight: np.ndarray, blur: float = 0.9) -> EdgeF
     # One lens blurs all edges alike. Where one side is dark and so has little noise, place and blur are hard to tell
     # apart, edge by edge; together they are not.
     common = (sure * sigma).sum() / max(sure.sum(), 1e-30)
-    alike = np.abs(sigma / max(common, 1e-30) - 1) < 0.5
+    alike = (np.abs(sigma / max(common, 1e-30) - 1) < 0.5) & (sure > 0)
     other = ~alike & ((sigma - common) ** 2 * sure > _OTHER**2)  # surely not blurred by that lens
     together = max((sure * alike).sum(), 1e-30)
     sigma = np.where(alike, (sure * alike * sigma).sum() / together, sigma)
     more = 2
     while True:
-        (pp, pb, _), (p, _), amplitude, middle, up = _edge_terms(t, place, sigma, *given)
+        (pp, pb, _), (p, _), amplitude, middle, up, own = _edge_terms(t, place, sigma, *given)
         move = (p / np.maximum(pp, 1e-30)).clip(-0.5, 0.5)
         place, more = (place + move).clip(-far, far), more - 1
         if not more or float(np.abs(move).max()) < _NEAR:
@@ -111,14 +111,39 @@ def fit_edges(light: np.ndarray, weight: np.ndarray, blur: float = 0.9) -> EdgeF
     doubt = np.maximum(strange / _STRANGE, 1) ** 2
     good = (pp > 0) & np.isfinite(variance) & (free > 0) & ~other
     deviation = np.where(good, _SHARED * np.sqrt(variance) * np.maximum(noise, 0.5) * doubt, np.inf)
+    deviation *= _apart(weight, amplitude, np.maximum(noise, 0.5), *own, rows[-1])
     steps, levels = (value.reshape(-1, *rows) for value in (amplitude, mean - amplitude * middle))
     return EdgeFit(place, sigma, deviation, noise, steps, levels)
+
+
+def _apart(
+    weight: np.ndarray,
+    amplitude: np.ndarray,
+    noise: np.ndarray,
+    slope: np.ndarray,
+    taken: np.ndarray,
+    bell: np.ndarray,
+    colours: int,
+) -> float:
+    """How much farther apart the channels put edges than noise does, 1 or more.
+
+    Codecs keep colours at half the resolution of the luma, often half a pixel aside, and blur them in levels instead of
+    light. No one place is right for all channels then, and all edges suffer alike.
+    """
+    raw = ((bell * bell)[:, None] @ weight)[:, 0] * amplitude**2
+    power = raw - (taken**2).reshape(len(raw), 2, -1).sum(1)  # normal matrix for a place of its own in each row
+    slope, power = (value.reshape(len(value), -1, colours).sum(1) for value in (slope, power))
+    power = np.maximum(power, 1e-30)
+    spread = (slope * slope / power).sum(1) - slope.sum(1) ** 2 / power.sum(1)
+    return math.sqrt(max(1.0, (spread / noise**2).sum() / (_SHARED**2 * len(slope) * max(1, colours - 1))))
 
 
 def _edge_terms(
     t: np.ndarray, place: np.ndarray, sigma: np.ndarray, weight: np.ndarray, weighted: np.ndarray, total: np.ndarray
 ):
     """Normal matrix (pp, pb, bb) and slope (p, b) [E] for place and blur, amplitudes and means [E, U C], rise [E, T].
+
+    And what :func:`_apart` needs of the last.
 
     ``weight`` and ``weighted`` (light times it) are [E, T, U C], their ``total`` over T [E, U C].
     """
@@ -134,7 +159,8 @@ def _edge_terms(
     second = moments[:, 3:] - moments[:, :1] * means
     power = np.maximum(second[:, :1], 1e-30)
     amplitude = with_light[:, :1] / power
-    slopes = ((with_light[:, 1:] - second[:, 1:] * amplitude) * amplitude).sum(-1)
+    each = (with_light[:, 1:] - second[:, 1:] * amplitude) * amplitude
+    slopes = each.sum(-1)
     # What the rise itself, and the levels, explain is taken out of its slopes (Kaufman's form).
     square = (amplitude * amplitude).swapaxes(1, 2)
     raw = (basis[:, 1:3] * (weight @ square).swapaxes(1, 2)) @ basis[:, 1:3].swapaxes(1, 2)
@@ -143,4 +169,4 @@ def _edge_terms(
     )
     normal = raw - taken @ taken.swapaxes(1, 2)
     entries = normal[:, 0, 0], normal[:, 0, 1], normal[:, 1, 1]
-    return entries, (slopes[:, 0], slopes[:, 1]), amplitude[:, 0], means[:, 0], up
+    return entries, (slopes[:, 0], slopes[:, 1]), amplitude[:, 0], means[:, 0], up, (each[:, 0], taken[:, 0], bell)

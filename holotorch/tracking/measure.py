@@ -61,26 +61,27 @@ def find_bands(
     t = np.arange(-end, end + 1.0)
     u = np.arange(-math.ceil(aside), aside + 1.0)
     some = t[end % _EVERY :: _EVERY]
-    levels, inside = sampler.nearest(line.pixels(lens, some, u))
-    found = find_axis(table.labels(levels) * inside, some, u, reach)
+    found = find_axis(table.labels(sampler.nearest(line.pixels(lens, some, u))), some, u, reach)
     if found is None:
         raise Refusal(Status.NO_AXIS, "nothing thin and straight with the bands' colours")
     line = line.moved(*found)
     rows = np.array([-1.0, 0.0, 1.0, -_BESIDE, _BESIDE])
-    levels, inside = sampler.nearest(line.pixels(lens, t, rows))
-    near = table.labels(levels) * inside
+    levels = sampler.nearest(line.pixels(lens, t, rows))
+    near = table.labels(levels)
     # What looks the same on both sides of the line is a drape, or cannot be told from one.
-    shown = levels.astype(np.float32)
-    gap = np.abs(shown[..., 3:] - shown[..., 1:2]).max(0)
+    shown = levels[:, [1, 3, 4]].transpose(2, 0, 1).astype(np.float32, order="C")
+    most = shown.max(0)
+    gap = np.abs(shown[..., 1:] - shown[..., :1]).max(0)
     alike = near[:, 3:] == near[:, 1:2]
-    drape = (alike & (gap < _ALIKE * shown[..., 1:2].max(0))).all(-1)
+    drape = alike[:, 0] & alike[:, 1] & (np.maximum(gap[:, 0], gap[:, 1]) < _ALIKE * most[:, 0])
     # A tube that lets cloth shine through has the cloth's hue, but is paler than any band on it.
-    bright = shown.max(0)
-    pure = (bright - shown.min(0)) / np.maximum(bright, 1.0)
-    through = alike.all(-1) & (pure[:, 1] < _PALE * pure[:, 3:].min(-1))
+    pure = 1 - shown.min(0) / np.maximum(most, 1.0)
+    through = alike[:, 0] & alike[:, 1] & (pure[:, 0] < _PALE * np.minimum(pure[:, 1], pure[:, 2]))
     stretches = find_stretches(near[:, :3], drape, through, table, float(end), onward=onward)
     if stretches is None:
-        raise Refusal(Status.BANDS_MISSING, "no stretch of line shows the bands in their order")
+        raise Refusal(
+            Status.BANDS_MISSING, "no stretch of line shows the bands in their order, or it shows them both ways"
+        )
     if stretches.flipped:  # from here on t rises from the tip to the rear
         turned = Line(line.origin, -line.along, line.scale)
         return turned, dataclasses.replace(stretches, edges=-stretches.edges, flipped=False)

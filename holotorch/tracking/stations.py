@@ -7,6 +7,7 @@ import numpy as np
 
 from holotorch.tracking.axis_fit import AxisFit, fit_axis
 from holotorch.tracking.bands import Stretches
+from holotorch.tracking.fits import median
 from holotorch.tracking.lens import Lens
 from holotorch.tracking.status import Refusal, Status
 from holotorch.tracking.strips import Line, Sampler
@@ -14,8 +15,9 @@ from holotorch.tracking.strips import Line, Sampler
 _LEVEL_SD = 2.5 / 255  # of a pixel's level; fits correct it by what they leave
 _ONE_SIDED = 0.15  # contrast to one side over that to the other
 _NARROWEST = 2.4  # pixels: below it no pixel shows one band alone
-_STATIONS = 24
-_SAMPLES = 3  # for each station
+_STATIONS, _FEWEST = 12, 6
+_SAMPLES = 6  # for each station: along the tube neighbours differ in nothing but noise
+_MOST = 700  # samples across, of all stations together: wide tubes take fewer stations
 _FOCUS = 0.1  # of a blur: how well edges and sides agree in it
 _LINE_FLOOR = 0.008  # of the width: what gloss and shadow, which repeat along the tube, may move its middle
 
@@ -63,6 +65,14 @@ class Stations:
     t: np.ndarray
     band: np.ndarray
     level: np.ndarray
+    bright: np.ndarray
+
+    def rough_width(self) -> float:
+        """Of the tube in pixels: where the signal is nearer to what it is at most than to what is beside."""
+        left, right = self.signal[:, :2].mean(1), self.signal[:, -2:].mean(1)
+        middle = self.signal.shape[1] // 2
+        away = np.abs(self.signal - np.repeat(np.stack([left, right], 1), [middle, middle + 1], 1))
+        return median((2 * away > away.max(1, keepdims=True)).sum(1))
 
     def show(self, width: float, blur: float) -> bool:
         """Whether they reach beyond the sides of a tube so wide."""
@@ -79,28 +89,30 @@ def look_across(sampler: Sampler, lens: Lens, line: Line, stretches: Stretches, 
     ]
     if not spans:
         raise Refusal(Status.BANDS_MISSING, "no band is seen from one end to the other")
-    every = max(1.0, sum(b - a for a, b in spans) / (_SAMPLES * _STATIONS))
-    # Several samples for each station: along the tube neighbours differ in nothing but noise.
-    parts = [np.arange(a, max(a, b - (_SAMPLES - 1) * every), _SAMPLES * every) for a, b in spans]
-    band = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    t = np.concatenate(parts)[:, None] + every * np.arange(_SAMPLES)
-    if len(t) < 6:
-        raise Refusal(Status.TOO_NARROW, "the bands are a few pixels long")
     half = math.ceil(0.6 * width + 4 + 2 * blur)
     u = np.arange(-half, half + 1.0)
-    light = sampler(line.pixels(lens, t.ravel(), u)).reshape(3, *t.shape, len(u)).sum(2) / np.float32(_SAMPLES)
-    signal, weight, level = _contrast(light, u, width, band, len(spans))
-    return Stations(line, float(t.max() - t.min()), signal, weight, t.mean(-1), band, level)
+    wanted = min(_STATIONS, max(_FEWEST, _MOST // len(u)))
+    length = sum(b - a for a, b in spans)
+    every = max(1.0, length / (_SAMPLES * wanted))
+    samples = min(_SAMPLES, max(1, int(length / (every * wanted))))
+    parts = [np.arange(a, max(a, b - (samples - 1) * every), samples * every) for a, b in spans]
+    band = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    t = np.concatenate(parts)[:, None] + every * np.arange(samples)
+    if len(t) < _FEWEST:
+        raise Refusal(Status.TOO_NARROW, "the bands are a few pixels long")
+    light = sampler(line.pixels(lens, t.ravel(), u)).reshape(3, *t.shape, len(u)).sum(2) / np.float32(samples)
+    signal, weight, *levels = _contrast(light, u, width, band, samples)
+    return Stations(line, float(t.max() - t.min()), signal, weight, t.mean(-1), band, *levels)
 
 
 def measure_axis(
     stations: Stations, width: tuple[float, float], known: float, blur: float, before: Axis | None = None
 ) -> Axis:
     """Mid-line and width; ``width`` and ``known`` as for ``fit_axis``, which begins at what was found ``before``."""
-    given = stations.signal, stations.weight, stations.t, stations.band, stations.level
+    given = stations.signal, stations.weight, stations.t, stations.band, stations.level, stations.bright
     fit = fit_axis(*given, width, blur, known, before.fit.unknown if before else None)
     axis = _axis(stations, fit)
-    if not np.isfinite(fit.covariance).all() or axis.width > 2 * width[0] + 3:
+    if not np.isfinite(fit.covariance).all() or not 0 < axis.width < 2 * width[0] + 3:
         raise Refusal(Status.NO_AXIS, "the bands have no clear sides")
     if min(fit.contrast) < _ONE_SIDED:
         raise Refusal(Status.NO_AXIS, "the bands' colours go on beside the line: too wide for the catheter")
@@ -138,21 +150,22 @@ def _axis(stations: Stations, fit: AxisFit) -> Axis:
     )
 
 
-def _contrast(light: np.ndarray, u: np.ndarray, width: float, band: np.ndarray, bands: int):
-    """Light [3, S, U] as one signal [S, U], its inverse variances, and each band's own level in it [bands].
+def _contrast(light: np.ndarray, u: np.ndarray, width: float, band: np.ndarray, samples: int):
+    """Light [3, S, U] as one signal [S, U], its inverse variances, and each band's level in it [bands], and brightness.
 
     The signal is the mix of channels, one for each band, in which tube and surroundings differ most over the noise.
     """
     where = np.stack([np.abs(u) <= max(0.6, 0.3 * width), np.abs(u) >= 0.5 * width + 1.5], -1).astype(np.float32)
     parts = light @ (where / where.sum(0))  # [3, S, 2]
-    member = (band[:, None] == np.arange(bands)).astype(np.float32)
+    member = (band[:, None] == np.arange(band[-1] + 1)).astype(np.float32)
     own, around = np.moveaxis(parts, -1, 0) @ (member / np.maximum(member.sum(0), 1))  # [3, bands] each
     mixes = (own - around) / (variance_of(own) + variance_of(around))
     mixes = mixes / np.maximum(np.sqrt((mixes * mixes).sum(0)), 1e-12)
     mix = mixes[:, band, None]  # [3, S, 1]
     signal = (light * mix).sum(0)
-    variance = (mix * mix * variance_of(light)).sum(0) / _SAMPLES
-    return signal, 1 / np.maximum(variance, 1e-30), (mixes * own).sum(0).astype(np.float64)
+    variance = (mix * mix * variance_of(light)).sum(0) / samples
+    level, bright = np.array([mixes * own, np.abs(mixes) * own], dtype=np.float64).sum(1)
+    return signal, 1 / np.maximum(variance, 1e-30), level, bright
 
 
 def variance_of(light: np.ndarray) -> np.ndarray:

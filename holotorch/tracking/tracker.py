@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.tracking.bands import Stretches
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import Catheter
 from holotorch.tracking.coarse import find_segments
@@ -35,10 +36,12 @@ _CLEAR = 0.04  # where their distance is as clear as this
 _SLOW = 0.2  # of the width: a standard deviation that says that it may not have been reached yet
 _THIRD, _NEARLY, _EXACT = 0.35, 0.01, 0.002  # how well the width is known without a pose, from a rough one, and after
 _WIDEST = 120.0  # pixels
+_AWAY = 1.5  # pixels from its width at which a tube is surely wider or narrower
 _BLUR = 0.9  # pixels, to begin with,
 _SMEARED = 4.0  # and where it is larger,
 _BLURRED = 0.6  # from which edges that differ by more are looked at again,
 _BENT = 0.05  # as are those whose fronts bulge by so many pixels more or less than was thought
+_FLAT = 0.05  # and by so many a pose is none that is thought anew
 _MOVED = 30.0  # pixels that a catheter may move between two frames
 _MEASURED = 2  # lines on a frame whose edges are looked at; those without bands cost little
 
@@ -68,7 +71,7 @@ class CatheterTracker:
     Source: Chapter 3 of the thesis for bands, one camera and what is asked; the method is our own.
     """
 
-    def __init__(self, camera: Camera, catheter: Catheter, *, most_sd: float = 1.5e-3):
+    def __init__(self, camera: Camera, catheter: Catheter, *, most_sd: float = 2e-3):
         self.camera, self.catheter = camera, catheter
         self.most_sd = checks.positive("most_sd", most_sd, "m")
         self.table = ColourTable(camera, catheter)
@@ -90,11 +93,12 @@ class CatheterTracker:
         if height < 32 or width < 32:
             return Pose.refused(Status.BAD_FRAME, f"a frame of {height} x {width} px is too small")
         sampler = Sampler(frame, self.lens.light)
+        found = _host(before) if before is not None and before.answered else None
         try:
-            if before is not None and before.answered:
-                found = _host(before)
-                return self._along(sampler, *self._expected(found), _MOVED, found)
-            return self._anywhere(sampler)
+            if found is None:
+                return self._anywhere(sampler)
+            line, stretches = self._shown(sampler, *self._expected(found), _MOVED, onward=True)
+            return self._along(sampler, line, stretches, found)
         except Refusal as refusal:
             return Pose.refused(refusal.status, refusal.reason)
 
@@ -103,7 +107,7 @@ class CatheterTracker:
             segments = find_segments(sampler.frame, self.table)
         if not segments:
             raise Refusal(Status.NO_CATHETER, "nothing thin in the bands' colours")
-        first, measured = None, 0
+        furthest, measured = (Status.OK, ""), 0
         planes = self.lens.undistort(np.array([(segment.start, segment.end) for segment in segments]).ravel())
         for segment, (start, end) in zip(segments, planes.reshape(-1, 2).tolist(), strict=True):
             try:
@@ -111,42 +115,53 @@ class CatheterTracker:
                 if not cmath.isfinite(line.origin + line.along):
                     raise Refusal(Status.OUTSIDE_CAMERA, "it lies where the lens's distortion cannot be inverted")
                 length = abs(segment.end - segment.start)
-                return self._along(sampler, line, 0.5 * length + max(40.0, 0.7 * length), 10.0, None)
+                half = 0.5 * length + max(40.0, 0.7 * length)
+                line, stretches = self._shown(sampler, line, half, 10.0, onward=False)
+                measured += 1
+                return self._along(sampler, line, stretches, None)
             except Refusal as refusal:
-                # What came nearest to a pose tells most.
-                if first is None or refusal.status > first.status:
-                    first = refusal
-                measured += refusal.status is not Status.BANDS_MISSING
+                # What came nearest to a pose tells most; the refusal itself would keep the frame alive.
+                if refusal.status > furthest[0]:
+                    furthest = refusal.status, refusal.reason
                 if measured == _MEASURED:
                     break
-        assert first is not None
-        raise first
+        raise Refusal(*furthest)
 
     def _expected(self, found: Found) -> tuple[Line, float]:
         """Where the bands of a pose lie, and half their length with room to move."""
         start, end = on_plane(found.tip + self._positions[[0, -1], None] * found.direction).tolist()
         return Line.between(self.lens, start, end), abs(end - start) * self.lens.scale / 2 + 1.5 * _MOVED
 
-    def _along(self, sampler: Sampler, line: Line, half: float, aside: float, before: Found | None) -> Pose:
-        """The pose on a line around which to look, ``half`` its length, or a Refusal."""
+    def _shown(
+        self, sampler: Sampler, line: Line, half: float, aside: float, *, onward: bool
+    ) -> tuple[Line, Stretches]:
+        """The line near a first one, ``half`` its length, and which bands it shows; a Refusal where these are few."""
         half = min(half, 1.5 * math.hypot(sampler.height, sampler.width))
+        with self._timed("axis"):
+            reach = min(0.15, 2 * aside / half) if onward else 0.06
+            line, stretches = find_bands(sampler, self.lens, line, self.table, half, aside, reach, onward=onward)
+        if stretches.known < 3:
+            few = "a band hides, is drowned by its surroundings or leaves the frame"
+            raise Refusal(Status.BANDS_MISSING, f"{stretches.known} edges of bands are seen, 3 are needed: {few}")
+        return line, stretches
+
+    def _along(self, sampler: Sampler, line: Line, stretches: Stretches, before: Found | None) -> Pose:
+        """The pose on a line that shows the bands, or a Refusal."""
         lens = self.lens
         with self._timed("axis"):
-            reach = min(0.15, 2 * aside / half) if before is not None else 0.06
-            line, stretches = find_bands(sampler, lens, line, self.table, half, aside, reach, onward=before is not None)
-            if stretches.known < 3:
-                few = "a band hides, is drowned by its surroundings or leaves the frame"
-                raise Refusal(Status.BANDS_MISSING, f"{stretches.known} edges of bands are seen, 3 are needed: {few}")
-            places = halfway(sampler, lens, line, stretches.edges)
+            places = stretches.edges if before else halfway(sampler, lens, line, stretches.edges)
             near = before or self._rough(line, places)
             wide, known = (self._wide(near, line), _NEARLY) if near else (self._slight(places), _THIRD)
             stations = look_across(sampler, lens, line, stretches, wide[0], _BLUR)
             axis = width = measure_axis(stations, wide, known, _BLUR)
             if before is None:
-                if (
-                    near
-                ):  # its own width is the check; beginning with one that is nearly right, gloss is not taken for it
-                    width = measure_axis(stations, wide, _THIRD, axis.blur, axis)
+                if near:
+                    # Its own width is the check. Beginning with one that is nearly right, gloss is not taken for it.
+                    rough = stations.rough_width()
+                    if abs(rough - wide[0]) < max(_AWAY, 0.25 * wide[0]):
+                        width = measure_axis(stations, wide, _THIRD, axis.blur, axis)
+                    else:
+                        width = measure_axis(stations, (rough, 0.0), _THIRD, _BLUR)
                 if not stations.show(width.width, width.blur):
                     stations = look_across(sampler, lens, line, stretches, width.width, width.blur)
                     other = abs(width.width - wide[0]) > 3 * width.width_sd
@@ -168,10 +183,11 @@ class CatheterTracker:
             found = self._solved(axis, edges)
             for _ in range(2):
                 bulge = self._bulge(found, axis.line)
-                if float(np.abs(bulge - curve).max()) < 0.01:
+                change, curve = bulge - curve, bulge
+                edges = dataclasses.replace(edges, t=edges.t - math.pi / 4 * change)
+                if float(np.abs(change).max()) < _FLAT:
                     break
-                edges = dataclasses.replace(edges, t=edges.t - math.pi / 4 * (bulge - curve))
-                found, curve = self._solved(axis, edges), bulge
+                found = self._solved(axis, edges)
             plane, wide = axis.line.plane(edges.t), self._wide(found, line)
         with self._timed("axis"):
             # With the width that the pose and the radius give; what was found without them is the check.
@@ -186,7 +202,7 @@ class CatheterTracker:
             with self._timed("edges"):
                 edges = measure_edges(sampler, lens, axis, edges.t, stretches.doubtful, edges.blur, curve)
         with self._timed("pose"):
-            return self._judged(self._solved(axis, edges), width, axis.line, edges)
+            return self._judged(self._solved(axis, edges), width, edges, cold=before is None)
 
     def _rough(self, line: Line, places: np.ndarray) -> Found | None:
         """A first pose, from where the colours change; None where one of these places may be no edge."""
@@ -241,8 +257,8 @@ class CatheterTracker:
             raise Refusal(Status.INCONSISTENT, "no pose in front of the camera explains the edges")
         return found
 
-    def _judged(self, found: Found, axis: Axis, line: Line, edges: Edges) -> Pose:
-        """The pose, if nothing speaks against it; ``axis`` is that with a width of its own."""
+    def _judged(self, found: Found, axis: Axis, edges: Edges, *, cold: bool) -> Pose:
+        """The pose, if nothing speaks against it; ``axis`` is that with a width of its own where the frame is cold."""
         seen = edges.t[np.isfinite(edges.t)]
         count = len(seen)
         freedom = count - 3  # the line is fitted by itself, so only places along it can disagree
@@ -262,8 +278,9 @@ class CatheterTracker:
         due = math.hypot(edges.blur, own)
         clear = axis.width_sd < _CLEAR * axis.width
         moved = clear and 1 < ratio < _PATH and abs(axis.blur / due - 1) < _ALIKE
-        if min(axis.blur, edges.blur) > own:  # where blur is larger, the two are hard to tell apart; their sum is not
-            ratio = math.hypot(axis.blur, own * ratio) / due
+        both = math.hypot(axis.blur, own * ratio) / due  # where width and blur are hard to tell apart, their sum is not
+        if min(axis.blur, edges.blur) > own or (cold and both > max(ratio, 1.0)):
+            ratio = both
         if abs(ratio - 1) > most and not moved:
             away = float((found.tip + self._positions.mean() * found.direction)[2])
             raise Refusal(Status.INCONSISTENT, f"{ratio:.2f} times as wide as it should be at {away:.2f} m")
@@ -285,9 +302,8 @@ class CatheterTracker:
             self.times[stage] += time.perf_counter() - began
 
 
-def _host(pose: Pose) -> Found:
-    """The same in NumPy, whatever device it is on."""
-    tip, direction, covariance = (
-        value.detach().to("cpu", torch.float64).numpy() for value in (pose.tip, pose.direction, pose.covariance)
-    )
-    return Found(tip, direction, covariance, float(pose.chi_square))
+def _host(pose: Pose) -> Found | None:
+    """Its tip and direction in NumPy, whatever device it is on; None where they are not finite."""
+    place, onward = (value.detach().to("cpu", torch.float64).numpy() for value in (pose.tip, pose.direction))
+    known = np.isfinite(place).all() and np.isfinite(onward).all()
+    return Found(place, onward, np.zeros((6, 6)), 0.0) if known else None

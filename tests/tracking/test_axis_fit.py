@@ -24,7 +24,9 @@ def tube(width, blur, shade=None, noise=0.0, seed=0, offset=0.3, slope=0.004, ta
 
 
 def axis(light, width, noise, taper=0.0, known=0.35, blur=0.9, start=None):
-    return fit_axis(light, np.full_like(light, noise**-2), T, BAND, LEVEL, (width, taper), blur, known, start)
+    return fit_axis(
+        light, np.full_like(light, noise**-2), T, BAND, LEVEL, np.abs(LEVEL), (width, taper), blur, known, start
+    )
 
 
 def deviations(fit: AxisFit) -> np.ndarray:
@@ -131,7 +133,7 @@ def test_contrast_tells_one_sided_strips():
     light = strips.tube(0.3 * ones, 10 * ones, 0.9, 0.25 * ones, 0.25, 0.02, 25)
     light = light + 0.004 * np.random.default_rng(3).normal(size=light.shape)
     weight = np.full_like(light, 0.004**-2)
-    fit = fit_axis(light, weight, T, np.zeros(41, dtype=int), np.array([0.25]), (10.0, 0.0), 0.9)
+    fit = fit_axis(light, weight, T, np.zeros(41, dtype=int), np.array([0.25]), np.array([0.25]), (10.0, 0.0), 0.9)
     assert min(fit.contrast) < 0.15
     assert fit.contrast[0] < fit.contrast[1]  # left is the side of negative u
 
@@ -145,12 +147,15 @@ def test_a_fit_to_nothing_is_no_number_to_trust():
 
 
 def test_a_fit_that_begins_at_an_earlier_one_ends_there():
-    """Steps below 0.035 px are not sought on, and each is a third of the one before: 0.02 px and less remain."""
+    """Steps below 0.05 px are not sought on, and each is a third of the one before: 0.025 px and less remain.
+
+    Deviations are of the noise before the last step, in which shadings still move: a tenth larger at most.
+    """
     light, _ = tube(10, 0.8, SHADES["aside"], 0.004)
     one = axis(light, 10.0, 0.004)
     again = axis(light, 10.0, 0.004, start=one.unknown)
-    assert np.abs((again.sides - one.sides) * REACH).max() < 0.02
-    np.testing.assert_allclose(deviations(again), deviations(one), rtol=0.02)
+    assert np.abs((again.sides - one.sides) * REACH).max() < 0.025
+    np.testing.assert_allclose(deviations(again), deviations(one), rtol=0.12)
 
 
 def settled(light, width, taper, known, noise, start):
