@@ -66,53 +66,49 @@ class _Tiles:
 def _tiles(labels: np.ndarray, colours: int) -> _Tiles | None:
     height, width = labels.shape
     flat = labels.ravel()
-    if len(flat) % 8:
-        flat = np.pad(flat, (0, -len(flat) % 8))
-    words = flat.view(np.int64).nonzero()[0]  # eight at once: nearly all are nought
-    some = flat.reshape(-1, 8)[words].ravel()
-    lit = some.nonzero()[0]
+    lit = np.flatnonzero(flat != 0)
     if len(lit) < 8:
         return None
-    share = -(-len(lit) // _MOST)
-    lit = lit[::share]
-    place = 8 * words[lit >> 3] + (lit & 7)
     rows, columns = -(-height // _TILE), -(-width // _TILE)
     total = rows * columns
-    tile, dx, dy = (of_place.take(place) for of_place in _places(height, width))
-    key = (some[lit].astype(np.intp) - 1) * total + tile
+    of_tile, right, down = _places(height, width)
+    key = (flat[lit].astype(np.intp) - 1) * total + of_tile.take(lit)
     count = np.bincount(key, minlength=colours * total).astype(np.float32)
     around = cv2.blur(
-        np.moveaxis(count.reshape(colours, rows, columns), 0, -1) * np.float32(share / _TILE**2),
+        np.moveaxis(count.reshape(colours, rows, columns), 0, -1) / np.float32(_TILE**2),
         (3, 3),
         borderType=cv2.BORDER_CONSTANT,
     ).reshape(rows, columns, colours)
     thin = np.moveaxis(around, -1, 0).ravel() < _DENSE
-    kept = ((count >= max(4, _TILE // (2 * share))) & thin).nonzero()[0]
+    kept = ((count >= _TILE // 2) & thin).nonzero()[0]
     if not len(kept):
         return None
-    among = np.full(len(count), len(kept))
+    among = np.full(len(count), len(kept), dtype=np.int32)
     among[kept] = np.arange(len(kept))
-    of = among[key]
-    some = of < len(kept)
-    of, dx, dy = of[some], dx[some], dy[some]
-    n = count[kept]
+    of = among.take(key)
+    some = np.flatnonzero(of < len(kept))
+    share = -(-len(some) // _MOST)
+    some = some[::share]
+    of, lit = of.take(some), lit.take(some)
+    dx, dy = right.take(lit), down.take(lit)
+    n = np.maximum(np.bincount(of, minlength=len(kept)), 1)
     sx, sy, xx, xy, yy = (np.bincount(of, value, len(kept)) for value in (dx, dy, dx * dx, dx * dy, dy * dy))
     mx, my = sx / n, sy / n
     vx, vy, c = xx / n - mx * mx, yy / n - my * my, xy / n - mx * my
     root = np.sqrt((vx - vy) ** 2 / 4 + c * c)
     long, short = (vx + vy) / 2 + root, (vx + vy) / 2 - root
-    worth = np.minimum(long / (short + 0.3), 20) * np.minimum(n, 2 * _TILE)
+    worth = np.minimum(long / (short + 0.3), 20) * np.minimum(share * n, 2 * _TILE)
     label, tile = np.divmod(kept, total)
     pick = np.concatenate([_most(np.where(label == colour, worth, -1.0), _TILES, 0.0) for colour in range(colours)])
     below, aside = np.divmod(tile[pick], columns)
     centre = mx[pick] + aside * _TILE + 1j * (my[pick] + below * _TILE)
-    return _Tiles(label[pick], n[pick], centre, np.exp(0.5j * np.arctan2(2 * c, vx - vy)[pick]))
+    return _Tiles(label[pick], count[kept[pick]], centre, np.exp(0.5j * np.arctan2(2 * c, vx - vy)[pick]))
 
 
 @lru_cache(maxsize=4)
 def _places(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of each pixel: its tile, and where in it to the right and down. Dividing anew takes longer than looking it up."""
-    y, x = np.divmod(np.arange(height * width + 8), width)
+    y, x = np.divmod(np.arange(height * width), width)
     (row, dy), (column, dx) = np.divmod(y, _TILE), np.divmod(x, _TILE)
     return row * -(-width // _TILE) + column, dx.astype(np.float32), dy.astype(np.float32)
 

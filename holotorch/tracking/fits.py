@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 _STEPS = 8
-_NEAR = 0.03  # samples: the next step is a twentieth, and of places two more follow
+_NEAR = 0.03  # of a blur, or samples: the next step is a twentieth, and of places two more follow
 _SHARED = 1.2  # neighbours share pixels: how much larger deviations are than of samples that do not, measured
 _STRANGE = 1.5  # what is left, over its white part: above it the model misses something, and averaging does not help
 _OTHER = 4.0  # standard deviations of an edge's own blur
@@ -82,7 +82,7 @@ def fit_edges(light: np.ndarray, weight: np.ndarray, blur: float = 0.9) -> EdgeF
         whole[~(whole > 0)] = np.inf
         step = (np.array([bb * p - pb * b, pp * b - pb * p]) / whole).clip(-1.5, 1.5)
         place, sigma = (place + step[0]).clip(-far, far), (sigma + step[1]).clip(SHARPEST, BLUNTEST)
-        if float(np.abs(step).max()) < _NEAR:
+        if bool((np.abs(step) < _NEAR * np.maximum(sigma, 1.0)).all()):
             break
     # One lens blurs all edges alike. Where one side is dark and so has little noise, place and blur are hard to tell
     # apart, edge by edge; together they are not.

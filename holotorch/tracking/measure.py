@@ -20,6 +20,7 @@ _OUTSIDE = 10  # samples beyond the outermost edges
 _HALFWAY, _SURE = 6, 3  # samples to either side of where labels change; the outermost of them that show one colour
 _AWAY = 2.0  # pixels from where it was expected at which an edge is looked at once more
 _MARGIN = 8.0  # pixels, and two blurs: what must be seen to either side of an edge
+_SMEARED = 4.0  # pixels of blur that no lens makes
 _UNSURE = 0.1  # pixels: a clear edge is known to a few hundredths
 _ALIKE = 0.2  # of the brightest channel: colours nearer than this are one
 _PALE = 0.5  # of the purity of what lies beside it
@@ -32,11 +33,15 @@ _SOFTER = 0.3  # pixels of blur that make no difference to it
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """Of the band edges [N] on a line, in pixels: t (NaN where not seen), its deviation, blur, bulge, and failures."""
+    """Of the band edges [N] on a line, in pixels: t (NaN where not seen), its deviation, blur, bulge, and failures.
+
+    ``expected`` is the blur for which the windows were made.
+    """
 
     t: np.ndarray
     deviation: np.ndarray
     blur: float
+    expected: float
     bulge: float
     hidden: tuple[int, ...]
     outside: tuple[int, ...]
@@ -111,7 +116,7 @@ def measure_edges(
     guess: np.ndarray,
     doubtful: tuple[bool, ...],
     blur: float,
-    curve: np.ndarray | None = None,
+    curve: np.ndarray,
 ) -> Edges:
     """Places of the edges near ``guess`` [N] (NaN: not looked for); ``curve`` [N]: how far a ring's front bulges in t.
 
@@ -122,7 +127,7 @@ def measure_edges(
     chosen = np.isfinite(guess).nonzero()[0]
     t, deviation = np.full(len(guess), np.nan), np.full(len(guess), np.inf)
     if not len(chosen):
-        return Edges(t, deviation, blur, 0.0, (), ())
+        return Edges(t, deviation, blur, blur, 0.0, (), ())
     near = guess[chosen]
     gaps = np.abs(np.diff(near))
     window = int(min(_WINDOW + 2 * blur, max(4.0, 0.45 * float(gaps.min()) if len(gaps) else _WINDOW)))
@@ -131,7 +136,7 @@ def measure_edges(
     widths = axis.width_at(near)
     half = math.ceil(float(widths.max()) / 2 + 0.5)
     u = np.arange(-half, half + 1.0)
-    bulge = np.zeros_like(near) if curve is None else curve[chosen]
+    bulge = curve[chosen]
     # Rows on the tube, and three to either side of it, which tell whether something lies across.
     sides = _sides(widths, blur)
     rows = np.concatenate([np.broadcast_to(u, (len(near), len(u))), sides], 1)  # [E, U + 6]
@@ -153,6 +158,11 @@ def measure_edges(
         shown = kept[..., None] * row[:, None] * sampler.inside(pixels[..., : len(u)])
         weight = shown[..., None] / variance_of(light)
         fit = fit_edges(light, weight, blur)
+        known = np.isfinite(fit.deviation)
+        if known.any() and median(fit.blur[known]) > _SMEARED > blur:
+            # It moved along itself, farther than what was looked at.
+            t[chosen] = near + fit.place
+            return measure_edges(sampler, lens, axis, t, doubtful, median(fit.blur[known]), curve)
         if bool((fit.deviation > _UNSURE).any()):
             # Surroundings that are not even leak into the outer rows; those in the middle may tell all the same.
             core = (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)
@@ -168,7 +178,7 @@ def measure_edges(
     else:
         beside = seen[:, :, len(u) :]
     covered, beyond = _across(beside, along - fit.place[:, None], fit)
-    if beyond and curve is not None and len(near) > 2:
+    if beyond and len(near) > 2:
         raise Refusal(Status.INCONSISTENT, "all bands go on beside the tube: this is thicker, seen in one part of it")
     reached = lens.distort(line.plane(near[:, None] + (_MARGIN + 2 * soft) * np.array([-1, 1])))
     within = np.all(sampler.inside(reached), -1)
@@ -185,6 +195,7 @@ def measure_edges(
         t,
         deviation,
         median(blurs) if len(blurs) else blur,
+        blur,
         float(np.abs(bulge).max()),
         tuple(hidden),
         tuple(outside),

@@ -37,8 +37,7 @@ _SLOW = 0.2  # of the width: a standard deviation that says that it may not have
 _THIRD, _NEARLY, _EXACT = 0.35, 0.01, 0.002  # how well the width is known without a pose, from a rough one, and after
 _WIDEST = 120.0  # pixels
 _AWAY = 1.5  # pixels from its width at which a tube is surely wider or narrower
-_BLUR = 0.9  # pixels, to begin with,
-_SMEARED = 4.0  # and where it is larger,
+_BLUR = 0.9  # pixels, to begin with
 _BLURRED = 0.6  # from which edges that differ by more are looked at again,
 _BENT = 0.05  # as are those whose fronts bulge by so many pixels more or less than was thought
 _FLAT = 0.05  # and by so many a pose is none that is thought anew
@@ -173,11 +172,7 @@ class CatheterTracker:
         with self._timed("edges"):
             first = curve = self._bulge(near, axis.line) if near else np.zeros(len(places))
             guess, _ = axis.line.place(line.plane(places))
-            blur = _BLUR
-            edges = measure_edges(sampler, lens, axis, guess - curve, stretches.doubtful, blur, curve)
-            if edges.blur > _SMEARED:  # it moved along itself: farther than what was looked at
-                blur = _SMEARED
-                edges = measure_edges(sampler, lens, axis, guess - curve, stretches.doubtful, blur, curve)
+            edges = measure_edges(sampler, lens, axis, guess - curve, stretches.doubtful, _BLUR, curve)
         with self._timed("pose"):
             # What the bulge has changed by is set right without another look at the frame: the mean over a front.
             found = self._solved(axis, edges)
@@ -198,7 +193,7 @@ class CatheterTracker:
             else:
                 axis = measure_axis(stations, wide, _EXACT, axis.blur, axis)
             edges = dataclasses.replace(edges, t=axis.line.place(plane)[0])
-        if float(np.abs(curve - first).max()) > _BENT or abs(edges.blur - blur) > _BLURRED:
+        if float(np.abs(curve - first).max()) > _BENT or abs(edges.blur - edges.expected) > _BLURRED:
             with self._timed("edges"):
                 edges = measure_edges(sampler, lens, axis, edges.t, stretches.doubtful, edges.blur, curve)
         with self._timed("pose"):
