@@ -5,6 +5,7 @@ In linear light, and what need not be known (levels of each row and channel) is 
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -14,8 +15,11 @@ _STEPS = 8
 _NEAR = 0.03  # of a blur, or samples: the next step is a twentieth, and of places two more follow
 _SHARED = 1.2  # neighbours share pixels: how much larger deviations are than of samples that do not, measured
 _STRANGE = 1.5  # what is left, over its white part: above it the model misses something, and averaging does not help
+_OWN = 1.4  # of the same: how far apart shading and gloss put the places of channels, in what noise does, measured
 _OTHER = 4.0  # standard deviations of an edge's own blur
 SHARPEST, BLUNTEST = 0.35, 10.0  # pixels, standard deviation of an edge
+
+Shape = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 def rise(z: np.ndarray) -> np.ndarray:
@@ -39,6 +43,7 @@ class EdgeFit:
         noise: Standard deviation of what the fit leaves, over that of the weights: 1 where those are right.
         steps: [E, U, C], light after the edge less light before, of each row and channel.
         levels: [E, U, C], light before.
+        apart: [E], how much farther apart the channels put edges than noise does; 1 or more, alike for all.
     """
 
     place: np.ndarray
@@ -47,6 +52,7 @@ class EdgeFit:
     noise: np.ndarray
     steps: np.ndarray
     levels: np.ndarray
+    apart: np.ndarray
 
     def or_better(self, other: "EdgeFit") -> "EdgeFit":
         """Of each edge the fit with the smaller deviation."""
@@ -55,13 +61,21 @@ class EdgeFit:
         return EdgeFit(*(np.where(better.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in pairs))
 
 
-def fit_edges(light: np.ndarray, weight: np.ndarray, blur: float = 0.9) -> EdgeFit:
+def normal_step(t: np.ndarray, place: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """A step from 0 to 1 at ``place`` [E], blurred by ``sigma`` [E], at t [T]; and its slopes to both: [E, 3, T]."""
+    z = (t - place[:, None]) / sigma[:, None]
+    bell = np.exp(-0.5 * z * z) / (-math.sqrt(2 * math.pi) * sigma[:, None])
+    return np.stack([rise(z), bell, bell * z], 1)
+
+
+def fit_edges(light: np.ndarray, weight: np.ndarray, blur: float = 0.9, shape: Shape = normal_step) -> EdgeFit:
     """Error functions of a place for each edge and one blur, with levels of their own in each row and channel.
 
     Args:
         light: [E, T, U, C] samples; T odd, the edge near the middle.
         weight: Inverse variances, of the same shape; 0 leaves a sample out.
         blur: To begin with, in samples.
+        shape: Of an edge.
     """
     rows = light.shape[2:]
     light, weight = (given.reshape(*given.shape[:2], -1).astype(np.float64) for given in (light, weight))  # [E, T, U C]
@@ -75,7 +89,7 @@ def fit_edges(light: np.ndarray, weight: np.ndarray, blur: float = 0.9) -> EdgeF
     given = weight, weight * centred, total
     sure = place
     for _ in range(_STEPS):
-        (pp, pb, bb), (p, b), *_ = _edge_terms(t, place, sigma, *given)
+        (pp, pb, bb), (p, b), *_ = _edge_terms(shape(t, place, sigma), *given)
         sure = (bb - pb * pb / np.maximum(pp, 1e-30)).clip(0, 1e12)  # inverse variance of the blur
         # An edge without weight has 0 / 0: it stays where it is, of infinite deviation.
         whole = (1 + 1e-6) * pp * bb - pb * pb
@@ -93,7 +107,7 @@ def fit_edges(light: np.ndarray, weight: np.ndarray, blur: float = 0.9) -> EdgeF
     sigma = np.where(alike, (sure * alike * sigma).sum() / together, sigma)
     more = 2
     while True:
-        (pp, pb, _), (p, _), amplitude, middle, up, own = _edge_terms(t, place, sigma, *given)
+        (pp, pb, _), (p, _), amplitude, middle, up, own = _edge_terms(shape(t, place, sigma), *given)
         move = (p / np.maximum(pp, 1e-30)).clip(-0.5, 0.5)
         place, more = (place + move).clip(-far, far), more - 1
         if not more or float(np.abs(move).max()) < _NEAR:
@@ -111,9 +125,9 @@ def fit_edges(light: np.ndarray, weight: np.ndarray, blur: float = 0.9) -> EdgeF
     doubt = np.maximum(strange / _STRANGE, 1) ** 2
     good = (pp > 0) & np.isfinite(variance) & (free > 0) & ~other
     deviation = np.where(good, _SHARED * np.sqrt(variance) * np.maximum(noise, 0.5) * doubt, np.inf)
-    deviation *= _apart(weight, amplitude, np.maximum(noise, 0.5), *own, rows[-1])
+    apart = _apart(weight, amplitude, np.maximum(noise, 0.5), *own, rows[-1])
     steps, levels = (value.reshape(-1, *rows) for value in (amplitude, mean - amplitude * middle))
-    return EdgeFit(place, sigma, deviation, noise, steps, levels)
+    return EdgeFit(place, sigma, apart * deviation, noise, steps, levels, np.full(len(place), apart))
 
 
 def _apart(
@@ -135,24 +149,17 @@ def _apart(
     slope, power = (value.reshape(len(value), -1, colours).sum(1) for value in (slope, power))
     power = np.maximum(power, 1e-30)
     spread = (slope * slope / power).sum(1) - slope.sum(1) ** 2 / power.sum(1)
-    return math.sqrt(max(1.0, (spread / noise**2).sum() / (_SHARED**2 * len(slope) * max(1, colours - 1))))
+    return math.sqrt(max(1.0, (spread / noise**2).sum() / ((_SHARED * _OWN) ** 2 * len(slope) * max(1, colours - 1))))
 
 
-def _edge_terms(
-    t: np.ndarray, place: np.ndarray, sigma: np.ndarray, weight: np.ndarray, weighted: np.ndarray, total: np.ndarray
-):
+def _edge_terms(shape: np.ndarray, weight: np.ndarray, weighted: np.ndarray, total: np.ndarray):
     """Normal matrix (pp, pb, bb) and slope (p, b) [E] for place and blur, amplitudes and means [E, U C], rise [E, T].
 
     And what :func:`_apart` needs of the last.
 
     ``weight`` and ``weighted`` (light times it) are [E, T, U C], their ``total`` over T [E, U C].
     """
-    z = (t - place[:, None]) / sigma[:, None]
-    basis = np.empty((len(place), 6, len(t)))  # the rise, its slopes to place and blur, and all three times the rise
-    basis[:, 0] = up = rise(z)
-    basis[:, 1] = bell = np.exp(-0.5 * z * z) / (-math.sqrt(2 * math.pi) * sigma[:, None])
-    basis[:, 2] = bell * z
-    basis[:, 3:] = basis[:, :3] * up[:, None]
+    basis = np.concatenate([shape, shape * shape[:, :1]], 1)  # the edge, its slopes, and all three times the edge
     # Weighted moments over T, for each row and channel.
     moments = basis @ weight
     means, with_light = moments[:, :3] / total[:, None], basis[:, :3] @ weighted
@@ -169,4 +176,11 @@ def _edge_terms(
     )
     normal = raw - taken @ taken.swapaxes(1, 2)
     entries = normal[:, 0, 0], normal[:, 0, 1], normal[:, 1, 1]
-    return entries, (slopes[:, 0], slopes[:, 1]), amplitude[:, 0], means[:, 0], up, (each[:, 0], taken[:, 0], bell)
+    return (
+        entries,
+        (slopes[:, 0], slopes[:, 1]),
+        amplitude[:, 0],
+        means[:, 0],
+        shape[:, 0],
+        (each[:, 0], taken[:, 0], shape[:, 1]),
+    )

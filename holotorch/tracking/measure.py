@@ -10,6 +10,7 @@ from holotorch.tracking.bands import Stretches, find_axis, find_stretches
 from holotorch.tracking.colours import ColourTable
 from holotorch.tracking.fits import EdgeFit, fit_edges, median, rise
 from holotorch.tracking.lens import Lens
+from holotorch.tracking.luma import coarse_colours, fit_luma
 from holotorch.tracking.stations import Axis, variance_of
 from holotorch.tracking.status import Refusal, Status
 from holotorch.tracking.strips import Line, Sampler
@@ -20,6 +21,7 @@ _OUTSIDE = 10  # samples beyond the outermost edges
 _HALFWAY, _SURE = 6, 3  # samples to either side of where labels change; the outermost of them that show one colour
 _AWAY = 2.0  # pixels from where it was expected at which an edge is looked at once more
 _MARGIN = 8.0  # pixels, and two blurs: what must be seen to either side of an edge
+_APART = 2.5  # from which channels put edges so far apart that a codec has moved the colours
 _SMEARED = 4.0  # pixels of blur that no lens makes
 _UNSURE = 0.1  # pixels: a clear edge is known to a few hundredths
 _ALIKE = 0.2  # of the brightest channel: colours nearer than this are one
@@ -35,7 +37,7 @@ _SOFTER = 0.3  # pixels of blur that make no difference to it
 class Edges:
     """Of the band edges [N] on a line, in pixels: t (NaN where not seen), its deviation, blur, bulge, and failures.
 
-    ``expected`` is the blur for which the windows were made.
+    ``expected`` is the blur for which the windows were made; ``coarse`` says that colours have fewer pixels than luma.
     """
 
     t: np.ndarray
@@ -43,6 +45,7 @@ class Edges:
     blur: float
     expected: float
     bulge: float
+    coarse: bool
     hidden: tuple[int, ...]
     outside: tuple[int, ...]
 
@@ -127,7 +130,7 @@ def measure_edges(
     chosen = np.isfinite(guess).nonzero()[0]
     t, deviation = np.full(len(guess), np.nan), np.full(len(guess), np.inf)
     if not len(chosen):
-        return Edges(t, deviation, blur, blur, 0.0, (), ())
+        return Edges(t, deviation, blur, blur, 0.0, False, (), ())
     near = guess[chosen]
     gaps = np.abs(np.diff(near))
     window = int(min(_WINDOW + 2 * blur, max(4.0, 0.45 * float(gaps.min()) if len(gaps) else _WINDOW)))
@@ -167,6 +170,9 @@ def measure_edges(
             # Surroundings that are not even leak into the outer rows; those in the middle may tell all the same.
             core = (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)
             fit = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur))
+        coarse = float(fit.apart[0]) > _APART or coarse_colours(sampler, complex(pixels[0, window, half]))
+        if coarse:
+            fit = fit_luma(fit, light, shown, sampler.light)
         near, looks = near + fit.place, looks - 1
         if not looks or float(np.abs(fit.place).max()) < _AWAY:
             break
@@ -197,6 +203,7 @@ def measure_edges(
         median(blurs) if len(blurs) else blur,
         blur,
         float(np.abs(bulge).max()),
+        coarse,
         tuple(hidden),
         tuple(outside),
     )

@@ -1,6 +1,7 @@
 """The mid-line of the tube's image and its width, from many stations across the bands."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,10 @@ _NARROWEST = 2.4  # pixels: below it no pixel shows one band alone
 _STATIONS, _FEWEST = 12, 6
 _SAMPLES = 6  # for each station: along the tube neighbours differ in nothing but noise
 _MOST = 700  # samples across, of all stations together: wide tubes take fewer stations
+THIRD = 0.35  # how well a width is known of which nothing is known, as a share of it
+_SLOW = 0.2  # of the width: a standard deviation that says that it may not have been reached yet
+_OTHER = 1.5  # pixels from its width at which a tube is surely wider or narrower
+_SHARP = 0.9  # pixels of blur, to begin with
 _FOCUS = 0.1  # of a blur: how well edges and sides agree in it
 _LINE_FLOOR = 0.008  # of the width: what gloss and shadow, which repeat along the tube, may move its middle
 
@@ -121,6 +126,33 @@ def measure_axis(
     if axis.width + axis.width_sd < _NARROWEST:
         raise Refusal(Status.TOO_NARROW, f"the catheter is {axis.width:.1f} px wide; {_NARROWEST:g} px are needed")
     return axis
+
+
+def measure_width(
+    look: Callable[[float, float], Stations], stations: Stations, axis: Axis, wide: tuple[float, float], known: float
+) -> tuple[Stations, Axis, Axis]:
+    """Stations, axis, and one more axis whose width is its own, to check with.
+
+    ``axis`` is that of a tube ``wide`` (at t = 0, and its taper, ``known`` to a share). Where the tube reaches beyond
+    the stations, ``look`` (at a width and a blur) sees it anew.
+    """
+    width = axis
+    if known < THIRD:
+        # Beginning with a width that is nearly right, gloss is not taken for it.
+        rough = stations.rough_width()
+        if abs(rough - wide[0]) < max(_OTHER, 0.25 * wide[0]):
+            width = measure_axis(stations, wide, THIRD, axis.blur, axis)
+        else:
+            width = measure_axis(stations, (rough, 0.0), THIRD, _SHARP)
+    if not stations.show(width.width, width.blur):
+        stations = look(width.width, width.blur)
+        other = abs(width.width - wide[0]) > 3 * width.width_sd
+        axis = measure_axis(stations, wide, known, width.blur)
+        own = (width.width, width.taper) if other else wide
+        width = measure_axis(stations, own, THIRD, width.blur, None if other else axis)
+        if width.width_sd > _SLOW * wide[0]:  # width against blur: a long valley, and steps are small
+            width = measure_axis(stations, (width.width, width.taper), THIRD, width.blur)
+    return stations, axis, width
 
 
 def narrowed(stations: Stations, axis: Axis, width: tuple[float, float], known: float) -> Axis:

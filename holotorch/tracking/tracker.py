@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 from contextlib import contextmanager
+from functools import partial
 
 import numpy as np
 import torch
@@ -21,7 +22,7 @@ from holotorch.tracking.footprint import bulge_px, on_plane, width_px
 from holotorch.tracking.lens import Lens
 from holotorch.tracking.measure import Edges, find_bands, halfway, measure_edges
 from holotorch.tracking.resection import Found, pose_on_line
-from holotorch.tracking.stations import Axis, focused, look_across, measure_axis, narrowed
+from holotorch.tracking.stations import THIRD, Axis, focused, look_across, measure_axis, measure_width, narrowed
 from holotorch.tracking.status import Pose, Refusal, Status
 from holotorch.tracking.strips import Line, Sampler
 
@@ -29,18 +30,17 @@ _FLOOR = 0.02  # pixels: what model, pixels and a table that shines through leav
 _ROUND = 0.008  # of what a ring's front bulges,
 _SOFT = 0.08  # of blur to all sides, since what lies beside the tube leaks into it,
 _SMEAR = 0.03  # and of blur along it, which is that of a lens or of a movement
+_ASIDE = 0.12  # pixels: what colours between other pixels than the luma leave in a line
 _UNLIKELY = {1: 10.83, 2: 13.82, 3: 16.27, 4: 18.47, 5: 20.52, 6: 22.46, 7: 24.32, 8: 26.12, 9: 27.88}  # 0.1 % of chi^2
 _SLANTED = 1.5  # times as wide as at a slight tilt, 55 degrees
 _PATH, _ALIKE = 2.5, 0.25  # longest way across, in widths, and how well the softness of the sides must agree with it,
 _CLEAR = 0.04  # where their distance is as clear as this
-_SLOW = 0.2  # of the width: a standard deviation that says that it may not have been reached yet
-_THIRD, _NEARLY, _EXACT = 0.35, 0.01, 0.002  # how well the width is known without a pose, from a rough one, and after
+_NEARLY, _EXACT = 0.01, 0.002  # how well the width is known from a rough pose, and after
 _WIDEST = 120.0  # pixels
-_AWAY = 1.5  # pixels from its width at which a tube is surely wider or narrower
 _BLUR = 0.9  # pixels, to begin with
 _BLURRED = 0.6  # from which edges that differ by more are looked at again,
 _BENT = 0.05  # as are those whose fronts bulge by so many pixels more or less than was thought
-_FLAT = 0.05  # and by so many a pose is none that is thought anew
+_FLAT = 0.05  # pixels of a bulge that change the tube's width by nothing
 _MOVED = 30.0  # pixels that a catheter may move between two frames
 _MEASURED = 2  # lines on a frame whose edges are looked at; those without bands cost little
 
@@ -49,12 +49,16 @@ class CatheterTracker:
     """Finds the catheter's bands on frames, and from their edges the pose.
 
     Coarse detection by a table of colours on every second pixel, a few line hypotheses, one strip of the frame along
-    each in the lens's own coordinates, edges in linear light, the pose by :func:`pose_on_line`. With a previous pose
-    only the strip around it is read, 30 pixels to each side: what has left it is refused, and found again on a frame
-    that comes without one. The work for a frame is bounded.
+    each in the lens's own coordinates, edges in linear light, or in luma where a codec has left colours fewer pixels,
+    the pose by :func:`pose_on_line`. With a previous pose only the strip around it is read, 30 pixels to each side:
+    what has left it is refused, and found again on a frame that comes without one. The work for a frame is bounded.
 
-    Frames may be on any device; what is read of them, a few thousand pixels, is worked on by the host, where one of the
-    thousand small calls costs less than its start does elsewhere. Poses are the host's.
+    Without a previous pose the tube's width, measured by itself, must agree with the pose; with one, what was found is
+    taken for the same catheter.
+
+    Frames may be on any device; what is read of them (every second pixel of every second row, or with a previous pose
+    some 15,000 pixels) is worked on by the host, where one of the thousand small calls costs less than its start does
+    elsewhere. Poses are the host's.
 
     Args:
         camera: Intrinsics and tone curve.
@@ -62,10 +66,11 @@ class CatheterTracker:
         most_sd: Standard deviation of the tip in metres above which a pose is refused as UNCERTAIN.
 
     Attributes:
-        times: Seconds that each stage of the last call took: colour, axis, edges, pose.
+        times: Seconds that each stage of the last call took, all frames together: colour, axis, edges, pose.
 
     Raises:
-        TypeError, ValueError: In a call: frames that are not uint8 [B, 3, H, W]; as many previous poses as frames.
+        TypeError, ValueError: ``most_sd`` not above 0; colours that are grey, alike, or the same from both ends; in a
+            call frames that are not uint8 [B, 3, H, W], or another number of previous poses.
 
     Source: Chapter 3 of the thesis for bands, one camera and what is asked; the method is our own.
     """
@@ -79,9 +84,13 @@ class CatheterTracker:
         self.times: dict[str, float] = {}
 
     def __call__(self, frames: Tensor, previous: Sequence[Pose] | None = None) -> list[Pose]:
-        """A pose for each frame of uint8 [B, 3, H, W]; ``previous`` poses of the same cameras narrow the search."""
+        """A pose for each frame, uint8 [B, 3, H, W], RGB; ``previous`` poses of the same cameras narrow the search."""
+        if not isinstance(frames, Tensor):
+            raise TypeError(f"frames must be a torch tensor, uint8 of shape [B, 3, H, W], got {type(frames).__name__}")
         if frames.ndim != 4 or frames.shape[1] != 3 or frames.dtype != torch.uint8:
             raise ValueError(f"frames must be uint8 of shape [B, 3, H, W], got {frames.dtype}, {list(frames.shape)}")
+        if isinstance(previous, Pose):
+            raise TypeError("previous must be a list with a pose for each frame, got one pose: write [pose]")
         if previous is not None and len(previous) != len(frames):
             raise ValueError(f"{len(frames)} frames take {len(frames)} previous poses, got {len(previous)}")
         self.times = dict.fromkeys(("colour", "axis", "edges", "pose"), 0.0)
@@ -150,25 +159,12 @@ class CatheterTracker:
         with self._timed("axis"):
             places = stretches.edges if before else halfway(sampler, lens, line, stretches.edges)
             near = before or self._rough(line, places)
-            wide, known = (self._wide(near, line), _NEARLY) if near else (self._slight(places), _THIRD)
+            wide, known = (self._wide(near, line), _NEARLY) if near else (self._slight(places), THIRD)
             stations = look_across(sampler, lens, line, stretches, wide[0], _BLUR)
             axis = width = measure_axis(stations, wide, known, _BLUR)
             if before is None:
-                if near:
-                    # Its own width is the check. Beginning with one that is nearly right, gloss is not taken for it.
-                    rough = stations.rough_width()
-                    if abs(rough - wide[0]) < max(_AWAY, 0.25 * wide[0]):
-                        width = measure_axis(stations, wide, _THIRD, axis.blur, axis)
-                    else:
-                        width = measure_axis(stations, (rough, 0.0), _THIRD, _BLUR)
-                if not stations.show(width.width, width.blur):
-                    stations = look_across(sampler, lens, line, stretches, width.width, width.blur)
-                    other = abs(width.width - wide[0]) > 3 * width.width_sd
-                    axis = measure_axis(stations, wide, known, width.blur)
-                    own = (width.width, width.taper) if other else wide
-                    width = measure_axis(stations, own, _THIRD, width.blur, None if other else axis)
-                    if width.width_sd > _SLOW * wide[0]:  # width against blur: a long valley, and steps are small
-                        width = measure_axis(stations, (width.width, width.taper), _THIRD, width.blur)
+                look = partial(look_across, sampler, lens, line, stretches)
+                stations, axis, width = measure_width(look, stations, axis, wide, known)
         with self._timed("edges"):
             first = curve = self._bulge(near, axis.line) if near else np.zeros(len(places))
             guess, _ = axis.line.place(line.plane(places))
@@ -245,7 +241,7 @@ class CatheterTracker:
         # amount to the larger of the two.
         middle = float(t.sum()) / len(t)
         reach = math.sqrt(float((t - middle) @ (t - middle)) / len(t))
-        about = math.hypot(axis.offset_sd, axis.slope_sd * (middle - axis.centre))
+        about = math.hypot(axis.offset_sd, axis.slope_sd * (middle - axis.centre), _ASIDE * edges.coarse)
         most = max(about, axis.slope_sd * reach)
         found = pose_on_line(axis.line, t, self._positions[known], along, most, most / reach)
         if found is None:

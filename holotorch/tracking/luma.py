@@ -1,0 +1,79 @@
+"""Edges in the luma of frames that a codec has taken the colours' resolution from: 4:2:0 video, JPEG, webcams.
+
+Codecs keep each pixel's luma, a sum of gamma's levels, but one colour for two or four pixels, often half a pixel aside.
+What all channels say of an edge is then off by up to a pixel; its luma still shows where it is.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from holotorch.tracking.fits import EdgeFit, fit_edges, median, normal_step
+from holotorch.tracking.strips import Sampler
+
+_SHARES = np.array([0.299, 0.587, 0.114])  # of red, green and blue levels in luma, ITU-R BT.601
+_LEVEL_SD = 2.5  # of a pixel's level; fits correct it by what they leave
+_PATCH, _COARSE = 24, 0.6  # pixels, and of luma's change
+_ASIDE = 0.25  # pixels: standard deviation of where an edge of coarse colours lies
+_STEP = 0.02  # pixels, and shares of a blur, between which slopes are taken
+
+
+def coarse_colours(sampler: Sampler, pixel: complex) -> bool:
+    """Whether near a pixel x + i y colours have fewer pixels than luma.
+
+    Noise that is each channel's own changes red less luma 1.3 times as much from pixel to pixel as luma. Where a codec
+    has halved the colours' resolution, they change less: between pixels that share one, or all along if smoothed.
+    """
+    room = (pixel.real, sampler.width - _PATCH), (pixel.imag, sampler.height - _PATCH)
+    x, y = (int(min(max(v - _PATCH // 2, 0), most)) for v, most in room)
+    patch = sampler.frame[:, y : y + _PATCH, x : x + _PATCH].cpu().numpy().astype(np.float32)
+    both = np.empty((2, *patch.shape[1:]), dtype=np.float32)
+    both[0] = _SHARES[0] * patch[0] + _SHARES[1] * patch[1] + _SHARES[2] * patch[2]
+    both[1] = patch[0] - both[0]
+    step = both[..., 1:] - both[..., :-1]
+    bend = np.abs(step[..., 1:] - step[..., :-1]).reshape(2, -1)
+    step = np.abs(step)
+    shared = min(median(step[1, :, ::2].ravel()), median(step[1, :, 1::2].ravel()))
+    return shared < _COARSE * median(step[0].ravel()) or median(bend[1]) < _COARSE * median(bend[0])
+
+
+def fit_luma(fit: EdgeFit, light: np.ndarray, shown: np.ndarray, curve: np.ndarray) -> EdgeFit:
+    """Places of edges by luma, where it tells them better than all channels did.
+
+    Blur acts on light and luma is a sum of levels: an edge's luma is no error function, but follows from the light on
+    both sides, which colours' lost resolution leaves alone.
+
+    Args:
+        fit: Of all channels, to ``light``.
+        light: [E, T, U, 3].
+        shown: [E, T, U], how much each sample counts.
+        curve: [256] light of each level, rising.
+    """
+    rows = shown.sum(1)[..., None]
+    low, step = ((value * rows).sum(1) / np.maximum(rows.sum(1), 1e-9) for value in (fit.levels, fit.steps))  # [E, 3]
+
+    def luma(values: np.ndarray) -> np.ndarray:
+        return np.interp(values, curve, np.arange(256.0)) @ _SHARES
+
+    def shape(t: np.ndarray, place: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+        def at(place: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+            up = normal_step(t, place, sigma)[:, 0]
+            return luma(low[:, None] + step[:, None] * up[..., None])
+
+        before, after = at(place - _STEP, sigma), at(place + _STEP, sigma)
+        sharp, blunt = at(place, sigma * (1 - _STEP)), at(place, sigma * (1 + _STEP))
+        slopes = (after - before) / (2 * _STEP), (blunt - sharp) / (2 * _STEP * sigma[:, None])
+        return np.stack([(before + after) / 2, *slopes], 1)
+
+    weight = shown[..., None] / (_LEVEL_SD**2 * float(_SHARES @ _SHARES))
+    found = fit_edges(
+        luma(light)[..., None], np.broadcast_to(weight, (*shown.shape, 1)), float(np.median(fit.blur)), shape
+    )
+    # All channels may be off together, too, by half a pixel of the colours' and farther where they are far apart.
+    worse = np.hypot(fit.apart * fit.deviation, _ASIDE)
+    better = found.deviation < worse
+    fit = dataclasses.replace(fit, deviation=worse)
+    return dataclasses.replace(
+        fit,
+        **{name: np.where(better, getattr(found, name), getattr(fit, name)) for name in ("place", "deviation", "blur")},
+    )
