@@ -47,6 +47,13 @@ def whole(name: str, value: int, least: int) -> int:
     return int(value)
 
 
+def port(value: int, least: int = 0) -> int:
+    """Return a port of TCP or UDP as int, or raise as :func:`whole`, also above 65535; ``least`` 0 picks a free one."""
+    if whole("port", value, least) > 65535:
+        raise ValueError(f"port must be at most 65535, got {value!r}")
+    return int(value)
+
+
 def pair(name: str, values: Sequence[float], unit: str = "") -> tuple[float, float]:
     """Return two finite numbers (y, x) as floats, or raise TypeError for what is no pair of numbers."""
     items = values if isinstance(values, Sequence) and not isinstance(values, str) else ()

@@ -223,7 +223,9 @@ def address(text: str) -> tuple[str, int]:
     host, colon, port = text.rpartition(":") if not text.endswith("]") and text.count(":") else (text, "", "")
     host = host.removeprefix("[").removesuffix("]")
     number = int(port) if port.isascii() and port.isdigit() else 0
-    if not host or (":" in host and not text.startswith("[")) or (colon and not 0 < number < 65536):
+    if colon and number > 65535:
+        raise ConfigError([f"expected a port from 1 to 65535, got {number} in {text!r}"])
+    if not host or (":" in host and not text.startswith("[")) or (colon and not number):
         raise ConfigError([f"expected HOST:PORT, such as 192.168.1.20:{PORT}, got {text!r}"])
     return host, number if colon else PORT
 

@@ -77,7 +77,7 @@ class TransformServer:
 
     def __init__(self, port: int = PORT, *, host: str = "0.0.0.0", name: str = "ToolToCamera"):
         _pyigtl()
-        self.port, self.host, self.name = checks.whole("port", port, 0), host, name
+        self.port, self.host, self.name = checks.port(port), host, name
         self._clients: set[_Client] = set()
         self._server: asyncio.Server | None = None
 

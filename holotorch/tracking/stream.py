@@ -29,12 +29,16 @@ class PoseSender:
     Args:
         receivers: Hosts (names or addresses) and ports.
         frame: Name of the matrix that the packets carry.
+
+    Raises:
+        ValueError: No receivers, or a port outside 1 to 65535.
+        OSError: No way to a receiver; when it is opened.
     """
 
     def __init__(self, receivers: Sequence[tuple[str, int]], *, frame: str = FRAME):
         if not receivers or isinstance(receivers[0], str):
             raise ValueError(f"receivers must be pairs (host, port), at least one, got {receivers!r}")
-        self.links = [Link(host, checks.whole("port", port, 1)) for host, port in receivers]
+        self.links = [Link(host, checks.port(port, 1)) for host, port in receivers]
         self.frame, self.stream = frame, secrets.randbits(63)
         self._sequence = itertools.count()
 
@@ -152,6 +156,7 @@ class PoseReceiver(asyncio.DatagramProtocol):
         clock: Seconds; by default that of the packets. The offset to the sender's is measured.
 
     Raises:
+        ValueError: A port outside 0 to 65535, or times that are not above zero.
         OSError: The port is in use; when it is opened.
     """
 
@@ -164,7 +169,7 @@ class PoseReceiver(asyncio.DatagramProtocol):
         late: float = 0.1,
         clock: Callable[[], float] = now,
     ):
-        self.port, self.host, self.clock = checks.whole("port", port, 0), host, clock
+        self.port, self.host, self.clock = checks.port(port), host, clock
         self.oldest, self.late = checks.positive("oldest", oldest, "s"), checks.positive("late", late, "s")
         self.statistics = Statistics()
         self.packet: PosePacket | None = None  # the newest, of any status and age

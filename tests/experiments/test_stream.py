@@ -87,9 +87,12 @@ def test_addresses():
     assert address("10.0.0.7:5005") == ("10.0.0.7", 5005)
     assert address("headset") == ("headset", 18950)
     assert address("[::1]:7") == ("::1", 7) and address("[::1]") == ("::1", 18950)
-    for bad in ("", ":5", "host:", "host:0", "host:70000", "host:port", "::1", "::1:7"):
+    for bad in ("", ":5", "host:", "host:0", "host:port", "::1", "::1:7"):
         with pytest.raises(ConfigError, match="expected HOST:PORT"):
             address(bad)
+    assert address("host:65535") == ("host", 65535)
+    with pytest.raises(ConfigError, match="expected a port from 1 to 65535, got 65536 in 'host:65536'"):
+        address("host:65536")
     assert socket.inet_aton(module.own_address())
 
 

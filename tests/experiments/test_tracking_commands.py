@@ -190,7 +190,8 @@ def test_stream_with_nobody_and_nothing_to_send(capsys):
     Path("other.csv").write_text("a,b\n1,2\n")
     assert "other.csv: not a table of poses" in said(capsys, "stream", "other.csv", *to)
     assert "rate must be above 0 Hz, got -5" in said(capsys, "stream", "poses.csv", *to, "--rate", "-5")
-    assert "expected HOST:PORT" in said(capsys, "stream", "poses.csv", "--to", "127.0.0.1:99999")
+    error = said(capsys, "stream", "poses.csv", "--to", "127.0.0.1:99999")
+    assert "expected a port from 1 to 65535, got 99999 in '127.0.0.1:99999'" in error
 
 
 def test_ports_that_are_none(capsys):

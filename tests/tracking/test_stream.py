@@ -270,5 +270,12 @@ def test_what_cannot_work_is_said():
         PoseSender([])
     with pytest.raises(ValueError, match="pairs"):
         PoseSender((HOME, 5))  # type: ignore[arg-type]
+    for wrong, message in ((99999, "port must be at most 65535, got 99999"), (0, "port must be at least 1, got 0")):
+        with pytest.raises(ValueError, match=message):
+            PoseSender([(HOME, 5), (HOME, wrong)])
+    for wrong, message in ((70000, "port must be at most 65535, got 70000"), (-1, "port must be at least 0, got -1")):
+        with pytest.raises(ValueError, match=message):
+            PoseReceiver(wrong)
+    assert PoseReceiver(65535).port == 65535
     with pytest.raises(ValueError, match="oldest must be above zero"):
         PoseReceiver(0, oldest=0.0)
