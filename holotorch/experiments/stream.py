@@ -7,6 +7,7 @@ import socket
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AsyncExitStack, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 
@@ -16,10 +17,24 @@ from holotorch.tracking.igtl import TransformServer
 from holotorch.tracking.packet import PosePacket, encode, now
 from holotorch.tracking.smoothing import OneEuro
 from holotorch.tracking.status import Pose, Status
-from holotorch.tracking.stream import PORT, PoseReceiver, PoseSender
+from holotorch.tracking.stream import PORT, Link, PoseReceiver, PoseSender
 
 _PLACE, _SPREAD = COLUMNS[5:11], COLUMNS[11:17]  # tip and direction; covariance of the tip
 _COLUMNS = ("time_s", "status", "reason", *_PLACE, *_SPREAD, "chi_square", "freedom")
+
+
+class Streamed(NamedTuple):
+    """What became of a stream.
+
+    Attributes:
+        frames: Poses and refusals that were handed on.
+        complete: Whether it came to its end; False where the user ended it.
+        delivered: False where every packet to every receiver met an error, and no OpenIGTLink was served.
+    """
+
+    frames: int
+    complete: bool
+    delivered: bool
 
 
 def read_poses(path: Path) -> list[tuple[float, Pose]]:
@@ -43,8 +58,10 @@ def read_poses(path: Path) -> list[tuple[float, Pose]]:
                     raise ConfigError([f"{path}:{table.line_num}: cannot be read as a pose: {error}"]) from None
                 if len(found) > 1 and found[-1][0] <= found[-2][0]:
                     raise ConfigError([f"{path}:{table.line_num}: time_s must rise from line to line"])
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError([f"{path}: {getattr(error, 'strerror', None) or error}"]) from None
+    except (UnicodeDecodeError, csv.Error):
+        raise ConfigError([f"{path}: no poses.csv as holotorch track writes it: not a text file"]) from None
+    except OSError as error:
+        raise ConfigError([f"{path}: {error.strerror or error}"]) from None
     if not found:
         raise ConfigError([f"{path}: no poses in it"])
     return found
@@ -85,8 +102,8 @@ def stream(
     smooth: bool = False,
     track: Callable[[Sequence[str]], Iterable[tuple[float, Pose]]] | None = None,
     show: Callable[[str], None] = print,
-) -> int:
-    """Send poses until they end or the user interrupts; the number sent.
+) -> Streamed:
+    """Send poses until they end or the user interrupts.
 
     Args:
         sources: One poses.csv, or what ``track`` understands: videos, folders, a camera's index.
@@ -112,16 +129,18 @@ def stream(
         poses = track(sources)
     else:
         raise ConfigError([f"expected one poses.csv or videos to track, got {' '.join(sources) or 'nothing'}"])
-    count = [0]
+    count, links, complete = [0], list[Link](), True
     try:
-        asyncio.run(_send(iter(poses), receivers, igtl, OneEuro() if smooth else None, count, show))
+        asyncio.run(_send(iter(poses), receivers, igtl, OneEuro() if smooth else None, count, links, show))
     except KeyboardInterrupt:
         show("interrupted")
+        complete = False
     except ImportError as error:
         raise ConfigError([str(error)]) from None
     except OSError as error:
         raise _said(error) from None
-    return count[0]
+    failed = igtl is None and bool(links) and all(link.errors and not link.sent for link in links)
+    return Streamed(count[0], complete, not failed)
 
 
 def _said(error: OSError) -> Exception:
@@ -135,11 +154,13 @@ async def _send(
     igtl: int | None,
     smoother: OneEuro | None,
     count: list[int],
+    links: list[Link],
     show: Callable[[str], None],
 ) -> None:
     async with AsyncExitStack() as stack:
         sender = await stack.enter_async_context(PoseSender(receivers)) if receivers else None
         server = await stack.enter_async_context(TransformServer(igtl)) if igtl is not None else None
+        links += sender.links if sender else ()
         show(f"Sending    to {', '.join(f'{host}:{port}' for host, port in receivers) or 'OpenIGTLink clients'}")
         if server:
             show(f"Slicer     connects to {own_address()}, port {server.port}")
@@ -156,8 +177,8 @@ async def _send(
                 count[0] += 1
         finally:
             show(f"Frames     {count[0]}")
-            for link in sender.links if sender else ():
-                text = f"; {link.errors} errors: {link.last_error}" if link.errors else ""
+            for link in links:
+                text = f", {link.errors} failed: {link.last_error}" if link.errors else ""
                 show(f"Receiver   {link.host}:{link.port}: {link.sent} sent, {link.dropped} dropped for newer{text}")
 
 

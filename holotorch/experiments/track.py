@@ -108,10 +108,17 @@ def live(
     """Times on the packets' clock and poses of one source, as its frames come; see :func:`run_tracking`.
 
     Frames of a file come at the pace of its times: those of their poses are when each is due, and may be still to come.
+    The source and its files are opened, and refused, when this is called; frames are read as poses are asked for.
     """
     if len(sources) != 1:
         raise ConfigError([f"expected one source to track and stream, got {len(sources)}"])
-    with opened(sources[0], camera, catheter, "ours", rate) as (frames, _, _, tracker, _):
+    stack = ExitStack()
+    return _live(stack, stack.enter_context(opened(sources[0], camera, catheter, "ours", rate)))
+
+
+def _live(stack: ExitStack, given: Given) -> Iterator[tuple[float, Pose]]:
+    with stack:
+        frames, tracker = given.frames, given.tracker
         for note in frames.notes:
             print(note, flush=True)
         said, began = len(frames.notes), None

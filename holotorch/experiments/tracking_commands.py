@@ -1,6 +1,7 @@
 """The commands track, calibrate and stream: their arguments, and what they call. Nothing loads before it is used."""
 
 import argparse
+import sys
 from pathlib import Path
 
 OK, FAILED, INTERRUPTED = 0, 1, 130
@@ -86,6 +87,8 @@ def _calibrate(options: argparse.Namespace) -> int:
 
 
 def _stream(options: argparse.Namespace) -> int:
+    if options.check or options.view:
+        _listens(options)
     if options.check:
         from holotorch.experiments.stream_check import check
 
@@ -96,8 +99,9 @@ def _stream(options: argparse.Namespace) -> int:
         stream.view(options.port)
         return OK
     from holotorch.experiments.track import live
+    from holotorch.io.video import is_camera
 
-    stream.stream(
+    found = stream.stream(
         options.sources,
         options.to or (),
         igtl=options.igtl,
@@ -105,4 +109,22 @@ def _stream(options: argparse.Namespace) -> int:
         smooth=options.smooth,
         track=lambda sources: live(sources, options.camera, options.catheter, options.rate),
     )
-    return OK
+    if not found.delivered:
+        print("nothing could be delivered: does a receiver run there? holotorch stream --view is one", file=sys.stderr)
+        return FAILED
+    # Of a camera, which never ends, Ctrl-C is the ordinary end.
+    return OK if found.complete or is_camera(options.sources[0]) else INTERRUPTED
+
+
+def _listens(options: argparse.Namespace) -> None:
+    """ConfigError for what the two ways of ``stream`` that send no poses of the user's would leave unused."""
+    from holotorch.experiments.errors import ConfigError
+
+    chosen = "--check" if options.check else "--view"
+    unused = ["SOURCE"] if options.sources else []
+    names = ("to", "igtl", "rate", "smooth", "camera", "catheter", *(["view"] if options.check else []))
+    given = {name: getattr(options, name) for name in names}
+    unused += [f"--{name}" for name, value in given.items() if value is not None and value is not False]
+    if unused:
+        does = "sends to this computer itself" if options.check else "only listens; send from another terminal"
+        raise ConfigError([f"{chosen} {does}: it takes no {', '.join(unused)}"])

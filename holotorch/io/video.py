@@ -85,9 +85,14 @@ def open_frames(source: str | Path, rate: float | None = None) -> Frames:
         return _folder(path, rate)
     if path.is_file():
         return _video(path, rate)
-    if str(source).isdecimal():
+    if is_camera(source):
         return _camera(int(str(source)), rate)
     raise ValueError(f"no such video, folder or camera: {source}; a camera is given by its number, such as 0")
+
+
+def is_camera(source: str | Path) -> bool:
+    """Whether a source is the number of a camera, and no file or folder of that name."""
+    return str(source).isdecimal() and not Path(source).exists()
 
 
 def _video(path: Path, rate: float | None) -> Frames:

@@ -118,7 +118,10 @@ class Newest(asyncio.BaseProtocol):
 
 
 class Link(Newest, asyncio.DatagramProtocol):
-    """One receiver as its sender sees it: counts of packets ``sent``, ``dropped`` for newer ones, and ``errors``."""
+    """One receiver as its sender sees it: counts of packets ``sent``, ``dropped`` for newer ones, and ``errors``.
+
+    ``sent`` has what the system took and nobody refused: UDP does not say what arrived. Each refusal is of one packet.
+    """
 
     def __init__(self, host: str, port: int):
         super().__init__()
@@ -131,7 +134,7 @@ class Link(Newest, asyncio.DatagramProtocol):
 
     def error_received(self, exc: Exception) -> None:
         """Called by asyncio: nobody listens there, or the network is gone; both may pass."""
-        self.errors, self.last_error = self.errors + 1, str(exc)
+        self.errors, self.last_error, self.sent = self.errors + 1, _reason(exc), max(0, self.sent - 1)
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
         """Called by asyncio: a clock request."""
@@ -143,6 +146,10 @@ class Link(Newest, asyncio.DatagramProtocol):
         if isinstance(asked, Echo) and not asked.reply and self.transport is not None:
             reply = Echo(asked.stream, asked.number, asked.asked, heard, now(), reply=True)
             self.transport.sendto(encode(reply))
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or str(error)
 
 
 class PoseReceiver(asyncio.DatagramProtocol):

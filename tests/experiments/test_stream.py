@@ -79,7 +79,7 @@ def test_what_is_wrong_in_a_file_is_said_with_its_line(tmp_path):
     with pytest.raises(ConfigError, match="No such file"):
         read_poses(tmp_path / "none.csv")
     path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match="poses.csv: "):
+    with pytest.raises(ConfigError, match="poses.csv: no poses.csv as holotorch track writes it: not a text file"):
         read_poses(path)
 
 
@@ -125,7 +125,8 @@ def test_ctrl_c_does_not_wait_for_the_next_pose(tmp_path, monkeypatch):
     monkeypatch.setattr(module.PoseSender, "send", send)
     lines: list[str] = []
     path = write(tmp_path / "poses.csv", [(10.0, pose(0.1)), (910.0, pose(0.2))])
-    assert stream([str(path)], ["127.0.0.1:9"], show=lines.append) == 1
+    found = stream([str(path)], ["127.0.0.1:9"], show=lines.append)
+    assert (found.frames, found.complete) == (1, False)
     assert len(sent) == 1 and lines[-1] == "interrupted"
 
 
@@ -158,10 +159,11 @@ def heard(sources, wanted, **options):
     listener, lines = Listener(wanted), []
     listener.start()
     listener.ready.wait(20)
-    count = stream(sources, [f"127.0.0.1:{listener.port}"], show=lines.append, **options)
+    found = stream(sources, [f"127.0.0.1:{listener.port}"], show=lines.append, **options)
     listener.join(20)
     assert not listener.is_alive()
-    return count, listener, lines
+    assert found.complete and found.delivered
+    return found.frames, listener, lines
 
 
 def test_a_recording_reaches_a_receiver(tmp_path):
@@ -174,6 +176,25 @@ def test_a_recording_reaches_a_receiver(tmp_path):
     assert "camera_from_tool tip 300.0, -333.3, 500.0 mm" in listener.lines[0]
     assert listener.lines[1] == "Received   4, lost 0, reordered 0, repeated 0"
     assert listener.lines[2].startswith("Of these   refused 1")
+
+
+def nobody() -> int:
+    """A UDP port of this computer on which nobody listens."""
+    with socket.socket(type=socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def test_packets_that_are_refused_are_not_said_to_be_sent(tmp_path):
+    path, dead, lines = str(write(tmp_path / "poses.csv")), nobody(), []
+    found = stream([path], [f"127.0.0.1:{dead}"], rate=50.0, show=lines.append)
+    assert (found.frames, found.complete, found.delivered) == (4, True, False)
+    assert lines[-1] == f"Receiver   127.0.0.1:{dead}: 0 sent, 0 dropped for newer, 4 failed: Connection refused"
+    with socket.socket(type=socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        to = [f"127.0.0.1:{dead}", f"127.0.0.1:{other.getsockname()[1]}"]
+        assert stream([path], to, rate=50.0, show=lines.append).delivered
+        assert lines[-1].endswith(": 4 sent, 0 dropped for newer")
 
 
 def test_tracked_and_smoothed_poses_reach_a_receiver():
@@ -191,7 +212,7 @@ def test_tracked_and_smoothed_poses_reach_a_receiver():
 def test_openigtlink_needs_its_package_or_serves(tmp_path, monkeypatch):
     path, lines = str(write(tmp_path / "poses.csv")), []
     pytest.importorskip("pyigtl")
-    assert stream([path], igtl=0, show=lines.append) == 4
+    assert stream([path], igtl=0, show=lines.append).frames == 4
     assert "Slicer     connects to" in lines[1]
 
     def missing(*_):

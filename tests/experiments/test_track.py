@@ -134,7 +134,9 @@ def test_live_poses_of_a_folder_come_with_its_notes_and_at_the_rate_asked_for(tm
     assert [pose.status.name for _, pose in found if isinstance(pose.status, Status)] == ["OK", "NO_CATHETER", "OK"]
     assert "calibrated at another resolution" in capsys.readouterr().out
     with pytest.raises(ConfigError, match="expected one source to track and stream, got 2"):
-        list(live(["a.mp4", "b.mp4"], *files))
+        live(["a.mp4", "b.mp4"], *files)
+    with pytest.raises(ConfigError, match="no camera.yaml"):  # at once, not with the first frame
+        live([str(source)], None, files[1])
 
 
 def test_live_poses_of_a_recording_need_no_other_files(tmp_path, tracker):

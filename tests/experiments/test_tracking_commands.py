@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from holotorch.cli import main
-from holotorch.experiments import stream_check, synthetic, track
+from holotorch.experiments import stream, stream_check, synthetic, track
 from holotorch.experiments.synthetic import write_synthetic
 from holotorch.tracking.packet import PosePacket, decode
 from holotorch.tracking.status import Status
@@ -208,6 +208,33 @@ def test_stream_of_a_video_takes_a_camera_and_a_catheter(capsys):
     assert "expected one source to track and stream, got 2" in said(capsys, "stream", "a.mp4", "b.mp4", *FILES, *to)
     assert "nowhere.mp4" in said(capsys, "stream", "nowhere.mp4", *FILES, *to)
     assert "none.yaml" in said(capsys, "stream", ".", "--camera", "none.yaml", *FILES[2:], *to)
+
+
+def test_stream_looks_at_its_files_before_it_says_that_it_sends(capsys):
+    cv2.imwrite("0.png", np.zeros((1080, 1920, 3), np.uint8))
+    assert main(["stream", ".", "--to", "127.0.0.1:1"]) == 2
+    assert capsys.readouterr().out == ""
+
+
+def test_what_sends_nothing_of_the_users_takes_no_source(capsys):
+    error = said(capsys, "stream", "poses.csv", "--to", "127.0.0.1:1", "--view")
+    assert error.splitlines() == ["--view only listens; send from another terminal: it takes no SOURCE, --to"]
+    error = said(capsys, "stream", "poses.csv", "--check")
+    assert error.splitlines() == ["--check sends to this computer itself: it takes no SOURCE"]
+    error = said(capsys, "stream", "--check", "--view", "--smooth", "--igtl", "0")
+    assert "takes no --igtl, --smooth, --view" in error
+
+
+def test_stream_says_by_its_status_what_became_of_it(monkeypatch, capsys):
+    for ended, source, status in (
+        ((4, True, True), "rec", 0),
+        ((4, False, True), "rec", 130),
+        ((4, False, True), "0", 0),  # a camera never ends
+        ((4, True, False), "rec", 1),
+    ):
+        monkeypatch.setattr(stream, "stream", lambda *_, ended=ended, **__: stream.Streamed(*ended))
+        assert main(["stream", source, "--to", "127.0.0.1:1"]) == status
+    assert "nothing could be delivered" in capsys.readouterr().err
 
 
 def test_stream_tracks_a_recording(recording, capsys):
