@@ -47,6 +47,9 @@ def calibrate_photographs(
     names = [path.name for path in paths]
     for path in paths:
         name = path.name if names.count(path.name) == 1 else str(path)
+        if not path.exists():
+            mistakes.append(f"{path}: no such file or folder")
+            continue
         try:
             grey = (with_channels(load_image(path), 1)[0] * 255).round().to(torch.uint8)
         except (ValueError, OSError) as error:

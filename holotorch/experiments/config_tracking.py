@@ -154,6 +154,11 @@ def build_catheter(settings: CatheterSettings) -> Catheter:
     return Catheter(settings.edges, settings.colours, settings.radius, settings.length)
 
 
+def misfit(path: Path, error: ValueError) -> ConfigError:
+    """What a tracker says of a catheter that it cannot see, where the colours stand, which it is always about."""
+    return ConfigError([read_source(path, []).mistake(("colours",), str(error))])
+
+
 def save_catheter(path: Path, catheter: Catheter) -> None:
     """Write a catheter, for instance one with edges that were measured."""
     settings = CatheterSettings(
@@ -195,7 +200,9 @@ def save_headset(path: Path, alignment: Alignment) -> None:
 
 
 def _read(model: type[AnySettings], path: Path | str, overrides: Sequence[str]) -> tuple[Source, AnySettings]:
-    source = read_source(Path(path), list(overrides))
+    needed = ", ".join(name for name, field in model.model_fields.items() if field.is_required())
+    kind = model.__name__.removesuffix("Settings").lower()
+    source = read_source(Path(path), list(overrides), f"the settings of a {kind}: {needed}")
     return source, validated(source, model)
 
 

@@ -28,8 +28,11 @@ class Source:
         return f"{self.places.get(known, f'{self.path}:1:1')}: {name + ': ' if name else ''}{message}"
 
 
-def read_source(path: Path, overrides: list[str]) -> Source:
-    """Read a YAML file and apply ``key.sub=value`` words to it; ConfigError lists all that cannot be read."""
+def read_source(path: Path, overrides: list[str], wanted: str = "settings such as 'experiment: pec'") -> Source:
+    """Read a YAML file and apply ``key.sub=value`` words to it; ConfigError lists all that cannot be read.
+
+    ``wanted`` says what such a file holds, to whoever gives one that holds nothing of the kind.
+    """
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -39,9 +42,9 @@ def read_source(path: Path, overrides: list[str]) -> Source:
     mistakes: list[str] = []
     data = _parse(text, str(path), source.places, (), mistakes)
     if data is None and not mistakes:
-        mistakes.append(f"{path}:1:1: the file is empty; expected settings such as 'experiment: pec'")
+        mistakes.append(f"{path}:1:1: the file is empty; expected {wanted}")
     elif not isinstance(data, dict) and not mistakes:
-        mistakes.append(f"{path}:1:1: expected settings such as 'experiment: pec', got {data!r}")
+        mistakes.append(f"{path}:1:1: expected {wanted}, got {data!r}")
     if not mistakes and isinstance(data, dict):
         source.data = data
         for word in overrides:

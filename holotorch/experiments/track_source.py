@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -13,11 +13,12 @@ from holotorch.experiments.config_tracking import (
     build_catheter,
     load_camera,
     load_catheter,
+    misfit,
 )
 from holotorch.experiments.errors import ConfigError
 from holotorch.io.bundled import find_config
 from holotorch.io.recording import is_recording, open_recording
-from holotorch.io.video import Frames, open_frames
+from holotorch.io.video import Frames, is_camera, no_such_source, open_frames
 from holotorch.tracking import Camera, Catheter, Pose
 
 METHODS = ("ours", "thesis")
@@ -53,7 +54,7 @@ def opened(
     """
     if method not in METHODS:
         raise ConfigError([f"expected one of {', '.join(METHODS)} as the method, got {method!r}"])
-    replayed = is_recording(Path(source))
+    replayed = _found(source)
     files = {"camera.yaml": camera, "catheter.yaml": catheter}
     for name in files:
         if files[name] is None and replayed and (Path(source) / name).is_file():
@@ -62,16 +63,47 @@ def opened(
     if missing:
         raise ConfigError(missing)
     paths = {name: find_config(path) or path for name, path in files.items() if path is not None}
-    lens, tool = load_camera(paths["camera.yaml"]), build_catheter(load_catheter(paths["catheter.yaml"]))
+    lens, tool = _loaded(paths)
     seen = build_camera(lens)
     try:
         tracker = make_tracker(method, seen, tool)
+    except ValueError as error:
+        raise misfit(paths["catheter.yaml"], error) from None
+    try:
         frames = open_recording(Path(source)) if replayed else open_frames(source, rate)
     except ValueError as error:
         raise ConfigError([str(error)]) from None
     with frames:
         _same_size(lens, frames)
         yield Given(frames, seen, tool, tracker, paths)
+
+
+def _found(source: str | Path) -> bool:
+    """Whether the source is a recording; ConfigError where there is none, or a part of one."""
+    path = Path(source)
+    if not (path.exists() or is_camera(source)):
+        raise ConfigError([no_such_source(source)])
+    if is_recording(path):
+        return True
+    parts = ("recording.json", "frames.rgb")
+    if any((path / name).is_file() for name in parts):
+        missing = [name for name in (parts[0], "times.csv") if not (path / name).is_file()]
+        raise ConfigError([f"{path}: a recording without its {' and '.join(missing)} cannot be replayed"])
+    return False
+
+
+def _loaded(paths: dict[str, Path]) -> tuple[CameraSettings, Catheter]:
+    """Camera and catheter of two files; ConfigError with the mistakes of both."""
+    mistakes: list[str] = []
+    found: list[Any] = []
+    for load, name in ((load_camera, "camera.yaml"), (load_catheter, "catheter.yaml")):
+        try:
+            found.append(load(paths[name]))
+        except ConfigError as error:
+            mistakes += error.mistakes
+    if mistakes:
+        raise ConfigError(mistakes)
+    return found[0], build_catheter(found[1])
 
 
 def make_tracker(method: str, camera: Camera, catheter: Catheter) -> Tracker:

@@ -1,6 +1,7 @@
 """The commands track, calibrate and stream: their arguments, and what they call. Nothing loads before it is used."""
 
 import argparse
+import re
 import sys
 from pathlib import Path
 
@@ -24,6 +25,8 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     calibrate.add_argument("files", nargs="+", type=Path, metavar="FILE", help="photographs, or folders of them")
     board = "chessboard 9x6 25mm (default; inner corners, square) or charuco 5x7 40mm 20mm DICT_6X6_250"
     calibrate.add_argument("--board", nargs="+", metavar="WORD", help=board)
+    # A size of -25mm is a wrong size, and no unknown option; argparse knows this of whole numbers only.
+    calibrate._negative_number_matcher = re.compile(r"-\.?\d")
     calibrate.add_argument("--out", type=Path, default=Path("camera.yaml"), help="file (default: camera.yaml)")
     calibrate.set_defaults(action=_calibrate)
 

@@ -87,7 +87,12 @@ def open_frames(source: str | Path, rate: float | None = None) -> Frames:
         return _video(path, rate)
     if is_camera(source):
         return _camera(int(str(source)), rate)
-    raise ValueError(f"no such video, folder or camera: {source}; a camera is given by its number, such as 0")
+    raise ValueError(no_such_source(source))
+
+
+def no_such_source(source: str | Path) -> str:
+    """Message for a source that is neither there nor the number of a camera."""
+    return f"no such video, folder or camera: {source}; a camera is given by its number, such as 0"
 
 
 def is_camera(source: str | Path) -> bool:

@@ -71,7 +71,11 @@ def test_bad_photographs_are_all_named(photographs, tmp_path):
     with pytest.raises(ConfigError) as caught:
         calibrate_photographs(files, tmp_path / "camera.yaml", WORDS)
     text = str(caught.value)
-    assert "gone.png" in text and "text.png is not a readable picture" in text
+    assert (
+        "gone.png: no such file or folder" in text
+        and "astronaut" not in text
+        and "text.png is not a readable picture" in text
+    )
     assert "small.png: 400 x 200 px, the others have 400 x 300" in text
     assert not (tmp_path / "camera.yaml").exists()
 
@@ -124,6 +128,7 @@ def test_boards_by_their_words():
         ("chess 9x6 25mm", "chessboard 9x6 25mm"),
         ("chessboard 9 25mm", "expected chessboard"),
         ("chessboard 9x6 25", "25 mm are 0.025"),
+        ("chessboard 9x6 -25mm", "--board: square must be above zero in metres, got -0.025"),
         ("chessboard 9x6 25foot", "expected a length"),
         ("chessboard 9x6 25mm 3mm", "expected chessboard"),
         ("charuco 5x7 40mm 20mm", "DICT_6X6_250"),

@@ -115,7 +115,9 @@ def test_a_catheter_that_no_tracker_sees_is_refused_before_anything_is_written(t
     save_camera(tmp_path / "camera.yaml", CAMERA, SIZE)
     save_catheter(tmp_path / "catheter.yaml", Catheter(THESIS.edges, greys, THESIS.radius, THESIS.length))
     source = pictures(tmp_path / "in", [9])
-    with pytest.raises(ConfigError, match=message):
+    text = (tmp_path / "catheter.yaml").read_text()
+    line = text[: text.index("colours:")].count("\n") + 1
+    with pytest.raises(ConfigError, match=f"catheter.yaml:{line}:1: colours: .*{message}"):
         tracked(tmp_path, source, method=method)
     assert not (tmp_path / "out").exists()
     if method == "ours":

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import socket
 import subprocess
 import sys
@@ -121,6 +122,29 @@ def test_track_with_wrong_arguments(capsys):
     assert "unrecognized arguments: --colour" in wrong(capsys, "track", ".", "--colour", "red")
 
 
+def test_track_looks_for_the_source_first(recording, capsys):
+    assert said(capsys, "track", "nowhere").splitlines() == [
+        "no such video, folder or camera: nowhere; a camera is given by its number, such as 0"
+    ]
+    for name, lost in (("a", "times.csv"), ("b", "recording.json")):
+        shutil.copytree(recording, name)
+        Path(name, lost).unlink()
+        assert said(capsys, "track", name) == f"{name}: a recording without its {lost} cannot be replayed\n"
+
+
+def test_track_with_two_wrong_files_names_both(capsys):
+    cv2.imwrite("0.png", np.zeros((1080, 1920, 3), np.uint8))
+    error = said(capsys, "track", ".", "--camera", "no1.yaml", "--catheter", "no2.yaml")
+    assert [line.split(":")[0] for line in error.splitlines()] == ["no1.yaml", "no2.yaml"]
+    Path("no1.yaml").write_text("")
+    Path("no2.yaml").write_text("[1, 2]\n")
+    error = said(capsys, "track", ".", "--camera", "no1.yaml", "--catheter", "no2.yaml")
+    assert error.splitlines() == [
+        "no1.yaml:1:1: the file is empty; expected the settings of a camera: fx, fy, cx, cy",
+        "no2.yaml:1:1: expected the settings of a catheter: edges, colours, radius, length, got [1, 2]",
+    ]
+
+
 def test_track_for_frames_of_another_size(capsys):
     cv2.imwrite("0.png", np.zeros((48, 64, 3), np.uint8))
     Path("camera.yaml").write_text("fx: 60\nfy: 60\ncx: 320\ncy: 240\nsize: [480, 640]\n")
@@ -130,7 +154,9 @@ def test_track_for_frames_of_another_size(capsys):
 
 def test_calibrate_with_files_that_are_missing_or_wrong(capsys):
     assert "FILE" in wrong(capsys, "calibrate")
-    assert "none.png" in said(capsys, "calibrate", "none.png")
+    assert said(capsys, "calibrate", "none.png", "camera") == (
+        "none.png: no such file or folder\ncamera: no such file or folder\n"
+    )
     Path("empty").mkdir()
     assert "empty" in said(capsys, "calibrate", "empty")
     for i in range(4):
@@ -144,6 +170,8 @@ def test_calibrate_with_files_that_are_missing_or_wrong(capsys):
 
 def test_calibrate_with_a_board_that_is_none(capsys):
     cv2.imwrite("0.png", np.full((120, 160, 3), 90, np.uint8))
+    error = said(capsys, "calibrate", "0.png", "--board", "chessboard", "9x6", "-25mm")
+    assert error == "--board: square must be above zero in metres, got -0.025\n"
     for words in (["circles", "9x6", "25mm"], ["chessboard", "9x6"], ["chessboard", "nine", "25mm"], ["charuco"]):
         assert "--board: expected chessboard 9x6 25mm" in said(capsys, "calibrate", "0.png", "--board", *words)
 
