@@ -3,20 +3,32 @@
 import csv
 import io
 import math
+import shutil
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 import torch
 from tqdm import tqdm
 
-from holotorch.experiments.config_tracking import save_camera, save_catheter
+from holotorch.experiments.config_tracking import (
+    build_camera,
+    build_catheter,
+    load_camera,
+    load_catheter,
+    save_camera,
+    save_catheter,
+)
+from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.run import claim
+from holotorch.io.bundled import find_config
 from holotorch.io.files import write_text
-from holotorch.io.recording import Recorder
+from holotorch.io.recording import Recorder, is_recording
 from holotorch.io.video import Frame
+from holotorch.tracking.catheter import THESIS
 from holotorch.tracking.protocols import coverage
 from holotorch.tracking.scenery import SKIN, drape, finger
-from holotorch.tracking.world import World
+from holotorch.tracking.world import World, synthetic_camera
 
 RATE = 30.0  # frames per second
 _TIP = ("tip_x_m", "tip_y_m", "tip_z_m")
@@ -26,18 +38,52 @@ _WRONG = 5.0  # mm
 _COLUMNS = ("frame", "time_s", *_TIP, "direction_x", "direction_y", "direction_z")
 
 
-def write_synthetic(out: Path | None, frames: int = 45, size: tuple[int, int] = (1080, 1920)) -> Path:
+def write_synthetic(
+    out: Path | None,
+    frames: int = 45,
+    size: tuple[int, int] = (1080, 1920),
+    camera: Path | None = None,
+    catheter: Path | None = None,
+) -> Path:
     """Render a recording, and ``truth.csv`` beside its frames; its folder, ``out`` or the next free runs/synthetic-001.
 
     A catheter swings over a surgical drape and skin-coloured fingers pass over its bands. ``holotorch track`` takes
-    the folder as it is, with the camera and the catheter that were rendered.
+    the folder as it is, with the camera and the catheter that were rendered. Whatever ends the rendering early leaves
+    no folder.
+
+    Args:
+        out: New or empty folder.
+        frames: To render.
+        size: (H, W) of a camera that states none.
+        camera: YAML file; :func:`synthetic_camera` by default.
+        catheter: The same; the thesis's.
+
+    Raises:
+        ConfigError: A file that cannot be used, a folder in use, or a catheter that is nowhere before the camera.
     """
+    lens = None if camera is None else load_camera(find_config(camera) or camera)
+    tool = THESIS if catheter is None else build_catheter(load_catheter(find_config(catheter) or catheter))
+    size = (lens and lens.size) or size
+    seen = synthetic_camera(size) if lens is None else build_camera(lens)
     folder = claim(out, "synthetic")
+    try:
+        _render(folder, frames, World(size=size, camera=seen, catheter=tool))
+    except ValueError as error:
+        shutil.rmtree(folder)
+        raise ConfigError([f"this catheter cannot be rendered with this camera: {error}"]) from None
+    except BaseException:
+        shutil.rmtree(folder)  # claimed empty a moment ago
+        raise
+    return folder
+
+
+def _render(folder: Path, frames: int, world: World) -> None:
     if (folder / "images").is_dir():
         (folder / "images").rmdir()
-    world = World(size=size)
+    size, tool = world.size, world.catheter
     cloth = drape(size, 0, (70, 120, 130))
-    scale = size[1] / 1920
+    scale = float(world.camera.matrix[0, 0]) / 1400  # of a finger in pixels
+    across = (tool.edges[0] + tool.edges[-1]) / 2
     table = io.StringIO()
     rows = csv.writer(table, lineterminator="\n")
     rows.writerow(_COLUMNS)
@@ -52,8 +98,8 @@ def write_synthetic(out: Path | None, frames: int = 45, size: tuple[int, int] = 
                 turn = 2 * math.pi * i / 45
                 at = (0.05 * math.sin(turn), 0.03 * math.cos(turn))
                 tip, along = world.pose(0.5 + 0.03 * math.sin(turn), math.radians(15 + 8 * math.cos(turn)), 0.4, at)
-                middle = world.camera.project((tip + 0.127 * along)[None])[0]
-                # A finger passes over the second band for a while.
+                middle = world.camera.project((tip + across * along)[None])[0]
+                # A finger passes over the middle of the bands for a while.
                 covers = 20 <= i % 45 < 30
                 start = (float(middle[0]), float(middle[1]) - 260 * scale)
                 end = (float(middle[0]), float(middle[1]) + 14 * scale)
@@ -66,24 +112,53 @@ def write_synthetic(out: Path | None, frames: int = 45, size: tuple[int, int] = 
             path.unlink()
         own.rmdir()
     write_text(folder / "truth.csv", table.getvalue())
-    return folder
 
 
-def errors(poses: Path, truth: Path) -> dict[str, float]:
-    """How far the tips of a poses.csv lie from a truth.csv, as plain JSON values in mm; nothing where there is none.
+def read_truth(folder: Path) -> dict[str, list[float]]:
+    """True tips in metres by the number of their frame, of the truth.csv in a folder; empty where there is none.
 
-    ``coverage``: share of the answered frames whose truth lies in the 95 % ellipsoid of the stated covariance.
-    ``wrong``: frames off by more than 5 mm.
+    Beside pictures a table of that name may be about something else and is left alone; in a recording it is the truth.
+
+    Raises:
+        ConfigError: A table that cannot be read as the truth, with the first line that is wrong.
     """
-    if not (poses.is_file() and truth.is_file()):
+    path = folder / "truth.csv"
+    if not path.is_file():
         return {}
-    with open(truth, newline="") as stream:
-        table = csv.DictReader(stream)
-        if not {"frame", *_TIP} <= set(table.fieldnames or ()):
-            return {}  # another table of that name
-        true = {row["frame"]: [row[name] for name in _TIP] for row in table}
+    wanted, found = ("frame", *_TIP), dict[str, list[float]]()
+    try:
+        with open(path, newline="", encoding="utf-8") as stream:
+            table = csv.DictReader(stream)
+            names = table.fieldnames or ()
+            if missing := [name for name in wanted if name not in names]:
+                if not is_recording(folder):
+                    return {}
+                raise ConfigError([f"{path}:1: columns {', '.join(missing)} are missing, got {', '.join(names)}"])
+            for row in table:
+                try:
+                    frame, place = str(int(row["frame"])), [float(row[name]) for name in _TIP]
+                    if not all(map(math.isfinite, place)) or frame in found:
+                        raise ValueError
+                except (TypeError, ValueError):
+                    got = ",".join(str(row[name]) for name in wanted)
+                    text = "the number of a frame, each once, and a finite tip in metres"
+                    raise ConfigError([f"{path}:{table.line_num}: expected {text}, got {got}"]) from None
+                found[frame] = place
+    except (UnicodeDecodeError, csv.Error):
+        raise ConfigError([f"{path}: not a table in UTF-8 text"]) from None
+    return found
+
+
+def errors(poses: Path, true: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    """How far the tips of a poses.csv lie from the truth, as plain JSON values in mm; nothing where none is known.
+
+    ``true``: as :func:`read_truth` gives it. ``coverage``: share of the answered frames whose truth lies in the 95 %
+    ellipsoid of the stated covariance. ``wrong``: frames off by more than 5 mm.
+    """
     with open(poses, newline="") as stream:
         known = [row for row in csv.DictReader(stream) if row["frame"] in true]
+    if not known:
+        return {}
     rows = [row for row in known if row["tip_x_m"] not in ("", "nan")]
     found: dict[str, float] = {"frames": len(rows), "refused": len(known) - len(rows)}
     if not rows:
@@ -103,11 +178,10 @@ def errors(poses: Path, truth: Path) -> dict[str, float]:
     return found
 
 
-def compared(poses: Path, truth: Path) -> str:
-    """The same in words."""
-    found = errors(poses, truth)
-    if not found.get("frames"):
-        return f"Truth      no frame answered of {found.get('refused', 0)} (synthetic)"
+def compared(found: Mapping[str, float]) -> str:
+    """What :func:`errors` has found, in words."""
+    if not found["frames"]:
+        return f"Truth      no frame answered of {found['refused']} (synthetic)"
     return (
         f"Truth      the tip is {found['median_mm']:.2f} mm off (median), {found['worst_mm']:.2f} at most, "
         f"in {found['frames']} frames; {found['refused']} refused (synthetic)"

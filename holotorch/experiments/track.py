@@ -18,8 +18,8 @@ from tqdm import tqdm
 from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.run import claim, deferred, interruptible
-from holotorch.experiments.synthetic import errors
-from holotorch.experiments.track_report import COLUMNS, Log, Tracked, row, summarised, verdict, write_page
+from holotorch.experiments.synthetic import compared, errors, read_truth
+from holotorch.experiments.track_report import COLUMNS, Log, Tracked, known, row, summarised, verdict, write_page
 from holotorch.experiments.track_source import Given, Tracker, opened
 from holotorch.io.files import append, replacing, write_bytes, write_json, write_text
 from holotorch.io.recording import Recorder, free_bytes, recording_bytes
@@ -85,9 +85,11 @@ def run_tracking(
         The folder, and whether the source was tracked to its end.
 
     Raises:
-        ConfigError: A source, file or method that cannot be used, a folder in use, or no room for the recording.
+        ConfigError: A source, file or method that cannot be used, a truth.csv of a recording that cannot be read, a
+            folder in use, or no room for the recording.
     """
     with opened(source, camera, catheter, method, rate) as given:
+        truth = read_truth(Path(source))
         for line in [*_announced(given.frames, out, record), *given.frames.notes]:
             print(line, flush=True)
         settings = {
@@ -99,7 +101,7 @@ def run_tracking(
             "still": still,
             "rate_hz": rate,
         }
-        return _fill(claim(out, "track"), given, settings)
+        return _fill(claim(out, "track"), given, settings, truth)
 
 
 def live(
@@ -130,7 +132,7 @@ def _live(stack: ExitStack, given: Given) -> Iterator[tuple[float, Pose]]:
             print(note, flush=True)
 
 
-def _fill(folder: Path, given: Given, settings: dict[str, Any]) -> tuple[Path, bool]:
+def _fill(folder: Path, given: Given, settings: dict[str, Any], truth: dict[str, list[float]]) -> tuple[Path, bool]:
     frames, log, failure, recorder = given.frames, Log(folder / "images"), None, None
     said = len(frames.notes)
     with interruptible() as pressed:
@@ -177,14 +179,15 @@ def _fill(folder: Path, given: Given, settings: dict[str, Any]) -> tuple[Path, b
                 raise failure or KeyboardInterrupt
             complete = failure is None and (not pressed or frames.live)
             summary = summarised(log, frames, settings["method"], settings["still"])
-            if truth := errors(folder / "poses.csv", Path(settings["source"]) / "truth.csv"):
-                summary["truth"] = truth
+            if found := errors(folder / "poses.csv", truth):
+                summary["truth"] = found
             summary["status"] = "complete" if complete else "interrupted"
             if failure is not None:
                 summary["failure"] = f"{type(failure).__name__}: {failure}"
             write_page(folder, summary, log)
-            write_json(folder / ("summary.json" if complete else "interrupted.json"), summary)
-    print("\n".join([verdict(summary), *frames.notes[said:]]), flush=True)
+            write_json(folder / ("summary.json" if complete else "interrupted.json"), known(summary))
+    lines = [verdict(summary), *frames.notes[said:]]
+    print("\n".join(lines + ([compared(summary["truth"])] if "truth" in summary else [])), flush=True)
     if failure is not None:
         print(f"failed; what was found until then is in {folder}", file=sys.stderr)
         raise failure

@@ -124,8 +124,8 @@ def summarised(log: Log, frames: Frames, method: str, still: bool) -> dict[str, 
         "stated_rate_hz": frames.rate,
     }
     if answered:
-        known = torch.tensor([value for value in log.deviations if math.isfinite(value)], dtype=torch.float64)
-        summary["tip_sd_mm"] = {"median": 1e3 * _at(known, 0.5), "largest": 1e3 * _at(known, 1.0)}
+        stated = torch.tensor([value for value in log.deviations if math.isfinite(value)], dtype=torch.float64)
+        summary["tip_sd_mm"] = {"median": 1e3 * _at(stated, 0.5), "largest": 1e3 * _at(stated, 1.0)}
     if log.seconds:
         taken = 1e3 * torch.tensor(log.seconds, dtype=torch.float64)
         summary["milliseconds"] = {
@@ -153,6 +153,15 @@ def summarised(log: Log, frames: Frames, method: str, still: bool) -> dict[str, 
         except ValueError as error:
             notes.append(f"no stability: {error}")
     return summary | {"notes": notes, "peak_memory_bytes": peak_memory()}
+
+
+def known(value: Any) -> Any:
+    """JSON values with nothing (null) for NaN and infinity: one number must not cost a run its summary."""
+    if isinstance(value, dict):
+        return {key: known(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [known(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def verdict(summary: dict[str, Any]) -> str:
@@ -221,6 +230,8 @@ def _inline(folder: Path, name: str) -> str:
 
 
 def _at(values: Tensor, share: float) -> float:
+    if not len(values):
+        return math.nan
     return float(values.sort().values[round(share * (len(values) - 1))])
 
 

@@ -58,7 +58,7 @@ def _track(options: argparse.Namespace) -> int:
     if source == "synthetic":
         from holotorch.experiments.synthetic import write_synthetic
 
-        source = str(write_synthetic(None))
+        source = str(write_synthetic(None, camera=options.camera, catheter=options.catheter))
         print(source)
     folder, complete = run_tracking(
         source,
@@ -71,10 +71,6 @@ def _track(options: argparse.Namespace) -> int:
         still=options.still,
         rate=options.rate,
     )
-    if (truth := Path(source) / "truth.csv").is_file():
-        from holotorch.experiments.synthetic import compared
-
-        print(compared(folder / "poses.csv", truth))
     print(folder / "report.html")
     return OK if complete else INTERRUPTED
 

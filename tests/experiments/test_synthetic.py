@@ -3,14 +3,17 @@
 import csv
 import json
 import math
+import shutil
+import signal
 
 import numpy as np
 import pytest
 import torch
 
+from holotorch.experiments import synthetic, track
 from holotorch.experiments.config_tracking import build_camera, build_catheter, load_camera, load_catheter
 from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.synthetic import RATE, compared, errors, write_synthetic
+from holotorch.experiments.synthetic import RATE, compared, errors, read_truth, write_synthetic
 from holotorch.experiments.track import run_tracking
 from holotorch.io.recording import is_recording, open_recording
 from holotorch.tracking.catheter import THESIS
@@ -93,9 +96,9 @@ def test_poses_are_compared_with_the_truth_in_words(tmp_path):
         ("3", "", "", ""),
         ("4", "nan", "nan", "nan"),
     ]
-    text = compared(write(tmp_path / "poses.csv", rows), true)
+    text = compared(errors(write(tmp_path / "poses.csv", rows), read_truth(true.parent)))
     assert "the tip is 1.00 mm off (median), 5.00 at most, in 3 frames; 2 refused (synthetic)" in text
-    nothing = compared(write(tmp_path / "poses.csv", rows[3:]), true)
+    nothing = compared(errors(write(tmp_path / "poses.csv", rows[3:]), read_truth(true.parent)))
     assert "no frame answered of 2 (synthetic)" in nothing
 
 
@@ -120,9 +123,60 @@ def test_a_run_of_a_synthetic_recording_holds_its_errors(folder, tmp_path):
 
 def test_other_tables_of_that_name_and_frames_beyond_it_are_left_out(tmp_path):
     poses = write(tmp_path / "poses.csv", [("0", "0.01", "0.02", "0.507"), ("7", "0.01", "0.02", "0.5")])
-    assert errors(poses, tmp_path / "truth.csv") == {}
+    assert read_truth(tmp_path) == {} and errors(poses, {}) == {}
     (tmp_path / "truth.csv").write_text("name,value\na,1\n")
-    assert errors(poses, tmp_path / "truth.csv") == {}
-    true = write(tmp_path / "truth.csv", [("0", "0.01", "0.02", "0.5")])
-    found = errors(poses, true)
+    assert read_truth(tmp_path) == {}  # beside pictures it may be anything
+    write(tmp_path / "truth.csv", [("0", "0.01", "0.02", "0.5")])
+    found = errors(poses, read_truth(tmp_path))
     assert found["frames"] == found["wrong"] == 1 and found["worst_mm"] == pytest.approx(7) and "coverage" not in found
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a,b\n1,2\n", "1: columns frame, tip_x_m, tip_y_m, tip_z_m are missing, got a, b"),
+        ("", "1: columns frame, tip_x_m, tip_y_m, tip_z_m are missing, got "),
+        ("frame,tip_x_m,tip_y_m,tip_z_m\n0,0,0,1\n1,0,nan,1\n", "3: expected .* a finite tip in metres, got 1,0,nan,1"),
+        ("frame,tip_x_m,tip_y_m,tip_z_m\n0,0,0,left\n", "2: expected .*, got 0,0,0,left"),
+        ("frame,tip_x_m,tip_y_m,tip_z_m\n0,0\n", "2: expected .*, got 0,0,None,None"),
+        ("frame,tip_x_m,tip_y_m,tip_z_m\n0,0,0,1\n0,0,0,1\n", "3: expected the number of a frame, each once"),
+        ("frame,tip_x_m,tip_y_m,tip_z_m\nfirst,0,0,1\n", "2: expected the number of a frame"),
+        ("\0\udcff", " not a table in UTF-8 text"),
+    ],
+)
+def test_a_truth_that_is_none_is_refused_before_tracking_begins(folder, tmp_path, text, message):
+    source = shutil.copytree(folder, tmp_path / "source")
+    (source / "truth.csv").write_text(text, errors="surrogateescape")
+    with pytest.raises(ConfigError, match=f"truth.csv:{message}"):
+        run_tracking(source, out=tmp_path / "run", video=False)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_number_that_is_none_costs_no_summary(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(track, "errors", lambda *_: {"frames": 3, "refused": 0, "median_mm": 1.0, "worst_mm": math.nan})
+    run, complete = run_tracking(folder, out=tmp_path / "run", video=False)
+    assert complete and json.loads((run / "summary.json").read_text())["truth"]["worst_mm"] is None
+
+
+def test_what_ends_the_rendering_early_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(synthetic.Recorder, "write", lambda *_: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        write_synthetic(tmp_path / "here", 2, (64, 96))
+    assert not list(tmp_path.iterdir())
+
+
+def test_it_is_rendered_with_the_camera_and_the_catheter_that_were_given(tmp_path):
+    """A wider lens, bands further from the tip: tracked with the same files, the tip is where the truth has it."""
+    (tmp_path / "c.yaml").write_text("fx: 620\nfy: 640\ncx: 470\ncy: 280\nsize: [540, 960]\n")
+    bands = "edges: [50 mm, 90 mm, 130 mm, 170 mm]\ncolours: [[40, 70, 190], [200, 40, 45], [40, 150, 70]]\n"
+    (tmp_path / "t.yaml").write_text(bands + "radius: 1.5 mm\nlength: 300 mm\n")
+    files = tmp_path / "c.yaml", tmp_path / "t.yaml"
+    made = write_synthetic(tmp_path / "made", 2, camera=files[0], catheter=files[1])
+    out, _ = run_tracking(made, *files, tmp_path / "run", video=False)
+    found = json.loads((out / "summary.json").read_text())
+    assert found["answered"] == 2 and found["truth"]["worst_mm"] < 1.5
+    own, _ = run_tracking(made, out=tmp_path / "own", video=False)  # with the files that it holds
+    assert json.loads((own / "summary.json").read_text())["truth"] == pytest.approx(found["truth"], rel=1e-6)
+    with pytest.raises(ConfigError, match="c.yaml"):
+        write_synthetic(tmp_path / "more", 1, camera=tmp_path / "none" / "c.yaml")
+    assert not (tmp_path / "more").exists()

@@ -61,11 +61,19 @@ def test_track_a_recording_with_its_own_files(recording, capsys):
 
 
 def test_track_the_synthetic_source_renders_it_first(monkeypatch, capsys):
-    monkeypatch.setattr(synthetic, "write_synthetic", lambda out: write_synthetic(out, 1, (540, 960)))
+    monkeypatch.setattr(synthetic, "write_synthetic", lambda out, **given: write_synthetic(out, 1, (540, 960), **given))
     assert main(["track", "synthetic", "--no-video"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "runs/synthetic-001" and lines[-1] == "runs/track-001/report.html"
     assert "in 1 frames; 0 refused" in lines[-2]
+    Path("c.yaml").write_text("fx: 620\nfy: 620\ncx: 480\ncy: 270\nsize: [540, 960]\n")
+    assert main(["track", "synthetic", "--no-video", "--camera", "c.yaml", *FILES[2:]]) == 0
+    assert "fx: 620" in Path("runs/synthetic-002/camera.yaml").read_text()
+    with open("runs/track-002/poses.csv", newline="") as stream:
+        (row,) = csv.DictReader(stream)
+    with open("runs/synthetic-002/truth.csv", newline="") as stream:
+        (true,) = csv.DictReader(stream)
+    assert abs(float(row["tip_z_m"]) - float(true["tip_z_m"])) < 1.5e-3
 
 
 def test_track_says_an_interruption_by_its_status(monkeypatch, capsys):
