@@ -27,6 +27,7 @@ from holotorch.experiments.perception_weight import ZONES, eccentricities, weigh
 from holotorch.experiments.plan import plan, plan_text, shortage
 from holotorch.experiments.progress import Log
 from holotorch.experiments.report import write_report
+from holotorch.experiments.source import read_source
 from holotorch.io.files import save_array, write_bytes, write_json, write_text
 from holotorch.io.images import encode_png
 
@@ -103,6 +104,10 @@ def resume(folder: Path) -> tuple[Path, bool]:
         ConfigError: The folder holds no run of this program, or its configuration no longer works.
     """
     config = folder / "config.yaml"
+    if config.is_file() and read_source(config, []).data.get("experiment") == "track":
+        again = f"{folder}/recording" if (folder / "recording").is_dir() else "SOURCE"
+        text = "holds a tracking run, which is not resumed: its poses are kept; to track its frames from the first"
+        raise ConfigError([f"{folder} {text}: holotorch track {again}"])
     if not config.is_file() or not (folder / "plan.json").is_file():
         raise ConfigError([f"{folder} holds no run to resume: config.yaml and plan.json are not both there"])
     if (folder / "summary.json").is_file():

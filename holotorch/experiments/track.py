@@ -174,7 +174,7 @@ def _fill(folder: Path, given: Given, settings: dict[str, Any], truth: dict[str,
                 except OSError as error:
                     failure = failure or error
             if not log.statuses:
-                if recorder is None or not recorder.frames:
+                if failure is None or recorder is None or not recorder.frames:  # a frame that fails is kept
                     shutil.rmtree(folder)  # claimed empty a moment ago: only this run's own files are in it
                 raise failure or KeyboardInterrupt
             complete = failure is None and (not pressed or frames.live)

@@ -8,7 +8,8 @@ import pytest
 from stand_in import SIZE, pictures, read, summary, tracked
 
 from holotorch.experiments import track, track_source
-from holotorch.experiments.run import deferred
+from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.run import deferred, resume
 from holotorch.io.recording import open_recording
 from holotorch.io.video import open_frames
 
@@ -150,6 +151,44 @@ def test_ctrl_c_is_the_ordinary_end_of_a_camera(tmp_path, tracker, monkeypatch):
     folder, complete = tracked(tmp_path, "0", video=False)
     assert complete and summary(folder)["status"] == "complete"
     assert [float(row["time_s"]) for row in read(folder)] == pytest.approx([1.033, 1.066, 1.099, 1.132])
+
+
+def test_ctrl_c_while_the_first_frame_is_tracked_leaves_the_folder_free(tmp_path, tracker, monkeypatch):
+    def pressed(frames, previous=None):
+        signal.raise_signal(signal.SIGINT)
+        return tracker(frames, previous)
+
+    source = pictures(tmp_path / "in", [9, 12])
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(track_source, "make_tracker", lambda *_: pressed)
+        tracked(tmp_path, source, record=True)
+    assert not (tmp_path / "out").exists()
+    assert tracked(tmp_path, source, record=True)[1]
+
+
+def test_a_frame_that_the_tracker_fails_on_is_kept(tmp_path, tracker, monkeypatch):
+    def failing(frames, previous=None):
+        raise RuntimeError("no convergence")
+
+    monkeypatch.setattr(track_source, "make_tracker", lambda *_: failing)
+    with pytest.raises(RuntimeError, match="no convergence"):
+        tracked(tmp_path, pictures(tmp_path / "in", [9]), record=True)
+    assert len(list(open_recording(tmp_path / "out" / "recording"))) == 1
+
+
+def test_resume_says_what_to_do_with_a_tracking_run(tmp_path, tracker, monkeypatch):
+    def pressed(frames, previous=None):
+        if int(frames[0, 0, 0, 0]) == 12:
+            signal.raise_signal(signal.SIGINT)
+        return tracker(frames, previous)
+
+    monkeypatch.setattr(track_source, "make_tracker", lambda *_: pressed)
+    source = pictures(tmp_path / "in", [9, 12])
+    for name, again in (("a", f"{tmp_path}/a/recording"), ("b", "SOURCE")):
+        folder, complete = tracked(tmp_path, source, name, record=name == "a", video=False)
+        assert not complete
+        with pytest.raises(ConfigError, match=f"tracking run, which is not resumed: .* holotorch track {again}$"):
+            resume(folder)
 
 
 def test_ctrl_c_before_the_first_frame_leaves_nothing(tmp_path, tracker, monkeypatch):
