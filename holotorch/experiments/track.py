@@ -186,7 +186,7 @@ def _fill(folder: Path, given: Given, settings: dict[str, Any], truth: dict[str,
                 summary["failure"] = f"{type(failure).__name__}: {failure}"
             write_page(folder, summary, log)
             write_json(folder / ("summary.json" if complete else "interrupted.json"), known(summary))
-    lines = [verdict(summary), *frames.notes[said:]]
+    lines = [verdict(summary), *summary["notes"][said:]]
     print("\n".join(lines + ([compared(summary["truth"])] if "truth" in summary else [])), flush=True)
     if failure is not None:
         print(f"failed; what was found until then is in {folder}", file=sys.stderr)

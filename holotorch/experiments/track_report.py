@@ -29,6 +29,9 @@ COLUMNS = (
 )
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
+_STATED = "what the frames leave open; not what is unknown of the camera (its calibration) and of the catheter's edges"
+_MOVED = 3.0  # times the stated deviation that tips may spread about their mean and still be called at rest
+
 _SHOWN = 4  # statuses of which the page shows the first frame
 
 
@@ -126,6 +129,7 @@ def summarised(log: Log, frames: Frames, method: str, still: bool) -> dict[str, 
     if answered:
         stated = torch.tensor([value for value in log.deviations if math.isfinite(value)], dtype=torch.float64)
         summary["tip_sd_mm"] = {"median": 1e3 * _at(stated, 0.5), "largest": 1e3 * _at(stated, 1.0)}
+        summary["tip_sd_holds"] = _STATED
     if log.seconds:
         taken = 1e3 * torch.tensor(log.seconds, dtype=torch.float64)
         summary["milliseconds"] = {
@@ -150,9 +154,23 @@ def summarised(log: Log, frames: Frames, method: str, still: bool) -> dict[str, 
                 "differences": found.differences,
                 "answered": found.answered,
             }
+            notes += _moved(log, found.sd)
         except ValueError as error:
             notes.append(f"no stability: {error}")
     return summary | {"notes": notes, "peak_memory_bytes": peak_memory()}
+
+
+def _moved(log: Log, spread: float) -> list[str]:
+    """A doubt where the tips spread (m, root mean square about their mean) by far more than is stated of them."""
+    stated = torch.tensor([value for value in log.deviations if math.isfinite(value)], dtype=torch.float64)
+    allowed = float(stated.square().mean().sqrt()) if len(stated) else math.inf
+    if spread <= _MOVED * allowed:
+        return []
+    return [
+        f"was the catheter at rest? The tips spread by {1e3 * spread:.3f} mm about their mean, more than {_MOVED:g} "
+        f"times their stated deviation of {1e3 * allowed:.3f} mm (root mean squares); S_RMS of a moving catheter says "
+        "nothing of stability"
+    ]
 
 
 def known(value: Any) -> Any:
@@ -177,14 +195,14 @@ def verdict(summary: dict[str, Any]) -> str:
 
 def write_page(folder: Path, summary: dict[str, Any], log: Log) -> None:
     """Write ``report.html`` with everything inline, and the figure of the track."""
-    write_bytes(folder / "images" / "track.png", _track(log))
+    write_bytes(folder / "images" / "track.png", _png(drawn_track(log)))
     body = f"<h1>{html.escape(folder.resolve().name)}: {html.escape(summary['source'])}</h1>"
     if summary["status"] != "complete":
         body += f"<p><b>{summary['status']} {html.escape(summary.get('failure', ''))}</b></p>"
     share = 100 * summary["answered"] / summary["frames"]
     body += f"<p>{summary['answered']} of {summary['frames']} frames have a pose ({share:.1f} %); every other says why "
     body += "it has none. " + ("" if "truth" in summary else "Errors against the truth are not known here. ")
-    body += "Deviations (sd) are the tracker's own estimate.</p>"
+    body += f"Deviations (sd) are the tracker's own estimate: {html.escape(_STATED)}, which adds to them.</p>"
     body += _truth(summary["truth"]) if "truth" in summary else ""
     body += "".join(f"<p>Note: {html.escape(note)}.</p>" for note in summary["notes"])
     rows = [[name, str(count)] for name, count in summary["statuses"].items()]
@@ -235,25 +253,42 @@ def _at(values: Tensor, share: float) -> float:
     return float(values.sort().values[round(share * (len(values) - 1))])
 
 
-def _track(log: Log) -> bytes:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+def drawn_track(log: Log) -> Any:
+    """Figure of the tip and of its stated deviation against time; it says so where there is no pose."""
     from matplotlib.figure import Figure
 
     drawn = Figure(figsize=(9, 4.5), layout="constrained")
     upper, lower = drawn.subplots(2, 1, sharex=True)
     start = log.times[0]
     seconds = [value - start for value in log.times]
+    poses = sum(map(math.isfinite, log.deviations))
+    size = 2 if poses > 1 else 6
+    if len(seconds) == 1:
+        upper.set_xticks([0])
+    if poses == 1:
+        upper.set_yticks([0])  # it is its own median
+    if not poses:
+        upper.set_xlim(0, seconds[-1] or None)
+        for axes in (upper, lower):
+            axes.text(0.5, 0.5, "no pose", transform=axes.transAxes, ha="center", va="center", color="0.4")
+            axes.set_yticks([])
     for axis, name in enumerate("xyz"):
         middle = torch.tensor(log.tips, dtype=torch.float64)[:, axis]
         offset = 1e3 * (middle - middle.nanmedian())
-        upper.plot(seconds, offset.tolist(), ".-", linewidth=0.8, markersize=2, label=name)
+        upper.plot(seconds, offset.tolist(), ".-", linewidth=0.8, markersize=size, label=name)
     upper.set_ylabel("tip from its median (mm)")
     upper.legend(ncols=3)
     upper.grid(alpha=0.3)
-    lower.plot(seconds, [1e3 * value for value in log.deviations], ".", markersize=2)
+    lower.plot(seconds, [1e3 * value for value in log.deviations], ".", markersize=size)
     lower.set_ylabel("sd of the tip (mm)")
     lower.set_xlabel("time (s)")
     lower.grid(alpha=0.3)
+    return drawn
+
+
+def _png(drawn: Any) -> bytes:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     FigureCanvasAgg(drawn)
     data = io.BytesIO()
     drawn.savefig(data, format="png", dpi=100)

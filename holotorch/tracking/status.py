@@ -66,7 +66,9 @@ class Pose:
     Attributes:
         tip: [..., 3] in metres; NaN where there is no pose, as in all that follows.
         direction: [..., 3], unit vector from the tip to the rear: ``tip + s * direction`` lies s metres from the tip.
-        covariance: [..., 6, 6] of (tip, direction) in m^2, m and 1; of rank 5.
+        covariance: [..., 6, 6] of (tip, direction) in m^2, m and 1; of rank 5. It holds what the frame leaves open, and
+            not what is unknown of the camera (its calibration) or of where the catheter's edges are: those shift the
+            poses of all frames alike, and with a good calibration (rms 0.04 px) by more than is stated here.
         chi_square: [...] squared deviations of the edges from the pose, each over its variance.
         freedom: [...] degrees of freedom of ``chi_square``.
         status: One, or a tuple of them for a batch.

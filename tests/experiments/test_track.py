@@ -10,7 +10,7 @@ from holotorch.experiments import track, track_source
 from holotorch.experiments.config_tracking import save_camera, save_catheter
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.track import follow, live, run_tracking
-from holotorch.experiments.track_report import COLUMNS, Tracked
+from holotorch.experiments.track_report import COLUMNS, Log, Tracked, drawn_track
 from holotorch.io.files import write_bytes
 from holotorch.io.images import encode_png
 from holotorch.io.recording import is_recording, open_recording
@@ -54,6 +54,41 @@ def test_every_frame_gets_a_pose_or_a_reason(tmp_path, tracker):
     assert "4 of 6 frames" in page and "NO_CATHETER" in page and page.count("data:image/png") == 4
     with open_frames(folder / "overlay.mp4") as drawn:
         assert len(list(drawn)) == 6 and drawn.rate == 20
+
+
+def test_a_catheter_that_moves_is_no_catheter_at_rest(tmp_path, tracker, capsys):
+    """Of the stand-in 0.24 mm are stated (variances of 1, 2 and 3 e-8 m^2), and levels are 1/3 mm apart."""
+    rest, _ = tracked(tmp_path, pictures(tmp_path / "rest", [30, 31, 30, 31]), "a", still=True, video=False)
+    assert summary(rest)["notes"] == ["pictures have no times; 30 frames per second assumed"]
+    capsys.readouterr()
+    moved, _ = tracked(tmp_path, pictures(tmp_path / "moved", [30, 33, 36, 39]), "b", still=True, video=False)
+    (note,) = summary(moved)["notes"][1:]
+    # 1 mm apart: +-0.5 and +-1.5 mm, over 3 degrees of freedom.
+    assert "spread by 1.291 mm about their mean, more than 3 times their stated deviation of 0.245 mm" in note
+    assert note in capsys.readouterr().out and note.split("?")[0] in (moved / "report.html").read_text()
+
+
+def test_what_the_deviations_hold_is_said(tmp_path, tracker):
+    folder, _ = tracked(tmp_path, pictures(tmp_path / "in", [30]), video=False)
+    assert "not what is unknown of the camera (its calibration)" in summary(folder)["tip_sd_holds"]
+    assert "not what is unknown of the camera (its calibration)" in (folder / "report.html").read_text()
+
+
+def test_the_figure_of_no_pose_says_so_and_of_one_frame_has_no_scale(tmp_path):
+    def axes(levels):
+        log = Log(tmp_path)
+        for i, level in enumerate(levels):
+            log.take(Tracked(i, Frame(5 + 0.1 * i, grey(level)), StandIn()(grey(level)[None])[0], 0.0, {}), None)
+        return drawn_track(log).axes
+
+    for each in axes([0, 0, 0]):
+        assert [text.get_text() for text in each.texts] == ["no pose"] and each.get_xlim() == pytest.approx((0, 0.2))
+    for each in axes([9]):
+        assert not each.texts and list(each.get_xticks()) == [0]
+    for each in axes([0]):
+        assert [text.get_text() for text in each.texts] == ["no pose"] and list(each.get_xticks()) == [0]
+    for each in axes([9, 0, 12]):
+        assert not each.texts and len(each.get_xticks()) > 2 and len(each.get_yticks()) > 2
 
 
 def test_the_pose_before_is_passed_on_but_not_across_a_refusal():
