@@ -104,10 +104,12 @@ def resume(folder: Path) -> tuple[Path, bool]:
         ConfigError: The folder holds no run of this program, or its configuration no longer works.
     """
     config = folder / "config.yaml"
-    if config.is_file() and read_source(config, []).data.get("experiment") == "track":
-        again = f"{folder}/recording" if (folder / "recording").is_dir() else "SOURCE"
-        text = "holds a tracking run, which is not resumed: its poses are kept; to track its frames from the first"
-        raise ConfigError([f"{folder} {text}: holotorch track {again}"])
+    held = read_source(config, []).data if config.is_file() else {}
+    if held.get("experiment") == "track":
+        again = f"its poses are kept, and all is tracked anew by: holotorch track {held.get('source', 'SOURCE')}"
+        kept = f", the frames that it kept by: holotorch track {folder / 'recording'}"
+        kept = kept if (folder / "recording").is_dir() else ""
+        raise ConfigError([f"{folder} holds a tracking run, which is not resumed: {again}{kept}"])
     if not config.is_file() or not (folder / "plan.json").is_file():
         raise ConfigError([f"{folder} holds no run to resume: config.yaml and plan.json are not both there"])
     if (folder / "summary.json").is_file():

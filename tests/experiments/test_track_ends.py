@@ -184,10 +184,10 @@ def test_resume_says_what_to_do_with_a_tracking_run(tmp_path, tracker, monkeypat
 
     monkeypatch.setattr(track_source, "make_tracker", lambda *_: pressed)
     source = pictures(tmp_path / "in", [9, 12])
-    for name, again in (("a", f"{tmp_path}/a/recording"), ("b", "SOURCE")):
+    for name, kept in (("a", f", the frames that it kept by: holotorch track {tmp_path}/a/recording"), ("b", "")):
         folder, complete = tracked(tmp_path, source, name, record=name == "a", video=False)
         assert not complete
-        with pytest.raises(ConfigError, match=f"tracking run, which is not resumed: .* holotorch track {again}$"):
+        with pytest.raises(ConfigError, match=f"which is not resumed: its poses .* holotorch track {source}{kept}$"):
             resume(folder)
 
 
