@@ -32,6 +32,7 @@ class AxisFit:
         reach: Of the stations from t = 0, in samples.
         contrast: Light of the tube less that on either side, over the larger of the two; medians.
         weight: [S], how much each station counts; near 0 where something else is seen.
+        moving: Pixels by which the middle moved in the last step.
     """
 
     unknown: np.ndarray
@@ -39,6 +40,7 @@ class AxisFit:
     reach: float
     contrast: tuple[float, float]
     weight: np.ndarray
+    moving: float
 
     @property
     def sides(self) -> np.ndarray:
@@ -129,7 +131,7 @@ def fit_axis(
     prior = np.concatenate([[0.0, 0.0, *2 * [(known * width[0]) ** -2], 0.0], shares.ravel() ** -2.0])
     farthest = np.full(len(prior), np.inf)
     farthest[:5] = 1.5, 1.5, 1.5, 1.5, 0.5
-    station, noise, normal, beside = np.ones(stations), 1.0, np.diag(prior), np.zeros((stations, 2))
+    moving, station, noise, normal, beside = 0.0, np.ones(stations), 1.0, np.diag(prior), np.zeros((stations, 2))
     for k in range(_STEPS):
         seen = (flat @ unknown).reshape(stations, -1)
         half = np.maximum(seen[:, 1], 1.0) / 2
@@ -160,12 +162,13 @@ def fit_axis(
         step = _solved(normal, slope)
         unknown = unknown + step.clip(-farthest, farthest)
         unknown[4] = min(max(unknown[4], SHARPEST), BLUNTEST)
+        moving = float(np.abs(step[:2]).max())
         if k and float(np.abs(step[:4]).max()) < max(_SETTLED, 0.1 * known):
             break
     tube = member @ (unknown[5:].reshape(bands, kinds) @ np.array(_MEANS))
     one, other = median(np.abs(tube - beside[:, 0])), median(np.abs(tube - beside[:, 1]))
     most = max(one, other, 1e-300)
-    return AxisFit(unknown, normal / max(noise, 0.5) ** 2, reach, (one / most, other / most), station)
+    return AxisFit(unknown, normal / max(noise, 0.5) ** 2, reach, (one / most, other / most), station, moving)
 
 
 def _solved(normal: np.ndarray, right: np.ndarray) -> np.ndarray:

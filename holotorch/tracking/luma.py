@@ -15,14 +15,14 @@ _SHARES = np.array([0.299, 0.587, 0.114])  # of red, green and blue levels in lu
 _LEVEL_SD = 2.5  # of a pixel's level; fits correct it by what they leave
 _PATCH, _COARSE = 24, 0.6  # pixels, and of luma's change
 _ASIDE = 0.25  # pixels: standard deviation of where an edge of coarse colours lies
-_STEP = 0.02  # pixels, and shares of a blur, between which slopes are taken
 
 
 def coarse_colours(sampler: Sampler, pixel: complex) -> bool:
     """Whether near a pixel x + i y colours have fewer pixels than luma.
 
     Noise that is each channel's own changes red less luma 1.3 times as much from pixel to pixel as luma. Where a codec
-    has halved the colours' resolution, they change less: between pixels that share one, or all along if smoothed.
+    has halved the colours' resolution, pixels that share a colour change less than those that do not, or, smoothed,
+    all of them bend less.
     """
     room = (pixel.real, sampler.width - _PATCH), (pixel.imag, sampler.height - _PATCH)
     x, y = (int(min(max(v - _PATCH // 2, 0), most)) for v, most in room)
@@ -33,8 +33,9 @@ def coarse_colours(sampler: Sampler, pixel: complex) -> bool:
     step = both[..., 1:] - both[..., :-1]
     bend = np.abs(step[..., 1:] - step[..., :-1]).reshape(2, -1)
     step = np.abs(step)
-    shared = min(median(step[1, :, ::2].ravel()), median(step[1, :, 1::2].ravel()))
-    return shared < _COARSE * median(step[0].ravel()) or median(bend[1]) < _COARSE * median(bend[0])
+    less, more = sorted(median(step[1, :, first::2].ravel()) for first in (0, 1))
+    shared = less < _COARSE * min(more, median(step[0].ravel()))
+    return shared or median(bend[1]) < _COARSE * median(bend[0])
 
 
 def fit_luma(fit: EdgeFit, light: np.ndarray, shown: np.ndarray, curve: np.ndarray) -> EdgeFit:
@@ -52,23 +53,18 @@ def fit_luma(fit: EdgeFit, light: np.ndarray, shown: np.ndarray, curve: np.ndarr
     rows = shown.sum(1)[..., None]
     low, step = ((value * rows).sum(1) / np.maximum(rows.sum(1), 1e-9) for value in (fit.levels, fit.steps))  # [E, 3]
 
-    def luma(values: np.ndarray) -> np.ndarray:
-        return np.interp(values, curve, np.arange(256.0)) @ _SHARES
+    levels = np.arange(256.0)
+    steep = np.gradient(levels) / np.gradient(curve.astype(np.float64))  # of levels over light
 
     def shape(t: np.ndarray, place: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-        def at(place: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-            up = normal_step(t, place, sigma)[:, 0]
-            return luma(low[:, None] + step[:, None] * up[..., None])
+        rise, *slopes = np.moveaxis(normal_step(t, place, sigma)[..., None], 1, 0)  # [E, T, 1] each
+        here = low[:, None] + step[:, None] * rise  # [E, T, 3]
+        each = np.interp(here, curve, steep) * step[:, None] @ _SHARES
+        return np.stack([np.interp(here, curve, levels) @ _SHARES, *(each * slope[..., 0] for slope in slopes)], 1)
 
-        before, after = at(place - _STEP, sigma), at(place + _STEP, sigma)
-        sharp, blunt = at(place, sigma * (1 - _STEP)), at(place, sigma * (1 + _STEP))
-        slopes = (after - before) / (2 * _STEP), (blunt - sharp) / (2 * _STEP * sigma[:, None])
-        return np.stack([(before + after) / 2, *slopes], 1)
-
+    luma = np.interp(light, curve, levels) @ _SHARES
     weight = shown[..., None] / (_LEVEL_SD**2 * float(_SHARES @ _SHARES))
-    found = fit_edges(
-        luma(light)[..., None], np.broadcast_to(weight, (*shown.shape, 1)), float(np.median(fit.blur)), shape
-    )
+    found = fit_edges(luma[..., None], np.broadcast_to(weight, (*shown.shape, 1)), float(np.median(fit.blur)), shape)
     # All channels may be off together, too, by half a pixel of the colours' and farther where they are far apart.
     worse = np.hypot(fit.apart * fit.deviation, _ASIDE)
     better = found.deviation < worse

@@ -166,13 +166,13 @@ def measure_edges(
             # It moved along itself, farther than what was looked at.
             t[chosen] = near + fit.place
             return measure_edges(sampler, lens, axis, t, doubtful, median(fit.blur[known]), curve)
-        if bool((fit.deviation > _UNSURE).any()):
-            # Surroundings that are not even leak into the outer rows; those in the middle may tell all the same.
-            core = (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)
-            fit = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur))
         coarse = float(fit.apart[0]) > _APART or coarse_colours(sampler, complex(pixels[0, window, half]))
         if coarse:
             fit = fit_luma(fit, light, shown, sampler.light)
+        elif bool((fit.deviation > _UNSURE).any()):
+            # Surroundings that are not even leak into the outer rows; those in the middle may tell all the same.
+            core = (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)
+            fit = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur))
         near, looks = near + fit.place, looks - 1
         if not looks or float(np.abs(fit.place).max()) < _AWAY:
             break

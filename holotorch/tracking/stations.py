@@ -23,6 +23,7 @@ THIRD = 0.35  # how well a width is known of which nothing is known, as a share 
 _SLOW = 0.2  # of the width: a standard deviation that says that it may not have been reached yet
 _OTHER = 1.5  # pixels from its width at which a tube is surely wider or narrower
 _SHARP = 0.9  # pixels of blur, to begin with
+_SETTLED = 3.0  # pixels: a middle that moves farther in the last of a fit's steps is none
 _FOCUS = 0.1  # of a blur: how well edges and sides agree in it
 _LINE_FLOOR = 0.008  # of the width: what gloss and shadow, which repeat along the tube, may move its middle
 
@@ -117,7 +118,8 @@ def measure_axis(
     given = stations.signal, stations.weight, stations.t, stations.band, stations.level, stations.bright
     fit = fit_axis(*given, width, blur, known, before.fit.unknown if before else None)
     axis = _axis(stations, fit)
-    if not np.isfinite(fit.covariance).all() or not 0 < axis.width < 2 * width[0] + 3:
+    lost = not np.isfinite(fit.covariance).all() or fit.moving > _SETTLED
+    if lost or not 0 < axis.width < 2 * width[0] + 3:
         raise Refusal(Status.NO_AXIS, "the bands have no clear sides")
     if min(fit.contrast) < _ONE_SIDED:
         raise Refusal(Status.NO_AXIS, "the bands' colours go on beside the line: too wide for the catheter")

@@ -42,7 +42,6 @@ _BLURRED = 0.6  # from which edges that differ by more are looked at again,
 _BENT = 0.05  # as are those whose fronts bulge by so many pixels more or less than was thought
 _FLAT = 0.05  # pixels of a bulge that change the tube's width by nothing
 _MOVED = 30.0  # pixels that a catheter may move between two frames
-_MEASURED = 2  # lines on a frame whose edges are looked at; those without bands cost little
 
 
 class CatheterTracker:
@@ -115,7 +114,7 @@ class CatheterTracker:
             segments = find_segments(sampler.frame, self.table)
         if not segments:
             raise Refusal(Status.NO_CATHETER, "nothing thin in the bands' colours")
-        furthest, measured = (Status.OK, ""), 0
+        furthest = Status.OK, ""
         planes = self.lens.undistort(np.array([(segment.start, segment.end) for segment in segments]).ravel())
         for segment, (start, end) in zip(segments, planes.reshape(-1, 2).tolist(), strict=True):
             try:
@@ -124,15 +123,13 @@ class CatheterTracker:
                     raise Refusal(Status.OUTSIDE_CAMERA, "it lies where the lens's distortion cannot be inverted")
                 length = abs(segment.end - segment.start)
                 half = 0.5 * length + max(40.0, 0.7 * length)
-                line, stretches = self._shown(sampler, line, half, 10.0, onward=False)
-                measured += 1
-                return self._along(sampler, line, stretches, None)
+                shown = self._shown(sampler, line, half, 10.0, onward=False)
             except Refusal as refusal:
                 # What came nearest to a pose tells most; the refusal itself would keep the frame alive.
                 if refusal.status > furthest[0]:
                     furthest = refusal.status, refusal.reason
-                if measured == _MEASURED:
-                    break
+            else:  # only one line is measured: what shows the bands in their order is seldom something else
+                return self._along(sampler, *shown, None)
         raise Refusal(*furthest)
 
     def _expected(self, found: Found) -> tuple[Line, float]:
