@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import torch
 
-from holotorch.tracking.fits import BLUNTEST, SHARPEST, median
+from holotorch.tracking.fits import BLUNTEST, SHARPEST, erf, median
 
 _STEPS = 8
 _SETTLED = 0.05  # pixels: the step after is a third of it; gloss and shadow move a middle by as much
@@ -188,12 +187,6 @@ def _inverse(normal: np.ndarray) -> np.ndarray:
     return inverse / np.maximum(a * d - b * b, 1e-300)[:, None, None]
 
 
-def _erf(z: np.ndarray) -> np.ndarray:
-    """The error function. Above 2047 numbers torch divides the work among threads, and waits for those of others."""
-    parts = torch.from_numpy(z).view(-1).split(2047)
-    return torch.cat([torch.erf(part) for part in parts]).numpy().reshape(z.shape)
-
-
 def _slices() -> tuple[np.ndarray, np.ndarray]:
     """Nodes [N] over the tube, -1 to 1, and what columns (left, right, shadings) take of a rise there [N, 2 + K]."""
     q = np.linspace(-1, 1, _SLICES + 1)
@@ -215,7 +208,7 @@ def _strip_terms(u: np.ndarray, at: np.ndarray, half: np.ndarray, blur: float):
     scale = math.sqrt(2) * blur
     z = (u[:, None] - (at[:, None] + half[:, None] * _NODES)[:, None]) / scale  # [S, U, N]
     # A rise is (1 + erf z) / 2; what the tube takes of the 1 cancels.
-    columns = _erf(z) @ (_TAKES / 2)
+    columns = erf(z) @ (_TAKES / 2)
     columns[..., :2] += 0.5
     bell = np.exp(-z * z)
 

@@ -22,9 +22,19 @@ SHARPEST, BLUNTEST = 0.35, 10.0  # pixels, standard deviation of an edge
 Shape = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
+def erf(z: np.ndarray) -> np.ndarray:
+    """The error function, which NumPy lacks.
+
+    Of more than some 1,200 numbers torch's is shared out among threads, and where others keep the processor busy the
+    wait for these is a thousand times as long as the work.
+    """
+    parts = torch.from_numpy(np.ascontiguousarray(z)).view(-1).split(1000)
+    return torch.cat([torch.erf(part) for part in parts]).numpy().reshape(z.shape)
+
+
 def rise(z: np.ndarray) -> np.ndarray:
-    """The normal distribution's cumulative function, from 0 to 1."""
-    return 0.5 * torch.erfc(torch.from_numpy(np.asarray(z * -math.sqrt(0.5)))).numpy()  # NumPy has none
+    """The normal distribution's cumulative function, from 0 to 1; to 1e-16, not of itself."""
+    return 0.5 + 0.5 * erf(z * math.sqrt(0.5))
 
 
 def median(values: np.ndarray) -> float:
