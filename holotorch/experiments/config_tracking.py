@@ -109,7 +109,7 @@ def build_camera(settings: CameraSettings) -> Camera:
     matrix = [[settings.fx, 0.0, settings.cx], [0.0, settings.fy, settings.cy], [0.0, 0.0, 1.0]]
     tone = settings.tone if isinstance(settings.tone, str) else torch.tensor(settings.tone, dtype=torch.float64)
     distortion = torch.tensor(settings.distortion, dtype=torch.float64)
-    return Camera(torch.tensor(matrix, dtype=torch.float64), distortion, tone)
+    return Camera(torch.tensor(matrix, dtype=torch.float64), distortion, tone, settings.size)
 
 
 def save_camera(path: Path, camera: Camera | Calibration, size: tuple[int, int] | None = None) -> None:

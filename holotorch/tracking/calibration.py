@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -114,7 +114,7 @@ def calibrate(views: Sequence[View], size: tuple[int, int]) -> Calibration:
             f"the views leave the focal length open to {100 * relative:.0f} % (one standard deviation); tilt the board "
             "by 20 to 45 degrees to several sides and fill the picture with it"
         )
-    camera = fit.camera
+    camera = replace(fit.camera, size=size)
     weights = np.array([len(view.points) for view in kept])
     return Calibration(
         camera,

@@ -24,6 +24,8 @@ class Camera:
         matrix: [3, 3] float64 with fx, fy, cx, cy in pixels; no skew. Differentiable, as ``distortion`` is.
         distortion: [5] float64: k1, k2, p1, p2, k3 in OpenCV's order.
         tone: From light to levels: "srgb", "linear", or a rising table [256] of light 0 to 1 for each 8-bit level.
+        size: (H, W) of the frames that the parameters are for, or None: trackers refuse others, on which poses would be
+            wrong and plausible.
 
     Raises:
         TypeError, ValueError: Impossible parameters.
@@ -34,6 +36,7 @@ class Camera:
     matrix: Tensor
     distortion: Tensor
     tone: str | Tensor = "srgb"
+    size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         for name, shape in (("matrix", (3, 3)), ("distortion", (5,))):
@@ -46,6 +49,8 @@ class Camera:
         kept = given * torch.tensor([[1.0, 0, 1], [0, 1, 1], [0, 0, 1]], dtype=torch.float64, device=given.device)
         if not bool((given == kept).all()) or given[2, 2] != 1 or given[0, 0] <= 0 or given[1, 1] <= 0:
             raise ValueError(f"matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx, fy > 0, got {given.tolist()}")
+        if self.size is not None:
+            object.__setattr__(self, "size", tuple(checks.whole("size", side, 1) for side in self.size))
         if isinstance(self.tone, str):
             if self.tone not in ("srgb", "linear"):
                 raise ValueError(f"tone must be 'srgb', 'linear' or a table of 256 values, got {self.tone!r}")
@@ -54,6 +59,14 @@ class Camera:
             if table.shape != (256,) or not bool((table.diff() > 0).all()) or table[0] < 0 or table[-1] > 1:
                 raise ValueError("a tone table must have 256 values that rise from >= 0 to <= 1, one for each level")
             object.__setattr__(self, "tone", table)
+
+    def need_size(self, frames: Tensor) -> None:
+        """ValueError for frames [..., H, W] of another size than the camera's."""
+        if self.size is not None and tuple(frames.shape[-2:]) != self.size:
+            (h, w), (height, width) = self.size, frames.shape[-2:]
+            raise ValueError(
+                f"the camera is for frames of {w} x {h} px, got {width} x {height}: scale or move its matrix likewise"
+            )
 
     @cached_property
     def valid_radius(self) -> float:

@@ -58,6 +58,7 @@ class ThesisTracker:
             TypeError, ValueError: Not such a tensor.
         """
         stages.need_frames(frames)
+        self.camera.need_size(frames)
         watch = Stopwatch(torch.cuda.synchronize if frames.is_cuda else None)
         poses: list[Pose | None] = [None] * len(frames)
         self.endpoints = [[] for _ in poses]

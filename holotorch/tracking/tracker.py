@@ -88,6 +88,7 @@ class CatheterTracker:
             raise TypeError(f"frames must be a torch tensor, uint8 of shape [B, 3, H, W], got {type(frames).__name__}")
         if frames.ndim != 4 or frames.shape[1] != 3 or frames.dtype != torch.uint8:
             raise ValueError(f"frames must be uint8 of shape [B, 3, H, W], got {frames.dtype}, {list(frames.shape)}")
+        self.camera.need_size(frames)
         if isinstance(previous, Pose):
             raise TypeError("previous must be a list with a pose for each frame, got one pose: write [pose]")
         if previous is not None and len(previous) != len(frames):

@@ -6,7 +6,8 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from kornia.geometry.calibration import distort_points, undistort_points
 from oracles import tracking as oracle
 
-from holotorch.tracking import Camera
+from holotorch.tracking import Camera, CatheterTracker, ThesisTracker
+from holotorch.tracking.world import THESIS
 
 MATRIX = torch.tensor([[1400.0, 0, 959.5], [0, 1350, 539.5], [0, 0, 1]], dtype=torch.float64)
 MILD = (-0.12, 0.05, 1e-3, -5e-4, -0.01)
@@ -183,6 +184,20 @@ def test_tables_of_tone():
 def test_impossible_cameras(matrix, distortion, tone, message):
     with pytest.raises(ValueError, match=message):
         Camera(matrix, distortion, tone)
+
+
+@pytest.mark.parametrize("tracker", [CatheterTracker, ThesisTracker])
+def test_frames_of_another_size_are_an_error(tracker):
+    """Half the pixels or a part of the frame: a pose would be found, and decimetres off."""
+    lens = Camera(MATRIX, torch.zeros(5), size=(48, 64))
+    track = tracker(lens, THESIS)
+    assert not track(torch.zeros(1, 3, 48, 64, dtype=torch.uint8))[0].answered
+    for shape in ((36, 48), (64, 48)):
+        with pytest.raises(ValueError, match=f"for frames of 64 x 48 px, got {shape[1]} x {shape[0]}: scale or move"):
+            track(torch.zeros(2, 3, *shape, dtype=torch.uint8))
+    for size in ((0, 5), (-1, 5), (1.5, 5)):
+        with pytest.raises((ValueError, TypeError), match="size"):
+            Camera(MATRIX, torch.zeros(5), size=size)  # type: ignore[arg-type]
 
 
 def test_impossible_points():
