@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from holotorch.experiments.tracking_bench import STILL, Row, covered, empty, grids, scenes, still
+from holotorch.experiments.tracking_bench import STILL, Row, codecs, covered, empty, grids, scenes, still
 from holotorch.experiments.tracking_methods import BASE, COLD, FEWER, LITERAL, PRIOR, Answer, methods, photographs
 from holotorch.experiments.tracking_timing import spread, stages, timing
 from holotorch.tracking.world import World
@@ -51,6 +51,7 @@ def tracking() -> tuple[list[Row], dict[str, list[Row]], dict[str, bytes], list[
     said: dict[str, list[Answer]] = {}
     tables["still"], said["still"] = still(world, trackers, amount.still)
     tables["grids"], said["grids"] = grids(world, trackers, amount.share)
+    tables["codecs"], said["codecs"] = codecs(world, three, amount.share)
     for kind, count in (("conditions", amount.seeds), ("occlusions", amount.poses)):
         tables[kind], said[kind] = scenes(world, three, count, kind, amount.share)
     two = {name: trackers[name] for name in (BASE, COLD)}
@@ -121,9 +122,13 @@ def _verdict(world: World, rows: list[Row], tables: dict[str, list[Row]]) -> lis
     ]
     lines += [f"synthetic {line}" for name in (COLD, PRIOR) for line in _accuracy(name, rows, tables)]
     for row in tables["reliability"]:
-        if row["frames_of"] in ("still", "grids"):
+        if row["frames_of"] in ("still", "grids", "codecs"):
             continue  # they are in the sum, and their errors are above
         lines += [f"synthetic {line}" for line in _reliability(row)]
+    for row in tables["codecs"]:
+        error = f"median {row['median_mm']} mm, worst {row['worst_mm']} mm, {row['refused']} of {row['points']} refused"
+        inside = f"the 95 % ellipsoid holds the truth in {row['coverage']} of the answers"
+        lines.append(f"synthetic 2D grid through codec {row['codec']}, {row['method']}: {error}, {inside}")
     lines += [f"synthetic {line}" for line in _unanswerable(tables)]
     for row in tables["times"]:
         goal = {COLD: 0.5, PRIOR: 0.2}.get(row["method"], math.inf)

@@ -27,6 +27,12 @@ STILL: dict[tuple[int, int], float | None] = {
     (520, 0): None,
     (520, 20): None,
 }
+_CODECS: dict[str, dict[str, Any]] = {
+    "none": {},
+    "video 4:2:0": {"video": True},
+    "JPEG 95, 4:2:0": {"jpeg_quality": 95},
+    "JPEG 75, 4:2:0": {"jpeg_quality": 75},
+}
 _PLACES = 5  # less than a pixel apart
 # What a refusal may say of scenes that cannot be answered, by what their names begin with.
 _UNSEEN = frozenset({Status.NO_CATHETER, Status.BANDS_MISSING, Status.NO_AXIS})
@@ -94,6 +100,21 @@ def grids(world: World, trackers: dict[str, Method], share: float = 1.0) -> tupl
         whole["acc_mm"] = round(sum(seen) / len(seen), 4) if seen else ""  # the thesis's is the mean of its faces, too
         rows += [*faces, whole]
     return rows, [answer for found in said.values() for answer in found]
+
+
+def codecs(world: World, trackers: dict[str, Method], share: float = 1.0) -> tuple[list[Row], list[Answer]]:
+    """Every fourth tip of the sheet, with all colours and through codecs that keep fewer of them."""
+    every = max(1, round(4 / share))
+    rows, said = [], []
+    for codec, changes in _CODECS.items():
+        cases = replace(world, look=replace(world.look, **changes)).grid_2d()[::every]
+        found = list(answers(cases, trackers, codec))
+        for name in trackers:
+            row = _grid_row("2D", name, [answer for answer in found if answer.method == name])
+            kept = ("method", "points", "refused", "median_mm", "p95_mm", "worst_mm", "coverage")
+            rows.append({"codec": codec} | {key: row[key] for key in kept})
+        said += found
+    return rows, said
 
 
 def scenes(

@@ -14,11 +14,11 @@ from holotorch.core import checks
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.cast import Rays, Tube, cast, light_of, tube_of
 from holotorch.tracking.catheter import Catheter
+from holotorch.tracking.exposure import compress, expose, halve_colours
 
 Colour = tuple[int, int, int]
 _FINE = 4  # samples along a pixel's side while it is blurred; on an edge each has 8 rays
 _TILE = 96  # pixels along the side of what is cast and blurred at a time
-_NOISE = 1 << 21  # normal deviates drawn once; each row of a frame begins anywhere among them
 _LARGEST = 8192  # pixels along a side
 
 
@@ -66,7 +66,8 @@ class Look:
         motion_px: (x, y) path of catheter and occluders over the background while the shutter is open, at constant
             speed. The truth is the middle.
         noise_dn: Standard deviation of white Gaussian noise, in 8-bit levels, after the tone curve.
-        jpeg_quality: 1 to 100, chroma at half resolution (4:2:0); None does not compress.
+        video: Whether each 2 x 2 pixels share one's chroma (4:2:0), as webcams' and videos' decoders give it.
+        jpeg_quality: 1 to 100, chroma at half resolution (4:2:0), smoothed; None does not compress.
         occluders: In front of the catheter, later ones in front of earlier ones; not shaded.
 
     Raises:
@@ -85,6 +86,7 @@ class Look:
     blur_px: float = 0.7
     motion_px: tuple[float, float] = (0.0, 0.0)
     noise_dn: float = 2.5
+    video: bool = False
     jpeg_quality: int | None = None
     occluders: tuple[Occluder, ...] = ()
 
@@ -161,7 +163,12 @@ def render(
     frame = _backdrop(look, camera, (height, width))
     if tube is not None or look.occluders:
         _draw(frame, look, camera, tube)
-    return _expose(frame, look, generator)
+    levels = expose(frame, look.noise_dn, generator)
+    if look.video:
+        levels = halve_colours(levels)
+    if look.jpeg_quality is not None:
+        levels = compress(levels, look.jpeg_quality)
+    return torch.from_numpy(levels)
 
 
 def _backdrop(look: Look, camera: Camera, size: tuple[int, int]) -> np.ndarray:
@@ -272,27 +279,6 @@ def _lens(blur_px: float, count: int, pad: int) -> np.ndarray:
     for row in range(count):
         rows[row, row * _FINE : row * _FINE + len(kernel)] = kernel
     return rows
-
-
-@lru_cache(maxsize=1)
-def _deviates() -> np.ndarray:
-    return torch.randn(_NOISE, generator=torch.Generator().manual_seed(20)).numpy()
-
-
-def _expose(frame: np.ndarray, look: Look, generator: torch.Generator | None) -> Tensor:
-    """Noise, rounding to uint8 and compression of levels [3, H, W]."""
-    flat = frame.reshape(-1, frame.shape[-1])
-    rows = np.lib.stride_tricks.sliding_window_view(_deviates(), frame.shape[-1])
-    start = torch.randint(len(rows), (len(flat),), generator=generator).numpy()
-    levels = cv2.addWeighted(flat, 1.0, rows[start], look.noise_dn, 0.0, dtype=cv2.CV_8U)  # rounds and clips
-    levels = levels.reshape(frame.shape)
-    if look.jpeg_quality is not None:
-        options = [cv2.IMWRITE_JPEG_QUALITY, look.jpeg_quality]
-        options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
-        _, data = cv2.imencode(".jpg", np.ascontiguousarray(levels[::-1].transpose(1, 2, 0)), options)
-        decoded = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))
-        levels = np.ascontiguousarray(decoded[..., ::-1].transpose(2, 0, 1))
-    return torch.from_numpy(levels)
 
 
 def _colour(name: str, value: tuple[int, ...]) -> None:

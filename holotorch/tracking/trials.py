@@ -51,6 +51,7 @@ def conditions(world: World) -> list[Case]:
     looks: tuple[tuple[str, dict[str, Any]], ...] = (
         ("plain", {}),
         ("defocus 3 px", {"blur_px": 3.0}),
+        ("video 4:2:0", {"video": True}),
         ("jpeg 90", {"jpeg_quality": 90}),
         ("jpeg 60", {"jpeg_quality": 60}),
         ("noise 12", {"noise_dn": 12.0}),

@@ -37,7 +37,18 @@ def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(tracking_bench, "tip_bound", lambda *_: 1e-9 * torch.eye(3))
     monkeypatch.setattr(tracking_timing, "_REPEATS", 1)
     assert main(["chart", "tracking", "--out", str(tmp_path)]) == 0
-    names = ["conditions", "grids", "negatives", "occlusions", "reliability", "slowest", "stages", "still", "times"]
+    names = [
+        "codecs",
+        "conditions",
+        "grids",
+        "negatives",
+        "occlusions",
+        "reliability",
+        "slowest",
+        "stages",
+        "still",
+        "times",
+    ]
     files = {f"{name}.csv" for name in ["chart", *names]} | {"chart.png", "verdict.txt"}
     assert {path.name for path in tmp_path.iterdir()} == files
     tables = {}

@@ -205,6 +205,20 @@ def test_ramp_changes_the_background_in_linear_light():
         assert light[row, column].item() / centre == pytest.approx(factor, rel=0.03)  # half a level of 100
 
 
+def test_video_shares_the_chroma_of_each_two_by_two_pixels():
+    """The luma (BT.601) stays to the rounding of three channels, two of chroma and back: 3 levels."""
+    size = (33, 47)
+    noise = torch.randint(40, 200, (3, *size), generator=torch.Generator().manual_seed(3), dtype=torch.uint8)
+    frame = render(None, LINEAR, None, None, size, Look(noise, noise_dn=0, video=True)).double()
+    shares = torch.tensor([0.299, 0.587, 0.114], dtype=torch.float64)
+    luma = lambda levels: torch.einsum("c,chw->hw", shares, levels.double())  # noqa: E731
+    red = frame[0] - luma(frame)
+    spread = torch.nn.functional.unfold(red[None, None, :32, :46], 2, stride=2).std(1)
+    assert spread.mean() < 2 and red.std() > 15
+    inside = (frame > 0).all(0) & (frame < 255).all(0)  # others are clipped
+    assert (luma(frame) - luma(noise))[inside].abs().max() < 3 and inside.double().mean() > 0.5
+
+
 def test_jpeg_halves_the_chroma():
     background = torch.zeros(3, *SIZE, dtype=torch.uint8)
     background[0, :, ::2], background[2, :, 1::2] = 200, 200

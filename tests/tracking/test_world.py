@@ -158,8 +158,10 @@ def test_conditions_cover_the_list():
     names = {case.name: case.answerable for case in trials.conditions(world)}
     for way, path in itertools.product(("along", "across"), (2, 5, 10, 20)):
         assert f"motion {way} {path} px" in names
-    wanted = "plain|defocus 3 px|jpeg 90|jpeg 60|noise 12|gain 0.25|gain 1.8|highlight|tilt 45|tilt 60|photograph 0"
-    wanted += "|cloth as band 3|white glove behind|blue glove behind|heavy clutter|rear out of frame from band 3"
+    wanted = "plain|defocus 3 px|video 4:2:0|jpeg 90|jpeg 60|noise 12|gain 0.25|gain 1.8|highlight|tilt 45|tilt 60"
+    wanted += (
+        "|photograph 0|cloth as band 3|white glove behind|blue glove behind|heavy clutter|rear out of frame from band 3"
+    )
     assert all(names[name] for name in wanted.split("|"))
     refused = "tilt 75|1200 mm away|line of sight|motion across 20 px|rear out of frame from band 2"
     assert not any(names[name] for name in refused.split("|"))

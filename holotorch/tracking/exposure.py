@@ -1,0 +1,41 @@
+"""What a sensor and a codec do to levels: noise, rounding, colours at half resolution, JPEG."""
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import torch
+
+_NOISE = 1 << 21  # normal deviates drawn once; each row of a frame begins anywhere among them
+
+
+@lru_cache(maxsize=1)
+def _deviates() -> np.ndarray:
+    return torch.randn(_NOISE, generator=torch.Generator().manual_seed(20)).numpy()
+
+
+def expose(frame: np.ndarray, noise: float, generator: torch.Generator | None) -> np.ndarray:
+    """Levels uint8 [3, H, W] of levels float32 of the same shape, with white noise of so many levels."""
+    flat = frame.reshape(-1, frame.shape[-1])
+    rows = np.lib.stride_tricks.sliding_window_view(_deviates(), frame.shape[-1])
+    start = torch.randint(len(rows), (len(flat),), generator=generator).numpy()
+    levels = cv2.addWeighted(flat, 1.0, rows[start], noise, 0.0, dtype=cv2.CV_8U)  # rounds and clips
+    return levels.reshape(frame.shape)
+
+
+def halve_colours(levels: np.ndarray) -> np.ndarray:
+    """Levels [3, H, W] whose every 2 x 2 pixels keep their luma and share the chroma of the upper left one."""
+    height, width = levels.shape[1:]
+    even = np.pad(levels, ((0, 0), (0, height % 2), (0, width % 2)), "edge").transpose(1, 2, 0)
+    planes = cv2.cvtColor(np.ascontiguousarray(even), cv2.COLOR_RGB2YUV_I420)
+    shared = cv2.cvtColor(planes, cv2.COLOR_YUV2RGB_I420)[:height, :width]
+    return np.ascontiguousarray(shared.transpose(2, 0, 1))
+
+
+def compress(levels: np.ndarray, quality: int) -> np.ndarray:
+    """Levels [3, H, W] through a JPEG of ``quality`` 1 to 100, its chroma at half resolution."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
+    _, data = cv2.imencode(".jpg", np.ascontiguousarray(levels[::-1].transpose(1, 2, 0)), options)
+    decoded = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))
+    return np.ascontiguousarray(decoded[..., ::-1].transpose(2, 0, 1))
