@@ -162,7 +162,7 @@ def fit_axis(
         unknown = unknown + step.clip(-farthest, farthest)
         unknown[4] = min(max(unknown[4], SHARPEST), BLUNTEST)
         moving = float(np.abs(step[:2]).max())
-        if k and float(np.abs(step[:4]).max()) < max(_SETTLED, 0.1 * known):
+        if k and float(np.abs(step[:4]).max()) < _SETTLED:
             break
     tube = member @ (unknown[5:].reshape(bands, kinds) @ np.array(_MEANS))
     one, other = median(np.abs(tube - beside[:, 0])), median(np.abs(tube - beside[:, 1]))

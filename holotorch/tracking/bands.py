@@ -88,8 +88,8 @@ def find_stretches(
     ``through`` [T] is, they shine through a tube that is none. ``middle`` is the index where t = 0. With ``onward`` the
     tip is known to lie towards smaller t.
 
-    Of all ways to cut the line into "before, band 1, ..., band n, after", in both directions, that which most colours
-    agree with. Stretches that something hides count little, so that a finger within a band leaves it one band.
+    Of all ways to cut the line into "before, band 1, ..., band n, after", in both directions, that which is worth most
+    (:func:`_sweep`). Stretches that something hides count little, so that a finger within a band leaves it one band.
     """
     raw = _shares(labels, table)  # [C, T]
     share = raw * ~drape
@@ -108,7 +108,7 @@ def find_stretches(
 
 
 def order_scores(labels: np.ndarray, table: ColourTable) -> np.ndarray:
-    """How well the bands in their order explain lines of labels [K, T, R], in either direction: [K], in pixels."""
+    """What lines of labels [K, T, R] are worth in the better direction, above no bands on them: [K], in pixels."""
     share = _shares(labels, table).swapaxes(0, 1)
     value, _, nothing = _sweep(np.concatenate([share, share[..., ::-1]]), table.bands)
     return (value[:, -1] - nothing[:, -1]).reshape(2, -1).max(0)
@@ -123,8 +123,11 @@ def _shares(labels: np.ndarray, table: ColourTable) -> np.ndarray:
 
 
 def _sweep(share: np.ndarray, bands: tuple[int, ...]) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]], np.ndarray]:
-    """Dynamic programming over the cuts: best value [K, T + 1], what each cut chose from, and the value of no band."""
-    # Around the bands anything may lie; within, labels of another band speak against it, none at all less so: fingers.
+    """Dynamic programming over the cuts: best value [K, T + 1], what each cut chose from, and the value of no band.
+
+    A pixel within a band is worth +1 where it shows the band's colour, -1 where it shows another band's and -0.6 where
+    it shows none, as fingers do; around the bands -0.25 where it shows one, and 0 where it shows none.
+    """
     gains = np.full((len(bands) + 2, share.shape[1]), -0.4, dtype=np.float32)
     gains[[0, -1]] = -0.25
     for i, band in enumerate(bands):

@@ -151,8 +151,8 @@ def _lines(tiles: _Tiles, table: ColourTable) -> tuple[np.ndarray, ...] | None:
     middle = (weight * t).sum(-1) / whole
     spread = np.sqrt((weight * (t - middle[:, None]) ** 2).sum(-1) / whole)
     filled = np.minimum(each.sum(-1) / (4 * spread + _TILE), 3.0)
-    smallest = np.sort(each, -1)[:, -min(2, colours)]
-    score = (np.minimum(each, 300).sum(-1) + 3 * smallest) * filled
+    runner_up = np.sort(each, -1)[:, -min(2, colours)]
+    score = (np.minimum(each, 300).sum(-1) + 3 * runner_up) * filled
     best = _most(score, 120, -1.0)
     used = used[best].astype(np.float32)
     shared, size = used @ used.T, used.sum(-1)

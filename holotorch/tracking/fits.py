@@ -19,6 +19,8 @@ _OWN = 1.4  # of the same: how far apart shading and gloss put the places of cha
 _OTHER = 4.0  # standard deviations of an edge's own blur
 SHARPEST, BLUNTEST = 0.35, 10.0  # pixels, standard deviation of an edge
 
+_ALONE = 1000  # numbers, and fewer, of which one thread takes the error function
+
 Shape = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -28,7 +30,9 @@ def erf(z: np.ndarray) -> np.ndarray:
     Of more than some 1,200 numbers torch's is shared out among threads, and where others keep the processor busy the
     wait for these is a thousand times as long as the work.
     """
-    parts = torch.from_numpy(np.ascontiguousarray(z)).view(-1).split(1000)
+    if z.size <= _ALONE:
+        return torch.erf(torch.from_numpy(z)).numpy()
+    parts = torch.from_numpy(np.ascontiguousarray(z)).view(-1).split(_ALONE)
     return torch.cat([torch.erf(part) for part in parts]).numpy().reshape(z.shape)
 
 
@@ -74,8 +78,11 @@ class EdgeFit:
 def normal_step(t: np.ndarray, place: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """A step from 0 to 1 at ``place`` [E], blurred by ``sigma`` [E], at t [T]; and its slopes to both: [E, 3, T]."""
     z = (t - place[:, None]) / sigma[:, None]
-    bell = np.exp(-0.5 * z * z) / (-math.sqrt(2 * math.pi) * sigma[:, None])
-    return np.stack([rise(z), bell, bell * z], 1)
+    found = np.empty((len(z), 3, len(t)))
+    found[:, 0] = rise(z)
+    found[:, 1] = np.exp(-0.5 * z * z) / (-math.sqrt(2 * math.pi) * sigma[:, None])
+    np.multiply(found[:, 1], z, out=found[:, 2])
+    return found
 
 
 def fit_edges(light: np.ndarray, weight: np.ndarray, blur: float = 0.9, shape: Shape = normal_step) -> EdgeFit:
@@ -169,7 +176,9 @@ def _edge_terms(shape: np.ndarray, weight: np.ndarray, weighted: np.ndarray, tot
 
     ``weight`` and ``weighted`` (light times it) are [E, T, U C], their ``total`` over T [E, U C].
     """
-    basis = np.concatenate([shape, shape * shape[:, :1]], 1)  # the edge, its slopes, and all three times the edge
+    basis = np.empty((len(shape), 6, shape.shape[2]))  # the edge, its slopes, and all three times the edge
+    basis[:, :3] = shape
+    np.multiply(shape, shape[:, :1], out=basis[:, 3:])
     # Weighted moments over T, for each row and channel.
     moments = basis @ weight
     means, with_light = moments[:, :3] / total[:, None], basis[:, :3] @ weighted

@@ -63,7 +63,8 @@ def find_bands(
 ) -> tuple[Line, Stretches]:
     """Line, and stretches on it, in a strip around a first line, ``half`` its length, ``aside`` half its width.
 
-    All in pixels; t rises from the tip to the rear, as on the first line where that is ``onward``.
+    All in pixels; t rises from the tip to the rear, as on the first line where that is ``onward``. A Refusal (NO_AXIS,
+    BANDS_MISSING) where nothing thin has the bands' colours, or not in their order.
     """
     end = math.ceil(half)
     t = np.arange(-end, end + 1.0)
@@ -123,8 +124,8 @@ def measure_edges(
 ) -> Edges:
     """Places of the edges near ``guess`` [N] (NaN: not looked for); ``curve`` [N]: how far a ring's front bulges in t.
 
-    An edge fails that is hidden (the surroundings change where it does), unclear, or too near the frame's border. With
-    ``curve``, a Refusal where all of them go on beside the tube.
+    An edge fails that is hidden (the surroundings change where it does), unclear, or too near the frame's border. A
+    Refusal (INCONSISTENT) where all of them go on beside the tube.
     """
     line = axis.line
     chosen = np.isfinite(guess).nonzero()[0]

@@ -86,7 +86,10 @@ class Stations:
 
 
 def look_across(sampler: Sampler, lens: Lens, line: Line, stretches: Stretches, width: float, blur: float) -> Stations:
-    """Stations within the bands that are seen, of a tube some ``width`` pixels wide."""
+    """Stations within the bands that are seen, of a tube some ``width`` pixels wide.
+
+    A Refusal (BANDS_MISSING, TOO_NARROW) where no band is seen whole, or too little of them.
+    """
     edges = stretches.edges.tolist()
     spans = [
         (a + 3, b - 3)
@@ -114,7 +117,10 @@ def look_across(sampler: Sampler, lens: Lens, line: Line, stretches: Stretches, 
 def measure_axis(
     stations: Stations, width: tuple[float, float], known: float, blur: float, before: Axis | None = None
 ) -> Axis:
-    """Mid-line and width; ``width`` and ``known`` as for ``fit_axis``, which begins at what was found ``before``."""
+    """Mid-line and width; ``width`` and ``known`` as for ``fit_axis``, which begins at what was found ``before``.
+
+    A Refusal (NO_AXIS, TOO_NARROW) where sides are unclear, one-sided or bent, or too near each other.
+    """
     given = stations.signal, stations.weight, stations.t, stations.band, stations.level, stations.bright
     fit = fit_axis(*given, width, blur, known, before.fit.unknown if before else None)
     axis = _axis(stations, fit)
