@@ -175,7 +175,8 @@ def measure_edges(
             core = (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)
             fit = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur))
         near, looks = near + fit.place, looks - 1
-        if not looks or float(np.abs(fit.place).max()) < _AWAY:
+        lost = np.count_nonzero(np.isfinite(fit.deviation)) < 3  # no pose either way
+        if not looks or lost or float(np.abs(fit.place).max()) < _AWAY:
             break
     blurs = fit.blur[np.isfinite(fit.deviation)]
     soft = median(fit.blur)

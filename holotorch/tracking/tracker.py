@@ -187,7 +187,8 @@ class CatheterTracker:
             else:
                 axis = measure_axis(stations, wide, _EXACT, axis.blur, axis)
             edges = dataclasses.replace(edges, t=axis.line.place(plane)[0])
-        if float(np.abs(curve - first).max()) > _BENT or abs(edges.blur - edges.expected) > _BLURRED:
+        blurred = not edges.coarse and abs(edges.blur - edges.expected) > _BLURRED  # luma has a blur of its own
+        if blurred or float(np.abs(curve - first).max()) > _BENT:
             with self._timed("edges"):
                 edges = measure_edges(sampler, lens, axis, edges.t, stretches.doubtful, edges.blur, curve)
         with self._timed("pose"):
