@@ -219,7 +219,7 @@ def _goal(value: float | str, limit: float, sign: str) -> str:
 
 
 def _draw(rows: list[Row], tables: dict[str, list[Row]]) -> bytes:
-    figure = Figure(figsize=(17, 5), layout="constrained")
+    figure = Figure(figsize=(14, 4.6), layout="constrained")
     first, second, third = (figure.add_subplot(1, 3, k + 1) for k in range(3))
     _errors(first, rows)
     _precision(second, tables["still"])
@@ -242,7 +242,7 @@ def _errors(axes: Axes, rows: list[Row]) -> None:
                 axes.semilogy(row["milliseconds"], ends[0], marker, color=colour, markerfacecolor=fill, label=label)
     axes.set_xlim(left=0)
     axes.set_xlabel("milliseconds per frame, plain desk")
-    axes.set_ylabel("absolute tip error: median, line to p95 (mm)")
+    axes.set_ylabel("tip error: median, line up to p95 (mm)")
     axes.set_title("synthetic frames")
     axes.grid(alpha=0.3, which="both")
     axes.legend(fontsize=7)
@@ -257,7 +257,8 @@ def _precision(axes: Axes, rows: list[Row]) -> None:
     bounds = [_one(rows, depth_mm=depth, tilt_deg=tilt, method=BASE)["bound_mm"] for depth, tilt in places]
     axes.semilogy(range(len(places)), bounds, "_", color="black", markersize=20, label="Cramér-Rao bound")
     axes.set_xticks(range(len(places)), [f"{depth} mm\n{tilt}°" for depth, tilt in places])
-    axes.set_ylabel("standard deviation of a resting tip, unfiltered (mm)")
+    axes.set_xlabel("distance of the bands' middle and their tilt")
+    axes.set_ylabel("sd of a resting tip, unfiltered (mm)")
     axes.set_title("synthetic frames")
     axes.grid(alpha=0.3, which="both")
     axes.legend(fontsize=7)
