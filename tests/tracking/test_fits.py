@@ -1,6 +1,7 @@
 """Edge fits against edges that numpy made by counting fine samples."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -126,3 +127,30 @@ def test_of_two_fits_the_surer_one_is_taken_edge_by_edge():
     assert both.deviation.tolist() == [other.deviation[0], one.deviation[1]]
     assert both.place.tolist() == [other.place[0], one.place[1]]
     assert np.array_equal(both.steps[1], one.steps[1]) and np.array_equal(both.levels[0], other.levels[0])
+
+
+def test_channels_that_put_edges_apart_make_all_of_them_unsure():
+    """Colours half a pixel on, as codecs leave them: no place is right for all channels, so none is sure.
+
+    Places of channels that agree scatter by noise alone: their spread over it is known to 1 / sqrt(2 * 200 * 2) = 4 %.
+    """
+    noise = 0.01 * normal((200, 23, 5, 3), 4)
+    one, far = edges(np.zeros(200), 0.9), edges(np.full(200, 0.5), 0.9)
+    weight = np.full_like(one, 1e4)
+    mixed = np.concatenate([one[..., :1], far[..., 1:]], -1)
+    alike, apart = fit_edges(one + noise, weight), fit_edges(mixed + noise, weight)
+    assert alike.apart[0] == 1 and (apart.apart == apart.apart[0]).all() and apart.apart[0] > 2.5
+    missed = np.minimum(np.abs(apart.place), np.abs(apart.place - 0.5))
+    assert np.median(missed) > 4 * np.median(alike.deviation)  # far from either place for what noise alone would say
+    assert np.median(apart.deviation) > np.median(missed) / 3
+
+
+@pytest.mark.parametrize("blur", [0.35, 0.9, 5.0])
+def test_edges_of_any_blur_and_weight_are_fitted_quietly(blur):
+    """Blurs far apart, some edges nearly certain, one without weight: no 0 / 0 on the way."""
+    light = np.concatenate([edges([0.1], 0.35), edges([0.2], 5.0), edges([-0.2], 0.9)])
+    weight = np.ones_like(light) * np.array([1e4, 349, 0])[:, None, None, None]
+    with np.errstate(all="raise", under="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit = fit_edges(light, weight, blur)
+    assert np.isfinite(fit.blur).all() and np.isfinite(fit.place).all() and not np.isfinite(fit.deviation[2])

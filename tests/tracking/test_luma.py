@@ -1,0 +1,213 @@
+"""Whether a codec has halved the colours' resolution, and where edges lie by what it has left: their luma."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from oracles import codec
+from torch import Tensor
+from tracked import truth
+
+from holotorch.tracking import luma, measure, scenery
+from holotorch.tracking.fits import EdgeFit, fit_edges
+from holotorch.tracking.luma import coarse_colours, fit_luma
+from holotorch.tracking.stations import variance_of
+from holotorch.tracking.status import Pose, Status
+from holotorch.tracking.strips import Sampler
+from holotorch.tracking.tracker import CatheterTracker
+from holotorch.tracking.world import Case, World
+
+WORLD = World()
+TRACKER = CatheterTracker(WORLD.camera, WORLD.catheter)
+CURVE = TRACKER.lens.light
+CODECS = {"4:2:0 video": codec.i420, "jpeg 95": codec.jpeg}
+ROWS, COUNT, NOISE = 5, 23, 2.5
+RED, GREEN, BLUE = WORLD.catheter.colours
+TUBE = (228, 228, 222)
+
+
+def coded(frame: Tensor, name: str) -> Tensor:
+    """Frame [3, H, W] after a codec, in the memory of a camera's frame."""
+    return torch.from_numpy(np.ascontiguousarray(CODECS[name](frame.permute(1, 2, 0).numpy()))).permute(2, 0, 1)
+
+
+def asked(frame: Tensor, pixels: list[complex]) -> list[bool]:
+    sampler = Sampler(frame, CURVE)
+    return [coarse_colours(sampler, pixel) for pixel in pixels]
+
+
+def everywhere(frame: Tensor, step: int = 97) -> list[complex]:
+    """Pixels all over a frame, its four corners too."""
+    height, width = frame.shape[1:]
+    inner = [complex(x, y) for y in range(0, height, step) for x in range(0, width, step)]
+    return [*inner, complex(width - 1, 0), complex(0, height - 1), complex(width - 1, height - 1)]
+
+
+@cache
+def shown(roll: int) -> tuple[Tensor, list[complex]]:
+    """A frame, and the pixels of its band edges."""
+    pose = WORLD.pose(0.5, 0.3, math.radians(roll))
+    frame = WORLD.case(f"roll {roll}", pose).frame()
+    points = WORLD.camera.project(pose[0] + WORLD.catheter.positions[:, None] * pose[1])
+    return frame, [complex(x, y) for x, y in points.tolist()]
+
+
+@pytest.mark.parametrize("noise", [1.0, 2.5, 8.0])
+def test_noise_of_each_channels_own_is_no_codecs(noise):
+    """Of 484 changes a median is known to 6 %; red less luma changes 1.3 times as much as luma, 0.6 is half of it."""
+    levels = 120 + noise * np.random.default_rng(1).normal(size=(3, 200, 300))
+    frame = torch.from_numpy(np.round(levels).clip(0, 255).astype(np.uint8))
+    assert not any(asked(frame, everywhere(frame, 31)))
+    if noise > 1:  # at 1 the rounding of a JPEG's coefficients takes as much away as the codec
+        for name in CODECS:
+            assert all(asked(coded(frame, name), everywhere(frame, 31))), name
+
+
+def test_colours_that_were_smoothed_all_along_are_coarse_too():
+    """A ramp of red, as between two colours that a reader has mixed: it rises by more than noise, and bends by less."""
+    grey = 120 + 3 * np.random.default_rng(1).normal(size=(1, 60, 60)) * np.ones((3, 1, 1))
+    grey[0] += 4 * np.arange(-30, 30).clip(-14, 14)
+    smooth = torch.from_numpy(np.round(grey).clip(0, 255).astype(np.uint8))
+    assert asked(smooth, [30 + 30j]) == [True]
+    grey[0] += 3 * np.random.default_rng(2).normal(size=(60, 60))
+    noisy = torch.from_numpy(np.round(grey).clip(0, 255).astype(np.uint8))
+    assert asked(noisy, [30 + 30j]) == [False]
+
+
+@pytest.mark.parametrize("name", CODECS)
+def test_a_desk_from_a_codec_has_coarse_colours_to_its_corners(name):
+    frame = WORLD.case("desk", None).frame()
+    pixels = everywhere(frame)
+    assert not any(asked(frame, pixels)) and all(asked(coded(frame, name), pixels))
+
+
+@pytest.mark.parametrize("roll", range(0, 180, 20))
+def test_bands_at_any_roll_have_coarse_colours_from_a_codec_alone(roll):
+    """At the first and last edge half of the patch is desk; between two bands of a JPEG their colours may ring."""
+    frame, pixels = shown(roll)
+    assert not any(asked(frame, pixels))
+    assert all(asked(coded(frame, "4:2:0 video"), pixels))
+    assert any(asked(coded(frame, "jpeg 95"), pixels[::3]))
+
+
+def test_a_photographs_colours_are_its_own():
+    """Strong shapes of all scales, with each pixel's own noise; grain of one grey is left out: it is a codec's too."""
+    grainless = scenery.texture(WORLD.size, 0).numpy().transpose(1, 2, 0)
+    smooth = torch.nn.functional.avg_pool2d(torch.from_numpy(grainless).permute(2, 0, 1).float(), 9, 1, 4)
+    frame = WORLD.case("texture", None, lambda: smooth.round().to(torch.uint8)).frame()
+    pixels = everywhere(frame)
+    assert np.mean(asked(frame, pixels)) < 0.05
+    assert np.mean(asked(coded(frame, "4:2:0 video"), pixels)) > 0.95
+
+
+@pytest.mark.parametrize("name", [None, *CODECS])
+def test_memory_makes_no_difference(name):
+    frame = shown(40)[0] if name is None else coded(shown(40)[0], name)
+    planar = frame.contiguous(memory_format=torch.contiguous_format)
+    camera = frame.permute(1, 2, 0).contiguous().permute(2, 0, 1)
+    assert planar.stride() != camera.stride()
+    pixels = [*shown(40)[1], *everywhere(frame, 301)]
+    assert asked(planar, pixels) == asked(camera, pixels)
+
+
+def both(places, blur, ends, levels=codec.levels_of, curve=CURVE) -> tuple[EdgeFit, EdgeFit]:
+    """Fits of all channels, and of luma, to edges whose colours lie half a pixel on."""
+    rng, (before, after) = np.random.default_rng(3), ends
+    light = curve[codec.edges(places, blur, before, after, COUNT, ROWS, NOISE, rng, levels)]
+    seen = np.ones(light.shape[:3])
+    fit = fit_edges(light, seen[..., None] / variance_of(light), 0.9)
+    return fit, fit_luma(fit, light, seen, curve)
+
+
+@pytest.mark.parametrize("blur", [0.7, 0.9, 1.5])
+@pytest.mark.parametrize("ends", [(RED, GREEN), (GREEN, BLUE), (BLUE, TUBE)], ids=["1", "2", "3"])
+def test_luma_tells_the_place_as_well_as_its_noise_lets_it(ends, blur):
+    """White noise in levels leaves a place at least ``bound``; the blur, found from the same samples, a little more.
+
+    200 errors have a root mean square that is known to 5 %, four times that is a fifth; 2 % of a blur for levels that
+    colours half a pixel aside have bent and clipped. The stated deviation is 1.2 times the scatter of such samples.
+    """
+    place = np.random.default_rng(1).uniform(-0.5, 0.5, 200)
+    every, found = both(place, blur, ends)
+    (before, after), noise = ends, math.hypot(NOISE, 1 / math.sqrt(12))
+    least = codec.bound(blur, before, after, COUNT, ROWS, noise)
+    missed = found.place - place
+    scatter = math.sqrt(float((missed * missed).mean()))
+    assert scatter < math.hypot(1.2 * least, 0.02 * blur)
+    assert np.median(found.deviation) == pytest.approx(1.2 * least, rel=0.4)
+    assert scatter < 0.5 * math.sqrt(float(((every.place - place) ** 2).mean()))
+    assert np.median(found.blur) == pytest.approx(blur, rel=0.03)
+
+
+def test_edges_without_luma_keep_their_place_and_say_that_it_may_be_half_a_colour_off():
+    """A linear tone curve: colours of one luma have it all along the edge, where it tells nothing."""
+    flat = np.arange(256, dtype=np.float32) / 255
+    ends = (150, 60, 60), (60, 60 + 90 * codec.SHARES[0] / codec.SHARES[1], 60)
+    place = np.random.default_rng(1).uniform(-0.3, 0.3, 60)
+    every, found = both(place, 0.9, ends, lambda light: 255 * light, flat)
+    kept = found.place == every.place
+    assert kept.mean() > 0.9  # noise may pass for an edge
+    assert (found.deviation[kept] >= 0.25).all() and np.abs(every.place - place).mean() > 0.25
+    missed = np.abs(found.place - place)[kept]
+    assert (missed < 3 * found.deviation[kept]).all()
+    # Those channels that are as clear as before are still widened, never narrowed.
+    assert (found.deviation[kept] > every.deviation[kept]).all()
+
+
+@cache
+def tracked(name: str, by_luma: bool) -> list[tuple[Pose, Case]]:
+    """Ten poses, cold; without ``by_luma`` as if no codec had been there."""
+    rng, found = np.random.default_rng(0), []
+    with pytest.MonkeyPatch.context() as patch:
+        if not by_luma:
+            patch.setattr(measure, "coarse_colours", lambda sampler, pixel: False)
+            patch.setattr(measure, "_APART", math.inf)
+        for i in range(10):
+            depth, tilt, roll = rng.uniform([0.4, 0.1, 0], [0.6, 0.5, 2 * math.pi])
+            case = WORLD.case(f"coded {i}", WORLD.pose(depth, tilt, roll))
+            found.append((TRACKER(coded(case.frame(), name)[None])[0], case))
+    return found
+
+
+def missed(found: list[tuple[Pose, Case]]) -> np.ndarray:
+    """Of answered poses, in metres."""
+    return np.array([float((pose.tip - truth(case)[0]).norm()) for pose, case in found if pose.answered])
+
+
+@pytest.mark.parametrize("name", CODECS)
+def test_frames_from_a_codec_are_answered_within_what_is_stated(name):
+    """3 stated deviations of all three axes are passed once in 1000; one of ten may be refused."""
+    found = tracked(name, True)
+    assert sum(pose.answered or pose.status is Status.UNCERTAIN for pose, _ in found) >= 9
+    stated = np.array([float(pose.tip_sd) for pose, _ in found if pose.answered])
+    assert (missed(found) < 3 * stated).all() and np.median(stated) < 1e-3
+
+
+def test_without_luma_the_tip_would_be_several_times_as_far_off():
+    """Colours that lie half a pixel aside move edges by half a pixel; the luma's places scatter by 0.04."""
+    assert np.median(missed(tracked("4:2:0 video", False))) > 3 * np.median(missed(tracked("4:2:0 video", True)))
+
+
+def test_the_line_is_as_far_aside_as_is_stated():
+    """The middle of the bands, across: ten ratios have a root mean square that is known to 22 %, four times that."""
+    ratios = []
+    for pose, case in tracked("4:2:0 video", True):
+        if pose.answered:
+            tip, direction = truth(case)
+            normal = torch.linalg.cross(tip, direction)
+            normal = normal / normal.norm()
+            lever = torch.cat([normal, 0.127 * normal])
+            aside = float(normal @ pose.point(0.127))
+            ratios.append(aside / math.sqrt(float(lever @ pose.covariance @ lever)))
+    assert len(ratios) >= 8 and math.sqrt(np.mean(np.square(ratios))) < 1 + 4 * 0.22
+
+
+def test_patches_end_at_the_frames_border():
+    """A frame hardly larger than a patch, asked beyond all sides: the same patch as at its border."""
+    frame = torch.from_numpy(np.random.default_rng(2).integers(100, 140, (3, 32, 40)).astype(np.uint8))
+    other = frame.clone()
+    other[:, :, luma._PATCH :] = other[:1, :, luma._PATCH :]  # grey to the right of the leftmost patch
+    assert asked(other, [-50 + 5j, 0j, 12 + 12j, 12 + 90j]) == [False] * 4
+    assert asked(other, [39 + 5j, 99 + 31j]) == asked(other, [28 + 16j, 28 + 20j]) == [True, True]
