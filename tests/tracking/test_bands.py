@@ -245,3 +245,30 @@ def test_who_knows_where_the_tip_lies_does_not_turn_round():
     assert one.edges.tolist() == other.edges.tolist() and one.whole == other.whole and one.doubtful == other.doubtful
     turned = stretches(labels[::-1], onward=True)
     assert turned is None or (not turned.flipped and turned.known < 3)
+
+
+LIKE = ColourTable(CAMERA, Catheter((0.01, 0.03, 0.05, 0.07, 0.09), (RED, GREEN, RED, BLUE), 1e-3, 0.2))
+
+
+@pytest.mark.parametrize("flipped", [False, True])
+def test_what_reads_the_same_from_both_ends_says_nothing_of_the_tip(flipped):
+    """Red, green, red, with the blue that follows hidden: who knows where the tip lies can use it, others cannot."""
+    labels = strip((30, 30, 30, 30), LIKE.bands)
+    labels[102:132] = 0
+    given = labels[::-1] if flipped else labels
+    assert stretches(given, LIKE) is None
+    known = stretches(given, LIKE, onward=True)
+    assert known is not None and not known.flipped
+    # Turned round, the first band is the red that comes first on the way, as the catheter has it.
+    assert seen(known)[:3] == [True] * 3 and known.edges[1] - known.edges[0] == 30
+
+
+@pytest.mark.parametrize("flipped", [False, True])
+def test_a_part_of_the_band_that_differs_tells_the_tip(flipped):
+    """6 px of blue: as many as the colours beside an edge. Of 3, which specks of noise may be, there is no answer."""
+    labels = strip((30, 30, 30, 30), LIKE.bands)
+    labels[111:132] = 0
+    found = stretches(labels[::-1] if flipped else labels, LIKE)
+    assert found is not None and found.flipped == flipped
+    labels[105:132] = 0
+    assert stretches(labels[::-1] if flipped else labels, LIKE) is None

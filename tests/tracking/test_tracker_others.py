@@ -1,10 +1,11 @@
 """The tracker with things that are not the catheter, and with other catheters and cameras."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
-from tracked import SIZE, TRACKER, WORLD, at, refused, right, scenes
+from tracked import SIZE, TRACKER, WORLD, at, refused, right, scenes, truth
 
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import THESIS, Catheter
@@ -18,6 +19,8 @@ SIX = Catheter((0.050, 0.062, 0.080, 0.090, 0.108, 0.120, 0.135), (RED, GREEN, B
 STRONG = Camera(
     torch.tensor([[700.0, 0, 480], [0, 700, 270], [0, 0, 1]]), torch.tensor([-0.35, 0.15, 2e-3, -1e-3, -0.02])
 )
+
+FULL = World()
 
 LOOK_ALIKES = {
     "wrong order": replace(THESIS, colours=(GREEN, RED, BLUE)),
@@ -37,6 +40,51 @@ def test_look_alikes_are_refused(kind):
         "other colours": (Status.NO_CATHETER, Status.BANDS_MISSING),
     }
     refused(TRACKER(case.frame()[None])[0], *expected.get(kind, (Status.INCONSISTENT,)))
+
+
+@pytest.mark.parametrize("roll", [25, 100])
+@pytest.mark.parametrize("depth", [0.4, 0.52, 0.7])
+@pytest.mark.parametrize("times", [1.5, 1.6, 1.8, 2.0])
+def test_a_stick_half_as_thick_again_is_refused_for_it(times, depth, roll):
+    """Bands in their order and lengths: the width alone tells, of 4 to 7 px at least 2 too many."""
+    pose = FULL.pose(depth, 0.2, math.radians(roll))
+    case = FULL.case(f"thick {times} {depth} {roll}", pose, shown=replace(THESIS, radius=times * THESIS.radius))
+    found = CatheterTracker(FULL.camera, THESIS)(case.frame()[None])[0]
+    refused(found, Status.INCONSISTENT)
+    assert "wide" in found.reason or "thicker" in found.reason
+
+
+def across(pose: tuple[torch.Tensor, torch.Tensor], path: float) -> tuple[float, float]:
+    """A movement of ``path`` pixels at right angles to the bands' image."""
+    ends = FULL.camera.project(pose[0] + THESIS.positions[[0, -1], None] * pose[1])
+    x, y = ((ends[1] - ends[0]) / (ends[1] - ends[0]).norm()).tolist()
+    return -path * y, path * x
+
+
+BLURRED = {  # times as thick, depth, roll, defocus, movement across; what it is that tells
+    "a movement that leaves the sides unclear": (1.6, 0.7, 100, 0.7, 5),
+    "sides that are too unclear to show one": (2.0, 0.7, 25, 0.7, 5),
+    "sides too sharp for so long a way": (1.5, 0.4, 25, 0.7, 10),
+    "more than a tube so blurred may be off": (2.5, 0.4, 100, 2.0, 0),
+}
+
+
+@pytest.mark.parametrize("kind", BLURRED)
+def test_a_thicker_stick_that_is_blurred_is_refused_while_its_width_can_be_told(kind):
+    times, depth, roll, blur, path = BLURRED[kind]
+    pose = FULL.pose(depth, 0.3, math.radians(roll))
+    shown, moved = replace(THESIS, radius=times * THESIS.radius), across(pose, path)
+    case = FULL.case(f"{kind}, thick", pose, shown=shown, blur_px=blur, motion_px=moved)
+    refused(CatheterTracker(FULL.camera, THESIS)(case.frame()[None])[0], Status.INCONSISTENT)
+
+
+@pytest.mark.parametrize(("depth", "roll", "blur"), [(0.52, 100, 3.0), (0.7, 25, 2.0)])
+def test_blurred_by_more_than_its_width_the_catheter_is_still_itself(depth, roll, blur):
+    """Width and blur are hard to tell apart then; their sum is not."""
+    case = FULL.case(f"soft {depth} {roll}", FULL.pose(depth, 0.3, math.radians(roll)), blur_px=blur)
+    pose = CatheterTracker(FULL.camera, THESIS)(case.frame()[None])[0]
+    assert pose.answered, pose.reason
+    assert float((pose.tip - truth(case)[0]).norm()) < 3 * float(pose.tip_sd)
 
 
 def test_sheets_in_a_row_are_refused():
