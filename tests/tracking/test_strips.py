@@ -182,6 +182,29 @@ def test_memory_of_any_layout_is_read_alike(frame, sampler, kind):
     assert np.array_equal(again.nearest(pixels[None]), sampler.nearest(pixels[None]))
 
 
+@pytest.mark.parametrize("kind", ["planar", "camera", "part", "padded", "turned"])
+def test_frames_that_are_not_the_hosts_are_read_alike(frame, kind):
+    """To the last bit, by the way that other devices take; between pixels, on half pixels, and beyond the border."""
+    places = np.random.default_rng(6).uniform(-2, 33, (2, 90))
+    halves = (np.arange(-3, 64) / 2 + 1j * np.array([[-0.5], [0.5], [7.5], [8.0], [23.0], [23.5]])).ravel()
+    pixels = np.concatenate([places[0] + 1j * places[1], halves, [30 + 23j, 1e6 - 1e6j]])
+    there = Sampler(layouts(frame)[kind], LIGHT)
+    here = (there(pixels), there.sharp(pixels), there.nearest(pixels[:90, None]))
+    there._host, there._image = None, None
+    for one, other in zip((there(pixels), there.sharp(pixels), there.nearest(pixels[:90, None])), here, strict=True):
+        assert one.dtype == other.dtype and np.array_equal(one, other)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("kind", ["planar", "camera", "padded"])
+def test_frames_of_a_gpu_are_read_alike(frame, kind):
+    pixels = np.random.default_rng(6).uniform(-2, 33, (2, 90))
+    pixels = pixels[0] + 1j * pixels[1]
+    here, there = (Sampler(given, LIGHT) for given in (frame, layouts(frame)[kind].cuda()))
+    assert np.array_equal(there(pixels), here(pixels)) and np.array_equal(there.sharp(pixels), here.sharp(pixels))
+    assert np.array_equal(there.nearest(pixels[None]), here.nearest(pixels[None]))
+
+
 def test_grey_frames_that_share_one_plane_are_read_as_three():
     grey = torch.from_numpy(np.random.default_rng(8).integers(0, 256, (1, 9, 11)).astype(np.uint8))
     pixels = np.array([0j, 3.3 + 4.1j, 10 + 8j])
