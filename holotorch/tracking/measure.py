@@ -21,7 +21,6 @@ _OUTSIDE = 10  # samples beyond the outermost edges
 _HALFWAY, _SURE = 6, 3  # samples to either side of where labels change; the outermost of them that show one colour
 _AWAY = 2.0  # pixels from where it was expected at which an edge is looked at once more
 _MARGIN = 8.0  # pixels, and two blurs: what must be seen to either side of an edge
-_APART = 2.5  # from which channels put edges so far apart that a codec has moved the colours
 _SMEARED = 4.0  # pixels of blur that no lens makes
 _UNSURE = 0.1  # pixels: a clear edge is known to a few hundredths
 _ALIKE = 0.2  # of the brightest channel: colours nearer than this are one
@@ -167,7 +166,7 @@ def measure_edges(
             # It moved along itself, farther than what was looked at.
             t[chosen] = near + fit.place
             return measure_edges(sampler, lens, axis, t, doubtful, median(fit.blur[known]), curve)
-        coarse = float(fit.apart[0]) > _APART or coarse_colours(sampler, complex(pixels[0, window, half]))
+        coarse = coarse_colours(sampler, complex(pixels[0, window, half]))
         if coarse:
             fit = fit_luma(fit, light, shown, sampler.light)
         elif bool((fit.deviation > _UNSURE).any()):
@@ -175,8 +174,7 @@ def measure_edges(
             core = (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)
             fit = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur))
         near, looks = near + fit.place, looks - 1
-        lost = np.count_nonzero(np.isfinite(fit.deviation)) < 3  # no pose either way
-        if not looks or lost or float(np.abs(fit.place).max()) < _AWAY:
+        if not looks or float(np.abs(fit.place).max()) < _AWAY:
             break
     blurs = fit.blur[np.isfinite(fit.deviation)]
     soft = median(fit.blur)

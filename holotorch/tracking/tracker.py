@@ -187,8 +187,7 @@ class CatheterTracker:
             else:
                 axis = measure_axis(stations, wide, _EXACT, axis.blur, axis)
             edges = dataclasses.replace(edges, t=axis.line.place(plane)[0])
-        blurred = not edges.coarse and abs(edges.blur - edges.expected) > _BLURRED  # luma has a blur of its own
-        if blurred or float(np.abs(curve - first).max()) > _BENT:
+        if float(np.abs(curve - first).max()) > _BENT or abs(edges.blur - edges.expected) > _BLURRED:
             with self._timed("edges"):
                 edges = measure_edges(sampler, lens, axis, edges.t, stretches.doubtful, edges.blur, curve)
         with self._timed("pose"):

@@ -163,7 +163,6 @@ def tracked(name: str, by_luma: bool) -> list[tuple[Pose, Case]]:
     with pytest.MonkeyPatch.context() as patch:
         if not by_luma:
             patch.setattr(measure, "coarse_colours", lambda sampler, pixel: False)
-            patch.setattr(measure, "_APART", math.inf)
         for i in range(10):
             depth, tilt, roll = rng.uniform([0.4, 0.1, 0], [0.6, 0.5, 2 * math.pi])
             case = WORLD.case(f"coded {i}", WORLD.pose(depth, tilt, roll))

@@ -131,12 +131,12 @@ def test_lines_without_bands_do_not_use_up_those_that_are_measured(monkeypatch):
 
 
 def test_the_work_for_a_frame_is_bounded(monkeypatch):
-    """Of lines that show bands two are measured, and the refusal is that which came nearest to a pose."""
+    """Of lines that show bands one is measured, and the refusal is its own."""
     frame = WORLD.case("shorter", at(), shown=SHORTER).frame()
     there, looked = segment_of(at()), []
     monkeypatch.setattr(tracker_module, "find_segments", lambda frame, table: [there, EMPTY[0], there, there, there])
     monkeypatch.setattr(tracker_module, "halfway", lambda *given: looked.append(1) or given[-1])
     refused(TRACKER(frame[None])[0], Status.INCONSISTENT)
-    assert len(looked) == 2
+    assert len(looked) == 1
     monkeypatch.setattr(tracker_module, "find_segments", lambda frame, table: [there, *EMPTY])
     refused(TRACKER(frame[None])[0], Status.INCONSISTENT)
