@@ -14,7 +14,6 @@ from holotorch.tracking.fits import BLUNTEST, SHARPEST, erf, median
 
 _STEPS = 8
 _SETTLED = 0.05  # pixels: the step after is a third of it; gloss and shadow move a middle by as much
-_LIKELY = 2.5  # standard deviations
 _SLICES = 8
 _SHADINGS = (np.ones_like, lambda q: q, lambda q: np.sqrt(1 - q * q), lambda q: q**3)
 _MEANS = (1.0, 0.0, math.pi / 4, 0.0)  # of the shadings over the tube
@@ -58,19 +57,9 @@ class AxisFit:
 
     def given(self, width: tuple[float, float], known: float) -> "AxisFit":
         """The same where width and taper come to be known, to a share of the width; to first order."""
-        values = np.array([width[0], width[1] * self.reach])
-        return self._with(slice(2, 4), values, (known * width[0]) ** -2)
-
-    def blurred(self, blur: float, known: float) -> "AxisFit":
-        """The same where the blur comes to be known, to a share, if it may be that; to first order."""
-        own = _solved(self.normal, np.eye(len(self.normal))[4])[4]
-        near = (blur - self.unknown[4]) ** 2 < _LIKELY**2 * own + (known * blur) ** 2
-        return self._with(slice(4, 5), np.array([blur]), (known * blur) ** -2) if near else self
-
-    def _with(self, which: slice, values: np.ndarray, weight: float) -> "AxisFit":
         more, away = np.zeros(len(self.unknown)), np.zeros(len(self.unknown))
-        more[which] = weight
-        away[which] = values - self.unknown[which]
+        more[2:4] = (known * width[0]) ** -2
+        away[2:4] = np.array([width[0], width[1] * self.reach]) - self.unknown[2:4]
         normal = self.normal + np.diag(more)
         return replace(self, unknown=self.unknown + _solved(normal, more * away), normal=normal)
 

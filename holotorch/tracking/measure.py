@@ -29,7 +29,6 @@ _BESIDE = 14.0  # pixels from the mid-line, beside the widest catheters
 _SIDE_STEP = 0.25  # light that changes beside an edge, over what changes on it: something lies across the tube
 _SAME_STEP = 0.6  # the same, where the bands themselves go on there
 _CLEAR = 4.0  # standard deviations of that change
-_SOFTER = 0.3  # pixels of blur that make no difference to it
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +165,7 @@ def measure_edges(
             # It moved along itself, farther than what was looked at.
             t[chosen] = near + fit.place
             return measure_edges(sampler, lens, axis, t, doubtful, median(fit.blur[known]), curve)
-        coarse = coarse_colours(sampler, complex(pixels[0, window, half]))
+        coarse = any(coarse_colours(sampler, complex(pixels[i, window, half])) for i in (0, -1))
         if coarse:
             fit = fit_luma(fit, light, shown, sampler.light)
         elif bool((fit.deviation > _UNSURE).any()):
@@ -178,11 +177,7 @@ def measure_edges(
             break
     blurs = fit.blur[np.isfinite(fit.deviation)]
     soft = median(fit.blur)
-    if soft > blur + _SOFTER:  # what is blurred more reaches farther
-        place, sides = (near - fit.place)[:, None, None] + along[:, None], _sides(widths, soft)
-        beside = sampler(lens.distort(line.plane(place, sides[:, None]))).transpose(1, 2, 3, 0)
-    else:
-        beside = seen[:, :, len(u) :]
+    beside = seen[:, :, len(u) :]
     covered, beyond = _across(beside, along - fit.place[:, None], fit)
     if beyond and len(near) > 2:
         raise Refusal(Status.INCONSISTENT, "all bands go on beside the tube: this is thicker, seen in one part of it")

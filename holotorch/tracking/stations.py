@@ -24,7 +24,6 @@ _SLOW = 0.2  # of the width: a standard deviation that says that it may not have
 _OTHER = 1.5  # pixels from its width at which a tube is surely wider or narrower
 _SHARP = 0.9  # pixels of blur, to begin with
 _SETTLED = 3.0  # pixels: a middle that moves farther in the last of a fit's steps is none
-_FOCUS = 0.1  # of a blur: how well edges and sides agree in it
 _LINE_FLOOR = 0.008  # of the width: what gloss and shadow, which repeat along the tube, may move its middle
 
 
@@ -166,11 +165,6 @@ def measure_width(
 def narrowed(stations: Stations, axis: Axis, width: tuple[float, float], known: float) -> Axis:
     """The axis, where its width comes to be known."""
     return _axis(stations, axis.fit.given(width, known))
-
-
-def focused(stations: Stations, axis: Axis, blur: float) -> Axis:
-    """The axis, where the blur of the lens comes to be known; where it is large, width and blur are hard to tell."""
-    return _axis(stations, axis.fit.blurred(blur, _FOCUS))
 
 
 def _axis(stations: Stations, fit: AxisFit) -> Axis:

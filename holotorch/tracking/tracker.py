@@ -22,7 +22,7 @@ from holotorch.tracking.footprint import bulge_px, on_plane, width_px
 from holotorch.tracking.lens import Lens
 from holotorch.tracking.measure import Edges, find_bands, halfway, measure_edges
 from holotorch.tracking.resection import Found, pose_on_line
-from holotorch.tracking.stations import THIRD, Axis, focused, look_across, measure_axis, measure_width, narrowed
+from holotorch.tracking.stations import THIRD, Axis, look_across, measure_axis, measure_width, narrowed
 from holotorch.tracking.status import Pose, Refusal, Status
 from holotorch.tracking.strips import Line, Sampler
 
@@ -30,10 +30,10 @@ _FLOOR = 0.02  # pixels: what model, pixels and a table that shines through leav
 _ROUND = 0.008  # of what a ring's front bulges,
 _SOFT = 0.08  # of blur to all sides, since what lies beside the tube leaks into it,
 _SMEAR = 0.03  # and of blur along it, which is that of a lens or of a movement
-_ASIDE = 0.12  # pixels: what colours between other pixels than the luma leave in a line
+_ASIDE = 0.17  # pixels: what colours between other pixels than the luma leave in a line
 _UNLIKELY = {1: 10.83, 2: 13.82, 3: 16.27, 4: 18.47, 5: 20.52, 6: 22.46, 7: 24.32, 8: 26.12, 9: 27.88}  # 0.1 % of chi^2
 _SLANTED = 1.5  # times as wide as at a slight tilt, 55 degrees
-_PATH, _ALIKE = 2.5, 0.25  # longest way across, in widths, and how well the softness of the sides must agree with it,
+_PATH, _ALIKE = 2.5, 0.2  # longest way across, in widths, and how well the softness of the sides must agree with it,
 _CLEAR = 0.04  # where their distance is as clear as this
 _NEARLY, _EXACT = 0.01, 0.002  # how well the width is known from a rough pose, and after
 _WIDEST = 120.0  # pixels
@@ -89,8 +89,8 @@ class CatheterTracker:
         if frames.ndim != 4 or frames.shape[1] != 3 or frames.dtype != torch.uint8:
             raise ValueError(f"frames must be uint8 of shape [B, 3, H, W], got {frames.dtype}, {list(frames.shape)}")
         self.camera.need_size(frames)
-        if isinstance(previous, Pose):
-            raise TypeError("previous must be a list with a pose for each frame, got one pose: write [pose]")
+        if isinstance(previous, Pose) or not all(isinstance(pose, Pose) for pose in previous or ()):
+            raise TypeError("previous must be a list with a Pose for each frame")
         if previous is not None and len(previous) != len(frames):
             raise ValueError(f"{len(frames)} frames take {len(frames)} previous poses, got {len(previous)}")
         self.times = dict.fromkeys(("colour", "axis", "edges", "pose"), 0.0)
@@ -180,8 +180,6 @@ class CatheterTracker:
             plane, wide = axis.line.plane(edges.t), self._wide(found, line)
         with self._timed("axis"):
             # With the width that the pose and the radius give; what was found without them is the check.
-            if before is None and abs(edges.blur - _BLUR) > _BLURRED:
-                width = focused(stations, width, edges.blur)
             if near:
                 axis = narrowed(stations, axis, wide, _EXACT)
             else:

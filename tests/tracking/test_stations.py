@@ -13,7 +13,7 @@ from holotorch.tracking.axis_fit import AxisFit
 from holotorch.tracking.bands import Stretches
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.lens import Lens
-from holotorch.tracking.stations import THIRD, Stations, focused, look_across, measure_axis, measure_width, narrowed
+from holotorch.tracking.stations import THIRD, Stations, look_across, measure_axis, measure_width, narrowed
 from holotorch.tracking.status import Refusal, Status
 from holotorch.tracking.strips import Line
 
@@ -245,8 +245,3 @@ def test_what_comes_to_be_known_changes_an_axis_as_a_new_fit_would():
     assert one.width == pytest.approx(8.0, abs=4 * both) and one.width_sd == pytest.approx(both, rel=0.05)
     assert abs(complex(one.line.origin - other.line.origin)) * LENS.scale < 0.02
     assert one.width_sd < free.width_sd and one.offset_sd <= free.offset_sd
-    soft = focused(found, free, 1.0)
-    sure = math.sqrt(np.linalg.inv(free.fit.normal)[4, 4])
-    share = (0.1 * 1.0) ** -2 / ((0.1 * 1.0) ** -2 + sure**-2)  # of two that know a blur, the weight of the second
-    assert soft.blur - free.blur == pytest.approx(share * (1.0 - free.blur), rel=1e-6)
-    assert focused(found, free, 3.0).blur == free.blur  # it cannot be that
