@@ -20,7 +20,7 @@ from holotorch.tracking.world import Case, World
 
 BASE, COLD, PRIOR, FEWER = "thesis, OpenCV", "ours, cold", "ours, prior", "ours, fewer stations"
 LITERAL = "thesis, OpenCV, maps anew"
-STATIONS = 8  # of the one with fewer
+STATIONS = 6  # of the one with fewer
 WRONG = 5e-3  # metres from the truth
 # Photographs for backgrounds: a folder beside the checkout, or else those that scikit-image brings.
 PHOTOGRAPHS = Path(__file__).parents[3] / "shared" / "data" / "images"

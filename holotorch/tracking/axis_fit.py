@@ -55,10 +55,13 @@ class AxisFit:
     def _scale(self) -> np.ndarray:
         return np.array([1.0, 1.0 / self.reach, 1.0, 1.0 / self.reach])
 
-    def given(self, width: tuple[float, float], known: float) -> "AxisFit":
-        """The same where width and taper come to be known, to a share of the width; to first order."""
+    def given(self, width: tuple[float, float], known: float, before: float = math.inf) -> "AxisFit":
+        """The same where width and taper come to be known, to a share of the width; to first order.
+
+        With ``before`` they were known to that share already, and are no more.
+        """
         more, away = np.zeros(len(self.unknown)), np.zeros(len(self.unknown))
-        more[2:4] = (known * width[0]) ** -2
+        more[2:4] = (known * width[0]) ** -2 - (before * width[0]) ** -2
         away[2:4] = np.array([width[0], width[1] * self.reach]) - self.unknown[2:4]
         normal = self.normal + np.diag(more)
         return replace(self, unknown=self.unknown + _solved(normal, more * away), normal=normal)

@@ -16,11 +16,12 @@ from holotorch.tracking.strips import Line, Sampler
 _LEVEL_SD = 2.5 / 255  # of a pixel's level; fits correct it by what they leave
 _ONE_SIDED = 0.15  # contrast to one side over that to the other
 _NARROWEST = 2.4  # pixels: below it no pixel shows one band alone
-_STATIONS, _FEWEST = 12, 6
-_SAMPLES = 6  # for each station: along the tube neighbours differ in nothing but noise
+_STATIONS, _FEWEST = 8, 6
+_SAMPLES = 9  # for each station: along the tube neighbours differ in nothing but noise
 _MOST = 700  # samples across, of all stations together: wide tubes take fewer stations
 THIRD = 0.35  # how well a width is known of which nothing is known, as a share of it
 _SLOW = 0.2  # of the width: a standard deviation that says that it may not have been reached yet
+_LINEAR = 0.1  # of a width: of what it is freed by one step of a fit, not by a new one, errs by the square of that
 _OTHER = 1.5  # pixels from its width at which a tube is surely wider or narrower
 _SHARP = 0.9  # pixels of blur, to begin with
 _SETTLED = 3.0  # pixels: a middle that moves farther in the last of a fit's steps is none
@@ -101,13 +102,15 @@ def look_across(sampler: Sampler, lens: Lens, line: Line, stretches: Stretches, 
     u = np.arange(-half, half + 1.0)
     wanted = min(_STATIONS, max(_FEWEST, _MOST // len(u)))
     length = sum(b - a for a, b in spans)
-    every = max(1.0, length / (_SAMPLES * wanted))
-    samples = min(_SAMPLES, max(1, int(length / (every * wanted))))
-    parts = [np.arange(a, max(a, b - (samples - 1) * every), samples * every) for a, b in spans]
-    band = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    t = np.concatenate(parts)[:, None] + every * np.arange(samples)
-    if len(t) < _FEWEST:
+    samples = min(_SAMPLES, max(1, int(length / wanted)))
+    each = [max(1, round(wanted * (b - a) / length)) for a, b in spans]
+    if samples < 2 and sum(each) > length:
         raise Refusal(Status.TOO_NARROW, "the bands are a few pixels long")
+    parts = [
+        a + (np.arange(count * samples) + 0.5).reshape(count, samples) * ((b - a) / (count * samples))
+        for (a, b), count in zip(spans, each, strict=True)
+    ]
+    band, t = np.repeat(np.arange(len(parts)), each), np.concatenate(parts)
     light = sampler(line.pixels(lens, t.ravel(), u)).reshape(3, *t.shape, len(u)).sum(2) / np.float32(samples)
     signal, weight, *levels = _contrast(light, u, width, band, samples)
     return Stations(line, float(t.max() - t.min()), signal, weight, t.mean(-1), band, *levels)
@@ -148,7 +151,9 @@ def measure_width(
         # Beginning with a width that is nearly right, gloss is not taken for it.
         rough = stations.rough_width()
         if abs(rough - wide[0]) < max(_OTHER, 0.25 * wide[0]):
-            width = measure_axis(stations, wide, THIRD, axis.blur, axis)
+            width = _axis(stations, axis.fit.given(wide, THIRD, known))
+            if abs(width.width - wide[0]) > _LINEAR * wide[0]:
+                width = measure_axis(stations, wide, THIRD, axis.blur, axis)
         else:
             width = measure_axis(stations, (rough, 0.0), THIRD, _SHARP)
     if not stations.show(width.width, width.blur):
