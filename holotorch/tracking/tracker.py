@@ -39,7 +39,7 @@ _NEARLY, _EXACT = 0.01, 0.002  # how well the width is known from a rough pose, 
 _WIDEST = 120.0  # pixels
 _BLUR = 0.9  # pixels, to begin with
 _BLURRED = 0.6  # from which edges that differ by more are looked at again,
-_BENT = 0.05  # as are those whose fronts bulge by so many pixels more or less than was thought
+_BENT = 0.1  # as are those whose fronts bulge by so many pixels more or less than was thought
 _FLAT = 0.05  # pixels of a bulge that change the tube's width by nothing
 _MOVED = 30.0  # pixels that a catheter may move between two frames
 
