@@ -21,6 +21,7 @@ SHARPEST, BLUNTEST = 0.35, 10.0  # pixels, standard deviation of an edge
 
 _ALONE = 1000  # numbers, and fewer, of which one thread takes the error function
 
+# Of an edge: (t [T], place [E], blur [E]), all in samples, to what it is there and its slopes to both, [E, 3, T].
 Shape = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -92,7 +93,7 @@ def fit_edges(light: np.ndarray, weight: np.ndarray, blur: float = 0.9, shape: S
         light: [E, T, U, C] samples; T odd, the edge near the middle.
         weight: Inverse variances, of the same shape; 0 leaves a sample out.
         blur: To begin with, in samples.
-        shape: Of an edge.
+        shape: Of an edge: a step in light, unless something else is told of it.
     """
     rows = light.shape[2:]
     light, weight = (given.reshape(*given.shape[:2], -1).astype(np.float64) for given in (light, weight))  # [E, T, U C]

@@ -11,14 +11,14 @@ import numpy as np
 from holotorch.tracking.fits import EdgeFit, fit_edges, median, normal_step
 from holotorch.tracking.strips import Sampler
 
-_SHARES = np.array([0.299, 0.587, 0.114])  # of red, green and blue levels in luma, ITU-R BT.601
+_LUMA = np.array([0.299, 0.587, 0.114])  # of red, green and blue levels in luma, ITU-R BT.601
 _LEVEL_SD = 2.5  # of a pixel's level; fits correct it by what they leave
 _PATCH, _COARSE = 24, 0.6  # pixels, and of luma's change
 _ASIDE = 0.25  # pixels: standard deviation of where an edge of coarse colours lies
 
 
 def coarse_colours(sampler: Sampler, pixel: complex) -> bool:
-    """Whether near a pixel x + i y colours have fewer pixels than luma.
+    """Whether near a pixel x + i y of a frame of at least 24 x 24 colours have fewer pixels than luma.
 
     Noise that is each channel's own changes red less luma 1.3 times as much from pixel to pixel as luma. Where a codec
     has halved the colours' resolution, pixels that share a colour change less than those that do not, or, smoothed,
@@ -28,7 +28,7 @@ def coarse_colours(sampler: Sampler, pixel: complex) -> bool:
     x, y = (int(min(max(v - _PATCH // 2, 0), most)) for v, most in room)
     patch = sampler.frame[:, y : y + _PATCH, x : x + _PATCH].cpu().numpy().astype(np.float32)
     both = np.empty((2, *patch.shape[1:]), dtype=np.float32)
-    both[0] = _SHARES[0] * patch[0] + _SHARES[1] * patch[1] + _SHARES[2] * patch[2]
+    both[0] = _LUMA[0] * patch[0] + _LUMA[1] * patch[1] + _LUMA[2] * patch[2]
     both[1] = patch[0] - both[0]
     step = both[..., 1:] - both[..., :-1]
     bend = np.abs(step[..., 1:] - step[..., :-1]).reshape(2, -1)
@@ -46,9 +46,13 @@ def fit_luma(fit: EdgeFit, light: np.ndarray, shown: np.ndarray, curve: np.ndarr
 
     Args:
         fit: Of all channels, to ``light``.
-        light: [E, T, U, 3].
-        shown: [E, T, U], how much each sample counts.
+        light: [E, T, U, 3] samples, red, green and blue, 0 to 1.
+        shown: [E, T, U], how much each sample counts, 0 to 1.
         curve: [256] light of each level, rising.
+
+    Returns:
+        ``fit`` with place, blur and deviation, in samples, of luma or, where they are surer, of all channels; the
+        deviation of these widened.
     """
     rows = shown.sum(1)[..., None]
     low, step = ((value * rows).sum(1) / np.maximum(rows.sum(1), 1e-9) for value in (fit.levels, fit.steps))  # [E, 3]
@@ -59,11 +63,11 @@ def fit_luma(fit: EdgeFit, light: np.ndarray, shown: np.ndarray, curve: np.ndarr
     def shape(t: np.ndarray, place: np.ndarray, sigma: np.ndarray) -> np.ndarray:
         rise, *slopes = np.moveaxis(normal_step(t, place, sigma)[..., None], 1, 0)  # [E, T, 1] each
         here = low[:, None] + step[:, None] * rise  # [E, T, 3]
-        each = np.interp(here, curve, steep) * step[:, None] @ _SHARES
-        return np.stack([np.interp(here, curve, levels) @ _SHARES, *(each * slope[..., 0] for slope in slopes)], 1)
+        each = np.interp(here, curve, steep) * step[:, None] @ _LUMA
+        return np.stack([np.interp(here, curve, levels) @ _LUMA, *(each * slope[..., 0] for slope in slopes)], 1)
 
-    luma = np.interp(light, curve, levels) @ _SHARES
-    weight = shown[..., None] / (_LEVEL_SD**2 * float(_SHARES @ _SHARES))
+    luma = np.interp(light, curve, levels) @ _LUMA
+    weight = shown[..., None] / (_LEVEL_SD**2 * float(_LUMA @ _LUMA))
     found = fit_edges(luma[..., None], np.broadcast_to(weight, (*shown.shape, 1)), float(np.median(fit.blur)), shape)
     # All channels may be off together, too, by half a pixel of the colours' and farther where they are far apart.
     worse = np.hypot(fit.apart * fit.deviation, _ASIDE)

@@ -168,7 +168,7 @@ def measure_width(
 
 
 def narrowed(stations: Stations, axis: Axis, width: tuple[float, float], known: float) -> Axis:
-    """The axis, where its width comes to be known."""
+    """The axis, where its width (pixels at t = 0, and taper per pixel) comes to be known, to a share of it."""
     return _axis(stations, axis.fit.given(width, known))
 
 

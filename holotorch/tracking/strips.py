@@ -60,7 +60,12 @@ class Line:
 
 
 class Sampler:
-    """Reads one frame uint8 [3, H, W], of any device, at pixels between pixels: levels, or light of a table [256]."""
+    """Reads one frame at pixels between pixels: levels, or light.
+
+    Args:
+        frame: uint8 [3, H, W], RGB, of any device and any strides; H and W are 4 or more.
+        light: float32 [256], of each level.
+    """
 
     def __init__(self, frame: Tensor, light: np.ndarray):
         self.frame, self.light = frame, light
