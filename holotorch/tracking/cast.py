@@ -14,6 +14,7 @@ from holotorch.tracking.catheter import Catheter
 
 # A lattice of 8 points in the unit square: each axis meets 8 different values, where a 3 x 3 grid would offer 3.
 _LATTICE = (np.stack([np.arange(8), 3 * np.arange(8) % 8], -1) + 0.5) / 8
+_DARKEST = 0.25  # light on a surface that faces the camera, below which no camera makes up for it
 _TURN = np.array([0.7548776662466927, 0.5698402909980532])  # shifts it from one place to the next, evenly (R2 sequence)
 
 
@@ -36,6 +37,7 @@ class Tube:
         clear: [N + 1], share of the background that shines through the same parts.
         light: Unit vector [3] towards the light.
         ambient: Share of the light that comes from everywhere.
+        level: Of all light: 1 over that on a surface which faces the camera, so that it shows its own colour.
         highlight: Light of the gloss.
         highlight_width: Standard deviation of its lobe in radians.
     """
@@ -49,6 +51,7 @@ class Tube:
     clear: np.ndarray
     light: np.ndarray
     ambient: float
+    level: float
     highlight: float
     highlight_width: float
 
@@ -103,7 +106,7 @@ class Tube:
         gloss = np.exp((np.minimum(halfway, 1) ** 2 - 1) / (2 * self.highlight_width**2))
         # The way through a wall that is seen at a slant is longer.
         cover = 1 - self.clear[part] ** (1 / np.maximum(facing, 0.05))
-        shade = cover * (self.ambient + (1 - self.ambient) * np.maximum(lit, 0))
+        shade = self.level * cover * (self.ambient + (1 - self.ambient) * np.maximum(lit, 0))
         seen = np.empty((len(part), 4), np.float32)
         seen[:, :3] = self.colours[part] * shade[:, None] + (self.highlight * gloss * (lit > 0))[:, None]
         seen[:, 3] = cover
@@ -159,6 +162,8 @@ def tube_of(
     nearest = place + np.clip(-place @ axis, 0, catheter.length) * axis
     if np.linalg.norm(nearest) < 10 * catheter.radius:
         raise ValueError(f"the tube comes within {np.linalg.norm(nearest):.3g} m of the camera; keep 10 radii away")
+    toward = np.asarray(light, dtype=np.float64) / np.linalg.norm(light)
+    facing = ambient + (1 - ambient) * max(0.0, -float(toward[2]))
     return Tube(
         place,
         axis,
@@ -167,8 +172,9 @@ def tube_of(
         np.asarray(catheter.edges),
         np.stack([light_of(one) for one in (colour, *catheter.colours, colour)]).astype(np.float32),
         np.array([1 - opacity, *(0 for _ in catheter.colours), 1 - opacity], np.float32),
-        np.asarray(light, dtype=np.float64) / np.linalg.norm(light),
+        toward,
         ambient,
+        1 / max(facing, _DARKEST),
         *highlight,
     )
 

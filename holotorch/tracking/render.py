@@ -55,7 +55,8 @@ class Look:
         background: uint8 [3, H, W] as the camera shows it without the catheter (its lens has blurred it already), or
             one colour.
         gain: Factor on all light: the exposure.
-        light: Towards the light, in the camera's frame; any length.
+        light: Towards the light, in the camera's frame; any length. It is as strong as it takes to show a surface that
+            faces the camera in its own colour, up to four times: the background is such a surface.
         ambient: Share of the light that comes from everywhere, 0 to 1.
         ramp: Relative change of all light from the centre of the frame to its right and to its lower border.
         highlight: Light that shines back from the tube's gloss, 1 as bright as white paper.

@@ -180,14 +180,19 @@ def test_shading_gain_and_highlight():
     middle = round(LINEAR.project(tip + 0.085 * axis)[0].item())
 
     def rows(**changes) -> Tensor:
-        look = replace(FLAT, ambient=0.2, light=(0.0, -1.0, -1.0), **changes)
+        # Dark enough for the upper side, which gets 1.3 times what a surface gets that faces the camera.
+        look = replace(FLAT, **({"gain": 0.5, "ambient": 0.2, "light": (0.0, -1.0, -1.0)} | changes))
         return render(PURE, LINEAR, tip, axis, SIZE, look)[:, :, middle].double()
 
     plain = rows()[1]
     lit = plain.nonzero()[:, 0]
     upper, lower = plain[lit[: len(lit) // 2]], plain[lit[-(len(lit) // 2) :]]
     assert upper.sum() > 1.2 * lower.sum()  # the light comes from above
-    assert (rows(gain=0.5)[1] - plain / 2).abs().max() <= 0.75
+    middle_row = round(LINEAR.project(tip + 0.085 * axis)[1].item())
+    assert plain[middle_row].item() == pytest.approx(0.5 * 255, abs=4)  # what faces the camera shows its own colour,
+    behind = rows(light=(0.0, 0.0, 1.0))[1][middle_row].item()
+    assert behind == pytest.approx(4 * 0.2 * 0.5 * 255, abs=1)  # but where there is a quarter of that light or less
+    assert (rows(gain=0.25)[1] - plain / 2).abs().max() <= 0.75
     assert (rows(ramp=(0.0, -0.5))[1] / plain)[lit[1:-1]].median() == pytest.approx(1, abs=0.02)  # at the centre
     gloss = rows(highlight=0.5)
     assert gloss[0].sum() > 50 and torch.equal(gloss[0], gloss[2])  # white: in the channels that were dark
