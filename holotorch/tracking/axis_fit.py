@@ -13,7 +13,8 @@ import numpy as np
 from holotorch.tracking.fits import BLUNTEST, SHARPEST, erf, median
 
 _STEPS = 8
-_SETTLED = 0.05  # pixels: the step after is a third of it; gloss and shadow move a middle by as much
+_SETTLED, _WIDENED = 0.03, 0.15  # pixels: the middle's and the width's steps after are a third of it or less, which
+# gloss and shadow move a middle by, and pixels leave in a width
 _SLICES = 8
 _SHADINGS = (np.ones_like, lambda q: q, lambda q: np.sqrt(1 - q * q), lambda q: q**3)
 _MEANS = (1.0, 0.0, math.pi / 4, 0.0)  # of the shadings over the tube
@@ -154,7 +155,7 @@ def fit_axis(
         unknown = unknown + step.clip(-farthest, farthest)
         unknown[4] = min(max(unknown[4], SHARPEST), BLUNTEST)
         moving = float(np.abs(step[:2]).max())
-        if k and float(np.abs(step[:4]).max()) < _SETTLED:
+        if k and max(moving, abs(float(step[4]))) < _SETTLED and float(np.abs(step[2:4]).max()) < _WIDENED:
             break
     tube = member @ (unknown[5:].reshape(bands, kinds) @ np.array(_MEANS))
     one, other = median(np.abs(tube - beside[:, 0])), median(np.abs(tube - beside[:, 1]))

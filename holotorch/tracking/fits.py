@@ -12,7 +12,8 @@ import numpy as np
 import torch
 
 _STEPS = 8
-_NEAR = 0.03  # of a blur, or samples: the next step is a twentieth, and of places two more follow
+_NEAR = 0.03  # of a blur, or samples: the step after is lost in noise
+_ENDS = np.array([[0.06], [0.16]])  # the same of place and blur: steps after are a twentieth; of places two more follow
 _SHARED = 1.2  # neighbours share pixels: how much larger deviations are than of samples that do not, measured
 _STRANGE = 1.5  # what is left, over its white part: above it the model misses something, and averaging does not help
 _OWN = 1.4  # of the same: how far apart shading and gloss put the places of channels, in what noise does, measured
@@ -58,6 +59,7 @@ class EdgeFit:
         noise: Standard deviation of what the fit leaves, over that of the weights: 1 where those are right.
         steps: [E, U, C], light after the edge less light before, of each row and channel.
         levels: [E, U, C], light before.
+        told: [E, U, C], what a step of 1 would tell of the place in each row and channel: an inverse variance.
         apart: [E], how much farther apart the channels put edges than noise does; 1 or more, alike for all.
     """
 
@@ -67,6 +69,7 @@ class EdgeFit:
     noise: np.ndarray
     steps: np.ndarray
     levels: np.ndarray
+    told: np.ndarray
     apart: np.ndarray
 
     def or_better(self, other: "EdgeFit") -> "EdgeFit":
@@ -86,7 +89,13 @@ def normal_step(t: np.ndarray, place: np.ndarray, sigma: np.ndarray) -> np.ndarr
     return found
 
 
-def fit_edges(light: np.ndarray, weight: np.ndarray, blur: float = 0.9, shape: Shape = normal_step) -> EdgeFit:
+def fit_edges(
+    light: np.ndarray,
+    weight: np.ndarray,
+    blur: float = 0.9,
+    shape: Shape = normal_step,
+    t: np.ndarray | None = None,
+) -> EdgeFit:
     """Error functions of a place for each edge and one blur, with levels of their own in each row and channel.
 
     Args:
@@ -94,12 +103,12 @@ def fit_edges(light: np.ndarray, weight: np.ndarray, blur: float = 0.9, shape: S
         weight: Inverse variances, of the same shape; 0 leaves a sample out.
         blur: To begin with, in samples.
         shape: Of an edge: a step in light, unless something else is told of it.
+        t: [T], where the samples lie, rising, as far to one side of the middle as to the other; one apart by itself.
     """
     rows = light.shape[2:]
     light, weight = (given.reshape(*given.shape[:2], -1).astype(np.float64) for given in (light, weight))  # [E, T, U C]
-    count = light.shape[1]
-    far = (count - 1) / 2
-    t = np.arange(count) - far
+    t = np.arange(light.shape[1]) - (light.shape[1] - 1) / 2 if t is None else t
+    far = float(t[-1])
     place, sigma = np.zeros(len(light)), np.full(len(light), blur)
     total = np.maximum(weight.sum(1), 1e-30)
     mean = (weight * light).sum(1) / total
@@ -114,7 +123,7 @@ def fit_edges(light: np.ndarray, weight: np.ndarray, blur: float = 0.9, shape: S
         whole[~(whole > 0)] = np.inf
         step = (np.array([bb * p - pb * b, pp * b - pb * p]) / whole).clip(-1.5, 1.5)
         place, sigma = (place + step[0]).clip(-far, far), (sigma + step[1]).clip(SHARPEST, BLUNTEST)
-        if bool((np.abs(step) < _NEAR * np.maximum(sigma, 1.0)).all()):
+        if bool((np.abs(step) < _ENDS * np.maximum(sigma, 1.0)).all()):
             break
     # One lens blurs all edges alike. Where one side is dark and so has little noise, place and blur are hard to tell
     # apart, edge by edge; together they are not.
@@ -143,27 +152,23 @@ def fit_edges(light: np.ndarray, weight: np.ndarray, blur: float = 0.9, shape: S
     doubt = np.maximum(strange / _STRANGE, 1) ** 2
     good = (pp > 0) & np.isfinite(variance) & (free > 0) & ~other
     deviation = np.where(good, _SHARED * np.sqrt(variance) * np.maximum(noise, 0.5) * doubt, np.inf)
-    apart = _apart(weight, amplitude, np.maximum(noise, 0.5), *own, rows[-1])
-    steps, levels = (value.reshape(-1, *rows) for value in (amplitude, mean - amplitude * middle))
-    return EdgeFit(place, sigma, apart * deviation, noise, steps, levels, np.full(len(place), apart))
+    slope, taken, bell = own
+    told = ((bell * bell)[:, None] @ weight)[:, 0]
+    apart = _apart(told, amplitude, np.maximum(noise, 0.5), slope, taken, rows[-1])
+    steps, levels, told = (v.reshape(-1, *rows) for v in (amplitude, mean - amplitude * middle, told))
+    return EdgeFit(place, sigma, apart * deviation, noise, steps, levels, told, np.full(len(place), apart))
 
 
 def _apart(
-    weight: np.ndarray,
-    amplitude: np.ndarray,
-    noise: np.ndarray,
-    slope: np.ndarray,
-    taken: np.ndarray,
-    bell: np.ndarray,
-    colours: int,
+    told: np.ndarray, amplitude: np.ndarray, noise: np.ndarray, slope: np.ndarray, taken: np.ndarray, colours: int
 ) -> float:
     """How much farther apart the channels put edges than noise does, 1 or more.
 
     Codecs keep colours at half the resolution of the luma, often half a pixel aside, and blur them in levels instead of
     light. No one place is right for all channels then, and all edges suffer alike.
     """
-    raw = ((bell * bell)[:, None] @ weight)[:, 0] * amplitude**2
-    power = raw - (taken**2).reshape(len(raw), 2, -1).sum(1)  # normal matrix for a place of its own in each row
+    power = told * amplitude**2
+    power = power - (taken**2).reshape(len(power), 2, -1).sum(1)  # normal matrix for a place of its own in each row
     slope, power = (value.reshape(len(value), -1, colours).sum(1) for value in (slope, power))
     power = np.maximum(power, 1e-30)
     spread = (slope * slope / power).sum(1) - slope.sum(1) ** 2 / power.sum(1)

@@ -1,11 +1,20 @@
 """What a pose makes of the catheter on a line of its image: how wide it is there, and how its rings bulge."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
+from holotorch.tracking.fits import SHARPEST
 from holotorch.tracking.resection import Found
 from holotorch.tracking.strips import Line
+
+_INTERPOLATED = 1 / 6  # pixels^2 that bilinear samples add to a blur, whatever their direction
+_NODES = (np.arange(16) + 0.5) / 8 - 1  # across a tube, from one side to the other
+_ROUND = np.sqrt(1 - _NODES**2)
+_LIT = np.stack([np.ones_like(_NODES), _NODES, _ROUND], -1)
+_BOTH = np.concatenate([_LIT, _LIT * _ROUND[:, None]], -1)
+_RIDGE = 1e-4 * np.eye(_LIT.shape[1])
 
 
 def width_px(found: Found, positions: np.ndarray, radius: float, line: Line) -> tuple[float, float]:
@@ -35,3 +44,46 @@ def bulge_px(found: Found, positions: np.ndarray, radius: float, line: Line) -> 
 def on_plane(points: np.ndarray) -> np.ndarray:
     """Points [N, 3] of space, seen on the plane z = 1 as complex numbers [N]."""
     return (points[:, 0] + 1j * points[:, 1]) / points[:, 2]
+
+
+@dataclass(frozen=True, eq=False)
+class Front:
+    """How far rings' fronts bulge in rows [U] across the images of tubes [E], as shares of the bulge in their middles.
+
+    A row sees its neighbours through the blur: what it shows is the mean of their shares, weighed by how much each of
+    them changes at the edge. Light on a tube changes across it, and what shines through clear tube not in the same way.
+
+    Attributes:
+        mean: [E, U], where the change is the same all across.
+        change, bulge: [E, U, K], of changes of K shapes across: what a row sees of each, and that times the share.
+    """
+
+    mean: np.ndarray
+    change: np.ndarray
+    bulge: np.ndarray
+
+    @staticmethod
+    def of(u: np.ndarray, widths: np.ndarray, blur: float) -> "Front":
+        """In rows ``u`` from the mid-line of tubes so wide [E], all in pixels; ``blur`` of bilinear samples' sides."""
+        sigma = math.sqrt(max(blur**2 - _INTERPOLATED, SHARPEST**2))
+        bell = np.exp(-0.5 * ((u[:, None] - widths[:, None, None] / 2 * _NODES) / sigma) ** 2) + 1e-30
+        change, bulge = np.split(bell @ _BOTH, 2, -1)
+        return Front(bulge[..., 0] / change[..., 0], change, bulge)
+
+    def shift(self, steps: np.ndarray, told: np.ndarray, row: np.ndarray) -> np.ndarray:
+        """[E], by how much more than ``mean`` the edges bulge on average, as light changes at them.
+
+        Args:
+            steps: [E, U, C], change of light at the edges.
+            told: [E, U, C], what a step of 1 tells of the place: an inverse variance.
+            row: [E, U], weights of the rows.
+        """
+        known = (row[:, None] * (told > 0).swapaxes(1, 2))[..., None]
+        weighed = (self.change[:, None] * known).swapaxes(2, 3)  # [E, C, K, U]
+        normal = weighed @ self.change[:, None]
+        normal += (normal.trace(axis1=2, axis2=3) + 1e-30)[..., None, None] * _RIDGE
+        shapes = np.linalg.solve(normal, weighed @ steps.swapaxes(1, 2)[..., None])
+        share = (self.bulge[:, None] @ shapes)[..., 0].swapaxes(1, 2)  # [E, U, C], times the step
+        each = told * steps
+        power = np.maximum((each * steps).sum((1, 2)), 1e-30)
+        return (each * (share - self.mean[..., None] * steps)).sum((1, 2)) / power

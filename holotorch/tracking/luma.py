@@ -8,7 +8,8 @@ import dataclasses
 
 import numpy as np
 
-from holotorch.tracking.fits import EdgeFit, fit_edges, median, normal_step
+from holotorch.tracking.fits import EdgeFit, fit_edges, normal_step
+from holotorch.tracking.lens import Points
 from holotorch.tracking.strips import Sampler
 
 _LUMA = np.array([0.299, 0.587, 0.114])  # of red, green and blue levels in luma, ITU-R BT.601
@@ -17,28 +18,39 @@ _PATCH, _COARSE = 24, 0.6  # pixels, and of luma's change
 _ASIDE = 0.25  # pixels: standard deviation of where an edge of coarse colours lies
 
 
-def coarse_colours(sampler: Sampler, pixel: complex) -> bool:
-    """Whether near a pixel x + i y of a frame of at least 24 x 24 colours have fewer pixels than luma.
+def coarse_colours(sampler: Sampler, pixels: Points) -> np.ndarray:
+    """Whether near pixels x + i y [n] of a frame of at least 24 x 24 colours have fewer pixels than luma: bool [n].
 
     Noise that is each channel's own changes red less luma 1.3 times as much from pixel to pixel as luma. Where a codec
     has halved the colours' resolution, pixels that share a colour change less than those that do not, or, smoothed,
     all of them bend less.
     """
-    room = (pixel.real, sampler.width - _PATCH), (pixel.imag, sampler.height - _PATCH)
-    x, y = (int(min(max(v - _PATCH // 2, 0), most)) for v, most in room)
-    patch = sampler.frame[:, y : y + _PATCH, x : x + _PATCH].cpu().numpy().astype(np.float32)
+    patches = []
+    for pixel in pixels.tolist():
+        room = (pixel.real, sampler.width - _PATCH), (pixel.imag, sampler.height - _PATCH)
+        x, y = (int(min(max(v - _PATCH // 2, 0), most)) for v, most in room)
+        patches.append(sampler.frame[:, y : y + _PATCH, x : x + _PATCH].cpu().numpy())
+    patch = np.stack(patches, 1).astype(np.float32)  # [3, n, 24, 24]
     both = np.empty((2, *patch.shape[1:]), dtype=np.float32)
     both[0] = _LUMA[0] * patch[0] + _LUMA[1] * patch[1] + _LUMA[2] * patch[2]
     both[1] = patch[0] - both[0]
     step = both[..., 1:] - both[..., :-1]
-    bend = np.abs(step[..., 1:] - step[..., :-1]).reshape(2, -1)
+    bend = _median(np.abs(step[..., 1:] - step[..., :-1]))
     step = np.abs(step)
-    less, more = sorted(median(step[1, :, first::2].ravel()) for first in (0, 1))
-    shared = less < _COARSE * min(more, median(step[0].ravel()))
-    return shared or median(bend[1]) < _COARSE * median(bend[0])
+    even, odd = (_median(step[1, ..., first::2]) for first in (0, 1))
+    shared = np.minimum(even, odd) < _COARSE * np.minimum(np.maximum(even, odd), _median(step[0]))
+    return shared | (bend[1] < _COARSE * bend[0])
 
 
-def fit_luma(fit: EdgeFit, light: np.ndarray, shown: np.ndarray, curve: np.ndarray) -> EdgeFit:
+def _median(values: np.ndarray) -> np.ndarray:
+    """Over the last two axes; of an even number the one above the middle."""
+    flat = values.reshape(*values.shape[:-2], -1)
+    return np.partition(flat, flat.shape[-1] // 2)[..., flat.shape[-1] // 2]
+
+
+def fit_luma(
+    fit: EdgeFit, light: np.ndarray, shown: np.ndarray, curve: np.ndarray, t: np.ndarray | None = None
+) -> EdgeFit:
     """Places of edges by luma, where it tells them better than all channels did.
 
     Blur acts on light and luma is a sum of levels: an edge's luma is no error function, but follows from the light on
@@ -49,6 +61,7 @@ def fit_luma(fit: EdgeFit, light: np.ndarray, shown: np.ndarray, curve: np.ndarr
         light: [E, T, U, 3] samples, red, green and blue, 0 to 1.
         shown: [E, T, U], how much each sample counts, 0 to 1.
         curve: [256] light of each level, rising.
+        t: [T], where the samples lie, as of :func:`fit_edges`.
 
     Returns:
         ``fit`` with place, blur and deviation, in samples, of luma or, where they are surer, of all channels; the
@@ -68,7 +81,7 @@ def fit_luma(fit: EdgeFit, light: np.ndarray, shown: np.ndarray, curve: np.ndarr
 
     luma = np.interp(light, curve, levels) @ _LUMA
     weight = shown[..., None] / (_LEVEL_SD**2 * float(_LUMA @ _LUMA))
-    found = fit_edges(luma[..., None], np.broadcast_to(weight, (*shown.shape, 1)), float(np.median(fit.blur)), shape)
+    found = fit_edges(luma[..., None], np.broadcast_to(weight, (*shown.shape, 1)), float(np.median(fit.blur)), shape, t)
     # All channels may be off together, too, by half a pixel of the colours' and farther where they are far apart.
     worse = np.hypot(fit.apart * fit.deviation, _ASIDE)
     better = found.deviation < worse

@@ -9,19 +9,24 @@ import numpy as np
 from holotorch.tracking.bands import Stretches, find_axis, find_stretches
 from holotorch.tracking.colours import ColourTable
 from holotorch.tracking.fits import EdgeFit, fit_edges, median, rise
+from holotorch.tracking.footprint import Front
 from holotorch.tracking.lens import Lens
 from holotorch.tracking.luma import coarse_colours, fit_luma
 from holotorch.tracking.stations import Axis, variance_of
 from holotorch.tracking.status import Refusal, Status
 from holotorch.tracking.strips import Line, Sampler
 
-_EVERY = 2  # pixels along a line, whose colours say where it lies
-_WINDOW, _CLOSE = 20, 4  # samples to either side of an edge, and where light changes fast
-_OUTSIDE = 10  # samples beyond the outermost edges
+_COLUMNS = 60  # and more, along half a line: of every second to fourth pixel, whose colours say where it lies
+_WINDOW = 20  # pixels to either side of an edge, of which every second one is read,
+_CLOSE = 5  # but each as near as this, and two blurs farther
+_OUTSIDE = 10  # pixels beyond the outermost edges
+_ASIDE = 0.9  # pixels beyond the tube's sides, from which on a row tells nothing
 _HALFWAY, _SURE = 6, 3  # samples to either side of where labels change; the outermost of them that show one colour
 _AWAY = 2.0  # pixels from where it was expected at which an edge is looked at once more
 _MARGIN = 8.0  # pixels, and two blurs: what must be seen to either side of an edge
+_WHITE, _CUT = 252, 0.1  # a level that may be more light than it says, and the share of such in a row that spoils it
 _SMEARED = 4.0  # pixels of blur that no lens makes
+BLURRED = 0.6  # pixels from the blur that was expected, beyond which edges want another look
 _UNSURE = 0.1  # pixels: a clear edge is known to a few hundredths
 _ALIKE = 0.2  # of the brightest channel: colours nearer than this are one
 _PALE = 0.5  # of the purity of what lies beside it
@@ -67,7 +72,8 @@ def find_bands(
     end = math.ceil(half)
     t = np.arange(-end, end + 1.0)
     u = np.arange(-math.ceil(aside), aside + 1.0)
-    some = t[end % _EVERY :: _EVERY]
+    every = min(4, max(2, end // _COLUMNS)) if onward else 2  # a wide tube fills the narrow strip of a cold frame
+    some = t[end % every :: every]
     found = find_axis(table.labels(sampler.nearest(line.pixels(lens, some, u))), some, u, reach)
     if found is None:
         raise Refusal(Status.NO_AXIS, "nothing thin and straight with the bands' colours")
@@ -134,17 +140,18 @@ def measure_edges(
     gaps = np.abs(np.diff(near))
     window = int(min(_WINDOW + 2 * blur, max(4.0, 0.45 * float(gaps.min()) if len(gaps) else _WINDOW)))
     along = np.arange(-window, window + 1.0)
-    close = slice(max(0, window - _CLOSE), window + _CLOSE + 1)
+    along = along[(np.abs(along) <= _CLOSE + 2 * blur) | (along % 2 == window % 2)]
     widths = axis.width_at(near)
-    half = math.ceil(float(widths.max()) / 2 + 0.5)
+    half = math.ceil(float(widths.max()) / 2 + _ASIDE) - 1
     u = np.arange(-half, half + 1.0)
     bulge = curve[chosen]
+    front = Front.of(u, widths, axis.blur)
     # Rows on the tube, and three to either side of it, which tell whether something lies across.
-    sides = _sides(widths, blur)
-    rows = np.concatenate([np.broadcast_to(u, (len(near), len(u))), sides], 1)  # [E, U + 6]
-    round_ = np.sqrt(np.maximum(1 - (2 * rows / widths[:, None]) ** 2, 0))
+    rows = np.concatenate([np.broadcast_to(u, (len(near), len(u))), _sides(widths, blur)], 1)  # [E, U + 6]
+    farther = np.zeros_like(rows)
+    farther[:, : len(u)] = bulge[:, None] * front.mean
     # A row that is mostly surroundings tells little of the edge, and what it tells may be of something else.
-    row = (widths[:, None] / 2 + 1.2 - np.abs(u)).clip(0, 1)
+    row = (widths[:, None] / 2 + _ASIDE - np.abs(u)).clip(0, 1)
     # Beyond the bands a table's grain shines through the tube: light that drifts draws an edge to where it grows.
     outside = _OUTSIDE + 2 * blur
     kept = np.ones((len(near), len(along)), dtype=np.float32)
@@ -152,34 +159,37 @@ def measure_edges(
     kept[chosen == len(guess) - 1] *= along <= outside
     looks = 2
     while True:
-        place = near[:, None, None] + along[:, None] + (bulge[:, None] * round_)[:, None]
-        pixels = lens.distort(line.plane(place, rows[:, None]))
-        seen = sampler(pixels).transpose(1, 2, 3, 0)
-        light = seen[:, :, : len(u)]  # [E, T, U, C]
-        light[:, close] = sampler.sharp(pixels[:, close, : len(u)]).transpose(1, 2, 3, 0)
-        shown = kept[..., None] * row[:, None] * sampler.inside(pixels[..., : len(u)])
-        weight = shown[..., None] / variance_of(light)
-        fit = fit_edges(light, weight, blur)
+        place = near[:, None, None] + along[:, None] + farther[:, None]
+        every = lens.distort(line.plane(place, rows[:, None]))
+        pixels = every[..., : len(u)]
+        light = sampler.sharp(pixels).transpose(1, 2, 3, 0)  # [E, T, U, C]
+        shown = kept[..., None] * row[:, None] * sampler.inside(pixels)
+        # Where light is cut off on one side, halfway is no longer where the edge is.
+        whole = (light > sampler.light[_WHITE]).mean(1, keepdims=True) < _CUT
+        weight = shown[..., None] * whole / variance_of(light)
+        fit = fit_edges(light, weight, blur, t=along)
         known = np.isfinite(fit.deviation)
         if known.any() and median(fit.blur[known]) > _SMEARED > blur:
             # It moved along itself, farther than what was looked at.
             t[chosen] = near + fit.place
             return measure_edges(sampler, lens, axis, t, doubtful, median(fit.blur[known]), curve)
-        coarse = any(coarse_colours(sampler, complex(pixels[i, window, half])) for i in (0, -1))
+        coarse = bool(np.any(coarse_colours(sampler, pixels[[0, -1], len(along) // 2, half])))
         if coarse:
-            fit = fit_luma(fit, light, shown, sampler.light)
+            fit = fit_luma(fit, light, shown, sampler.light, along)
         elif bool((fit.deviation > _UNSURE).any()):
             # Surroundings that are not even leak into the outer rows; those in the middle may tell all the same.
             core = (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)
-            fit = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur))
+            fit = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur, t=along))
         near, looks = near + fit.place, looks - 1
         if not looks or float(np.abs(fit.place).max()) < _AWAY:
             break
+    if not coarse:
+        near = near - bulge * front.shift(fit.steps, fit.told, row)
     blurs = fit.blur[np.isfinite(fit.deviation)]
     soft = median(fit.blur)
-    beside = seen[:, :, len(u) :]
-    covered, beyond = _across(beside, along - fit.place[:, None], fit)
-    if beyond and len(near) > 2:
+    beside = sampler.light.take(sampler.nearest(every[..., len(u) :].reshape(-1, 6)))
+    covered, beyond = _across(beside.reshape(*every.shape[:2], 6, 3), along - fit.place[:, None], fit)
+    if beyond and len(near) > 2 and soft < blur + BLURRED:
         raise Refusal(Status.INCONSISTENT, "all bands go on beside the tube: this is thicker, seen in one part of it")
     reached = lens.distort(line.plane(near[:, None] + (_MARGIN + 2 * soft) * np.array([-1, 1])))
     within = np.all(sampler.inside(reached), -1)

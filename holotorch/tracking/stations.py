@@ -25,7 +25,7 @@ _LINEAR = 0.1  # of a width: of what it is freed by one step of a fit, not by a 
 _OTHER = 1.5  # pixels from its width at which a tube is surely wider or narrower
 _SHARP = 0.9  # pixels of blur, to begin with
 _SETTLED = 3.0  # pixels: a middle that moves farther in the last of a fit's steps is none
-_LINE_FLOOR = 0.008  # of the width: what gloss and shadow, which repeat along the tube, may move its middle
+_LINE_FLOOR = 0.002  # of the width: what gloss and shadow, which repeat along the tube, may move its middle
 
 
 @dataclass(frozen=True, eq=False)

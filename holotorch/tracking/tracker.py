@@ -20,17 +20,18 @@ from holotorch.tracking.coarse import find_segments
 from holotorch.tracking.colours import ColourTable
 from holotorch.tracking.footprint import bulge_px, on_plane, width_px
 from holotorch.tracking.lens import Lens
-from holotorch.tracking.measure import Edges, find_bands, halfway, measure_edges
+from holotorch.tracking.measure import BLURRED, Edges, find_bands, halfway, measure_edges
 from holotorch.tracking.resection import Found, pose_on_line
 from holotorch.tracking.stations import THIRD, Axis, look_across, measure_axis, measure_width, narrowed
 from holotorch.tracking.status import Pose, Refusal, Status
 from holotorch.tracking.strips import Line, Sampler
 
-_FLOOR = 0.02  # pixels: what model, pixels and a table that shines through leave in an edge, however little noise;
-_ROUND = 0.008  # of what a ring's front bulges,
+_FLOOR = 0.004  # pixels: what model and pixels leave in an edge, however little noise;
+_SHINES = 0.010  # in an outermost one, whose tube a table's grain shines through;
+_ROUND = 0.004  # of what a ring's front bulges,
 _SOFT = 0.08  # of blur to all sides, since what lies beside the tube leaks into it,
 _SMEAR = 0.03  # and of blur along it, which is that of a lens or of a movement
-_ASIDE = 0.17  # pixels: what colours between other pixels than the luma leave in a line
+_COARSE, _ASIDE = 0.07, 0.17  # pixels: what colours between other pixels than the luma leave in an edge and a line
 _UNLIKELY = {1: 10.83, 2: 13.82, 3: 16.27, 4: 18.47, 5: 20.52, 6: 22.46, 7: 24.32, 8: 26.12, 9: 27.88}  # 0.1 % of chi^2
 _SLANTED = 1.5  # times as wide as at a slight tilt, 55 degrees
 _PATH, _ALIKE = 2.5, 0.2  # longest way across, in widths, and how well the softness of the sides must agree with it,
@@ -38,8 +39,7 @@ _CLEAR = 0.04  # where their distance is as clear as this
 _NEARLY, _EXACT = 0.01, 0.002  # how well the width is known from a rough pose, and after
 _WIDEST = 120.0  # pixels
 _BLUR = 0.9  # pixels, to begin with
-_BLURRED = 0.6  # from which edges that differ by more are looked at again,
-_BENT = 0.1  # as are those whose fronts bulge by so many pixels more or less than was thought
+_BENT = 0.1  # pixels by which fronts bulge more or less than was thought, beyond which they want another look
 _FLAT = 0.05  # pixels of a bulge that change the tube's width by nothing
 _MOVED = 30.0  # pixels that a catheter may move between two frames
 
@@ -124,7 +124,7 @@ class CatheterTracker:
                     raise Refusal(Status.OUTSIDE_CAMERA, "it lies where the lens's distortion cannot be inverted")
                 length = abs(segment.end - segment.start)
                 half = 0.5 * length + max(40.0, 0.7 * length)
-                shown = self._shown(sampler, line, half, 10.0, onward=False)
+                shown = self._shown(sampler, line, half, 16.0, onward=False)
             except Refusal as refusal:
                 # What came nearest to a pose tells most; the refusal itself would keep the frame alive.
                 if refusal.status > furthest[0]:
@@ -180,12 +180,11 @@ class CatheterTracker:
             plane, wide = axis.line.plane(edges.t), self._wide(found, line)
         with self._timed("axis"):
             # With the width that the pose and the radius give; what was found without them is the check.
-            if near:
-                axis = narrowed(stations, axis, wide, _EXACT)
-            else:
-                axis = measure_axis(stations, wide, _EXACT, axis.blur, axis)
-            edges = dataclasses.replace(edges, t=axis.line.place(plane)[0])
-        if float(np.abs(curve - first).max()) > _BENT or abs(edges.blur - edges.expected) > _BLURRED:
+            if before is None or abs(wide[0] - axis.width) > _NEARLY * wide[0]:
+                rest = axis.blur, axis
+                axis = narrowed(stations, axis, wide, _EXACT) if near else measure_axis(stations, wide, _EXACT, *rest)
+                edges = dataclasses.replace(edges, t=axis.line.place(plane)[0])
+        if float(np.abs(curve - first).max()) > _BENT or abs(edges.blur - edges.expected) > BLURRED:
             with self._timed("edges"):
                 edges = measure_edges(sampler, lens, axis, edges.t, stretches.doubtful, edges.blur, curve)
         with self._timed("pose"):
@@ -231,8 +230,12 @@ class CatheterTracker:
                 raise Refusal(Status.OUT_OF_FRAME, f"{count} lie within the frame, 3 are needed")
             raise Refusal(Status.EDGES_UNCLEAR, f"{count} are clear, 3 are needed")
         soft, smeared = (max(0.0, blur - _BLUR) for blur in (axis.blur, edges.blur))
-        floor = math.hypot(_FLOOR, _ROUND * edges.bulge, _SOFT * min(soft, smeared), _SMEAR * smeared)
-        along = np.hypot(edges.deviation[known], floor)
+        floor = math.hypot(
+            _FLOOR, _COARSE * edges.coarse, _ROUND * edges.bulge, _SOFT * min(soft, smeared), _SMEAR * smeared
+        )
+        outer = np.zeros(len(known))
+        outer[[0, -1]] = _SHINES
+        along = np.sqrt(edges.deviation[known] ** 2 + floor**2 + outer[known] ** 2)
         # Shading, the same all along, moves and turns a line by more than its fit tells: over the edges both deviations
         # amount to the larger of the two.
         middle = float(t.sum()) / len(t)

@@ -33,16 +33,17 @@ def test_the_rise_and_the_median_are_what_they_are_called():
 def test_edges_without_noise_are_found(blur):
     """Sums over samples a 32nd of a pixel wide have a variance of 1 / 12 / 32^2 more: a blur 2e-4 larger at most.
 
-    Blurs are not sought on after a step below 0.03, which leaves a hundredth of it; places are.
+    Blurs are not sought on after a step below 0.16, which leaves a twentieth of it, 0.008, and of levels where the edge
+    lies, a tenth of the samples, as little of the step as the blur is off; places are.
     """
     place = np.linspace(-1.4, 1.4, 15)
     light = edges(place, blur)
     fit = fit_edges(light, np.full_like(light, 1e4))
     assert np.abs(fit.place - place).max() < 1e-4
-    assert np.abs(fit.blur - math.hypot(blur, 1 / 32 / math.sqrt(12))).max() < 3e-4
+    assert np.abs(fit.blur - math.hypot(blur, 1 / 32 / math.sqrt(12))).max() < 8e-3
     assert fit.levels.shape == fit.steps.shape == (15, 5, 3)
-    assert np.abs(fit.levels - BEFORE).max() < 1e-5
-    assert np.abs(fit.steps - (AFTER - BEFORE)).max() < 2e-5
+    assert np.abs(fit.levels - BEFORE).max() < 3e-4
+    assert np.abs(fit.steps - (AFTER - BEFORE)).max() < 6e-4
 
 
 @pytest.mark.parametrize("noise", [0.005, 0.02])

@@ -8,7 +8,7 @@ import torch
 
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import THESIS
-from holotorch.tracking.footprint import bulge_px, on_plane, width_px
+from holotorch.tracking.footprint import Front, bulge_px, on_plane, width_px
 from holotorch.tracking.lens import Lens
 from holotorch.tracking.resection import Found
 from holotorch.tracking.strips import Line
@@ -74,3 +74,57 @@ def test_a_pose_along_the_line_of_sight_has_no_width():
     line = Line.between(LENS, 0j, 0.1 + 0j)
     near, taper = width_px(found_at(tip, -tip / np.linalg.norm(tip)), THESIS.positions.numpy(), THESIS.radius, line)
     assert not (1 < near < 1000 and abs(taper) < 1)
+
+
+def rows_of(bulge: float, width: float, blur: float, change) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows [U], where each shows an edge that bulges across a tube, and its step: of a blurred picture's fine samples.
+
+    The edge lies at ``bulge`` sqrt(1 - q^2), q from -1 to 1 across; light changes by ``change`` of q there.
+    """
+    fine = 16
+    u = (np.arange(-12 * fine, 12 * fine) + 0.5) / fine
+    t = u[:, None]
+    q = 2 * u / width
+    inside = np.abs(q) < 1
+    place = bulge * np.sqrt(np.where(inside, 1 - q * q, 0))
+    picture = np.where(inside, change(np.where(inside, q, 0.0)), 0.0) * (t > place)
+    bell = np.exp(-0.5 * (np.arange(-8 * fine, 8 * fine + 1) / fine / blur) ** 2)
+    bell = bell / bell.sum()
+    for axis in (0, 1):
+        picture = np.apply_along_axis(np.convolve, axis, picture, bell, "same")
+    rows = np.arange(-3.0, 4.0)
+    seen = np.stack([0.5 * (picture[:, int((12 + r) * fine) - 1] + picture[:, int((12 + r) * fine)]) for r in rows])
+    near = np.abs(u) < 7  # beyond, the picture's own border is blurred
+    step = seen[:, u > 6].T[0]
+    return rows, 7 - seen[:, near].sum(1) / fine / step, step
+
+
+@pytest.mark.parametrize(("width", "blur"), [(5.4, 0.7), (4.0, 1.2), (9.0, 0.5)])
+def test_rows_see_a_ring_where_its_front_has_it_through_the_blur(width, blur):
+    """To half of one of the picture's samples, which is what is missed where the front is flat."""
+    rows, place, _ = rows_of(0.9, width, blur, np.ones_like)
+    front = Front.of(rows, np.array([width, width]), math.sqrt(blur**2 + 1 / 6))
+    on = np.abs(rows) < width / 2 + 0.5
+    np.testing.assert_allclose(0.9 * front.mean[0][on], place[on], rtol=0, atol=1 / 32)
+
+
+@pytest.mark.parametrize("lit", ["alike", "from one side", "round", "more at its sides"])
+def test_how_a_tube_is_lit_moves_its_rings_by_what_is_said(lit):
+    """As above; without it an edge would be off by several hundredths of the bulge."""
+    change = {
+        "alike": np.ones_like,
+        "from one side": lambda q: 1 + 0.8 * q,
+        "round": lambda q: np.sqrt(1 - q * q),
+        "more at its sides": lambda q: 1.2 - np.sqrt(1 - q * q),
+    }[lit]
+    rows, place, step = rows_of(-1.0, 5.4, 0.7, change)
+    front = Front.of(rows, np.array([5.4]), math.sqrt(0.7**2 + 1 / 6))
+    row = (5.4 / 2 + 0.9 - np.abs(rows)).clip(0, 1)
+    told = np.ones((1, len(rows), 3))
+    told[..., 1] = 0.0  # a channel that tells nothing
+    steps = step[:, None] * np.array([1.0, 0.3, -0.5])
+    # What rows of the tube say on average, above what they would if all of it were as bright as its middle.
+    wanted = float((step**2 * (-place - front.mean[0])).sum() / (step**2).sum())
+    found = float(front.shift(steps[None], told, row[None])[0])
+    assert found == pytest.approx(wanted, abs=0.015)
+    assert lit in ("alike", "from one side") or abs(wanted) > 0.02

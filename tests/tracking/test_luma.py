@@ -35,7 +35,7 @@ def coded(frame: Tensor, name: str) -> Tensor:
 
 def asked(frame: Tensor, pixels: list[complex]) -> list[bool]:
     sampler = Sampler(frame, CURVE)
-    return [coarse_colours(sampler, pixel) for pixel in pixels]
+    return coarse_colours(sampler, np.array(pixels)).tolist()
 
 
 def everywhere(frame: Tensor, step: int = 97) -> list[complex]:

@@ -159,7 +159,8 @@ def fit_of(steps: float, edges: int = 3) -> EdgeFit:
     """Edges in the middle, of a step in all channels."""
     flat = np.zeros(edges)
     shape = (edges, 5, 3)
-    return EdgeFit(flat, flat + 0.9, flat + 0.05, flat + 1, np.full(shape, steps), np.zeros(shape), flat + 1)
+    light = np.full(shape, steps), np.zeros(shape), np.ones(shape)
+    return EdgeFit(flat, flat + 0.9, flat + 0.05, flat + 1, *light, flat + 1)
 
 
 def beside(steps: list[list[float]], noise: float = 0.01) -> np.ndarray:
