@@ -29,7 +29,7 @@ def coarse_colours(sampler: Sampler, pixels: Points) -> np.ndarray:
     for pixel in pixels.tolist():
         room = (pixel.real, sampler.width - _PATCH), (pixel.imag, sampler.height - _PATCH)
         x, y = (int(min(max(v - _PATCH // 2, 0), most)) for v, most in room)
-        patches.append(sampler.frame[:, y : y + _PATCH, x : x + _PATCH].cpu().numpy())
+        patches.append(sampler.patch(x, y, _PATCH))
     patch = np.stack(patches, 1).astype(np.float32)  # [3, n, 24, 24]
     both = np.empty((2, *patch.shape[1:]), dtype=np.float32)
     both[0] = _LUMA[0] * patch[0] + _LUMA[1] * patch[1] + _LUMA[2] * patch[2]

@@ -2,6 +2,7 @@
 
 import cmath
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -59,6 +60,9 @@ class Line:
         return Line((complex(start) + complex(end)) / 2, gap / abs(gap) if gap else complex(cmath.nan), lens.scale)
 
 
+_LONGEST = 32767  # pixels in a row, of which OpenCV wants fewer
+
+
 class Sampler:
     """Reads one frame at pixels between pixels: levels, or light.
 
@@ -75,10 +79,7 @@ class Sampler:
         reach = sum((n - 1) * step for n, step in zip(frame.shape, frame.stride(), strict=True))
         self._memory = frame.as_strided((reach + 1,), (1,))
         self._host = self._memory.numpy() if frame.device.type == "cpu" else None
-        self._colours = colour * np.arange(3)
-        self._taps = np.add.outer(self._colours, [0, self._right, self._down, self._down + self._right])
-        lines = np.arange(-1, 3)
-        self._around = np.add.outer(self._colours, np.add.outer(lines * self._down, lines * self._right))
+        self._colours, self._taps, self._around = _neighbours(colour, self._down, self._right)
         # OpenCV reads ten times as fast what lies as cameras deliver it.
         like = self._host is not None and frame.stride()[::2] == (1, 3) and max(self.height, self.width) < 32767
         self._image = frame.movedim(0, -1).numpy() if like else None
@@ -89,6 +90,12 @@ class Sampler:
         """Whether pixels x + i y lie on the frame; NaN does not."""
         x, y = pixels.real, pixels.imag
         return (x >= 0) & (y >= 0) & (x <= self.width - 1) & (y <= self.height - 1)
+
+    def patch(self, x: int, y: int, side: int) -> np.ndarray:
+        """Levels uint8 [3, side, side] of the pixels from (x, y) on, which lie on the frame."""
+        if self._image is not None:
+            return self._image[y : y + side, x : x + side].transpose(2, 0, 1)
+        return self.frame[:, y : y + side, x : x + side].cpu().numpy()
 
     def _clipped(self, pixels: Points) -> np.ndarray:
         """Real and imaginary parts [..., 2], moved onto the frame."""
@@ -104,8 +111,11 @@ class Sampler:
     def nearest(self, pixels: Points) -> np.ndarray:
         """Levels uint8 [T, U, 3] of those nearest to pixels x + i y [T, U]; black where these leave the frame."""
         if self._image is not None:
-            places = pixels.astype(np.complex64).view(np.float32).reshape(*pixels.shape, 2)
-            return cv2.remap(self._image, places, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
+            # As one row: rows are shared out among threads, and to wake them takes longer than to do the work.
+            wide = pixels.size if pixels.size < _LONGEST else pixels.shape[-1]
+            places = pixels.astype(np.complex64).view(np.float32).reshape(-1, wide, 2)
+            found = cv2.remap(self._image, places, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
+            return found.reshape(*pixels.shape, 3)
         x, y = np.rint(pixels.real), np.rint(pixels.imag)
         inside = (x >= 0) & (y >= 0) & (x < self.width) & (y < self.height)
         index = np.where(inside, y * self._down + x * self._right, 0).astype(np.intp)
@@ -133,6 +143,14 @@ class Sampler:
         index = np.add.outer(self._around, whole[..., 1] * self._down + whole[..., 0] * self._right)  # [3, 4, 4, ...]
         light = cv2.LUT(self._levels(index).reshape(48, -1), self.light).reshape(index.shape)
         return ((light * x).sum(2) * y).sum(1)
+
+
+@lru_cache(maxsize=16)
+def _neighbours(colour: int, down: int, right: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Steps in memory from a pixel's first colour to all [3], of four pixels [3, 4], and of sixteen [3, 4, 4]."""
+    colours, lines = colour * np.arange(3), np.arange(-1, 3)
+    four = np.add.outer(colours, [0, right, down, down + right])
+    return colours, four, np.add.outer(colours, np.add.outer(lines * down, lines * right))
 
 
 def _keys(share: np.ndarray) -> np.ndarray:
