@@ -33,6 +33,12 @@ _CODECS: dict[str, dict[str, Any]] = {
     "JPEG 95, 4:2:0": {"jpeg_quality": 95},
     "JPEG 75, 4:2:0": {"jpeg_quality": 75},
 }
+_LIGHTS: dict[str, dict[str, Any]] = {
+    "as everywhere here": {},
+    "even, without gloss": {"ambient": 1.0, "highlight": 0.0},
+    "half of it": {"gain": 0.5},
+    "a quarter of it": {"gain": 0.25},
+}
 _PLACES = 5  # less than a pixel apart
 # What a refusal may say of scenes that cannot be answered, by what their names begin with.
 _UNSEEN = frozenset({Status.NO_CATHETER, Status.BANDS_MISSING, Status.NO_AXIS})
@@ -115,6 +121,23 @@ def codecs(world: World, trackers: dict[str, Method], share: float = 1.0) -> tup
             rows.append({"codec": codec} | {key: row[key] for key in kept})
         said += found
     return rows, said
+
+
+def lights(world: World, tracker: Method, count: int, share: float = 1.0) -> list[Row]:
+    """What light is worth: S_RMS of a catheter at rest, ``count`` frames a pose, and every second tip of the sheet."""
+    rows = []
+    for light, changes in _LIGHTS.items():
+        lit, row = replace(world, look=replace(world.look, **changes)), {"light": light}
+        for (depth, tilt), goal in STILL.items():
+            if goal is not None:
+                cases = lit.still(1e-3 * depth, math.radians(tilt), max(2, count))
+                own = list(answers(cases, {light: tracker}, f"light, {light}"))
+                told = any(a.pose.answered and b.pose.answered for a, b in pairwise(own))
+                row[f"s_rms_mm_{depth}_{tilt}"] = _mm(protocols.s_rms(tips_of(own)).s_rms) if told else ""
+        found = answers(lit.grid_2d()[:: max(1, round(2 / share))], {light: tracker}, f"light, {light}")
+        grid = _grid_row("2D", light, list(found))
+        rows.append(row | {key: grid[key] for key in ("points", "refused", "median_mm", "p95_mm", "coverage")})
+    return rows
 
 
 def scenes(

@@ -41,6 +41,7 @@ def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
         "codecs",
         "conditions",
         "grids",
+        "lights",
         "negatives",
         "occlusions",
         "reliability",
@@ -66,6 +67,8 @@ def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
     assert sum(int(row["frames"]) for row in tables["negatives"]) == 20
     for row in tables["reliability"]:
         assert int(row["right"]) + int(row["wrong"]) + int(row["refused"]) == int(row["frames"])
+    darker = [row for row in tables["lights"] if row["light"].endswith("of it")]
+    assert len(tables["lights"]) == 4 and len(darker) == 2 and all(int(row["points"]) > 1 for row in darker)
     said = capsys.readouterr().out
     assert "mm (goal <= 0.2: " in said and "(dissertation, real camera: Acc 0.85)" in said
     text = (tmp_path / "verdict.txt").read_text().splitlines()
