@@ -20,9 +20,9 @@ def tip_bound(world: World, pose: tuple[Tensor, Tensor], frames: int = 2) -> Ten
     """Least covariance [3, 3] in m^2 that an unbiased estimate of the tip from one synthetic frame can have.
 
     Known are camera, colours, light and background; unknown the pose's five numbers, the radius and the blur. Who knows
-    the light can tell a slant from how bright the tube is, and no tracker does: of edges alone the bound is
-    higher. What counts are the pixels within 10 px of the bands: an end of the tube that happens to be in view does not. Noise is
-    that of the world's look, and rounding.
+    the light can tell a slant from how bright the tube is, and no tracker does: of edges alone the bound is higher.
+    What counts are the pixels within 10 px of the bands: an end of the tube that happens to be in view does not. Noise
+    is that of the world's look, and rounding.
 
     Args:
         world: Camera, catheter and look; on its desk.
