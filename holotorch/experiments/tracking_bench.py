@@ -127,7 +127,8 @@ def lights(world: World, tracker: Method, count: int, share: float = 1.0) -> lis
     """What light is worth: S_RMS of a catheter at rest, ``count`` frames a pose, and every second tip of the sheet."""
     rows = []
     for light, changes in _LIGHTS.items():
-        lit, row = replace(world, look=replace(world.look, **changes)), {"light": light}
+        lit = replace(world, look=replace(world.look, **changes))
+        row: Row = {"light": light}
         for (depth, tilt), goal in STILL.items():
             if goal is not None:
                 cases = lit.still(1e-3 * depth, math.radians(tilt), max(2, count))
