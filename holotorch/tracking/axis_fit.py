@@ -13,8 +13,8 @@ import numpy as np
 from holotorch.tracking.fits import BLUNTEST, SHARPEST, erf, median
 
 _STEPS = 8
-_SETTLED, _WIDENED = 0.03, 0.15  # pixels: the middle's and the width's steps after are a third of it or less, which
-# gloss and shadow move a middle by, and pixels leave in a width
+_SETTLED = 0.03  # pixels, of middle and blur: the step after is a third of it; gloss and shadow move a middle by more
+_WIDENED = 0.15  # pixels, of width and taper: the step after is a fifth of it, and moves the middle by next to nothing
 _SLICES = 8
 _SHADINGS = (np.ones_like, lambda q: q, lambda q: np.sqrt(1 - q * q), lambda q: q**3)
 _MEANS = (1.0, 0.0, math.pi / 4, 0.0)  # of the shadings over the tube

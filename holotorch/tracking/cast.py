@@ -14,8 +14,8 @@ from holotorch.tracking.catheter import Catheter
 
 # A lattice of 8 points in the unit square: each axis meets 8 different values, where a 3 x 3 grid would offer 3.
 _LATTICE = (np.stack([np.arange(8), 3 * np.arange(8) % 8], -1) + 0.5) / 8
-_DARKEST = 0.25  # light on a surface that faces the camera, below which no camera makes up for it
 _TURN = np.array([0.7548776662466927, 0.5698402909980532])  # shifts it from one place to the next, evenly (R2 sequence)
+_DARKEST = 0.25  # light on a surface that faces the camera, below which no camera makes up for it
 
 
 def light_of(colour: tuple[int, int, int]) -> np.ndarray:

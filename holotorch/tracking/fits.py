@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 _STEPS = 8
-_NEAR = 0.03  # of a blur, or samples: the step after is lost in noise
-_ENDS = np.array([[0.06], [0.16]])  # the same of place and blur: steps after are a twentieth; of places two more follow
+_ENDS = np.array([[0.06], [0.16]])  # of a blur, or samples, of place and blur: the steps after are a twentieth,
+_NEAR = 0.03  # and of places two more follow, the last of them so small
 _SHARED = 1.2  # neighbours share pixels: how much larger deviations are than of samples that do not, measured
 _STRANGE = 1.5  # what is left, over its white part: above it the model misses something, and averaging does not help
 _OWN = 1.4  # of the same: how far apart shading and gloss put the places of channels, in what noise does, measured

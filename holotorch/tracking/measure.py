@@ -183,7 +183,7 @@ def measure_edges(
         near, looks = near + fit.place, looks - 1
         if not looks or float(np.abs(fit.place).max()) < _AWAY:
             break
-    if not coarse:
+    if not coarse:  # across a tube coarse colours are smeared: what they say of its light would not be true
         near = near - bulge * front.shift(fit.steps, fit.told, row)
     blurs = fit.blur[np.isfinite(fit.deviation)]
     soft = median(fit.blur)

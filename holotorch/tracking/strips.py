@@ -60,7 +60,7 @@ class Line:
         return Line((complex(start) + complex(end)) / 2, gap / abs(gap) if gap else complex(cmath.nan), lens.scale)
 
 
-_LONGEST = 32767  # pixels in a row, of which OpenCV wants fewer
+_LONGEST = 32767  # OpenCV's remap takes pictures and places in rows of fewer than these
 
 
 class Sampler:
@@ -81,7 +81,7 @@ class Sampler:
         self._host = self._memory.numpy() if frame.device.type == "cpu" else None
         self._colours, self._taps, self._around = _neighbours(colour, self._down, self._right)
         # OpenCV reads ten times as fast what lies as cameras deliver it.
-        like = self._host is not None and frame.stride()[::2] == (1, 3) and max(self.height, self.width) < 32767
+        like = self._host is not None and frame.stride()[::2] == (1, 3) and max(self.height, self.width) < _LONGEST
         self._image = frame.movedim(0, -1).numpy() if like else None
         self._last = np.array([self.width - 1.0, self.height - 1.0])
         self._before = np.array([self.width - 2, self.height - 2])

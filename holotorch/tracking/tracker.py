@@ -41,6 +41,7 @@ _WIDEST = 120.0  # pixels
 _BLUR = 0.9  # pixels, to begin with
 _BENT = 0.1  # pixels by which fronts bulge more or less than was thought, beyond which they want another look
 _FLAT = 0.05  # pixels of a bulge that change the tube's width by nothing
+_ASTRAY = 16.0  # pixels aside of a segment that its tube may show, the glow of one out of focus included
 _MOVED = 30.0  # pixels that a catheter may move between two frames
 
 
@@ -124,7 +125,7 @@ class CatheterTracker:
                     raise Refusal(Status.OUTSIDE_CAMERA, "it lies where the lens's distortion cannot be inverted")
                 length = abs(segment.end - segment.start)
                 half = 0.5 * length + max(40.0, 0.7 * length)
-                shown = self._shown(sampler, line, half, 16.0, onward=False)
+                shown = self._shown(sampler, line, half, _ASTRAY, onward=False)
             except Refusal as refusal:
                 # What came nearest to a pose tells most; the refusal itself would keep the frame alive.
                 if refusal.status > furthest[0]:
