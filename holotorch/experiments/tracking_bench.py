@@ -1,6 +1,7 @@
 """What catheter trackers are held to, on synthetic frames: each part streams over its frames and returns rows."""
 
 import math
+import statistics
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -9,7 +10,7 @@ from typing import Any
 
 import torch
 
-from holotorch.experiments.tracking_bound import tip_bound
+from holotorch.experiments.tracking_bound import tip_bounds
 from holotorch.experiments.tracking_methods import Answer, Method, answers, tips_of, truth_of
 from holotorch.tracking import protocols
 from holotorch.tracking.status import Status
@@ -36,6 +37,7 @@ _CODECS: dict[str, dict[str, Any]] = {
 _LIGHTS: dict[str, dict[str, Any]] = {
     "as everywhere here": {},
     "even, without gloss": {"ambient": 1.0, "highlight": 0.0},
+    "a quarter more": {"gain": 1.25},
     "half of it": {"gain": 0.5},
     "a quarter of it": {"gain": 0.25},
 }
@@ -64,7 +66,7 @@ def still(world: World, trackers: dict[str, Method], count: int) -> tuple[list[R
     offsets = (pixel * (torch.rand(_PLACES, 2, generator=torch.Generator().manual_seed(world.seed)) - 0.5)).tolist()
     for (depth, tilt), goal in STILL.items():
         place = (1e-3 * depth, math.radians(tilt))
-        bound = 1e3 * math.sqrt(tip_bound(world, world.pose(*place)).trace())
+        bound, of_edges = (1e3 * math.sqrt(own.trace()) for own in tip_bounds(world, world.pose(*place)))
         parts = [world.still(*place, max(2, count // _PLACES), at) for at in offsets]
         found = [list(answers(part, trackers, f"still, {depth} mm, {tilt} deg")) for part in parts]
         said += [answer for part in found for answer in part]
@@ -75,9 +77,11 @@ def still(world: World, trackers: dict[str, Method], count: int) -> tuple[list[R
             row |= {
                 "answered": sum(answer.pose.answered for answer in own),
                 "s_rms_mm": "",
+                "s_rms_error_mm": "",
                 "s_rms_goal_mm": goal or "",
             }
-            row |= {"sd_mm": "", "bias_mm": "", "bound_mm": round(bound, 4), "efficiency": "", "coverage": ""}
+            row |= {"sd_mm": "", "bias_mm": "", "bound_mm": round(bound, 4), "edges_bound_mm": round(of_edges, 4)}
+            row |= {"efficiency": "", "coverage": ""}
             known = [tips_of(g) for g in groups if any(a.pose.answered and b.pose.answered for a, b in pairwise(g))]
             if known:
                 seen = [protocols.s_rms(tips) for tips in known]
@@ -86,7 +90,8 @@ def still(world: World, trackers: dict[str, Method], count: int) -> tuple[list[R
                     for values in ([each.sd for each in seen], [each.s_rms for each in seen])
                 )
                 bias = float((tips_of(own) - truth_of(own)).nanmean(0).norm())
-                row |= {"s_rms_mm": _mm(s_rms), "sd_mm": _mm(sd), "bias_mm": _mm(bias)}
+                row |= {"s_rms_mm": _mm(s_rms), "s_rms_error_mm": _mm(_error([each.s_rms for each in seen]))}
+                row |= {"sd_mm": _mm(sd), "bias_mm": _mm(bias)}
                 row |= {"efficiency": round((bound / (1e3 * sd)) ** 2, 3), "coverage": covered(own)}
             rows.append(row)
     return rows, said
@@ -247,6 +252,14 @@ def _plain(name: str) -> str:
 
 def _kind(name: str) -> str:
     return name.split(", ")[1]
+
+
+def _error(values: list[float]) -> float:
+    """Standard error of the root mean square of a few values; NaN of one."""
+    squares = [value * value for value in values]
+    if len(values) < 2:
+        return math.nan
+    return statistics.stdev(squares) / math.sqrt(len(values)) / (2 * math.sqrt(statistics.fmean(squares)))
 
 
 def _mm(metres: float) -> float:

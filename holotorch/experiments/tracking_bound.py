@@ -1,7 +1,8 @@
-"""How well a tip can be told from a frame at all: the Cramér-Rao bound of the bands' pixels."""
+"""How well a tip can be told from a frame at all: Cramér-Rao bounds of the bands' pixels, and of their edges alone."""
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,13 +17,25 @@ _MARGIN = 10.0  # pixels around the bands; the rest of the tube is not asked
 _DITHER = 0.6  # levels of noise, so that rounded frames have the mean of frames that are not
 
 
-def tip_bound(world: World, pose: tuple[Tensor, Tensor], frames: int = 2) -> Tensor:
-    """Least covariance [3, 3] in m^2 that an unbiased estimate of the tip from one synthetic frame can have.
+class Bounds(NamedTuple):
+    """Least covariances [3, 3] in m^2 that an unbiased estimate of the tip from one synthetic frame can have.
 
-    Known are camera, colours, light and background; unknown the pose's five numbers, the radius and the blur. Who knows
-    the light can tell a slant from how bright the tube is, and no tracker does: of edges alone the bound is higher.
-    What counts are the pixels within 10 px of the bands: an end of the tube that happens to be in view does not. Noise
-    is that of the world's look, and rounding.
+    Attributes:
+        pixels: Of all that the pixels tell; who knows the light can tell a slant from how the tube shines.
+        edges: Of where the bands' edges lie along the tube, and the tube across it: what trackers look at. The light
+            to both sides is known; who must find it, too, stays some per cent above.
+    """
+
+    pixels: Tensor
+    edges: Tensor
+
+
+def tip_bounds(world: World, pose: tuple[Tensor, Tensor], frames: int = 2) -> Bounds:
+    """How well one frame can tell a tip: by all its pixels, and by the edges of the bands alone.
+
+    Known are camera, colours, light and background; unknown the pose's five numbers, the radius and the blur. What
+    counts are the pixels within 10 px of the bands: an end of the tube that happens to be in view does not. Noise is
+    that of the world's look, and rounding.
 
     Args:
         world: Camera, catheter and look; on its desk.
@@ -43,12 +56,15 @@ def tip_bound(world: World, pose: tuple[Tensor, Tensor], frames: int = 2) -> Ten
     # Steps that move the bands' ends and middle by a pixel each: in them the information is far from singular.
     slopes = torch.linalg.inv(_image_slopes(camera, catheter, pose, axes))
     generator = torch.Generator().manual_seed(world.seed)
+    zero, count = torch.zeros(5, dtype=torch.float64), len(catheter.edges)
+    still = torch.zeros(count, dtype=torch.float64)
 
-    def mean(moved: Tensor, radius: float, blur: float) -> Tensor:
-        """Levels of the bands' pixels, averaged over noise."""
-        tip, direction = pose[0] + moved[:3], pose[1] + axes @ moved[3:]
-        tool = replace(catheter, radius=catheter.radius * (1 + radius))
-        seen = replace(look, blur_px=look.blur_px + blur)
+    def mean(way: int, moved: Tensor, painted: Tensor, radius: float, blur: float) -> Tensor:
+        """Levels of the bands' pixels, averaged over noise; ``way`` is 1 or -1, edges are ``painted`` metres aside."""
+        tip, direction = pose[0] + way * moved[:3], pose[1] + way * axes @ moved[3:]
+        edges = tuple((catheter.positions + way * painted).tolist())
+        tool = replace(catheter, edges=edges, radius=catheter.radius * (1 + way * radius))
+        seen = replace(look, blur_px=look.blur_px + way * blur)
         total = torch.zeros(int(near.sum()) * 3, dtype=torch.float64)
         for _ in range(frames):
             frame = render(tool, camera, tip, direction / direction.norm(), size, seen, generator=generator)
@@ -56,16 +72,26 @@ def tip_bound(world: World, pose: tuple[Tensor, Tensor], frames: int = 2) -> Ten
         return total / frames
 
     wide = catheter.radius * float(camera.matrix[0, 0]) / float(_middle(catheter, pose)[2])
-    still = torch.zeros(5, dtype=torch.float64)
-    steps = [(_STEP * slopes[:, i], 0.0, 0.0) for i in range(5)] + [(still, _STEP / wide, 0.0), (still, 0.0, 0.1)]
+    to_edges, per_metre = _edge_slopes(camera, catheter, pose, axes)
+    steps = [(_STEP * slopes[:, i], still, 0.0, 0.0) for i in range(5)]
+    steps += [(zero, still, _STEP / wide, 0.0), (zero, still, 0.0, 0.1)]
+    steps += [(zero, _STEP * shifted, 0.0, 0.0) for shifted in torch.diag(1 / per_metre)]
     halves = []
     for _ in range(2):
-        columns = [mean(move, r, b) - mean(-move, -r, -b) for move, r, b in steps]
+        columns = [mean(1, *step) - mean(-1, *step) for step in steps]
         halves.append(torch.stack(columns, -1) / 2)
     product = halves[0].T @ halves[1] / (world.look.noise_dn**2 + 1 / 12)
-    covariance = torch.linalg.inv((product + product.T) / 2)[:5, :5]  # of the steps
+    information = (product + product.T) / 2
     moves = _STEP * slopes[:3]
-    return moves @ covariance @ moves.T
+    whole = torch.linalg.inv(information[:7, :7])[:5, :5]
+    # Of edges along and ends across, in steps; then of the pose that moves them so.
+    some = torch.linalg.inv(information[3:, 3:])
+    seen = torch.cat([torch.arange(4, 4 + count), torch.arange(2)])
+    lever = torch.zeros(count + 2, 5, dtype=torch.float64)
+    lever[:count] = to_edges @ slopes
+    lever[count:, 3:] = torch.eye(2)
+    edges = torch.linalg.inv(lever.T @ torch.linalg.solve(some[seen][:, seen], lever))
+    return Bounds(moves @ whole @ moves.T, moves @ edges @ moves.T)
 
 
 def _middle(catheter: Catheter, pose: tuple[Tensor, Tensor]) -> Tensor:
@@ -100,6 +126,23 @@ def _image_slopes(camera: Camera, catheter: Catheter, pose: tuple[Tensor, Tensor
     slopes = torch.autograd.functional.jacobian(places, torch.zeros(5, dtype=torch.float64))
     assert isinstance(slopes, Tensor)
     return slopes
+
+
+def _edge_slopes(
+    camera: Camera, catheter: Catheter, pose: tuple[Tensor, Tensor], axes: Tensor
+) -> tuple[Tensor, Tensor]:
+    """[N, 5] how the edges move along the image in pixels, as :func:`_image_slopes`, and [N] per metre on the tube."""
+    first, _, last = _marks(camera, catheter, *pose)
+    along = (last - first) / (last - first).norm()
+
+    def places(moved: Tensor, painted: Tensor) -> Tensor:
+        direction = pose[1] + axes @ moved[3:]
+        at = (catheter.positions + painted)[:, None] * (direction / direction.norm())
+        return camera.project(pose[0] + moved[:3] + at) @ along
+
+    start = torch.zeros(5, dtype=torch.float64), torch.zeros(len(catheter.edges), dtype=torch.float64)
+    moved, painted = torch.autograd.functional.jacobian(places, start)
+    return moved, painted.diagonal()
 
 
 def _window(world: World, pose: tuple[Tensor, Tensor]) -> tuple[tuple[int, int], tuple[int, int]]:

@@ -50,7 +50,8 @@ def find_axis(labels: np.ndarray, t: np.ndarray, u: np.ndarray, reach: float) ->
     if len(along) < least:
         return None
     place, offset, end = t[along], u[across], float(t[-1])
-    slopes = np.linspace(-reach, reach, min(81, max(3, 2 * int(reach * 2 * end / 3) + 1)))
+    most = min(40, max(1, int(reach * 2 * end / 3)))
+    slopes = np.arange(-most, most + 1) * (reach / most)
     low = float(u[0]) - reach * end - 4
     bins = int(2 * (float(u[-1]) - low)) + 8
     some = slice(None, None, -(-len(along) // _VOTERS))
@@ -60,7 +61,9 @@ def find_axis(labels: np.ndarray, t: np.ndarray, u: np.ndarray, reach: float) ->
     sums = counts.cumsum(-1)  # of five neighbours is the difference of two
     best = int((sums[:, 5:] - sums[:, :-5]).argmax())
     slope, value = float(slopes[best // (bins - 5)]), best % (bins - 5) + 3 + low
-    moments = np.stack([np.ones_like(place), place, offset, place * place, place * offset])
+    moments = np.empty((5, len(place)))
+    moments[0], moments[1], moments[2] = 1.0, place, offset
+    np.multiply(moments[1:3], place, out=moments[3:])
     for width in (6.0, 4.0, 3.0, 3.0):
         away = (offset - value - slope * place) / width
         weight = np.maximum(1 - away * away, 0)
@@ -157,11 +160,11 @@ def _judged(
     count, last = share.shape[1], len(bands)
     sums = _sums(share)
     own = _sums(share * ~through) if through.any() else sums
-    drowned = _sums(drape[None])[0] if drape.any() else [0.0] * (count + 1)
+    drowned = _sums(drape[None])[0]
 
-    def mean(row: list[float], low: int, high: int) -> float:
+    def mean(row: np.ndarray, low: int, high: int) -> float:
         low, high = max(0, low), min(count, high)
-        return (row[high] - row[low]) / (high - low) if high > low else 0.0
+        return (row.item(high) - row.item(low)) / (high - low) if high > low else 0.0
 
     def clear(i: int, cut: int, mixed: int, side: int, longest: int) -> bool:
         """Whether the right colours lie to both sides of an edge, beyond what is mixed there."""
@@ -196,13 +199,15 @@ def _judged(
     spans = list(zip(bands, cuts, cuts[1:], strict=False))
     return Stretches(
         np.array(edges),
-        tuple(sums[band][high] - sums[band][low] for band, low, high in spans),
+        tuple(sums[band].item(high) - sums[band].item(low) for band, low, high in spans),
         tuple(float(high - low) for _, low, high in spans),
         tuple(doubtful),
         flipped,
     )
 
 
-def _sums(values: np.ndarray) -> list[list[float]]:
-    """Of values [C, T], those before each place: [C][T + 1]."""
-    return [[0.0, *row] for row in values.cumsum(1).tolist()]
+def _sums(values: np.ndarray) -> np.ndarray:
+    """Of values [C, T], those before each place: [C, T + 1]."""
+    sums = np.zeros((len(values), values.shape[1] + 1), dtype=np.float32)
+    np.cumsum(values, 1, out=sums[:, 1:])
+    return sums

@@ -16,7 +16,7 @@ from holotorch.tracking.stations import Axis, variance_of
 from holotorch.tracking.status import Refusal, Status
 from holotorch.tracking.strips import Line, Sampler
 
-_COLUMNS = 60  # and more, along half a line: of every second to fourth pixel, whose colours say where it lies
+_COLUMNS = 40  # and more, along half a line: of every second to sixth pixel, whose colours say where it lies
 _WINDOW = 20  # pixels to either side of an edge, of which every second one is read,
 _CLOSE = 5  # but each as near as this, and two blurs farther
 _OUTSIDE = 10  # pixels beyond the outermost edges
@@ -72,7 +72,7 @@ def find_bands(
     end = math.ceil(half)
     t = np.arange(-end, end + 1.0)
     u = np.arange(-math.ceil(aside), aside + 1.0)
-    every = min(4, max(2, end // _COLUMNS)) if onward else 2  # a wide tube fills the narrow strip of a cold frame
+    every = min(6, max(2, end // _COLUMNS)) if onward else 2  # a wide tube fills the narrow strip of a cold frame
     some = t[end % every :: every]
     found = find_axis(table.labels(sampler.nearest(line.pixels(lens, some, u))), some, u, reach)
     if found is None:
