@@ -50,7 +50,7 @@ def _median(values: np.ndarray) -> np.ndarray:
 
 def fit_luma(
     fit: EdgeFit, light: np.ndarray, shown: np.ndarray, curve: np.ndarray, t: np.ndarray | None = None
-) -> EdgeFit:
+) -> tuple[EdgeFit, EdgeFit]:
     """Places of edges by luma, where it tells them better than all channels did.
 
     Blur acts on light and luma is a sum of levels: an edge's luma is no error function, but follows from the light on
@@ -65,7 +65,8 @@ def fit_luma(
 
     Returns:
         ``fit`` with place, blur and deviation, in samples, of luma or, where they are surer, of all channels; the
-        deviation of these widened.
+        deviation of these widened. And the fit of luma alone, whose steps say how light changes across a tube, where
+        coarse colours are smeared; it tells nothing of edges that are by all channels.
     """
     rows = shown.sum(1)[..., None]
     low, step = ((value * rows).sum(1) / np.maximum(rows.sum(1), 1e-9) for value in (fit.levels, fit.steps))  # [E, 3]
@@ -86,7 +87,7 @@ def fit_luma(
     worse = np.hypot(fit.apart * fit.deviation, _ASIDE)
     better = found.deviation < worse
     fit = dataclasses.replace(fit, deviation=worse)
-    return dataclasses.replace(
-        fit,
-        **{name: np.where(better, getattr(found, name), getattr(fit, name)) for name in ("place", "deviation", "blur")},
-    )
+    surer = {
+        name: np.where(better, getattr(found, name), getattr(fit, name)) for name in ("place", "deviation", "blur")
+    }
+    return dataclasses.replace(fit, **surer), dataclasses.replace(found, told=found.told * better[:, None, None])

@@ -174,17 +174,17 @@ def measure_edges(
             t[chosen] = near + fit.place
             return measure_edges(sampler, lens, axis, t, doubtful, median(fit.blur[known]), curve)
         coarse = bool(np.any(coarse_colours(sampler, pixels[[0, -1], len(along) // 2, half])))
+        told = fit
         if coarse:
-            fit = fit_luma(fit, light, shown, sampler.light, along)
+            fit, told = fit_luma(fit, light, shown, sampler.light, along)
         elif bool((fit.deviation > _UNSURE).any()):
             # Surroundings that are not even leak into the outer rows; those in the middle may tell all the same.
             core = (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)
-            fit = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur, t=along))
+            fit = told = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur, t=along))
         near, looks = near + fit.place, looks - 1
         if not looks or float(np.abs(fit.place).max()) < _AWAY:
             break
-    if not coarse:  # across a tube coarse colours are smeared: what they say of its light would not be true
-        near = near - bulge * front.shift(fit.steps, fit.told, row)
+    near = near - bulge * front.shift(told.steps, told.told, row)
     blurs = fit.blur[np.isfinite(fit.deviation)]
     soft = median(fit.blur)
     beside = sampler.light.take(sampler.nearest(every[..., len(u) :].reshape(-1, 6)))
