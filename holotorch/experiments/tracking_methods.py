@@ -72,7 +72,7 @@ def methods(world: World, names: Sequence[str] = (BASE, LITERAL, COLD, PRIOR, FE
     camera, catheter = world.camera, world.catheter
     thesis, ours = ThesisOpenCV(camera, catheter), CatheterTracker(camera, catheter)
     literal = ThesisOpenCV(camera, catheter, literal=True)
-    expected = lru_cache(maxsize=1)(before)  # made once for a frame, so that its making is not the tracker's time
+    expected = lru_cache(maxsize=16)(before)  # made once for a frame, so that its making is not the tracker's time
 
     def fewer(frame: Tensor, _: Case) -> Pose:
         # The tracker has no option for this: nothing but this comparison wants it.

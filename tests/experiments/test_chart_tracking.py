@@ -36,6 +36,7 @@ def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(module, "STILL", {(520, 20): 0.2, (520, 5): None})
     monkeypatch.setattr(tracking_bench, "tip_bounds", lambda *_: Bounds(1e-9 * torch.eye(3), 2e-9 * torch.eye(3)))
     monkeypatch.setattr(tracking_timing, "_REPEATS", 1)
+    monkeypatch.setattr(tracking_timing, "_STREAM", 2)
     assert main(["chart", "tracking", "--out", str(tmp_path)]) == 0
     names = [
         "codecs",
@@ -60,6 +61,8 @@ def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
     assert tables["chart"][-1]["3D_acc_mm"] == "0.85" and tables["chart"][-1]["data"].startswith("real camera")
     assert {row["method"] for row in tables["times"]} == {BASE, LITERAL, COLD, PRIOR, FEWER, KORNIA}
     assert all(row["ratio"] == "1.0" for row in tables["times"] if row["method"] == BASE)
+    # Of each kind a few frames, each with a status.
+    assert all(sum(int(part.split()[1]) for part in row["status"].split(", ")) == 2 for row in tables["times"])
     for method in (BASE, KORNIA, COLD, PRIOR):
         shares = {row["stage"]: float(row["percent"]) for row in tables["stages"] if row["method"] == method}
         # Up to ten stages, each rounded to 0.01.
