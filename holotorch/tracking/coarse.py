@@ -2,7 +2,6 @@
 
 import itertools
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -14,12 +13,16 @@ from holotorch.tracking.colours import ColourTable
 _STEP = 2  # every second pixel of every second row
 _TILE = 12  # of those, along the side of a tile
 _DENSE = 0.35  # share of a tile and those around it that thin things never fill
-_MOST = 1 << 17  # coloured pixels that are looked at; of more, every second, third ...
+_FEWEST = 6  # coloured pixels of a tile that count
 _TILES = 40  # for each colour
 _CANDIDATES = 16  # lines whose labels are read,
 _EVERY = 2  # coarse pixels along each,
 _LINES = 3  # and that are measured
 _ACROSS = 3.0  # coarse pixels beside a line that still count
+
+
+_Y, _X = np.divmod(np.arange(_TILE**2, dtype=np.float32), _TILE)
+_MOMENTS = np.stack([np.ones_like(_X), _X, _Y, _X * _X, _X * _Y, _Y * _Y], -1)  # of a tile's pixels
 
 
 @dataclass(frozen=True)
@@ -65,52 +68,33 @@ class _Tiles:
 
 def _tiles(labels: np.ndarray, colours: int) -> _Tiles | None:
     height, width = labels.shape
-    flat = labels.ravel()
-    lit = np.flatnonzero(flat != 0)
-    if len(lit) < 8:
+    down, aside = -height % _TILE, -width % (2 * _TILE)  # whole tiles, and whole words of eight pixels
+    if down or aside:
+        labels = cv2.copyMakeBorder(labels, 0, down, 0, aside, cv2.BORDER_CONSTANT, value=0)
+    blocks = labels.reshape(-1, _TILE, labels.shape[1])
+    # Eight pixels at a time: sums of so few ones do not overflow a byte.
+    lit = np.add.reduce((blocks != 0).view(np.uint64), 1).view(np.uint8)
+    lit = np.add.reduce(lit.reshape(len(lit), -1, _TILE), 2, dtype=np.float32)
+    row, column = (lit >= _FEWEST).nonzero()
+    tiles = blocks.reshape(*lit.shape[:1], _TILE, -1, _TILE)[row, :, column].reshape(-1, _TILE**2)
+    each = tiles == np.arange(1, colours + 1, dtype=np.uint8)[:, None, None]  # [colours, tiles, pixels]
+    own = np.add.reduce(each.view(np.uint64), 2, keepdims=True).view(np.uint8).sum(2, dtype=np.float32)
+    count = np.zeros((*lit.shape, colours), dtype=np.float32)
+    count[row, column] = own.T
+    around = cv2.blur(count, (3, 3), borderType=cv2.BORDER_CONSTANT).reshape(count.shape)[row, column].T
+    label, which = ((own >= _FEWEST) & (around < _DENSE * _TILE**2)).nonzero()
+    if not len(label):
         return None
-    rows, columns = -(-height // _TILE), -(-width // _TILE)
-    total = rows * columns
-    of_tile, right, down = _places(height, width)
-    key = (flat[lit].astype(np.intp) - 1) * total + of_tile.take(lit)
-    count = np.bincount(key, minlength=colours * total).astype(np.float32)
-    around = cv2.blur(
-        np.moveaxis(count.reshape(colours, rows, columns), 0, -1) / np.float32(_TILE**2),
-        (3, 3),
-        borderType=cv2.BORDER_CONSTANT,
-    ).reshape(rows, columns, colours)
-    thin = np.moveaxis(around, -1, 0).ravel() < _DENSE
-    kept = ((count >= _TILE // 2) & thin).nonzero()[0]
-    if not len(kept):
-        return None
-    among = np.full(len(count), len(kept), dtype=np.int32)
-    among[kept] = np.arange(len(kept))
-    of = among.take(key)
-    some = np.flatnonzero(of < len(kept))
-    share = -(-len(some) // _MOST)
-    some = some[::share]
-    of, lit = of.take(some), lit.take(some)
-    dx, dy = right.take(lit), down.take(lit)
-    n = np.maximum(np.bincount(of, minlength=len(kept)), 1)
-    sx, sy, xx, xy, yy = (np.bincount(of, value, len(kept)) for value in (dx, dy, dx * dx, dx * dy, dy * dy))
+    row, column = row[which], column[which]
+    n, sx, sy, xx, xy, yy = (each[label, which].astype(np.float32) @ _MOMENTS).T.astype(np.float64)
     mx, my = sx / n, sy / n
     vx, vy, c = xx / n - mx * mx, yy / n - my * my, xy / n - mx * my
     root = np.sqrt((vx - vy) ** 2 / 4 + c * c)
     long, short = (vx + vy) / 2 + root, (vx + vy) / 2 - root
-    worth = np.minimum(long / (short + 0.3), 20) * np.minimum(share * n, 2 * _TILE)
-    label, tile = np.divmod(kept, total)
+    worth = np.minimum(long / (short + 0.3), 20) * np.minimum(n, 2 * _TILE)
     pick = np.concatenate([_most(np.where(label == colour, worth, -1.0), _TILES, 0.0) for colour in range(colours)])
-    below, aside = np.divmod(tile[pick], columns)
-    centre = mx[pick] + aside * _TILE + 1j * (my[pick] + below * _TILE)
-    return _Tiles(label[pick], count[kept[pick]], centre, np.exp(0.5j * np.arctan2(2 * c, vx - vy)[pick]))
-
-
-@lru_cache(maxsize=4)
-def _places(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each pixel: its tile, and where in it to the right and down. Dividing anew takes longer than looking it up."""
-    y, x = np.divmod(np.arange(height * width), width)
-    (row, dy), (column, dx) = np.divmod(y, _TILE), np.divmod(x, _TILE)
-    return row * -(-width // _TILE) + column, dx.astype(np.float32), dy.astype(np.float32)
+    centre = mx[pick] + column[pick] * _TILE + 1j * (my[pick] + row[pick] * _TILE)
+    return _Tiles(label[pick], n[pick].astype(np.float32), centre, np.exp(0.5j * np.arctan2(2 * c, vx - vy)[pick]))
 
 
 def _most(worth: np.ndarray, count: int, least: float) -> np.ndarray:

@@ -16,7 +16,8 @@ from holotorch.tracking.stations import Axis, variance_of
 from holotorch.tracking.status import Refusal, Status
 from holotorch.tracking.strips import Line, Sampler
 
-_COLUMNS = 40  # and more, along half a line: of every second to sixth pixel, whose colours say where it lies
+_COLUMNS = 40  # and more, along half a line: of every second to sixth pixel, whose colours say where it lies,
+_CERTAIN = 280  # or this many, where only coarse colours have said that it is there
 _WINDOW = 20  # pixels to either side of an edge, of which every second one is read,
 _CLOSE = 5  # but each as near as this, and two blurs farther
 _OUTSIDE = 10  # pixels beyond the outermost edges
@@ -27,7 +28,7 @@ _MARGIN = 8.0  # pixels, and two blurs: what must be seen to either side of an e
 _WHITE, _CUT = 252, 0.1  # a level that may be more light than it says, and the share of such in a row that spoils it
 _SMEARED = 4.0  # pixels of blur that no lens makes
 BLURRED = 0.6  # pixels from the blur that was expected, beyond which edges want another look
-_UNSURE = 0.1  # pixels: a clear edge is known to a few hundredths
+_UNSURE, _LOST = 0.1, 3.0  # pixels: a clear edge is known to a few hundredths, and what may become one to a few
 _ALIKE = 0.2  # of the brightest channel: colours nearer than this are one
 _PALE = 0.5  # of the purity of what lies beside it
 _BESIDE = 14.0  # pixels from the mid-line, beside the widest catheters
@@ -72,7 +73,7 @@ def find_bands(
     end = math.ceil(half)
     t = np.arange(-end, end + 1.0)
     u = np.arange(-math.ceil(aside), aside + 1.0)
-    every = min(6, max(2, end // _COLUMNS)) if onward else 2  # a wide tube fills the narrow strip of a cold frame
+    every = min(6, max(2, end // (_COLUMNS if onward else _CERTAIN)))
     some = t[end % every :: every]
     found = find_axis(table.labels(sampler.nearest(line.pixels(lens, some, u))), some, u, reach)
     if found is None:
@@ -169,7 +170,7 @@ def measure_edges(
         weight = shown[..., None] * whole / variance_of(light)
         fit = fit_edges(light, weight, blur, t=along)
         known = np.isfinite(fit.deviation)
-        if known.any() and median(fit.blur[known]) > _SMEARED > blur:
+        if np.count_nonzero(known) > 1 and median(fit.blur[known]) > _SMEARED > blur:
             # It moved along itself, farther than what was looked at.
             t[chosen] = near + fit.place
             return measure_edges(sampler, lens, axis, t, doubtful, median(fit.blur[known]), curve)
@@ -182,7 +183,8 @@ def measure_edges(
             core = (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)
             fit = told = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur, t=along))
         near, looks = near + fit.place, looks - 1
-        if not looks or float(np.abs(fit.place).max()) < _AWAY:
+        lost = np.count_nonzero(fit.deviation < _LOST) < 2  # there is nothing to look at once more
+        if not looks or lost or float(np.abs(fit.place).max()) < _AWAY:
             break
     near = near - bulge * front.shift(told.steps, told.told, row)
     blurs = fit.blur[np.isfinite(fit.deviation)]

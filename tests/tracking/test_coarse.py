@@ -1,5 +1,6 @@
 """Coarse lines on frames that are drawn by distance from a line."""
 
+import itertools
 import math
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from holotorch.tracking import coarse
 from holotorch.tracking.catheter import THESIS
 from holotorch.tracking.coarse import Segment, find_segments
 from holotorch.tracking.colours import ColourTable
@@ -130,3 +132,42 @@ def test_lines_along_the_border_are_found(border):
     """Half of the tube is on the frame, and of that every second pixel."""
     found = find_segments(drawn((border, 180), math.pi / 2, width=8.0, noise=2.5), TABLE)
     assert missed(found[0], (border, 180), math.pi / 2) < 4
+
+
+@pytest.mark.parametrize("size", [(60, 96), (61, 101), (49, 59)])
+def test_tiles_are_those_of_a_count_one_by_one(size):
+    """Lines and specks of three colours: count, middle and longest axis of each colour's pixels in tiles of 12."""
+    rng = np.random.default_rng(sum(size))
+    labels = np.where(rng.random(size) < 0.08, rng.integers(1, 4, size), 0).astype(np.uint8)
+    along = np.arange(min(size))
+    labels[along, along], labels[along // 2, along] = 1, 2
+    labels[:36, :36] = 3  # too dense to be thin
+    count: dict[tuple[int, int, int], int] = {}
+    lines: dict[tuple[int, int, int], tuple[complex, NDArray, NDArray]] = {}
+    for y, x in itertools.product(range(0, size[0], 12), range(0, size[1], 12)):
+        part = labels[y : y + 12, x : x + 12]
+        if np.count_nonzero(part) >= 6:
+            for label in (1, 2, 3):
+                down, right = (part == label).nonzero()
+                count[y, x, label] = len(down)
+                if len(down) >= 6:
+                    values, vectors = np.linalg.eigh(np.cov(right, down, bias=True))
+                    lines[y, x, label] = right.mean() + x + 1j * (down.mean() + y), vectors[:, 1], values
+    thin = {
+        key: value
+        for key, value in lines.items()
+        if sum(count.get((key[0] + dy, key[1] + dx, key[2]), 0) for dy in (-12, 0, 12) for dx in (-12, 0, 12))
+        < 9 * 0.35 * 144
+    }
+    assert 0 < len(thin) < len(lines)
+    found = coarse._tiles(labels, 3)
+    assert found is not None and len(found.label) == len(thin) <= 40
+    at = {(round(c.real, 4), round(c.imag, 4), label) for c, label in zip(found.centre, found.label + 1, strict=True)}
+    assert at == {(round(c.real, 4), round(c.imag, 4), key[2]) for key, (c, _, _) in thin.items()}
+    for label, n, centre, way in zip(found.label + 1, found.count, found.centre, found.along, strict=True):
+        (y, x, _), (_, vector, values) = next(
+            (key, value) for key, value in thin.items() if key[2] == label and abs(value[0] - centre) < 1e-4
+        )
+        assert n == count[y, x, label]
+        if values[1] > 1.01 * values[0]:
+            assert abs(way.real * vector[0] + way.imag * vector[1]) == pytest.approx(1, abs=1e-6)
