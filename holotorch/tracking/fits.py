@@ -154,7 +154,9 @@ def fit_edges(
     deviation = np.where(good, _SHARED * np.sqrt(variance) * np.maximum(noise, 0.5) * doubt, np.inf)
     slope, taken, bell = own
     told = ((bell * bell)[:, None] @ weight)[:, 0]
-    apart = _apart(told, amplitude, np.maximum(noise, 0.5), slope, taken, rows[-1])
+    # Of an edge that is none, such as one whose other side lies beyond the frame, all of these are rounding.
+    every = told[good], amplitude[good], np.maximum(noise[good], 0.5), slope[good], taken[good]
+    apart = _apart(*every, rows[-1]) if good.any() else 1.0
     steps, levels, told = (v.reshape(-1, *rows) for v in (amplitude, mean - amplitude * middle, told))
     return EdgeFit(place, sigma, apart * deviation, noise, steps, levels, told, np.full(len(place), apart))
 

@@ -65,3 +65,17 @@ def test_what_is_blurred_is_said_to_be_less_sure(name):
     """Fewer pixels see an edge or a side of it clearly; a movement across leaves the edges a fifth of their light."""
     plain, blurred = (TRACKER(seen(which)[1])[0] for which in ("plain", name))
     assert float(blurred.tip_sd) > 1.1 * float(plain.tip_sd)
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if "out of frame" in name])
+@pytest.mark.parametrize("earlier", [None, *EARLIER])
+def test_three_edges_in_the_frame_tell_a_pose_though_the_fourth_lies_beyond_it(name, earlier):
+    """Nothing checks it; that from the bands far from the tip has 2 mm, which is refused by default. Two tell none."""
+    case, frames = seen(name)
+    bold = CatheterTracker(WORLD.camera, WORLD.catheter, most_sd=5e-3)
+    pose = bold(frames, None if earlier is None else [before(case, *EARLIER[earlier])])[0]
+    if case.answerable:
+        assert pose.status is Status.UNVERIFIED
+        assert case.tip is not None and (pose.tip - case.tip).norm() < 3 * pose.tip_sd
+    else:
+        assert pose.status in (Status.OUT_OF_FRAME, Status.BANDS_MISSING)
