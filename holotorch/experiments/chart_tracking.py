@@ -47,7 +47,7 @@ def tracking() -> tuple[list[Row], dict[str, list[Row]], dict[str, bytes], list[
     trackers = methods(world, (BASE, COLD, PRIOR, FEWER))
     three = {name: trackers[name] for name in (BASE, COLD, PRIOR)}
     tables: dict[str, list[Row]] = {"times": timing(world, amount.rounds), "stages": stages(world, amount.rounds)}
-    tables["slowest"] = spread(world, amount.share)
+    tables["slowest"] = spread(world, amount.seeds, amount.share)
     said: dict[str, list[Answer]] = {}
     tables["still"], said["still"] = still(world, trackers, amount.still)
     tables["grids"], said["grids"] = grids(world, trackers, amount.share)

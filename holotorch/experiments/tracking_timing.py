@@ -97,13 +97,17 @@ def stages(world: World, rounds: int) -> list[Row]:
     return rows
 
 
-def spread(world: World, share: float = 1.0) -> list[Row]:
+def spread(world: World, seeds: int, share: float = 1.0) -> list[Row]:
     """Slowest frame over the median one of each method: conditions, occlusions and one negative of each kind.
 
-    Each frame counts with the median of a few calls, so that what the machine does meanwhile is not the frame's.
+    From as many seeds, each with two of the world's photographs. Each frame counts with the median of a few calls, so
+    that what the machine does meanwhile is not the frame's.
     """
-    some = replace(world, photographs=world.photographs[:2])
-    cases = [*conditions(some), *occlusions(some), *negatives(some, 10)][:: max(1, round(1 / share))]
+    cases = []
+    for i in range(seeds):
+        some = replace(world, photographs=world.photographs[2 * i : 2 * i + 2], seed=world.seed + i)
+        found = [*conditions(some), *occlusions(some), *negatives(some, 10)][:: max(1, round(1 / share))]
+        cases += [replace(case, name=f"{case.name}, seed {some.seed}") for case in found]
     trackers = methods(world, (BASE, COLD, PRIOR))
     taken: dict[str, list[tuple[float, str]]] = {name: [] for name in trackers}
     for case in tqdm(cases, desc="slowest frames", unit="frame", dynamic_ncols=True):

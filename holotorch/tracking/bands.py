@@ -1,5 +1,6 @@
 """Which stretch of a line shows which band: the line found among labels, the bands by the best order of stretches."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,8 +97,9 @@ def find_stretches(
     """
     raw = _shares(labels, table)  # [C, T]
     share = raw * ~drape
-    value, cuts, nothing = _sweep(share[None] if onward else np.stack([share, share[:, ::-1]]), table.bands)
-    score = (value[:, -1] - nothing[:, -1]).tolist()
+    sums = _worth(share[None] if onward else np.stack([share, share[:, ::-1]]), table.bands)
+    value, cuts = _sweep(sums)
+    score = (value[:, -1] - sums[0, :, -1]).tolist()
     flipped = score[-1] > score[0]
     if score[int(flipped)] <= 0 or (not onward and abs(score[0] - score[1]) < _SIDE):
         return None
@@ -112,9 +114,10 @@ def find_stretches(
 
 def order_scores(labels: np.ndarray, table: ColourTable) -> np.ndarray:
     """What lines of labels [K, T, R] are worth in the better direction, above no bands on them: [K], in pixels."""
-    share = _shares(labels, table).swapaxes(0, 1)
-    value, _, nothing = _sweep(np.concatenate([share, share[..., ::-1]]), table.bands)
-    return (value[:, -1] - nothing[:, -1]).reshape(2, -1).max(0)
+    sums = _worth(_shares(labels, table).swapaxes(0, 1), table.bands)
+    # The other way round, the same stretches are worth the same.
+    one, other = (_sweep(order)[0][:, -1] for order in (sums, [sums[0], *sums[-2:0:-1], sums[-1]]))
+    return np.maximum(one, other) - sums[0, :, -1]
 
 
 def _shares(labels: np.ndarray, table: ColourTable) -> np.ndarray:
@@ -125,8 +128,8 @@ def _shares(labels: np.ndarray, table: ColourTable) -> np.ndarray:
     return np.moveaxis(np.add.reduce(rows), -1, 0)
 
 
-def _sweep(share: np.ndarray, bands: tuple[int, ...]) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]], np.ndarray]:
-    """Dynamic programming over the cuts: best value [K, T + 1], what each cut chose from, and the value of no band.
+def _worth(share: np.ndarray, bands: tuple[int, ...]) -> np.ndarray:
+    """What pixels of lines [K, C, T] are worth before the bands, on each of them, and after: sums [n + 2, K, T + 1].
 
     A pixel within a band is worth +1 where it shows the band's colour, -1 where it shows another band's and -0.6 where
     it shows none, as fingers do; around the bands -0.25 where it shows one, and 0 where it shows none.
@@ -135,16 +138,22 @@ def _sweep(share: np.ndarray, bands: tuple[int, ...]) -> tuple[np.ndarray, list[
     gains[[0, -1]] = -0.25
     for i, band in enumerate(bands):
         gains[i + 1, band] += 2
-    least = np.array([0.0] + [-0.6] * len(bands) + [0.0], dtype=np.float32)
-    sums = np.zeros((len(share), len(least), share.shape[-1] + 1), dtype=np.float32)
-    np.cumsum(gains @ share + least[:, None], -1, out=sums[..., 1:])
-    value, cuts = sums[:, 0], []
-    for total in sums.swapaxes(0, 1)[1:]:
+    least = np.array([0.0] + [-0.6] * len(bands) + [0.0], dtype=np.float32)[:, None, None]
+    sums = np.zeros((len(least), len(share), share.shape[-1] + 1), dtype=np.float32)
+    np.cumsum((gains @ share).swapaxes(0, 1) + least, -1, out=sums[..., 1:])
+    return sums
+
+
+def _sweep(order: Iterable[np.ndarray]) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
+    """Dynamic programming over the cuts between stretches worth [K, T + 1]: best value, what each cut chose from."""
+    value, *rest = order
+    cuts = []
+    for total in rest:
         ahead = value - total
         reached = np.maximum.accumulate(ahead, -1)
         cuts.append((ahead, reached))
         value = total + reached
-    return value, cuts, sums[:, 0]
+    return value, cuts
 
 
 def _judged(

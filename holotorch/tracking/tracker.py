@@ -37,6 +37,7 @@ _SLANTED = 1.5  # times as wide as at a slight tilt, 55 degrees
 _PATH, _ALIKE = 2.5, 0.2  # longest way across, in widths, and how well the softness of the sides must agree with it,
 _CLEAR = 0.04  # where their distance is as clear as this
 _NEARLY, _EXACT = 0.01, 0.002  # how well the width is known from a rough pose, and after
+_VAGUE = 0.15  # of a width, to which a tube behind three edges is known, or clutter looks like one
 _WIDEST = 120.0  # pixels
 _BLUR = 0.9  # pixels, to begin with
 _BENT = 0.1  # pixels by which fronts bulge more or less than was thought, beyond which they want another look
@@ -162,6 +163,8 @@ class CatheterTracker:
             stations = look_across(sampler, lens, line, stretches, wide[0], _BLUR)
             axis = width = measure_axis(stations, wide, known, _BLUR)
             if before is None:
+                if stretches.known == 3 and axis.width_sd > _VAGUE * axis.width:
+                    raise Refusal(Status.INCONSISTENT, "3 edges, and a width too unclear to check them with")
                 look = partial(look_across, sampler, lens, line, stretches)
                 stations, axis, width = measure_width(look, stations, axis, wide, known)
         with self._timed("edges"):
@@ -194,14 +197,11 @@ class CatheterTracker:
     def _rough(self, line: Line, places: np.ndarray) -> Found | None:
         """A first pose, from where the colours change; None where one of these places may be no edge."""
         known = np.isfinite(places)
-        count = int(known.sum())
-        if count < 4:
+        if (count := int(known.sum())) < 4:
             return None
         found = pose_on_line(line, places[known], self._positions[known], np.ones(count), 1.0, 0.01)
-        wide, slight = (
-            width_px(found, self._positions, self.catheter.radius, line)[0] if found else 0.0,
-            self._slight(places)[0],
-        )
+        wide = width_px(found, self._positions, self.catheter.radius, line)[0] if found else 0.0
+        slight = self._slight(places)[0]
         return found if slight / _SLANTED < wide < slight * _SLANTED else None
 
     def _slight(self, places: np.ndarray) -> tuple[float, float]:

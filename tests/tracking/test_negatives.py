@@ -4,7 +4,9 @@ import math
 
 import pytest
 
+from holotorch.tracking import tracker
 from holotorch.tracking.catheter import THESIS
+from holotorch.tracking.status import Status
 from holotorch.tracking.tracker import CatheterTracker
 from holotorch.tracking.trials import negatives, occlusions
 from holotorch.tracking.world import World
@@ -42,3 +44,17 @@ def test_fingers_are_no_obstacle_and_no_lie():
         if pose.answered:
             assert case.tip is not None
             assert float((pose.tip - case.tip).norm()) < min(5e-3, 5 * float(pose.tip_sd)), case.name
+
+
+def test_clutter_that_shows_three_edges_and_no_tube_costs_no_second_look(monkeypatch):
+    """What such a line looked like at another width would be refused all the same, ten calls later."""
+
+    def looked(*_):
+        raise AssertionError("the width was measured")
+
+    monkeypatch.setattr(tracker, "measure_width", looked)
+    frame = negatives(World(seed=1), 6)[5].frame()
+    pose = TRACKER(frame[None])[0]
+    assert pose.status is Status.INCONSISTENT and "3 edges" in pose.reason
+    with pytest.raises(AssertionError, match="measured"):  # as it is wherever a tube is seen
+        TRACKER(World().still(0.5, 0.3, 1)[0].frame()[None])
