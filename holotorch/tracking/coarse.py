@@ -9,6 +9,7 @@ from torch import Tensor
 
 from holotorch.tracking.bands import order_scores
 from holotorch.tracking.colours import ColourTable
+from holotorch.tracking.status import Refusal, Status
 
 _STEP = 2  # every second pixel of every second row
 _TILE = 12  # of those, along the side of a tile
@@ -34,16 +35,19 @@ class Segment:
 
 
 def find_segments(frame: Tensor, table: ColourTable) -> list[Segment]:
-    """The most promising lines on a frame uint8 [3, H, W], best first; empty where nothing thin is coloured."""
+    """The most promising lines on a frame uint8 [3, H, W], best first, of two bands or more.
+
+    A Refusal where nothing thin is coloured (NO_CATHETER), or what is shows no two bands in a row (BANDS_MISSING).
+    """
     labels = _labels(frame, table)
     tiles = _tiles(labels, len(table.colours))
     if tiles is None:
-        return []
+        raise Refusal(Status.NO_CATHETER, "nothing thin in the bands' colours")
     lines = _lines(tiles, table)
-    if lines is None:
-        return []
-    mean, along, low, high = lines
-    return _ranked(labels, mean, along, low, high, table)
+    found = _ranked(labels, *lines, table) if lines else []
+    if not found:
+        raise Refusal(Status.BANDS_MISSING, "what is thin and coloured shows no two bands in a row")
+    return found
 
 
 def _labels(frame: Tensor, table: ColourTable) -> np.ndarray:
@@ -107,7 +111,7 @@ def _most(worth: np.ndarray, count: int, least: float) -> np.ndarray:
     return some[worth[some] > least]
 
 
-def _lines(tiles: _Tiles, table: ColourTable) -> tuple[np.ndarray, ...] | None:
+def _lines(tiles: _Tiles, table: ColourTable) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
     """Lines through two tiles of different bands: middle [K], direction [K], beginning and end [K] along it."""
     pairs = []
     for one, other in itertools.combinations(range(len(table.colours)), 2):

@@ -12,6 +12,7 @@ from holotorch.tracking import coarse
 from holotorch.tracking.catheter import THESIS
 from holotorch.tracking.coarse import Segment, find_segments
 from holotorch.tracking.colours import ColourTable
+from holotorch.tracking.status import Refusal, Status
 from holotorch.tracking.world import synthetic_camera
 
 SIZE = (360, 640)
@@ -67,14 +68,18 @@ def test_dark_and_bright_surroundings(ground):
     assert missed(found[0], (320, 180), 2.2) < 2
 
 
+def refused(frame: torch.Tensor) -> Status:
+    with pytest.raises(Refusal) as caught:
+        find_segments(frame, TABLE)
+    return caught.value.status
+
+
 def test_frames_without_colour_have_no_lines():
     zeros = torch.zeros(3, *SIZE, dtype=torch.uint8)
-    assert find_segments(zeros, TABLE) == []
-    assert find_segments(zeros + 255, TABLE) == []
     grey = (128 + 12 * torch.randn(1, *SIZE)).clamp(0, 255).to(torch.uint8).expand(3, -1, -1)
-    assert find_segments(grey, TABLE) == []
-    for colour in THESIS.colours:  # cloth: coloured, but nothing thin
-        assert find_segments(zeros + torch.tensor(colour, dtype=torch.uint8)[:, None, None], TABLE) == []
+    cloths = [zeros + torch.tensor(colour, dtype=torch.uint8)[:, None, None] for colour in THESIS.colours]
+    for frame in (zeros, zeros + 255, grey, *cloths):
+        assert refused(frame) is Status.NO_CATHETER
 
 
 def test_noise_and_clutter_give_few_lines():
@@ -101,8 +106,9 @@ def test_the_right_order_comes_before_the_wrong_one():
     assert missed(find_segments(both, TABLE)[0], (320, 90), 0.0) < 2
 
 
-def test_one_colour_alone_is_no_line():
-    assert find_segments(drawn((320, 180), 0.4, order=(1, 1, 1)), TABLE) == []
+@pytest.mark.parametrize("band", range(3))
+def test_one_colour_alone_is_no_line_but_a_band(band):
+    assert refused(drawn((320, 180), 0.4, order=(band, band, band))) is Status.BANDS_MISSING
 
 
 def test_it_is_the_same_each_time():

@@ -136,8 +136,9 @@ def test_frames_without_a_catheter_are_refused():
     noise = torch.randint(0, 256, zeros.shape, dtype=torch.uint8, generator=rng)
     stripe = zeros + 90
     stripe[:, 260:266, 200:700] = torch.tensor(RED, dtype=torch.uint8)[:, None, None]
-    for pose in TRACKER(torch.stack([zeros, zeros + 128, zeros + 255, stripe, WORLD.desk()])):
+    for pose in TRACKER(torch.stack([zeros, zeros + 128, zeros + 255, WORLD.desk()])):
         refused(pose, Status.NO_CATHETER)
+    refused(TRACKER(stripe[None])[0], Status.BANDS_MISSING)
     refused(TRACKER(noise[None])[0], Status.NO_CATHETER, Status.NO_AXIS, Status.BANDS_MISSING, Status.TOO_NARROW)
 
 
