@@ -261,8 +261,10 @@ def _precision(axes: Axes, rows: list[Row]) -> None:
         found = [_one(rows, depth_mm=depth, tilt_deg=tilt, method=name) for depth, tilt in places]
         values = [row["sd_mm"] if row["sd_mm"] != "" else math.nan for row in found]
         axes.semilogy(range(len(places)), values, marker, color=colour, label=name)
-    bounds = [_one(rows, depth_mm=depth, tilt_deg=tilt, method=BASE)["bound_mm"] for depth, tilt in places]
-    axes.semilogy(range(len(places)), bounds, "_", color="black", markersize=20, label="Cramér-Rao bound")
+    own = [_one(rows, depth_mm=depth, tilt_deg=tilt, method=BASE) for depth, tilt in places]
+    for of, colour, label in (("edges_bound_mm", "gray", ", of edges"), ("bound_mm", "black", ", of all pixels")):
+        bounds = [row[of] for row in own]
+        axes.semilogy(range(len(places)), bounds, "_", color=colour, markersize=20, label=f"Cramér-Rao bound{label}")
     axes.set_xticks(range(len(places)), [f"{depth} mm\n{tilt}°" for depth, tilt in places])
     axes.set_xlabel("distance of the bands' middle and their tilt")
     axes.set_ylabel("sd of a resting tip, unfiltered (mm)")
