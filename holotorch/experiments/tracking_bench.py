@@ -138,8 +138,8 @@ def lights(world: World, tracker: Method, count: int, share: float = 1.0) -> lis
             if goal is not None:
                 cases = lit.still(1e-3 * depth, math.radians(tilt), max(2, count))
                 own = list(answers(cases, {light: tracker}, f"light, {light}"))
-                told = any(a.pose.answered and b.pose.answered for a, b in pairwise(own))
-                row[f"s_rms_mm_{depth}_{tilt}"] = _mm(protocols.s_rms(tips_of(own)).s_rms) if told else ""
+                known = any(a.pose.answered and b.pose.answered for a, b in pairwise(own))
+                row[f"s_rms_mm_{depth}_{tilt}"] = _mm(protocols.s_rms(tips_of(own)).s_rms) if known else ""
         found = answers(lit.grid_2d()[:: max(1, round(2 / share))], {light: tracker}, f"light, {light}")
         grid = _grid_row("2D", light, list(found))
         rows.append(row | {key: grid[key] for key in ("points", "refused", "median_mm", "p95_mm", "coverage")})

@@ -80,7 +80,7 @@ def _tiles(labels: np.ndarray, colours: int) -> _Tiles | None:
     lit = np.add.reduce((blocks != 0).view(np.uint64), 1).view(np.uint8)
     lit = np.add.reduce(lit.reshape(len(lit), -1, _TILE), 2, dtype=np.float32)
     row, column = (lit >= _FEWEST).nonzero()
-    tiles = blocks.reshape(*lit.shape[:1], _TILE, -1, _TILE)[row, :, column].reshape(-1, _TILE**2)
+    tiles = blocks.reshape(len(blocks), _TILE, -1, _TILE)[row, :, column].reshape(-1, _TILE**2)
     each = tiles == np.arange(1, colours + 1, dtype=np.uint8)[:, None, None]  # [colours, tiles, pixels]
     own = np.add.reduce(each.view(np.uint64), 2, keepdims=True).view(np.uint8).sum(2, dtype=np.float32)
     count = np.zeros((*lit.shape, colours), dtype=np.float32)

@@ -175,18 +175,18 @@ def measure_edges(
             t[chosen] = near + fit.place
             return measure_edges(sampler, lens, axis, t, doubtful, median(fit.blur[known]), curve)
         coarse = bool(np.any(coarse_colours(sampler, pixels[[0, -1], len(along) // 2, half])))
-        told = fit
+        shading = fit
         if coarse:
-            fit, told = fit_luma(fit, light, shown, sampler.light, along)
+            fit, shading = fit_luma(fit, light, shown, sampler.light, along)
         elif bool((fit.deviation > _UNSURE).any()):
             # Surroundings that are not even leak into the outer rows; those in the middle may tell all the same.
             core = (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)
-            fit = told = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur, t=along))
+            fit = shading = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur, t=along))
         near, looks = near + fit.place, looks - 1
         lost = np.count_nonzero(fit.deviation < _LOST) < 2  # there is nothing to look at once more
         if not looks or lost or float(np.abs(fit.place).max()) < _AWAY:
             break
-    near = near - bulge * front.shift(told.steps, told.told, row)
+    near = near - bulge * front.shift(shading.steps, shading.told, row)
     blurs = fit.blur[np.isfinite(fit.deviation)]
     soft = median(fit.blur)
     beside = sampler.light.take(sampler.nearest(every[..., len(u) :].reshape(-1, 6)))
