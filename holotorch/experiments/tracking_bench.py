@@ -19,7 +19,7 @@ from holotorch.tracking.world import World
 
 Row = dict[str, Any]
 
-# Distance of the bands' middle in mm and tilt in degrees: what S_RMS may be in mm, or where efficiency is asked for.
+# Distance in mm and tilt in degrees: what S_RMS may be in mm, or where efficiency is asked for.
 STILL: dict[tuple[int, int], float | None] = {
     (450, 20): 0.05,
     (520, 5): 0.12,
@@ -28,6 +28,8 @@ STILL: dict[tuple[int, int], float | None] = {
     (520, 0): None,
     (520, 20): None,
 }
+# What lies at that distance: it moves S_RMS by a fifth and more, up at one pose and down at another.
+MIDDLE, SECOND = "middle of the bands", "second edge"
 _CODECS: dict[str, dict[str, Any]] = {
     "none": {},
     "video 4:2:0": {"video": True},
@@ -64,16 +66,18 @@ def still(world: World, trackers: dict[str, Method], count: int) -> tuple[list[R
     rows, said = [], []
     pixel = 1 / float(world.camera.matrix[0, 0])
     offsets = (pixel * (torch.rand(_PLACES, 2, generator=torch.Generator().manual_seed(world.seed)) - 0.5)).tolist()
-    for (depth, tilt), goal in STILL.items():
-        place = (1e-3 * depth, math.radians(tilt))
-        bound, of_edges = (1e3 * math.sqrt(own.trace()) for own in tip_bounds(world, world.pose(*place)))
-        parts = [world.still(*place, max(2, count // _PLACES), at) for at in offsets]
+    places = [(*place, goal, MIDDLE) for place, goal in STILL.items()]
+    for depth, tilt, goal, where in places + [(*place, goal, SECOND) for place, goal in STILL.items() if goal]:
+        place, point = (1e-3 * depth, math.radians(tilt)), None if where == MIDDLE else world.catheter.edges[1]
+        pose = world.pose(*place, point=point)
+        bound, of_edges = (1e3 * math.sqrt(own.trace()) for own in tip_bounds(world, pose))
+        parts = [world.still(*place, max(2, count // _PLACES), at, point) for at in offsets]
         found = [list(answers(part, trackers, f"still, {depth} mm, {tilt} deg")) for part in parts]
         said += [answer for part in found for answer in part]
         for name in trackers:
             groups = [[answer for answer in part if answer.method == name] for part in found]
             own = [answer for group in groups for answer in group]
-            row: Row = {"depth_mm": depth, "tilt_deg": tilt, "method": name, "frames": len(own)}
+            row: Row = {"depth_mm": depth, "of": where, "tilt_deg": tilt, "method": name, "frames": len(own)}
             row |= {
                 "answered": sum(answer.pose.answered for answer in own),
                 "s_rms_mm": "",
@@ -196,6 +200,11 @@ def empty(world: World, trackers: dict[str, Method], count: int) -> tuple[list[R
         row["statuses"] = told(answer.status for answer in own)
         rows.append(row | {"seed": world.seed, "numbers_of_false": " ".join(false)})
     return rows, found
+
+
+def one(rows: list[Row], **wanted: Any) -> Row:
+    """The first row with these values."""
+    return next(row for row in rows if all(row[key] == value for key, value in wanted.items()))
 
 
 def covered(own: Sequence[Answer]) -> float | str:

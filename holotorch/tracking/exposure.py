@@ -14,6 +14,16 @@ def _deviates() -> np.ndarray:
     return torch.randn(_NOISE, generator=torch.Generator().manual_seed(20)).numpy()
 
 
+def sensed(
+    levels: np.ndarray, noise: float, video: bool, jpeg_quality: int | None, generator: torch.Generator | None
+) -> np.ndarray:
+    """Frame uint8 [3, H, W] that sensor and codec make of levels float32 of the same shape, as a look says."""
+    frame = expose(levels, noise, generator)
+    if video:
+        frame = halve_colours(frame)
+    return frame if jpeg_quality is None else compress(frame, jpeg_quality)
+
+
 def expose(frame: np.ndarray, noise: float, generator: torch.Generator | None) -> np.ndarray:
     """Levels uint8 [3, H, W] of levels float32 of the same shape, with white noise of so many levels."""
     flat = frame.reshape(-1, frame.shape[-1])

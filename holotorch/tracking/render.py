@@ -14,7 +14,7 @@ from holotorch.core import checks
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.cast import Rays, Tube, cast, light_of, tube_of
 from holotorch.tracking.catheter import Catheter
-from holotorch.tracking.exposure import compress, expose, halve_colours
+from holotorch.tracking.exposure import sensed
 
 Colour = tuple[int, int, int]
 _FINE = 4  # samples along a pixel's side while it is blurred; on an edge each has 8 rays
@@ -144,6 +144,21 @@ def render(
         TypeError, ValueError: Shapes, NaN, a direction that is no unit vector, a tube that touches the camera.
     """
     look = look or Look()
+    levels = mean_levels(catheter, camera, (tip, direction), size, look)
+    return torch.from_numpy(sensed(levels, look.noise_dn, look.video, look.jpeg_quality, generator))
+
+
+def mean_levels(
+    catheter: Catheter | None,
+    camera: Camera,
+    pose: tuple[Tensor | None, Tensor | None],
+    size: tuple[int, int],
+    look: Look,
+) -> np.ndarray:
+    """Levels float32 [3, H, W], neither noisy nor rounded, of the frame that :func:`render` makes of the same.
+
+    ``pose`` are tip and direction.
+    """
     height, width = (checks.whole("size", side, 8) for side in size)
     if max(size) > _LARGEST:
         raise ValueError(f"size must be at most {_LARGEST} pixels along a side, got {size}")
@@ -153,8 +168,7 @@ def render(
     if catheter is not None:
         tube = tube_of(
             catheter,
-            tip,
-            direction,
+            *pose,
             light=look.light,
             ambient=look.ambient,
             highlight=(look.highlight, look.highlight_width),
@@ -164,12 +178,7 @@ def render(
     frame = _backdrop(look, camera, (height, width))
     if tube is not None or look.occluders:
         _draw(frame, look, camera, tube)
-    levels = expose(frame, look.noise_dn, generator)
-    if look.video:
-        levels = halve_colours(levels)
-    if look.jpeg_quality is not None:
-        levels = compress(levels, look.jpeg_quality)
-    return torch.from_numpy(levels)
+    return frame
 
 
 def _backdrop(look: Look, camera: Camera, size: tuple[int, int]) -> np.ndarray:

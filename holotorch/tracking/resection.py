@@ -36,7 +36,13 @@ class Found:
 
 
 def pose_on_line(
-    line: Line, t: np.ndarray, positions: np.ndarray, deviation: np.ndarray, offset_sd: float, slope_sd: float
+    line: Line,
+    t: np.ndarray,
+    positions: np.ndarray,
+    deviation: np.ndarray,
+    offset_sd: float,
+    slope_sd: float,
+    shared_sd: float = 0.0,
 ) -> Found | None:
     """Pose of a tool whose image is ``line``; the part of :func:`solve_pose` that is left where the line is known.
 
@@ -51,6 +57,7 @@ def pose_on_line(
         deviation: [N] standard deviations of t.
         offset_sd: Of the line at the mean of t, in the same unit.
         slope_sd: Of the line, in radians; independent of the offset.
+        shared_sd: Of what moves all points alike along the line, beside ``deviation``.
 
     Returns:
         The pose, or None where none in front of the camera is near the points.
@@ -96,9 +103,10 @@ def pose_on_line(
     pose, moved = raw[:, 0], raw[:, 1:]
     moved = moved - (moved[1] @ pose[1])[:, None] * pose[:, None]
     own = np.zeros((5, 5))
-    own[3, 3], own[4, 4] = offset_sd**2, slope_sd**2
     for column, right in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))):
         own[:3, column] = _solved(normal, right)
+    alike = shared_sd / wide * np.array([1.0, h2, 0.0, 0.0, 0.0])
+    own += np.diag([0.0, 0.0, 0.0, offset_sd**2, slope_sd**2]) + alike * alike[:, None]
     lever = moved.swapaxes(1, 2).reshape(6, 5)
     covariance = lever @ own @ lever.T
     return Found(pose[0], pose[1], covariance, chi_square) if np.isfinite(covariance).all() else None

@@ -29,6 +29,7 @@ from holotorch.tracking.strips import Line, Sampler
 _FLOOR = 0.004  # pixels: what model and pixels leave in an edge, however little noise;
 _SHINES = 0.010  # in an outermost one, whose tube a table's grain shines through;
 _ROUND = 0.004  # of what a ring's front bulges,
+_SHARED = 0.010  # in all edges alike,
 _SOFT = 0.08  # of blur to all sides, since what lies beside the tube leaks into it,
 _SMEAR = 0.03  # and of blur along it, which is that of a lens or of a movement
 _COARSE, _ASIDE = 0.07, 0.17  # pixels: what colours between other pixels than the luma leave in an edge and a line
@@ -241,7 +242,7 @@ class CatheterTracker:
         reach = math.sqrt(float((t - middle) @ (t - middle)) / len(t))
         about = math.hypot(axis.offset_sd, axis.slope_sd * (middle - axis.centre), _ASIDE * edges.coarse)
         most = max(about, axis.slope_sd * reach)
-        found = pose_on_line(axis.line, t, self._positions[known], along, most, most / reach)
+        found = pose_on_line(axis.line, t, self._positions[known], along, most, most / reach, _SHARED)
         if found is None:
             raise Refusal(Status.INCONSISTENT, "no pose in front of the camera explains the edges")
         return found

@@ -5,9 +5,10 @@ import math
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property, partial
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,7 +16,8 @@ from holotorch.core import checks
 from holotorch.tracking import scenery
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import THESIS, Catheter
-from holotorch.tracking.render import Look, render
+from holotorch.tracking.exposure import sensed
+from holotorch.tracking.render import Look, mean_levels, render
 
 _GRID, _SPACING = 0.0816, 0.010  # metres: side of the sheet of Sec. 3.5.2, distance of the holes of Sec. 3.5.3
 _ROLL = math.radians(25)  # of the catheter in the frame where nothing says otherwise
@@ -100,26 +102,37 @@ class World:
         Without a background, on the desk. ``changes`` are those of the look. The noise follows from the world's seed
         and the name.
         """
-        seed = zlib.crc32(f"{self.seed} {name}".encode())
 
         def frame() -> Tensor:
             look = replace(self.look, background=(background or self.desk)(), **changes)
             tip, direction = pose or (None, None)
             tool = None if pose is None else shown or self.catheter
-            generator = torch.Generator().manual_seed(seed)
-            return render(tool, self.camera, tip, direction, self.size, look, generator=generator)
+            return render(tool, self.camera, tip, direction, self.size, look, generator=self._noise(name))
 
         true = None if shown is not None else pose
         return Case(name, frame, *(true or (None, None)), answerable, why)
 
     def pose(
-        self, depth: float, tilt: float, roll: float = _ROLL, at: Sequence[float] = (0.0, 0.0)
+        self,
+        depth: float,
+        tilt: float,
+        roll: float = _ROLL,
+        at: Sequence[float] = (0.0, 0.0),
+        point: float | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Tip and direction with the middle of the bands at ``depth`` on the ray through ``at`` on the plane z = 1."""
+        """Tip and direction with a point of the catheter at ``depth`` on the ray through ``at`` on the plane z = 1.
+
+        The ``point`` is so many metres from the tip; None for the middle of the bands.
+        """
         checks.positive("depth", depth, "metres")
         direction = aimed(tilt, roll)
-        middle = (self.catheter.edges[0] + self.catheter.edges[-1]) / 2
-        return depth * torch.tensor([*at, 1.0], dtype=torch.float64) - middle * direction, direction
+        if point is None:
+            point = (self.catheter.edges[0] + self.catheter.edges[-1]) / 2
+        return depth * torch.tensor([*at, 1.0], dtype=torch.float64) - point * direction, direction
+
+    def _noise(self, name: str) -> torch.Generator:
+        """Of the frame of this name: the same at each call."""
+        return torch.Generator().manual_seed(zlib.crc32(f"{self.seed} {name}".encode()))
 
     def desk(self) -> Tensor:
         """The table of the measurements."""
@@ -129,11 +142,24 @@ class World:
     def _desk(self) -> Tensor:
         return scenery.desk(self.size, self.seed)
 
-    def still(self, depth: float, tilt: float, count: int, at: Sequence[float] = (0.0, 0.0)) -> list[Case]:
-        """``count`` frames of a catheter at rest, differing in noise only: Sec. 3.5.1; in metres, radians."""
-        place = self.pose(depth, tilt, at=at)
+    def still(
+        self, depth: float, tilt: float, count: int, at: Sequence[float] = (0.0, 0.0), point: float | None = None
+    ) -> list[Case]:
+        """``count`` frames of a catheter at rest, differing in noise only: Sec. 3.5.1; at a pose as :meth:`pose`'s."""
+        place = self.pose(depth, tilt, at=at, point=point)
         where = f", {1e3 * at[0]:.3f} {1e3 * at[1]:.3f}" if any(at) else ""
-        return [self.case(f"still {i}{where}", place) for i in range(checks.whole("count", count, 1))]
+
+        @cache
+        def levels() -> np.ndarray:  # the same of all frames, and most of their making
+            look = replace(self.look, background=self.desk())
+            return mean_levels(self.catheter, self.camera, place, self.size, look)
+
+        def frame(name: str) -> Tensor:
+            seen = self.look.noise_dn, self.look.video, self.look.jpeg_quality
+            return torch.from_numpy(sensed(levels(), *seen, self._noise(name)))
+
+        names = [f"still {i}{where}" for i in range(checks.whole("count", count, 1))]
+        return [Case(name, partial(frame, name), *place, True, "") for name in names]
 
     def grid_2d(self, depth: float = 0.52, tilt: float = math.radians(20)) -> list[Case]:
         """The sheet of Sec. 3.5.2: the tip at 9 x 9 places over 8.16 cm, row by row, always in the same direction.

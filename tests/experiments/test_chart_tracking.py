@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from holotorch.cli import main
-from holotorch.experiments import chart_tracking, tracking_bench, tracking_methods, tracking_timing
+from holotorch.experiments import chart_tracking, tracking_bench, tracking_methods, tracking_picture, tracking_timing
 from holotorch.experiments.chart_tracking import Amount
 from holotorch.experiments.tracking_bound import Bounds, tip_bounds
 from holotorch.experiments.tracking_methods import BASE, COLD, FEWER, LITERAL, PRIOR, Answer, before, methods
@@ -32,7 +32,7 @@ def small(**changes) -> World:
 def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(chart_tracking, "scene", small)
     monkeypatch.setattr(chart_tracking, "AMOUNT", Amount(2, 1, 1, 10, 1, 0.06))
-    for module in (chart_tracking, tracking_bench):
+    for module in (chart_tracking, tracking_bench, tracking_picture):
         monkeypatch.setattr(module, "STILL", {(520, 20): 0.2, (520, 5): None})
     monkeypatch.setattr(tracking_bench, "tip_bounds", lambda *_: Bounds(1e-9 * torch.eye(3), 2e-9 * torch.eye(3)))
     monkeypatch.setattr(tracking_timing, "_REPEATS", 1)
@@ -84,19 +84,28 @@ def test_rows_of_a_catheter_at_rest(monkeypatch):
     monkeypatch.setattr(
         tracking_bench, "tip_bounds", lambda *_: Bounds(*(torch.diag(torch.tensor([v, 0, 0])) for v in (4e-8, 9e-8)))
     )
-    turn = iter([1e-3, 3e-3] * 5)
+    turn = iter([1e-3, 3e-3] * 10)
 
     def known(_, case):
         pose = before(case, (next(turn), 0, 0), 0.0)
         return Pose(pose.tip, pose.direction, 4e-6 * torch.eye(6), pose.chi_square, pose.freedom, pose.status)
 
-    (row,), said = tracking_bench.still(small(), {"known": known}, 10)
+    world = small()
+    (row, other), said = tracking_bench.still(world, {"known": known}, 10)
     # Two frames at each of five places: changes of 2 mm, deviation sqrt(2 (1 mm)^2 / 1).
     # Bias 2 mm; 1 and 3 mm are within 2.8 deviations of 2 mm.
     assert row["s_rms_mm"] == 2 and row["sd_mm"] == pytest.approx(math.sqrt(2), abs=1e-4) and row["bias_mm"] == 2
     assert row["efficiency"] == pytest.approx(0.04 / 2, abs=1e-3) and row["coverage"] == 1
     assert row["bound_mm"] == 0.2 and row["edges_bound_mm"] == 0.3 and row["s_rms_error_mm"] == 0
-    assert [answer.right for answer in said] == [True] * 10
+    assert [answer.right for answer in said] == [True] * 20
+    # The same once more, with another point at the same distance.
+    numbers = ("depth_mm", "tilt_deg", "frames", "s_rms_mm", "s_rms_goal_mm", "sd_mm")
+    assert [row[key] for key in numbers] == [other[key] for key in numbers]
+    for place, answer in zip((0.127, 0.108), (said[0], said[10]), strict=True):
+        assert answer.case.tip is not None and answer.case.direction is not None
+        at = answer.case.tip + place * answer.case.direction
+        assert at[2] == pytest.approx(0.52, abs=1e-12) and at[:2].abs().max() < 0.52 / 1400
+    assert (row["of"], other["of"]) == ("middle of the bands", "second edge")
 
 
 def test_right_wrong_and_refused():

@@ -32,9 +32,15 @@ def seen(depth: float, tilt: float, positions: np.ndarray, place=(0.02, -0.03)) 
 
 
 def solved(
-    line: Line, t: np.ndarray, positions: np.ndarray, deviation: float | np.ndarray = 0.1, offset_sd=0.1, slope_sd=1e-4
+    line: Line,
+    t: np.ndarray,
+    positions: np.ndarray,
+    deviation: float | np.ndarray = 0.1,
+    offset_sd=0.1,
+    slope_sd=1e-4,
+    shared_sd=0.0,
 ) -> Found:
-    found = pose_on_line(line, t, positions, deviation * np.ones_like(t), offset_sd, slope_sd)
+    found = pose_on_line(line, t, positions, deviation * np.ones_like(t), offset_sd, slope_sd, shared_sd)
     assert found is not None
     return found
 
@@ -92,6 +98,16 @@ def test_the_stated_scatter_is_that_of_the_tip():
         stated = pose.tip_sd
     scatter = math.sqrt((np.array(missed) ** 2).sum(-1).mean())
     assert scatter == pytest.approx(stated, rel=4 * 0.041)
+
+
+def test_what_moves_all_places_alike_is_in_the_covariance():
+    """Slopes by differences over 0.02 px of some 300: what bends is 1e-4 of them."""
+    line, t, *_ = seen(0.5, 20, BANDS)
+    ahead, behind = solved(line, t + 0.01, BANDS), solved(line, t - 0.01, BANDS)
+    slope = np.concatenate([ahead.tip - behind.tip, ahead.direction - behind.direction]) / 0.02
+    alone, shared = solved(line, t, BANDS).covariance, solved(line, t, BANDS, shared_sd=0.3).covariance
+    expected = np.outer(slope, slope) * 0.3**2
+    np.testing.assert_allclose(shared - alone, expected, rtol=0, atol=1e-3 * np.abs(expected[:3, :3]).min())
 
 
 def test_a_direction_keeps_its_length_and_says_so():

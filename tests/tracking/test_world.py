@@ -78,8 +78,18 @@ def test_still_is_where_it_says():
         middle = tip + 0.127 * direction
         torch.testing.assert_close(middle, torch.tensor([0, 0, 0.45], dtype=torch.float64))
         assert math.degrees(math.asin(-direction[2])) == pytest.approx(20)
+    (case,) = WORLD.still(0.45, math.radians(20), 1, point=0.07)
+    tip, direction = truth(case)
+    torch.testing.assert_close(tip + 0.07 * direction, torch.tensor([0, 0, 0.45], dtype=torch.float64))
     with pytest.raises(ValueError, match="depth"):
         WORLD.still(-1.0, 0.0, 1)
+
+
+@pytest.mark.parametrize("codec", [{}, {"video": True}, {"jpeg_quality": 80}], ids=["none", "video", "jpeg"])
+def test_frames_at_rest_are_those_that_are_rendered_one_by_one(codec):
+    world = World(SIZE, look=Look(**codec))
+    for case in world.still(0.5, 0.3, 3):
+        assert torch.equal(case.frame(), world.case(case.name, truth(case)).frame())
 
 
 def test_grids_have_the_thesis_s_measures():
