@@ -77,9 +77,9 @@ def tracking() -> tuple[list[Row], dict[str, list[Row]], dict[str, bytes], list[
 
 def _share(kind: str, name: str, own: list[Answer]) -> Row:
     """One method on one kind of frames; of a negative a refusal is what is right."""
-    refused = [answer for answer in own if not answer.pose.answered]
-    answerable = sum(answer.case.answerable for answer in own)
-    lost = sum(answer.case.answerable for answer in refused)
+    refused = [answer for answer in own if not answer.answered]
+    answerable = sum(answer.answerable for answer in own)
+    lost = sum(answer.answerable for answer in refused)
     unseen = len(refused) - lost
     return {
         "frames_of": kind,
@@ -92,7 +92,7 @@ def _share(kind: str, name: str, own: list[Answer]) -> Row:
         "refused_though_answerable": lost,
         "refused_though_answerable_percent": round(100 * lost / answerable, 2) if answerable else "",
         "refused_unanswerable": unseen,
-        "wrong_cases": "; ".join(answer.case.name for answer in own if answer.wrong and name != BASE),
+        "wrong_cases": "; ".join(answer.name for answer in own if answer.wrong and name != BASE),
     }
 
 

@@ -79,14 +79,14 @@ def still(world: World, trackers: dict[str, Method], count: int) -> tuple[list[R
             own = [answer for group in groups for answer in group]
             row: Row = {"depth_mm": depth, "of": where, "tilt_deg": tilt, "method": name, "frames": len(own)}
             row |= {
-                "answered": sum(answer.pose.answered for answer in own),
+                "answered": sum(answer.answered for answer in own),
                 "s_rms_mm": "",
                 "s_rms_error_mm": "",
                 "s_rms_goal_mm": goal or "",
             }
             row |= {"sd_mm": "", "bias_mm": "", "bound_mm": round(bound, 4), "edges_bound_mm": round(of_edges, 4)}
             row |= {"efficiency": "", "coverage": ""}
-            known = [tips_of(g) for g in groups if any(a.pose.answered and b.pose.answered for a, b in pairwise(g))]
+            known = [tips_of(g) for g in groups if any(a.answered and b.answered for a, b in pairwise(g))]
             if known:
                 seen = [protocols.s_rms(tips) for tips in known]
                 sd, s_rms = (
@@ -142,7 +142,7 @@ def lights(world: World, tracker: Method, count: int, share: float = 1.0) -> lis
             if goal is not None:
                 cases = lit.still(1e-3 * depth, math.radians(tilt), max(2, count))
                 own = list(answers(cases, {light: tracker}, f"light, {light}"))
-                known = any(a.pose.answered and b.pose.answered for a, b in pairwise(own))
+                known = any(a.answered and b.answered for a, b in pairwise(own))
                 row[f"s_rms_mm_{depth}_{tilt}"] = _mm(protocols.s_rms(tips_of(own)).s_rms) if known else ""
         found = answers(lit.grid_2d()[:: max(1, round(2 / share))], {light: tracker}, f"light, {light}")
         grid = _grid_row("2D", light, list(found))
@@ -164,18 +164,18 @@ def scenes(
         cases = occlusions(world, count)
     found = list(answers(cases[:: max(1, round(1 / share))], trackers, kind))
     rows = []
-    for (name, method), own in _by(found, lambda answer: (_plain(answer.case.name), answer.method)).items():
-        errors = sorted(answer.error for answer in own if answer.pose.answered)
-        refused = [answer for answer in own if not answer.pose.answered]
+    for (name, method), own in _by(found, lambda answer: (_plain(answer.name), answer.method)).items():
+        errors = sorted(answer.error for answer in own if answer.answered)
+        refused = [answer for answer in own if not answer.answered]
         fitting: Any = ""
-        if not own[0].case.answerable:
+        if not own[0].answerable:
             right = next(says for start, says in _SAYS.items() if name.startswith(start))
             fitting = sum(answer.status in right for answer in refused)
         rows.append(
             {
                 "scene": name,
                 "method": method,
-                "answerable": own[0].case.answerable,
+                "answerable": own[0].answerable,
                 "frames": len(own),
                 "right": sum(answer.right for answer in own),
                 "wrong": sum(answer.wrong for answer in own),
@@ -184,7 +184,7 @@ def scenes(
                 "median_error_mm": _mm(errors[len(errors) // 2]) if errors else "",
                 "worst_error_mm": _mm(errors[-1]) if errors else "",
                 "statuses": told(answer.status for answer in own),
-                "reason": next((answer.pose.reason for answer in refused), ""),
+                "reason": next((answer.reason for answer in refused), ""),
             }
         )
     return rows, found
@@ -194,8 +194,8 @@ def empty(world: World, trackers: dict[str, Method], count: int) -> tuple[list[R
     """``count`` frames without the catheter, a row for each kind and method, with the names of those answered."""
     found = list(answers(negatives(world, count), trackers, "negatives"))
     rows = []
-    for (kind, method), own in _by(found, lambda answer: (_kind(answer.case.name), answer.method)).items():
-        false = [answer.case.name.split(",")[0].split()[-1] for answer in own if answer.pose.answered]
+    for (kind, method), own in _by(found, lambda answer: (_kind(answer.name), answer.method)).items():
+        false = [answer.name.split(",")[0].split()[-1] for answer in own if answer.answered]
         row: Row = {"kind": kind, "method": method, "frames": len(own), "false": len(false)}
         row["statuses"] = told(answer.status for answer in own)
         rows.append(row | {"seed": world.seed, "numbers_of_false": " ".join(false)})
@@ -209,10 +209,10 @@ def one(rows: list[Row], **wanted: Any) -> Row:
 
 def covered(own: Sequence[Answer]) -> float | str:
     """Share of answers whose 95 % ellipsoid holds the truth; "" without any."""
-    seen = [answer for answer in own if answer.pose.answered and answer.case.tip is not None]
+    seen = [answer for answer in own if answer.answered and answer.truth is not None]
     if not seen:
         return ""
-    covariance = torch.stack([answer.pose.covariance[:3, :3] for answer in seen])
+    covariance = torch.tensor([answer.covariance for answer in seen], dtype=torch.float64)
     return round(protocols.coverage(tips_of(seen), covariance, truth_of(seen))[0], 3)
 
 

@@ -31,23 +31,44 @@ Method = Callable[[Tensor, Case], Pose]
 
 
 class Answer(NamedTuple):
-    """What one method said of one frame, and in how many seconds."""
+    """What one method said of one frame, and in how many seconds.
+
+    Plain numbers: of thousands, tensors between the frames of a case would keep the memory of all of them.
+
+    Attributes:
+        name, answerable: The case's.
+        truth: Of the tip in metres; None where the frame shows no catheter.
+        tip: In metres; NaN where refused.
+        covariance: Of the tip, three rows of three, in m^2.
+    """
 
     method: str
-    case: Case
-    pose: Pose
+    name: str
+    answerable: bool
+    truth: list[float] | None
+    status: Status
+    reason: str
+    tip: list[float]
+    covariance: list[list[float]]
     seconds: float
 
+    @staticmethod
+    def of(method: str, case: Case, pose: Pose, seconds: float) -> "Answer":
+        """Of a pose that is one and no batch."""
+        assert isinstance(pose.status, Status) and isinstance(pose.reason, str)
+        truth, told = None if case.tip is None else case.tip.tolist(), (pose.status, pose.reason)
+        tip, covariance = pose.tip.tolist(), pose.covariance[:3, :3].tolist()
+        return Answer(method, case.name, case.answerable, truth, *told, tip, covariance, seconds)
+
     @property
-    def status(self) -> Status:
-        """Of the pose, which is one and no batch."""
-        assert isinstance(self.pose.status, Status)
-        return self.pose.status
+    def answered(self) -> bool:
+        """Not refused."""
+        return self.status.answered
 
     @property
     def error(self) -> float:
         """Of the tip in metres; NaN where refused or without a catheter."""
-        return math.nan if self.case.tip is None else float((self.pose.tip - self.case.tip).norm())
+        return math.nan if self.truth is None else math.dist(self.tip, self.truth)
 
     @property
     def right(self) -> bool:
@@ -57,7 +78,7 @@ class Answer(NamedTuple):
     @property
     def wrong(self) -> bool:
         """Answered, and too far away or with no catheter there."""
-        return self.pose.answered and not self.right
+        return self.answered and not self.right
 
 
 def photographs() -> tuple[Tensor, ...]:
@@ -106,7 +127,7 @@ def answers(cases: Iterable[Case], trackers: dict[str, Method], label: str = "fr
         for name, track in trackers.items():
             started = time.perf_counter()
             pose = track(frame, case)
-            yield Answer(name, case, pose, time.perf_counter() - started)
+            yield Answer.of(name, case, pose, time.perf_counter() - started)
 
 
 def as_camera(frame: Tensor) -> Tensor:
@@ -116,9 +137,9 @@ def as_camera(frame: Tensor) -> Tensor:
 
 def tips_of(own: Sequence[Answer]) -> Tensor:
     """[n, 3] in metres; NaN where refused."""
-    return torch.stack([answer.pose.tip.cpu() for answer in own])
+    return torch.tensor([answer.tip for answer in own], dtype=torch.float64)
 
 
 def truth_of(own: Sequence[Answer]) -> Tensor:
     """[n, 3] in metres, of frames with a catheter."""
-    return torch.stack([answer.case.tip for answer in own if answer.case.tip is not None])
+    return torch.tensor([answer.truth for answer in own if answer.truth is not None], dtype=torch.float64)

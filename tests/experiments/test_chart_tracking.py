@@ -17,7 +17,7 @@ from holotorch.tracking.camera import Camera
 from holotorch.tracking.pose import solve_pose
 from holotorch.tracking.render import Look
 from holotorch.tracking.status import Pose, Status
-from holotorch.tracking.world import World
+from holotorch.tracking.world import World, aimed
 
 TILT = math.radians(20)
 
@@ -102,8 +102,7 @@ def test_rows_of_a_catheter_at_rest(monkeypatch):
     numbers = ("depth_mm", "tilt_deg", "frames", "s_rms_mm", "s_rms_goal_mm", "sd_mm")
     assert [row[key] for key in numbers] == [other[key] for key in numbers]
     for place, answer in zip((0.127, 0.108), (said[0], said[10]), strict=True):
-        assert answer.case.tip is not None and answer.case.direction is not None
-        at = answer.case.tip + place * answer.case.direction
+        at = torch.tensor(answer.truth, dtype=torch.float64) + place * aimed(TILT)
         assert at[2] == pytest.approx(0.52, abs=1e-12) and at[:2].abs().max() < 0.52 / 1400
     assert (row["of"], other["of"]) == ("middle of the bands", "second edge")
 
@@ -113,7 +112,9 @@ def test_right_wrong_and_refused():
     case, none = world.still(0.52, TILT, 1)[0], world.case("nothing", None, answerable=False)
     near, far = before(case), before(case, (6e-3, 0, 0))
     cold = Pose.refused(Status.NO_AXIS, "none")
-    told = [Answer("a", *pair, 0.0) for pair in ((case, near), (case, far), (case, cold), (none, near), (none, cold))]
+    told = [
+        Answer.of("a", *pair, 0.0) for pair in ((case, near), (case, far), (case, cold), (none, near), (none, cold))
+    ]
     assert [answer.right for answer in told] == [True, False, False, False, False]
     assert [answer.wrong for answer in told] == [False, True, False, True, False]
     assert before(none).status == Status.NO_CATHETER
