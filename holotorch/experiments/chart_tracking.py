@@ -49,7 +49,7 @@ def scene() -> World:
 
 
 def tracking() -> tuple[list[Row], dict[str, list[Row]], dict[str, bytes], list[str]]:
-    """Rows of methods, further tables by name, pictures by name, and the verdict; about ten minutes on two cores."""
+    """Rows of methods, further tables by name, pictures by name, and the verdict; some 20 minutes on two cores."""
     world, amount = scene(), AMOUNT
     trackers = methods(world, (BASE, COLD, PRIOR, FEWER))
     three = {name: trackers[name] for name in (BASE, COLD, PRIOR)}
@@ -111,7 +111,7 @@ def _methods(tables: dict[str, list[Row]], said: dict[str, list[Answer]]) -> lis
             found = one(tables["grids"], grid=grid, method=name)
             row |= {f"{grid}_{key}": found[key] for key in ("median_mm", "p95_mm", "rigid_median_mm", "acc_mm")}
         for depth, tilt in STILL:
-            found = one(tables["still"], depth_mm=depth, tilt_deg=tilt, of=MIDDLE, method=name)
+            found = one(tables["still"], depth_mm=depth, tilt_deg=tilt, point=MIDDLE, method=name)
             row[f"s_rms_mm_{depth}_{tilt}"] = found["s_rms_mm"]
         # Apart: at rest it is the same few errors again and again.
         for kind in ("grids", "still"):
@@ -173,7 +173,7 @@ def _accuracy(name: str, rows: list[Row], tables: dict[str, list[Row]]) -> list[
     for row in tables["still"]:
         if row["method"] != name:
             continue
-        where, goal = f"{row['of']} at {row['depth_mm']} mm, {row['tilt_deg']} deg, {name}", row["s_rms_goal_mm"]
+        where, goal = f"{row['point']} at {row['depth_mm']} mm, {row['tilt_deg']} deg, {name}", row["s_rms_goal_mm"]
         if goal != "":
             least = round(math.sqrt(2) * row["edges_bound_mm"], 4)
             text = f"{where}: S_RMS unfiltered {row['s_rms_mm']} mm{_goal(row['s_rms_mm'], goal, '<=')}"

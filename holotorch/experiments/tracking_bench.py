@@ -60,6 +60,8 @@ _SAYS: dict[str, frozenset[Status]] = {
 def still(world: World, trackers: dict[str, Method], count: int) -> tuple[list[Row], list[Answer]]:
     """Catheters at rest, ``count`` frames at each pose of ``STILL``: stability, bias, coverage, efficiency.
 
+    With the bands' middle at that distance; where S_RMS has a goal, once more with the second edge there.
+
     Each pose is measured at five places less than a pixel apart, and spreads are the root of their mean square: where
     edges fall between pixels moves the spread at one place by a tenth and more.
     """
@@ -77,7 +79,7 @@ def still(world: World, trackers: dict[str, Method], count: int) -> tuple[list[R
         for name in trackers:
             groups = [[answer for answer in part if answer.method == name] for part in found]
             own = [answer for group in groups for answer in group]
-            row: Row = {"depth_mm": depth, "of": where, "tilt_deg": tilt, "method": name, "frames": len(own)}
+            row: Row = {"depth_mm": depth, "point": where, "tilt_deg": tilt, "method": name, "frames": len(own)}
             row |= {
                 "answered": sum(answer.answered for answer in own),
                 "s_rms_mm": "",

@@ -48,10 +48,10 @@ def _errors(axes: Axes, rows: list[Row]) -> None:
 def _precision(axes: Axes, rows: list[Row]) -> None:
     places = list(STILL)
     for name, (colour, marker) in _STYLE.items():
-        found = [one(rows, depth_mm=depth, tilt_deg=tilt, of=MIDDLE, method=name) for depth, tilt in places]
+        found = [one(rows, depth_mm=depth, tilt_deg=tilt, point=MIDDLE, method=name) for depth, tilt in places]
         values = [row["sd_mm"] if row["sd_mm"] != "" else math.nan for row in found]
         axes.semilogy(range(len(places)), values, marker, color=colour, label=name)
-    own = [one(rows, depth_mm=depth, tilt_deg=tilt, of=MIDDLE, method=BASE) for depth, tilt in places]
+    own = [one(rows, depth_mm=depth, tilt_deg=tilt, point=MIDDLE, method=BASE) for depth, tilt in places]
     for of, colour, label in (("edges_bound_mm", "gray", ", of edges"), ("bound_mm", "black", ", of all pixels")):
         bounds = [row[of] for row in own]
         axes.semilogy(range(len(places)), bounds, "_", color=colour, markersize=20, label=f"Cramér-Rao bound{label}")

@@ -104,7 +104,7 @@ def test_rows_of_a_catheter_at_rest(monkeypatch):
     for place, answer in zip((0.127, 0.108), (said[0], said[10]), strict=True):
         at = torch.tensor(answer.truth, dtype=torch.float64) + place * aimed(TILT)
         assert at[2] == pytest.approx(0.52, abs=1e-12) and at[:2].abs().max() < 0.52 / 1400
-    assert (row["of"], other["of"]) == ("middle of the bands", "second edge")
+    assert (row["point"], other["point"]) == ("middle of the bands", "second edge")
 
 
 def test_right_wrong_and_refused():
