@@ -81,8 +81,8 @@ def calibrate_photographs(
 
 
 def parse_board(words: Sequence[str]) -> Chessboard | Charuco:
-    """The board that words of the command line name; ConfigError says what is expected."""
-    kind, *rest = words or ("",)
+    """The board that words of the command line name, quoted together or not; ConfigError says what is expected."""
+    kind, *rest = " ".join(words).split() or ("",)
     sides = re.fullmatch(r"(\d{1,3})x(\d{1,3})", rest[0]) if rest else None
     wanted = {"chessboard": 1, "charuco": 2}.get(kind, -1)
     if not sides or len(rest) != (2 if wanted == 1 else 4) or wanted < 0:

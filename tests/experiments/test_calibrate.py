@@ -118,6 +118,7 @@ def test_pictures_of_every_kind_are_looked_for_in_a_folder(tmp_path):
 
 def test_boards_by_their_words():
     assert parse_board(["chessboard", "9x6", "25mm"]) == Chessboard(9, 6, 0.025)
+    assert parse_board(["chessboard 9x6 25mm"]) == Chessboard(9, 6, 0.025)  # quoted
     assert parse_board(["charuco", "5x7", "40mm", "0.02", "DICT_6X6_250"]) == Charuco(5, 7, 0.04, 0.02, "DICT_6X6_250")
 
 
