@@ -18,7 +18,7 @@ def _deviates() -> np.ndarray:
 def sensed(
     levels: np.ndarray, noise: float, video: bool, jpeg_quality: int | None, generator: torch.Generator | None
 ) -> np.ndarray:
-    """Frame uint8 [3, H, W] that sensor and codec make of levels float32 of the same shape, as a look says."""
+    """Frame uint8 [3, H, W] that sensor and codec make of levels float32 of the same shape; ``noise`` in levels."""
     frame = expose(levels, noise, generator)
     if video:
         frame = halve_colours(frame)

@@ -157,7 +157,7 @@ def mean_levels(
 ) -> np.ndarray:
     """Levels float32 [3, H, W], neither noisy nor rounded, of the frame that :func:`render` makes of the same.
 
-    ``pose`` are tip and direction.
+    ``pose`` are tip and direction, as there; so are the errors raised.
     """
     height, width = (checks.whole("size", side, 8) for side in size)
     if max(size) > _LARGEST:
