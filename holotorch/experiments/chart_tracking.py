@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 
 from holotorch.experiments.tracking_bench import (
-    MIDDLE,
     STILL,
+    TIP,
     Row,
     codecs,
     covered,
@@ -111,7 +111,7 @@ def _methods(tables: dict[str, list[Row]], said: dict[str, list[Answer]]) -> lis
             found = one(tables["grids"], grid=grid, method=name)
             row |= {f"{grid}_{key}": found[key] for key in ("median_mm", "p95_mm", "rigid_median_mm", "acc_mm")}
         for depth, tilt in STILL:
-            found = one(tables["still"], depth_mm=depth, tilt_deg=tilt, point=MIDDLE, method=name)
+            found = one(tables["still"], depth_mm=depth, tilt_deg=tilt, point=TIP, method=name)
             row[f"s_rms_mm_{depth}_{tilt}"] = found["s_rms_mm"]
         # Apart: at rest it is the same few errors again and again.
         for kind in ("grids", "still"):

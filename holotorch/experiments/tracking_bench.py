@@ -5,7 +5,7 @@ import statistics
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any
 
 import torch
@@ -28,8 +28,10 @@ STILL: dict[tuple[int, int], float | None] = {
     (520, 0): None,
     (520, 20): None,
 }
-# What lies at that distance: it moves S_RMS by a fifth and more, up at one pose and down at another.
-MIDDLE, SECOND = "middle of the bands", "second edge"
+# Which point lies at that distance, in metres from the tip; tilt brings the bands nearer to the camera than the tip. A
+# pose is told by its tip, so the first is what the goals mean; the second moves S_RMS by a half at 450 and 700 mm.
+TIP, MIDDLE = "tip", "middle of the bands"
+POINTS: dict[str, float | None] = {TIP: 0.0, MIDDLE: None}
 _CODECS: dict[str, dict[str, Any]] = {
     "none": {},
     "video 4:2:0": {"video": True},
@@ -60,7 +62,8 @@ _SAYS: dict[str, frozenset[Status]] = {
 def still(world: World, trackers: dict[str, Method], count: int) -> tuple[list[Row], list[Answer]]:
     """Catheters at rest, ``count`` frames at each pose of ``STILL``: stability, bias, coverage, efficiency.
 
-    With the bands' middle at that distance; where S_RMS has a goal, once more with the second edge there.
+    With the tip at that distance, and once more with the middle of the bands there, which is what the frame's middle
+    shows both times.
 
     Each pose is measured at five places less than a pixel apart, and spreads are the root of their mean square: where
     edges fall between pixels moves the spread at one place by a tenth and more.
@@ -68,9 +71,8 @@ def still(world: World, trackers: dict[str, Method], count: int) -> tuple[list[R
     rows, said = [], []
     pixel = 1 / float(world.camera.matrix[0, 0])
     offsets = (pixel * (torch.rand(_PLACES, 2, generator=torch.Generator().manual_seed(world.seed)) - 0.5)).tolist()
-    places = [(*place, goal, MIDDLE) for place, goal in STILL.items()]
-    for depth, tilt, goal, where in places + [(*place, goal, SECOND) for place, goal in STILL.items() if goal]:
-        place, point = (1e-3 * depth, math.radians(tilt)), None if where == MIDDLE else world.catheter.edges[1]
+    for (where, point), ((depth, tilt), goal) in product(POINTS.items(), STILL.items()):
+        place = (1e-3 * depth, math.radians(tilt))
         pose = world.pose(*place, point=point)
         bound, of_edges = (1e3 * math.sqrt(own.trace()) for own in tip_bounds(world, pose))
         parts = [world.still(*place, max(2, count // _PLACES), at, point) for at in offsets]
@@ -142,7 +144,7 @@ def lights(world: World, tracker: Method, count: int, share: float = 1.0) -> lis
         row: Row = {"light": light}
         for (depth, tilt), goal in STILL.items():
             if goal is not None:
-                cases = lit.still(1e-3 * depth, math.radians(tilt), max(2, count))
+                cases = lit.still(1e-3 * depth, math.radians(tilt), max(2, count), point=POINTS[TIP])
                 own = list(answers(cases, {light: tracker}, f"light, {light}"))
                 known = any(a.answered and b.answered for a, b in pairwise(own))
                 row[f"s_rms_mm_{depth}_{tilt}"] = _mm(protocols.s_rms(tips_of(own)).s_rms) if known else ""

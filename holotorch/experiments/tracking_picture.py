@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from holotorch.experiments.tracking_bench import MIDDLE, STILL, Row, one
+from holotorch.experiments.tracking_bench import STILL, TIP, Row, one
 from holotorch.experiments.tracking_methods import BASE, COLD, FEWER, PRIOR
 
 _FALSE, _RIGHT, _REFUSED = "tab:red", "tab:green", "lightgray"
@@ -48,15 +48,15 @@ def _errors(axes: Axes, rows: list[Row]) -> None:
 def _precision(axes: Axes, rows: list[Row]) -> None:
     places = list(STILL)
     for name, (colour, marker) in _STYLE.items():
-        found = [one(rows, depth_mm=depth, tilt_deg=tilt, point=MIDDLE, method=name) for depth, tilt in places]
+        found = [one(rows, depth_mm=depth, tilt_deg=tilt, point=TIP, method=name) for depth, tilt in places]
         values = [row["sd_mm"] if row["sd_mm"] != "" else math.nan for row in found]
         axes.semilogy(range(len(places)), values, marker, color=colour, label=name)
-    own = [one(rows, depth_mm=depth, tilt_deg=tilt, point=MIDDLE, method=BASE) for depth, tilt in places]
+    own = [one(rows, depth_mm=depth, tilt_deg=tilt, point=TIP, method=BASE) for depth, tilt in places]
     for of, colour, label in (("edges_bound_mm", "gray", ", of edges"), ("bound_mm", "black", ", of all pixels")):
         bounds = [row[of] for row in own]
         axes.semilogy(range(len(places)), bounds, "_", color=colour, markersize=20, label=f"Cramér-Rao bound{label}")
     axes.set_xticks(range(len(places)), [f"{depth} mm\n{tilt}°" for depth, tilt in places])
-    axes.set_xlabel("distance of the bands' middle and their tilt")
+    axes.set_xlabel("distance of the tip and tilt")
     axes.set_ylabel("sd of a resting tip, unfiltered (mm)")
     axes.set_title("synthetic frames")
     axes.grid(alpha=0.3, which="both")

@@ -120,15 +120,23 @@ class World:
         at: Sequence[float] = (0.0, 0.0),
         point: float | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Tip and direction with a point of the catheter at ``depth`` on the ray through ``at`` on the plane z = 1.
+        """Tip and direction with the middle of the bands on the ray through ``at`` on the plane z = 1.
 
-        The ``point`` is so many metres from the tip; None for the middle of the bands.
+        At ``depth``, along the optical axis, lies the ``point`` so many metres from the tip; None for that middle.
+
+        Raises:
+            ValueError: No depth, or the bands' middle is not in front of the camera.
         """
         checks.positive("depth", depth, "metres")
         direction = aimed(tilt, roll)
-        if point is None:
-            point = (self.catheter.edges[0] + self.catheter.edges[-1]) / 2
-        return depth * torch.tensor([*at, 1.0], dtype=torch.float64) - point * direction, direction
+        middle = (self.catheter.edges[0] + self.catheter.edges[-1]) / 2
+        ahead = depth + (0.0 if point is None else (middle - checks.finite("point", point)) * float(direction[2]))
+        if ahead <= 0:
+            got = f"{ahead:.3g} m with the point {point:g} m from the tip at depth {depth:g} m"
+            raise ValueError(
+                f"the middle of the bands must lie in front of the camera, got {got}; tilt less or go further"
+            )
+        return ahead * torch.tensor([*at, 1.0], dtype=torch.float64) - middle * direction, direction
 
     def _noise(self, name: str) -> torch.Generator:
         """Of the frame of this name: the same at each call."""

@@ -101,10 +101,11 @@ def test_rows_of_a_catheter_at_rest(monkeypatch):
     # The same once more, with another point at the same distance.
     numbers = ("depth_mm", "tilt_deg", "frames", "s_rms_mm", "s_rms_goal_mm", "sd_mm")
     assert [row[key] for key in numbers] == [other[key] for key in numbers]
-    for place, answer in zip((0.127, 0.108), (said[0], said[10]), strict=True):
-        at = torch.tensor(answer.truth, dtype=torch.float64) + place * aimed(TILT)
-        assert at[2] == pytest.approx(0.52, abs=1e-12) and at[:2].abs().max() < 0.52 / 1400
-    assert (row["point"], other["point"]) == ("middle of the bands", "second edge")
+    for place, answer in zip((0.0, 0.127), (said[0], said[10]), strict=True):
+        tip = torch.tensor(answer.truth, dtype=torch.float64)
+        assert (tip + place * aimed(TILT))[2] == pytest.approx(0.52, abs=1e-12)
+        assert (tip + 0.127 * aimed(TILT))[:2].abs().max() < 0.52 / 1400
+    assert (row["point"], other["point"]) == ("tip", "middle of the bands")
 
 
 def test_right_wrong_and_refused():

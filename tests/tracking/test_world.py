@@ -78,11 +78,18 @@ def test_still_is_where_it_says():
         middle = tip + 0.127 * direction
         torch.testing.assert_close(middle, torch.tensor([0, 0, 0.45], dtype=torch.float64))
         assert math.degrees(math.asin(-direction[2])) == pytest.approx(20)
-    (case,) = WORLD.still(0.45, math.radians(20), 1, point=0.07)
-    tip, direction = truth(case)
-    torch.testing.assert_close(tip + 0.07 * direction, torch.tensor([0, 0, 0.45], dtype=torch.float64))
+    for point, at in ((0.0, (0.0, 0.0)), (0.07, (0.05, -0.02))):
+        (case,) = WORLD.still(0.45, math.radians(20), 1, at, point)
+        tip, direction = truth(case)
+        assert float((tip + point * direction)[2]) == pytest.approx(0.45, abs=1e-12)
+        middle = tip + 0.127 * direction
+        torch.testing.assert_close(middle[:2] / middle[2], torch.tensor(at, dtype=torch.float64))
     with pytest.raises(ValueError, match="depth"):
         WORLD.still(-1.0, 0.0, 1)
+    with pytest.raises(ValueError, match="point"):
+        WORLD.pose(0.45, 0.0, point=math.nan)
+    with pytest.raises(ValueError, match="in front of the camera, got -0.02"):
+        WORLD.pose(0.1, math.radians(75), point=0.0)
 
 
 @pytest.mark.parametrize("codec", [{}, {"video": True}, {"jpeg_quality": 80}], ids=["none", "video", "jpeg"])
