@@ -175,16 +175,15 @@ def measure_edges(
             t[chosen] = near + fit.place
             return measure_edges(sampler, lens, axis, t, doubtful, median(fit.blur[known]), curve)
         coarse = bool(np.any(coarse_colours(sampler, pixels[[0, -1], len(along) // 2, half])))
-        shading = fit
+        shading, looks = fit, looks - 1
         if coarse:
             fit, shading = fit_luma(fit, light, shown, sampler.light, along)
-        elif bool((fit.deviation > _UNSURE).any()):
+        elif bool((fit.deviation > _UNSURE).any()) and not _astray(fit, looks):
             # Surroundings that are not even leak into the outer rows; those in the middle may tell all the same.
             core = (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)
             fit = shading = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur, t=along))
-        near, looks = near + fit.place, looks - 1
-        lost = np.count_nonzero(fit.deviation < _LOST) < 2  # there is nothing to look at once more
-        if not looks or lost or float(np.abs(fit.place).max()) < _AWAY:
+        near = near + fit.place
+        if not _astray(fit, looks):
             break
     near = near - bulge * front.shift(shading.steps, shading.told, row)
     blurs = fit.blur[np.isfinite(fit.deviation)]
@@ -214,6 +213,12 @@ def measure_edges(
         tuple(hidden),
         tuple(outside),
     )
+
+
+def _astray(fit: EdgeFit, looks: int) -> bool:
+    """Whether edges are far from where they were looked for, and there are ``looks`` left to look at them once more."""
+    some = int(np.count_nonzero(fit.deviation < _LOST))
+    return looks > 0 and some >= 2 and float(np.abs(fit.place).max()) >= _AWAY
 
 
 def _sides(widths: np.ndarray, blur: float) -> np.ndarray:

@@ -146,24 +146,29 @@ def measure_width(
     ``axis`` is that of a tube ``wide`` (at t = 0, and its taper, ``known`` to a share). Where the tube reaches beyond
     the stations, ``look`` (at a width and a blur) sees it anew.
     """
-    width = axis
-    if known < THIRD:
+    narrow = not stations.show(axis.width, axis.blur)
+    if narrow:
+        stations = look(axis.width, axis.blur)
+    rough = stations.rough_width()
+    if known >= THIRD:
+        axis = width = measure_axis(stations, wide, known, axis.blur) if narrow else axis
+    elif abs(rough - wide[0]) >= max(_OTHER, 0.25 * wide[0]):
+        width = measure_axis(stations, (rough, 0.0), THIRD, _SHARP)
+    else:
         # Beginning with a width that is nearly right, gloss is not taken for it.
-        rough = stations.rough_width()
-        if abs(rough - wide[0]) < max(_OTHER, 0.25 * wide[0]):
-            width = _axis(stations, axis.fit.given(wide, THIRD, known))
-            if abs(width.width - wide[0]) > _LINEAR * wide[0]:
-                width = measure_axis(stations, wide, THIRD, axis.blur, axis)
-        else:
-            width = measure_axis(stations, (rough, 0.0), THIRD, _SHARP)
-    if not stations.show(width.width, width.blur):
-        stations = look(width.width, width.blur)
-        other = abs(width.width - wide[0]) > 3 * width.width_sd
-        axis = measure_axis(stations, wide, known, width.blur)
-        own = (width.width, width.taper) if other else wide
-        width = measure_axis(stations, own, THIRD, width.blur, None if other else axis)
-        if width.width_sd > _SLOW * wide[0]:  # width against blur: a long valley, and steps are small
-            width = measure_axis(stations, (width.width, width.taper), THIRD, width.blur)
+        width = _axis(stations, axis.fit.given(wide, THIRD, known))
+        if narrow or abs(width.width - wide[0]) > _LINEAR * wide[0]:
+            width = measure_axis(stations, wide, THIRD, axis.blur, axis)
+    if stations.show(width.width, width.blur):
+        axis = measure_axis(stations, wide, known, width.blur) if narrow and known < THIRD else axis
+        return stations, axis, width
+    stations = look(width.width, width.blur)
+    other = abs(width.width - wide[0]) > 3 * width.width_sd
+    axis = measure_axis(stations, wide, known, width.blur)
+    own = (width.width, width.taper) if other else wide
+    width = measure_axis(stations, own, THIRD, width.blur, None if other else axis)
+    if width.width_sd > _SLOW * wide[0]:  # width against blur: a long valley, and steps are small
+        width = measure_axis(stations, (width.width, width.taper), THIRD, width.blur)
     return stations, axis, width
 
 
