@@ -56,6 +56,7 @@ def _precision(axes: Axes, rows: list[Row]) -> None:
         bounds = [row[of] for row in own]
         axes.semilogy(range(len(places)), bounds, "_", color=colour, markersize=20, label=f"Cramér-Rao bound{label}")
     axes.set_xticks(range(len(places)), [f"{depth} mm\n{tilt}°" for depth, tilt in places])
+    axes.set_ylim(top=8 * axes.get_ylim()[1])  # room for the legend
     axes.set_xlabel("distance of the tip and tilt")
     axes.set_ylabel("sd of a resting tip, unfiltered (mm)")
     axes.set_title("synthetic frames")
