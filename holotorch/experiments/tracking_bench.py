@@ -29,7 +29,7 @@ STILL: dict[tuple[int, int], float | None] = {
     (520, 20): None,
 }
 # Which point lies at that distance, in metres from the tip; tilt brings the bands nearer to the camera than the tip. A
-# pose is told by its tip, so the first is what the goals mean; the second moves S_RMS by a half at 450 and 700 mm.
+# pose is told by its tip, so that is how the goals are read; the second moves S_RMS by a half at 450 and 700 mm.
 TIP, MIDDLE = "tip", "middle of the bands"
 POINTS: dict[str, float | None] = {TIP: 0.0, MIDDLE: None}
 _CODECS: dict[str, dict[str, Any]] = {
