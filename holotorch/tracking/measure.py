@@ -216,7 +216,7 @@ def measure_edges(
 
 
 def _astray(fit: EdgeFit, looks: int) -> bool:
-    """Whether edges are far from where they were looked for, and there are ``looks`` left to look at them once more."""
+    """Whether an edge is 2 px and more from where it was looked for, with ``looks`` left and two edges to look at."""
     some = int(np.count_nonzero(fit.deviation < _LOST))
     return looks > 0 and some >= 2 and float(np.abs(fit.place).max()) >= _AWAY
 

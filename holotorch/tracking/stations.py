@@ -143,8 +143,9 @@ def measure_width(
 ) -> tuple[Stations, Axis, Axis]:
     """Stations, axis, and one more axis whose width is its own, to check with.
 
-    ``axis`` is that of a tube ``wide`` (at t = 0, and its taper, ``known`` to a share). Where the tube reaches beyond
-    the stations, ``look`` (at a width and a blur) sees it anew.
+    ``axis`` is that of a tube ``wide`` (pixels at t = 0, and its taper per pixel, ``known`` to a share). Where the tube
+    reaches beyond the stations, ``look`` (at a width and a blur in pixels) sees it anew: by the axis before its width
+    is measured, and once more by that width. Refusals are those of :func:`look_across` and :func:`measure_axis`.
     """
     narrow = not stations.show(axis.width, axis.blur)
     if narrow:

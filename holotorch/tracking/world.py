@@ -120,12 +120,14 @@ class World:
         at: Sequence[float] = (0.0, 0.0),
         point: float | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Tip and direction with the middle of the bands on the ray through ``at`` on the plane z = 1.
+        """Tip in metres and direction, float64 [3] each, with the bands' middle on the ray through ``at`` on z = 1.
 
-        At ``depth``, along the optical axis, lies the ``point`` so many metres from the tip; None for that middle.
+        At ``depth``, in metres along the optical axis, lies the ``point`` so many metres from the tip; None for that
+        middle. ``tilt`` and ``roll`` are in radians, as of :func:`aimed`.
 
         Raises:
-            ValueError: No depth, or the bands' middle is not in front of the camera.
+            TypeError, ValueError: ``depth`` not above 0, ``point`` not finite, or the bands' middle not in front of the
+                camera.
         """
         checks.positive("depth", depth, "metres")
         direction = aimed(tilt, roll)
@@ -134,7 +136,7 @@ class World:
         if ahead <= 0:
             got = f"{ahead:.3g} m with the point {point:g} m from the tip at depth {depth:g} m"
             raise ValueError(
-                f"the middle of the bands must lie in front of the camera, got {got}; tilt less or go further"
+                f"the middle of the bands must lie in front of the camera, got {got}; tilt less or go farther"
             )
         return ahead * torch.tensor([*at, 1.0], dtype=torch.float64) - middle * direction, direction
 
