@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.special import erf
 
-from holotorch.tracking.fits import BLUNTEST, SHARPEST, erf, median
+from holotorch.tracking.fits import BLUNTEST, SHARPEST, median
 
 _STEPS = 8
 _SETTLED = 0.03  # pixels, of middle and blur: the step after is a third of it; gloss and shadow move a middle by more

@@ -7,12 +7,13 @@ In linear light, and what need not be known (levels of each row and channel) is 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
-import torch
+from scipy.special import ndtr
 
 _STEPS = 8
-_ENDS = np.array([[0.06], [0.16]])  # of a blur, or samples, of place and blur: the steps after are a twentieth,
+_ENDS = 0.06, 0.16  # of a blur, or samples, of place and blur: the steps after are a twentieth,
 _NEAR = 0.03  # and of places two more follow, the last of them so small
 _SHARED = 1.2  # neighbours share pixels: how much larger deviations are than of samples that do not, measured
 _STRANGE = 1.5  # what is left, over its white part: above it the model misses something, and averaging does not help
@@ -20,27 +21,8 @@ _OWN = 1.4  # of the same: how far apart shading and gloss put the places of cha
 _OTHER = 4.0  # standard deviations of an edge's own blur
 SHARPEST, BLUNTEST = 0.35, 10.0  # pixels, standard deviation of an edge
 
-_ALONE = 1000  # numbers, and fewer, of which one thread takes the error function
-
 # Of an edge: (t [T], place [E], blur [E]), all in samples, to what it is there and its slopes to both, [E, 3, T].
 Shape = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-
-
-def erf(z: np.ndarray) -> np.ndarray:
-    """The error function, which NumPy lacks.
-
-    Of more than some 1,200 numbers torch's is shared out among threads, and where others keep the processor busy the
-    wait for these is a thousand times as long as the work.
-    """
-    if z.size <= _ALONE:
-        return torch.erf(torch.from_numpy(z)).numpy()
-    parts = torch.from_numpy(np.ascontiguousarray(z)).view(-1).split(_ALONE)
-    return torch.cat([torch.erf(part) for part in parts]).numpy().reshape(z.shape)
-
-
-def rise(z: np.ndarray) -> np.ndarray:
-    """The normal distribution's cumulative function, from 0 to 1; to 1e-16, not of itself."""
-    return 0.5 + 0.5 * erf(z * math.sqrt(0.5))
 
 
 def median(values: np.ndarray) -> float:
@@ -83,7 +65,7 @@ def normal_step(t: np.ndarray, place: np.ndarray, sigma: np.ndarray) -> np.ndarr
     """A step from 0 to 1 at ``place`` [E], blurred by ``sigma`` [E], at t [T]; and its slopes to both: [E, 3, T]."""
     z = (t - place[:, None]) / sigma[:, None]
     found = np.empty((len(z), 3, len(t)))
-    found[:, 0] = rise(z)
+    found[:, 0] = ndtr(z)
     found[:, 1] = np.exp(-0.5 * z * z) / (-math.sqrt(2 * math.pi) * sigma[:, None])
     np.multiply(found[:, 1], z, out=found[:, 2])
     return found
@@ -105,109 +87,131 @@ def fit_edges(
         shape: Of an edge: a step in light, unless something else is told of it.
         t: [T], where the samples lie, rising, as far to one side of the middle as to the other; one apart by itself.
     """
-    rows = light.shape[2:]
-    light, weight = (given.reshape(*given.shape[:2], -1).astype(np.float64) for given in (light, weight))  # [E, T, U C]
+    rows, flat = light.shape[2:], (*light.shape[:2], -1)  # [E, T, U C]
+    light, weight = (np.ascontiguousarray(given, dtype=np.float64).reshape(flat) for given in (light, weight))
     t = np.arange(light.shape[1]) - (light.shape[1] - 1) / 2 if t is None else t
     far = float(t[-1])
-    place, sigma = np.zeros(len(light)), np.full(len(light), blur)
     total = np.maximum(weight.sum(1), 1e-30)
     mean = (weight * light).sum(1) / total
     centred = light - mean[:, None]
-    given = weight, weight * centred, total
-    sure = place
+    given = np.concatenate([weight, weight * centred], 2), total
+    # What is known of each edge is a few plain numbers: calls into NumPy would cost several times as much.
+    edges = range(len(light))
+    place, sigma, sure = [0.0 for _ in edges], [blur for _ in edges], [0.0 for _ in edges]
     for _ in range(_STEPS):
-        (pp, pb, bb), (p, b), *_ = _edge_terms(shape(t, place, sigma), *given)
-        sure = (bb - pb * pb / np.maximum(pp, 1e-30)).clip(0, 1e12)  # inverse variance of the blur
-        # An edge without weight has 0 / 0: it stays where it is, of infinite deviation.
-        whole = (1 + 1e-6) * pp * bb - pb * pb
-        whole[~(whole > 0)] = np.inf
-        step = (np.array([bb * p - pb * b, pp * b - pb * p]) / whole).clip(-1.5, 1.5)
-        place, sigma = (place + step[0]).clip(-far, far), (sigma + step[1]).clip(SHARPEST, BLUNTEST)
-        if bool((np.abs(step) < _ENDS * np.maximum(sigma, 1.0)).all()):
+        settled = True
+        terms = _edge_terms(shape(t, np.array(place), np.array(sigma)), *given)
+        for e, (((pp, pb), (_, bb)), (p, b)) in enumerate(terms.sums):
+            sure[e] = _within(bb - pb * pb / max(pp, 1e-30), 0.0, 1e12)  # inverse variance of the blur
+            whole = (1 + 1e-6) * pp * bb - pb * pb
+            if whole > 0:  # an edge without weight has 0 / 0: it stays where it is, of infinite deviation
+                along = _within((bb * p - pb * b) / whole, -1.5, 1.5)
+                wider = _within((pp * b - pb * p) / whole, -1.5, 1.5)
+                place[e] = _within(place[e] + along, -far, far)
+                sigma[e] = _within(sigma[e] + wider, SHARPEST, BLUNTEST)
+                least = max(sigma[e], 1.0)
+                settled = settled and abs(along) < _ENDS[0] * least and abs(wider) < _ENDS[1] * least
+        if settled:
             break
     # One lens blurs all edges alike. Where one side is dark and so has little noise, place and blur are hard to tell
     # apart, edge by edge; together they are not.
-    common = (sure * sigma).sum() / max(sure.sum(), 1e-30)
-    alike = (np.abs(sigma / max(common, 1e-30) - 1) < 0.5) & (sure > 0)
-    other = ~alike & ((sigma - common) ** 2 * sure > _OTHER**2)  # surely not blurred by that lens
-    together = max((sure * alike).sum(), 1e-30)
-    sigma = np.where(alike, (sure * alike * sigma).sum() / together, sigma)
+    common = max(sum(s * width for s, width in zip(sure, sigma, strict=True)) / max(sum(sure), 1e-30), 1e-30)
+    alike = [abs(width / common - 1) < 0.5 and s > 0 for s, width in zip(sure, sigma, strict=True)]
+    together = max(sum(s for s, one in zip(sure, alike, strict=True) if one), 1e-30)
+    shared = sum(s * width for s, width, one in zip(sure, sigma, alike, strict=True) if one) / together
+    # Others surely are not blurred by that lens.
+    other = [not alike[e] and (sigma[e] - common) ** 2 * sure[e] > _OTHER**2 for e in edges]
+    sigma = np.array([shared if alike[e] else sigma[e] for e in edges])
     more = 2
     while True:
-        (pp, pb, _), (p, _), amplitude, middle, up, own = _edge_terms(shape(t, place, sigma), *given)
-        move = (p / np.maximum(pp, 1e-30)).clip(-0.5, 0.5)
-        place, more = (place + move).clip(-far, far), more - 1
-        if not more or float(np.abs(move).max()) < _NEAR:
+        terms, settled = _edge_terms(shape(t, np.array(place), sigma), *given), True
+        for e, (((pp, _), _), (p, _)) in enumerate(terms.sums):
+            move = _within(p / max(pp, 1e-30), -0.5, 0.5)
+            place[e] = _within(place[e] + move, -far, far)
+            settled = settled and abs(move) < _NEAR
+        more -= 1
+        if settled or not more:
             break
-    left = centred - amplitude[:, None] * (up[..., None] - middle[:, None])
-    used = weight > 0
-    free = used.sum((1, 2)) - 2 * used.any(1).sum(1) - 2
-    noise = np.sqrt((weight * left * left).sum((1, 2)) / np.maximum(free, 1))
-    some = np.maximum(pp, 1e-30)
-    variance = 1 / some + (pb / some) ** 2 / np.maximum(np.where(alike, together, sure), 1e-12)
-    # What varies from sample to sample is noise; what does not is something else that the edge is mixed with.
+    left = centred - terms.amplitude[:, None] * (terms.rise[..., None] - terms.middle[:, None])
     bent = left[:, 2:] - 2 * left[:, 1:-1] + left[:, :-2]
-    rough = (weight[:, 1:-1] * bent * bent).sum((1, 2)) / np.maximum(used[:, 1:-1].sum((1, 2)), 1) / 6
-    strange = noise / np.maximum(np.sqrt(rough), 1e-9)
-    doubt = np.maximum(strange / _STRANGE, 1) ** 2
-    good = (pp > 0) & np.isfinite(variance) & (free > 0) & ~other
-    deviation = np.where(good, _SHARED * np.sqrt(variance) * np.maximum(noise, 0.5) * doubt, np.inf)
-    slope, taken, bell = own
-    told = ((bell * bell)[:, None] @ weight)[:, 0]
+    whole = (weight * left * left).sum((1, 2)).tolist()
+    rough = (weight[:, 1:-1] * bent * bent).sum((1, 2)).tolist()
+    used = weight > 0
+    each = used.sum(1)  # [E, U C]
+    count, levels = each.sum(1).tolist(), np.count_nonzero(each, 1).tolist()
+    ends = used[:, :: len(t) - 1].sum((1, 2)).tolist()
+    noise, deviation = [], []
+    for e, (((pp, pb), _), _) in enumerate(terms.sums):
+        free = count[e] - 2 * levels[e] - 2
+        noise.append(math.sqrt(whole[e] / max(free, 1)))
+        some = max(pp, 1e-30)
+        variance = 1 / some + pb / some * (pb / some) / max(together if alike[e] else sure[e], 1e-12)
+        # What varies from sample to sample is noise; what does not is something else that the edge is mixed with.
+        strange = noise[e] / max(math.sqrt(rough[e] / (6 * max(count[e] - ends[e], 1))), 1e-9)
+        doubt = max(strange / _STRANGE, 1) ** 2
+        good = pp > 0 and math.isfinite(variance) and free > 0 and not other[e]
+        deviation.append(_SHARED * math.sqrt(variance) * max(noise[e], 0.5) * doubt if good else math.inf)
+    noise, deviation = np.array(noise), np.array(deviation)
+    good = np.isfinite(deviation)
     # Of an edge that is none, such as one whose other side lies beyond the frame, all of these are rounding.
-    every = told[good], amplitude[good], np.maximum(noise[good], 0.5), slope[good], taken[good]
-    apart = _apart(*every, rows[-1]) if good.any() else 1.0
-    steps, levels, told = (v.reshape(-1, *rows) for v in (amplitude, mean - amplitude * middle, told))
-    return EdgeFit(place, sigma, apart * deviation, noise, steps, levels, told, np.full(len(place), apart))
+    apart = _apart(terms.slope[good], terms.own[good], noise[good], rows[-1]) if good.any() else 1.0
+    levels = mean - terms.amplitude * terms.middle
+    steps, levels, told = (v.reshape(-1, *rows) for v in (terms.amplitude, levels, terms.told))
+    place, alike = np.array(place), np.full(len(place), apart)
+    return EdgeFit(place, sigma, apart * deviation, noise, steps, levels, told, alike)
 
 
-def _apart(
-    told: np.ndarray, amplitude: np.ndarray, noise: np.ndarray, slope: np.ndarray, taken: np.ndarray, colours: int
-) -> float:
+class _Terms(NamedTuple):
+    """Of edges [E] of rows and channels [R], of a given place and blur.
+
+    ``sums`` are entries of the normal matrix for place and blur, and slopes: ((pp, pb), (pb, bb)), (p, b) of each edge,
+    over all rows and channels. Of each of these ``own`` [E, R] is pp and ``slope`` p; ``told`` is pp of a step of 1,
+    had it and the levels been known. ``amplitude`` [E, R] of steps; ``rise`` [E, T] and its means ``middle`` [E, R].
+    """
+
+    sums: list[tuple[list[list[float]], list[float]]]
+    own: np.ndarray
+    slope: np.ndarray
+    told: np.ndarray
+    amplitude: np.ndarray
+    middle: np.ndarray
+    rise: np.ndarray
+
+
+def _edge_terms(shape: np.ndarray, weights: np.ndarray, total: np.ndarray) -> _Terms:
+    """Of edges and their slopes [E, 3, T]; ``weights`` [E, T, 2 R], and light times it; ``total`` over T [E, R]."""
+    rows = total.shape[1]
+    # Weighted moments over T, of each row and channel; less what levels explain.
+    first = shape @ weights
+    first, light = first[..., :rows], first[..., rows:]
+    products = (shape[:, :, None] * shape[:, None]).reshape(len(shape), 9, -1)
+    raw = (products @ weights[..., :rows]).reshape(len(shape), 3, 3, rows)
+    means = first / total[:, None]
+    second = raw - first[:, :, None] * means[:, None]
+    across, power = second[:, 0, 1:], np.maximum(second[:, 0, 0], 1e-30)
+    amplitude = light[:, 0] / power
+    each = amplitude[:, None]
+    slopes = (light[:, 1:] - across * each) * each
+    # What the rise itself explains is taken out of its slopes (Kaufman's form).
+    normal = second[:, 1:, 1:] - across[:, :, None] * (across / power[:, None])[:, None]
+    normal *= (each * each)[:, None]
+    sums = list(zip(normal.sum(-1).tolist(), slopes.sum(-1).tolist(), strict=True))
+    return _Terms(sums, normal[:, 0, 0], slopes[:, 0], raw[:, 1, 1], amplitude, means[:, 0], shape[:, 0])
+
+
+def _within(value: float, least: float, most: float) -> float:
+    return min(max(value, least), most)
+
+
+def _apart(slope: np.ndarray, power: np.ndarray, noise: np.ndarray, colours: int) -> float:
     """How much farther apart the channels put edges than noise does, 1 or more.
 
     Codecs keep colours at half the resolution of the luma, often half a pixel aside, and blur them in levels instead of
-    light. No one place is right for all channels then, and all edges suffer alike.
+    light. No one place is right for all channels then, and all edges suffer alike. Of slope and normal matrix [E, R]
+    for a place of its own in each row and channel.
     """
-    power = told * amplitude**2
-    power = power - (taken**2).reshape(len(power), 2, -1).sum(1)  # normal matrix for a place of its own in each row
     slope, power = (value.reshape(len(value), -1, colours).sum(1) for value in (slope, power))
     power = np.maximum(power, 1e-30)
     spread = (slope * slope / power).sum(1) - slope.sum(1) ** 2 / power.sum(1)
-    return math.sqrt(max(1.0, (spread / noise**2).sum() / ((_SHARED * _OWN) ** 2 * len(slope) * max(1, colours - 1))))
-
-
-def _edge_terms(shape: np.ndarray, weight: np.ndarray, weighted: np.ndarray, total: np.ndarray):
-    """Normal matrix (pp, pb, bb) and slope (p, b) [E] for place and blur, amplitudes and means [E, U C], rise [E, T].
-
-    And what :func:`_apart` needs of the last.
-
-    ``weight`` and ``weighted`` (light times it) are [E, T, U C], their ``total`` over T [E, U C].
-    """
-    basis = np.empty((len(shape), 6, shape.shape[2]))  # the edge, its slopes, and all three times the edge
-    basis[:, :3] = shape
-    np.multiply(shape, shape[:, :1], out=basis[:, 3:])
-    # Weighted moments over T, for each row and channel.
-    moments = basis @ weight
-    means, with_light = moments[:, :3] / total[:, None], basis[:, :3] @ weighted
-    second = moments[:, 3:] - moments[:, :1] * means
-    power = np.maximum(second[:, :1], 1e-30)
-    amplitude = with_light[:, :1] / power
-    each = (with_light[:, 1:] - second[:, 1:] * amplitude) * amplitude
-    slopes = each.sum(-1)
-    # What the rise itself, and the levels, explain is taken out of its slopes (Kaufman's form).
-    square = (amplitude * amplitude).swapaxes(1, 2)
-    raw = (basis[:, 1:3] * (weight @ square).swapaxes(1, 2)) @ basis[:, 1:3].swapaxes(1, 2)
-    taken = np.concatenate(
-        [moments[:, 1:3] * (amplitude / np.sqrt(total[:, None])), second[:, 1:] * (amplitude / np.sqrt(power))], -1
-    )
-    normal = raw - taken @ taken.swapaxes(1, 2)
-    entries = normal[:, 0, 0], normal[:, 0, 1], normal[:, 1, 1]
-    return (
-        entries,
-        (slopes[:, 0], slopes[:, 1]),
-        amplitude[:, 0],
-        means[:, 0],
-        shape[:, 0],
-        (each[:, 0], taken[:, 0], shape[:, 1]),
-    )
+    excess = (spread / np.maximum(noise, 0.5) ** 2).sum() / ((_SHARED * _OWN) ** 2 * len(slope) * max(1, colours - 1))
+    return math.sqrt(max(1.0, excess))

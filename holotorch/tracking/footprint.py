@@ -66,8 +66,9 @@ class Front:
     def of(u: np.ndarray, widths: np.ndarray, blur: float) -> "Front":
         """In rows ``u`` from the mid-line of tubes so wide [E], all in pixels; ``blur`` of bilinear samples' sides."""
         sigma = math.sqrt(max(blur**2 - _INTERPOLATED, SHARPEST**2))
-        bell = np.exp(-0.5 * ((u[:, None] - widths[:, None, None] / 2 * _NODES) / sigma) ** 2) + 1e-30
-        change, bulge = np.split(bell @ _BOTH, 2, -1)
+        z = (u[:, None] - widths[:, None, None] / 2 * _NODES) * (math.sqrt(0.5) / sigma)
+        both = (np.exp(-z * z) + 1e-30) @ _BOTH
+        change, bulge = both[..., : _LIT.shape[1]], both[..., _LIT.shape[1] :]
         return Front(bulge[..., 0] / change[..., 0], change, bulge)
 
     def shift(self, steps: np.ndarray, told: np.ndarray, row: np.ndarray) -> np.ndarray:

@@ -24,15 +24,15 @@ class Lens:
         (self._fx, _, self._cx), (_, self._fy, self._cy), _ = camera.matrix.tolist()
         self._k1, self._k2, self._p1, self._p2, self._k3 = camera.distortion.tolist()
         self.scale = (self._fx + self._fy) / 2
+        self._slim = (self._fx - self._fy) / 2
         self.light = camera.table().detach().cpu().numpy()
 
     def distort(self, plane: Points) -> Points:
         """Pixels of points on the plane z = 1."""
-        bent = self._bent(plane)
-        pixels = np.empty_like(bent)
-        pixels.real = bent.real * self._fx + self._cx
-        pixels.imag = bent.imag * self._fy + self._cy
-        return pixels
+        pixels = self._bent(plane)
+        slim = pixels.conj() * self._slim if self._slim else 0.0  # fx x + i fy y, in few calls
+        pixels *= self.scale
+        return pixels + (slim + complex(self._cx, self._cy))
 
     def undistort(self, pixels: Points) -> Points:
         """Points [n] on the plane z = 1 of pixels [n]; NaN where there is none."""
@@ -55,10 +55,14 @@ class Lens:
         return found[:, 0] + 1j * found[:, 1]
 
     def _radial(self, square: np.ndarray) -> np.ndarray:
-        return 1 + square * (self._k1 + square * (self._k2 + square * self._k3))
+        most = self._k2 + square * self._k3 if self._k3 else self._k2
+        return 1 + square * (self._k1 + square * most)
 
     def _bent(self, plane: Points) -> Points:
         x, y = plane.real, plane.imag
         square = x * x + y * y
-        radial = self._radial(square) + 2 * (self._p2 * x + self._p1 * y)
-        return plane * radial + complex(self._p2, self._p1) * square
+        radial = self._radial(square)
+        if self._p1 or self._p2:
+            radial += (plane * complex(2 * self._p2, -2 * self._p1)).real
+            return plane * radial + complex(self._p2, self._p1) * square
+        return plane * radial

@@ -35,17 +35,18 @@ def coarse_colours(sampler: Sampler, pixels: Points) -> np.ndarray:
     both[0] = _LUMA[0] * patch[0] + _LUMA[1] * patch[1] + _LUMA[2] * patch[2]
     both[1] = patch[0] - both[0]
     step = both[..., 1:] - both[..., :-1]
-    bend = _median(np.abs(step[..., 1:] - step[..., :-1]))
-    step = np.abs(step)
-    even, odd = (_median(step[1, ..., first::2]) for first in (0, 1))
-    shared = np.minimum(even, odd) < _COARSE * np.minimum(np.maximum(even, odd), _median(step[0]))
-    return shared | (bend[1] < _COARSE * bend[0])
+    bent, red = _median(step[..., 1:] - step[..., :-1])
+    even, odd, luma = _median(np.concatenate([step[1:, ..., :-1:2], step[1:, ..., 1::2], step[:1, ..., 1::2]]))
+    shared = np.minimum(even, odd) < _COARSE * np.minimum(np.maximum(even, odd), luma)
+    return shared | (red < _COARSE * bent)
 
 
 def _median(values: np.ndarray) -> np.ndarray:
-    """Over the last two axes; of an even number the one above the middle."""
-    flat = values.reshape(*values.shape[:-2], -1)
-    return np.partition(flat, flat.shape[-1] // 2)[..., flat.shape[-1] // 2]
+    """Of sizes over the last two axes; of an even number the one above the middle."""
+    flat = np.abs(values).reshape(*values.shape[:-2], -1)
+    middle = flat.shape[-1] // 2
+    flat.partition(middle)
+    return flat[..., middle]
 
 
 def fit_luma(

@@ -1,14 +1,16 @@
 """From a line on a frame to the places of the band edges on it: bands from labels, edges from whole windows."""
 
 import dataclasses
+import itertools
 import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtr
 
 from holotorch.tracking.bands import Stretches, find_axis, find_stretches
 from holotorch.tracking.colours import ColourTable
-from holotorch.tracking.fits import EdgeFit, fit_edges, median, rise
+from holotorch.tracking.fits import EdgeFit, fit_edges, median
 from holotorch.tracking.footprint import Front
 from holotorch.tracking.lens import Lens
 from holotorch.tracking.luma import coarse_colours, fit_luma
@@ -138,8 +140,8 @@ def measure_edges(
     if not len(chosen):
         return Edges(t, deviation, blur, blur, 0.0, False, (), ())
     near = guess[chosen]
-    gaps = np.abs(np.diff(near))
-    window = int(min(_WINDOW + 2 * blur, max(4.0, 0.45 * float(gaps.min()) if len(gaps) else _WINDOW)))
+    gap = min((abs(b - a) for a, b in itertools.pairwise(near.tolist())), default=math.inf)
+    window = int(min(_WINDOW + 2 * blur, max(4.0, 0.45 * gap)))
     along = np.arange(-window, window + 1.0)
     along = along[(np.abs(along) <= _CLOSE + 2 * blur) | (along % 2 == window % 2)]
     widths = axis.width_at(near)
@@ -148,26 +150,31 @@ def measure_edges(
     bulge = curve[chosen]
     front = Front.of(u, widths, axis.blur)
     # Rows on the tube, and three to either side of it, which tell whether something lies across.
-    rows = np.concatenate([np.broadcast_to(u, (len(near), len(u))), _sides(widths, blur)], 1)  # [E, U + 6]
+    rows = np.empty((len(near), len(u) + 6))
+    rows[:, : len(u)], rows[:, len(u) :] = u, _sides(widths, blur)
     farther = np.zeros_like(rows)
     farther[:, : len(u)] = bulge[:, None] * front.mean
     # A row that is mostly surroundings tells little of the edge, and what it tells may be of something else.
-    row = (widths[:, None] / 2 + _ASIDE - np.abs(u)).clip(0, 1)
+    row = np.minimum(np.maximum(widths[:, None] / 2 + _ASIDE - np.abs(u), 0), 1)
     # Beyond the bands a table's grain shines through the tube: light that drifts draws an edge to where it grows.
     outside = _OUTSIDE + 2 * blur
     kept = np.ones((len(near), len(along)), dtype=np.float32)
-    kept[chosen == 0] *= along >= -outside
-    kept[chosen == len(guess) - 1] *= along <= outside
+    if chosen[0] == 0:
+        kept[0] *= along >= -outside
+    if chosen[-1] == len(guess) - 1:
+        kept[-1] *= along <= outside
     looks = 2
     while True:
         place = near[:, None, None] + along[:, None] + farther[:, None]
         every = lens.distort(line.plane(place, rows[:, None]))
         pixels = every[..., : len(u)]
         light = sampler.sharp(pixels).transpose(1, 2, 3, 0)  # [E, T, U, C]
-        shown = kept[..., None] * row[:, None] * sampler.inside(pixels)
-        # Where light is cut off on one side, halfway is no longer where the edge is.
-        whole = (light > sampler.light[_WHITE]).mean(1, keepdims=True) < _CUT
-        weight = shown[..., None] * whole / variance_of(light)
+        inside = sampler.inside(pixels)
+        shown = kept[..., None] * row[:, None] * inside
+        weight = shown[..., None] / variance_of(light)
+        most = sampler.light[_WHITE]
+        if light.max() > most:  # where light is cut off on one side, halfway is no longer where the edge is
+            weight *= (light > most).mean(1, keepdims=True) < _CUT
         fit = fit_edges(light, weight, blur, t=along)
         known = np.isfinite(fit.deviation)
         if np.count_nonzero(known) > 1 and median(fit.blur[known]) > _SMEARED > blur:
@@ -192,9 +199,13 @@ def measure_edges(
     covered, beyond = _across(beside.reshape(*every.shape[:2], 6, 3), along - fit.place[:, None], fit)
     if beyond and len(near) > 2 and soft < blur + BLURRED:
         raise Refusal(Status.INCONSISTENT, "all bands go on beside the tube: this is thicker, seen in one part of it")
-    reached = lens.distort(line.plane(near[:, None] + (_MARGIN + 2 * soft) * np.array([-1, 1])))
-    within = np.all(sampler.inside(reached), -1)
-    clear = (fit.deviation < 0.6) & (np.abs(fit.place) < window / 2) & (fit.blur < 0.55 * window)
+    reach = _MARGIN + 2 * soft
+    far = np.abs(fit.place)
+    if inside.all() and window >= reach + far.max():
+        within = [True] * len(near)
+    else:
+        within = np.all(sampler.inside(lens.distort(line.plane(near[:, None] + reach * np.array([-1, 1])))), -1)
+    clear = (fit.deviation < 0.6) & (far < window / 2) & (fit.blur < 0.55 * window)
     hidden, outside = [], []
     for j, index in enumerate(chosen.tolist()):
         if not within[j]:
@@ -217,33 +228,42 @@ def measure_edges(
 
 def _astray(fit: EdgeFit, looks: int) -> bool:
     """Whether an edge is 2 px and more from where it was looked for, with ``looks`` left and two edges to look at."""
-    some = int(np.count_nonzero(fit.deviation < _LOST))
-    return looks > 0 and some >= 2 and float(np.abs(fit.place).max()) >= _AWAY
+    far = float(np.abs(fit.place).max())
+    return looks > 0 and far >= _AWAY and int(np.count_nonzero(fit.deviation < _LOST)) >= 2
+
+
+_SIGNS, _ROWS = np.repeat([-1.0, 1.0], 3), np.tile([2.0, 3.0, 4.0], 2)
 
 
 def _sides(widths: np.ndarray, blur: float) -> np.ndarray:
     """Three rows to either side of tubes so wide [E], beyond what blur makes of their sides: [E, 6] across."""
-    aside = np.arange(3.0) + 2 + 2 * blur
-    return np.concatenate([-aside, aside]) + widths[:, None] / 2 * np.repeat([-1, 1], 3)
+    return _SIGNS * (_ROWS + 2 * blur + widths[:, None] / 2)
 
 
-def _across(light: np.ndarray, along: np.ndarray, fit: EdgeFit) -> tuple[np.ndarray, bool]:
+def _across(light: np.ndarray, along: np.ndarray, fit: EdgeFit) -> tuple[list[bool], bool]:
     """Whether the surroundings change where the edges are: light [E, T, 6, C] at places [E, T] along from them.
 
     [E], on both sides of each: something lies across the tube there. And on one side of all, as much as on the tube.
     """
-    light = light.astype(np.float64)
-    up = rise(along / fit.blur[:, None])
-    up = up - up.sum(1, keepdims=True) / up.shape[1]
-    side = light.reshape(*light.shape[:2], 2, 3, 3).sum(3) / 3  # [E, T, 2, C]
-    rest = side - side.sum(1, keepdims=True) / up.shape[1]
-    power = (up * up).sum(1)[:, None]
-    step = (up[:, None] @ rest.reshape(*rest.shape[:2], -1)).reshape(len(up), 2, -1) / power[..., None]
-    left = rest - step[:, None] * up[:, :, None, None]
-    variance = (left * left).sum((1, 3)) / (up.shape[1] * power)
-    size = np.sqrt((step * step).sum(-1))
+    count, samples, _, colours = light.shape
+    side = light.reshape(count, samples, 2, 3, colours).sum(3, dtype=np.float64).reshape(count, samples, -1) / 3
+    up = ndtr(along / fit.blur[:, None])
+    up -= up.sum(1, keepdims=True) / samples
+    power = np.maximum((up * up).sum(1), 1e-30).tolist()
+    steps = (up[:, None] @ side)[:, 0].reshape(count, 2, colours).tolist()
+    sums, squares = (v.sum(1).reshape(count, 2, colours).tolist() for v in (side, side * side))
     middle = fit.steps.shape[1] // 2
-    own = np.sqrt((fit.steps[:, middle - 1 : middle + 2].sum(1) ** 2).sum(-1)) / 3
-    clear = size > _CLEAR * np.sqrt(variance)
-    across, beyond = (clear & (size > least * own[:, None]) for least in (_SIDE_STEP, _SAME_STEP))
-    return across.all(-1), bool(np.any(beyond.all(0)))
+    own = fit.steps[:, middle - 1 : middle + 2].sum(1).tolist()
+    across, beyond = [], []
+    for e in range(count):
+        least = math.hypot(*own[e]) / 3
+        size = [math.hypot(*step) / power[e] for step in steps[e]]
+        # What is left of light beside the edge, once its mean and its step are taken out.
+        rest = [
+            sum(b - a * a / samples - step * step / power[e] for a, b, step in zip(*each, strict=True))
+            for each in zip(sums[e], squares[e], steps[e], strict=True)
+        ]
+        noise = [_CLEAR * math.sqrt(max(value, 0.0) / (samples * power[e])) for value in rest]
+        across.append(all(s > max(n, _SIDE_STEP * least) for s, n in zip(size, noise, strict=True)))
+        beyond.append([s > max(n, _SAME_STEP * least) for s, n in zip(size, noise, strict=True)])
+    return across, any(all(sides) for sides in zip(*beyond, strict=True))

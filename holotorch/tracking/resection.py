@@ -43,6 +43,8 @@ def pose_on_line(
     offset_sd: float,
     slope_sd: float,
     shared_sd: float = 0.0,
+    *,
+    rough: bool = False,
 ) -> Found | None:
     """Pose of a tool whose image is ``line``; the part of :func:`solve_pose` that is left where the line is known.
 
@@ -58,16 +60,20 @@ def pose_on_line(
         offset_sd: Of the line at the mean of t, in the same unit.
         slope_sd: Of the line, in radians; independent of the offset.
         shared_sd: Of what moves all points alike along the line, beside ``deviation``.
+        rough: Without the covariance, which costs as much as the rest: noughts in its place.
 
     Returns:
         The pose, or None where none in front of the camera is near the points.
     """
-    middle, mean = float(t.sum()) / len(t), float(positions.sum()) / len(t)
-    far, long = t - middle, positions - mean
-    wide, length = float(np.abs(far).max()), float(np.abs(long).max())
+    # In plain numbers: of so few points, the calls into NumPy would cost several times as much.
+    places, onto, count = t.tolist(), positions.tolist(), len(t)
+    middle, mean = sum(places) / count, sum(onto) / count
+    far, long = [value - middle for value in places], [value - mean for value in onto]
+    wide, length = max(map(abs, far)), max(map(abs, long))
     if not wide > 0:
         return None
-    points = list(zip((far / wide).tolist(), (long / length).tolist(), (wide / deviation).tolist(), strict=True))
+    each = zip(far, long, deviation.tolist(), strict=True)
+    points = [(x / wide, s / length, wide / sd if sd else math.inf) for x, s, sd in each]
     h = (0.0, 0.0, 0.0)
     for _ in range(1 + _STEPS):
         normal, slope, _, _ = _terms(points, h)
@@ -78,7 +84,8 @@ def pose_on_line(
         return None
     # Points of space are p e1 + q e2, up to one scale: tip and direction. A line that is not quite where it was found
     # moves them to the side.
-    (h0, h1, h2), place, onward = h, complex(line.plane(middle)), line.along / line.scale
+    (h0, h1, h2), onward = h, line.along / line.scale
+    place = line.origin + middle * onward
     unit, start = 1 / length, -mean / length
     axes = np.array(
         [
@@ -88,6 +95,10 @@ def pose_on_line(
         ]
     )
     (p, q), (along, deep) = (h0 + h1 * start, 1 + h2 * start), (h1 * unit, h2 * unit)
+    if rough:
+        tip, direction = np.array([[p, q, 0.0], [along, deep, 0.0]]) @ axes
+        size = math.sqrt(float(direction @ direction))
+        return Found(tip / size, direction / size, np.zeros((6, 6)), chi_square) if size > 0 else None
     # Tip and direction, how they move with h, and with the line's offset and slope.
     tip = [[p, q, 0.0], [1.0, 0.0, 0.0], [start, 0.0, 0.0], [0.0, start, 0.0], [0.0, 0.0, q], [0.0, 0.0, p * wide]]
     direction = [
@@ -113,10 +124,7 @@ def pose_on_line(
 
 
 def _terms(points: list[tuple[float, float, float]], h: _Three) -> tuple[list[float], _Three, float, float]:
-    """Normal matrix (its six entries), slope, sum of weighted squares, and the least depth; x where h is nought.
-
-    In plain numbers: of so few points, the calls into NumPy would cost five times as much.
-    """
+    """Normal matrix (its six entries), slope, sum of weighted squares, and the least depth; x where h is nought."""
     h0, h1, h2 = h
     started = h1 != 0
     a00 = a01 = a02 = a11 = a12 = a22 = b0 = b1 = b2 = chi = 0.0

@@ -38,10 +38,13 @@ class Line:
         Three lines along are distorted, and a parabola across laid through them. What it misses is odd in u and rises
         with its third power: a thousandth of a pixel at 30, of a lens with k1 = -0.12 and a focal length of 1400.
         """
-        far = max(1.0, float(np.abs(u).max()))
-        s = u / far
-        weight = np.array([s * (s - 1) / 2, 1 - s * s, s * (s + 1) / 2])
-        return lens.distort(self.plane(t[:, None], np.array([-far, 0.0, far]))) @ weight
+        far, step = max(1.0, float(np.abs(u).max())), self.along / self.scale
+        half = u / (2 * far)
+        square = 2 * half * half
+        weight = np.array([square - half, 1 - 2 * square, square + half])
+        side = 1j * far * step
+        three = np.array([self.origin - side, self.origin, self.origin + side])
+        return lens.distort(t[:, None] * step + three) @ weight
 
     def place(self, plane: Points) -> tuple[np.ndarray, np.ndarray]:
         """Places t and u of points on the plane z = 1."""
@@ -83,8 +86,7 @@ class Sampler:
         # OpenCV reads ten times as fast what lies as cameras deliver it.
         like = self._host is not None and frame.stride()[::2] == (1, 3) and max(self.height, self.width) < _LONGEST
         self._image = frame.movedim(0, -1).numpy() if like else None
-        self._last = np.array([self.width - 1.0, self.height - 1.0])
-        self._before = np.array([self.width - 2, self.height - 2])
+        self._last, self._before = _borders(self.width, self.height)
 
     def inside(self, pixels: Points) -> np.ndarray:
         """Whether pixels x + i y lie on the frame; NaN does not."""
@@ -98,9 +100,14 @@ class Sampler:
         return self.frame[:, y : y + side, x : x + side].cpu().numpy()
 
     def _clipped(self, pixels: Points) -> np.ndarray:
-        """Real and imaginary parts [..., 2], moved onto the frame."""
-        both = np.ascontiguousarray(pixels).view(np.float64).reshape(*pixels.shape, 2)
-        return np.fmin(np.fmax(both, 0.0), self._last)
+        """Real and imaginary parts [2, n], moved onto the frame."""
+        place = np.empty((2, pixels.size))
+        place[0], place[1] = pixels.real.ravel(), pixels.imag.ravel()
+        return np.fmin(np.fmax(place, 0.0, out=place), self._last, out=place)
+
+    def _index(self, taps: np.ndarray, whole: np.ndarray) -> np.ndarray:
+        """In memory, of ``taps`` [...] around pixels [2, n]: [..., n]."""
+        return np.add.outer(taps, whole[1] * self._down + whole[0] * self._right)
 
     def _levels(self, index: np.ndarray) -> np.ndarray:
         if self._host is not None:
@@ -129,20 +136,30 @@ class Sampler:
         place = self._clipped(pixels)
         whole = np.minimum(place.astype(np.intp), self._before)
         share = (place - whole).astype(np.float32)
-        index = np.add.outer(self._taps, whole[..., 1] * self._down + whole[..., 0] * self._right)  # [3, 4, ...]
+        index = self._index(self._taps, whole)  # [3, 4, n]
         light = cv2.LUT(self._levels(index).reshape(12, -1), self.light).reshape(index.shape)
-        mixed = light[:, ::2] + share[..., 0] * (light[:, 1::2] - light[:, ::2])
-        return mixed[:, 0] + share[..., 1] * (mixed[:, 1] - mixed[:, 0])
+        mixed = light[:, ::2] + share[0] * (light[:, 1::2] - light[:, ::2])
+        return (mixed[:, 0] + share[1] * (mixed[:, 1] - mixed[:, 0])).reshape(3, *pixels.shape)
 
     def sharp(self, pixels: np.ndarray) -> np.ndarray:
         """As a call, but cubic among sixteen (Keys 1981), which keeps more of what is as fine as a pixel."""
         place = self._clipped(pixels)
-        whole = np.clip(place.astype(np.intp), 1, self._before - 1)
-        share = (place - whole).astype(np.float32)
-        x, y = np.moveaxis(_keys(share), -1, 0)  # [4, ...] each
-        index = np.add.outer(self._around, whole[..., 1] * self._down + whole[..., 0] * self._right)  # [3, 4, 4, ...]
+        whole = place.astype(np.intp)
+        np.minimum(np.maximum(whole, 1, out=whole), self._before - 1, out=whole)
+        weights = _keys((place - whole).astype(np.float32))  # [4, 2, n]
+        index = self._index(self._around, whole)  # [3, 4, 4, n]
         light = cv2.LUT(self._levels(index).reshape(48, -1), self.light).reshape(index.shape)
-        return ((light * x).sum(2) * y).sum(1)
+        light *= weights[:, 0]
+        rows = light.sum(2)
+        rows *= weights[:, 1]
+        return rows.sum(1).reshape(3, *pixels.shape)
+
+
+@lru_cache(maxsize=16)
+def _borders(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Both [2, 1], x and y, of a frame's last pixel, and of that before it."""
+    last = np.array([[width - 1.0], [height - 1.0]])
+    return last, last.astype(np.intp) - 1
 
 
 @lru_cache(maxsize=16)
@@ -157,6 +174,8 @@ def _keys(share: np.ndarray) -> np.ndarray:
     """Weights [4, ...] of the pixels at -1, 0, 1 and 2 for a place ``share`` after that at 0; Keys (1981), Eq. 4."""
     square = share * share
     cube = square * share
-    first, last = square - (cube + share) / 2, (cube - square) / 2
-    after = (4 * square - 3 * cube + share) / 2
-    return np.stack([first, 1 - first - after - last, after, last])
+    weights = np.empty((4, *share.shape), dtype=share.dtype)
+    weights[0], weights[3] = square - (cube + share) / 2, (cube - square) / 2
+    weights[2] = (4 * square - 3 * cube + share) / 2
+    np.subtract(1, weights[0] + weights[2] + weights[3], out=weights[1])
+    return weights

@@ -172,14 +172,14 @@ class CatheterTracker:
             edges = measure_edges(sampler, lens, axis, guess - curve, stretches.doubtful, _BLUR, curve)
         with self._timed("pose"):
             # What the bulge has changed by is set right without another look at the frame: the mean over a front.
-            found = self._solved(axis, edges)
+            found = self._solved(axis, edges, rough=True)
             for _ in range(2):
                 bulge = self._bulge(found, axis.line)
                 change, curve = bulge - curve, bulge
                 edges = dataclasses.replace(edges, t=edges.t - math.pi / 4 * change)
                 if float(np.abs(change).max()) < _FLAT:
                     break
-                found = self._solved(axis, edges)
+                found = self._solved(axis, edges, rough=True)
             plane, wide = axis.line.plane(edges.t), self._wide(found, line)
         with self._timed("axis"):
             # With the width that the pose and the radius give; what was found without them is the check.
@@ -219,7 +219,7 @@ class CatheterTracker:
             raise Refusal(Status.INCONSISTENT, "no pose in front of the camera explains the edges")
         return width, taper
 
-    def _solved(self, axis: Axis, edges: Edges) -> Found:
+    def _solved(self, axis: Axis, edges: Edges, *, rough: bool = False) -> Found:
         known = np.isfinite(edges.t)
         t = edges.t[known]
         if len(t) < 3:
@@ -242,7 +242,7 @@ class CatheterTracker:
         reach = math.sqrt(float((t - middle) @ (t - middle)) / len(t))
         about = math.hypot(axis.offset_sd, axis.slope_sd * (middle - axis.centre), _ASIDE * edges.coarse)
         most = max(about, axis.slope_sd * reach)
-        found = pose_on_line(axis.line, t, self._positions[known], along, most, most / reach, _SHARED)
+        found = pose_on_line(axis.line, t, self._positions[known], along, most, most / reach, _SHARED, rough=rough)
         if found is None:
             raise Refusal(Status.INCONSISTENT, "no pose in front of the camera explains the edges")
         return found

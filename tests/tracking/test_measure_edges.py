@@ -188,12 +188,12 @@ def test_something_lies_across_where_both_sides_change_by_a_quarter_of_the_edge(
     """Of an edge of 0.2: above 0.05 on both sides; above 0.12 on one side of all, the bands go on there."""
     along = np.broadcast_to(np.arange(-16.0, 17), (3, 33))
     found, on = _across(beside(steps), along, fit_of(0.2))
-    assert found.tolist() == across and on == beyond
+    assert found == across and on == beyond
 
 
 def test_changes_that_noise_may_make_are_none():
     """33 x 3 rows of noise 0.3: a step is known to 0.3 / sqrt(3 * 33 / 4), a tenth, and one of 0.1 not clear."""
     along = np.broadcast_to(np.arange(-16.0, 17), (3, 33))
     steps = [[0.1, 0.1]] * 3
-    assert not _across(beside(steps, 0.3), along, fit_of(0.2))[0].any()
-    assert _across(beside(steps, 0.01), along, fit_of(0.2))[0].all()
+    assert not any(_across(beside(steps, 0.3), along, fit_of(0.2))[0])
+    assert all(_across(beside(steps, 0.01), along, fit_of(0.2))[0])
