@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import cv2
 import numpy as np
 from scipy.special import erf
 
@@ -105,14 +106,14 @@ def fit_axis(
     u = np.arange(count) - (count - 1) / 2
     reach = max(1.0, float(np.abs(t).max()))
     # Unknown are middle and width (each at t = 0 and what t = reach adds), blur, and the shadings of each band. A
-    # station sees 3 + kinds numbers of them: ``parts`` [S, 3 + kinds, 5 + bands kinds].
-    parts = np.zeros((stations, 3 + kinds, 5 + bands * kinds))
-    parts[:, 0, 0] = parts[:, 1, 2] = parts[:, 2, 4] = 1
+    # station sees 3 + kinds numbers of them: ``parts`` [S, 4 + kinds, 6 + bands kinds], with what is left of the light.
+    parts = np.zeros((stations, 4 + kinds, 6 + bands * kinds))
+    parts[:, 0, 0] = parts[:, 1, 2] = parts[:, 2, 4] = parts[:, -1, -1] = 1
     parts[:, 0, 1] = parts[:, 1, 3] = t / reach
     member = (band[:, None] == np.arange(bands)).astype(np.float64)
     for kind in range(kinds):
-        parts[:, 3 + kind, 5 + kind :: kinds] = member
-    flat = parts.reshape(-1, parts.shape[-1])
+        parts[:, 3 + kind, 5 + kind : -1 : kinds] = member
+    flat = parts[:, :-1, :-1].reshape(stations * (3 + kinds), -1)
     expected = np.zeros(flat.shape[1])
     expected[2:5] = width[0], width[1] * reach, blur
     unknown = expected.copy()
@@ -122,22 +123,21 @@ def fit_axis(
         unknown[:2], unknown[4:] = start[:2], start[4:]
     shares = np.maximum(bright, 1e-9)[:, None] * np.array(_SHARES)
     prior = np.concatenate([[0.0, 0.0, *2 * [(known * width[0]) ** -2], 0.0], shares.ravel() ** -2.0])
-    farthest = np.full(len(prior), np.inf)
-    farthest[:5] = 1.5, 1.5, 1.5, 1.5, 0.5
-    moving, station, noise, normal, beside = 0.0, np.ones(stations), 1.0, np.diag(prior), np.zeros((stations, 2))
+    moving, station, noise, normal, beside = 0.0, np.ones(stations), 1.0, prior, prior
     for k in range(_STEPS):
         seen = (flat @ unknown).reshape(stations, -1)
         half = np.maximum(seen[:, 1], 1.0) / 2
         columns, slopes_of = _strip_terms(u, seen[:, 0], half, float(seen[0, 2]))
+        levels = seen[:, 1:]
         outer, inner = columns[..., :2], columns[..., 2:]
         design = np.empty((stations, count, 4 + kinds))  # slopes, shadings and what is left without levels beside
         design[..., 3:-1] = inner
-        design[..., -1] = light - (inner @ seen[:, 3:, None])[..., 0]
+        design[..., -1] = light - (inner @ levels[:, 2:, None])[..., 0]
         # Levels beside the tube are projected out, station by station.
         weighted = (outer * weight).swapaxes(1, 2)
         inverse = _inverse(weighted @ outer)
-        beside = (inverse @ (weighted @ design[..., -1:]))[..., 0]
-        design[..., :3] = slopes_of(np.concatenate([beside, seen[:, 3:]], -1))
+        levels[:, :2] = beside = (inverse @ (weighted @ design[..., -1:]))[..., 0]
+        slopes_of(levels, design)
         both = weighted @ design
         gram = (design * weight).swapaxes(1, 2) @ design - both.swapaxes(1, 2) @ (inverse @ both)
         if k:
@@ -146,17 +146,19 @@ def fit_axis(
             noise = math.sqrt(typical * count / max(1, count - 3))
             station = np.maximum(chi / (4 * typical), 1.0) ** -2
             gram = gram * station[:, None, None]
-        normal = flat.T @ (gram[:, :-1, :-1] @ parts).reshape(flat.shape)
+        both = flat.T @ (gram[:, :-1] @ parts).reshape(len(flat), -1)
+        normal, slope = both[:, :-1], both[:, -1]
         ridge = prior * max(noise, 0.5) ** 2
-        normal.flat[:: len(ridge) + 1] += ridge + 1e-12 * normal.diagonal()
+        both.flat[:: len(ridge) + 2] += ridge + 1e-12 * normal.diagonal()
         if k == _STEPS - 1:
             break
-        slope = flat.T @ gram[:, :-1, -1].ravel() - ridge * (unknown - expected)
-        step = _solved(normal, slope)
-        unknown = unknown + step.clip(-farthest, farthest)
-        unknown[4] = min(max(unknown[4], SHARPEST), BLUNTEST)
-        moving = float(np.abs(step[:2]).max())
-        if k and max(moving, abs(float(step[4]))) < _SETTLED and float(np.abs(step[2:4]).max()) < _WIDENED:
+        step = _solved(normal, slope - ridge * (unknown - expected))
+        middle, turn, wide, taper, soft = step[:5].tolist()
+        step[:4] = np.minimum(np.maximum(step[:4], -1.5), 1.5)
+        unknown += step
+        unknown[4] = min(max(unknown[4] - soft + min(max(soft, -0.5), 0.5), SHARPEST), BLUNTEST)
+        moving = max(abs(middle), abs(turn))
+        if k and max(moving, abs(soft)) < _SETTLED and max(abs(wide), abs(taper)) < _WIDENED:
             break
     tube = member @ (unknown[5:].reshape(bands, kinds) @ np.array(_MEANS))
     one, other = median(np.abs(tube - beside[:, 0])), median(np.abs(tube - beside[:, 1]))
@@ -165,20 +167,19 @@ def fit_axis(
 
 
 def _solved(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
-    try:
-        return np.linalg.solve(normal, right)
-    except np.linalg.LinAlgError:  # nothing is seen: NaN is refused by whoever asked
-        return np.full_like(right, np.nan)
+    # By Cholesky's factors from OpenCV: the call into NumPy's solver takes several times as long as the work.
+    known, found = cv2.solve(normal, right.reshape(len(right), -1), flags=cv2.DECOMP_CHOLESKY)
+    return found.reshape(right.shape) if known else np.full_like(right, np.nan)  # which is refused by whoever asked
 
 
 def _inverse(normal: np.ndarray) -> np.ndarray:
     """Of matrices [S, 2, 2], positive but for rounding."""
-    a, b, d = normal[:, 0, 0], normal[:, 0, 1], normal[:, 1, 1]
-    a, d = a * (1 + 1e-9) + 1e-300, d * (1 + 1e-9) + 1e-300
-    inverse = np.empty_like(normal)
-    inverse[:, 0, 0], inverse[:, 1, 1] = d, a
-    inverse[:, 0, 1] = inverse[:, 1, 0] = -b
-    return inverse / np.maximum(a * d - b * b, 1e-300)[:, None, None]
+    inverse = []
+    for (a, b), (_, d) in normal.tolist():
+        a, d = a * (1 + 1e-9) + 1e-300, d * (1 + 1e-9) + 1e-300
+        whole = max(a * d - b * b, 1e-300)
+        inverse.append((d / whole, -b / whole, -b / whole, a / whole))
+    return np.array(inverse).reshape(-1, 2, 2)
 
 
 def _slices() -> tuple[np.ndarray, np.ndarray]:
@@ -192,26 +193,30 @@ def _slices() -> tuple[np.ndarray, np.ndarray]:
 
 
 _NODES, _TAKES = _slices()
+_HALVES = _TAKES / 2
+_RISES = -np.stack([_TAKES, _TAKES * _NODES[:, None]], 1).transpose(2, 0, 1).reshape(_TAKES.shape[1], -1)
 
 
 def _strip_terms(u: np.ndarray, at: np.ndarray, half: np.ndarray, blur: float):
     """Columns [S, U, 2 + K]: light to the left of tubes at [S], to the right, and K shadings of the tube.
 
-    And a function of levels [S, 2 + K]: the slopes [S, U, 3] of the columns' sum to middle, width and blur.
+    And a function of levels [S, 2 + K], which writes the slopes of the columns' sum to middle, width and blur into the
+    first three of [S, U, 3 and more].
     """
     scale = math.sqrt(2) * blur
     z = (u[:, None] - (at[:, None] + half[:, None] * _NODES)[:, None]) / scale  # [S, U, N]
     # A rise is (1 + erf z) / 2; what the tube takes of the 1 cancels.
-    columns = erf(z) @ (_TAKES / 2)
+    columns = erf(z) @ _HALVES
     columns[..., :2] += 0.5
     bell = np.exp(-z * z)
 
-    def slopes(levels: np.ndarray) -> np.ndarray:
-        steps = levels @ _TAKES.T / (-math.sqrt(math.pi) * scale)
-        found = np.empty((*z.shape[:2], 3))
-        found[..., :2] = bell @ np.stack([steps, steps * _NODES], -1)
-        found[..., 2] = ((u - at[:, None]) * found[..., 0] - half[:, None] * found[..., 1]) / blur
-        found[..., 1] /= 2
-        return found
+    def slopes(levels: np.ndarray, found: np.ndarray) -> None:
+        steps = (levels @ _RISES).reshape(len(levels), -1, 2) / (math.sqrt(math.pi) * scale)
+        both = bell @ steps
+        middle, sides = both[..., 0], both[..., 1]
+        found[..., 0] = middle
+        np.multiply(sides, 0.5, out=found[..., 1])
+        np.subtract((u - at[:, None]) * middle, half[:, None] * sides, out=found[..., 2])
+        found[..., 2] /= blur
 
     return columns, slopes

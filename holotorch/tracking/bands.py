@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -134,14 +135,20 @@ def _worth(share: np.ndarray, bands: tuple[int, ...]) -> np.ndarray:
     A pixel within a band is worth +1 where it shows the band's colour, -1 where it shows another band's and -0.6 where
     it shows none, as fingers do; around the bands -0.25 where it shows one, and 0 where it shows none.
     """
-    gains = np.full((len(bands) + 2, share.shape[1]), -0.4, dtype=np.float32)
-    gains[[0, -1]] = -0.25
-    for i, band in enumerate(bands):
-        gains[i + 1, band] += 2
-    least = np.array([0.0] + [-0.6] * len(bands) + [0.0], dtype=np.float32)[:, None, None]
+    gains, least = _gains(bands, share.shape[1])
     sums = np.zeros((len(least), len(share), share.shape[-1] + 1), dtype=np.float32)
     np.cumsum((gains @ share).swapaxes(0, 1) + least, -1, out=sums[..., 1:])
     return sums
+
+
+@lru_cache(maxsize=16)
+def _gains(bands: tuple[int, ...], colours: int) -> tuple[np.ndarray, np.ndarray]:
+    """What a pixel that shows a colour is worth more [n + 2, colours] than one that shows none [n + 2, 1, 1]."""
+    gains = np.full((len(bands) + 2, colours), -0.4, dtype=np.float32)
+    gains[[0, -1]] = -0.25
+    for i, band in enumerate(bands):
+        gains[i + 1, band] += 2
+    return gains, np.array([0.0] + [-0.6] * len(bands) + [0.0], dtype=np.float32)[:, None, None]
 
 
 def _sweep(order: Iterable[np.ndarray]) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:

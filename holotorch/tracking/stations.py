@@ -200,10 +200,12 @@ def _contrast(light: np.ndarray, u: np.ndarray, width: float, band: np.ndarray, 
 
     The signal is the mix of channels, one for each band, in which tube and surroundings differ most over the noise.
     """
-    where = np.stack([np.abs(u) <= max(0.6, 0.3 * width), np.abs(u) >= 0.5 * width + 1.5], -1).astype(np.float32)
+    away = np.abs(u)
+    where = np.empty((len(u), 2), dtype=np.float32)
+    where[:, 0], where[:, 1] = away <= max(0.6, 0.3 * width), away >= 0.5 * width + 1.5
     parts = light @ (where / where.sum(0))  # [3, S, 2]
     member = (band[:, None] == np.arange(band[-1] + 1)).astype(np.float32)
-    own, around = np.moveaxis(parts, -1, 0) @ (member / np.maximum(member.sum(0), 1))  # [3, bands] each
+    own, around = parts.transpose(2, 0, 1) @ (member / np.maximum(member.sum(0), 1))  # [3, bands] each
     mixes = (own - around) / (variance_of(own) + variance_of(around))
     mixes = mixes / np.maximum(np.sqrt((mixes * mixes).sum(0)), 1e-12)
     mix = mixes[:, band, None]  # [3, S, 1]
