@@ -1,6 +1,7 @@
 """What a pose makes of the catheter on a line of its image: how wide it is there, and how its rings bulge."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,33 +18,39 @@ _BOTH = np.concatenate([_LIT, _LIT * _ROUND[:, None]], -1)
 _RIDGE = 1e-4 * np.eye(_LIT.shape[1])
 
 
-def width_px(found: Found, positions: np.ndarray, radius: float, line: Line) -> tuple[float, float]:
+def width_px(found: Found, positions: Sequence[float], radius: float, line: Line) -> tuple[float, float]:
     """Of the tube's image at t = 0 in pixels across the line, and its change per pixel.
 
     2 r / (z sqrt(1 - n_z^2)) on the plane z = 1, n the unit normal of the plane through axis and camera: what is
     seen aside of the image's middle is seen at a slant.
     """
-    ends = found.tip + positions[[0, -1], None] * found.direction
-    (t0, t1), _ = line.place(on_plane(ends))
+    # In plain numbers, as all of this: of so few rings, the calls into NumPy would cost several times as much.
     (x, y, z), (a, b, c) = found.tip.tolist(), found.direction.tolist()
     nx, ny, nz = y * c - z * b, z * a - x * c, x * b - y * a
     slant = math.sqrt(1 + nz * nz / (nx * nx + ny * ny)) if nx or ny else math.inf
-    near, far = (2 * radius * line.scale * slant / ends[:, 2]).tolist()
-    taper = (far - near) / float(t1 - t0) if t1 != t0 else math.inf
-    return near - taper * float(t0), taper
+    t0, t1 = (line.along_at(axis_on_plane(found, positions[n])) for n in (0, -1))
+    near, far = (2 * radius * line.scale * slant / (z + positions[n] * c or math.nan) for n in (0, -1))
+    taper = (far - near) / (t1 - t0) if t1 != t0 else math.inf
+    return near - taper * t0, taper
 
 
-def bulge_px(found: Found, positions: np.ndarray, radius: float, line: Line) -> np.ndarray:
+def bulge_px(found: Found, positions: Sequence[float], radius: float, line: Line) -> np.ndarray:
     """How far along the line [N], in pixels, the front of each ring's image lies from that of its centre."""
-    toward = float(found.tip @ found.direction) * found.direction - found.tip
-    centres = found.tip + positions[:, None] * found.direction
-    fronts = centres + (radius / math.sqrt(float(toward @ toward))) * toward
-    return line.place(on_plane(fronts))[0] - line.place(on_plane(centres))[0]
+    (x, y, z), (a, b, c) = found.tip.tolist(), found.direction.tolist()
+    onward = x * a + y * b + z * c
+    fx, fy, fz = onward * a - x, onward * b - y, onward * c - z
+    share = radius / (math.sqrt(fx * fx + fy * fy + fz * fz) or math.nan)
+    bulges = []
+    for s in positions:
+        front = complex(x + s * a + share * fx, y + s * b + share * fy) / (z + s * c + share * fz or math.nan)
+        bulges.append(line.along_at(front) - line.along_at(axis_on_plane(found, s)))
+    return np.array(bulges)
 
 
-def on_plane(points: np.ndarray) -> np.ndarray:
-    """Points [N, 3] of space, seen on the plane z = 1 as complex numbers [N]."""
-    return (points[:, 0] + 1j * points[:, 1]) / points[:, 2]
+def axis_on_plane(found: Found, position: float) -> complex:
+    """The tool's point ``position`` metres from its tip, seen on the plane z = 1."""
+    (x, y, z), (a, b, c) = found.tip.tolist(), found.direction.tolist()
+    return complex(x + position * a, y + position * b) / (z + position * c or math.nan)
 
 
 @dataclass(frozen=True, eq=False)

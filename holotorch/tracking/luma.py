@@ -13,6 +13,7 @@ from holotorch.tracking.lens import Points
 from holotorch.tracking.strips import Sampler
 
 _LUMA = np.array([0.299, 0.587, 0.114])  # of red, green and blue levels in luma, ITU-R BT.601
+_MIXES = np.stack([_LUMA, np.array([1.0, 0.0, 0.0]) - _LUMA]).astype(np.float32)  # luma, and red less luma
 _LEVEL_SD = 2.5  # of a pixel's level; fits correct it by what they leave
 _PATCH, _COARSE = 24, 0.6  # pixels, and of luma's change
 _ASIDE = 0.25  # pixels: standard deviation of where an edge of coarse colours lies
@@ -25,15 +26,12 @@ def coarse_colours(sampler: Sampler, pixels: Points) -> np.ndarray:
     has halved the colours' resolution, pixels that share a colour change less than those that do not, or, smoothed,
     all of them bend less.
     """
-    patches = []
-    for pixel in pixels.tolist():
+    patches = np.empty((3, len(pixels), _PATCH, _PATCH), dtype=np.float32)
+    for n, pixel in enumerate(pixels.tolist()):
         room = (pixel.real, sampler.width - _PATCH), (pixel.imag, sampler.height - _PATCH)
         x, y = (int(min(max(v - _PATCH // 2, 0), most)) for v, most in room)
-        patches.append(sampler.patch(x, y, _PATCH))
-    patch = np.stack(patches, 1).astype(np.float32)  # [3, n, 24, 24]
-    both = np.empty((2, *patch.shape[1:]), dtype=np.float32)
-    both[0] = _LUMA[0] * patch[0] + _LUMA[1] * patch[1] + _LUMA[2] * patch[2]
-    both[1] = patch[0] - both[0]
+        patches[:, n] = sampler.patch(x, y, _PATCH)
+    both = (_MIXES @ patches.reshape(3, -1)).reshape(2, *patches.shape[1:])
     step = both[..., 1:] - both[..., :-1]
     bent, red = _median(step[..., 1:] - step[..., :-1])
     even, odd, luma = _median(np.concatenate([step[1:, ..., :-1:2], step[1:, ..., 1::2], step[:1, ..., 1::2]]))

@@ -240,30 +240,25 @@ def _sides(widths: np.ndarray, blur: float) -> np.ndarray:
     return _SIGNS * (_ROWS + 2 * blur + widths[:, None] / 2)
 
 
-def _across(light: np.ndarray, along: np.ndarray, fit: EdgeFit) -> tuple[list[bool], bool]:
+def _across(light: np.ndarray, along: np.ndarray, fit: EdgeFit) -> tuple[np.ndarray, bool]:
     """Whether the surroundings change where the edges are: light [E, T, 6, C] at places [E, T] along from them.
 
     [E], on both sides of each: something lies across the tube there. And on one side of all, as much as on the tube.
     """
     count, samples, _, colours = light.shape
-    side = light.reshape(count, samples, 2, 3, colours).sum(3, dtype=np.float64).reshape(count, samples, -1) / 3
+    light = light.reshape(count, samples, -1).astype(np.float64)
     up = ndtr(along / fit.blur[:, None])
     up -= up.sum(1, keepdims=True) / samples
-    power = np.maximum((up * up).sum(1), 1e-30).tolist()
-    steps = (up[:, None] @ side)[:, 0].reshape(count, 2, colours).tolist()
-    sums, squares = (v.sum(1).reshape(count, 2, colours).tolist() for v in (side, side * side))
+    power = np.maximum((up * up).sum(1), 1e-30)[:, None, None]
+    step = (up[:, None] @ light).reshape(count, 2, 3, colours).sum(2) / (3 * power)  # [E, 2, C]
+    size = np.sqrt((step * step).sum(-1))
     middle = fit.steps.shape[1] // 2
-    own = fit.steps[:, middle - 1 : middle + 2].sum(1).tolist()
-    across, beyond = [], []
-    for e in range(count):
-        least = math.hypot(*own[e]) / 3
-        size = [math.hypot(*step) / power[e] for step in steps[e]]
-        # What is left of light beside the edge, once its mean and its step are taken out.
-        rest = [
-            sum(b - a * a / samples - step * step / power[e] for a, b, step in zip(*each, strict=True))
-            for each in zip(sums[e], squares[e], steps[e], strict=True)
-        ]
-        noise = [_CLEAR * math.sqrt(max(value, 0.0) / (samples * power[e])) for value in rest]
-        across.append(all(s > max(n, _SIDE_STEP * least) for s, n in zip(size, noise, strict=True)))
-        beyond.append([s > max(n, _SAME_STEP * least) for s, n in zip(size, noise, strict=True)])
-    return across, any(all(sides) for sides in zip(*beyond, strict=True))
+    own = fit.steps[:, middle - 1 : middle + 2].sum(1)
+    own = np.sqrt((own * own).sum(-1, keepdims=True)) / 3
+    large = size > _SIDE_STEP * own
+    if not large.any():
+        return large[:, 0], False
+    side = light.reshape(count, samples, 2, 3, colours).sum(3) / 3
+    left = side - side.sum(1, keepdims=True) / samples - step[:, None] * up[:, :, None, None]
+    large &= size > _CLEAR * np.sqrt((left * left).sum((1, 3)) / (samples * power[..., 0]))
+    return large.all(1), bool((large & (size > _SAME_STEP * own)).all(0).any())

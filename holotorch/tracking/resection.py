@@ -1,6 +1,7 @@
 """The pose of a straight tool from where known points of it lie along one line of the image: three unknowns."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,9 +38,9 @@ class Found:
 
 def pose_on_line(
     line: Line,
-    t: np.ndarray,
-    positions: np.ndarray,
-    deviation: np.ndarray,
+    t: Sequence[float],
+    positions: Sequence[float],
+    deviation: Sequence[float],
     offset_sd: float,
     slope_sd: float,
     shared_sd: float = 0.0,
@@ -66,13 +67,12 @@ def pose_on_line(
         The pose, or None where none in front of the camera is near the points.
     """
     # In plain numbers: of so few points, the calls into NumPy would cost several times as much.
-    places, onto, count = t.tolist(), positions.tolist(), len(t)
-    middle, mean = sum(places) / count, sum(onto) / count
-    far, long = [value - middle for value in places], [value - mean for value in onto]
+    middle, mean = sum(t) / len(t), sum(positions) / len(t)
+    far, long = [value - middle for value in t], [value - mean for value in positions]
     wide, length = max(map(abs, far)), max(map(abs, long))
     if not wide > 0:
         return None
-    each = zip(far, long, deviation.tolist(), strict=True)
+    each = zip(far, long, deviation, strict=True)
     points = [(x / wide, s / length, wide / sd if sd else math.inf) for x, s, sd in each]
     h = (0.0, 0.0, 0.0)
     for _ in range(1 + _STEPS):

@@ -51,6 +51,10 @@ class Line:
         offset = (plane - self.origin) * (self.along.conjugate() * self.scale)
         return offset.real, offset.imag
 
+    def along_at(self, plane: complex) -> float:
+        """The place t of one point on the plane z = 1."""
+        return ((plane - self.origin) * self.along.conjugate()).real * self.scale
+
     def moved(self, offset: float, slope: float) -> "Line":
         """The line u = offset + slope t, with t = 0 where it was."""
         turned = self.along * complex(1.0, slope)
@@ -78,14 +82,14 @@ class Sampler:
         self.frame, self.light = frame, light
         self.height, self.width = frame.shape[-2:]
         # One row of memory, whichever way colours lie in it: the quickest to pick from.
-        colour, self._down, self._right = frame.stride()
-        reach = sum((n - 1) * step for n, step in zip(frame.shape, frame.stride(), strict=True))
+        strides = colour, self._down, self._right = frame.stride()
+        reach = sum((n - 1) * step for n, step in zip(frame.shape, strides, strict=True))
         self._memory = frame.as_strided((reach + 1,), (1,))
         self._host = self._memory.numpy() if frame.device.type == "cpu" else None
-        self._colours, self._taps, self._around = _neighbours(colour, self._down, self._right)
+        self._colours, self._taps, self._around = _neighbours(*strides)
         # OpenCV reads ten times as fast what lies as cameras deliver it.
-        like = self._host is not None and frame.stride()[::2] == (1, 3) and max(self.height, self.width) < _LONGEST
-        self._image = frame.movedim(0, -1).numpy() if like else None
+        like = self._host is not None and strides[::2] == (1, 3) and max(self.height, self.width) < _LONGEST
+        self._image = frame.numpy().transpose(1, 2, 0) if like else None
         self._last, self._before = _borders(self.width, self.height)
 
     def inside(self, pixels: Points) -> np.ndarray:

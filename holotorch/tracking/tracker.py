@@ -18,7 +18,7 @@ from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import Catheter
 from holotorch.tracking.coarse import find_segments
 from holotorch.tracking.colours import ColourTable
-from holotorch.tracking.footprint import bulge_px, on_plane, width_px
+from holotorch.tracking.footprint import axis_on_plane, bulge_px, width_px
 from holotorch.tracking.lens import Lens
 from holotorch.tracking.measure import BLURRED, Edges, find_bands, halfway, measure_edges
 from holotorch.tracking.resection import Found, pose_on_line
@@ -82,7 +82,7 @@ class CatheterTracker:
         self.most_sd = checks.positive("most_sd", most_sd, "m")
         self.table = ColourTable(camera, catheter)
         self.lens = Lens(camera)
-        self._positions = catheter.positions.numpy()
+        self._positions: list[float] = catheter.positions.tolist()
         self.times: dict[str, float] = {}
 
     def __call__(self, frames: Tensor, previous: Sequence[Pose] | None = None) -> list[Pose]:
@@ -136,7 +136,7 @@ class CatheterTracker:
 
     def _expected(self, found: Found) -> tuple[Line, float]:
         """Where the bands of a pose lie, and half their length with room to move."""
-        start, end = on_plane(found.tip + self._positions[[0, -1], None] * found.direction).tolist()
+        start, end = (axis_on_plane(found, self._positions[n]) for n in (0, -1))
         return Line.between(self.lens, start, end), abs(end - start) * self.lens.scale / 2 + 1.5 * _MOVED
 
     def _shown(
@@ -195,18 +195,19 @@ class CatheterTracker:
 
     def _rough(self, line: Line, places: np.ndarray) -> Found | None:
         """A first pose, from where the colours change; None where one of these places may be no edge."""
-        known = np.isfinite(places)
-        if (count := int(known.sum())) < 4:
+        seen = [(t, s) for t, s in zip(places.tolist(), self._positions, strict=True) if math.isfinite(t)]
+        if (count := len(seen)) < 4:
             return None
-        found = pose_on_line(line, places[known], self._positions[known], np.ones(count), 1.0, 0.01)
+        t, positions = zip(*seen, strict=True)
+        found = pose_on_line(line, t, positions, [1.0] * count, 1.0, 0.01, rough=True)
         wide = width_px(found, self._positions, self.catheter.radius, line)[0] if found else 0.0
         slight = self._slight(places)[0]
         return found if slight / _SLANTED < wide < slight * _SLANTED else None
 
     def _slight(self, places: np.ndarray) -> tuple[float, float]:
         """Of the tube's image in pixels, roughly: from the bands' lengths at a slight tilt; and no taper."""
-        seen = np.isfinite(places).nonzero()[0][[0, -1]]
-        (a, b), (near, far) = places[seen].tolist(), self._positions[seen].tolist()
+        seen = [(s, t) for s, t in zip(self._positions, places.tolist(), strict=True) if math.isfinite(t)]
+        (near, a), (far, b) = seen[0], seen[-1]
         return min(max(2 * self.catheter.radius * 1.15 * (b - a) / (far - near), 2.0), _WIDEST), 0.0
 
     def _bulge(self, found: Found, line: Line) -> np.ndarray:
@@ -220,29 +221,29 @@ class CatheterTracker:
         return width, taper
 
     def _solved(self, axis: Axis, edges: Edges, *, rough: bool = False) -> Found:
-        known = np.isfinite(edges.t)
-        t = edges.t[known]
+        known, last = np.isfinite(edges.t).nonzero()[0].tolist(), len(edges.t) - 1
+        t: list[float] = edges.t[known].tolist()
         if len(t) < 3:
-            count = f"{len(t)} edges"
-            if edges.hidden:
-                raise Refusal(Status.EDGES_UNCLEAR, f"{count} are clear, 3 are needed: something lies across")
-            if edges.outside:
-                raise Refusal(Status.OUT_OF_FRAME, f"{count} lie within the frame, 3 are needed")
-            raise Refusal(Status.EDGES_UNCLEAR, f"{count} are clear, 3 are needed")
+            gone = edges.outside and not edges.hidden
+            status, where = (
+                (Status.OUT_OF_FRAME, "lie within the frame") if gone else (Status.EDGES_UNCLEAR, "are clear")
+            )
+            why = ": something lies across" if edges.hidden else ""
+            raise Refusal(status, f"{len(t)} edges {where}, 3 are needed{why}")
         soft, smeared = (max(0.0, blur - _BLUR) for blur in (axis.blur, edges.blur))
         floor = math.hypot(
             _FLOOR, _COARSE * edges.coarse, _ROUND * edges.bulge, _SOFT * min(soft, smeared), _SMEAR * smeared
         )
-        outer = np.zeros(len(known))
-        outer[[0, -1]] = _SHINES
-        along = np.sqrt(edges.deviation[known] ** 2 + floor**2 + outer[known] ** 2)
+        shines = (_SHINES if n in (0, last) else 0.0 for n in known)
+        along = [math.hypot(*each, floor) for each in zip(edges.deviation[known].tolist(), shines, strict=True)]
         # Shading, the same all along, moves and turns a line by more than its fit tells: over the edges both deviations
         # amount to the larger of the two.
-        middle = float(t.sum()) / len(t)
-        reach = math.sqrt(float((t - middle) @ (t - middle)) / len(t))
+        middle = sum(t) / len(t)
+        reach = math.sqrt(sum((place - middle) ** 2 for place in t) / len(t))
         about = math.hypot(axis.offset_sd, axis.slope_sd * (middle - axis.centre), _ASIDE * edges.coarse)
         most = max(about, axis.slope_sd * reach)
-        found = pose_on_line(axis.line, t, self._positions[known], along, most, most / reach, _SHARED, rough=rough)
+        positions = [self._positions[n] for n in known]
+        found = pose_on_line(axis.line, t, positions, along, most, most / max(reach, 1e-9), _SHARED, rough=rough)
         if found is None:
             raise Refusal(Status.INCONSISTENT, "no pose in front of the camera explains the edges")
         return found
@@ -272,7 +273,7 @@ class CatheterTracker:
         if min(axis.blur, edges.blur) > own or (cold and both > max(ratio, 1.0)):
             ratio = both
         if abs(ratio - 1) > most and not moved:
-            away = float((found.tip + self._positions.mean() * found.direction)[2])
+            away = float((found.tip + sum(self._positions) / len(self._positions) * found.direction)[2])
             raise Refusal(Status.INCONSISTENT, f"{ratio:.2f} times as wide as it should be at {away:.2f} m")
         if found.tip_sd > self.most_sd:
             text = f"tip uncertain to {1e3 * found.tip_sd:.1f} mm, above {1e3 * self.most_sd:g} mm"
@@ -294,6 +295,6 @@ class CatheterTracker:
 
 def _host(pose: Pose) -> Found | None:
     """Its tip and direction in NumPy, whatever device it is on; None where they are not finite."""
-    place, onward = (value.detach().to("cpu", torch.float64).numpy() for value in (pose.tip, pose.direction))
-    known = np.isfinite(place).all() and np.isfinite(onward).all()
+    place, onward = (value.numpy(force=True).astype(np.float64) for value in (pose.tip, pose.direction))
+    known = all(map(math.isfinite, (*place.tolist(), *onward.tolist())))
     return Found(place, onward, np.zeros((6, 6)), 0.0) if known else None

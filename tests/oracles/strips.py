@@ -56,3 +56,8 @@ def tube(offset, width, blur, level, left, right, count, shade=lambda q: np.ones
     q = 2 * (x - np.asarray(offset)[:, None]) / np.asarray(width)[:, None]
     fine = left * (1 - a) + right * (1 - b) + inside * np.asarray(level)[:, None] * shade(q)
     return _blurred(fine, blur, count)
+
+
+def on_plane(points: np.ndarray) -> np.ndarray:
+    """Points [N, 3] of space, seen on the plane z = 1 as complex numbers [N]."""
+    return (points[:, 0] + 1j * points[:, 1]) / points[:, 2]

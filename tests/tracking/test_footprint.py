@@ -5,10 +5,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from oracles.strips import on_plane
 
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import THESIS
-from holotorch.tracking.footprint import Front, bulge_px, on_plane, width_px
+from holotorch.tracking.footprint import Front, bulge_px, width_px
 from holotorch.tracking.lens import Lens
 from holotorch.tracking.resection import Found
 from holotorch.tracking.strips import Line
@@ -39,7 +40,7 @@ def test_width_is_that_of_the_outline(place, direction):
     positions = THESIS.positions.numpy()
     points = tip + positions[[0, -1], None] * direction
     line = Line.between(LENS, *on_plane(points).tolist())
-    near, taper = width_px(found_at(tip, direction), positions, THESIS.radius, line)
+    near, taper = width_px(found_at(tip, direction), positions.tolist(), THESIS.radius, line)
     for t in (-100.0, 0.0, 100.0):
         # Where the line across at t meets the images of the two planes, n . (x, y, 1) = 0.
         start, across = complex(line.plane(t)), 1j * line.along
@@ -61,7 +62,7 @@ def test_rings_bulge_to_where_their_points_nearest_to_the_camera_are_seen(direct
     one /= np.linalg.norm(one)
     turn = np.linspace(0, 2 * math.pi, 20000)[:, None]
     ring = THESIS.radius * (np.cos(turn) * one + np.sin(turn) * np.cross(direction, one))
-    found = bulge_px(found_at(tip, direction), positions, THESIS.radius, line)
+    found = bulge_px(found_at(tip, direction), positions.tolist(), THESIS.radius, line)
     assert found.shape == (4,) and np.abs(found).max() > 0.3 * (direction[2] != 0)
     for centre, bulge in zip(centres, found, strict=True):
         front = centre + ring[np.linalg.norm(centre + ring, axis=-1).argmin()]
@@ -72,7 +73,7 @@ def test_rings_bulge_to_where_their_points_nearest_to_the_camera_are_seen(direct
 def test_a_pose_along_the_line_of_sight_has_no_width():
     tip = np.array([0.02, 0.01, 0.7])
     line = Line.between(LENS, 0j, 0.1 + 0j)
-    near, taper = width_px(found_at(tip, -tip / np.linalg.norm(tip)), THESIS.positions.numpy(), THESIS.radius, line)
+    near, taper = width_px(found_at(tip, -tip / np.linalg.norm(tip)), THESIS.positions.tolist(), THESIS.radius, line)
     assert not (1 < near < 1000 and abs(taper) < 1)
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from oracles.strips import on_plane
 
 from holotorch.tracking import THESIS, Camera, solve_pose
-from holotorch.tracking.footprint import on_plane
 from holotorch.tracking.lens import Lens
 from holotorch.tracking.resection import Found, pose_on_line
 from holotorch.tracking.strips import Line
@@ -40,7 +40,9 @@ def solved(
     slope_sd=1e-4,
     shared_sd=0.0,
 ) -> Found:
-    found = pose_on_line(line, t, positions, deviation * np.ones_like(t), offset_sd, slope_sd, shared_sd)
+    found = pose_on_line(
+        line, t.tolist(), positions.tolist(), (deviation * np.ones_like(t)).tolist(), offset_sd, slope_sd, shared_sd
+    )
     assert found is not None
     return found
 
@@ -130,4 +132,4 @@ WRONG = {
 @pytest.mark.parametrize("kind", WRONG)
 def test_what_no_pose_explains_is_refused(kind):
     line, *_ = seen(0.5, 20, BANDS)
-    assert pose_on_line(line, WRONG[kind], BANDS, np.full(4, 0.1), 0.1, 1e-4) is None
+    assert pose_on_line(line, WRONG[kind].tolist(), BANDS.tolist(), [0.1] * 4, 0.1, 1e-4) is None
