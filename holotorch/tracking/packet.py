@@ -40,10 +40,10 @@ import math
 import struct
 import time
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from holotorch.tracking.status import Pose, Status
 
@@ -55,7 +55,9 @@ _BODY, _STAMPS = struct.Struct("<dd4s2s2s32sHHf16d21dd64s"), struct.Struct("<ddd
 _LENGTHS = {
     kind: _HEAD.size + part.size + _CRC.size for kind, part in ((POSE, _BODY), (ASK, _STAMPS), (REPLY, _STAMPS))
 }
-_UPPER = torch.triu_indices(6, 6)
+_UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
+_DIAGONAL = [n for n, (i, j) in enumerate(_UPPER) if i == j]
+_ALL = [_UPPER.index((min(i, j), max(i, j))) for i in range(6) for j in range(6)]
 _FARTHEST = 100.0  # metres; a tip farther off was given in another unit
 _LONGEST = torch.finfo(torch.float32).max  # seconds of lag
 _START = time.time() - time.perf_counter()
@@ -124,15 +126,12 @@ def encode(packet: PosePacket | Echo) -> bytes:
     if not isinstance(pose.status, Status) or pose.tip.shape != (3,):
         raise TypeError(f"a packet carries one pose with one status, got tips {list(pose.tip.shape)}; index the batch")
     status, answered = pose.status, pose.status.answered
-    matrix, covariance = torch.full((4, 4), torch.nan, dtype=torch.float64), torch.full((21,), torch.nan)
+    # In plain numbers, as in the other direction: the calls into torch took three quarters of a packet's way.
+    matrix, covariance = [math.nan] * 16, [math.nan] * 21
     if answered:
-        matrix = pose.camera_from_tool.detach().to("cpu", torch.float64, copy=True)
-        # The given numbers themselves, and the other axes square to them whatever the rounding.
-        along, first = pose.direction.detach().to(matrix), matrix[:3, 0]
-        first = torch.nn.functional.normalize(first - (first @ along) * along, dim=0)
-        matrix[:3, :3] = torch.stack([first, torch.linalg.cross(along, first), along], -1)
-        matrix[:3, 3] = pose.tip.detach()
-        covariance = pose.covariance.detach().to("cpu", torch.float64)[_UPPER[0], _UPPER[1]]
+        matrix = _matrix(pose.tip.tolist(), pose.direction.tolist())
+        both = pose.covariance.tolist()
+        covariance = [both[i][j] for i, j in _UPPER]
     chi_square, freedom = float(pose.chi_square), float(pose.freedom)
     freedom = int(freedom) if math.isfinite(freedom) else 0
     frame = packet.frame.encode("ascii", "replace")
@@ -147,7 +146,7 @@ def encode(packet: PosePacket | Echo) -> bytes:
         raise ValueError(wrong)
     body = _BODY.pack(
         *(packet.captured, packet.sent, _AXES, _UNIT, _ORDER, frame, int(status), freedom, packet.lag),
-        *(*matrix.flatten().tolist(), *covariance.tolist(), chi_square, _cut(pose.reason, 64)),
+        *(*matrix, *covariance, chi_square, _cut(pose.reason, 64)),
     )
     return _sealed(_HEAD.pack(_MAGIC, VERSION, POSE, int(answered), packet.stream, packet.sequence) + body)
 
@@ -194,34 +193,63 @@ def _pose_packet(fields: tuple, flags: int, stream: int, sequence: int) -> PoseP
         raise PacketError(f"frame name and reason must be printable, got {name!r} and {reason!r}")
     if bool(flags & 1) != status.answered:
         raise PacketError(f"flags {flags} do not fit the status {status.name}")
-    matrix = torch.tensor(fields[9:25], dtype=torch.float64).reshape(4, 4)
-    upper, chi_square = torch.tensor(fields[25:46], dtype=torch.float64), fields[46]
+    matrix, upper, chi_square = fields[9:25], fields[25:46], fields[46]
     if wrong := _mistake(status, matrix, upper, chi_square, freedom, (captured, sent, lag)):
         raise PacketError(wrong)
-    covariance = torch.empty(6, 6, dtype=torch.float64)
-    covariance[_UPPER[0], _UPPER[1]] = covariance[_UPPER[1], _UPPER[0]] = upper
-    chi, free = (torch.tensor(float(value), dtype=torch.float64) for value in (chi_square, freedom))
-    pose = Pose(matrix[:3, 3].clone(), matrix[:3, 2].clone(), covariance, chi, free, status, reason)
+    parts = matrix[3:12:4], matrix[2:11:4], [upper[n] for n in _ALL], chi_square, float(freedom)
+    tip, direction, covariance, chi, free = (torch.tensor(part, dtype=torch.float64) for part in parts)
+    pose = Pose(tip, direction, covariance.reshape(6, 6), chi, free, status, reason)
     return PosePacket(pose, captured, sent, sequence, stream, name, lag)
 
 
-def _mistake(status: Status, matrix: Tensor, upper: Tensor, chi: float, freedom: int, times: tuple) -> str:
-    """What is impossible about a pose, or nothing."""
+def _matrix(tip: list[float], along: list[float]) -> list[float]:
+    """As :attr:`Pose.camera_from_tool` row by row: the given numbers themselves, and the other axes square to them."""
+    x, y, z = along
+    square = x * x + y * y
+    if z < 0 and square < 1e-30:
+        first = [1.0, 0.0, 0.0]
+    else:
+        share = (1 - z) / square if z < 0 else 1 / (1 + z)
+        first = [1 - x * x * share, -x * y * share, -x]
+    # Square to it whatever the rounding.
+    tilt = _dot(first, along)
+    first = [a - tilt * b for a, b in zip(first, along, strict=True)]
+    length = math.sqrt(_dot(first, first)) or math.nan
+    first = [a / length for a in first]
+    second = _cross(along, first)
+    return [*(value for row in zip(first, second, along, tip, strict=True) for value in row), 0.0, 0.0, 0.0, 1.0]
+
+
+def _dot(one: Sequence[float], other: Sequence[float]) -> float:
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+
+
+def _cross(one: Sequence[float], other: Sequence[float]) -> list[float]:
+    (a, b, c), (x, y, z) = one, other
+    return [b * z - c * y, c * x - a * z, a * y - b * x]
+
+
+def _mistake(
+    status: Status, matrix: Sequence[float], upper: Sequence[float], chi: float, freedom: int, times: tuple
+) -> str:
+    """What is impossible about a pose, or nothing; its matrix row by row, and the upper triangle of its covariance."""
     if not all(map(math.isfinite, times)) or min(times) < 0:
         return f"capture time, time of sending and lag must be finite and not negative, got {times}"
     if not status.answered:
-        carried = not bool(matrix.isnan().all()) or not bool(upper.isnan().all())
+        carried = not all(map(math.isnan, (*matrix, *upper)))
         return f"a refusal ({status.name}) must not carry a pose; its matrix and covariance are NaN" if carried else ""
-    if not bool(matrix.isfinite().all()) or not bool(upper.isfinite().all()) or (freedom and not math.isfinite(chi)):
+    if not all(map(math.isfinite, (*matrix, *upper))) or (freedom and not math.isfinite(chi)):
         return f"a pose that is {status.name} must have a finite matrix, covariance and chi-square"
-    rotation, last = matrix[:3, :3], matrix.new_tensor([0.0, 0, 0, 1])
+    first, second, third, tip = (matrix[n:12:4] for n in range(4))
     # 1e-6 rad is 0.1 micrometres at the bands, and float32 poses pass.
-    twisted = (rotation.T @ rotation - torch.eye(3, dtype=matrix.dtype)).abs().max() > 1e-6
-    if bool(twisted) or bool((matrix[3] != last).any()) or torch.linalg.det(rotation) < 0:
+    lengths = [_dot(axis, axis) - 1 for axis in (first, second, third)]
+    twisted = [*lengths, _dot(first, second), _dot(second, third), _dot(third, first)]
+    turned = _dot(_cross(first, second), third) < 0
+    if not all(abs(value) <= 1e-6 for value in twisted) or tuple(matrix[12:]) != (0.0, 0.0, 0.0, 1.0) or turned:
         return "the matrix must be a right-handed rotation and a translation, with a unit direction in its third column"
-    if matrix[:3, 3].abs().max() > _FARTHEST:
-        return f"the tip must be within {_FARTHEST:g} m, in metres, got {matrix[:3, 3].tolist()}"
-    if bool((upper[_UPPER[0] == _UPPER[1]] < 0).any()):
+    if max(map(abs, tip)) > _FARTHEST:
+        return f"the tip must be within {_FARTHEST:g} m, in metres, got {list(tip)}"
+    if min(upper[n] for n in _DIAGONAL) < 0:
         return "the covariance must not be negative on its diagonal"
     return ""
 

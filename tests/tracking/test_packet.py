@@ -103,12 +103,38 @@ def test_a_refusal_carries_no_numbers(status):
         decode(put(data, 88, "<d", 0.0))
 
 
+def on_the_wire(given: Pose) -> torch.Tensor:
+    return torch.tensor(struct.unpack_from("<16d", encode(packet(given)), 88), dtype=torch.float64).reshape(4, 4)
+
+
 @pytest.mark.parametrize("slope", [0.0, 1e-12, 1e-9, 4e-5, 1e-3])
 def test_a_tool_that_points_at_the_camera_is_sent_too(slope):
-    """There the smallest rotation from +z to the direction is half a turn about an axis that is hard to tell."""
+    """There the smallest rotation from +z to the direction is half a turn about an axis that is hard to tell.
+
+    Of (s, -s / 3, -1) it is about the axis square to it and to z, so a rounding of 1e-16 of s turns it by as much of s.
+    """
     given = pose(direction=(slope, -slope / 3, -1.0))
     back = decode(encode(packet(given)))
     assert isinstance(back, PosePacket) and torch.equal(back.pose.direction, given.direction)
+    missed = 1e-15 / slope if slope else 1e-15
+    torch.testing.assert_close(on_the_wire(given), given.camera_from_tool, rtol=0, atol=max(missed, 1e-15))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.tuples(numbers, numbers, numbers).filter(lambda v: math.hypot(*v) > 1e-3))
+def test_the_matrix_is_that_of_the_pose(direction):
+    """In plain numbers what the pose does in torch: rounding, over the distance from straight back."""
+    given = pose(direction=direction)
+    back = math.hypot(*direction[:2]) / math.hypot(*direction)
+    missed = 1e-15 / max(back, 1e-15) if direction[2] < 0 else 1e-15
+    torch.testing.assert_close(on_the_wire(given), given.camera_from_tool, rtol=0, atol=2e-15 + missed)
+
+
+def test_a_pose_that_carries_gradients_or_single_numbers_is_sent_too():
+    given = pose()
+    learnt = replace(given, tip=given.tip.float().requires_grad_(), covariance=given.covariance.float())
+    back = decode(encode(packet(learnt)))
+    assert isinstance(back, PosePacket) and torch.equal(back.pose.tip, learnt.tip.detach().double())
 
 
 def test_every_damaged_byte_is_noticed():
