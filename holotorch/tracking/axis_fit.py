@@ -194,6 +194,7 @@ def _slices() -> tuple[np.ndarray, np.ndarray]:
 
 _NODES, _TAKES = _slices()
 _HALVES = _TAKES / 2
+# Of levels of the columns, what a rise at each node adds to the slopes to the middle and, times the node, to the width.
 _RISES = -np.stack([_TAKES, _TAKES * _NODES[:, None]], 1).transpose(2, 0, 1).reshape(_TAKES.shape[1], -1)
 
 

@@ -95,14 +95,48 @@ def fit_edges(
     mean = (weight * light).sum(1) / total
     centred = light - mean[:, None]
     given = np.concatenate([weight, weight * centred], 2), total
-    # What is known of each edge is a few plain numbers: calls into NumPy would cost several times as much.
-    edges = range(len(light))
-    place, sigma, sure = [0.0 for _ in edges], [blur for _ in edges], [0.0 for _ in edges]
+    place, sigma, sure = _each_by_itself(shape, t, blur, given)
+    sigma, sure, other = _one_lens(sigma, sure)
+    blurs, more = np.array(sigma), 2
+    while True:
+        terms, settled = _edge_terms(shape(t, np.array(place), blurs), *given), True
+        for e, (((pp, _), _), (p, _)) in enumerate(terms.sums):
+            move = _within(p / max(pp, 1e-30), -0.5, 0.5)
+            place[e] = _within(place[e] + move, -far, far)
+            settled = settled and abs(move) < _NEAR
+        more -= 1
+        if settled or not more:
+            break
+    left = centred - terms.amplitude[:, None] * (terms.rise[..., None] - terms.middle[:, None])
+    noise, strange, free = _left(left, weight)
+    deviation = []
+    for e, (((pp, pb), _), _) in enumerate(terms.sums):
+        some = max(pp, 1e-30)
+        variance = 1 / some + pb / some * (pb / some) / max(sure[e], 1e-12)
+        good = pp > 0 and math.isfinite(variance) and free[e] > 0 and not other[e]
+        doubt = max(strange[e] / _STRANGE, 1) ** 2
+        deviation.append(_SHARED * math.sqrt(variance) * max(noise[e], 0.5) * doubt if good else math.inf)
+    noise, deviation = np.array(noise), np.array(deviation)
+    good = np.isfinite(deviation)
+    # Of an edge that is none, such as one whose other side lies beyond the frame, all of these are rounding.
+    apart = _apart(terms.slope[good], terms.own[good], noise[good], rows[-1]) if good.any() else 1.0
+    levels = mean - terms.amplitude * terms.middle
+    steps, levels, told = (v.reshape(-1, *rows) for v in (terms.amplitude, levels, terms.told))
+    return EdgeFit(np.array(place), blurs, apart * deviation, noise, steps, levels, told, np.full(len(place), apart))
+
+
+# What is known of each edge is a few plain numbers: of these, calls into NumPy would cost several times as much.
+def _each_by_itself(
+    shape: Shape, t: np.ndarray, blur: float, given: tuple[np.ndarray, np.ndarray]
+) -> tuple[list[float], list[float], list[float]]:
+    """Place and blur of each edge, and the inverse variance of the blur; ``given`` as :func:`_edge_terms` takes it."""
+    count, far = len(given[0]), float(t[-1])
+    place, sigma, sure = [0.0] * count, [blur] * count, [0.0] * count
     for _ in range(_STEPS):
         settled = True
         terms = _edge_terms(shape(t, np.array(place), np.array(sigma)), *given)
         for e, (((pp, pb), (_, bb)), (p, b)) in enumerate(terms.sums):
-            sure[e] = _within(bb - pb * pb / max(pp, 1e-30), 0.0, 1e12)  # inverse variance of the blur
+            sure[e] = _within(bb - pb * pb / max(pp, 1e-30), 0.0, 1e12)
             whole = (1 + 1e-6) * pp * bb - pb * pb
             if whole > 0:  # an edge without weight has 0 / 0: it stays where it is, of infinite deviation
                 along = _within((bb * p - pb * b) / whole, -1.5, 1.5)
@@ -113,52 +147,40 @@ def fit_edges(
                 settled = settled and abs(along) < _ENDS[0] * least and abs(wider) < _ENDS[1] * least
         if settled:
             break
-    # One lens blurs all edges alike. Where one side is dark and so has little noise, place and blur are hard to tell
-    # apart, edge by edge; together they are not.
-    common = max(sum(s * width for s, width in zip(sure, sigma, strict=True)) / max(sum(sure), 1e-30), 1e-30)
-    alike = [abs(width / common - 1) < 0.5 and s > 0 for s, width in zip(sure, sigma, strict=True)]
-    together = max(sum(s for s, one in zip(sure, alike, strict=True) if one), 1e-30)
-    shared = sum(s * width for s, width, one in zip(sure, sigma, alike, strict=True) if one) / together
-    # Others surely are not blurred by that lens.
-    other = [not alike[e] and (sigma[e] - common) ** 2 * sure[e] > _OTHER**2 for e in edges]
-    sigma = np.array([shared if alike[e] else sigma[e] for e in edges])
-    more = 2
-    while True:
-        terms, settled = _edge_terms(shape(t, np.array(place), sigma), *given), True
-        for e, (((pp, _), _), (p, _)) in enumerate(terms.sums):
-            move = _within(p / max(pp, 1e-30), -0.5, 0.5)
-            place[e] = _within(place[e] + move, -far, far)
-            settled = settled and abs(move) < _NEAR
-        more -= 1
-        if settled or not more:
-            break
-    left = centred - terms.amplitude[:, None] * (terms.rise[..., None] - terms.middle[:, None])
+    return place, sigma, sure
+
+
+def _one_lens(sigma: list[float], sure: list[float]) -> tuple[list[float], list[float], list[bool]]:
+    """Blurs, their inverse variances, and which edges surely are not blurred by the lens that most of them show.
+
+    One lens blurs all edges alike. Where one side is dark and so has little noise, place and blur are hard to tell
+    apart, edge by edge; together they are not.
+    """
+    both = list(zip(sigma, sure, strict=True))
+    common = max(sum(width * s for width, s in both) / max(sum(sure), 1e-30), 1e-30)
+    alike = [abs(width / common - 1) < 0.5 and s > 0 for width, s in both]
+    those = [pair for pair, one in zip(both, alike, strict=True) if one]
+    together = max(sum(s for _, s in those), 1e-30)
+    shared = sum(width * s for width, s in those) / together
+    other = [not one and (width - common) ** 2 * s > _OTHER**2 for (width, s), one in zip(both, alike, strict=True)]
+    sigma = [shared if one else width for width, one in zip(sigma, alike, strict=True)]
+    return sigma, [together if one else s for s, one in zip(sure, alike, strict=True)], other
+
+
+def _left(left: np.ndarray, weight: np.ndarray) -> tuple[list[float], list[float], list[int]]:
+    """Of what fits leave [E, T, R]: its size over the noise, the same over its white part, and degrees of freedom."""
     bent = left[:, 2:] - 2 * left[:, 1:-1] + left[:, :-2]
     whole = (weight * left * left).sum((1, 2)).tolist()
     rough = (weight[:, 1:-1] * bent * bent).sum((1, 2)).tolist()
     used = weight > 0
-    each = used.sum(1)  # [E, U C]
+    each = used.sum(1)  # [E, R]
     count, levels = each.sum(1).tolist(), np.count_nonzero(each, 1).tolist()
-    ends = used[:, :: len(t) - 1].sum((1, 2)).tolist()
-    noise, deviation = [], []
-    for e, (((pp, pb), _), _) in enumerate(terms.sums):
-        free = count[e] - 2 * levels[e] - 2
-        noise.append(math.sqrt(whole[e] / max(free, 1)))
-        some = max(pp, 1e-30)
-        variance = 1 / some + pb / some * (pb / some) / max(together if alike[e] else sure[e], 1e-12)
-        # What varies from sample to sample is noise; what does not is something else that the edge is mixed with.
-        strange = noise[e] / max(math.sqrt(rough[e] / (6 * max(count[e] - ends[e], 1))), 1e-9)
-        doubt = max(strange / _STRANGE, 1) ** 2
-        good = pp > 0 and math.isfinite(variance) and free > 0 and not other[e]
-        deviation.append(_SHARED * math.sqrt(variance) * max(noise[e], 0.5) * doubt if good else math.inf)
-    noise, deviation = np.array(noise), np.array(deviation)
-    good = np.isfinite(deviation)
-    # Of an edge that is none, such as one whose other side lies beyond the frame, all of these are rounding.
-    apart = _apart(terms.slope[good], terms.own[good], noise[good], rows[-1]) if good.any() else 1.0
-    levels = mean - terms.amplitude * terms.middle
-    steps, levels, told = (v.reshape(-1, *rows) for v in (terms.amplitude, levels, terms.told))
-    place, alike = np.array(place), np.full(len(place), apart)
-    return EdgeFit(place, sigma, apart * deviation, noise, steps, levels, told, alike)
+    ends = used[:, :: used.shape[1] - 1].sum((1, 2)).tolist()
+    free = [n - 2 * level - 2 for n, level in zip(count, levels, strict=True)]
+    noise = [math.sqrt(value / max(n, 1)) for value, n in zip(whole, free, strict=True)]
+    # What varies from sample to sample is noise; what does not is something else that the edge is mixed with.
+    white = [math.sqrt(rough[e] / (6 * max(count[e] - ends[e], 1))) for e in range(len(rough))]
+    return noise, [value / max(part, 1e-9) for value, part in zip(noise, white, strict=True)], free
 
 
 class _Terms(NamedTuple):

@@ -133,3 +133,15 @@ WRONG = {
 def test_what_no_pose_explains_is_refused(kind):
     line, *_ = seen(0.5, 20, BANDS)
     assert pose_on_line(line, WRONG[kind].tolist(), BANDS.tolist(), [0.1] * 4, 0.1, 1e-4) is None
+
+
+@pytest.mark.parametrize("tilt", [0.0, 20.0, -60.0])
+def test_a_rough_pose_is_the_same_without_its_covariance(tilt):
+    line, t, *_ = seen(0.52, tilt, SIX)
+    places = (t + 0.1 * np.random.default_rng(5).normal(size=len(t))).tolist()
+    given = line, places, SIX.tolist(), [0.05] * len(t), 0.1, 1e-4, 0.01
+    whole, rough = pose_on_line(*given), pose_on_line(*given, rough=True)
+    assert whole is not None and rough is not None and whole.covariance.any() and not rough.covariance.any()
+    np.testing.assert_allclose(rough.tip, whole.tip, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(rough.direction, whole.direction, rtol=0, atol=1e-15)
+    assert rough.chi_square == whole.chi_square
