@@ -34,7 +34,7 @@ def coarse_colours(sampler: Sampler, pixels: Points) -> np.ndarray:
     both = (_MIXES @ patches.reshape(3, -1)).reshape(2, *patches.shape[1:])
     step = both[..., 1:] - both[..., :-1]
     bent, red = _median(step[..., 1:] - step[..., :-1])
-    even, odd, luma = _median(np.concatenate([step[1:, ..., :-1:2], step[1:, ..., 1::2], step[:1, ..., 1::2]]))
+    even, odd, luma = (_median(some) for some in (step[1, ..., ::2], step[1, ..., 1::2], step[0]))
     shared = np.minimum(even, odd) < _COARSE * np.minimum(np.maximum(even, odd), luma)
     return shared | (red < _COARSE * bent)
 
