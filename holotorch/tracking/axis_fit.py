@@ -17,6 +17,7 @@ from holotorch.tracking.fits import BLUNTEST, SHARPEST, median
 _STEPS = 8
 _SETTLED = 0.03  # pixels, of middle and blur: the step after is a third of it; gloss and shadow move a middle by more
 _WIDENED = 0.15  # pixels, of width and taper: the step after is a fifth of it, and moves the middle by next to nothing
+_FARTHEST = np.array([1.5, 1.5, 1.5, 1.5, 0.5])  # pixels in one step, of middle and width at both, and of blur
 _SLICES = 8
 _SHADINGS = (np.ones_like, lambda q: q, lambda q: np.sqrt(1 - q * q), lambda q: q**3)
 _MEANS = (1.0, 0.0, math.pi / 4, 0.0)  # of the shadings over the tube
@@ -154,9 +155,9 @@ def fit_axis(
             break
         step = _solved(normal, slope - ridge * (unknown - expected))
         middle, turn, wide, taper, soft = step[:5].tolist()
-        step[:4] = np.minimum(np.maximum(step[:4], -1.5), 1.5)
+        step[:5] = np.minimum(np.maximum(step[:5], -_FARTHEST), _FARTHEST)
         unknown += step
-        unknown[4] = min(max(unknown[4] - soft + min(max(soft, -0.5), 0.5), SHARPEST), BLUNTEST)
+        unknown[4] = min(max(unknown[4], SHARPEST), BLUNTEST)
         moving = max(abs(middle), abs(turn))
         if k and max(moving, abs(soft)) < _SETTLED and max(abs(wide), abs(taper)) < _WIDENED:
             break
@@ -167,9 +168,13 @@ def fit_axis(
 
 
 def _solved(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
-    # By Cholesky's factors from OpenCV: the call into NumPy's solver takes several times as long as the work.
+    """Of a positive matrix [N, N] and right sides [N] or [N, K]; NaN, which whoever asked refuses, where it is not.
+
+    By Cholesky's factors from OpenCV: the call into NumPy's solver takes several times as long as the work. It gives up
+    on pivots below 2e-16, where nothing is seen; 3000 fits to frames of all conditions had none below 1e-3.
+    """
     known, found = cv2.solve(normal, right.reshape(len(right), -1), flags=cv2.DECOMP_CHOLESKY)
-    return found.reshape(right.shape) if known else np.full_like(right, np.nan)  # which is refused by whoever asked
+    return found.reshape(right.shape) if known else np.full_like(right, np.nan)
 
 
 def _inverse(normal: np.ndarray) -> np.ndarray:

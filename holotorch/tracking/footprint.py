@@ -48,7 +48,7 @@ def bulge_px(found: Found, positions: Sequence[float], radius: float, line: Line
 
 
 def axis_on_plane(found: Found, position: float) -> complex:
-    """The tool's point ``position`` metres from its tip, seen on the plane z = 1."""
+    """The tool's point ``position`` metres from its tip, seen on the plane z = 1; NaN in the camera's own plane."""
     (x, y, z), (a, b, c) = found.tip.tolist(), found.direction.tolist()
     return complex(x + position * a, y + position * b) / (z + position * c or math.nan)
 

@@ -24,15 +24,16 @@ class Lens:
         (self._fx, _, self._cx), (_, self._fy, self._cy), _ = camera.matrix.tolist()
         self._k1, self._k2, self._p1, self._p2, self._k3 = camera.distortion.tolist()
         self.scale = (self._fx + self._fy) / 2
-        self._slim = (self._fx - self._fy) / 2
+        self._uneven = (self._fx - self._fy) / 2
         self.light = camera.table().detach().cpu().numpy()
 
     def distort(self, plane: Points) -> Points:
         """Pixels of points on the plane z = 1."""
+        # fx x + i fy y of a complex number, and no more calls than the lens at hand needs; so below.
         pixels = self._bent(plane)
-        slim = pixels.conj() * self._slim if self._slim else 0.0  # fx x + i fy y, in few calls
+        uneven = pixels.conj() * self._uneven if self._uneven else 0.0
         pixels *= self.scale
-        return pixels + (slim + complex(self._cx, self._cy))
+        return pixels + (uneven + complex(self._cx, self._cy))
 
     def undistort(self, pixels: Points) -> Points:
         """Points [n] on the plane z = 1 of pixels [n]; NaN where there is none."""

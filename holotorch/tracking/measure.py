@@ -34,6 +34,7 @@ _UNSURE, _LOST = 0.1, 3.0  # pixels: a clear edge is known to a few hundredths, 
 _ALIKE = 0.2  # of the brightest channel: colours nearer than this are one
 _PALE = 0.5  # of the purity of what lies beside it
 _BESIDE = 14.0  # pixels from the mid-line, beside the widest catheters
+_SIGNS, _ROWS = np.repeat([-1.0, 1.0], 3), np.tile([2.0, 3.0, 4.0], 2)  # three rows to either side, pixels beyond it
 _SIDE_STEP = 0.25  # light that changes beside an edge, over what changes on it: something lies across the tube
 _SAME_STEP = 0.6  # the same, where the bands themselves go on there
 _CLEAR = 4.0  # standard deviations of that change
@@ -232,9 +233,6 @@ def _astray(fit: EdgeFit, looks: int) -> bool:
     return looks > 0 and far >= _AWAY and int(np.count_nonzero(fit.deviation < _LOST)) >= 2
 
 
-_SIGNS, _ROWS = np.repeat([-1.0, 1.0], 3), np.tile([2.0, 3.0, 4.0], 2)
-
-
 def _sides(widths: np.ndarray, blur: float) -> np.ndarray:
     """Three rows to either side of tubes so wide [E], beyond what blur makes of their sides: [E, 6] across."""
     return _SIGNS * (_ROWS + 2 * blur + widths[:, None] / 2)
@@ -256,7 +254,7 @@ def _across(light: np.ndarray, along: np.ndarray, fit: EdgeFit) -> tuple[np.ndar
     own = fit.steps[:, middle - 1 : middle + 2].sum(1)
     own = np.sqrt((own * own).sum(-1, keepdims=True)) / 3
     large = size > _SIDE_STEP * own
-    if not large.any():
+    if not large.any():  # as mostly: what noise may do need not be known
         return large[:, 0], False
     side = light.reshape(count, samples, 2, 3, colours).sum(3) / 3
     left = side - side.sum(1, keepdims=True) / samples - step[:, None] * up[:, :, None, None]

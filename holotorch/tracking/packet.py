@@ -203,7 +203,10 @@ def _pose_packet(fields: tuple, flags: int, stream: int, sequence: int) -> PoseP
 
 
 def _matrix(tip: list[float], along: list[float]) -> list[float]:
-    """As :attr:`Pose.camera_from_tool` row by row: the given numbers themselves, and the other axes square to them."""
+    """As :attr:`Pose.camera_from_tool`, row by row [16], of a tip [3] in metres and a direction [3].
+
+    The given numbers themselves, and the other axes square to them. In plain numbers, a thirtieth of the time there.
+    """
     x, y, z = along
     square = x * x + y * y
     if z < 0 and square < 1e-30:
