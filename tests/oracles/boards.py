@@ -87,3 +87,23 @@ def handheld(count, centre, size=1.0, tilt=0.7, seed=0):
         turned = generator.uniform(-1, 1, 3) * [tilt, tilt, 0.3]
         at = generator.uniform(-1, 1, 3) * [0.08, 0.05, 0.08] * size + [0, 0, 0.42 * size]
         yield turned, around(centre, turned, at)
+
+
+def scatter(points, pixels, values, free=False):
+    """Squared distances in px^2 that one view keeps: board's pose fitted, and all nine intrinsics too if ``free``.
+
+    ``values`` are fx, fy, cx, cy, k1, k2, p1, p2, k3: the camera, or where the search for the best one starts.
+    """
+    fx, fy, cx, cy, *distortion = values
+    matrix, distortion = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(distortion)
+    stop = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 1000, 1e-14)
+    if free:
+        given = [points.astype(np.float32)], [pixels.astype(np.float32)]
+        flags = cv2.CALIB_USE_INTRINSIC_GUESS
+        return cv2.calibrateCamera(*given, (640, 480), matrix, distortion, flags=flags, criteria=stop)[0] ** 2 * len(
+            points
+        )
+    _, turned, at = cv2.solvePnP(points, pixels, matrix, distortion)
+    turned, at = cv2.solvePnPRefineLM(points, pixels, matrix, distortion, turned, at, stop)
+    seen = cv2.projectPoints(points, turned, at, matrix, distortion)[0].reshape(-1, 2)
+    return np.square(seen - pixels).sum()

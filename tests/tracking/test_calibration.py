@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import scipy.stats
 import torch
 from oracles import boards as oracle
 
@@ -259,13 +260,29 @@ def test_bard_photographs_give_the_reference_within_their_deviations():
     assert apart < 1.5
 
 
-def test_one_charuco_photograph_is_explained_by_its_reference_and_no_calibration():
+def test_one_charuco_photograph_says_what_its_reference_says():
+    """Three of the reference's four photographs are not here, and one determines no camera: ours refuses it.
+
+    What it says all the same: the reference lies within the region of confidence of its nine intrinsics, and cameras
+    5 % or 10 px beside it do not.
+    """
     board = Charuco(5, 7, 0.04, 0.02, "DICT_6X6_250")
     images, views = photographs("charuco_choriginal.jpg", board)
     assert len(views[0].points) == 24
-    fx, fy, cx, cy, *distortion = stored("charuco_camera.yml")
+    reference = stored("charuco_camera.yml")
+    # Of 48 coordinates the board's pose takes six and the best camera for this photograph nine more.
+    best = oracle.scatter(views[0].points.numpy(), views[0].pixels.numpy(), reference, free=True)
+
+    def f_ratio(values):
+        least = oracle.scatter(views[0].points.numpy(), views[0].pixels.numpy(), values)
+        return (least - best) / 9 / (best / (48 - 15))
+
+    limit = scipy.stats.f.ppf(0.95, 9, 48 - 15)
+    assert f_ratio(reference) < limit
+    for changed in ([0.95, 0.95, 1, 1], [1.05, 1.05, 1, 1], [1, 1, 1, 1 + 10 / reference[3]]):
+        assert f_ratio(reference * [*changed, 1, 1, 1, 1, 1]) > limit
+    fx, fy, cx, cy, *distortion = reference
     camera = Camera(torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), torch.tensor(distortion))
-    # The reference states 0.18 px over its own four photographs; twice that is no other camera's.
-    assert reprojection(camera, views).item() < 0.36
+    assert reprojection(camera, views).item() < 0.25
     with pytest.raises(ValueError, match="at least 4 photographs"):
         calibrate(views, images[0].shape)
