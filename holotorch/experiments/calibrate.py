@@ -14,7 +14,7 @@ from holotorch.experiments.settings import metres
 from holotorch.io.images import load_image, with_channels
 from holotorch.io.video import PICTURES
 from holotorch.tracking.boards import Charuco, Chessboard, View, describe_board, find_board
-from holotorch.tracking.calibration import PARAMETERS, Calibration, calibrate, enough
+from holotorch.tracking.calibration import PARAMETERS, Calibration, calibrate
 
 BOARD = ("chessboard", "9x6", "25mm")
 _KINDS = "chessboard 9x6 25mm (inner corners, square) or charuco 5x7 40mm 20mm DICT_6X6_250 (squares, square, marker)"
@@ -34,7 +34,7 @@ def calibrate_photographs(
         The calibration, and the photographs in which no board was found, with the reason.
 
     Raises:
-        ConfigError: Unreadable photographs, different sizes, too few with a board, views that determine no camera.
+        ConfigError: Unreadable photographs, different sizes, none with a board, views that determine no camera.
     """
     wanted = parse_board(board)
     if out.exists():
@@ -71,7 +71,6 @@ def calibrate_photographs(
     if mistakes:
         raise ConfigError(mistakes)
     try:
-        enough(len(views))
         found = calibrate(views, next(iter(sizes.values())))
     except ValueError as error:
         raise ConfigError([str(error), *(f"{name}: {reason}" for name, reason in missing.items())]) from None
@@ -104,13 +103,14 @@ def calibration_text(found: Calibration, missing: dict[str, str], board: Sequenc
         f"{name} {_rounded(value, found.deviations[name])}" for name, value in zip(PARAMETERS, values, strict=True)
     ]
     seen = found.coverage
+    between = f", {math.degrees(seen.between):.0f} deg between boards at most" if len(found.views) > 1 else ""
     low, high = (math.degrees(angle) for angle in seen.tilts)
     lines = [
         f"Camera     {', '.join(words[:4])} px, for frames of {found.size[1]} x {found.size[0]} px",
         f"Distortion {', '.join(words[4:])}",
-        f"Board      {describe_board(parse_board(board))}, rms {found.rms_px:.2f} px over {len(found.views)} views",
+        f"Board      {describe_board(parse_board(board))}, rms {found.rms_px:.2f} px, views: {len(found.views)}",
         f"Coverage   {100 * seen.cells:.0f} % of the picture, {100 * seen.radius:.0f} % of the way to its corners, "
-        f"tilts of {low:.0f} to {high:.0f} deg, {math.degrees(seen.between):.0f} deg between boards at most",
+        f"tilts of {low:.0f} to {high:.0f} deg{between}",
     ]
     lines += [f"View       {name}: {error:.2f} px" for name, error in found.views.items()]
     lines += [

@@ -38,7 +38,7 @@ Row = tuple[Number, Number, Number, Number]
 
 
 class EvidenceSettings(Settings):
-    """What a calibration says of itself; for the reader, and not used by tracking. Angles in radians.
+    """What a calibration says of itself; for the reader, and for a doubt that tracking notes. Angles in radians.
 
     ``deviations``: of each parameter. ``views`` and ``left_out``: rms in pixels by photograph. ``cells``, ``radius``,
     ``tilts``, ``between``: see ``Coverage``.

@@ -20,6 +20,7 @@ from holotorch.io.bundled import find_config
 from holotorch.io.recording import is_recording, open_recording
 from holotorch.io.video import Frames, is_camera, no_such_source, open_frames
 from holotorch.tracking import Camera, Catheter, Pose
+from holotorch.tracking.calibration import SURE
 
 METHODS = ("ours", "thesis")
 _OFF_CENTRE = 0.15  # of a side; two thirds of the resolution, as 720 to 1080 lines, shift the centre by a sixth
@@ -74,7 +75,7 @@ def opened(
     except ValueError as error:
         raise ConfigError([str(error)]) from None
     with frames:
-        _same_size(lens, frames)
+        _checked(lens, frames)
         yield Given(frames, seen, tool, tracker, paths)
 
 
@@ -131,8 +132,8 @@ class _Cold:
         return getattr(self._tracker, "times", {})
 
 
-def _same_size(lens: CameraSettings, frames: Frames) -> None:
-    """ConfigError, or a doubt noted, for intrinsics of another resolution: poses would be wrong, and plausible."""
+def _checked(lens: CameraSettings, frames: Frames) -> None:
+    """ConfigError, or a doubt noted, for intrinsics that make poses wrong, and plausible: rough, or of another size."""
     height, width = frames.shape
     if lens.size is not None and tuple(lens.size) != frames.shape:
         held = f"{lens.size[1]} x {lens.size[0]}"
@@ -141,4 +142,10 @@ def _same_size(lens: CameraSettings, frames: Frames) -> None:
         frames.notes.append(
             f"the principal point ({lens.cx:.0f}, {lens.cy:.0f}) is far from the middle of frames of {width} x "
             f"{height} px: was the camera calibrated at another resolution?"
+        )
+    unsure = lens.calibration.deviations.get("fx", 0.0) / lens.fx if lens.calibration else 0.0
+    if unsure > SURE:
+        frames.notes.append(
+            f"the camera's calibration leaves its focal length open to {100 * unsure:.1f} %: tips are as far off along "
+            "the line of sight, in all frames alike, and no deviation below says so"
         )

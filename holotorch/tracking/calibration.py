@@ -11,12 +11,14 @@ from torch import Tensor
 
 from holotorch.tracking.boards import View
 from holotorch.tracking.camera import Camera
+from holotorch.tracking.few_views import estimate
 
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-_FEWEST = 4  # views; with three nothing is left to check them
+SURE = 2e-3  # relative deviation of the focal length: moves a tip at 0.5 m by 1 mm
+_CHECKED = 4  # views; of fewer, leaving one out tells nothing
 _ADVISED = 10
 _SAME_TILT = math.radians(10)  # boards nearer to parallel leave the focal length open
-_WORST = 0.1  # relative deviation of the focal length beyond which nothing was determined
+_WORST = 0.2  # relative deviation of the focal length: two of them make 1.4 or 0.6 of it, nothing was determined
 _GROUPS = 20  # of views, left out one after the other
 _CELLS = (6, 8)  # rows and columns of the picture that the coverage counts
 
@@ -47,8 +49,9 @@ class Calibration:
         size: (H, W) of the photographs in pixels; it holds for frames of this size.
         deviations: Standard deviation of each of ``PARAMETERS``: the larger one of what the corners' scatter says by
             linear propagation (OpenCV) and what leaving out views says (jackknife). The first takes the errors of
-            neighbouring corners as independent, which boards that bend and corner finders do not grant.
-        formal: The first of the two alone, for comparison.
+            neighbouring corners as independent, which boards that bend and corner finders do not grant. Of fewer than
+            4 views: see ``holotorch.tracking.few_views``.
+        formal: Those of independent corners, for comparison.
         rms_px: Of all corners that were used.
         views: rms in pixels of each view that was used, by name.
         left_out: The same of those that were not: rms above 3 times the median and above 0.5 px.
@@ -71,44 +74,49 @@ def calibrate(views: Sequence[View], size: tuple[int, int]) -> Calibration:
     """Estimate focal lengths, principal point and five terms of distortion from views of a board.
 
     Views whose rms exceeds 3 times the median of all and 0.5 px are left out, the worst one first, as long as three
-    quarters remain.
+    quarters and 4 remain. What fewer than 4 leave open is closed by what ordinary cameras are like (square pixels,
+    centred, moderate distortion: no fisheye), and is in the deviations: a start, not for measuring.
 
     Args:
-        views: At least 4, better 10 or more, of a flat board tilted differently; see ``holotorch.tracking.boards``.
-            Flat, because a bend that is the same in all views is in no deviation: 1 mm over 200 mm of board makes the
-            focal length wrong by about 2 %.
+        views: 10 or more, of a flat board tilted differently; see ``holotorch.tracking.boards``. Flat, because a bend
+            that is the same in all views is in no deviation: 1 mm over 200 mm of board makes the focal length wrong by
+            about 2 %.
         size: (H, W) of the photographs in pixels.
 
     Raises:
-        ValueError: Too few views, all of them parallel, or others that leave the focal length open (deviation above
-            10 %), corners outside the picture; with what to do.
+        ValueError: No views, all of them parallel, or others that leave the focal length open (deviation above 20 %),
+            corners outside the picture; with what to do.
 
     Source: Zhang (2000) as in OpenCV's calibrateCameraExtended; Quenouille and Tukey for the jackknife, here over
     up to 20 groups of views.
     """
     height, width = size
     kept = list(views)
-    enough(len(kept))
+    if not kept:
+        raise ValueError(f"a calibration needs photographs that show the board, better {_ADVISED} or more, got none")
     for view in kept:
         low, high = view.pixels.amin(0), view.pixels.amax(0)
         if low.min() < -0.5 or high[0] > width - 0.5 or high[1] > height - 0.5:
             raise ValueError(f"corners must lie within {width} x {height} px, but {view.name!r} has others")
     names = [view.name or f"view {i}" for i, view in enumerate(kept)]
     left_out: dict[str, float] = {}
-    while True:
+    if len(kept) < _CHECKED:
+        values, spread, formal, normals, errors = estimate(kept, size)
+        fit = _Fit(values, formal, normals, errors)
+        coverage = _coverage(kept, fit, size)
+    else:
         fit = _fit(kept, size)
-        errors = fit.errors
-        worst = int(errors.argmax())
-        limit = max(3 * float(np.median(errors)), 0.5)
-        if errors[worst] <= limit or 4 * (len(kept) - 1) < 3 * len(views) or len(kept) <= _FEWEST:
-            break
-        left_out[names.pop(worst)] = float(errors[worst])
-        kept.pop(worst)
-    coverage = _coverage(kept, fit, size)
-    _check_tilts(coverage)
-    formal = np.asarray(fit.deviations)
-    spread = np.maximum(formal, _jackknife(kept, size, fit))
-    relative = float(max(spread[0] / fit.values[0], spread[1] / fit.values[1]))
+        while len(kept) > _CHECKED and 4 * (len(kept) - 1) >= 3 * len(views):
+            worst = int(fit.errors.argmax())
+            if fit.errors[worst] <= max(3 * float(np.median(fit.errors)), 0.5):
+                break
+            left_out[names.pop(worst)] = float(fit.errors[worst])
+            kept.pop(worst)
+            fit = _fit(kept, size)
+        coverage = _coverage(kept, fit, size)
+        _check_tilts(coverage)
+        spread = np.maximum(fit.deviations, _jackknife(kept, size, fit))
+    relative = float(max(spread[:2] / fit.values[:2]))
     if not relative <= _WORST:
         raise ValueError(
             f"the views leave the focal length open to {100 * relative:.0f} % (one standard deviation); tilt the board "
@@ -120,12 +128,12 @@ def calibrate(views: Sequence[View], size: tuple[int, int]) -> Calibration:
         camera,
         (int(height), int(width)),
         dict(zip(PARAMETERS, spread.tolist(), strict=True)),
-        dict(zip(PARAMETERS, formal.tolist(), strict=True)),
-        math.sqrt(float((errors**2 * weights).sum() / weights.sum())),
-        dict(zip(names, errors.tolist(), strict=True)),
+        dict(zip(PARAMETERS, fit.deviations.tolist(), strict=True)),
+        math.sqrt(float((fit.errors**2 * weights).sum() / weights.sum())),
+        dict(zip(names, fit.errors.tolist(), strict=True)),
         left_out,
         coverage,
-        tuple(_warnings(camera, size, len(kept), relative, coverage, errors)),
+        tuple(_warnings(camera, size, len(kept), relative, coverage, fit.errors)),
     )
 
 
@@ -143,15 +151,6 @@ def reprojection(camera: Camera, views: Sequence[View]) -> Tensor:
         seen = cv2.projectPoints(points, turned, at, matrix, distortion)[0].reshape(-1, 2)
         errors.append(math.sqrt(float(((seen - pixels) ** 2).sum(-1).mean())))
     return torch.tensor(errors, dtype=torch.float64)
-
-
-def enough(count: int) -> None:
-    """Raise ValueError if so few views of a board determine nothing that could be checked."""
-    if count < _FEWEST:
-        raise ValueError(
-            f"a calibration needs at least {_FEWEST} photographs that show the board, better {_ADVISED} or more, "
-            f"tilted differently; got {count}"
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,9 +227,14 @@ def _warnings(
     camera: Camera, size: tuple[int, int], count: int, relative: float, coverage: Coverage, errors: np.ndarray
 ) -> list[str]:
     found = []
-    if count < _ADVISED:
+    if count < _CHECKED:
+        found.append(
+            f"Too few views to check one another ({count}): what is open is taken from ordinary cameras, which is a "
+            f"start and no measurement. Take {_ADVISED} or more."
+        )
+    elif count < _ADVISED:
         found.append(f"Only {count} views: take {_ADVISED} or more.")
-    if relative > 2e-3:
+    if relative > SURE:
         found.append(
             f"The focal length is known to {100 * relative:.1f} % only: at 0.5 m that may move a tip by "
             f"{500 * relative:.1f} mm. Take more views, tilted by 20 to 45 degrees to several sides."
@@ -242,7 +246,7 @@ def _warnings(
             f"No corner beyond {100 * coverage.radius:.0f} % of the way to the picture's corners: the distortion there "
             "is a guess."
         )
-    if coverage.between < math.radians(25):
+    if count > 1 and coverage.between < math.radians(25):
         found.append(
             f"The boards differ by {math.degrees(coverage.between):.0f} degrees at most: tilt the board more, to "
             "several sides."

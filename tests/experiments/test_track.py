@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+import yaml
 from stand_in import CAMERA, SIZE, StandIn, grey, pictures, read, summary, tracked
 
 from holotorch.experiments import track, track_source
@@ -203,6 +204,25 @@ def test_intrinsics_of_another_resolution_are_noticed(tmp_path, tracker):
     save_camera(tmp_path / "camera.yaml", double)  # says no size
     folder, _ = tracked(tmp_path, source, video=False)
     assert any("calibrated at another resolution" in note for note in summary(folder)["notes"])
+
+
+def test_a_rough_calibration_is_noted(tmp_path, tracker):
+    source = pictures(tmp_path / "in", [9])
+    path = tmp_path / "camera.yaml"
+    settings = yaml.safe_load(path.read_text())
+    evidence = {
+        "rms_px": 0.2,
+        "views": {"a.png": 0.2},
+        "cells": 0.3,
+        "radius": 0.4,
+        "tilts": [0.5, 0.5],
+        "between": 0.0,
+    }
+    for name, share, told in (("rough", 0.15, True), ("good", 0.001, False)):
+        evidence["deviations"] = {"fx": share * settings["fx"], "fy": share * settings["fx"]}
+        path.write_text(yaml.safe_dump(settings | {"calibration": evidence}))
+        folder, _ = tracked(tmp_path, source, name, video=False)
+        assert any("leaves its focal length open to 15.0 %" in note for note in summary(folder)["notes"]) == told
 
 
 def test_a_recording_that_does_not_fit_is_refused(tmp_path, tracker, monkeypatch):

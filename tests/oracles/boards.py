@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+import scipy.optimize
 
 PRINTED = 40  # samples of the printed board along a square
 
@@ -107,3 +108,57 @@ def scatter(points, pixels, values, free=False):
     turned, at = cv2.solvePnPRefineLM(points, pixels, matrix, distortion, turned, at, stop)
     seen = cv2.projectPoints(points, turned, at, matrix, distortion)[0].reshape(-1, 2)
     return np.square(seen - pixels).sum()
+
+
+def grid(columns=9, rows=6, square=0.025):
+    """Corners [n, 3] of a chessboard."""
+    return np.stack(np.meshgrid(np.arange(columns), np.arange(rows), [0]), -1).reshape(-1, 3) * square
+
+
+def bent(points, x, y, xy):
+    """Corners of a board bent by second-order bows, as shares of its diagonal at its ends."""
+    across = np.linalg.norm(np.ptp(points, axis=0))
+    u, v = (2 * (points - points.mean(0)) / across).T[:2]
+    return points + np.outer(across * (x * u * u + y * v * v + 2 * xy * u * v), [0, 0, 1])
+
+
+def most_probable(views, size, start, error):
+    """Camera [9] and its deviations: the maximum of corners' and an ordinary camera's probability.
+
+    ``views`` are pairs of corners on the board and in the picture, ``error`` their standard deviation in pixels. No
+    derivatives, and the curvature by differences: slow, and independent of OpenCV's.
+    """
+    height, width = size
+    diagonal = np.hypot(height, width)
+    mean = [np.log(0.9 * width), 0, (width - 1) / 2, (height - 1) / 2, 0, 0, 0, 0, 0]
+    spread = np.array([0.5, 0.01, 0.05 * diagonal, 0.05 * diagonal, 0.3, 1, 0.005, 0.005, 2])
+
+    def camera(traits):
+        f, ratio, cx, cy, *distortion = traits
+        matrix = [[np.exp(f + ratio / 2), 0, cx], [0, np.exp(f - ratio / 2), cy], [0, 0, 1]]
+        return Camera(matrix, distortion, (2, 2))
+
+    def residuals(unknowns):
+        traits = mean + spread * unknowns[:9]
+        taken, found = camera(traits), [unknowns[:9]]
+        for (points, pixels), (turned, at) in zip(views, unknowns[9:].reshape(-1, 2, 3), strict=True):
+            found.append((taken.project(points @ rotation(turned).T + at) - pixels).ravel() / error)
+        return np.concatenate(found)
+
+    fx, fy, *rest = start[:9]
+    traits = np.array([np.log(fx * fy) / 2, np.log(fx / fy), *rest])
+    poses = []
+    for points, pixels in views:
+        matrix = np.array([[fx, 0, rest[0]], [0, fy, rest[1]], [0, 0, 1.0]])
+        _, turned, at = cv2.solvePnP(points, pixels, matrix, np.array(rest[2:]))
+        poses += [turned.ravel(), at.ravel()]
+    found = scipy.optimize.least_squares(
+        residuals, np.concatenate([(traits - mean) / spread, *poses]), "3-point", xtol=1e-14, ftol=1e-14, gtol=1e-12
+    )
+    taken = camera(mean + spread * found.x[:9])
+    fx, fy = taken.matrix[[0, 1], [0, 1]]
+    turned = np.eye(9)
+    turned[:2, :2] = [[fx, fx / 2], [fy, -fy / 2]]
+    turned = turned * spread
+    covariance = turned @ np.linalg.inv(found.jac.T @ found.jac)[:9, :9] @ turned.T
+    return np.array([fx, fy, *taken.matrix[:2, 2], *taken.distortion]), np.sqrt(np.diag(covariance))
