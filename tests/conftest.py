@@ -1,3 +1,4 @@
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -6,6 +7,8 @@ import torch
 
 # Tests are small: threads gain nothing, and where others share the cores they cost tens of times.
 torch.set_num_threads(1)
+# A job in the background is started with Ctrl-C ignored, and tests of Ctrl-C would wait for ever.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True)
