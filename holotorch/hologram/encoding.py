@@ -6,12 +6,17 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from holotorch.core import checks
 from holotorch.core.complex import intensity, phasor
 
 
 def kinoform(field: Tensor) -> Tensor:
-    """Phase of a complex hologram [..., H, W] in rad; its amplitude is thrown away."""
-    return torch.angle(field)
+    """Phase of a complex hologram [..., H, W] in rad; its amplitude is thrown away. Gradients as :func:`double_phase`.
+
+    Raises:
+        TypeError, ValueError: Not complex [..., H, W], no pixels, or values that are not finite.
+    """
+    return _phase(_checked(field))
 
 
 def double_phase(field: Tensor) -> Tensor:
@@ -20,14 +25,23 @@ def double_phase(field: Tensor) -> Tensor:
     The largest amplitude becomes 1. What neighbours differ by goes to the highest frequencies; an aperture in the
     frequency plane takes it out again. Source: Hsueh and Sawchuk (1978), as used by Maimone et al. (2017). A black
     hologram has no phase to show and gives the two that cancel.
+
+    Gradients are finite everywhere. Two terms have no derivative and pass zero: the phase of a pixel that is dark, and
+    the arccosine of a pixel that has the largest amplitude, which is 1 whatever that amplitude is.
+
+    Raises:
+        TypeError, ValueError: Not complex [..., H, W], no pixels, or values that are not finite.
     """
+    field = _checked(field)
     amplitude = field.abs()
     peak = amplitude.amax((-2, -1), keepdim=True)
-    aside = torch.acos((amplitude / torch.where(peak > 0, peak, 1)).clamp(0, 1))
+    part = amplitude / torch.where(peak > 0, peak, 1)
+    below = part < 1
+    aside = torch.where(below, torch.acos(torch.where(below, part, 0)), 0)
     height, width = field.shape[-2:]
     rows, columns = torch.arange(height, device=field.device), torch.arange(width, device=field.device)
     sign = 1 - 2 * ((rows[:, None] + columns) % 2)
-    return torch.angle(field) + sign * aside
+    return _phase(field) + sign * aside
 
 
 def error_diffused(field: Tensor) -> Tensor:
@@ -35,7 +49,11 @@ def error_diffused(field: Tensor) -> Tensor:
 
     Rows run to and fro. The error goes to high frequencies, where it is seen less. Source: Floyd and Steinberg (1976)
     with the fields of Tsang and Poon (2013). Pixel after pixel: half a second for 512 x 512.
+
+    Raises:
+        TypeError, ValueError: Not complex [..., H, W], no pixels, or values that are not finite.
     """
+    field = _checked(field)
     peak = field.abs().amax((-2, -1), keepdim=True)
     flat = (field / torch.where(peak > 0, peak, 1)).reshape(-1, *field.shape[-2:]).cpu()
     found = []
@@ -75,9 +93,16 @@ def iterated(
         propagate: To the plane that counts; ``adjoint`` is its conjugate transpose, near enough its inverse.
         adjoint: See ``propagate``.
         steps: To and fro.
+
+    Raises:
+        TypeError, ValueError: Not complex [..., H, W], no pixels, or values that are not finite.
     """
+    field = _checked(field)
+    if not field.numel():  # an empty batch, which transforms refuse
+        return torch.angle(field)
     wanted = propagate(field)
-    strength = wanted.abs() * (field.abs().square().mean((-2, -1), keepdim=True).rsqrt())
+    power = field.abs().square().mean((-2, -1), keepdim=True)
+    strength = wanted.abs() * power.clamp(min=torch.finfo(power.dtype).tiny).rsqrt()
     phase = torch.angle(field)
     for _ in range(steps):
         there = propagate(phasor(phase))
@@ -94,3 +119,19 @@ def encoding_loss(field: Tensor, phase: Tensor, view: Callable[[Tensor], Tensor]
     scale = (wanted * shown).sum((-2, -1)) / shown.square().sum((-2, -1)).clamp(min=torch.finfo(shown.dtype).tiny)
     error = (scale[..., None, None] * shown - wanted).square().sum((-2, -1))
     return error / wanted.square().sum((-2, -1)).clamp(min=torch.finfo(shown.dtype).tiny)
+
+
+def _checked(field: Tensor) -> Tensor:
+    """The field with subnormal values, whose derivatives overflow, made zero. See callers for what is refused."""
+    if not isinstance(field, Tensor) or not field.is_complex():
+        raise TypeError(f"field must be a complex tensor (..., H, W), got {getattr(field, 'dtype', type(field))}")
+    if field.ndim < 2 or 0 in field.shape[-2:]:
+        raise ValueError(f"field must end in (H, W), both at least 1, got {tuple(field.shape)}")
+    checks.all_finite("field", field)
+    return torch.where(field.detach().abs() >= torch.finfo(field.dtype).tiny, field, 0)
+
+
+def _phase(field: Tensor) -> Tensor:
+    """Phase in rad, 0 where dark; differentiated through the unit phasor, as torch.angle squares small amplitudes."""
+    amplitude = field.abs()
+    return torch.angle(field / torch.where(amplitude > 0, amplitude, 1))
