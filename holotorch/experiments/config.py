@@ -14,8 +14,8 @@ from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.messages import nearest, validated
 from holotorch.experiments.settings import (
     Count,
+    Distance,
     GridSettings,
-    Length,
     Number,
     Settings,
     Side,
@@ -101,7 +101,7 @@ class NearFieldSettings(Settings):
 
     kind: Literal["fresnel", "angular_spectrum"]
     distance: Annotated[
-        tuple[Annotated[Length, AfterValidator(_not_zero)], ...], BeforeValidator(several), Field(min_length=1)
+        tuple[Annotated[Distance, AfterValidator(_not_zero)], ...], BeforeValidator(several), Field(min_length=1)
     ]
     boundary: Literal["isolated", "periodic"] = "isolated"
 
@@ -236,7 +236,7 @@ def _contradictions(settings: PECSettings) -> list[tuple[Key, str]]:
     elif size is not None and size > smallest:
         key = ("modulator", "kernel_size")
         found.append((key, f"expected at most {smallest}, the smaller side of the grid, got {size}"))
-    light, finest, longest = settings.propagator, min(settings.grid.pitch), max(settings.wavelengths)
+    light, finest, longest = settings.propagator, min(settings.grid.pitch), max(settings.wavelengths, default=0.0)
     if isinstance(light, NearFieldSettings) and finest < 0.9 * longest:
         least = f"at least 0.9 of the longest wavelength, {0.9 * longest:.3g} m, for an image at a distance"
         found.append((("grid", "pitch"), f"expected {least}, got {finest:g} m"))

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
-from holotorch.experiments.settings import Count, Length, Number, Settings, number, several
+from holotorch.experiments.settings import Count, Length, Number, Settings, number, several, within
 from holotorch.io.bundled import find_config
 
 Source = Literal["laser", "narrow_sled", "sled", "led"]
@@ -56,8 +56,8 @@ class PlanarSettings(Settings):
 class EyeSettings(Settings):
     """The eye: radius of its pupil, distance of its retina, and whether it has the colour error of human eyes."""
 
-    pupil_radius: Positive = 1.5e-3
-    axial_length: Positive = 24e-3
+    pupil_radius: Annotated[Positive, within(1e-5, 2e-2, "the radius of a pupil, 10 um to 20 mm")] = 1.5e-3
+    axial_length: Annotated[Positive, within(1e-3, 0.2, "the length of an eye, 1 mm to 0.2 m; 24 mm is usual")] = 24e-3
     chromatic: bool = False
 
 

@@ -3,13 +3,14 @@
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
 from holotorch.experiments.settings import (
     Count,
+    Distance,
     GridSettings,
-    Length,
     Number,
     Settings,
     Wavelength,
@@ -27,13 +28,23 @@ def _file(value: Any) -> Any:
     return value
 
 
+def _number_type(value: Any) -> Any:
+    try:
+        fits = not isinstance(value, str) or np.dtype(value).kind in "buif"
+    except (TypeError, ValueError):
+        fits = False
+    if not fits:
+        raise PydanticCustomError("dtype", "expected a type of number, such as uint8, float32, or '>i2' if big-endian")
+    return value
+
+
 def _ahead(value: float) -> float:
     if not value > 0:
         raise PydanticCustomError("depth", "expected a distance above zero: the scene lies before the hologram")
     return value
 
 
-Depth = Annotated[Length, AfterValidator(_ahead)]
+Depth = Annotated[Distance, AfterValidator(_ahead)]
 
 
 class VolumeSource(Settings):
@@ -52,7 +63,7 @@ class VolumeSource(Settings):
     directory: str | None = None
     spacing: Annotated[tuple[Number, ...], BeforeValidator(several)] | None = None
     shape: tuple[Count, Count, Count] | None = None
-    dtype: str | None = None
+    dtype: Annotated[str, BeforeValidator(_number_type)] | None = None
     unit: Literal["m", "relative"] | None = None
 
 
@@ -141,6 +152,8 @@ def contradictions(settings: VolumeSettings) -> list[tuple[tuple[str | int, ...]
         found.append((("transfer",), "a preset needs low and high, the values between which it lies, low < high"))
     if transfer.points is not None and len(transfer.points) < 2:
         found.append((("transfer", "points"), "expected at least 2 points"))
+    if hologram.depths == ():
+        found.append((("hologram", "depths"), "expected a number of planes, or one distance at least, got none"))
     if len(settings.wavelengths) != 3:
         found.append((("wavelengths",), f"expected 3 (red, green, blue), got {len(settings.wavelengths)}"))
     side, rays = hologram.shape, hologram.rays

@@ -12,6 +12,7 @@ from holotorch.experiments.source import Key, Source
 
 Model = TypeVar("Model", bound=BaseModel)
 
+_LONGEST = 200  # characters that a message repeats of a value
 _EXPECTED = {
     "int_": "a whole number",
     "float_": "a number",
@@ -58,7 +59,7 @@ def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
         options = options or [tag for option in _options_at(model, entry["loc"]) for tag in _tags(option)]
         got = given.get("kind", "none") if isinstance(given, dict) else given
         hint = nearest(str(got), options)
-        return source.mistake((*key, "kind"), f"expected one of {', '.join(options)}, got {got!r}{hint}")
+        return source.mistake((*key, "kind"), f"expected one of {', '.join(options)}, got {_short(got)}{hint}")
     if kind == "picture":
         return source.mistake(key, entry["msg"])
     if kind in ("too_short", "too_long"):
@@ -67,9 +68,15 @@ def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
         return source.mistake(key, f"expected at {bound} {number} {'entry' if number == 1 else 'entries'}, got {got}")
     wanted = next((text for start, text in _EXPECTED.items() if kind.startswith(start)), None)
     wanted = wanted or entry["msg"].replace("Input should be ", "").removeprefix("expected ")
-    near = difflib.get_close_matches(str(given), re.findall(r"'([^']+)'", wanted), 1)
-    shown = "nothing" if given is None else "NaN" if isinstance(given, float) and math.isnan(given) else repr(given)
+    near = difflib.get_close_matches(str(given)[:_LONGEST], re.findall(r"'([^']+)'", wanted), 1)
+    shown = "nothing" if given is None else "NaN" if isinstance(given, float) and math.isnan(given) else _short(given)
     return source.mistake(key, f"expected {wanted}, got {shown}" + (f"; did you mean {near[0]!r}?" if near else ""))
+
+
+def _short(value: Any) -> str:
+    """What came, without what no line has room for."""
+    text = repr(value)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}... ({len(text)} characters)"
 
 
 def _unknown(model: type[BaseModel], location: tuple[str | int, ...], name: str) -> str:

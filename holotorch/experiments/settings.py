@@ -8,7 +8,8 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from pydantic_core import PydanticCustomError
 
 _POWERS = {"m": 0, "cm": -2, "mm": -3, "um": -6, "µm": -6, "μm": -6, "nm": -9}  # of ten, in metres
-_LENGTH = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-zµμ]*)")
+# No two parts of it match the same characters, so that a text that fits in no way takes linear time.
+_LENGTH = re.compile(r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-zµμ]*)")
 
 
 def metres(value: Any) -> Any:
@@ -19,7 +20,10 @@ def metres(value: Any) -> Any:
             raise PydanticCustomError(
                 "length", "expected a length such as 530 nm, 3.74 um, 100 mm or a number of metres"
             )
-        return float(Decimal(match[1]).scaleb(_POWERS[match[2] or "m"]))  # rounded once: 0.57 um is 5.7e-07
+        try:
+            return float(Decimal(match[1]).scaleb(_POWERS[match[2] or "m"]))  # rounded once: 0.57 um is 5.7e-07
+        except ArithmeticError:  # an exponent beyond those of a decimal
+            raise PydanticCustomError("length", "expected a length that a number can hold, such as 100 mm") from None
     return number(value)
 
 
@@ -56,6 +60,8 @@ Count = Annotated[int, BeforeValidator(number), Field(ge=1)]
 Length = Annotated[float, BeforeValidator(metres), Field(allow_inf_nan=False)]
 # Ranges that catch a forgotten unit: 530 is no wavelength in metres and 9 no pitch.
 Wavelength = Annotated[Length, within(1e-7, 2e-5, "a wavelength between 100 nm and 20 um")]
+# Of an image or a plane, either side of the hologram.
+Distance = Annotated[Length, within(-10, 10, "a distance of at most 10 m; 360 mm is 0.36")]
 Pitch = Annotated[Length, within(1e-9, 1e-3, "a pitch between 1 nm and 1 mm")]
 Side = Annotated[Count, Field(le=16384)]
 

@@ -8,6 +8,7 @@ weighted by how many pairs of source and pixel lie so far apart.
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -16,6 +17,8 @@ from torch import Tensor
 from holotorch.core.fourier import good_length
 from holotorch.hologram.cone import Cone, taper
 from holotorch.hologram.raster import strided_length
+
+_LONGEST = 1 << 24  # samples of one axis, whose kernel takes 2 GB and seconds
 
 
 @dataclass(frozen=True)
@@ -79,8 +82,7 @@ class Axis:
         # The reference's own tails wrap too: four times the length leaves a quarter of them.
         longer = good_length(math.ceil(4 * max(length, spread)))
         displacement = np.arange(self.apart + 1)
-        taps, exact = self._taps(length, depth, True)[displacement % length], self._taps(longer, depth, False)
-        exact = exact[displacement]
+        taps, exact = self._taps(length, depth, True)[displacement % length], _exact_taps(self, longer, depth)
         pairs = np.clip(self.apart - displacement, 0, min(self.sources, self.pixels)) + 1.0
         pairs[1:] *= 2
         return math.sqrt((pairs * np.abs(taps - exact) ** 2).sum() / (pairs * np.abs(exact) ** 2).sum())
@@ -100,6 +102,11 @@ class Axis:
         return np.fft.ifft(kernel)
 
 
+@lru_cache(maxsize=8)  # far away it is the same for every length that is tried, and longer than all of them
+def _exact_taps(axis: Axis, length: int, depth: float) -> np.ndarray:
+    return axis._taps(length, depth, False)[: axis.apart + 1].copy()
+
+
 def faded_out(values: Tensor, begin: float, end: float) -> Tensor:
     """1 up to ``begin``, 0 from ``end`` on, of abs(values), with three continuous derivatives, so that little rings."""
     t = ((values.abs() - begin) / max(end - begin, 1e-12)).clamp(0, 1)
@@ -111,6 +118,12 @@ def choose_length(axis: Axis, tolerance: float) -> tuple[int, float]:
 
     Tried are lengths up to three windows and twelve times sqrt(wavelength z), how far light spreads around an edge.
     """
+    spread = 4 * (axis.apart + axis.steepest * axis.farthest / axis.pitch)
+    if spread > _LONGEST:
+        raise ValueError(
+            f"depth {axis.farthest:g} m is too far for pixels of {axis.pitch:g} m: light spreads over {spread / 4:.2g} "
+            "of them; use nearer planes or a larger pitch"
+        )
     length, best = axis.least(), None
     around = math.sqrt(axis.wavelength * axis.farthest) / axis.pitch
     most = max(3 * (axis.sources + axis.pixels), length) + 12 * around

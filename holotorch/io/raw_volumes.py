@@ -9,7 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from holotorch.io.scan import Scan, existing, expect_bytes, gunzip, mapped, metres, placed, readable, unpacked
+from holotorch.io.scan import (
+    Scan,
+    existing,
+    expect_bytes,
+    gunzip,
+    mapped,
+    metres,
+    number_type,
+    placed,
+    readable,
+    unpacked,
+)
 
 _META_TYPES = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4",
@@ -44,12 +55,7 @@ def read_raw(path: Path, shape: Sequence[int] | None, dtype: DTypeLike | None) -
         raise ValueError(
             f"{path} has no header: pass shape=(D, H, W) and dtype=, such as 'uint8', or '>i2' if big-endian; or {hint}"
         )
-    try:
-        kind = np.dtype(dtype)
-    except TypeError as error:
-        raise ValueError(
-            f"dtype must name a type of number, such as 'uint8' or '>i2', got {dtype!r}: {error}"
-        ) from None
+    kind = number_type(dtype)
     if path.suffix == ".gz":
         return Scan(unpacked(path, gunzip(path), shape, kind))
     return Scan(mapped(path, shape, kind))
@@ -72,8 +78,8 @@ def read_metaimage(path: Path) -> Scan:
         raise ValueError(f"{path} has ElementType = {kind}; known are {', '.join(_META_TYPES)}")
     big = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", "False")).lower() == "true"
     dtype = np.dtype((">" if big else "<") + _META_TYPES[kind])
-    shape = [int(size) for size in _numbers(fields, ("DimSize",), 3, path)[::-1]]
-    skip = int(_numbers(fields, ("HeaderSize",), 1, path, default=[0])[0])
+    shape = _whole(fields, "DimSize", 3, path, least=1)[::-1]
+    skip = _whole(fields, "HeaderSize", 1, path, least=-1)[0] if "HeaderSize" in fields else 0
     data = path if name == "LOCAL" else existing(path.parent / name, path)
     offset = end if name == "LOCAL" else skip
     if fields.get("CompressedData", "False").lower() == "true":
@@ -189,6 +195,13 @@ def _metaimage_header(path: Path) -> tuple[dict[str, str], int]:
         if "ElementDataFile" not in fields:
             raise ValueError(f"{path} is no MetaImage header: it has no field ElementDataFile")
         return fields, stream.tell()
+
+
+def _whole(fields: dict[str, str], name: str, count: int, path: Path, *, least: int) -> list[int]:
+    numbers = _numbers(fields, (name,), count, path)
+    if not all(number.is_integer() and number >= least for number in numbers):
+        raise ValueError(f"{path} must give whole numbers from {least} on as {name}, got {fields[name]!r}")
+    return [int(number) for number in numbers]
 
 
 def _numbers(

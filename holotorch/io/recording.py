@@ -208,7 +208,11 @@ def _rows(folder: Path) -> list[tuple[float, int | None, str]]:
     """Time, checksum and problem of each line; a last line without its end was being written when it was cut off."""
     path = folder / "times.csv"
     text = path.read_bytes().decode("utf-8", "replace")
-    lines = list(csv.reader(text[: text.rfind("\n") + 1].split("\n")[:-1]))
+    reader = csv.reader(text[: text.rfind("\n") + 1].split("\n")[:-1])
+    try:
+        lines = list(reader)
+    except csv.Error as error:  # a carriage return within a line, a cell longer than csv takes
+        raise ValueError(f"{path}:{reader.line_num} is damaged: {error}") from None
     if not lines or tuple(lines[0]) != _COLUMNS:
         raise ValueError(
             f"{path} must begin with {','.join(_COLUMNS)}, got {','.join(lines[0]) if lines else 'nothing'}"

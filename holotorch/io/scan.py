@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from holotorch.scene.volume import IDENTITY, Triple
 
@@ -92,8 +93,23 @@ def existing(path: Path, named_by: Path | None = None) -> Path:
     return path
 
 
+def number_type(dtype: DTypeLike) -> np.dtype:
+    """The type that ``dtype`` names; ValueError for what is no type of real numbers."""
+    try:
+        kind = np.dtype(dtype)
+        if kind.kind not in "buif":
+            raise TypeError("not a real number")
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"dtype must name a type of number, such as 'uint8' or '>i2', got {dtype!r}: {error}"
+        ) from None
+    return kind
+
+
 def expect_bytes(path: Path, found: int, shape: Sequence[int], dtype: np.dtype) -> int:
-    """Number of bytes of ``shape`` voxels; ValueError where ``found`` is another."""
+    """Number of bytes of ``shape`` voxels; ValueError where ``found`` is another, or for no voxels."""
+    if any(size < 1 for size in shape):
+        raise ValueError(f"{path} states {' x '.join(map(str, shape))} voxels (D x H x W); every size must be above 0")
     wanted = math.prod(shape) * dtype.itemsize
     if found != wanted:
         sizes = " x ".join(str(size) for size in shape)

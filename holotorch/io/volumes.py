@@ -9,7 +9,7 @@ from numpy.typing import DTypeLike
 
 from holotorch.core import checks
 from holotorch.io import array_files, medical, raw_volumes, slices, vti
-from holotorch.io.scan import Scan, existing, split_member, triple
+from holotorch.io.scan import Scan, existing, number_type, split_member, triple
 from holotorch.scene.volume import Volume
 
 _READERS: dict[str, Callable[[Path], Scan]] = {
@@ -134,7 +134,7 @@ def _read_folder(folder: Path) -> Scan:
 def _check_expected(file: Path, values: np.ndarray, shape: Sequence[int] | None, dtype: DTypeLike | None) -> None:
     if shape is not None and shape != values.shape:
         raise ValueError(f"{file} holds {values.shape} voxels (D, H, W), but shape={shape} was asked for")
-    if dtype is not None and np.dtype(dtype).newbyteorder("=") != values.dtype.newbyteorder("="):
+    if dtype is not None and number_type(dtype).newbyteorder("=") != values.dtype.newbyteorder("="):
         raise ValueError(f"{file} holds {values.dtype.name}, but dtype={dtype!r} was asked for")
 
 

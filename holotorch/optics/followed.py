@@ -45,7 +45,13 @@ def seen_light(grid: Grid, wavelength: float, display: Display, eye: Eye, *, rea
     first, second, _, _ = (number(value) for value in display.matrix(plane))
     sides = [n * p / 2 if n > 1 else 0.0 for n, p in zip(grid.shape, grid.pitch, strict=True)]
     ends = sides if reach is None else [checks.positive("reach", reach, "metres") * (side > 0) for side in sides]
-    radii = torch.linspace(0, 1, _RINGS + 1, dtype=torch.float64)[1:] * number(eye.pupil_radius)
+    # Rings lie where light may arrive: of a pupil far wider than that, rings of its own would all be dark.
+    steepest = [
+        min(wave / (2 * p), (s + e) / max(abs(plane), 1e-30)) for p, s, e in zip(grid.pitch, sides, ends, strict=True)
+    ]
+    lit = math.hypot(*(abs(first) * end + abs(second) * slope for end, slope in zip(ends, steepest, strict=True)))
+    radius = number(eye.pupil_radius)
+    radii = torch.linspace(0, 1, _RINGS + 1, dtype=torch.float64)[1:] * min(radius, lit)
     turn = torch.arange(_SPOKES, dtype=torch.float64) * (2 * math.pi / _SPOKES)
     along = torch.linspace(-1, 1, _POINTS, dtype=torch.float64)
     inside = torch.ones(_POINTS, _POINTS, _RINGS, _SPOKES, dtype=torch.bool)
@@ -65,7 +71,8 @@ def seen_light(grid: Grid, wavelength: float, display: Display, eye: Eye, *, rea
     left_out = path.square() / max(2 * abs(plane), 1e-30)
     mean = (shares * left_out).sum((-2, -1), keepdim=True) / shares.sum((-2, -1), keepdim=True).clamp_min(1e-30)
     bend = ((shares * (left_out - mean).square()).sum() / shares.sum().clamp_min(1e-30)).sqrt().item()
-    return SeenLight(inside[..., -1, :].double().mean().item(), spread.max().item(), bend)
+    rim = inside[..., -1, :].double().mean().item() if radius <= lit else 0.0
+    return SeenLight(rim, spread.max().item(), bend)
 
 
 def followed(places: Tensor, weights: Tensor, count: int) -> tuple[list[int], list[int]]:

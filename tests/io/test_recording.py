@@ -162,3 +162,11 @@ def test_what_cannot_be_recorded_or_replayed_says_why(tmp_path):
         with pytest.raises(ValueError, match=message):
             open_recording(tmp_path / "a")
     assert free_bytes(tmp_path / "not" / "yet") > 0
+
+
+def test_a_carriage_return_in_the_times_is_damage_with_its_line(tmp_path):
+    recorded(tmp_path / "made", noise(3))
+    times = tmp_path / "made" / "times.csv"
+    times.write_bytes(times.read_bytes().replace(b"1,", b"1\r,", 1))
+    with pytest.raises(ValueError, match=r"times.csv:\d is damaged: "):
+        open_recording(tmp_path / "made")

@@ -254,3 +254,21 @@ def test_spacing_given_replaces_what_the_file_states(tmp_path):
     assert volume.spacing == (1e-3, 2e-3, 3e-3) and volume.origin == pytest.approx((30e-3, 20e-3, 10e-3))
     relative = load_volume(header, spacing=2, unit="relative", shape=SHAPE, dtype="uint8")
     assert relative.spacing == (2, 2, 2) and relative.unit == "relative" and relative.origin == (0, 0, 0)
+
+
+@pytest.mark.parametrize("size", ["inf inf inf", "nan 5 4", "6 5 0", "-6 -5 4", "6.5 5 4", "1e400 5 4"])
+def test_sizes_that_are_no_counts_are_refused_by_name(tmp_path, size):
+    voxels("u1").tofile(tmp_path / "a.raw")
+    with pytest.raises(ValueError, match="a.mhd must give whole numbers from 1 on as DimSize, got"):
+        load_volume(metaimage(tmp_path, voxels("u1"), DimSize=size))
+    with pytest.raises(ValueError, match="whole numbers from -1 on as HeaderSize"):
+        load_volume(metaimage(tmp_path, voxels("u1"), HeaderSize="inf"))
+
+
+@pytest.mark.parametrize("dtype", ["cpu", "i4,i4", "O", "S4"])
+def test_a_type_that_is_no_number_is_refused_for_every_format(tmp_path, dtype):
+    voxels("u1").tofile(tmp_path / "a.raw")
+    header = metaimage(tmp_path, voxels("u1"))
+    for path in (header, tmp_path / "a.raw"):
+        with pytest.raises(ValueError, match="dtype must name a type of number, such as 'uint8'"):
+            load_volume(path, shape=SHAPE, dtype=dtype, **CUBES)
