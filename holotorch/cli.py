@@ -76,7 +76,8 @@ def _demo(options: argparse.Namespace) -> int:
     from holotorch.experiments.config import load_config
     from holotorch.experiments.perception_layout import run_layout
     from holotorch.experiments.report import write_report
-    from holotorch.experiments.run import claim, run
+    from holotorch.experiments.run import run
+    from holotorch.experiments.run_folder import claim
     from holotorch.experiments.synthetic import write_synthetic
     from holotorch.experiments.track import run_tracking
     from holotorch.experiments.volume_run import run_volume

@@ -23,7 +23,8 @@ from holotorch.experiments.eye_tradeoff import fitted_prefactor, in_words, trade
 from holotorch.experiments.markup import plain
 from holotorch.experiments.memory import peak_memory
 from holotorch.experiments.report import write_report
-from holotorch.experiments.run import claim, deferred, interruptible
+from holotorch.experiments.run_folder import claim
+from holotorch.experiments.signals import deferred, interruptible
 from holotorch.io.bundled import find_config
 from holotorch.io.colour_tables import srgb_matrix, white_balance
 from holotorch.io.files import save_array, write_bytes, write_json, write_text

@@ -40,7 +40,7 @@ from holotorch.experiments.perception_statistics import (
     one_way,
     repeated_measures,
 )
-from holotorch.experiments.run import claim
+from holotorch.experiments.run_folder import claim
 from holotorch.io.files import save_array, write_bytes, write_json, write_text
 
 LEFT_OUT = (

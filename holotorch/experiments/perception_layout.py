@@ -24,7 +24,7 @@ from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.markup import figure, table
 from holotorch.experiments.perception_icons import draw_ground, draw_icon
 from holotorch.experiments.report import page
-from holotorch.experiments.run import claim
+from holotorch.experiments.run_folder import claim
 from holotorch.io.files import write_bytes, write_json, write_text
 from holotorch.perception import (
     FITTED_DEG,

@@ -1,18 +1,18 @@
 """What is seen and kept of a solver at work: progress bar, metrics.csv, checkpoints."""
 
 import time
-from pathlib import Path
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
 from tqdm import tqdm
 
 from holotorch.correction import Solution
-from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.judge import quality
 from holotorch.experiments.memory import peak_memory
 from holotorch.experiments.pec import PECExperiment
-from holotorch.io.files import replacing
+from holotorch.experiments.run_folder import Checkpoint
 
 _CHECK_EVERY = 10  # steps between two measurements of quality, which cost about as much as a step
 _SAVE_EVERY = 30.0  # seconds between two checkpoints
@@ -21,14 +21,14 @@ _SAVE_EVERY = 30.0  # seconds between two checkpoints
 class Log:
     """Callback of the solver: progress bar, rows of metrics.csv, the last state, and a checkpoint now and then."""
 
-    def __init__(self, experiment: PECExperiment, checkpoint: Path):
-        self.experiment, self.path, self.last = experiment, checkpoint, None
+    def __init__(self, experiment: PECExperiment, checkpoint: Checkpoint):
+        self.experiment, self.checkpoint, self.last = experiment, checkpoint, None
         self.rows: list[list[str]] = []
         self.checked: list[tuple[int, float]] = []
         self.before = self.seconds_spent = 0.0
         self.resume: dict[str, torch.Tensor] | None = None
-        if checkpoint.is_file():
-            self._restore()
+        if content := checkpoint.load():
+            self._restore(content)
         self.started = self.saved = time.perf_counter()
         self.bar = tqdm(
             total=experiment.settings.solver.max_steps,
@@ -70,19 +70,29 @@ class Log:
             self.save()
         self.seconds_spent += time.perf_counter() - entered
 
-    def save(self) -> None:
-        """Write what it takes to go on from the last step."""
+    def save(self) -> bool:
+        """Write what it takes to go on from the last step; False where that is not possible."""
         if self.last is None:
-            return
+            return True
         content: dict[str, Any] = {
             "state": self.last.state,
             "rows": self.rows[: len(self.last.losses) - 1],  # an interruption may come between a row and its state
             "checked": self.checked,
             "seconds": self.seconds,
         }
-        with replacing(self.path) as stream:
-            torch.save(content, stream)
-        self.saved = time.perf_counter()
+        self.saved = time.perf_counter()  # the next try is not at once, either way
+        return self.checkpoint.save(content)
+
+    @contextmanager
+    def saved_on_failure(self) -> Iterator[None]:
+        """Save the last step also where the block fails, in the solver or after it, as of memory that runs out."""
+        try:
+            yield
+        except OSError:  # of files that cannot be written: told already
+            raise
+        except Exception:
+            self.save()
+            raise
 
     def close(self) -> None:
         """End the progress bar."""
@@ -94,11 +104,9 @@ class Log:
         header = ["step", "evaluations", "seconds", f"{self.metric}_mean", *colours]
         return "\n".join(",".join(row) for row in [header, *self.rows]) + "\n"
 
-    def _restore(self) -> None:
+    def _restore(self, content: dict[str, Any]) -> None:
         try:
-            content = torch.load(self.path, weights_only=True)
             self.resume, self.rows = content["state"], content["rows"]
             self.checked, self.before = [tuple(pair) for pair in content["checked"]], content["seconds"]
-        except Exception as error:  # what damaged bytes raise when unpickled is anyone's guess
-            reason = error.strerror if isinstance(error, OSError) else "it is damaged"
-            raise ConfigError([f"{self.path} cannot be read: {reason}; delete the folder and run again"]) from None
+        except (KeyError, TypeError, ValueError) as error:
+            raise self.checkpoint.unreadable(error) from None

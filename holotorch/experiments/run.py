@@ -1,12 +1,8 @@
 """One run: a folder that is complete, or one that says it was interrupted; never half a file."""
 
-import re
-import shutil
 import signal
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +23,8 @@ from holotorch.experiments.perception_weight import ZONES, eccentricities, weigh
 from holotorch.experiments.plan import plan, plan_text, shortage
 from holotorch.experiments.progress import Log
 from holotorch.experiments.report import write_report
+from holotorch.experiments.run_folder import Checkpoint, Results, claim, conclude, kept
+from holotorch.experiments.signals import deferred, interruptible
 from holotorch.experiments.source import read_source
 from holotorch.io.files import save_array, write_bytes, write_json, write_text
 from holotorch.io.images import encode_png
@@ -59,42 +57,8 @@ def run(settings: PECSettings, out: Path | None, name: str = "run") -> tuple[Pat
     if text := shortage(values):
         raise ConfigError([text])
     folder = claim(out, name)
-    try:
+    with kept(folder):
         return folder, _fill(folder, experiment, values)
-    except KeyboardInterrupt:
-        raise
-    except BaseException:
-        shutil.rmtree(folder)  # claimed empty a moment ago: only this run's own files are in it
-        raise
-
-
-def claim(out: Path | None, name: str) -> Path:
-    """Make the folder of a run so that no other run can have it too. ConfigError where that is not possible."""
-    if out is None:
-        parent = Path("runs")
-        pattern = re.compile(re.escape(name) + r"-(\d+)")
-        try:
-            parent.mkdir(exist_ok=True)
-            while True:
-                matches = [pattern.fullmatch(path.name) for path in parent.iterdir()]
-                folder = parent / f"{name}-{max((int(match[1]) for match in matches if match), default=0) + 1:03d}"
-                try:
-                    folder.mkdir()
-                    return folder
-                except FileExistsError:
-                    continue  # another run was faster
-        except OSError as error:
-            raise ConfigError([f"cannot write to {parent}: {error.strerror}; choose a place with --out"]) from None
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        if any(out.iterdir()):
-            raise ConfigError([f"{out} holds files already; choose another --out or delete it"])
-        (out / "images").mkdir()  # the claim: of two runs only one can make it
-    except FileExistsError:
-        raise ConfigError([f"{out} is a file, or in use by another run; choose another --out"]) from None
-    except OSError as error:
-        raise ConfigError([f"cannot write to {out}: {error.strerror}; choose another place with --out"]) from None
-    return out
 
 
 def resume(folder: Path) -> tuple[Path, bool]:
@@ -107,9 +71,9 @@ def resume(folder: Path) -> tuple[Path, bool]:
     held = read_source(config, []).data if config.is_file() else {}
     if held.get("experiment") == "track":
         again = f"its poses are kept, and all is tracked anew by: holotorch track {held.get('source', 'SOURCE')}"
-        kept = f", the frames that it kept by: holotorch track {folder / 'recording'}"
-        kept = kept if (folder / "recording").is_dir() else ""
-        raise ConfigError([f"{folder} holds a tracking run, which is not resumed: {again}{kept}"])
+        frames = f", the frames that it kept by: holotorch track {folder / 'recording'}"
+        frames = frames if (folder / "recording").is_dir() else ""
+        raise ConfigError([f"{folder} holds a tracking run, which is not resumed: {again}{frames}"])
     if not config.is_file() or not (folder / "plan.json").is_file():
         raise ConfigError([f"{folder} holds no run to resume: config.yaml and plan.json are not both there"])
     if (folder / "summary.json").is_file():
@@ -123,7 +87,8 @@ def resume(folder: Path) -> tuple[Path, bool]:
     if not isinstance(settings, PECSettings):
         raise ConfigError([f"{folder} holds a study, which cannot be resumed; run it again"])
     experiment = build(settings)
-    return folder, _fill(folder, experiment, plan(experiment))
+    with kept(folder, new=False):
+        return folder, _fill(folder, experiment, plan(experiment))
 
 
 def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
@@ -135,9 +100,8 @@ def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
     write_json(out / "env.json", environment(settings.seed, experiment.device))
     write_json(out / "plan.json", values)
 
-    checkpoint = out / "checkpoint.pt"
-    log = Log(experiment, checkpoint)
-    with interruptible() as pressed:
+    log, files = Log(experiment, Checkpoint(out / "checkpoint.pt")), Results()
+    with interruptible() as pressed, log.saved_on_failure():
         try:
             solution = experiment.solve(log, log.resume)
         except KeyboardInterrupt:
@@ -151,7 +115,7 @@ def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
             if pressed:
                 log.save()
             results = {"corrected": _result(experiment, solution, seconds)}
-            save_array(out / "arrays" / "phase.npy", results["corrected"].phase.float())
+            files.write(save_array, out / "arrays" / "phase.npy", results["corrected"].phase.float())
         several = len(experiment.distances) > 1
         if several and settings.report.baselines:
             print("baselines are left out: they know one distance only", file=sys.stderr)
@@ -167,66 +131,21 @@ def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
             except ValueError as error:
                 print(f"{name} is left out: {error}", file=sys.stderr)
         with deferred(pressed):
-            if pressed:
-                log.save()
-            _write_results(out, experiment, results, log, solution)
+            if pressed and not log.save():
+                files.fail(log.checkpoint.failure)
+            _write_results(out, experiment, results, log, solution, files)
             summary = {
                 "experiment": settings.experiment,
-                "status": "interrupted" if pressed else "complete",
+                "status": "",
                 "methods": {name: result.numbers for name, result in results.items()},
                 "peak_memory_bytes": peak_memory(),
             }
-            write_json(out / ("interrupted.json" if pressed else "summary.json"), summary)
-            if not pressed:
-                for left in (checkpoint, out / "interrupted.json"):
-                    left.unlink(missing_ok=True)
-            write_report([out], out / "report.html")
-    if pressed:
+            page, done = (lambda path: write_report([out], path)), not pressed
+            complete = conclude(out, summary, files, log.checkpoint, pressed, page, done=done)
+    if not complete:
         steps = int(solution.steps.max())
         print(f"interrupted; saved what {steps} steps have found; go on with: holotorch resume {out}", file=sys.stderr)
-    return not pressed
-
-
-@contextmanager
-def interruptible() -> Iterator[list[int]]:
-    """Let SIGTERM and SIGHUP (a closed terminal) act as Ctrl-C, and note in the list which have come.
-
-    Only the first raises KeyboardInterrupt: another would come while what was found is being saved, and end that.
-    """
-    pressed: list[int] = []
-
-    def note(number: int, _: Any) -> None:
-        pressed.append(number)
-        if len(pressed) == 1:
-            raise KeyboardInterrupt
-
-    with _handling(note):
-        yield pressed
-
-
-@contextmanager
-def deferred(pressed: list[int]) -> Iterator[None]:
-    """Only note that one of the signals has come."""
-    with _handling(lambda number, _: pressed.append(number)):
-        yield
-
-
-@contextmanager
-def _handling(handler) -> Iterator[None]:
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    hangup = getattr(signal, "SIGHUP", None)  # not on Windows
-    if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:  # under nohup a run goes on
-        numbers.append(hangup)
-    try:
-        before = [signal.signal(number, handler) for number in numbers]
-    except ValueError:  # signals reach the main thread only
-        yield
-        return
-    try:
-        yield
-    finally:
-        for number, old in zip(numbers, before, strict=True):
-            signal.signal(number, old)
+    return complete
 
 
 def _result(experiment: PECExperiment, solution: Solution, seconds: float, *, single: bool = False) -> Result:
@@ -243,19 +162,19 @@ def _result(experiment: PECExperiment, solution: Solution, seconds: float, *, si
 
 
 def _write_results(
-    out: Path, experiment: PECExperiment, results: dict[str, Result], log: Log, solution: Solution
+    out: Path, experiment: PECExperiment, results: dict[str, Result], log: Log, solution: Solution, files: Results
 ) -> None:
     corrected = results["corrected"]
-    write_text(out / "metrics.csv", log.table())
-    save_array(out / "arrays" / "intensity.npy", corrected.picture)
-    save_array(out / "arrays" / "target.npy", experiment.image)
+    files.write(write_text, out / "metrics.csv", log.table())
+    files.write(save_array, out / "arrays" / "intensity.npy", corrected.picture)
+    files.write(save_array, out / "arrays" / "target.npy", experiment.image)
     shown = {"target": experiment.image} | {name: results[name].picture for name in _CAPTIONS if name in results}
     captions = ["Target", *(_CAPTIONS[name] + _score(results[name].numbers) for name in shown if name in results)]
     if corrected.isolated is not None and not experiment.isolated:
         shown["isolated"] = corrected.isolated
         captions.append("Corrected, on a chip that stands alone" + _score(corrected.numbers["isolated"]))
     for name, picture in shown.items():
-        write_bytes(out / "images" / f"{name}.png", encode_png(picture))
+        files.write(write_bytes, out / "images" / f"{name}.png", encode_png(picture))
     names = [f"{wave * 1e9:.0f} nm" for wave in experiment.wavelengths]
     phase = corrected.phase[0][experiment.lit].to(experiment.device)  # of several frames, the first
     warm = experiment.array.temperature(experiment.array.crosstalk(phase)).cpu()
@@ -270,7 +189,7 @@ def _write_results(
         away = eccentricities(weight, shape)
         figures["weight"] = pictures.visual_field(weight_map(weight, shape), away, weight.field_deg, rings, "weight")
     for name, data in figures.items():
-        write_bytes(out / "images" / f"{name}.png", data)
+        files.write(write_bytes, out / "images" / f"{name}.png", data)
 
 
 def _per_colour(losses: Tensor, colours: int) -> Tensor:

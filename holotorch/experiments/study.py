@@ -16,7 +16,7 @@ from holotorch.experiments.pec_bench import Bench
 from holotorch.experiments.pec_claims import with_claims
 from holotorch.experiments.pec_studies import STUDIES
 from holotorch.experiments.pictures import curves
-from holotorch.experiments.run import claim
+from holotorch.experiments.run_folder import claim
 from holotorch.io.files import write_bytes, write_json, write_text
 from holotorch.metrics import PerceptualSimilarity
 

@@ -20,7 +20,7 @@ from holotorch.experiments.config_tracking import (
     save_catheter,
 )
 from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.run import claim
+from holotorch.experiments.run_folder import claim
 from holotorch.io.bundled import find_config
 from holotorch.io.files import write_text
 from holotorch.io.recording import Recorder, is_recording

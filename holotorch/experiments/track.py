@@ -17,7 +17,8 @@ from tqdm import tqdm
 
 from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.run import claim, deferred, interruptible
+from holotorch.experiments.run_folder import claim
+from holotorch.experiments.signals import deferred, interruptible
 from holotorch.experiments.synthetic import compared, errors, read_truth
 from holotorch.experiments.track_report import COLUMNS, Log, Tracked, known, row, summarised, verdict, write_page
 from holotorch.experiments.track_source import Given, Tracker, opened

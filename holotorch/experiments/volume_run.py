@@ -5,7 +5,7 @@ import io
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +22,12 @@ from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.memory import peak_memory
 from holotorch.experiments.plan import shortage
 from holotorch.experiments.report import write_report
-from holotorch.experiments.run import claim, deferred, interruptible
+from holotorch.experiments.run_folder import Checkpoint, Results, claim, conclude, kept
+from holotorch.experiments.signals import Pressed, deferred, interruptible
 from holotorch.experiments.volume import Part, VolumeExperiment, build
 from holotorch.experiments.volume_judge import VolumeJudge
 from holotorch.experiments.volume_plan import plan, plan_text
-from holotorch.io.files import replacing, save_array, write_bytes, write_json, write_text
+from holotorch.io.files import save_array, write_bytes, write_json, write_text
 from holotorch.io.images import encode_png
 
 _COLUMNS: tuple[str, ...] = (
@@ -51,15 +52,17 @@ def run_volume(settings: VolumeSettings, out: Path | None, name: str) -> tuple[P
             out = claim(out, name)
             for part in ("arrays", "images"):
                 (out / part).mkdir(exist_ok=True)
-            write_text(out / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
-            write_json(out / "plan.json", values)
-        return _fill(out or Path(), experiment, rank, count)
+            with kept(out):
+                write_text(out / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
+                write_json(out / "plan.json", values)
+                return _fill(out, experiment, rank, count)
+        return _fill(Path(), experiment, rank, count)
 
 
 def resume_volume(folder: Path) -> tuple[Path, bool]:
     """Go on with an interrupted run after its last complete realisation; equal to one that never stopped."""
     settings = load_config(folder / "config.yaml")
-    with _processes() as (rank, count):
+    with _processes() as (rank, count), kept(folder, new=False) if rank == 0 else nullcontext():
         return _fill(folder, build(settings), rank, count)
 
 
@@ -102,25 +105,20 @@ def _fill(out: Path, experiment: VolumeExperiment, rank: int, count: int) -> tup
         if not judge.count:
             raise KeyboardInterrupt
         with deferred(pressed):
-            complete = state.done == settings.report.seeds
-            _write(out, experiment, judge, state, complete)
-    return out, complete
+            return out, _write(out, experiment, judge, state, pressed)
 
 
 class _State:
     """What the realisations so far have given, on disk after each of them."""
 
     def __init__(self, out: Path, judge: VolumeJudge | None):
-        self.judge, self.out, self.path = judge, out, out / "checkpoint.pt"
+        self.judge, self.out, self.checkpoint = judge, out, Checkpoint(out / "checkpoint.pt")
         self.rows: list[dict[str, Any]] = []
-        if judge is not None and self.path.is_file():
+        if judge is not None and (content := self.checkpoint.load()):
             try:
-                content = torch.load(self.path, weights_only=True)
                 judge.sums, judge.count, self.rows = content["sums"], content["count"], content["rows"]
-            except Exception:  # what damaged bytes raise when unpickled is anyone's guess
-                raise ConfigError(
-                    [f"{self.path} cannot be read: it is damaged; delete the folder and run again"]
-                ) from None
+            except KeyError as error:
+                raise self.checkpoint.unreadable(error) from None
 
     @property
     def done(self) -> int:
@@ -139,37 +137,40 @@ class _State:
         row = (seed, round(seconds, 4), round(rendering, 4), round(refocusing, 4))
         scores = (numbers.get("ssim_in_focus"), numbers["speckle_contrast"])
         self.rows.append(dict(zip(_COLUMNS, (*row, *scores), strict=True)))
-        with replacing(self.path) as stream:
-            torch.save({"sums": self.judge.sums, "count": self.judge.count, "rows": self.rows}, stream)
+        self.checkpoint.save({"sums": self.judge.sums, "count": self.judge.count, "rows": self.rows})
 
 
-def _write(out: Path, experiment: VolumeExperiment, judge: VolumeJudge, state: _State, complete: bool) -> None:
+def _write(out: Path, experiment: VolumeExperiment, judge: VolumeJudge, state: _State, pressed: Pressed) -> bool:
+    files, done = Results(), state.done == experiment.settings.report.seeds
+    if not done:
+        files.fail(state.checkpoint.failure)
     text = io.StringIO()
     writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
     writer.writeheader()
     writer.writerows(state.rows)
-    write_text(out / "metrics.csv", text.getvalue())
+    files.write(write_text, out / "metrics.csv", text.getvalue())
     shown = judge.pictures
     for name, array in (("rendering", judge.rendering), ("refocused", shown), ("depth", judge.depth)):
-        save_array(out / "arrays" / f"{name}.npy", array)
+        files.write(save_array, out / "arrays" / f"{name}.npy", array)
     layers = {"depths_m": list(experiment.depths), "rays": list(experiment.rays.shape), "stride": experiment.stride}
-    write_json(out / "layers.json", layers | {"sign": "exp(+ikr) / r"})
+    files.write(write_json, out / "layers.json", layers | {"sign": "exp(+ikr) / r"})
     images = {"rendering": judge.rendering, "in_focus": judge.sharpest(shown)}
     images |= {f"focus_{f}": picture for f, picture in enumerate(shown)}
     for name, picture in images.items():
-        write_bytes(out / "images" / f"{name}.png", encode_png(picture.clamp(0, 1)))
+        files.write(write_bytes, out / "images" / f"{name}.png", encode_png(picture.clamp(0, 1)))
     captions = ["Direct volume rendering", "Hologram, every ray at its depth"]
     captions += [f"Hologram refocused at {depth * 1e3:.4g} mm" for depth in judge.depths]
     captions = [caption + (", synthetic" if experiment.synthetic else "") for caption in captions]
-    write_bytes(out / "images" / "comparison.png", pictures.comparison([*images.values()], captions))
+    files.write(write_bytes, out / "images" / "comparison.png", pictures.comparison([*images.values()], captions))
     depth = torch.where(judge.opacity > 0.05, judge.depth * 1e3, torch.nan)
-    write_bytes(
+    files.write(
+        write_bytes,
         out / "images" / "depth.png",
         pictures.channel_maps(depth[None], ["what a ray sees"], "mean depth behind the hologram (mm)", "viridis"),
     )
     summary = {
         "experiment": "volume",
-        "status": "complete" if complete else "interrupted",
+        "status": "",
         "synthetic": experiment.synthetic,
         "refocused_m": judge.depths,
         **judge.numbers(),
@@ -178,11 +179,7 @@ def _write(out: Path, experiment: VolumeExperiment, judge: VolumeJudge, state: _
         "refocus_seconds": round(sum(row["refocus_seconds"] for row in state.rows), 3),
         "peak_memory_bytes": peak_memory(),
     }
-    write_json(out / ("summary.json" if complete else "interrupted.json"), summary)
-    if complete:
-        for left in (state.path, out / "interrupted.json"):
-            left.unlink(missing_ok=True)
-    write_report([out], out / "report.html")
+    return conclude(out, summary, files, state.checkpoint, pressed, lambda path: write_report([out], path), done=done)
 
 
 @contextmanager

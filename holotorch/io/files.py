@@ -1,10 +1,12 @@
 """Whole files or none: everything is written under a temporary name and renamed when complete."""
 
+import errno
 import io
 import json
 import os
+import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -13,11 +15,11 @@ from torch import Tensor
 
 
 @contextmanager
-def replacing(path: Path, *, buffering: int = -1) -> Iterator[IO[bytes]]:
+def replacing(path: Path, *, buffering: int = -1, needed: int | None = None) -> Iterator[IO[bytes]]:
     """Open a temporary file beside ``path`` that takes its name when the block ends without an error.
 
     With ``buffering`` 0 and :func:`append` a block that caught the error of a full disk can end so too: nothing is left
-    in a buffer that could fail once more.
+    in a buffer that could fail once more. ``needed``: how many bytes will be written, for the message of a full disk.
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -27,10 +29,21 @@ def replacing(path: Path, *, buffering: int = -1) -> Iterator[IO[bytes]]:
             os.fsync(stream.fileno())
         os.replace(partial, path)
     except OSError as error:
+        with suppress(OSError):  # before the free space is measured
+            partial.unlink()
         # The user knows the final name only.
-        raise OSError(error.errno, error.strerror, str(path)) from None
+        raise OSError(error.errno, _reason(error, path, needed), str(path)) from None
     finally:
         partial.unlink(missing_ok=True)
+
+
+def _reason(error: OSError, path: Path, needed: int | None) -> str:
+    """What the system says; of a full disk also how much is missing."""
+    reason = error.strerror or str(error)
+    if needed is None or error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        return reason
+    free = shutil.disk_usage(path.parent).free
+    return f"{reason} ({needed / 1e6:.3f} MB needed, {free / 1e6:.3f} MB free)"
 
 
 def append(stream: IO[bytes], data: bytes | memoryview) -> None:
@@ -47,7 +60,7 @@ def append(stream: IO[bytes], data: bytes | memoryview) -> None:
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write ``data`` to ``path``, whole or not at all."""
-    with replacing(path) as stream:
+    with replacing(path, needed=len(data)) as stream:
         stream.write(data)
 
 

@@ -22,7 +22,8 @@ from holotorch.experiments.config import load_config
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.pec import PECExperiment, build
 from holotorch.experiments.plan import plan, plan_text
-from holotorch.experiments.run import claim, run
+from holotorch.experiments.run import run
+from holotorch.experiments.run_folder import claim
 from holotorch.io.images import load_image
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -226,11 +227,11 @@ def test_a_run_that_does_not_fit_is_refused_before_anything_is_allocated(tmp_pat
     assert not (tmp_path / "a").exists()
 
 
-def test_a_failed_run_leaves_no_folder(tmp_path, monkeypatch):
+def test_a_run_that_fails_before_anything_is_computed_leaves_no_folder(tmp_path, monkeypatch):
     def broken(*_):
-        raise OSError(28, "No space left on device", "phase.npy")
+        raise OSError(28, "No space left on device", "plan.json")
 
-    monkeypatch.setattr(run_module, "save_array", broken)
+    monkeypatch.setattr(run_module, "write_json", broken)
     with pytest.raises(OSError, match="No space left"):
         run(settings(), tmp_path / "a")
     assert not (tmp_path / "a").exists()

@@ -9,7 +9,8 @@ from stand_in import SIZE, pictures, read, summary, tracked
 
 from holotorch.experiments import track, track_source
 from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.run import deferred, resume
+from holotorch.experiments.run import resume
+from holotorch.experiments.signals import deferred
 from holotorch.io.recording import open_recording
 from holotorch.io.video import open_frames
 
