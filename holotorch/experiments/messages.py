@@ -7,12 +7,12 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.errors import ConfigError, short
 from holotorch.experiments.source import Key, Source
 
 Model = TypeVar("Model", bound=BaseModel)
 
-_LONGEST = 200  # characters that a message repeats of a value
+_MOST = 50  # mistakes that are listed
 _EXPECTED = {
     "int_": "a whole number",
     "float_": "a number",
@@ -34,8 +34,10 @@ def validated(source: Source, model: type[Model]) -> Model:
         return model.model_validate(source.data)
     except ValidationError as error:
         entries = error.errors()
-        mistakes = dict.fromkeys(describe(source, model, e) for e in entries if not _follows(e, entries))
-        raise ConfigError(sorted(mistakes, key=position)) from None
+        listed = entries[:_MOST]
+        mistakes = dict.fromkeys(describe(source, model, e) for e in listed if not _follows(e, listed))
+        more = [f"{source.path}: and {len(entries) - _MOST} more mistakes"] if len(entries) > _MOST else []
+        raise ConfigError([*sorted(mistakes, key=position), *more]) from None
 
 
 def _follows(entry: Any, others: list[Any]) -> bool:
@@ -59,7 +61,7 @@ def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
         options = options or [tag for option in _options_at(model, entry["loc"]) for tag in _tags(option)]
         got = given.get("kind", "none") if isinstance(given, dict) else given
         hint = nearest(str(got), options)
-        return source.mistake((*key, "kind"), f"expected one of {', '.join(options)}, got {_short(got)}{hint}")
+        return source.mistake((*key, "kind"), f"expected one of {', '.join(options)}, got {short(got)}{hint}")
     if kind == "picture":
         return source.mistake(key, entry["msg"])
     if kind in ("too_short", "too_long"):
@@ -68,15 +70,9 @@ def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
         return source.mistake(key, f"expected at {bound} {number} {'entry' if number == 1 else 'entries'}, got {got}")
     wanted = next((text for start, text in _EXPECTED.items() if kind.startswith(start)), None)
     wanted = wanted or entry["msg"].replace("Input should be ", "").removeprefix("expected ")
-    near = difflib.get_close_matches(str(given)[:_LONGEST], re.findall(r"'([^']+)'", wanted), 1)
-    shown = "nothing" if given is None else "NaN" if isinstance(given, float) and math.isnan(given) else _short(given)
+    near = difflib.get_close_matches(str(given)[:100], re.findall(r"'([^']+)'", wanted), 1)
+    shown = "nothing" if given is None else "NaN" if isinstance(given, float) and math.isnan(given) else short(given)
     return source.mistake(key, f"expected {wanted}, got {shown}" + (f"; did you mean {near[0]!r}?" if near else ""))
-
-
-def _short(value: Any) -> str:
-    """What came, without what no line has room for."""
-    text = repr(value)
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}... ({len(text)} characters)"
 
 
 def _unknown(model: type[BaseModel], location: tuple[str | int, ...], name: str) -> str:

@@ -6,9 +6,11 @@ from typing import Any
 
 import yaml
 
-from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.errors import ConfigError, short
 
 Key = tuple[str | int, ...]
+_LARGEST = 1 << 17  # bytes of a file, which take up to 4 s to parse
+_MOST = 100_000  # values of a file, more than one of that size can write out
 
 
 @dataclass
@@ -34,17 +36,23 @@ def read_source(path: Path, overrides: list[str], wanted: str = "settings such a
     ``wanted`` says what such a file holds, to whoever gives one that holds nothing of the kind.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        with open(path, "rb") as stream:
+            data = stream.read(_LARGEST + 1)
+        text = data.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a UTF-8 text file"
         raise ConfigError([f"{path}: cannot read the configuration: {reason}"]) from None
+    if len(data) > _LARGEST:
+        raise ConfigError(
+            [f"{path}: more than {_LARGEST} bytes; expected {wanted}, with long tables in files of their own"]
+        )
     source = Source(path, {})
     mistakes: list[str] = []
     data = _parse(text, str(path), source.places, (), mistakes)
     if data is None and not mistakes:
         mistakes.append(f"{path}:1:1: the file is empty; expected {wanted}")
     elif not isinstance(data, dict) and not mistakes:
-        mistakes.append(f"{path}:1:1: expected {wanted}, got {data!r}")
+        mistakes.append(f"{path}:1:1: expected {wanted}, got {short(data)}")
     if not mistakes and isinstance(data, dict):
         source.data = data
         for word in overrides:
@@ -88,13 +96,23 @@ def _parse(text: str, name: str, places: dict[Key, str], key: Key, mistakes: lis
         mistakes.append(f"{place}: not valid YAML: {error.problem or error.context}")
     except yaml.YAMLError as error:
         mistakes.append(f"{name}: not valid YAML: {' '.join(str(error).split())}")
+    except _Expanded as error:
+        mistakes.append(
+            f"{error}: its aliases (*name) stand for more than {_MOST} values in all; write out what is needed"
+        )
     except RecursionError:
         mistakes.append(f"{name}: not a configuration: nested without end")
     return None
 
 
+class _Expanded(Exception):
+    """Aliases of aliases, whose values no memory could hold; the place of the first value too many."""
+
+
 def _construct(loader, node: yaml.Node, name: str, places: dict[Key, str], key: Key, mistakes: list[str]) -> Any:
     places.setdefault(key, f"{name}:{node.start_mark.line + 1}:{node.start_mark.column + 1}")
+    if len(places) > _MOST:  # every value has its place
+        raise _Expanded(places[key])
     if isinstance(node, yaml.MappingNode):
         result: dict[str, Any] = {}
         for key_node, value_node in node.value:
@@ -109,6 +127,7 @@ def _construct(loader, node: yaml.Node, name: str, places: dict[Key, str], key: 
         return [_construct(loader, item, name, places, (*key, i), mistakes) for i, item in enumerate(node.value)]
     try:
         return loader.construct_object(node)
-    except (ValueError, TypeError) as error:  # an impossible date, a tag that does not fit
+    except (ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as error:
+        # An impossible date, a number beyond all, a tag that does not fit.
         mistakes.append(f"{places[key]}: {'.'.join(map(str, key))}: not a value: {error}")
         return None

@@ -81,3 +81,38 @@ def test_a_length_that_fits_in_no_way_takes_no_time(written):
     (found,) = mistakes(written(CORRECTION.replace("9 um", "1" * 200_000 + "!")))
     assert "grid.pitch: expected a length such as 530 nm" in found and len(found) < 400
     assert time.perf_counter() - began < 3
+
+
+LAUGHS = "a0: &a0 [1, 1]\n" + "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 30))
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "message"),
+    [
+        (CORRECTION + LAUGHS, ":8:10: ", "its aliases (*name) stand for more than 100000 values in all"),
+        (CORRECTION + "x: &x {y: *x}\n", ": ", "nested without end"),
+        (CORRECTION + f"# {'long ' * 60_000}\n", ": ", "more than 131072 bytes; expected settings such as"),
+        (CORRECTION + f"x: {'1:' * 2000}1.5\n", ":8:1: ", "x: not a value: "),
+        (CORRECTION + "x: !!int ''\n", ":8:1: ", "x: not a value: "),
+        (CORRECTION + "x: !!timestamp soon\n", ":8:1: ", "x: not a value: "),
+        (CORRECTION + "x: !!bool maybe\n", ":8:1: ", "x: not a value: "),
+    ],
+    ids=["aliases", "circle", "size", "sexagesimal", "int", "timestamp", "bool"],
+)
+def test_a_file_that_means_more_than_it_holds_is_refused_at_once(written, text, place, message):
+    began = time.perf_counter()
+    (found,) = mistakes(path := written(text))
+    assert found.startswith(f"{path}{place}") and message in found
+    assert time.perf_counter() - began < 10
+
+
+def test_aliases_of_ordinary_use_stay(written):
+    text = CORRECTION.replace("shape: [32, 48]", "shape: &sides [32, 48]").replace("coffee", "coffee, region: *sides")
+    text = text.replace("target", "x: 0\ntarget", 1).replace("x: 0\n", "")
+    lines = text.splitlines()
+    assert load_config(written("\n".join([lines[0], lines[2], lines[1], *lines[3:]]))).target.region == (32, 48)
+
+
+def test_a_thousand_mistakes_are_counted_not_listed(written):
+    found = mistakes(written(CORRECTION + "".join(f"k{i}: 1\n" for i in range(1000))))
+    assert len(found) == 51 and found[-1].endswith(": and 950 more mistakes")
