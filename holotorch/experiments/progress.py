@@ -85,13 +85,12 @@ class Log:
 
     @contextmanager
     def saved_on_failure(self) -> Iterator[None]:
-        """Save the last step also where the block fails, in the solver or after it, as of memory that runs out."""
+        """Save the last step also where the block fails, so that going on computes nothing again."""
         try:
             yield
-        except OSError:  # of files that cannot be written: told already
-            raise
         except Exception:
-            self.save()
+            if not (self.checkpoint.path.parent / "summary.json").is_file():
+                self.save()
             raise
 
     def close(self) -> None:
