@@ -78,7 +78,7 @@ def test_values_beyond_all_use_are_mistakes_of_their_key(written, text, change, 
 
 def test_a_length_that_fits_in_no_way_takes_no_time(written):
     began = time.perf_counter()
-    (found,) = mistakes(written(CORRECTION.replace("9 um", "1" * 200_000 + "!")))
+    (found,) = mistakes(written(CORRECTION.replace("9 um", "1" * 120_000 + "!")))
     assert "grid.pitch: expected a length such as 530 nm" in found and len(found) < 400
     assert time.perf_counter() - began < 3
 
@@ -89,7 +89,7 @@ LAUGHS = "a0: &a0 [1, 1]\n" + "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] *
 @pytest.mark.parametrize(
     ("text", "place", "message"),
     [
-        (CORRECTION + LAUGHS, ":8:10: ", "its aliases (*name) stand for more than 100000 values in all"),
+        (CORRECTION + LAUGHS, ":8:", "its aliases (*name) stand for more than 100000 values in all"),
         (CORRECTION + "x: &x {y: *x}\n", ": ", "nested without end"),
         (CORRECTION + f"# {'long ' * 60_000}\n", ": ", "more than 131072 bytes; expected settings such as"),
         (CORRECTION + f"x: {'1:' * 2000}1.5\n", ":8:1: ", "x: not a value: "),
