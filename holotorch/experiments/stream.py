@@ -177,6 +177,8 @@ async def _send(
                 count[0] += 1
         finally:
             show(f"Frames     {count[0]}")
+            if server and server.future:
+                show(f"Slicer     {server.future} sent as refusals: captured in the future")
             for link in links:
                 text = f", {link.errors} failed: {link.last_error}" if link.errors else ""
                 show(f"Receiver   {link.host}:{link.port}: {link.sent} sent, {link.dropped} dropped for newer{text}")
@@ -209,6 +211,8 @@ def _line(receiver: PoseReceiver) -> str:
     newest = receiver.packet
     if newest is None:
         bad = receiver.statistics
+        if bad.future:
+            return f"{bad.future} packets captured in the future, not used: compare the sender's clock and its camera's"
         return f"{bad.invalid} unreadable packets, the last: {bad.last_error}" if bad.invalid else "nothing yet"
     age = receiver.age()
     if not newest.answered:
@@ -224,14 +228,17 @@ def statistics_text(receiver: PoseReceiver) -> list[str]:
     """A receiver's statistics in a few lines."""
     found = receiver.statistics
     if not found.received:
-        return [f"Received   nothing; {found.invalid} unreadable packets {found.last_error}".rstrip()]
+        text = f"Received   nothing; {found.invalid} unreadable packets {found.last_error}".rstrip()
+        return [f"{text}; {found.future} captured in the future" if found.future else text]
     ms = {name: value * 1e3 for name, value in found.latency().items()}
     clock = "not measured: transit counted from the fastest packet"
     if found.offset is not None and found.round_trip is not None:
         clock = f"sender's is {found.offset * 1e3:+.3f} ms ahead, within {found.round_trip * 5e2:.3f} ms"
     return [
         f"Received   {found.received}, lost {found.lost}, reordered {found.reordered}, repeated {found.duplicated}",
-        f"Of these   refused {found.refused}, late {found.late}; unreadable {found.invalid}, foreign {found.foreign}",
+        f"Of these   refused {found.refused}, late {found.late}",
+        f"Not used   unreadable {found.invalid}, foreign {found.foreign}, captured in the future {found.future}, "
+        f"not continuing the stream {found.jumped}",
         f"Transit    median {ms['transit_median']:.2f} ms, p95 {ms['transit_p95']:.2f} ms, "
         f"jitter {found.jitter * 1e3:.3f} ms",
         f"Latency    median {ms['latency_median']:.2f} ms, p95 {ms['latency_p95']:.2f} ms since capture",

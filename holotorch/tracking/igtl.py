@@ -2,7 +2,8 @@
 
 Each frame gives one STRING, ``<name>Status``: ``OK``, ``UNVERIFIED: ...`` or ``NO_CATHETER: the reason``. An answered
 frame has a TRANSFORM before it, ``<name>``, stamped with its capture time. A refused one has none, so a client's last
-transform stays where it was: show the status beside it.
+transform stays where it was: show the status beside it, and hide the tool when the stamps stop advancing, since a
+sender that has died says nothing. A pose captured in the future is sent as a refusal: its age is unknown.
 
 The matrix is camera_from_tool, ``ToolToCamera`` in the words of PLUS, with its translation in MILLIMETRES. Its axes are
 the camera's (x right, y down, z forward) and neither RAS nor LPS. Slicer takes a TRANSFORM's numbers as they are, in
@@ -23,6 +24,7 @@ from holotorch.tracking.status import Pose, Status
 from holotorch.tracking.stream import Newest
 
 PORT = 18944
+_AHEAD = 0.05  # seconds that a capture time may lie in the future, by errors of the clocks
 
 
 def messages(pose: Pose, captured: float | None = None, *, name: str = "ToolToCamera") -> bytes:
@@ -30,7 +32,7 @@ def messages(pose: Pose, captured: float | None = None, *, name: str = "ToolToCa
 
     Args:
         pose: A single one.
-        captured: Seconds since 1970 at which the camera took it; now by default.
+        captured: Seconds since 1970 at which the camera took it; now by default. It becomes the stamp, unchecked.
         name: Of the transform, 1 to 14 ASCII characters: OpenIGTLink allows 20, and ``Status`` is appended.
 
     Raises:
@@ -70,6 +72,9 @@ class TransformServer:
         host: Address to listen on; all of this computer's by default, ``127.0.0.1`` for itself only.
         name: As in :func:`messages`.
 
+    Attributes:
+        future: Frames whose capture time lay more than 50 ms in the future; their poses were not sent.
+
     Raises:
         ImportError: pyigtl is not installed.
         OSError: The port is in use; when it is opened.
@@ -78,6 +83,7 @@ class TransformServer:
     def __init__(self, port: int = PORT, *, host: str = "0.0.0.0", name: str = "ToolToCamera"):
         _pyigtl()
         self.port, self.host, self.name = checks.port(port), host, name
+        self.future = 0
         self._clients: set[_Client] = set()
         self._server: asyncio.Server | None = None
 
@@ -100,7 +106,14 @@ class TransformServer:
         return len(self._clients)
 
     def send(self, pose: Pose, captured: float | None = None) -> None:
-        """Hand one frame to every client; errors as of :func:`messages`."""
+        """Hand one frame to every client, without its pose if it is ``captured`` in the future.
+
+        Errors as of :func:`messages`.
+        """
+        if captured is not None and (ahead := captured - now()) > _AHEAD:
+            self.future += 1
+            pose = Pose.refused(Status.UNCERTAIN, f"capture time {ahead:.3g} s in the future: age unknown")
+            captured = None
         data = messages(pose, captured, name=self.name)
         for client in self._clients:
             client.offer(data)

@@ -33,6 +33,8 @@ A clock request or reply is 52 bytes: the first 24 as above (``stream`` and ``se
 float64 at 24, 32 and 40 (asker's time of asking; answerer's time of hearing; answerer's time of answering; the last two
 0 in a request), CRC-32 at 48. A reply is no longer than its request.
 
+A capture time must not lie after the time of sending: a receiver does not use such a packet, since its age is unknown.
+
 Nothing here is secret or signed: who can send to a receiver's port can forge poses. Use a network of your own.
 """
 

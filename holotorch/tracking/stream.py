@@ -1,13 +1,15 @@
 """Poses over UDP: a sender to several receivers, and a receiver that counts what goes wrong on the way.
 
 Latest wins: nothing waits in a queue for a slow receiver, a lost packet is not sent again, and an older pose never
-replaces a newer one. The packets are those of :mod:`holotorch.tracking.packet`.
+replaces a newer one. The packets are those of :mod:`holotorch.tracking.packet`; they are not signed, and what a
+receiver does and does not detect is said in :mod:`holotorch.tracking.arrivals`.
 """
 
 import asyncio
 import errno
 import itertools
 import secrets
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -18,6 +20,7 @@ from holotorch.tracking.packet import FRAME, Echo, PacketError, PosePacket, deco
 from holotorch.tracking.status import Pose
 
 PORT = 18950
+_ROUNDING = 2e-6  # seconds: four clock stamps near 1.7e9, multiples of 2.4e-7
 
 
 class PoseSender:
@@ -160,6 +163,8 @@ class PoseReceiver(asyncio.DatagramProtocol):
         host: Address to listen on; all of this computer's by default.
         oldest: Seconds since capture above which a pose is not given.
         late: Seconds since capture above which an arriving packet counts as late.
+        ahead: Seconds that a capture time may lie in the future, by errors of the clocks. A packet beyond is not used,
+            and counted as ``statistics.future``.
         clock: Seconds; by default that of the packets. The offset to the sender's is measured.
 
     Raises:
@@ -174,13 +179,16 @@ class PoseReceiver(asyncio.DatagramProtocol):
         host: str = "0.0.0.0",
         oldest: float = 0.25,
         late: float = 0.1,
+        ahead: float = 0.05,
         clock: Callable[[], float] = now,
     ):
         self.port, self.host, self.clock = checks.port(port), host, clock
         self.oldest, self.late = checks.positive("oldest", oldest, "s"), checks.positive("late", late, "s")
+        self.ahead = checks.positive("ahead", ahead, "s")
         self.statistics = Statistics()
         self.packet: PosePacket | None = None  # the newest, of any status and age
         self._arrived, self._fresh = -float("inf"), asyncio.Event()
+        self._arrived_here = -float("inf")  # by this computer's monotonic clock, which nobody can set
         self._asked: dict[int, float] = {}
         self._last_asked = -float("inf")
         self._echoes: deque[tuple[float, float]] = deque(maxlen=8)  # round trip, offset
@@ -222,11 +230,18 @@ class PoseReceiver(asyncio.DatagramProtocol):
         return self.packet
 
     def age(self) -> float:
-        """Seconds since the capture of the newest packet; infinite before the first."""
+        """Seconds since the capture of the newest packet; infinite before the first.
+
+        At least those since it arrived, whatever its stamps say.
+        """
         if self.packet is None:
             return float("inf")
         way = self.statistics.transit(self._arrived - self.packet.sent)
-        return self.packet.sent - self.packet.captured + way + self.clock() - self._arrived
+        return max(self.packet.sent - self.packet.captured + way, 0.0) + self._silent()
+
+    def _silent(self) -> float:
+        """Seconds since the newest packet arrived, by the clock that says more."""
+        return max(self.clock() - self._arrived, time.monotonic() - self._arrived_here)
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
         """Called by asyncio."""
@@ -239,17 +254,23 @@ class PoseReceiver(asyncio.DatagramProtocol):
         if isinstance(packet, Echo):
             self._compare(packet, arrived)
             return
+        statistics = self.statistics
         if self.packet is not None and packet.stream != self.packet.stream:
-            if arrived - self._arrived <= self.oldest:
+            if self._silent() <= self.oldest:
                 self.statistics.foreign += 1
                 return
-            # The sender was started anew, perhaps on another computer.
-            self.statistics = Statistics(restarts=self.statistics.restarts + 1)
-            self._echoes.clear()
-            self._last_asked = -float("inf")
-        if self.statistics.heard(packet, arrived, self.late):
-            self.packet, self._arrived = packet, arrived
+            statistics = Statistics(restarts=self.statistics.restarts + 1)
+        if statistics.heard(packet, arrived, self.late, self.ahead):
+            if statistics is not self.statistics:
+                # The sender was started anew, perhaps on another computer.
+                self.statistics = statistics
+                self._echoes.clear()
+                self._last_asked = -float("inf")
+            self.packet, self._arrived, self._arrived_here = packet, arrived, time.monotonic()
             self._fresh.set()
+        elif statistics is not self.statistics:
+            self.statistics.future += statistics.future
+            return
         self._ask(addr)
 
     def _ask(self, addr: Any) -> None:
@@ -264,6 +285,10 @@ class PoseReceiver(asyncio.DatagramProtocol):
         if not echo.reply or echo.stream != self._name or self._asked.pop(echo.number, None) != echo.asked:
             return
         round_trip = arrived - echo.asked - (echo.answered - echo.heard)
+        if round_trip < -_ROUNDING:
+            self.statistics.invalid += 1
+            self.statistics.last_error = f"a clock reply that took {round_trip:.3g} s on its way there and back"
+            return
         offset = (echo.heard - echo.asked + echo.answered - arrived) / 2
         self._echoes.append((round_trip, offset))
         self.statistics.round_trip, self.statistics.offset = min(self._echoes)
