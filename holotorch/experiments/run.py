@@ -16,6 +16,7 @@ from holotorch.experiments.config import PECSettings, load_config
 from holotorch.experiments.config_volume import VolumeSettings
 from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.fingerprint import Fingerprint, fingerprint
 from holotorch.experiments.judge import Result, judge
 from holotorch.experiments.memory import peak_memory
 from holotorch.experiments.pec import PECExperiment, build
@@ -100,7 +101,7 @@ def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
     write_json(out / "env.json", environment(settings.seed, experiment.device))
     write_json(out / "plan.json", values)
 
-    log, files = Log(experiment, Checkpoint(out / "checkpoint.pt")), Results()
+    log, files = Log(experiment, Checkpoint(out / "checkpoint.pt", _fingerprint(experiment))), Results()
     with interruptible() as pressed, log.saved_on_failure():
         try:
             solution = experiment.solve(log, log.resume)
@@ -146,6 +147,14 @@ def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
         steps = int(solution.steps.max())
         print(f"interrupted; saved what {steps} steps have found; go on with: holotorch resume {out}", file=sys.stderr)
     return complete
+
+
+def _fingerprint(experiment: PECExperiment) -> Fingerprint:
+    """Without what a solver in steps that know nothing of their number, and the comparison after it, may have anew."""
+    free = {"device", "report.baselines"}
+    if experiment.settings.solver.kind != "lbfgs":  # whose stages share the steps
+        free.add("solver.max_steps")
+    return fingerprint(experiment.settings, {"target.image": (experiment.source,)}, free)
 
 
 def _result(experiment: PECExperiment, solution: Solution, seconds: float, *, single: bool = False) -> Result:

@@ -12,6 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.fingerprint import Fingerprint, differences
 from holotorch.experiments.signals import Pressed
 from holotorch.io.files import replacing, write_json
 
@@ -86,25 +87,37 @@ class Checkpoint:
 
     Attributes:
         path: The file; the one before stays until a new one is complete.
+        fingerprint: Of the configuration and inputs of the run; what another one has left is refused.
         failure: Why the last :meth:`save` wrote nothing, or None.
     """
 
-    def __init__(self, path: Path):
-        self.path = path
+    def __init__(self, path: Path, fingerprint: Fingerprint):
+        self.path, self.fingerprint = path, fingerprint
         self.failure: OSError | None = None
         self._told: set[int | None] = set()
 
     def load(self) -> dict[str, Any] | None:
-        """What was saved last; None where nothing was. ConfigError for a file that cannot be read."""
+        """What was saved last; None where nothing was. ConfigError for one of another configuration, or damaged."""
         if not self.path.is_file():
             return None
         try:
             content = torch.load(self.path, weights_only=True)
             if not isinstance(content, dict):
                 raise ValueError("not a checkpoint")
-            return content
         except Exception as error:  # what damaged bytes raise when unpickled is anyone's guess
             raise self.unreadable(error) from None
+        self._check(content.get("fingerprint"))
+        return content
+
+    def _check(self, before: Fingerprint | None) -> None:
+        config = self.path.parent / "config.yaml"
+        cure = f"run into a new folder: holotorch run {config} --out NEW"
+        if not isinstance(before, dict):
+            words = f"{self.path} does not say which configuration it belongs to, as those of older versions do not"
+            raise ConfigError([f"{words}; {cure}"])
+        if changed := differences(before, self.fingerprint):
+            words = f"{self.path} belongs to another configuration: {', '.join(changed)}"
+            raise ConfigError([f"{words}; undo that in {config}, or {cure}"])
 
     def unreadable(self, error: Exception) -> ConfigError:
         """What to say of a checkpoint whose content is not what it should be."""
@@ -117,7 +130,7 @@ class Checkpoint:
         try:
             with replacing(self.path, needed=_bytes(content)) as stream:
                 try:
-                    torch.save(content, stream)
+                    torch.save(content | {"fingerprint": self.fingerprint}, stream)
                 except RuntimeError as error:  # torch's own, raised while it handled the one of the disk
                     raise error.__context__ if isinstance(error.__context__, OSError) else error from None
         except (OSError, RuntimeError) as error:

@@ -19,6 +19,7 @@ from holotorch.experiments.config import load_config
 from holotorch.experiments.config_volume import VolumeSettings
 from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.fingerprint import fingerprint
 from holotorch.experiments.memory import peak_memory
 from holotorch.experiments.plan import shortage
 from holotorch.experiments.report import write_report
@@ -71,7 +72,7 @@ def _fill(out: Path, experiment: VolumeExperiment, rank: int, count: int) -> tup
     if rank == 0:
         write_json(out / "env.json", environment(settings.seed, experiment.device))
     judge = VolumeJudge(experiment) if rank == 0 else None
-    state = _State(out, judge)
+    state = _State(out, experiment, judge)
     start = _shared(torch.tensor(state.done)) if count > 1 else torch.tensor(state.done)
     part = Part(rank, count, planes) if count > 1 else None
     total = planes * settings.report.seeds
@@ -108,17 +109,31 @@ def _fill(out: Path, experiment: VolumeExperiment, rank: int, count: int) -> tup
             return out, _write(out, experiment, judge, state, pressed)
 
 
+def described(experiment: VolumeExperiment) -> tuple[VolumeSettings, dict[str, tuple[Any, ...]], set[str]]:
+    """What :func:`fingerprint` is made of: realisations may be added, on another device as well."""
+    volume, file = experiment.volume, experiment.settings.transfer.file
+    inputs: dict[str, tuple[Any, ...]] = {"volume": (volume.values, repr((volume.spacing, volume.unit)))}
+    if file:
+        inputs["transfer.file"] = (Path(file).read_bytes(),)
+    return experiment.settings, inputs, {"device", "report.seeds"}
+
+
 class _State:
     """What the realisations so far have given, on disk after each of them."""
 
-    def __init__(self, out: Path, judge: VolumeJudge | None):
-        self.judge, self.out, self.checkpoint = judge, out, Checkpoint(out / "checkpoint.pt")
-        self.rows: list[dict[str, Any]] = []
-        if judge is not None and (content := self.checkpoint.load()):
+    def __init__(self, out: Path, experiment: VolumeExperiment, judge: VolumeJudge | None):
+        self.judge, self.out, self.rows = judge, out, []
+        if judge is None:
+            return
+        self.checkpoint = Checkpoint(out / "checkpoint.pt", fingerprint(*described(experiment)))
+        if content := self.checkpoint.load():
             try:
                 judge.sums, judge.count, self.rows = content["sums"], content["count"], content["rows"]
             except KeyError as error:
                 raise self.checkpoint.unreadable(error) from None
+            if judge.count > (seeds := experiment.settings.report.seeds):
+                cure = f"set it to that in {out / 'config.yaml'}, or run into a new folder"
+                raise ConfigError([f"report.seeds: expected at least the {judge.count} done, got {seeds}; {cure}"])
 
     @property
     def done(self) -> int:

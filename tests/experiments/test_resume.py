@@ -259,7 +259,7 @@ def test_a_damaged_configuration_or_plan_is_refused(broken, capsys):
     config.write_text(text[:20] + "{")
     assert f"{config}:" in refused(broken, capsys)
     config.write_text(text.replace("- 24\n", "- 28\n"))
-    assert "the solver cannot start" in refused(broken, capsys)
+    assert "belongs to another configuration: grid.shape was [24, 20] and is [28, 20]; undo" in refused(broken, capsys)
     config.write_text(text)
     plan.write_text(plan.read_text()[:40])
     assert resume(broken) == 0  # planned anew
