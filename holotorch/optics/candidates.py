@@ -129,15 +129,22 @@ def _lengths(axis: AxisContent, pads: tuple[float, ...]) -> list[int]:
 
 
 def _identity(scenes: list[Axes]) -> Candidate:
-    # rms over the content of the phase pi lambda z f^2, which is the whole effect but for the carrier.
-    y, x = max(scenes, key=lambda axes: axes[0].distance)
-    square = y.moment(4) + x.moment(4) + 2 * y.moment(2) * x.moment(2)
-    phase = min(math.pi * y.wavelength * y.distance * math.sqrt(square), 2.0)
-    if y.distance <= 1e-12:
-        phase = 0.0
+    """The field as it is, times the carrier."""
+    axes = y, x = max(scenes, key=lambda axes: axes[0].distance)
+
+    def predict() -> float:
+        if y.distance <= 1e-12:
+            return 0.0
+        # rms over the content of the phase pi lambda z f^2, which is the whole effect inside the window.
+        square = y.moment(4) + x.moment(4) + 2 * y.moment(2) * x.moment(2)
+        phase = min(math.pi * y.wavelength * y.distance * math.sqrt(square), 2.0)
+        if phase > 0.1:  # much too far to stand still, whatever the edges do
+            return phase
+        return max(phase, sum(math.sqrt(axis.standing()) for axis in axes))
+
     size = (y.size, x.size)
     work = float(math.prod(size))
-    return Candidate("identity", (True, True), size, False, lambda: phase, work, 0, work)
+    return Candidate("identity", (True, True), size, False, predict, work, 0, work)
 
 
 def _sampled(scenes: list[Axes], padded: tuple[int, ...], dtype: torch.dtype) -> Candidate:

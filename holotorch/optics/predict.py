@@ -68,13 +68,23 @@ class AxisContent:
         return max(self._energy(self._taps), 1e-300)
 
     def moment(self, power: int, limit: float = math.inf) -> float:
-        """Mean of min(f, limit)^power over the content, f in cycles per metre."""
+        """Mean of min(f, limit)^power over the content, f in cycles per metre.
+
+        Measured content has the window's edges in it, of a band without measurement only :meth:`standing` and
+        :meth:`paraxial` know them.
+        """
         if self.measured is None:
             top = min(self.band, limit)
             return top**power / (power + 1)
-        frequency = torch.fft.fftfreq(self.size, self.pitch, dtype=torch.float64).abs().clamp(max=limit)
-        weight = torch.fft.fft(self.measured).abs().square().sum(0)
+        # Twice the window: on the window alone the field would repeat, and a uniform one would have no edges.
+        frequency = torch.fft.fftfreq(2 * self.size, self.pitch, dtype=torch.float64).abs().clamp(max=limit)
+        weight = torch.fft.fft(self.measured, 2 * self.size).abs().square().sum(0)
         return ((weight * frequency**power).sum() / weight.sum().clamp(min=1e-300)).item()
+
+    def standing(self) -> float:
+        """Error of leaving the field as it is, what its edges diffract included."""
+        still = (self._shifts == 0).to(torch.complex128)
+        return self._energy(still - self._taps) / self.captured
 
     def wrapped(self, padded: int) -> float:
         """Error of a transfer function sampled on ``padded`` points.
