@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_LONGEST = 0.1  # metres; longer is a forgotten unit
+from holotorch.core.quantities import WAVELENGTH, Quantity
 
 
 class SamplingWarning(UserWarning):
@@ -25,17 +25,41 @@ def positive(name: str, value: float, unit: str = "") -> float:
 
 def finite(name: str, value: float, unit: str = "") -> float:
     """Return ``value`` as float, or raise TypeError for what is no number and ValueError for NaN and infinity."""
-    if isinstance(value, Tensor) and value.requires_grad:
-        raise TypeError(f"{name} is fixed in a module and cannot carry a gradient; use the kernel function instead")
-    try:
-        if isinstance(value, bool | str):
-            raise TypeError
-        number = float(value)
-    except (TypeError, ValueError):
-        raise TypeError(f"{name} must be a number{_in(unit)}, got {type(value).__name__} {value!r}") from None
+    number = _number(name, value, unit)
     if not math.isfinite(number):
         raise ValueError(f"{name} must be finite{_in(unit)}, got {value!r}")
     return number
+
+
+def quantity(kind: Quantity, value: float, name: str = "") -> float:
+    """Return a physical quantity as float, or raise unless it can be meant: see :mod:`holotorch.core.quantities`.
+
+    Args:
+        kind: Which quantity, with its unit and range.
+        value: A number, or a tensor of one element that carries no gradient.
+        name: Of the argument; that of the quantity by default.
+
+    Raises:
+        TypeError: No number.
+        ValueError: NaN, or outside the range; the message names the unit, and the prefix that was forgotten.
+    """
+    name = name or kind.name
+    number = _number(name, value, kind.words)
+    problem = kind.problem(number)
+    if problem:
+        raise ValueError(f"{name} {problem}")
+    return number
+
+
+def quantities(kind: Quantity, values: Tensor, name: str = "") -> None:
+    """Raise ValueError for an element of ``values``, of any shape and with or without gradient, as :func:`quantity`."""
+    size = values.detach().abs() if kind.negative else values.detach()
+    if bool(((size >= kind.low) & (size <= kind.high)).all()):
+        return  # most calls end here, without a loop over all elements
+    for value in values.detach().reshape(-1).tolist():
+        problem = kind.problem(value)
+        if problem:
+            raise ValueError(f"{name or kind.name} {problem}")
 
 
 def whole(name: str, value: int, least: int) -> int:
@@ -67,10 +91,7 @@ def wavelengths(values: float | Sequence[float]) -> tuple[float, ...]:
     items: list[Any] = [values] if _scalar(values) else list(values)  # type: ignore[arg-type]
     if not items:
         raise ValueError("wavelengths must hold at least one value in metres, got none")
-    found = tuple(positive("wavelength", item, "metres") for item in items)
-    if max(found) > _LONGEST:
-        raise ValueError(f"wavelength must be that of light in metres, got {max(found):g}; 530 nm is 530e-9")
-    return found
+    return tuple(quantity(WAVELENGTH, item) for item in items)
 
 
 def field(name: str, value: Tensor, shape: tuple[int, ...], *, complex_valued: bool = True) -> None:
@@ -101,6 +122,17 @@ def all_finite(name: str, value: Tensor) -> None:
         index = tuple(int(i) for i in bad.nonzero()[0])
         count = int(bad.sum())
         raise ValueError(f"{name} must be finite, but element {index} is {value[index].item()} ({count} in all)")
+
+
+def _number(name: str, value: Any, unit: str) -> float:
+    if isinstance(value, Tensor) and value.requires_grad:
+        raise TypeError(f"{name} is fixed in a module and cannot carry a gradient; use the kernel function instead")
+    try:
+        if isinstance(value, bool | str):
+            raise TypeError
+        return float(value)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name} must be a number{_in(unit)}, got {type(value).__name__} {value!r}") from None
 
 
 def _complex(name: str, value: Tensor) -> None:

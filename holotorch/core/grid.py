@@ -9,6 +9,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.fourier import good_length
+from holotorch.core.quantities import PITCH
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Grid:
 
     Raises:
         TypeError: A size is no integer or a pitch no number.
-        ValueError: A size below 1, or a pitch that is not finite and positive.
+        ValueError: A size below 1, or a pitch outside 1 nm to 2 mm, such as one in micrometres.
     """
 
     shape: tuple[int, int]
@@ -32,7 +33,7 @@ class Grid:
         if len(sizes) != 2 or len(steps) != 2:
             raise ValueError(f"grid needs shape (H, W) and pitch (y, x), got shape {shape!r} and pitch {pitch!r}")
         object.__setattr__(self, "shape", tuple(checks.whole("grid shape", size, 1) for size in sizes))
-        object.__setattr__(self, "pitch", tuple(checks.positive("grid pitch", step, "metres") for step in steps))
+        object.__setattr__(self, "pitch", tuple(checks.quantity(PITCH, step, "grid pitch") for step in steps))
 
     @property
     def extent(self) -> tuple[float, float]:

@@ -8,6 +8,7 @@ import torch
 from numpy.typing import DTypeLike
 
 from holotorch.core import checks
+from holotorch.core.quantities import VOXEL
 from holotorch.io import array_files, medical, raw_volumes, slices, vti
 from holotorch.io.scan import Scan, existing, number_type, split_member, triple
 from holotorch.scene.volume import Volume
@@ -31,7 +32,6 @@ _MEMBER_READERS: dict[str, Callable[[Path, str | None], Scan]] = {
     ".hdf5": array_files.read_hdf5,
     ".zarr": array_files.read_zarr,
 }
-_LONGEST = 0.1  # metres between voxels; more is a forgotten unit
 
 
 def load_volume(
@@ -74,7 +74,7 @@ def load_volume(
     if spacing is None:
         return _as_stated(file, scan, unit)
     steps = (spacing,) * 3 if isinstance(spacing, int | float | np.number) else tuple(spacing)
-    if unit is None and any(checks.positive("spacing", step, "metres") > _LONGEST for step in steps):
+    if unit is None and any(checks.positive("spacing", step, "metres") > VOXEL.high for step in steps):
         raise ValueError(
             f"spacing between voxels must be in metres, got {spacing!r}; 1 mm is 1e-3. For a volume without a size add "
             "unit='relative'"

@@ -7,9 +7,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from holotorch.core import checks
+from holotorch.core.quantities import SIGMA_PX
 
 _SMALLEST_TAP = 1e-12  # of the centre tap; smaller ones would only make denormal numbers, which are slow
-_WIDEST = 100  # pixels; K is singular to double precision long before
 _DROPPED_TAP = 1e-6  # of the centre tap; with no size given, the kernel ends where the taps fall below this
 
 
@@ -33,9 +33,7 @@ class ThermalCrosstalk(nn.Module):
 
     def __init__(self, sigma_px: float, size: int | None = None):
         super().__init__()
-        sigma = checks.finite("sigma_px", sigma_px, "pixels")
-        if not 0 <= sigma <= _WIDEST:
-            raise ValueError(f"sigma_px must lie between 0 and {_WIDEST} pixels, got {sigma_px!r}")
+        sigma = checks.quantity(SIGMA_PX, sigma_px)
         if size is not None and checks.whole("crosstalk size", size, 1) % 2 == 0:
             raise ValueError(f"crosstalk size must be an odd number of taps of at least 1, got {size!r}")
         radius = _needed_radius(sigma) if size is None else size // 2
@@ -78,7 +76,7 @@ class ThermalCrosstalk(nn.Module):
         square = y[:, None] ** 2 + x**2
         if not (measured[square > 0] < 1).any():
             raise ValueError("patch must fall off from its centre to be fitted")
-        low, high = 1e-2, _WIDEST**2
+        low, high = 1e-2, SIGMA_PX.high**2
         for _ in range(60):  # of the error's slope in 1 / sigma^2, bisected: it changes sign once
             middle = math.sqrt(low * high)
             model = torch.exp(-square / middle)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.quantities import CAUCHY_B, WAVELENGTH
 
 Birefringence = Callable[[Tensor], Tensor]
 
@@ -25,7 +26,7 @@ class Cauchy:
 
     def __post_init__(self):
         checks.finite("a", self.a)
-        checks.finite("b", self.b, "square metres")
+        checks.quantity(CAUCHY_B, self.b)
 
     def __call__(self, wavelength: Tensor) -> Tensor:
         """Birefringence at ``wavelength``."""
@@ -177,6 +178,5 @@ def fit_cauchy(wavelengths: Sequence[float], phases: Sequence[float], *, path: f
 
 def _waves(wavelength: float | Tensor) -> Tensor:
     waves = torch.as_tensor(wavelength, dtype=torch.float64)
-    if not bool((torch.isfinite(waves) & (waves > 0)).all()):
-        raise ValueError(f"wavelengths must be finite and above zero in metres, got {waves.detach().tolist()!r}")
+    checks.quantities(WAVELENGTH, waves)
     return waves

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from holotorch.core import checks
 from holotorch.core.complex import phasor
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import WAVELENGTH
 from holotorch.modulator.crosstalk import ThermalCrosstalk
 from holotorch.modulator.dispersion import Birefringence, phase_scale
 
@@ -153,8 +154,10 @@ class PhaseModulator(nn.Module):
         if self.crosstalk is not None:
             weight = self.crosstalk(torch.ones(self.grid.shape, dtype=shown.dtype, device=shown.device))
             shown = self.crosstalk(shown) / weight
-        if light is not None and self.birefringence is not None:
-            lit = light if isinstance(light, Tensor) else torch.tensor(light, dtype=torch.float64)
+        lit = None if light is None else torch.as_tensor(light, dtype=torch.float64)
+        if lit is not None:
+            checks.quantities(WAVELENGTH, lit, "light")
+        if lit is not None and self.birefringence is not None:
             design = torch.tensor(self.wavelengths, dtype=torch.float64, device=lit.device)
             scale = phase_scale(lit, design, self.birefringence)
             shown = shown * scale.to(shown.device, shown.dtype)[..., None, None]

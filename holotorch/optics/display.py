@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.quantities import APERTURE_RADIUS, FOCAL_LENGTH, SPACING
 
 Length = float | Tensor
 Matrix = tuple[Length, Length, Length, Length]
@@ -25,7 +26,7 @@ class Display:
         lens_radius: r_el, half the clear width of the eyepiece; None does not limit the light.
 
     Raises:
-        ValueError: A distance below 0, a focal length of 0, a radius that is not positive.
+        ValueError: A length that cannot be meant: a distance below 0, a focal length of 0, millimetres for metres.
     """
 
     lens_distance: Length
@@ -35,13 +36,10 @@ class Display:
 
     def __post_init__(self):
         for name in ("lens_distance", "eye_distance"):
-            if checks.finite(name, number(getattr(self, name)), "metres") < 0:
-                raise ValueError(f"{name} must be at least 0 metres, got {getattr(self, name)!r}")
-        focal_length = number(self.focal_length)
-        if focal_length == 0 or math.isnan(focal_length):
-            raise ValueError("focal_length must be other than 0 metres, infinite for no eyepiece")
+            checks.quantity(SPACING, number(getattr(self, name)), name)
+        checks.quantity(FOCAL_LENGTH, number(self.focal_length))
         if self.lens_radius is not None:
-            checks.positive("lens_radius", number(self.lens_radius), "metres")
+            checks.quantity(APERTURE_RADIUS, number(self.lens_radius), "lens_radius")
 
     @classmethod
     def planar(cls, distance: Length) -> "Display":

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import ACCOMMODATION, EYE_LENGTH, PUPIL_RADIUS, SOFTNESS, WAVEFRONT_ERROR
 from holotorch.optics.display import Length, inverse, number
 from holotorch.optics.kernels import turns_phasor
 from holotorch.optics.lens import Transmission, lens_phase, opening, warn_if_coarse
@@ -35,7 +36,7 @@ class Eye:
         softness: Width in metres of the pupil's edge, 0 for a hard one. A gradient in the radius needs a soft edge.
 
     Raises:
-        ValueError: Pupil radius, axial length or accommodation not above 0, an unknown Zernike index.
+        ValueError: A length that cannot be meant, such as one in millimetres, or an unknown Zernike index.
     """
 
     pupil_radius: Length = 1.5e-3
@@ -46,21 +47,16 @@ class Eye:
     softness: float = 0.0
 
     def __post_init__(self):
-        checks.positive("pupil_radius", number(self.pupil_radius), "metres")
-        checks.positive("axial_length", number(self.axial_length), "metres")
-        if not number(self.accommodation) > 0:
-            raise ValueError(
-                f"accommodation must be a distance above 0 metres in front of the eye, infinite for the relaxed eye, "
-                f"got {self.accommodation!r}"
-            )
+        checks.quantity(PUPIL_RADIUS, number(self.pupil_radius))
+        checks.quantity(EYE_LENGTH, number(self.axial_length))
+        checks.quantity(ACCOMMODATION, number(self.accommodation))
         for index, coefficient in self.aberrations.items():
             if not 0 <= checks.whole("Zernike index", index, 0) <= _HIGHEST:
                 raise ValueError(f"Zernike index must be an OSA index of 0 .. {_HIGHEST}, got {index}")
-            checks.finite(f"Zernike coefficient {index}", coefficient, "metres")
+            checks.quantity(WAVEFRONT_ERROR, coefficient, f"Zernike coefficient {index}")
         if self.chromatic_reference is not None:
             chromatic_refraction(self.chromatic_reference)
-        if checks.finite("softness", self.softness, "metres") < 0:
-            raise ValueError(f"softness must be at least 0 metres, got {self.softness!r}")
+        checks.quantity(SOFTNESS, self.softness)
 
     @property
     def focal_length(self) -> Length:

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import APERTURE_RADIUS, FOCAL_LENGTH
 from holotorch.optics.kernels import turns_phasor
 
 
@@ -121,7 +122,7 @@ class Lens(Transmission):
         paraxial: Parabola, or the spherical wave.
 
     Raises:
-        ValueError: A focal length of 0, or a radius that is not positive.
+        ValueError: A focal length of 0, or a length that cannot be meant, such as one in millimetres.
 
     Warns:
         SamplingWarning: The grid is too coarse for the phase at the rim, or at the end of the window where there is
@@ -144,8 +145,8 @@ class Lens(Transmission):
         given = list(focal_length) if isinstance(focal_length, Sequence) else [focal_length] * len(waves)
         if len(given) != len(waves):
             raise ValueError(f"focal_length must be one number or one per wavelength ({len(waves)}), got {len(given)}")
-        lengths = [_focal_length(each) for each in given]
-        rim = None if radius is None else checks.positive("radius", radius, "metres")
+        lengths = [checks.quantity(FOCAL_LENGTH, each) for each in given]
+        rim = None if radius is None else checks.quantity(APERTURE_RADIUS, radius, "radius")
         turns = _turns(grid, _doubles(waves), _doubles(lengths), paraxial)
         values = turns_phasor(turns)
         if rim is not None:
@@ -168,7 +169,7 @@ class Aperture(Transmission):
         shape: Radius in metres of a circle around the axis, or the amplitude that passes, real [H, W] within 0 .. 1.
 
     Raises:
-        ValueError: A radius that is not positive, a mask of another shape or with values outside 0 .. 1.
+        ValueError: A radius that cannot be meant, a mask of another shape or with values outside 0 .. 1.
     """
 
     def __init__(self, grid: Grid, wavelengths: float | Sequence[float], shape: float | Tensor):
@@ -178,7 +179,7 @@ class Aperture(Transmission):
             if mask.ndim != 2 or not bool(((mask >= 0) & (mask <= 1)).all()):
                 raise ValueError(f"aperture must be [H, W] with values in 0 .. 1, got {tuple(mask.shape)}")
         else:
-            mask = pupil(grid, checks.positive("aperture radius", float(shape), "metres"))
+            mask = pupil(grid, checks.quantity(APERTURE_RADIUS, float(shape)))
         super().__init__(grid, wavelengths, torch.complex(mask.double(), torch.zeros_like(mask.double()))[None])
 
 
@@ -194,15 +195,6 @@ def _turns(grid: Grid, wavelength: Tensor | float, focal_length: Tensor | float,
 
 def _doubles(values: Sequence[float]) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
-
-
-def _focal_length(value: float) -> float:
-    if isinstance(value, int | float) and not isinstance(value, bool) and math.isinf(value):
-        return float(value)
-    number = checks.finite("focal_length", value, "metres")
-    if number == 0:
-        raise ValueError("focal_length must be other than 0 metres, infinite for no lens")
-    return number
 
 
 def warn_if_coarse(

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.quantities import BANDWIDTH
 from holotorch.optics.quadrature import gauss_rule, least_rule, speckle_rule
 
 CUTOFF = 0.1  # of the peak: the thesis drops what is weaker (Sec. 5.5.2.2)
@@ -64,7 +65,7 @@ class Spectrum:
 
     def __post_init__(self):
         checks.wavelengths(self.centre)
-        checks.positive("fwhm", self.fwhm, "metres")
+        checks.quantity(BANDWIDTH, self.fwhm)
         if not 0 < checks.finite("cutoff", self.cutoff) < 1:
             raise ValueError(f"cutoff must lie between 0 and 1, a part of the peak, got {self.cutoff!r}")
         if self.band()[0] <= 0:
@@ -76,17 +77,17 @@ class Spectrum:
     @classmethod
     def lorentzian(cls, centre: float, fwhm: float, *, cutoff: float = CUTOFF) -> "Spectrum":
         """1 / (1 + (2 (lambda - centre) / fwhm)^2), Eq. 5.15 with its gamma, the half width, as fwhm / 2."""
-        return cls(centre, fwhm, _Lorentzian(checks.positive("fwhm", fwhm, "metres") / 2), cutoff)
+        return cls(centre, fwhm, _Lorentzian(checks.quantity(BANDWIDTH, fwhm) / 2), cutoff)
 
     @classmethod
     def lorentzian_as_printed(cls, centre: float, gamma: float, *, cutoff: float = CUTOFF) -> "Spectrum":
         """Eq. 5.15 to the letter. Its ``gamma`` is called the FWHM but is half of it: the source is twice as wide."""
-        return cls.lorentzian(centre, 2 * checks.positive("gamma", gamma, "metres"), cutoff=cutoff)
+        return cls.lorentzian(centre, 2 * checks.quantity(BANDWIDTH, gamma, "gamma"), cutoff=cutoff)
 
     @classmethod
     def gaussian(cls, centre: float, fwhm: float, *, cutoff: float = CUTOFF) -> "Spectrum":
         """2^(-(2 (lambda - centre) / fwhm)^2)."""
-        return cls(centre, fwhm, _Gaussian(checks.positive("fwhm", fwhm, "metres") / 2), cutoff)
+        return cls(centre, fwhm, _Gaussian(checks.quantity(BANDWIDTH, fwhm) / 2), cutoff)
 
     @classmethod
     def table(cls, wavelengths: Sequence[float], power: Sequence[float], *, cutoff: float = CUTOFF) -> "Spectrum":
@@ -165,7 +166,7 @@ class Spectrum:
         :meth:`samples` for few wavelengths that do better.
         """
         low, high = self.band()
-        step, slack = checks.positive("step", step, "metres"), 1e-9  # rounding must not drop the last one
+        step, slack = checks.quantity(BANDWIDTH, step, "step"), 1e-9  # rounding must not drop the last one
         first, last = math.ceil((low - self.centre) / step - slack), math.floor((high - self.centre) / step + slack)
         places = self.centre + step * torch.arange(first, last + 1, dtype=torch.float64)
         shape = self._shape(places.clamp(low, high))

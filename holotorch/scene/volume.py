@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.quantities import VOXEL
 
 Triple = tuple[float, float, float]
 IDENTITY: tuple[Triple, Triple, Triple] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -44,9 +45,14 @@ class Volume:
                 f"volume unit must be 'm' or 'relative', got {self.unit!r}; convert other lengths to metres"
             )
         steps = _triple("volume spacing", self.spacing)
-        object.__setattr__(self, "spacing", tuple(checks.positive("volume spacing", step, self.unit) for step in steps))
+        object.__setattr__(self, "spacing", tuple(map(self._checked_spacing, steps)))
         object.__setattr__(self, "origin", _triple("volume origin", self.origin))
         object.__setattr__(self, "orientation", _right_angled(self.orientation))
+
+    def _checked_spacing(self, step: float) -> float:
+        if self.unit == "m":
+            return checks.quantity(VOXEL, step)
+        return checks.positive("volume spacing", step, "the unit of a relative volume")
 
     @property
     def shape(self) -> tuple[int, int, int]:

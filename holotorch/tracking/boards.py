@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.quantities import BOARD_SQUARE
 
 _DICTIONARIES = {name: getattr(cv2.aruco, name) for name in dir(cv2.aruco) if name.startswith("DICT_")}
 _FEWEST = 8  # corners of a view: a homography takes 4, the rest checks them
@@ -30,7 +31,7 @@ class Chessboard:
     def __post_init__(self) -> None:
         # OpenCV finds no smaller boards.
         _sides(self, least=3)
-        _length("square", self.square)
+        checks.quantity(BOARD_SQUARE, self.square)
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Charuco:
 
     def __post_init__(self) -> None:
         _sides(self, least=4)
-        if not _length("marker", self.marker) < _length("square", self.square):
+        if not checks.quantity(BOARD_SQUARE, self.marker, "marker") < checks.quantity(BOARD_SQUARE, self.square):
             raise ValueError(f"marker must be smaller than square, {self.square:g} m, got {self.marker:g} m")
         if self.dictionary not in _DICTIONARIES:
             raise ValueError(f"dictionary must be one of {', '.join(_DICTIONARIES)}, got {self.dictionary!r}")
@@ -171,9 +172,3 @@ def _sides(board: Chessboard | Charuco, least: int) -> None:
     for name in ("columns", "rows"):
         if checks.whole(name, getattr(board, name), least) > 100:
             raise ValueError(f"{name} must be at most 100, got {getattr(board, name)}")
-
-
-def _length(name: str, value: float) -> float:
-    if checks.positive(name, value, "metres") > 1:
-        raise ValueError(f"{name} must be at most 1 m, got {value:g} m; 25 mm are 0.025")
-    return value

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.quantities import TOOL_LENGTH, TOOL_POSITION, TOOL_RADIUS
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Catheter:
     length: float
 
     def __post_init__(self) -> None:
-        edges = tuple(checks.finite("edges", float(edge)) for edge in self.edges)
+        edges = tuple(checks.quantity(TOOL_POSITION, edge, "edges") for edge in self.edges)
         if len(edges) < 4 or edges[0] < 0 or any(b <= a for a, b in zip(edges, edges[1:], strict=False)):
             raise ValueError(f"edges must be at least 4 rising distances from the tip in metres, got {edges}")
         colours = tuple(tuple(int(value) for value in colour) for colour in self.colours)
@@ -44,13 +45,11 @@ class Catheter:
         for one, other in zip(colours, colours[1:], strict=False):
             if math.dist(one, other) < 40:
                 raise ValueError(f"neighbouring bands must differ in colour, got {one} beside {other}")
-        checks.positive("radius", self.radius, "m")
-        if checks.positive("length", self.length, "m") < edges[-1]:
+        checks.quantity(TOOL_RADIUS, self.radius)
+        if checks.quantity(TOOL_LENGTH, self.length) < edges[-1]:
             raise ValueError(f"length must reach the last edge at {edges[-1]:g} m, got {self.length:g} m")
         if self.radius > min(b - a for a, b in zip(edges, edges[1:], strict=False)) / 2:
             raise ValueError(f"bands must be longer than they are wide, got radius {self.radius:g} m, edges {edges}")
-        if max(edges) > 10:
-            raise ValueError(f"edges are in metres, got {edges}")
         object.__setattr__(self, "edges", edges)
         object.__setattr__(self, "colours", colours)
 

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.quantities import EDGE_DEVIATION, TOOL_OFFSET, TOOL_POSITION, Quantity
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.status import Pose, Status
 
@@ -40,7 +41,7 @@ def solve_pose(
         Poses [B] in float64. Those that cannot be found are NaN, with a status that says why.
 
     Raises:
-        TypeError, ValueError: Wrong shapes or types, fewer than three positions, equal positions, deviations <= 0.
+        TypeError, ValueError: Wrong shapes or types, fewer than three positions, equal or in mm, deviations <= 0.
 
     Source: Sec. 3.4.2 of the thesis asks for this; :func:`closed_form` is what its Eqs. 3.8 to 3.11 become.
     """
@@ -54,11 +55,10 @@ def solve_pose(
             raise ValueError(f"seen must be bool of shape [{batch}, {count}], got {seen.dtype}, {list(seen.shape)}")
         given = given & seen
     known = given & torch.isfinite(plane.detach()).all(-1)
-    shift = _expanded("offset", offset, pixels, 1)
-    deviations = [_expanded(name, v, pixels, 2) for name, v in (("along_px", along_px), ("across_px", across_px))]
-    for name, value in zip(("along_px", "across_px"), deviations, strict=True):
-        if not bool((value.detach() > 0).all()):
-            raise ValueError(f"{name} must be above zero, in pixels")
+    shift = _expanded("offset", TOOL_OFFSET, offset, pixels, 1)
+    deviations = [
+        _expanded(name, EDGE_DEVIATION, v, pixels, 2) for name, v in (("along_px", along_px), ("across_px", across_px))
+    ]
     plane = torch.where(known[..., None], plane, 0.0)
     weights = edge_weights(
         torch.where(known[..., None], pixels, 0.0), plane, known, torch.stack(deviations, -1), camera
@@ -88,12 +88,11 @@ def solve_pose(
     covariance = lever @ inverse @ lever.mT
     codes = _codes(given, known, flat | (singular != 0) | ~settled, point)
     lost = torch.tensor([not code.answered for code in codes], dtype=torch.bool, device=tip.device)
-    nan = torch.full((), torch.nan, dtype=tip.dtype, device=tip.device)
     return Pose(
-        torch.where(lost[:, None], nan, tip),
-        torch.where(lost[:, None], nan, along),
-        torch.where(lost[:, None, None], nan, covariance),
-        torch.where(lost, nan, residuals.square().sum(-1)),
+        torch.where(lost[:, None], torch.nan, tip),
+        torch.where(lost[:, None], torch.nan, along),
+        torch.where(lost[:, None, None], torch.nan, covariance),
+        torch.where(lost, torch.nan, residuals.square().sum(-1)),
         (2 * known.sum(-1) - 5).clamp(min=0).to(tip.dtype),
         codes,
     )
@@ -139,16 +138,16 @@ def _checked(edges_px: Tensor, positions_m: Tensor) -> tuple[Tensor, Tensor]:
         raise ValueError(f"positions_m must be of shape [{edges_px.shape[1]}], got {list(positions.shape)}")
     if len(positions) < 3:
         raise ValueError(f"a pose takes at least three edges, got {len(positions)}")
-    checks.all_finite("positions_m", positions)
+    checks.quantities(TOOL_POSITION, positions, "positions_m")
     positions = positions.to(edges_px.device, torch.float64)
     if bool((positions.detach().sort().values.diff() <= 0).any()):
         raise ValueError(f"positions_m must all differ, got {positions.tolist()}")
     return edges_px.to(torch.float64), positions
 
 
-def _expanded(name: str, value: float | Tensor, like: Tensor, axes: int) -> Tensor:
+def _expanded(name: str, kind: Quantity, value: float | Tensor, like: Tensor, axes: int) -> Tensor:
     tensor = torch.as_tensor(value).to(like.device, torch.float64)
-    checks.all_finite(name, tensor)
+    checks.quantities(kind, tensor, name)
     shape = like.shape[:axes]
     if tensor.ndim > axes or any(n not in (1, want) for n, want in zip(tensor.shape[::-1], shape[::-1], strict=False)):
         raise ValueError(f"{name} must be a number or of shape {list(shape)}, got {list(tensor.shape)}")

@@ -92,11 +92,13 @@ def test_fit_finds_both_coefficients_within_their_errors():
         (lambda: fit_cauchy([530e-9, 630e-9], [6.0]), "and 1 phases"),
         (lambda: fit_cauchy([530e-9, 630e-9], [6.0, -1.0]), "phase must be above zero"),
         (lambda: fit_cauchy([450e-9, 550e-9, 690e-9], [0.1, 0.1, 6.2]), "expected unwrapped ones"),
-        (lambda: fit_cauchy([530, 630], [6.0, 5.0]), "wavelength must be that of light in metres"),
+        (lambda: fit_cauchy([530, 630], [6.0, 5.0]), "wavelength must lie within 10 nm .. 300 um"),
         (lambda: BirefringenceTable([530e-9], [0.2]), "at least two different wavelengths"),
         (lambda: BirefringenceTable([530e-9, 630e-9], [0.2, 0]), "birefringence must be above zero"),
-        (lambda: Cauchy(0.18, -1)(torch.tensor(530e-9)), "birefringence must be positive, got -3.5"),
-        (lambda: phase_scale(-1.0, 530e-9), "wavelengths must be finite and above zero"),
+        (lambda: Cauchy(0.18, -1e-13)(torch.tensor(530e-9)), "birefringence must be positive, got -0.17"),
+        (lambda: Cauchy(0.18, 0.0085), "b must lie at 1e-12 square metres or less in magnitude, got 0.0085"),
+        (lambda: phase_scale(-1.0, 530e-9), "wavelength must be above zero"),
+        (lambda: phase_scale(450.0, 530.0), "got 450 m; 450 looks like nanometres: pass 450e-9"),
     ],
 )
 def test_refuses(call, message):

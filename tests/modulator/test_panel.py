@@ -195,7 +195,7 @@ def test_a_batch_mapped_or_turned_equals_its_items():
         ({"lut": torch.arange(256)}, TypeError, "lut must be a real floating-point tensor"),
         ({"fill_factor": 0}, ValueError, "fill_factor must be above 0 and at most 1"),
         ({"gap": 1.5}, ValueError, "gap must be at least 0 and at most 1"),
-        ({"crosstalk": -1}, ValueError, "sigma_px must lie between 0"),
+        ({"crosstalk": -1}, ValueError, "sigma_px must be at least zero in pixels"),
         ({"crosstalk": torch.ones(2, 3)}, ValueError, "patch must have two odd sizes"),
     ],
 )

@@ -95,11 +95,11 @@ def test_impossible_eyes():
     for wrong, message in (
         ({"pupil_radius": 0.0}, "pupil_radius must be above zero"),
         ({"axial_length": -1e-3}, "axial_length must be above zero"),
-        ({"accommodation": 0.0}, "above 0 metres in front of the eye"),
-        ({"accommodation": -0.01}, "above 0 metres in front of the eye"),
+        ({"accommodation": 0.0}, "accommodation must be above zero in metres"),
+        ({"accommodation": -0.01}, "accommodation must be above zero in metres"),
         ({"aberrations": {99: 1e-7}}, r"OSA index of 0 \.\. 27"),
         ({"chromatic_reference": 2e-6}, "within 380"),
-        ({"softness": -1.0}, "softness must be at least 0"),
+        ({"softness": -1.0}, "softness must be at least zero in metres"),
     ):
         with pytest.raises(ValueError, match=message):
             Eye(**wrong)  # type: ignore[arg-type]

@@ -1,4 +1,5 @@
 import math
+from decimal import Decimal, localcontext
 
 import pytest
 import torch
@@ -66,10 +67,14 @@ def test_carrier_is_reduced_before_it_is_rounded():
 
 
 def test_small_angles_do_not_cancel():
-    # At 1e-5 rad over 1 km, k_z - k is 1e-10 of k; the paraxial value is right to 1e-11 of itself.
-    grid = Grid((1, 2), (1.0, 530e-9 / 2e-5))
-    phase = torch.angle(angular(grid, 530e-9, 1e3)[0, 1])
-    assert phase.item() == pytest.approx(math.remainder(-math.pi * 1e3 / 530e-9 * 1e-10, 2 * math.pi), rel=1e-7)
+    # At 2.65e-4 rad, k_z - k is 3.5e-8 of k: a difference of the two in float64 is wrong by 3e-9 of itself.
+    grid = Grid((1, 2), (1e-3, 1e-3))
+    phase = torch.angle(angular(grid, 530e-9, 2.0)[0, 1])
+    with localcontext() as context:
+        context.prec = 40
+        sine = Decimal(530e-9) / Decimal(2e-3)
+        wanted = float(2 * ((1 - sine**2).sqrt() - 1) / Decimal(530e-9)) * 2 * math.pi
+    assert phase.item() == pytest.approx(wanted, rel=1e-12)
 
 
 def test_evanescent_waves_decay_forwards_and_backwards():
@@ -100,7 +105,7 @@ def test_fresnel_kernel_is_the_small_angle_limit():
 def test_kernel_stays_finite_at_grazing_incidence():
     # lambda f = 1 exactly at Nyquist: the root is zero there, its gradient must not be infinite.
     wavelength = torch.tensor(1e-6, dtype=torch.float64, requires_grad=True)
-    kernel = angular(Grid((1, 4), (1.0, 0.5e-6)), wavelength, 1e-6)
+    kernel = angular(Grid((1, 4), (1e-3, 0.5e-6)), wavelength, 1e-6)
     (gradient,) = torch.autograd.grad(kernel.abs().sum() + kernel.real.sum(), wavelength)
     assert torch.isfinite(torch.view_as_real(kernel)).all() and torch.isfinite(gradient)
 

@@ -101,7 +101,7 @@ def test_soft_pupil_has_the_gradient_of_its_area():
 
 
 def test_impossible_elements():
-    with pytest.raises(ValueError, match="other than 0"):
+    with pytest.raises(ValueError, match="focal_length must be other than zero"):
         Lens(GRID, RED, 0.0)
     with pytest.raises(ValueError, match="radius must be above zero"):
         Lens(GRID, RED, 1e-3, radius=0.0)

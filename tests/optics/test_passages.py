@@ -244,7 +244,11 @@ def test_what_a_plan_says_of_other_windows():
         ({"tilt": 0.1}, TypeError, r"tilt must be two numbers \(y, x\) in sines of the carrier's direction, got 0.1"),
         ({"offset": 1e-4}, TypeError, r"offset must be two numbers \(y, x\) in metres, got 0.0001"),
         ({"out_grid": (32, 32)}, TypeError, r"out_grid must be a Grid, such as .*got \(32, 32\)"),
-        ({"wavelength": 530.0}, ValueError, "wavelength must be that of light in metres, got 530; 530 nm is 530e-9"),
+        (
+            {"wavelength": 530.0},
+            ValueError,
+            "wavelength must lie within 10 nm .. 300 um, got 530 m; 530 looks like nanometres",
+        ),
         ({"tilt": (0.1, math.nan)}, ValueError, "tilt must be finite"),
         ({"offset": (0.0, math.inf)}, ValueError, "offset must be finite"),
         ({"distance": 0.0, "out_grid": Grid(8, 4e-6)}, ValueError, "distance must not be 0"),

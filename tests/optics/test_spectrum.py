@@ -101,9 +101,11 @@ def test_refuses_a_bad_width(fwhm):
 
 def test_refuses_what_is_no_spectrum():
     with pytest.raises(ValueError, match="reaches wavelength 0; widths are in metres"):
+        Spectrum.lorentzian(GREEN, 5e-7)
+    with pytest.raises(ValueError, match="fwhm must lie within 1 fm .. 100 um, got 5 m; 5 looks like nanometres"):
         Spectrum.lorentzian(GREEN, 5)
-    with pytest.raises(ValueError, match="wavelength must be that of light in metres"):
-        Spectrum.gaussian(520, 5)
+    with pytest.raises(ValueError, match="wavelength must lie within 10 nm .. 300 um"):
+        Spectrum.gaussian(520, 5e-9)
     with pytest.raises(ValueError, match="cutoff must lie between 0 and 1"):
         Spectrum.lorentzian(GREEN, 5e-9, cutoff=1.0)
     with pytest.raises(ValueError, match="cutoff must lie between 0 and 1"):

@@ -107,5 +107,5 @@ def test_impossible_numbers():
         optics.region_apex(WIDTH, 0.3e-6, RED)
     with pytest.raises(ValueError, match="sees no plane"):
         Display.planar(0.3).focus_plane(math.inf)
-    with pytest.raises(ValueError, match="lens_distance must be at least 0"):
+    with pytest.raises(ValueError, match="lens_distance must be at least zero"):
         Display(-1e-3, 20e-3, 50e-3)

@@ -169,7 +169,7 @@ def test_one_view_checks_a_known_camera():
     ("make", "error", "words"),
     [
         (lambda: Chessboard(2, 6, 0.025), ValueError, "at least 3"),
-        (lambda: Chessboard(9, 6, 25), ValueError, "25 mm are 0.025"),
+        (lambda: Chessboard(9, 6, 25), ValueError, "25 looks like millimetres: pass 25e-3"),
         (lambda: Charuco(5, 7, 0.04, 0.04, "DICT_6X6_250"), ValueError, "smaller than square"),
         (lambda: Charuco(5, 7, 0.04, 0.02, "DICT_6X6"), ValueError, "DICT_6X6_250"),
         (lambda: Charuco(20, 20, 0.04, 0.02, "DICT_4X4_50"), ValueError, "200 markers"),

@@ -237,3 +237,13 @@ def test_opencv_s_pose_solvers_are_never_called():
             assert not imported & {f"holotorch.tracking.{name}" for name in ("pose", "catheter", "band_edges")}
         else:
             assert not solvers, file.name
+
+
+def test_millimetres_are_refused():
+    positions, tip, direction = scenes(1, 4, np.random.default_rng(0))
+    pixels = image(tip, direction, positions)
+    assert solve_pose(pixels, torch.tensor(positions), CAMERA).status == (Status.OK,)
+    with pytest.raises(ValueError, match=r"positions_m must lie at 3 m or less .*looks like millimetres: pass"):
+        solve_pose(pixels, 1e3 * torch.tensor(positions), CAMERA)
+    with pytest.raises(ValueError, match="offset must lie at 50 mm or less .* 1 looks like millimetres: pass 1e-3"):
+        solve_pose(pixels, torch.tensor(positions), CAMERA, offset=1.0)
