@@ -1,9 +1,12 @@
 """Volumes in general array files: NumPy, HDF5 and Zarr, axes (z, y, x). None of them states a spacing."""
 
+import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from holotorch.io.limits import affordable
 from holotorch.io.scan import Scan, chosen, extra, mapped_from, readable, three_axes
 
 
@@ -23,8 +26,22 @@ def read_npz(path: Path, member: str | None = None) -> Scan:
     with archive:
         name = chosen(archive.files, member, path)
         with readable(path, ".npz archive"):
+            _check_member(path, archive, name)
             values = archive[name]
     return Scan(three_axes(values, path))
+
+
+def _check_member(path: Path, archive: Any, name: str) -> None:
+    """Raise ValueError for an array that states more than it holds, before numpy allocates what it states."""
+    entry = next(item for item in archive.zip.infolist() if item.filename in (name, f"{name}.npy"))
+    with archive.zip.open(entry) as stream:
+        version = np.lib.format.read_magic(stream)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(stream)
+        stated, present = math.prod(shape) * dtype.itemsize, entry.file_size - stream.tell()
+    if stated != present:
+        raise ValueError(f"its array {name} states {stated} bytes and holds {present}")
+    affordable(path, stated, path.stat().st_size)
 
 
 def read_hdf5(path: Path, member: str | None = None) -> Scan:
@@ -39,6 +56,7 @@ def read_hdf5(path: Path, member: str | None = None) -> Scan:
         asked = member.strip("/") if member else None
         name = chosen([name for name, axes in found.items() if axes == 3 or name == asked], asked, path)
         with readable(path, "HDF5 file"):
+            affordable(path, file[name].size * file[name].dtype.itemsize, path.stat().st_size)
             values = file[name][...]
     return Scan(three_axes(values, path))
 
@@ -56,5 +74,7 @@ def read_zarr(path: Path, member: str | None = None) -> Scan:
         asked = member.strip("/") if member else None
         node = found[chosen([name for name in found if found[name].ndim == 3 or name == asked], asked, path)]
     with readable(path, "Zarr folder"):
+        stored = sum(item.stat().st_size for item in path.rglob("*") if item.is_file())
+        affordable(path, node.size * node.dtype.itemsize, stored)
         values = np.asarray(node[...])
     return Scan(three_axes(values, path))

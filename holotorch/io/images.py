@@ -8,7 +8,9 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.io.bundled import BUNDLED_IMAGES, no_such_picture
+from holotorch.io.decoding import check_exr, decode
 
+_MEMORY = 56  # bytes of a pixel in load_image: three numbers of 8 bytes, their copy and the decoded ones
 SMALLEST_SIDE = 11  # pixels; the window of ssim
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # ITU-R BT.709
 
@@ -106,12 +108,10 @@ def _bundled(name: str) -> np.ndarray:
 def _decode(path: Path) -> np.ndarray:
     import cv2
 
-    data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+    data = path.read_bytes()
     # JPEG through the colour reader, which turns the picture as its orientation tag says.
-    jpeg = data[:2].tobytes() == b"\xff\xd8"
-    pixels = cv2.imdecode(data, cv2.IMREAD_COLOR if jpeg else cv2.IMREAD_UNCHANGED) if data.size else None
-    if pixels is None:
-        raise ValueError(f"{path} is not a readable picture (PNG, JPEG, TIFF or EXR)")
+    flags = cv2.IMREAD_COLOR if data.startswith(b"\xff\xd8") else cv2.IMREAD_UNCHANGED
+    pixels = decode(path, flags, data=data, memory=_MEMORY)
     if pixels.ndim == 3 and pixels.shape[2] >= 3:
         pixels = np.concatenate([pixels[..., 2::-1], pixels[..., 3:]], axis=2)
     return pixels
@@ -121,6 +121,7 @@ def _read_exr(path: Path) -> np.ndarray:
     import OpenEXR
 
     try:
+        check_exr(path, memory=_MEMORY)
         channels = OpenEXR.File(str(path), separate_channels=True).channels()
     except Exception as error:  # the library raises bare RuntimeError and others
         raise ValueError(f"{path} is not a readable EXR file: {error}") from None
@@ -136,11 +137,10 @@ def _read_exr(path: Path) -> np.ndarray:
 def _unit_range(pixels: np.ndarray) -> np.ndarray:
     if pixels.dtype == bool:
         return pixels.astype(np.float64)
-    if pixels.dtype in (np.uint8, np.uint16):
-        return pixels.astype(np.float64) / np.iinfo(pixels.dtype).max
     values = pixels.astype(np.float64)
-    peak = values.max()
-    return values / peak if np.isfinite(peak) and peak > 1 else values
+    whole = pixels.dtype in (np.uint8, np.uint16)
+    peak = np.iinfo(pixels.dtype).max if whole else values.max()
+    return np.divide(values, peak, out=values) if np.isfinite(peak) and peak > 1 else values
 
 
 def _checked(image: Tensor, source: str) -> Tensor:

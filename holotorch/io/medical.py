@@ -1,5 +1,6 @@
 """Volumes of medical formats: NIfTI files and folders of DICOM slices. Their lengths are millimetres."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from holotorch.io.limits import affordable
 from holotorch.io.scan import Scan, extra, placed, readable, three_axes
 
 _NIFTI_METRES = {"unknown": 1e-3, "mm": 1e-3, "meter": 1.0, "micron": 1e-6}
@@ -21,6 +23,8 @@ def read_nifti(path: Path) -> Scan:
     nibabel = extra("nibabel", "reading NIfTI")
     with readable(path, "NIfTI file"):
         image = nibabel.load(path)
+        scaled = 8 if image.dataobj.slope != 1 or image.dataobj.inter != 0 else image.get_data_dtype().itemsize
+        affordable(path, math.prod(image.shape) * scaled, path.stat().st_size)
         values = np.asanyarray(image.dataobj)
         matrix = np.asarray(image.affine, dtype=np.float64)
         unit = image.header.get_xyzt_units()[0]
@@ -76,7 +80,10 @@ def read_dicom(folder: Path) -> Scan:
     _one_series(slices, folder)
     slices.sort(key=lambda header: header.height)
     across = _step(slices, folder)
-    values = np.empty((len(slices), *slices[0].size), _rescaled_type(slices))
+    kind = _rescaled_type(slices)
+    stored = sum(header.path.stat().st_size for header in slices)
+    affordable(folder, len(slices) * math.prod(slices[0].size) * kind.itemsize, stored)
+    values = np.empty((len(slices), *slices[0].size), kind)
     for index, header in enumerate(slices):
         slope, intercept = header.scale
         with readable(header.path, "DICOM image (if it is compressed, decompress it or install pylibjpeg)"):

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.io.decoding import PNG, check_exr, decode
 from holotorch.io.files import write_bytes
 
 _KEY = "holotorch"  # of the PNG text chunk and the EXR attribute that hold the metadata as JSON
-_PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def write_levels(path: Path, levels: Tensor, metadata: Mapping[str, Any]) -> None:
@@ -59,16 +59,14 @@ def read_levels(path: Path) -> tuple[Tensor, dict[str, Any]]:
     import cv2
 
     data = _existing(path).read_bytes()
-    pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-    if pixels is None:
-        raise ValueError(f"{path} is not a readable PNG or BMP")
+    pixels = decode(path, cv2.IMREAD_UNCHANGED, data=data, memory=16)
     if pixels.ndim == 3 and (pixels == pixels[..., :1]).all():
         pixels = pixels[..., 0]  # a grey BMP is read as three equal channels
     if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{path} must be grey with 8 or 16 bits, got {pixels.shape} of {pixels.dtype}")
-    text = _text_of(data) if data.startswith(_PNG) else None
+    text = _text_of(data) if data.startswith(PNG) else None
     if text is None and _beside(path).is_file():
-        text = _beside(path).read_text(encoding="utf-8")
+        text = _beside(path).read_bytes().decode("utf-8", "replace")
     return torch.from_numpy(pixels.copy()), _metadata(path, text)
 
 
@@ -105,11 +103,10 @@ def read_phases(path: Path) -> tuple[Tensor, dict[str, Any]]:
     """
     import OpenEXR
 
+    check_exr(_existing(path), memory=8)
     try:
-        file = OpenEXR.File(str(_existing(path)), separate_channels=True)
+        file = OpenEXR.File(str(path), separate_channels=True)
         header, channels = file.header(), file.channels()
-    except ValueError:
-        raise
     except Exception as error:  # the library raises bare RuntimeError and others
         raise ValueError(f"{path} is not a readable EXR file: {error}") from None
     if "Y" not in channels or channels["Y"].pixels.dtype != np.float32:
@@ -119,13 +116,13 @@ def read_phases(path: Path) -> tuple[Tensor, dict[str, Any]]:
 
 def _with_text(png: bytes, text: str) -> bytes:
     """A PNG with an international text chunk (UTF-8, not compressed) after its header."""
-    end = len(_PNG) + 12 + struct.unpack(">I", png[8:12])[0]
+    end = len(PNG) + 12 + struct.unpack(">I", png[8:12])[0]
     body = b"iTXt" + _KEY.encode() + b"\0\0\0\0\0" + text.encode()
     return png[:end] + struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body)) + png[end:]
 
 
 def _text_of(png: bytes) -> str | None:
-    place = len(_PNG)
+    place = len(PNG)
     while place + 12 <= len(png):
         length = struct.unpack(">I", png[place : place + 4])[0]
         kind, body = png[place + 4 : place + 8], png[place + 8 : place + 8 + length]
@@ -144,7 +141,7 @@ def _metadata(path: Path, text: str | None) -> dict[str, Any]:
         return {}
     try:
         found = json.loads(text)
-    except ValueError:
+    except (ValueError, TypeError, RecursionError):  # of an attribute that is no text; of lists without end
         raise ValueError(f"{path}: its metadata are damaged: not JSON") from None
     if not isinstance(found, dict):
         raise ValueError(f"{path}: its metadata are damaged: expected settings, got {found!r}")

@@ -1,6 +1,6 @@
 """Volumes whose voxels lie in a file as they are, or gzipped: raw, MetaImage and NRRD. Uncompressed ones are mapped."""
 
-import bz2
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,19 +9,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
+from holotorch.io.limits import unzipped
 from holotorch.io.scan import (
     Scan,
     existing,
     expect_bytes,
-    gunzip,
+    from_words,
     mapped,
     metres,
     number_type,
     placed,
     readable,
+    stated_bytes,
     unpacked,
 )
 
+_HEADER = 1 << 20  # bytes, at most, of a header of unknown length within compressed data
 _META_TYPES = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4",
     "MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4", "MET_DOUBLE": "f8",
@@ -57,7 +60,7 @@ def read_raw(path: Path, shape: Sequence[int] | None, dtype: DTypeLike | None) -
         )
     kind = number_type(dtype)
     if path.suffix == ".gz":
-        return Scan(unpacked(path, gunzip(path), shape, kind))
+        return Scan(unpacked(path, unzipped(path, stated_bytes(path, shape, kind)), shape, kind))
     return Scan(mapped(path, shape, kind))
 
 
@@ -83,7 +86,7 @@ def read_metaimage(path: Path) -> Scan:
     data = path if name == "LOCAL" else existing(path.parent / name, path)
     offset = end if name == "LOCAL" else skip
     if fields.get("CompressedData", "False").lower() == "true":
-        values = unpacked(data, gunzip(data, offset), shape, dtype)
+        values = unpacked(data, unzipped(data, stated_bytes(data, shape, dtype), offset), shape, dtype)
     else:
         values = mapped(data, shape, dtype, _at_end(data, shape, dtype) if skip == -1 else offset)
     spacing = _numbers(fields, ("ElementSpacing", "ElementSize"), 3, path, default=[])
@@ -125,19 +128,24 @@ def _nrrd_values(path: Path, header: dict[str, Any], shape: list[int], end: int)
     with open(data, "rb") as stream:
         stream.seek(0 if name else end)
         for _ in range(int(header.get("line skip", header.get("lineskip", 0)))):
-            stream.readline()
+            if not stream.readline():
+                break
         offset = stream.tell()
     skip = int(header.get("byte skip", header.get("byteskip", 0)))
+    if skip < -1:
+        raise ValueError(f"{path} has byte skip {skip}; expected -1 or a number of bytes")
     if encoding == "raw":
         return mapped(data, shape, dtype, _at_end(data, shape, dtype) if skip == -1 else offset + skip)
     if encoding in ("gzip", "gz", "bzip2", "bz2"):
-        content = gunzip(data, offset) if encoding[0] == "g" else _bunzip(data, offset)
-        del content[: -dtype.itemsize * int(np.prod(shape)) if skip == -1 else skip]
+        size = stated_bytes(data, shape, dtype)
+        most = size + (_HEADER if skip == -1 else skip)
+        content = unzipped(data, most, offset, kind="gzip" if encoding[0] == "g" else "bzip2")
+        del content[: -size if skip == -1 else skip]
         return unpacked(data, content, shape, dtype)
     if encoding in ("ascii", "text", "txt"):
         with readable(data, "text"), open(data, "rb") as stream:
             stream.seek(offset)
-            values = np.array(stream.read().split()).astype(dtype)
+            values = from_words(stream.read().split(), dtype)
         expect_bytes(data, values.nbytes, shape, dtype)
         return values.reshape(shape)
     raise ValueError(f"{path} is encoded as {encoding!r}; known are raw, gzip, bzip2 and ascii")
@@ -170,18 +178,9 @@ def _nrrd_placed(values: np.ndarray, header: dict[str, Any], path: Path) -> Scan
     return placed(values, axes * scale, origin, "m" if units else "relative")
 
 
-def _bunzip(path: Path, offset: int) -> bytearray:
-    with open(path, "rb") as stream:
-        stream.seek(offset)
-        try:
-            return bytearray(bz2.decompress(stream.read()))
-        except (ValueError, OSError) as error:
-            raise ValueError(f"{path} holds damaged bzip2 data: {error}; fetch it again") from None
-
-
 def _at_end(path: Path, shape: list[int], dtype: np.dtype) -> int:
     # A header of unknown length is skipped by counting from the end; too short a file is reported by mapped.
-    return max(0, path.stat().st_size - int(np.prod(shape)) * dtype.itemsize)
+    return max(0, path.stat().st_size - math.prod(shape) * dtype.itemsize)
 
 
 def _metaimage_header(path: Path) -> tuple[dict[str, str], int]:

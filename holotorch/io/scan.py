@@ -4,7 +4,6 @@ import importlib
 import math
 import mmap
 import sys
-import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
+from holotorch.io.limits import affordable
 from holotorch.scene.volume import IDENTITY, Triple
 
 _MAP_NORESERVE = 0x4000  # of Linux; Python has no name for it before 3.13
-_CHUNK = 1 << 24  # bytes read at once
 _METRES = {
     "m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 1e-2, "mm": 1e-3, "millimeter": 1e-3, "um": 1e-6, "µm": 1e-6,
     "micron": 1e-6, "nm": 1e-9, "angstrom": 1e-10,
@@ -136,6 +135,13 @@ def mapped_from(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int) 
         return np.ndarray(tuple(shape), dtype, mmap.mmap(stream.fileno(), 0, **access), offset)
 
 
+def stated_bytes(path: Path, shape: Sequence[int], dtype: np.dtype) -> int:
+    """Bytes of the ``shape`` voxels that a file states; ValueError for none, or more than its own size allows."""
+    size = expect_bytes(path, math.prod(shape) * dtype.itemsize, shape, dtype)
+    affordable(path, size, path.stat().st_size)
+    return size
+
+
 def unpacked(path: Path, data: bytes | bytearray, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
     """Voxels of decompressed ``data``."""
     expect_bytes(path, len(data), shape, dtype)
@@ -143,26 +149,11 @@ def unpacked(path: Path, data: bytes | bytearray, shape: Sequence[int], dtype: n
     return np.frombuffer(data if isinstance(data, bytearray) else bytearray(data), dtype).reshape(tuple(shape))
 
 
-def gunzip(path: Path, offset: int = 0) -> bytearray:
-    """Decompressed content (gzip or zlib) from ``offset`` on; ValueError where it is damaged or cut short."""
-    content, rest, members = bytearray(), b"", 0
-    with open(path, "rb") as stream:
-        stream.seek(offset)
-        # A gzip file may hold several members, one after another, and padding.
-        while rest := rest or stream.read(_CHUNK):
-            if members and not rest.strip(b"\0"):
-                break
-            engine = zlib.decompressobj(32 + zlib.MAX_WBITS)  # whichever header it has
-            try:
-                while rest and not engine.eof:
-                    content += engine.decompress(rest)
-                    rest = engine.unused_data if engine.eof else stream.read(_CHUNK)
-            except zlib.error as error:
-                raise ValueError(f"{path} holds damaged gzip data: {error}; fetch it again") from None
-            if not engine.eof:
-                raise ValueError(f"{path} is truncated: its gzip data stop after {len(content)} bytes; fetch it again")
-            members += 1
-    return content
+def from_words(words: Sequence[str] | Sequence[bytes], dtype: np.dtype) -> np.ndarray:
+    """Numbers written as text, of a type in the native byte order."""
+    # numpy's own conversion makes every word as wide as the longest.
+    number = float if dtype.kind == "f" else int
+    return np.array([number(word) for word in words], dtype.newbyteorder("="))
 
 
 def three_axes(values: np.ndarray, path: Path) -> np.ndarray:

@@ -6,8 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from holotorch.io.decoding import decode
+from holotorch.io.limits import affordable
 from holotorch.io.scan import Scan, readable
 
+_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES = 256, 257, 258, 277  # tags
 SLICE_SUFFIXES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg")
 
 
@@ -74,12 +77,7 @@ def read_tiles(path: Path, shape: Sequence[int] | None) -> Scan:
 def _picture(path: Path) -> np.ndarray:
     import cv2
 
-    data = np.fromfile(path, np.uint8)
-    with readable(path, "picture"):
-        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-    if pixels is None:
-        raise ValueError(f"{path} is not a readable picture, or is truncated")
-    return _grey(pixels, str(path))
+    return _grey(decode(path, cv2.IMREAD_UNCHANGED), str(path))
 
 
 def _grey(pixels: np.ndarray, source: str) -> np.ndarray:
@@ -104,7 +102,10 @@ def _stacked(slices: Iterable[np.ndarray], sources: Sequence[str]) -> Scan:
 
 
 def _tiff_pages(path: Path) -> int:
-    """Number of pages by the chain of directories: OpenCV leaves out silently what it cannot decode."""
+    """Number of pages by the chain of directories: OpenCV leaves out silently what it cannot decode.
+
+    ValueError where their pixels need more than the memory limit.
+    """
     data = np.memmap(path, np.uint8, "r")
     order = "big" if data[:2].tobytes() == b"MM" else "little"
     # Version 42 has offsets of 4 bytes; 43, BigTIFF, of 8.
@@ -119,10 +120,26 @@ def _tiff_pages(path: Path) -> int:
             raise ValueError(f"{path} is truncated: it ends at byte {data.size}, before its page directory")
         return int.from_bytes(data[place : place + size].tobytes(), order)
 
-    place, pages = number(8 if wide else 4, length), 0
+    def fact(directory: int, tag: int, default: int) -> int:
+        """The number in the entry ``tag``: one of 2, 4 or 8 bytes by its type, or the first of several elsewhere."""
+        for place in range(directory + counter, directory + counter + entry * number(directory, counter), entry):
+            if number(place, 2) == tag:
+                size = {3: 2, 4: 4, 16: 8}.get(number(place + 2, 2), 1)
+                count, value = number(place + 4, length), place + 4 + length
+                return number(value if count * size <= length else number(value, length), size)
+        return default
+
+    place, directories, entries, needed = number(8 if wide else 4, length), set[int](), 0, 0
     while place:
-        pages += 1
-        place = number(place + counter + entry * number(place, counter), length)
-        if pages > data.size:
+        if place in directories:
             raise ValueError(f"{path} is damaged: its pages point at each other in a circle")
-    return pages
+        directories.add(place)
+        entries += number(place, counter)
+        if entries * entry > data.size:
+            raise ValueError(f"{path} is damaged: the directories of its pages overlap")
+        bits = max(8, fact(place, _TIFF_BITS, 1)) * fact(place, _TIFF_SAMPLES, 1)
+        needed += fact(place, _TIFF_WIDTH, 1) * fact(place, _TIFF_HEIGHT, 1) * bits // 8
+        place = number(place + counter + entry * number(place, counter), length)
+    # The pages, and the volume that they are copied to.
+    affordable(path, 2 * needed, data.size)
+    return len(directories)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.io.decoding import decode
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
@@ -270,9 +271,8 @@ def _picture(path: Path) -> np.ndarray | None:
     import cv2
 
     try:
-        data = np.fromfile(path, np.uint8)
-        return cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-    except (OSError, cv2.error):
+        return decode(path, cv2.IMREAD_COLOR)
+    except (OSError, ValueError):
         return None
 
 

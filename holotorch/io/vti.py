@@ -8,13 +8,28 @@ from pathlib import Path
 
 import numpy as np
 
-from holotorch.io.scan import Scan, chosen, expect_bytes, mapped_from, placed, readable, three_axes, unpacked
+from holotorch.io.limits import inflated
+from holotorch.io.scan import (
+    Scan,
+    chosen,
+    expect_bytes,
+    from_words,
+    mapped_from,
+    placed,
+    readable,
+    stated_bytes,
+    three_axes,
+    unpacked,
+)
 
 _TYPES = {
     "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4", "Int64": "i8",
     "UInt64": "u8", "Float32": "f4", "Float64": "f8",
 }  # fmt: skip
-_APPENDED = re.compile(rb"<AppendedData\s[^>]*encoding\s*=\s*[\"'](\w+)[\"'][^>]*>\s*_")
+# Bounded, since every part may match what the next one does: a file of nothing but such beginnings takes linear time.
+_APPENDED = re.compile(
+    rb"<AppendedData\s[^<>]{0,200}encoding\s{0,9}=\s{0,9}[\"'](\w{1,20})[\"'][^<>]{0,200}>\s{0,999}_"
+)
 
 
 def read_vti(path: Path, member: str | None = None) -> Scan:
@@ -90,7 +105,7 @@ def _values(
     form, compressor = array.get("format", "ascii"), root.get("compressor")
     if form == "ascii":
         with readable(path, "text of numbers"):
-            values = np.array((array.text or "").split()).astype(dtype.newbyteorder("="))
+            values = from_words((array.text or "").split(), dtype)
         expect_bytes(path, values.nbytes, shape, dtype)
         return values.reshape(shape)
     header_type = root.get("header_type", "UInt32")
@@ -109,7 +124,7 @@ def _values(
     else:
         data = _decoded(array.text or "" if form == "binary" else path.read_bytes()[offset:].decode("latin-1"))
     if compressor:
-        return unpacked(path, _inflated(path, data, count), shape, dtype)
+        return unpacked(path, _inflated(path, data, count, stated_bytes(path, shape, dtype)), shape, dtype)
     return unpacked(path, data[count.itemsize : count.itemsize + _length(data, count)], shape, dtype)
 
 
@@ -133,15 +148,18 @@ def _decoded(text: str) -> bytes:
     return b"".join(base64.b64decode(part[: len(part) // 4 * 4]) for part in parts)
 
 
-def _inflated(path: Path, data: bytes, count: np.dtype) -> bytearray:
-    """Blocks of compressed data behind a table: their number, full size, the last one's size, compressed sizes."""
+def _inflated(path: Path, data: bytes, count: np.dtype, size: int) -> bytearray:
+    """Blocks of compressed data behind a table: their number, full size, the last one's size, compressed sizes.
+
+    ``size``: bytes of all content, beyond which nothing is unpacked.
+    """
     try:
         blocks = int(np.frombuffer(data, count, 1)[0])
         sizes = np.frombuffer(data, count, blocks, 3 * count.itemsize)
         content, place = bytearray(), (3 + blocks) * count.itemsize
-        for size in sizes:
-            content += zlib.decompress(data[place : place + int(size)])
-            place += int(size)
+        for length in map(int, sizes):
+            content += inflated(data[place : place + length], size - len(content))
+            place += length
         return content
     except (ValueError, zlib.error) as error:
         raise ValueError(f"{path} is truncated or damaged: {error}") from None

@@ -113,7 +113,7 @@ def test_damaged_and_foreign_files(tmp_path):
     (tmp_path / "cut.exr").write_bytes(b"v/1\x01" + data[:40])
     cv2.imwrite(str(tmp_path / "colour.png"), np.arange(60, dtype=np.uint8).reshape(4, 5, 3))
     cv2.imwrite(str(tmp_path / "plain.png"), np.arange(60, dtype=np.uint8).reshape(6, 10))
-    with pytest.raises(ValueError, match="not a readable PNG or BMP"):
+    with pytest.raises(ValueError, match="empty.png is not a readable picture"):
         read_levels(tmp_path / "empty.png")
     with pytest.raises(ValueError, match="must be grey"):
         read_levels(tmp_path / "colour.png")
