@@ -23,6 +23,14 @@ def positive(name: str, value: float, unit: str = "") -> float:
     return number
 
 
+def nonnegative(name: str, value: float, unit: str = "") -> float:
+    """Return ``value`` as float, or raise ValueError unless it is finite and at least zero."""
+    number = finite(name, value, unit)
+    if number < 0:
+        raise ValueError(f"{name} must be at least zero{_in(unit)}, got {value!r}")
+    return number
+
+
 def finite(name: str, value: float, unit: str = "") -> float:
     """Return ``value`` as float, or raise TypeError for what is no number and ValueError for NaN and infinity."""
     number = _number(name, value, unit)
@@ -133,6 +141,24 @@ def _number(name: str, value: Any, unit: str) -> float:
         return float(value)
     except (TypeError, ValueError):
         raise TypeError(f"{name} must be a number{_in(unit)}, got {type(value).__name__} {value!r}") from None
+
+
+def weights(name: str, value: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Return weights as they are, or raise unless they broadcast to ``shape`` = (C, ...) and leave something of each C.
+
+    Raises:
+        ValueError: NaN, infinity, a weight below zero, another shape, or a channel in which all are zero: whatever is
+            compared there is equal.
+    """
+    all_finite(name, value)
+    behind = shape[len(shape) - value.ndim :]
+    fits = value.ndim <= len(shape) and all(n in (1, whole) for n, whole in zip(value.shape, behind, strict=True))
+    if not fits or (value.numel() and value.min() < 0):
+        raise ValueError(f"{name} must be >= 0 and broadcast to the target {shape}, got {tuple(value.shape)}")
+    empty = ~value.expand(shape).flatten(1).any(1)
+    if bool(empty.any()):
+        raise ValueError(f"{name} is zero everywhere in channel {int(empty.nonzero()[0])}: nothing is left to compare")
+    return value
 
 
 def _complex(name: str, value: Tensor) -> None:

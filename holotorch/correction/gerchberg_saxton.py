@@ -55,6 +55,8 @@ def gerchberg_saxton(
     checks.field("start", start, tuple(target.shape), complex_valued=False)
     if target.min() < 0:
         raise ValueError(f"target is an intensity and must be >= 0, got a minimum of {target.min().item():g}")
+    if mask is not None:
+        checks.weights("mask", mask, tuple(target.shape))
     amplitude = target.to(start.dtype).sqrt()
     far = amplitude * phasor(start)
     phase, losses = start, []

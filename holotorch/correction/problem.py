@@ -23,17 +23,18 @@ class PECProblem(nn.Module):
         scale_free: Compare s U with I instead, s = <U, I> / <U, U> the best scale of each hologram and colour. For
             light that may leave the window or the mask; report the efficiency beside the result.
         amplitude: Compare sqrt(U) with sqrt(I) instead, whose gradient does not vanish where U is dark.
-        frames: The unknown is [..., C, F, H, W], F frames shown in turn, and U the mean of their intensities. A run's
-            ``phase.npy`` is [F, C, H, W].
+        frames: The unknown is [..., C, F, H, W], F frames shown in turn, and U the mean of their intensities. Heater
+            phases elsewhere, such as a run's ``phase.npy``, are [F, C, H, W]; where F = C no shape can tell the two
+            orders apart, so go from one to the other by :meth:`unknown` and :meth:`heater_phase` only.
         limit: In rad, a number or [C]: from here on P(X), the temperature that the chip really reaches, is penalised. A
             penalty alone does not keep it: ``limited`` with ``below`` does.
-        limit_weight: Weight of the penalty || max(P(X) - limit, 0) ||^2 that is added.
-        power_weight: Weight of the sum of X, the heating power, that is added.
+        limit_weight: Weight >= 0 of the penalty || max(P(X) - limit, 0) ||^2 that is added.
+        power_weight: Weight >= 0 of the sum of X, the heating power, that is added.
 
     Raises:
         TypeError: ``target`` is not a real tensor.
-        ValueError: ``target`` is not [C, *image], not finite, negative somewhere, or black in a channel; in a call: a
-            phase of another shape.
+        ValueError: ``target`` is not [C, *image], not finite, negative somewhere, or black in a channel; a mask that is
+            negative or leaves nothing of a channel; a negative weight; in a call: a phase of another shape.
 
     Source: thesis Eqs. 4.9, 4.10 (Fourier) and 4.50, 4.51 (Fresnel; there H stands inside the transform by mistake).
     """
@@ -66,11 +67,12 @@ class PECProblem(nn.Module):
         for channel, mean in enumerate(target.flatten(1).mean(1).tolist()):
             if mean == 0:
                 raise ValueError(f"target channel {channel} is black: there is no light to form, leave it out")
-        if mask is not None and (mask.min() < 0 or not _broadcasts(mask.shape, target.shape)):
-            raise ValueError(f"mask must be >= 0 and broadcast to the target {tuple(target.shape)}")
+        if mask is not None:
+            checks.weights("mask", mask, tuple(target.shape))
         self.crosstalk, self.propagator, self.scale_free = crosstalk, propagator, scale_free
         self.amplitude, self.frames = amplitude, frames
-        self.limit_weight, self.power_weight = limit_weight, power_weight
+        self.limit_weight = checks.nonnegative("limit_weight", limit_weight)
+        self.power_weight = checks.nonnegative("power_weight", power_weight)
         self.register_buffer("target", target, persistent=False)
         self.register_buffer("mask", mask, persistent=False)
         if limit is not None:
@@ -97,6 +99,28 @@ class PECProblem(nn.Module):
         """U(X), real [..., C, *image]."""
         return self._formed(self.crosstalk(phase))
 
+    def unknown(self, phase: Tensor) -> Tensor:
+        """The unknown that :meth:`forward` takes, of heater phases: with ``frames`` of [..., F, C, H, W].
+
+        Raises:
+            ValueError: With ``frames``, C is not that of the target.
+        """
+        if not self.frames:
+            return phase
+        if phase.ndim < 4 or phase.shape[-3] != len(self.target):
+            wanted = f"(F, C, H, W) with C = {len(self.target)}"
+            raise ValueError(f"heater phases must end in {wanted}, got {tuple(phase.shape)}")
+        return phase.movedim(-3, -4)
+
+    def heater_phase(self, unknown: Tensor) -> Tensor:
+        """Heater phases, with ``frames`` [..., F, C, H, W], of the unknown; inverse of :meth:`unknown`."""
+        if not self.frames:
+            return unknown
+        if unknown.ndim < 4 or unknown.shape[-4] != len(self.target):
+            wanted = f"(C, F, H, W) with C = {len(self.target)}"
+            raise ValueError(f"the unknown must end in {wanted}, got {tuple(unknown.shape)}")
+        return unknown.movedim(-3, -4)
+
     def misfit(self, formed: Tensor) -> Tensor:
         """Distance [..., C] of an intensity [..., C, *image] from the target."""
         if formed.shape[-self.target.ndim :] != self.target.shape:
@@ -122,13 +146,8 @@ class PECProblem(nn.Module):
         if spread.ndim < 4:
             raise ValueError(f"phase must end in (C, F, H, W), as frames=True has it, got {tuple(spread.shape)}")
         # Fields keep their channel before the picture: frames go in front of it, and are averaged there.
-        formed = intensity(self.propagator(phasor(spread.movedim(-3, -4))))
+        formed = intensity(self.propagator(phasor(self.heater_phase(spread))))
         return formed.mean(-1 - self.target.ndim)
-
-
-def _broadcasts(shape: torch.Size, to: torch.Size) -> bool:
-    behind = to[len(to) - len(shape) :]
-    return len(shape) <= len(to) and all(have in (1, want) for have, want in zip(shape, behind, strict=True))
 
 
 def best_scale(formed: Tensor, target: Tensor, behind: int = -2) -> Tensor:

@@ -22,10 +22,18 @@ State = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class Box:
-    """The set lower <= x <= upper, called to project onto it; bounds are numbers or tensors that broadcast."""
+    """The set lower <= x <= upper, called to project onto it; bounds are numbers or tensors that broadcast.
+
+    Raises:
+        ValueError: A bound that is NaN, or a lower one above the upper one.
+    """
 
     lower: float | Tensor = 0.0
     upper: float | Tensor = torch.inf
+
+    def __post_init__(self):
+        if not bool((torch.as_tensor(self.lower) <= torch.as_tensor(self.upper)).all()):
+            raise ValueError(f"a box needs lower <= upper everywhere, got {self.lower!r} and {self.upper!r}")
 
     def __call__(self, x: Tensor) -> Tensor:
         """The nearest point of the box."""
@@ -180,5 +188,4 @@ def check_stop_rule(max_steps: int, tolerance: float, patience: int) -> None:
     """ValueError unless the fields of a solver's stop rule are in range."""
     checks.whole("max_steps", max_steps, 1)
     checks.whole("patience", patience, 1)
-    if not tolerance >= 0:
-        raise ValueError(f"tolerance must be at least 0, got {tolerance!r}")
+    checks.nonnegative("tolerance", tolerance)

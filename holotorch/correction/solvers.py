@@ -42,7 +42,7 @@ class APG:
         checks.positive("step", self.step)
         if not 0 < self.shrink < 1:
             raise ValueError(f"shrink must lie between 0 and 1, got {self.shrink!r}")
-        if not self.grow >= 1:
+        if checks.finite("grow", self.grow) < 1:
             raise ValueError(f"grow must be at least 1, got {self.grow!r}")
         check_stop_rule(self.max_steps, self.tolerance, self.patience)
 
@@ -121,6 +121,8 @@ class ProjectedAdam:
 
     def __post_init__(self):
         checks.positive("learning_rate", self.learning_rate)
+        if not all(0 <= beta < 1 for beta in self.betas):
+            raise ValueError(f"betas must be at least 0 and below 1, got {self.betas!r}")
         check_stop_rule(self.max_steps, self.tolerance, self.patience)
 
     def __call__(

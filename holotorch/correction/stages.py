@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from holotorch.core import checks
 from holotorch.correction.lbfgs import LBFGS
 from holotorch.correction.problem import PECProblem
 from holotorch.correction.run import Box, Callback, Objective, Solution, State, nonnegative
@@ -82,6 +83,9 @@ def limited(
         amplitude: Whether to begin with the amplitude's loss.
     """
     whole = solver.max_steps
+    spread = checks.positive("spread", spread)
+    if limit is not None:
+        limit = checks.positive("limit", limit, "rad")
     if limit is None:
         begin = whole // 6 if amplitude else 0
         parts: list[tuple[dict[str, Any], Box, int]] = [({"amplitude": True}, nonnegative, begin)]
@@ -123,7 +127,13 @@ def proximal_pec(
 
 
 def below(limit: float, phase: Tensor, crosstalk: Callable[[Tensor], Tensor]) -> Tensor:
-    """``phase`` [..., H, W] scaled down where its spread passes ``limit`` in rad, hologram by hologram."""
+    """``phase`` [..., H, W] scaled down where its spread passes ``limit`` in rad, hologram by hologram.
+
+    Raises:
+        ValueError: A limit that is not finite and above zero, or a phase that is not finite: neither holds anything.
+    """
+    limit = checks.positive("limit", limit, "rad")
+    checks.all_finite("phase", phase)
     peak = crosstalk(phase).amax((-2, -1), keepdim=True)
     held = limit * (1 - 1e-6)  # what float32 rounds may not pass the limit in float64
     return torch.where(peak > held, phase * (held / peak.clamp(min=held)), phase)

@@ -130,8 +130,9 @@ def zernike(index: int, y: Tensor, x: Tensor) -> Tensor:
     """Normalised Zernike polynomial of OSA/ANSI single index j at (y, x) in units of the pupil radius, any shape.
 
     Mean square 1 over the disc, orthogonal; angle counted from +x towards +y. j = (n (n + 2) + m) / 2.
-    Source: ANSI Z80.28.
+    Raises TypeError for an index that is no whole number and ValueError for one below 0. Source: ANSI Z80.28.
     """
+    checks.whole("Zernike index", index, 0)
     order = math.ceil((-3 + math.sqrt(9 + 8 * index)) / 2)
     signed = 2 * index - order * (order + 2)
     m = abs(signed)

@@ -103,3 +103,10 @@ def test_impossible_eyes():
     ):
         with pytest.raises(ValueError, match=message):
             Eye(**wrong)  # type: ignore[arg-type]
+
+
+def test_polynomials_of_no_index_are_refused():
+    y = x = torch.zeros(1)
+    for index, error in ((-1, ValueError), (-3, ValueError), (1.0, TypeError), (True, TypeError)):
+        with pytest.raises(error, match="Zernike index must be"):
+            zernike(index, y, x)
