@@ -24,7 +24,8 @@ def load_image(source: str | Path) -> Tensor:
         maximum where that exceeds 1. Transparency shows black.
 
     Raises:
-        ValueError: No such picture, not decodable, smaller than 11 px on a side, NaN, negative, or black throughout.
+        ValueError: No such picture, not decodable, beyond the memory limit of :mod:`holotorch.io.limits`, smaller than
+            11 px on a side, NaN, negative, or black throughout.
     """
     path = Path(source)
     if str(source) in BUNDLED_IMAGES:

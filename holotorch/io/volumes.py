@@ -61,7 +61,8 @@ def load_volume(
 
     Raises:
         ValueError: No such file, a format or geometry that is not known or not stated, a file that does not have the
-            size its header says, more than one number per voxel.
+            size its header says, more than one number per voxel, compressed voxels beyond the memory limit of
+            :mod:`holotorch.io.limits`.
         ImportError: The library for the format is not installed; the message has the line that installs it.
     """
     file, member = split_member(path)

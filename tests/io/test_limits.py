@@ -112,6 +112,7 @@ def bombs(tmp_path_factory) -> dict[str, list[str]]:
         "flat.png": (flat_png(32_000), "asks for 57.3 GB of memory"),
         "wide.png": (png(32_000, 32_000, b""), "asks for 57.3 GB of memory"),
         "wide.bmp": (bmp(30_000, 30_000), "asks for 50.4 GB of memory"),
+        "broken.bmp": (bmp(3, 1 << 21), "is not a readable picture"),
         "cut.bmp": (bmp(300, 300), "is not a readable picture"),
         "levels.png": (png(32_000, 32_000, b""), "asks for 16.4 GB of memory"),
         "levels.bmp": (bmp(300, 300), "is not a readable picture"),
@@ -126,7 +127,6 @@ def bombs(tmp_path_factory) -> dict[str, list[str]]:
 
 PROGRAM = """
 import json, resource, sys, time
-from holotorch.io.decoding import decode, picture_size
 from holotorch.io.images import load_image
 from holotorch.io.panel_files import read_levels
 from holotorch.io.volumes import load_volume
