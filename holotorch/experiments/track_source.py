@@ -21,6 +21,7 @@ from holotorch.io.recording import is_recording, open_recording
 from holotorch.io.video import Frames, is_camera, no_such_source, open_frames
 from holotorch.tracking import Camera, Catheter, Pose
 from holotorch.tracking.calibration import SURE
+from holotorch.tracking.channels import ChannelOrder, ambiguities, ambiguity_text
 
 METHODS = ("ours", "thesis")
 _OFF_CENTRE = 0.15  # of a side; two thirds of the resolution, as 720 to 1080 lines, shift the centre by a sixth
@@ -76,6 +77,8 @@ def opened(
         raise ConfigError([str(error)]) from None
     with frames:
         _checked(lens, frames)
+        if doubt := ambiguity_text(ambiguities(seen, tool)):
+            frames.notes.append(doubt)
         yield Given(frames, seen, tool, tracker, paths)
 
 
@@ -115,7 +118,7 @@ def make_tracker(method: str, camera: Camera, catheter: Catheter) -> Tracker:
         return _Cold(ThesisTracker(camera, catheter))
     from holotorch.tracking.tracker import CatheterTracker
 
-    return CatheterTracker(camera, catheter)
+    return CatheterTracker(camera, catheter, channels=ChannelOrder.RGB)  # as every source of frames gives them
 
 
 class _Cold:

@@ -15,6 +15,7 @@ from tqdm import tqdm
 from holotorch.experiments.thesis_opencv import ThesisOpenCV
 from holotorch.io.images import load_image
 from holotorch.tracking import stations
+from holotorch.tracking.channels import ChannelOrder
 from holotorch.tracking.status import Pose, Status
 from holotorch.tracking.tracker import CatheterTracker
 from holotorch.tracking.world import Case, World
@@ -91,7 +92,7 @@ def photographs() -> tuple[Tensor, ...]:
 def methods(world: World, names: Sequence[str] = (BASE, LITERAL, COLD, PRIOR, FEWER)) -> dict[str, Method]:
     """Trackers by name, each as a function of one frame [3, H, W] and its case (whose truth only the prior reads)."""
     camera, catheter = world.camera, world.catheter
-    thesis, ours = ThesisOpenCV(camera, catheter), CatheterTracker(camera, catheter)
+    thesis, ours = ThesisOpenCV(camera, catheter), CatheterTracker(camera, catheter, channels=ChannelOrder.RGB)
     literal = ThesisOpenCV(camera, catheter, literal=True)
     expected = lru_cache(maxsize=16)(before)  # made once for a frame, so that its making is not the tracker's time
 

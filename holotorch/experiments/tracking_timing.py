@@ -13,6 +13,7 @@ from holotorch.experiments.chart import interleaved
 from holotorch.experiments.thesis_opencv import ThesisOpenCV
 from holotorch.experiments.tracking_bench import Row, told
 from holotorch.experiments.tracking_methods import BASE, COLD, PRIOR, Method, as_camera, before, methods
+from holotorch.tracking.channels import ChannelOrder
 from holotorch.tracking.status import Pose, Status
 from holotorch.tracking.thesis import ThesisTracker
 from holotorch.tracking.tracker import CatheterTracker
@@ -64,7 +65,7 @@ def stages(world: World, rounds: int) -> list[Row]:
     case = next(case for case in conditions(world) if case.name == "plain")
     frames = as_camera(case.frame())[None]
     expected = [before(case)]
-    ours = CatheterTracker(world.camera, world.catheter)
+    ours = CatheterTracker(world.camera, world.catheter, channels=ChannelOrder.RGB)
     thesis, kornia = ThesisOpenCV(world.camera, world.catheter), ThesisTracker(world.camera, world.catheter)
     calls: dict[str, tuple[ThesisOpenCV | ThesisTracker | CatheterTracker, Callable[[], list[Pose]]]] = {
         BASE: (thesis, lambda: thesis(frames)),

@@ -4,6 +4,7 @@ from holotorch.tracking.alignment import headset_from_camera
 from holotorch.tracking.band_edges import fit_band_edges
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import THESIS, Catheter
+from holotorch.tracking.channels import ChannelOrder, ambiguities
 from holotorch.tracking.pose import closed_form, solve_pose
 from holotorch.tracking.smoothing import OneEuro
 from holotorch.tracking.status import Pose, Status
@@ -17,12 +18,14 @@ __all__ = [
     "Camera",
     "Catheter",
     "CatheterTracker",
+    "ChannelOrder",
     "OneEuro",
     "Pose",
     "PoseReceiver",
     "PoseSender",
     "Status",
     "ThesisTracker",
+    "ambiguities",
     "closed_form",
     "fit_band_edges",
     "headset_from_camera",

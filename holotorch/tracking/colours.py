@@ -38,6 +38,7 @@ class ColourTable:
             )
         levels = torch.arange(1 << _BITS, dtype=torch.float64) * 8 + 3.5
         cells = torch.cartesian_prod(levels, levels, levels)
+        self._linear = camera.linear
         chroma, pure = _chroma(camera.linear(cells))
         wanted, saturation = _chroma(camera.linear(torch.tensor(self.colours, dtype=torch.float64)))
         if float(saturation.min()) < 0.2:
@@ -45,6 +46,7 @@ class ColourTable:
         between = wanted @ wanted.T - 2 * torch.eye(len(wanted), dtype=torch.float64)
         if float(between.max()) > math.cos(math.radians(25)):
             raise ValueError(f"hues of the bands must lie 25 degrees apart at least, got {self.colours}")
+        self._wanted = wanted
         like, label = (chroma @ wanted.T).max(-1)
         good = (like > math.cos(_TURN)) & (pure > _PURE * saturation[label]) & (cells.amax(-1) > 255 * _DARK)
         self.table = np.tile(torch.where(good, label + 1, 0).to(torch.uint8).numpy(), 2)
@@ -53,6 +55,15 @@ class ColourTable:
         """uint8 [T, U] of levels uint8 [T, U, 3], neither of them nought."""
         # Five bits of each colour side by side, as the table wants them.
         return cv2.LUT(cv2.cvtColor(levels, cv2.COLOR_RGB2BGR555).view(np.uint16)[..., 0], self.table)
+
+    def alike(self, levels: Tensor, margin: float) -> list[list[int]]:
+        """Of each of the levels [n, 3]: indices of ``colours`` that it may pass for, -1 for none of them.
+
+        ``margin``: degrees by which its hue may be moved.
+        """
+        away = (_chroma(self._linear(levels.double()))[0] @ self._wanted.T).clamp(-1, 1).arccos()
+        wide, narrow = (_TURN + sign * math.radians(margin) for sign in (1, -1))
+        return [[-1] * (min(row) > narrow) + [i for i, each in enumerate(row) if each < wide] for row in away.tolist()]
 
 
 def _chroma(light: Tensor) -> tuple[Tensor, Tensor]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from holotorch.tracking.status import Pose
 from holotorch.tracking.strips import Line
 
 _STEPS = 2  # after a linear start that is right but for the noise, a thousandth or less; each squares what is left
@@ -159,3 +160,10 @@ def _solved(normal: list[float], right: _Three) -> _Three:
     af, bc, ad = a * f - c * c, b * c - a * e, a * d - b * b
     x, y, z = right
     return (df * x + ce * y + be * z) / whole, (ce * x + af * y + bc * z) / whole, (be * x + bc * y + ad * z) / whole
+
+
+def on_host(pose: Pose) -> Found | None:
+    """Its tip and direction in NumPy, whatever device it is on; None where they are not finite."""
+    place, onward = (value.numpy(force=True).astype(np.float64) for value in (pose.tip, pose.direction))
+    known = all(map(math.isfinite, (*place.tolist(), *onward.tolist())))
+    return Found(place, onward, np.zeros((6, 6)), 0.0) if known else None

@@ -11,6 +11,7 @@ from torch import Tensor
 from holotorch.tracking import thesis_stages as stages
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import Catheter
+from holotorch.tracking.channels import ChannelOrder
 from holotorch.tracking.pose import closed_form
 from holotorch.tracking.status import Pose, Refusal
 from holotorch.tracking.thesis_stages import Axis, Box, Endpoints, Stopwatch
@@ -31,6 +32,11 @@ class ThesisTracker:
     On a CPU this takes about eight times as long as the same stages in OpenCV, which are the baseline to compare times
     with (holotorch.experiments.thesis_opencv). It needs about 0.2 GB per 1080p frame of the batch.
 
+    Args:
+        camera: Intrinsics.
+        catheter: What to look for.
+        channels: Order of the frames' channels.
+
     Attributes:
         times: Seconds of each stage of the last call, by the names of Table 3.1; all frames of the batch together.
         endpoints: Of each frame of the last call, the bands' edges (x, y) in pixels of the undistorted frame, in the
@@ -42,8 +48,8 @@ class ThesisTracker:
     Source: Sec. 3.4 and Table 3.1 of the thesis, with its equations 3.5 to 3.12 corrected.
     """
 
-    def __init__(self, camera: Camera, catheter: Catheter):
-        self.camera, self.catheter = camera, catheter
+    def __init__(self, camera: Camera, catheter: Catheter, *, channels: ChannelOrder = ChannelOrder.RGB):
+        self.camera, self.catheter, self.channels = camera, catheter, channels
         self.times: dict[str, float] = dict.fromkeys(stages.STAGES, 0.0)
         self.endpoints: list[Endpoints] = []
         self._windows = stages.windows(catheter)
@@ -52,13 +58,14 @@ class ThesisTracker:
 
     @torch.no_grad()
     def __call__(self, frames: Tensor) -> list[Pose]:
-        """Pose in metres, or refusal, of each frame of uint8 [B, 3, H, W], RGB.
+        """Pose in metres, or refusal, of each frame of uint8 [B, 3, H, W].
 
         Raises:
             TypeError, ValueError: Not such a tensor.
         """
         stages.need_frames(frames)
         self.camera.need_size(frames)
+        frames = self.channels.to_rgb(frames)
         watch = Stopwatch(torch.cuda.synchronize if frames.is_cuda else None)
         poses: list[Pose | None] = [None] * len(frames)
         self.endpoints = [[] for _ in poses]

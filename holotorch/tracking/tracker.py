@@ -16,12 +16,13 @@ from holotorch.core import checks
 from holotorch.tracking.bands import Stretches
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import Catheter
+from holotorch.tracking.channels import ChannelOrder, need_frames, stated_order
 from holotorch.tracking.coarse import find_segments
 from holotorch.tracking.colours import ColourTable
 from holotorch.tracking.footprint import axis_on_plane, bulge_px, width_px
 from holotorch.tracking.lens import Lens
 from holotorch.tracking.measure import BLURRED, Edges, find_bands, halfway, measure_edges
-from holotorch.tracking.resection import Found, pose_on_line
+from holotorch.tracking.resection import Found, on_host, pose_on_line
 from holotorch.tracking.stations import THIRD, Axis, look_across, measure_axis, measure_width, narrowed
 from holotorch.tracking.status import Pose, Refusal, Status
 from holotorch.tracking.strips import Line, Sampler
@@ -66,6 +67,8 @@ class CatheterTracker:
         camera: Intrinsics and tone curve.
         catheter: What to look for; colours saturated, of hues 25 degrees apart.
         most_sd: Standard deviation of the tip in metres above which a pose is refused as UNCERTAIN.
+        channels: Order of the frames' channels. Where it is not stated frames are taken for RGB, with one warning if
+            the catheter looks like itself in another order (:func:`ambiguities`).
 
     Attributes:
         times: Seconds that each stage of the last call took, all frames together: colour, axis, edges, pose.
@@ -77,25 +80,26 @@ class CatheterTracker:
     Source: Chapter 3 of the thesis for bands, one camera and what is asked; the method is our own.
     """
 
-    def __init__(self, camera: Camera, catheter: Catheter, *, most_sd: float = 2e-3):
+    def __init__(
+        self, camera: Camera, catheter: Catheter, *, most_sd: float = 2e-3, channels: ChannelOrder | None = None
+    ):
         self.camera, self.catheter = camera, catheter
         self.most_sd = checks.positive("most_sd", most_sd, "m")
         self.table = ColourTable(camera, catheter)
+        self.channels = stated_order(channels, camera, catheter)
         self.lens = Lens(camera)
         self._positions: list[float] = catheter.positions.tolist()
         self.times: dict[str, float] = {}
 
     def __call__(self, frames: Tensor, previous: Sequence[Pose] | None = None) -> list[Pose]:
-        """A pose for each frame, uint8 [B, 3, H, W], RGB; ``previous`` poses of the same cameras narrow the search."""
-        if not isinstance(frames, Tensor):
-            raise TypeError(f"frames must be a torch tensor, uint8 of shape [B, 3, H, W], got {type(frames).__name__}")
-        if frames.ndim != 4 or frames.shape[1] != 3 or frames.dtype != torch.uint8:
-            raise ValueError(f"frames must be uint8 of shape [B, 3, H, W], got {frames.dtype}, {list(frames.shape)}")
+        """A pose for each frame, uint8 [B, 3, H, W]; ``previous`` poses of the same cameras narrow the search."""
+        need_frames(frames)
         self.camera.need_size(frames)
         if isinstance(previous, Pose) or not all(isinstance(pose, Pose) for pose in previous or ()):
             raise TypeError("previous must be a list with a Pose for each frame")
         if previous is not None and len(previous) != len(frames):
             raise ValueError(f"{len(frames)} frames take {len(frames)} previous poses, got {len(previous)}")
+        frames = self.channels.to_rgb(frames)
         self.times = dict.fromkeys(("colour", "axis", "edges", "pose"), 0.0)
         return [self._track(frame, previous[i] if previous else None) for i, frame in enumerate(frames)]
 
@@ -104,7 +108,7 @@ class CatheterTracker:
         if height < 32 or width < 32:
             return Pose.refused(Status.BAD_FRAME, f"a frame of {height} x {width} px is too small")
         sampler = Sampler(frame, self.lens.light)
-        found = _host(before) if before is not None and before.answered else None
+        found = on_host(before) if before is not None and before.answered else None
         try:
             if found is None:
                 return self._anywhere(sampler)
@@ -291,10 +295,3 @@ class CatheterTracker:
             yield
         finally:
             self.times[stage] += time.perf_counter() - began
-
-
-def _host(pose: Pose) -> Found | None:
-    """Its tip and direction in NumPy, whatever device it is on; None where they are not finite."""
-    place, onward = (value.numpy(force=True).astype(np.float64) for value in (pose.tip, pose.direction))
-    known = all(map(math.isfinite, (*place.tolist(), *onward.tolist())))
-    return Found(place, onward, np.zeros((6, 6)), 0.0) if known else None
