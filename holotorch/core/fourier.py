@@ -10,15 +10,20 @@ import math
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 
 def fft2(field: Tensor, size: tuple[int, int] | None = None) -> Tensor:
     """DFT over the last two axes, not scaled, of ``field`` padded with zeros at the end to ``size``."""
+    if 0 in field.shape[:-2]:
+        return _resized(field, size)
     return torch.fft.fft2(field, s=size)
 
 
 def ifft2(spectrum: Tensor, size: tuple[int, int] | None = None, first: tuple[int, int] = (0, 0)) -> Tensor:
     """Inverse of :func:`fft2`, cropped to ``size`` samples from ``first`` on; it is periodic."""
+    if 0 in spectrum.shape[:-2]:
+        return _resized(spectrum, size)
     field = torch.fft.ifft2(spectrum, norm="forward")
     for axis, begin, count in zip((-2, -1), first, size or (), strict=False):
         end, length = begin + count, field.shape[axis]
@@ -27,6 +32,18 @@ def ifft2(spectrum: Tensor, size: tuple[int, int] | None = None, first: tuple[in
         else:
             field = torch.cat([field.narrow(axis, begin, length - begin), field.narrow(axis, 0, end - length)], axis)
     return field * (1 / math.prod(spectrum.shape[-2:]))
+
+
+def fft(lines: Tensor, length: int | None = None) -> Tensor:
+    """DFT over the last axis, not scaled, of ``lines`` [..., n] padded with zeros at the end to ``length``."""
+    if 0 in lines.shape[:-1]:
+        return _resized(lines[..., None, :], None if length is None else (1, length))[..., 0, :]
+    return torch.fft.fft(lines, length)
+
+
+def ifft_unscaled(lines: Tensor) -> Tensor:
+    """Inverse DFT over the last axis of ``lines`` [..., n] without its factor 1 / n."""
+    return lines if 0 in lines.shape[:-1] else torch.fft.ifft(lines, norm="forward")
 
 
 def good_length(minimum: int, *, odd: bool = False) -> int:
@@ -54,11 +71,13 @@ def _powers(base: int, top: int) -> list[int]:
 
 def centred_fft2(field: Tensor) -> Tensor:
     """Unitary DFT over the last two axes with the origin of both sides on sample ``n // 2``; keeps the power."""
-    return _centred(torch.fft.fft2(_uncentred(field)))
+    return _centred(fft2(_uncentred(field)))
 
 
 def centred_ifft2(field: Tensor) -> Tensor:
     """Inverse, and adjoint, of :func:`centred_fft2`."""
+    if 0 in field.shape[:-2]:
+        return _resized(field, None)
     return _centred(torch.fft.ifft2(_uncentred(field), norm="forward"))
 
 
@@ -126,6 +145,9 @@ def convolve(image: Tensor, kernel: Tensor) -> Tensor:
     kh, kw = kernel.shape[-2:]
     size = (good_length(h + kh - 1), good_length(w + kw - 1))
     dtype = torch.promote_types(image.dtype, kernel.dtype)
+    batch = torch.broadcast_shapes(image.shape[:-2], kernel.shape[:-2])
+    if 0 in batch:
+        return image.to(dtype).expand(*batch, h, w)
     if dtype.is_complex:
         full = ifft2(fft2(image, size) * fft2(kernel, size))
     else:
@@ -139,9 +161,19 @@ def filter_real(image: Tensor, kernel: Tensor) -> Tensor:
 
     ``kernel`` holds the frequencies of a real transform, [H, W // 2 + 1].
     """
+    if 0 in image.shape[:-2]:
+        return image
     size = (image.shape[-2], image.shape[-1])
     full = torch.fft.irfft2(torch.fft.rfft2(image) * kernel, s=size, norm="forward")
     return full * (1 / math.prod(size))
+
+
+def _resized(batch: Tensor, size: tuple[int, int] | None) -> Tensor:
+    """The transform of a batch of no fields, of which MKL makes an error: complex, padded or cropped to ``size``."""
+    height, width = batch.shape[-2:]
+    to = size or (height, width)
+    values = batch if batch.is_complex() else torch.complex(batch, torch.zeros_like(batch))
+    return functional.pad(values, (0, to[1] - width, 0, to[0] - height))
 
 
 def _uncentred(field: Tensor) -> Tensor:

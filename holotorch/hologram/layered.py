@@ -35,6 +35,8 @@ class LayerHologram(nn.Module):
         """Field [..., H, W] of ``layers``, complex [..., D, h, w], whose samples h // 2, w // 2 lie on the axis."""
         check_layers(layers, len(self.depths))
         shape = (layers.shape[-2], layers.shape[-1])
+        if 0 in layers.shape[:-3]:  # a batch of no scenes
+            return (layers.sum((-3, -2, -1))[..., None, None]).expand(*layers.shape[:-3], *self.grid.shape)
         return linear(layers, self._formed, lambda field: self._gathered(field, shape))
 
     def adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from holotorch.core import checks
+from holotorch.core.precision import at_least_single
 
 SSIM_WINDOW = 11
 
@@ -12,9 +13,9 @@ def psnr(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
     """Peak signal-to-noise ratio in dB, [...] for images [..., H, W]; infinite for equal images.
 
     The peak is ``data_range``, not the maximum of the reference as printed in thesis Eq. 4.37. ValueError for unequal
-    shapes or a range that is not positive.
+    shapes or a range that is not positive. In float32 at least.
     """
-    _check_pair(image, reference, data_range)
+    image, reference = _checked_pair(image, reference, data_range)
     error = (image - reference).square().mean((-2, -1))
     return 10 * torch.log10(data_range**2 / error)
 
@@ -30,20 +31,22 @@ def ssim(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
         ValueError: Unequal shapes, a side below 11 px, or a range that is not positive.
     """
     scores = ssim_map(image, reference, data_range=data_range)
-    return scores.reshape(-1, 1, *scores.shape[-2:]).mean((-3, -2, -1)).reshape(image.shape[:-2])
+    return scores.mean((-2, -1))
 
 
 def ssim_map(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
     """:func:`ssim` before its mean, [..., H - 10, W - 10]: the value of each window that lies within the image."""
     from kornia.metrics import ssim as kornia_ssim
 
-    _check_pair(image, reference, data_range)
+    image, reference = _checked_pair(image, reference, data_range)
     height, width = image.shape[-2:]
     if min(height, width) < SSIM_WINDOW:
         raise ValueError(
             f"ssim needs images of at least {SSIM_WINDOW} x {SSIM_WINDOW} px, got {height} x {width}; "
             "psnr has no such limit"
         )
+    if not image.numel():  # an empty batch has empty scores
+        return image[..., SSIM_WINDOW - 1 :, SSIM_WINDOW - 1 :]
     images, references = (tensor.reshape(-1, 1, height, width) for tensor in (image, reference))
     scores = kornia_ssim(images, references, SSIM_WINDOW, float(data_range), eps=0.0, padding="valid")
     return scores.reshape(*image.shape[:-2], *scores.shape[-2:])
@@ -76,7 +79,7 @@ class PerceptualSimilarity(nn.Module):
 
         ValueError for unequal shapes or another C.
         """
-        _check_pair(image, reference, 1.0)
+        _checked_pair(image, reference, 1.0)
         if image.ndim < 3 or image.shape[-3] not in (1, 3):
             raise ValueError(f"images must be grey or red, green, blue, [..., 1 or 3, H, W], got {tuple(image.shape)}")
         pair = (
@@ -86,10 +89,11 @@ class PerceptualSimilarity(nn.Module):
         return torch.exp(-distances).reshape(image.shape[:-3]).to(image.dtype)
 
 
-def _check_pair(image: Tensor, reference: Tensor, data_range: float) -> None:
+def _checked_pair(image: Tensor, reference: Tensor, data_range: float) -> tuple[Tensor, Tensor]:
     checks.real("image", image)
     checks.real("reference", reference)
     checks.positive("data_range", data_range)
     if image.shape != reference.shape or image.ndim < 2:
         shapes = f"{tuple(image.shape)} and {tuple(reference.shape)}"
         raise ValueError(f"images must share a shape [..., H, W], got {shapes}")
+    return at_least_single(image), at_least_single(reference)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.precision import at_least_single
 
 
 class SeedStatistics(NamedTuple):
@@ -28,7 +29,7 @@ def seed_statistics(pictures: Tensor) -> SeedStatistics:
     """Statistics of ``pictures`` [S, ..., H, W], S >= 2 of independent seeds.
 
     The mean of S pictures keeps 1 / S of their variance, which would count as brightness in mean squared: that is
-    subtracted, so that ``contrast`` does not depend on S (6.4.2). 0 for a black scene.
+    subtracted, so that ``contrast`` does not depend on S (6.4.2). 0 for a black scene. In float32 at least.
 
     Raises:
         TypeError: Pictures that are not real floating-point.
@@ -37,7 +38,7 @@ def seed_statistics(pictures: Tensor) -> SeedStatistics:
     checks.real("pictures", pictures)
     if pictures.ndim < 3 or pictures.shape[0] < 2:
         raise ValueError(f"pictures must be [S, ..., H, W] with two seeds or more, got {tuple(pictures.shape)}")
-    variance, mean = torch.var_mean(pictures, 0)
+    variance, mean = torch.var_mean(at_least_single(pictures), 0)
     noise = variance.mean((-2, -1)) / pictures.shape[0]
     true = mean.square().mean((-2, -1)) - noise
     some = (true > 0) & (noise > 0)

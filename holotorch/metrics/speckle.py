@@ -1,4 +1,4 @@
-"""Speckle of a single picture: how strong, how coarse, how elongated, and what is left of the sharpness."""
+"""Speckle of a single picture: how strong, how coarse, how elongated, how sharp still; in float32 at least."""
 
 import math
 from collections.abc import Sequence
@@ -9,6 +9,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.fourier import fft2
+from holotorch.core.precision import at_least_single
 
 _BAND = (0.05, 0.25)  # cycles per sample, the middle of what a picture can hold
 _FINE = 16  # places per sample at which a correlation is looked up
@@ -39,7 +40,7 @@ def speckle_contrast(intensity: Tensor, *, reference: Tensor | None = None, mask
 
     Source: Goodman, Speckle Phenomena in Optics, Sec. 3.2.
     """
-    _picture("intensity", intensity)
+    intensity = _picture("intensity", intensity)
     if mask is None:
         mask = torch.ones((), dtype=torch.bool, device=intensity.device)
     elif mask.dtype != torch.bool:
@@ -51,7 +52,9 @@ def speckle_contrast(intensity: Tensor, *, reference: Tensor | None = None, mask
     count = weight.sum((-2, -1), keepdim=True)
     if not torch.compiler.is_compiling() and (count == 0).any():
         raise ValueError("mask leaves no pixel to measure")
-    if reference is None:
+    if reference is not None:
+        reference = at_least_single(reference)
+    else:
         reference = (intensity * weight).sum((-2, -1), keepdim=True) / count
     square = ((intensity - reference).square() * weight).sum((-2, -1)) / count[..., 0, 0]
     scale = (reference.square() * weight).sum((-2, -1)) / count[..., 0, 0]
@@ -67,7 +70,7 @@ def power_spectrum(intensity: Tensor) -> Tensor:
 
     Source: Goodman, Speckle Phenomena in Optics, Sec. 4.3; Parseval's theorem.
     """
-    _picture("intensity", intensity)
+    intensity = _picture("intensity", intensity)
     mean = intensity.mean((-2, -1), keepdim=True)
     away = fft2((intensity - mean).to(_complex(intensity)))
     size = intensity.shape[-2] * intensity.shape[-1]
@@ -89,7 +92,7 @@ def grain_size(intensity: Tensor, *, level: float = 0.5) -> Tensor:
 
     Source: Goodman, Speckle Phenomena in Optics, Sec. 4.4.
     """
-    _picture("intensity", intensity)
+    intensity = _picture("intensity", intensity)
     if not 0 < checks.finite("level", level) < 1:
         raise ValueError(f"level must lie between 0 and 1, got {level!r}")
     away = intensity - intensity.mean((-2, -1), keepdim=True)
@@ -108,7 +111,7 @@ def anisotropy(intensity: Tensor) -> Anisotropy:
         grains lie along the shorter one. A ratio of 1 has no direction. White noise, being isotropic and strong at high
         frequencies, draws the ratio towards 1.
     """
-    _picture("intensity", intensity)
+    intensity = _picture("intensity", intensity)
     windows = [torch.hann_window(n, dtype=intensity.dtype, device=intensity.device) for n in intensity.shape[-2:]]
     weight = windows[0][:, None] * windows[1]
     mean = (intensity * weight).sum((-2, -1), keepdim=True) / weight.sum()
@@ -133,8 +136,8 @@ def sharpness(intensity: Tensor, reference: Tensor, *, band: tuple[float, float]
     Raises:
         ValueError: Unequal shapes, a band that is not 0 <= low < high, or a reference without detail in it.
     """
-    _picture("intensity", intensity)
-    _picture("reference", reference)
+    intensity = _picture("intensity", intensity)
+    reference = _picture("reference", reference)
     if intensity.shape[-2:] != reference.shape[-2:]:
         raise ValueError(f"pictures must share (H, W), got {tuple(intensity.shape)} and {tuple(reference.shape)}")
     low, high = checks.pair("band", band, "cycles per sample")
@@ -187,7 +190,9 @@ def _complex(image: Tensor) -> torch.dtype:
     return torch.complex128 if image.dtype == torch.float64 else torch.complex64
 
 
-def _picture(name: str, image: Tensor) -> None:
+def _picture(name: str, image: Tensor) -> Tensor:
+    """The picture in float32 at least."""
     checks.real(name, image)
     if image.ndim < 2:
         raise ValueError(f"{name} must be [..., H, W], got {tuple(image.shape)}")
+    return at_least_single(image)

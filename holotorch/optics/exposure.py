@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.precision import at_least_single
 
 GAMMA = 0.5  # of Eq. 5.16
 
@@ -21,9 +22,9 @@ def equal_power(intensity: Tensor, reference: Tensor) -> Tensor:
             raise ValueError(f"{name} must be [..., H, W], got {tuple(part.shape)}")
     if intensity.shape[:-2] != reference.shape[:-2]:
         raise ValueError(f"channels must match, got {tuple(intensity.shape)} and {tuple(reference.shape)}")
-    ours, wanted = (part.mean((-2, -1), keepdim=True) for part in (intensity, reference))
+    ours, wanted = (at_least_single(part).mean((-2, -1), keepdim=True) for part in (intensity, reference))
     black = ours == 0
-    return intensity * torch.where(black, 0.0, wanted / torch.where(black, 1.0, ours))
+    return intensity * torch.where(black, 0.0, wanted / torch.where(black, 1.0, ours)).to(intensity.dtype)
 
 
 def exposed(intensity: Tensor, *, peak: Tensor | None = None, gamma: float = GAMMA) -> Tensor:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from holotorch.core import checks
-from holotorch.core.fourier import good_length
+from holotorch.core.fourier import fft, good_length, ifft_unscaled
 from holotorch.core.grid import Grid
 from holotorch.optics.taps import tap_indices
 
@@ -135,8 +135,8 @@ def _axis_kernel(size: int, fill: float, finer: int) -> Tensor:
 
 def _spread(lines: Tensor, kernel: Tensor) -> Tensor:
     """Convolve lines [..., n] with each of the s kernels [s, padded] and interleave the results, [..., s n]."""
-    spectrum = torch.fft.fft(lines, kernel.shape[-1])[..., None, :] * kernel
-    phases = torch.fft.ifft(spectrum, norm="forward")[..., : lines.shape[-1]]
+    spectrum = fft(lines, kernel.shape[-1])[..., None, :] * kernel
+    phases = ifft_unscaled(spectrum)[..., : lines.shape[-1]]
     return phases.transpose(-1, -2).flatten(-2)
 
 
@@ -144,5 +144,5 @@ def _gather(lines: Tensor, kernel: Tensor) -> Tensor:
     """Conjugate transpose of :func:`_spread`: lines [..., s n] to [..., n]."""
     count, padded = kernel.shape
     phases = lines.unflatten(-1, (-1, count)).transpose(-1, -2)
-    spectrum = (torch.fft.fft(phases, padded) * kernel.conj()).sum(-2)
-    return torch.fft.ifft(spectrum, norm="forward")[..., : lines.shape[-1] // count]
+    spectrum = (fft(phases, padded) * kernel.conj()).sum(-2)
+    return ifft_unscaled(spectrum)[..., : lines.shape[-1] // count]

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from holotorch.core import checks
-from holotorch.core.fourier import fft2, good_length, ifft2, multiplied
+from holotorch.core.fourier import fft, fft2, good_length, ifft2, ifft_unscaled, multiplied
 from holotorch.core.grid import Grid
 from holotorch.optics.kernels import turns_phasor
 
@@ -39,16 +39,16 @@ def zoom(spectrum: Tensor, factors: Chirp) -> Tensor:
     size, half = len(before), (len(before) + 1) // 2
     lines = spectrum * before
     gap = lines.new_zeros(*lines.shape[:-1], len(kernel) - size)
-    lines = torch.fft.fft(torch.cat([lines[..., :half], gap, lines[..., half:]], -1))
-    return torch.fft.ifft(multiplied(lines, kernel), norm="forward")[..., : len(after)] * after
+    lines = fft(torch.cat([lines[..., :half], gap, lines[..., half:]], -1))
+    return ifft_unscaled(multiplied(lines, kernel))[..., : len(after)] * after
 
 
 def zoom_adjoint(values: Tensor, factors: Chirp) -> Tensor:
     """Conjugate transpose of :func:`zoom`."""
     before, kernel, after = factors
     size, half = len(before), (len(before) + 1) // 2
-    lines = torch.fft.fft(values * after.conj(), len(kernel))
-    lines = torch.fft.ifft(multiplied(lines, kernel.conj()), norm="forward")
+    lines = fft(values * after.conj(), len(kernel))
+    lines = ifft_unscaled(multiplied(lines, kernel.conj()))
     return torch.cat([lines[..., :half], lines[..., len(kernel) - size + half :]], -1) * before.conj()
 
 
