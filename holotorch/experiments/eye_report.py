@@ -1,10 +1,9 @@
 """The part of a report page that shows what an observer sees."""
 
-import html
 from collections.abc import Callable
 from typing import Any
 
-from holotorch.experiments.markup import figure, plain, table
+from holotorch.experiments.markup import element, figure, heading, plain, table
 
 _PREDICTED = (
     "The predicted contrast is that of an evenly filled round pupil and fully developed speckle; a scene with "
@@ -25,10 +24,9 @@ def by_wavelength(row: dict[str, Any], wavelengths: list[float]) -> dict[str, An
 
 def eye_section(title: str, summary: dict[str, Any], plan: dict[str, Any], picture: Callable[[str], str]) -> list[str]:
     """HTML of a run: pictures by focus, numbers by source, plan; ``picture`` gives an image's data URL or nothing."""
-    status = "" if summary["status"] == "complete" else f' <span class="warn">{summary["status"]}</span>'
-    parts = [f"<h1>{html.escape(title)}{status}</h1>", "<p>What the observer sees.</p>"]
+    parts = [heading(title, summary["status"]), "<p>What the observer sees.</p>"]
     if summary["synthetic"]:
-        parts.append(f'<p class="warn">Synthetic volume: {html.escape(summary["synthetic"])}.</p>')
+        parts.append(element("p", f"Synthetic volume: {summary['synthetic']}.", "warn"))
     for f, depth in enumerate(plan["focus_mm"]):
         if source := picture(f"comparison_{f}"):
             kind = ", synthetic volume" if summary["synthetic"] else ""
@@ -39,9 +37,9 @@ def eye_section(title: str, summary: dict[str, Any], plan: dict[str, Any], pictu
     first = summary["rows"][0]
     at = f" at {' / '.join(f'{wave:.0f}' for wave in summary['wavelengths_nm'])} nm"
     names = [key.replace("_", " ") + (at if isinstance(first[key], list) else "") for key in first]
-    parts.append(table(names, [[html.escape(_cell(value)) for value in row.values()] for row in summary["rows"]]))
-    parts.append(f"<p>{_PREDICTED}</p>")
-    parts.append(f"<h2>Plan</h2><pre>{html.escape(plan.get('text', plain(plan)))}</pre>")
+    parts.append(table(names, [[_cell(value) for value in row.values()] for row in summary["rows"]]))
+    parts.append(element("p", _PREDICTED))
+    parts.append("<h2>Plan</h2>" + element("pre", plan.get("text", plain(plan))))
     return parts
 
 

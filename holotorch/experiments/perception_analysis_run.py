@@ -1,6 +1,5 @@
 """A run of the analysis: logs, or simulated participants, to tables, pictures and a page."""
 
-import html
 import math
 import time
 from dataclasses import asdict
@@ -18,7 +17,7 @@ from holotorch.experiments.chart import write_table
 from holotorch.experiments.config_analysis import AnalysisSettings
 from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.markup import figure, table
+from holotorch.experiments.markup import element, figure, table
 from holotorch.experiments.perception_analysis import (
     Curves,
     Responses,
@@ -164,7 +163,7 @@ def run_analysis(settings: AnalysisSettings, out: Path | None, name: str) -> tup
         print("\n".join(said), flush=True)
     for key, data in images.items():
         write_bytes(folder / "images" / f"{key}.png", data)
-    body = "<h1>Perception in the far periphery</h1>" + f"<pre>{html.escape(text)}</pre>" + _table(rows)
+    body = "<h1>Perception in the far periphery</h1>" + element("pre", text) + _table(rows)
     body += "".join(figure(f"images/{key}.png", _CAPTIONS[key], "wide") for key in images)
     body += _table(power) if power else ""
     write_text(folder / "report.html", f"<!DOCTYPE html><meta charset='utf-8'><title>perception</title>{body}")
@@ -218,6 +217,6 @@ def _curves(times: Times, curves: Curves) -> list[dict[str, Any]]:
 
 def _table(rows: list[dict[str, Any]]) -> str:
     def cell(value: Any) -> str:
-        return "" if value is None else f"{value:.4g}" if isinstance(value, float) else html.escape(str(value))
+        return "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
     return table([key.replace("_", " ") for key in rows[0]], [[cell(value) for value in row.values()] for row in rows])

@@ -1,7 +1,6 @@
 """A layout over a wide field, scaled for equal perception time: picture, tables and report (thesis Fig. 2.8)."""
 
 import base64
-import html
 import io
 import math
 from pathlib import Path
@@ -21,7 +20,7 @@ from holotorch.experiments.chart import write_table
 from holotorch.experiments.config_perception import ItemSettings, LayoutSettings
 from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.markup import figure, table
+from holotorch.experiments.markup import element, figure, table
 from holotorch.experiments.perception_icons import draw_ground, draw_icon
 from holotorch.experiments.report import page
 from holotorch.experiments.run_folder import claim
@@ -243,14 +242,13 @@ def _report(
     source = "data:image/png;base64," + base64.b64encode(picture).decode()
     caption = "Icons of a notional theme park with their sizes. Those framed in grey are not scaled"
     caption += "; * extrapolated." if any(row["note"].startswith("extrapolated") for row in rows) else "."
-    body = [f"<h1>{html.escape(name)}</h1>", figure(source, caption, "wide"), f"<pre>{html.escape(text)}</pre>"]
+    body = [element("h1", name), figure(source, caption, "wide"), element("pre", text)]
     for heading, lines in (
         ("Sizes", rows),
         ("Displays of thesis Table 2.1: how far out they show what is asked", displays),
     ):
         names = [key.replace("_", " ") for key in lines[0]]
-        cells = [[html.escape(str(value)) for value in line.values()] for line in lines]
-        body.append(f"<h2>{heading}</h2>" + table(names, cells))
-    command = html.escape(f"holotorch run {folder / 'config.yaml'}")
-    body.append(f"<h2>How to repeat</h2><code>{command}</code>")
+        cells = [[str(value) for value in line.values()] for line in lines]
+        body.append(element("h2", heading) + table(names, cells))
+    body.append("<h2>How to repeat</h2>" + element("code", f"holotorch run {folder / 'config.yaml'}"))
     return page(f"holotorch: {name}", "\n".join(body))

@@ -9,7 +9,7 @@ from typing import Any
 
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.eye_report import eye_section
-from holotorch.experiments.markup import figure, plain, table
+from holotorch.experiments.markup import element, figure, heading, plain, table
 from holotorch.experiments.volume_report import volume_section
 from holotorch.experiments.zone_table import zone_rows
 from holotorch.io.files import write_text
@@ -104,17 +104,16 @@ def _other(folder: Path, kind: str) -> str:
 
 
 def _comparison(runs: list[_Run]) -> str:
-    rows = [[html.escape(run.title), *_numbers(run.methods["corrected"])] for run in runs]
+    rows = [[run.title, *_numbers(run.methods["corrected"])] for run in runs]
     return "<h1>Runs</h1>" + table(["run", *_COLUMNS], rows)
 
 
 def _section(run: _Run) -> list[str]:
-    status = "" if run.summary["status"] == "complete" else f' <span class="warn">{run.summary["status"]}</span>'
-    parts = [f"<h1>{html.escape(run.title)}{status}</h1>"]
+    parts = [heading(run.title, run.summary["status"])]
     parts.append(
         table(["method", *_COLUMNS], [[_METHOD_NAMES.get(n, n), *_numbers(m)] for n, m in run.methods.items()])
     )
-    parts.append(f"<p>{_verdict(run)}</p>")
+    parts.append(element("p", _verdict(run)))
     head, rows = zone_rows(run.methods)
     if rows:
         parts.append("<h2>By eccentricity</h2>" + table(head, rows))
@@ -127,15 +126,13 @@ def _section(run: _Run) -> list[str]:
         if source := run.picture(name):
             parts.append(figure(source, caption, "wide"))
     parts.append("<h2>Plan</h2>" + table(["", ""], _plan_rows(run.plan), head=False))
-    for note in run.plan["notes"]:
-        parts.append(f'<p class="warn">{html.escape(note)}</p>')
-    return parts
+    return parts + [element("p", note, "warn") for note in run.plan["notes"]]
 
 
 def _repeat(run: _Run) -> list[str]:
     command = f"holotorch run {run.folder / 'config.yaml'}"
-    repeat = f"Repeat with <code>{html.escape(command)}</code>. Configuration:<pre>{html.escape(run.config)}</pre>"
-    rows = [[html.escape(key), html.escape(plain(value))] for key, value in run.env.items()]
+    repeat = f"Repeat with {element('code', command)}. Configuration:{element('pre', run.config)}"
+    rows = [[key, plain(value)] for key, value in run.env.items()]
     return [f"<h2>How to repeat</h2>{repeat}", table(["", ""], rows, head=False)]
 
 
@@ -190,8 +187,7 @@ def _verdict(run: _Run) -> str:
 
 
 def _plan_rows(plan: dict[str, Any]) -> list[list[str]]:
-    shown = {name.replace("_", " "): plain(value) for name, value in plan.items() if name != "notes"}
-    return [[html.escape(name), html.escape(text)] for name, text in shown.items()]
+    return [[name.replace("_", " "), plain(value)] for name, value in plan.items() if name != "notes"]
 
 
 def _score(run: _Run, name: str) -> str:

@@ -2,7 +2,6 @@
 
 import sys
 import time
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import yaml
 from holotorch.experiments.chart import write_table
 from holotorch.experiments.config import StudySettings
 from holotorch.experiments.environment import environment
+from holotorch.experiments.markup import element
 from holotorch.experiments.memory import peak_memory
 from holotorch.experiments.pec_bench import Bench
 from holotorch.experiments.pec_claims import with_claims
@@ -37,9 +37,8 @@ def run_study(settings: StudySettings, out: Path | None, name: str) -> tuple[Pat
     write_bytes(folder / "images" / "table.png", picture)
     text = table_text(rows)
     write_text(folder / "table.txt", text)
-    page = (
-        f"<title>{settings.study}</title><h1>{settings.study}</h1><img src='images/table.png'><pre>{escape(text)}</pre>"
-    )
+    page = element("title", settings.study) + element("h1", settings.study)
+    page += "<img src='images/table.png'>" + element("pre", text)
     write_text(folder / "report.html", f"<!DOCTYPE html><meta charset='utf-8'>{page}")
     verdicts = [row["verdict"].split(":")[0] for row in rows if row["verdict"]]
     summary = {

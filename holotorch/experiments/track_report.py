@@ -1,7 +1,6 @@
 """What a tracking run tells at its end: counts by status, time per stage, stability, and a page of them."""
 
 import base64
-import html
 import io
 import math
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from holotorch.experiments.markup import figure, plain, table
+from holotorch.experiments.markup import element, figure, plain, table
 from holotorch.experiments.memory import peak_memory
 from holotorch.io.files import write_bytes, write_text
 from holotorch.io.images import encode_png
@@ -196,24 +195,21 @@ def verdict(summary: dict[str, Any]) -> str:
 def write_page(folder: Path, summary: dict[str, Any], log: Log) -> None:
     """Write ``report.html`` with everything inline, and the figure of the track."""
     write_bytes(folder / "images" / "track.png", _png(drawn_track(log)))
-    body = f"<h1>{html.escape(folder.resolve().name)}: {html.escape(summary['source'])}</h1>"
+    body = element("h1", f"{folder.resolve().name}: {summary['source']}")
     if summary["status"] != "complete":
-        body += f"<p><b>{summary['status']} {html.escape(summary.get('failure', ''))}</b></p>"
+        body += f"<p>{element('b', summary['status'] + ' ' + summary.get('failure', ''))}</p>"
     share = 100 * summary["answered"] / summary["frames"]
-    body += f"<p>{summary['answered']} of {summary['frames']} frames have a pose ({share:.1f} %); every other says why "
-    body += "it has none. " + ("" if "truth" in summary else "Errors against the truth are not known here. ")
-    body += f"Deviations (sd) are the tracker's own estimate: {html.escape(_STATED)}, which adds to them.</p>"
+    text = f"{summary['answered']} of {summary['frames']} frames have a pose ({share:.1f} %); every other says why "
+    text += "it has none. " + ("" if "truth" in summary else "Errors against the truth are not known here. ")
+    body += element("p", text + f"Deviations (sd) are the tracker's own estimate: {_STATED}, which adds to them.")
     body += _truth(summary["truth"]) if "truth" in summary else ""
-    body += "".join(f"<p>Note: {html.escape(note)}.</p>" for note in summary["notes"])
+    body += "".join(element("p", f"Note: {note}.") for note in summary["notes"])
     rows = [[name, str(count)] for name, count in summary["statuses"].items()]
     body += table(["status", "frames"], rows)
     shown = [name for name in ("tip_sd_mm", "stability", "milliseconds") if name in summary]
     body += table(["", ""], [[name.replace("_", " "), plain(summary[name])] for name in shown], head=False)
     if "stages" in summary:
-        cells = [
-            [html.escape(each["stage"]), f"{each['milliseconds']:.2f}", f"{each['percent']:.2f}"]
-            for each in summary["stages"]
-        ]
+        cells = [[each["stage"], f"{each['milliseconds']:.2f}", f"{each['percent']:.2f}"] for each in summary["stages"]]
         total = sum(each["milliseconds"] for each in summary["stages"])
         cells.append(["Total", f"{total:.2f}", "100.00"])
         body += table(["stage", "mean time per frame (ms), without the first", "share (%)"], cells)
@@ -225,10 +221,8 @@ def write_page(folder: Path, summary: dict[str, Any], log: Log) -> None:
 
 def _truth(found: dict[str, float]) -> str:
     """HTML of how far the tips lie from where a synthetic recording has them."""
-    text = (
-        f"<p>The recording is synthetic, and where the tip truly is is known. Of {found['frames']} frames with a pose "
-    )
-    text += f"{found.get('wrong', 0)} are wrong by more than 5 mm.</p>"
+    text = f"The recording is synthetic, and where the tip truly is is known. Of {found['frames']} frames with a pose "
+    text = element("p", text + f"{found.get('wrong', 0)} are wrong by more than 5 mm.")
     shares = [
         (f"{name} (mm)", f"{found[f'{name}_mm']:.3f}") for name in ("median", "p95", "worst") if f"{name}_mm" in found
     ]

@@ -1,10 +1,9 @@
 """The part of a report page that shows a volume's run."""
 
-import html
 from collections.abc import Callable
 from typing import Any
 
-from holotorch.experiments.markup import figure, plain, table
+from holotorch.experiments.markup import element, figure, heading, plain, table
 
 _FIGURES = {
     "rendering": "Direct volume rendering",
@@ -16,10 +15,9 @@ def volume_section(
     title: str, summary: dict[str, Any], plan: dict[str, Any], picture: Callable[[str], str]
 ) -> list[str]:
     """HTML of a run: pictures side by side, scores, time and plan; ``picture`` gives an image's data URL or nothing."""
-    status = "" if summary["status"] == "complete" else f' <span class="warn">{summary["status"]}</span>'
-    parts = [f"<h1>{html.escape(title)}{status}</h1>"]
+    parts = [heading(title, summary["status"])]
     if summary["synthetic"]:
-        parts.append(f'<p class="warn">Synthetic volume: {html.escape(summary["synthetic"])}.</p>')
+        parts.append(element("p", f"Synthetic volume: {summary['synthetic']}.", "warn"))
     parts.append('<div class="row">')
     captions = dict(_FIGURES)
     depths: list[float] = summary["refocused_m"]
@@ -31,13 +29,12 @@ def volume_section(
     if source := picture("depth"):
         parts.append(figure(source, "Mean depth of what a ray sees", "wide"))
     parts.append(_scores(summary, depths))
-    parts.append(f"<p>{_cost(summary)}</p>")
+    parts.append(element("p", _cost(summary)))
     shown = {name.replace("_", " "): value for name, value in plan.items() if name not in ("notes", "holograms")}
-    rows = [[html.escape(name), html.escape(plain(value))] for name, value in shown.items()]
-    rows += [[f"{each['wavelength_nm']:.0f} nm", html.escape(plain(each))] for each in plan["holograms"]]
+    rows = [[name, plain(value)] for name, value in shown.items()]
+    rows += [[f"{each['wavelength_nm']:.0f} nm", plain(each)] for each in plan["holograms"]]
     parts.append("<h2>Plan</h2>" + table(["", ""], rows, head=False))
-    parts += [f'<p class="warn">{html.escape(note)}</p>' for note in plan["notes"]]
-    return parts
+    return parts + [element("p", note, "warn") for note in plan["notes"]]
 
 
 def _scores(summary: dict[str, Any], depths: list[float]) -> str:
@@ -54,7 +51,7 @@ def _scores(summary: dict[str, Any], depths: list[float]) -> str:
         "" if summary["speckle_contrast"] is None else f"speckle contrast {summary['speckle_contrast']:.2f}",
     ]
     words = "; ".join(score for score in scores if score)
-    return f"<p>{words}. Relative error of each part of the scene, by focus:</p>" + table(names, rows)
+    return element("p", f"{words}. Relative error of each part of the scene, by focus:") + table(names, rows)
 
 
 def _cost(summary: dict[str, Any]) -> str:

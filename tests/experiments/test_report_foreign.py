@@ -1,0 +1,118 @@
+"""A run folder from someone else: whatever its files say, nothing of it becomes a part of the page."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from holotorch.experiments.config import load_config
+from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.eye_run import run_observer
+from holotorch.experiments.report import write_report
+from holotorch.experiments.run import run
+from holotorch.experiments.track_report import write_page
+from holotorch.experiments.volume_run import run_volume
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+ATTACK = '"><script>alert(1)</script><img src=x onerror=alert(1)>'
+SCENE = "hologram={shape: [32, 32], pitch: 3.74 um, distance: 5 mm, depths: 4}"
+EYE = [
+    "scene={config: configs/volume/c60.yaml, change: ['volume={phantom: c60, samples: 16}', "
+    "'hologram={shape: [64, 64], pitch: 3.74 um, distance: 2 mm, depths: 4, rays: 32}']}",
+    *("display={kind: planar, distance: 4 mm}", "eye={pupil_radius: 0.1 mm, axial_length: 2 mm}"),
+    *("seeds=1", "light={sources: [laser]}", "focus=[2 mm]"),
+]
+
+
+class Foreign(HTMLParser):
+    """Counts elements that no report has."""
+
+    def __init__(self):
+        super().__init__()
+        self.count = 0
+
+    def handle_starttag(self, tag, attrs):
+        self.count += tag == "script" or any(name.startswith("on") or value == "x" for name, value in attrs)
+
+
+def foreign(page: str) -> int:
+    parser = Foreign()
+    parser.feed(page)
+    return parser.count + page.count("<script")
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory, tiny) -> dict[str, Path]:
+    base = tmp_path_factory.mktemp("runs")
+    words = ["grid.shape=[16,16]", "solver.max_steps=2", "report.metrics=[psnr]"]
+    run(load_config(CONFIGS / "pec" / "fourier.yaml", words), base / "pec")
+    volume = [SCENE, "volume.samples=8", "report.seeds=1"]
+    run_volume(load_config(CONFIGS / "demo_volume.yaml", volume), base / "volume", "volume")
+    run_observer(load_config(CONFIGS / "eye" / "teapot.yaml", EYE), base / "eye", "eye")
+    return {kind: base / kind for kind in ("pec", "volume", "eye")}
+
+
+def spoiled(value: Any) -> Iterator[Any]:
+    """``value`` with each of its keys, texts, numbers and lists in turn replaced by markup."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from ({**value, key: each} for each in spoiled(item))
+            yield {ATTACK if name == key else name: item for name, item in value.items()}
+            yield {**value, ATTACK: item}
+    elif isinstance(value, list):
+        yield from (value[:k] + [each] + value[k + 1 :] for k, item in enumerate(value) for each in spoiled(item))
+    yield ATTACK
+    yield [ATTACK]
+
+
+@pytest.mark.parametrize("kind", ["pec", "volume", "eye"])
+def test_no_file_of_a_run_writes_into_its_page(runs, tmp_path, kind):
+    folder, page = tmp_path / "run", tmp_path / "report.html"
+    shutil.copytree(runs[kind], folder, ignore=shutil.ignore_patterns("*.png", "*.npy"))
+    shown = 0
+    for name in ("summary.json", "plan.json", "env.json"):
+        text = (folder / name).read_text()
+        for value in spoiled(json.loads(text)):
+            (folder / name).write_text(json.dumps(value))
+            try:
+                write_report([folder], page)
+            except ConfigError:
+                continue
+            found = page.read_text()
+            shown += "&lt;script&gt;" in found
+            assert foreign(found) == 0, json.dumps(value)[:400]
+        (folder / name).write_text(text)
+    assert shown > 10  # what is shown is shown as text
+    (folder / "config.yaml").write_text(ATTACK)
+    write_report([folder], page, {ATTACK: ATTACK})
+    assert foreign(page.read_text()) == 0
+
+
+def test_no_source_of_a_track_writes_into_its_page(tmp_path, monkeypatch):
+    monkeypatch.setattr("holotorch.experiments.track_report.drawn_track", lambda _: None)
+    monkeypatch.setattr("holotorch.experiments.track_report._png", lambda _: b"")
+    (tmp_path / "images").mkdir()
+    summary = {
+        "source": ATTACK,
+        "status": ATTACK,
+        "failure": ATTACK,
+        "answered": 1,
+        "frames": 2,
+        "notes": [ATTACK],
+        "statuses": {ATTACK: 1},
+        "stability": {ATTACK: ATTACK},
+        "stages": [{"stage": ATTACK, "milliseconds": 1.0, "percent": 1.0}],
+        "truth": {"frames": ATTACK, "wrong": ATTACK},
+    }
+    (tmp_path / "images" / "one.png").write_bytes(b"")
+
+    class Log:
+        pictures = {"one": ATTACK}
+
+    write_page(tmp_path, summary, Log())  # type: ignore[arg-type]
+    found = (tmp_path / "report.html").read_text()
+    assert foreign(found) == 0 and found.count("&lt;script&gt;") > 8
