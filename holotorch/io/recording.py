@@ -2,7 +2,7 @@
 
 A recording is a folder::
 
-    recording.json   format, frame size, rate, source, files beside; written first
+    recording.json   format, frame size, rate, source, order of channels, files beside; written first
     camera.yaml ...  copies of the files that the recording was made with, byte for byte
     frames.rgb       the frames one after another, 8-bit, H rows of W pixels of red, green, blue; nothing between them
     times.csv        frame,seconds,crc32,problem: a line per frame, written after the frame; a frame that could not be
@@ -33,6 +33,7 @@ from holotorch.io.files import append, write_bytes, write_json
 from holotorch.io.video import Frame, Frames
 
 _FORMAT = 1
+_CHANNELS = "RGB"  # of every recording; those of before this was written down have nothing
 _COLUMNS = ("frame", "seconds", "crc32", "problem")
 
 
@@ -78,6 +79,7 @@ class Recorder:
             "format": _FORMAT,
             "height": shape[0],
             "width": shape[1],
+            "channels": _CHANNELS,
             "rate_hz": rate,
             "source": source,
             "copies": sorted(copies or {}),
@@ -199,6 +201,8 @@ def _facts(folder: Path) -> dict[str, Any]:
         checks.positive("rate_hz", facts["rate_hz"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is damaged: {type(error).__name__} {error}") from None
+    if (channels := facts.get("channels", _CHANNELS)) != _CHANNELS:
+        raise ValueError(f"{path} states channels {channels!r}; frames of a recording are {_CHANNELS}: convert them")
     if version > _FORMAT:
         raise ValueError(f"{path} is of format {version}; this version reads up to {_FORMAT}: use a newer one")
     return facts

@@ -157,10 +157,19 @@ def test_what_cannot_be_recorded_or_replayed_says_why(tmp_path):
     with pytest.raises(ValueError, match="times.csv:2 is damaged: '0,soon,"):
         open_recording(tmp_path / "a")
     facts = json.loads((tmp_path / "a" / "recording.json").read_text())
-    for change, message in (({"format": 2}, "use a newer one"), ({"height": 0}, "height must be at least 1")):
+    assert facts["channels"] == "RGB"
+    for change, message in (
+        ({"format": 2}, "use a newer one"),
+        ({"height": 0}, "height must be at least 1"),
+        ({"channels": "BGR"}, "states channels 'BGR'; frames of a recording are RGB"),
+    ):
         (tmp_path / "a" / "recording.json").write_text(json.dumps(facts | change))
         with pytest.raises(ValueError, match=message):
             open_recording(tmp_path / "a")
+    del facts["channels"]  # as recordings were before it was stated
+    (tmp_path / "a" / "recording.json").write_text(json.dumps(facts))
+    (tmp_path / "a" / "times.csv").write_text("\n".join(lines) + "\n")
+    assert len(list(open_recording(tmp_path / "a"))) == 2
     assert free_bytes(tmp_path / "not" / "yet") > 0
 
 
