@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 
 from holotorch.io.limits import affordable
-from holotorch.io.scan import Scan, chosen, extra, mapped_from, readable, three_axes
+from holotorch.io.scan import Scan, chosen, extra, readable, three_axes, uncompressed_from
 
 
 def read_npy(path: Path) -> Scan:
-    """NumPy array, mapped."""
+    """NumPy array, mapped if large."""
     with readable(path, ".npy array"):
         stored = np.load(path, mmap_mode="r", allow_pickle=False)
     if stored.flags.c_contiguous:
-        return Scan(three_axes(mapped_from(path, stored.shape, stored.dtype, stored.offset), path))
-    return Scan(three_axes(mapped_from(path, stored.shape[::-1], stored.dtype, stored.offset).T, path))
+        return Scan(three_axes(uncompressed_from(path, stored.shape, stored.dtype, stored.offset), path))
+    return Scan(three_axes(uncompressed_from(path, stored.shape[::-1], stored.dtype, stored.offset).T, path))
 
 
 def read_npz(path: Path, member: str | None = None) -> Scan:

@@ -58,7 +58,7 @@ PUBLISHED = {
 
 
 def fetch_volume(name: str, directory: str | Path | None = None) -> Volume:
-    """Fetch a volume of the thesis once, check it, and load it (mapped); later calls need no network.
+    """Fetch a volume of the thesis once, check it, and load it; later calls need no network.
 
     Args:
         name: One of :data:`PUBLISHED`. Engine, C60 and hand of Table 5.2 are not among them: no checksum of theirs is

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from holotorch.io.limits import affordable
+from holotorch.io.limits import MEMORY_LIMIT, affordable
 from holotorch.io.scan import Scan, extra, placed, readable, three_axes
 
 _NIFTI_METRES = {"unknown": 1e-3, "mm": 1e-3, "meter": 1.0, "micron": 1e-6}
@@ -16,13 +16,13 @@ _UNEVEN = 0.05  # of a spacing: positions are printed in hundredths of a millime
 
 
 def read_nifti(path: Path) -> Scan:
-    """NIfTI, .nii (mapped) or .nii.gz, in the type of the file, or float32 where it states a scale.
+    """NIfTI, .nii (mapped if large) or .nii.gz, in the type of the file, or float32 where it states a scale.
 
     A file that names no unit is in millimetres, as every reader of the format takes it.
     """
     nibabel = extra("nibabel", "reading NIfTI")
     with readable(path, "NIfTI file"):
-        image = nibabel.load(path)
+        image = nibabel.load(path, mmap=path.stat().st_size > MEMORY_LIMIT)
         scaled = 8 if image.dataobj.slope != 1 or image.dataobj.inter != 0 else image.get_data_dtype().itemsize
         affordable(path, math.prod(image.shape) * scaled, path.stat().st_size)
         values = np.asanyarray(image.dataobj)

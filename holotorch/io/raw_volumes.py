@@ -1,4 +1,4 @@
-"""Volumes whose voxels lie in a file as they are, or gzipped: raw, MetaImage and NRRD. Uncompressed ones are mapped."""
+"""Volumes whose voxels lie in a file as they are, or compressed: raw, MetaImage and NRRD."""
 
 import math
 import re
@@ -12,15 +12,15 @@ from numpy.typing import DTypeLike
 from holotorch.io.limits import unzipped
 from holotorch.io.scan import (
     Scan,
-    existing,
     expect_bytes,
     from_words,
-    mapped,
     metres,
+    named,
     number_type,
     placed,
     readable,
     stated_bytes,
+    uncompressed,
     unpacked,
 )
 
@@ -61,7 +61,7 @@ def read_raw(path: Path, shape: Sequence[int] | None, dtype: DTypeLike | None) -
     kind = number_type(dtype)
     if path.suffix == ".gz":
         return Scan(unpacked(path, unzipped(path, stated_bytes(path, shape, kind)), shape, kind))
-    return Scan(mapped(path, shape, kind))
+    return Scan(uncompressed(path, shape, kind))
 
 
 def read_metaimage(path: Path) -> Scan:
@@ -83,12 +83,12 @@ def read_metaimage(path: Path) -> Scan:
     dtype = np.dtype((">" if big else "<") + _META_TYPES[kind])
     shape = _whole(fields, "DimSize", 3, path, least=1)[::-1]
     skip = _whole(fields, "HeaderSize", 1, path, least=-1)[0] if "HeaderSize" in fields else 0
-    data = path if name == "LOCAL" else existing(path.parent / name, path)
+    data = path if name == "LOCAL" else named(path, name)
     offset = end if name == "LOCAL" else skip
     if fields.get("CompressedData", "False").lower() == "true":
         values = unpacked(data, unzipped(data, stated_bytes(data, shape, dtype), offset), shape, dtype)
     else:
-        values = mapped(data, shape, dtype, _at_end(data, shape, dtype) if skip == -1 else offset)
+        values = uncompressed(data, shape, dtype, _at_end(data, shape, dtype) if skip == -1 else offset)
     spacing = _numbers(fields, ("ElementSpacing", "ElementSize"), 3, path, default=[])
     if not spacing:
         return Scan(values)
@@ -124,7 +124,7 @@ def _nrrd_values(path: Path, header: dict[str, Any], shape: list[int], end: int)
     name = header.get("data file", header.get("datafile"))
     if name and (name.startswith("LIST") or "%" in name):
         raise ValueError(f"{path} lists one file per slice; load the folder of the slices instead")
-    data = existing(path.parent / name, path) if name else path
+    data = named(path, name) if name else path
     with open(data, "rb") as stream:
         stream.seek(0 if name else end)
         for _ in range(int(header.get("line skip", header.get("lineskip", 0)))):
@@ -135,7 +135,7 @@ def _nrrd_values(path: Path, header: dict[str, Any], shape: list[int], end: int)
     if skip < -1:
         raise ValueError(f"{path} has byte skip {skip}; expected -1 or a number of bytes")
     if encoding == "raw":
-        return mapped(data, shape, dtype, _at_end(data, shape, dtype) if skip == -1 else offset + skip)
+        return uncompressed(data, shape, dtype, _at_end(data, shape, dtype) if skip == -1 else offset + skip)
     if encoding in ("gzip", "gz", "bzip2", "bz2"):
         size = stated_bytes(data, shape, dtype)
         most = size + (_HEADER if skip == -1 else skip)
@@ -179,7 +179,7 @@ def _nrrd_placed(values: np.ndarray, header: dict[str, Any], path: Path) -> Scan
 
 
 def _at_end(path: Path, shape: list[int], dtype: np.dtype) -> int:
-    # A header of unknown length is skipped by counting from the end; too short a file is reported by mapped.
+    # A header of unknown length is skipped by counting from the end; too short a file is reported by uncompressed.
     return max(0, path.stat().st_size - math.prod(shape) * dtype.itemsize)
 
 

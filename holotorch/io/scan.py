@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from holotorch.io.limits import affordable
+from holotorch.io.limits import MEMORY_LIMIT, affordable
 from holotorch.scene.volume import IDENTITY, Triple
 
 _MAP_NORESERVE = 0x4000  # of Linux; Python has no name for it before 3.13
@@ -82,11 +82,32 @@ def triple(values: Sequence[float] | np.ndarray) -> Triple:
     return z, y, x
 
 
-def existing(path: Path, named_by: Path | None = None) -> Path:
-    """``path``, or ValueError where it is missing or an empty file; ``named_by`` is the header that asks for it."""
-    where = f"the data file {path}, which {named_by} names," if named_by else f"{path}"
+def existing(path: Path) -> Path:
+    """``path``, or ValueError where it is missing or an empty file."""
+    return _not_empty(path, str(path))
+
+
+def named(header: Path, name: str) -> Path:
+    """The data file that a header names, in the header's folder or below it.
+
+    Raises:
+        ValueError: It is missing, empty or no file, or lies elsewhere: a header from someone else must not choose which
+            of the user's files are read.
+    """
+    path = header.parent / name
+    if not path.resolve().is_relative_to(header.parent.resolve()):
+        raise ValueError(
+            f"{header} names the data file {name!r}, which lies outside the header's folder; move it (no link) beside "
+            "the header, or load it without its header, with shape=, dtype= and spacing="
+        )
+    return _not_empty(path, f"the data file {path}, which {header} names,", file=True)
+
+
+def _not_empty(path: Path, where: str, *, file: bool = False) -> Path:
     if not path.exists():
         raise ValueError(f"{where} does not exist")
+    if file and not path.is_file():
+        raise ValueError(f"{where} is no file")
     if path.is_file() and not path.stat().st_size:
         raise ValueError(f"{where} is empty (0 bytes)")
     return path
@@ -119,14 +140,23 @@ def expect_bytes(path: Path, found: int, shape: Sequence[int], dtype: np.dtype) 
     return wanted
 
 
-def mapped(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int = 0) -> np.ndarray:
-    """Voxels of a file that holds nothing else after ``offset`` bytes."""
+def uncompressed(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int = 0) -> np.ndarray:
+    """Voxels of a file that holds nothing else after ``offset`` bytes; see :func:`uncompressed_from`."""
     expect_bytes(path, path.stat().st_size - offset, shape, dtype)
-    return mapped_from(path, shape, dtype, offset)
+    return uncompressed_from(path, shape, dtype, offset)
 
 
-def mapped_from(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int) -> np.ndarray:
-    """Voxels from ``offset`` bytes on, read when touched; what is written to them never reaches the file."""
+def uncompressed_from(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int) -> np.ndarray:
+    """Voxels from ``offset`` bytes on: read, or mapped where they are more than the memory limit of a small file.
+
+    A mapped voxel is read when it is touched, and the system ends the program where the file has been cut short since.
+    So only volumes that may be larger than memory are mapped. What is written to them never reaches the file.
+    """
+    size = math.prod(shape) * dtype.itemsize
+    if size <= MEMORY_LIMIT:
+        values = np.fromfile(path, dtype, math.prod(shape), offset=offset)
+        expect_bytes(path, values.nbytes, shape, dtype)
+        return values.reshape(tuple(shape))
     if sys.platform != "linux":
         return np.memmap(path, dtype, "c", offset, tuple(shape))
     # numpy's mapping reserves memory for a copy of it all, so that volumes larger than memory would be refused.

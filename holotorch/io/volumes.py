@@ -55,9 +55,9 @@ def load_volume(
         unit: Unit of ``spacing``: "m" (default), or "relative" for a volume that has proportions but no size.
 
     Returns:
-        Voxels [D, H, W], mapped into memory where the file holds them in native byte order without compression; such
-        a file is read as it is used and never written. Floating-point values are not searched for NaN here, which
-        would read it all: see :meth:`Volume.check_finite`.
+        Voxels [D, H, W]. More than 1 GiB of them are mapped into memory where the file holds them in native byte order
+        without compression: such a file is read as it is used and never written, and must not be cut short meanwhile.
+        Floating-point values are not searched for NaN here, which would read it all: see :meth:`Volume.check_finite`.
 
     Raises:
         ValueError: No such file, a format or geometry that is not known or not stated, a file that does not have the

@@ -14,11 +14,11 @@ from holotorch.io.scan import (
     chosen,
     expect_bytes,
     from_words,
-    mapped_from,
     placed,
     readable,
     stated_bytes,
     three_axes,
+    uncompressed_from,
     unpacked,
 )
 
@@ -35,7 +35,7 @@ _APPENDED = re.compile(
 def read_vti(path: Path, member: str | None = None) -> Scan:
     """A scalar array of the only piece: the active one, the only one, or ``member``. VTK knows no units: relative.
 
-    Raw appended data without compression are mapped, not read.
+    Raw appended data without compression are mapped if large.
     """
     root, start, base64_coded = _document(path)
     image = root.find("ImageData")
@@ -120,7 +120,7 @@ def _values(
     if form == "appended" and not base64_coded:
         if compressor is None:
             return _mapped(path, shape, dtype, offset, count)
-        data = np.memmap(path, np.uint8, "r", offset).tobytes()
+        data = path.read_bytes()[offset:]
     else:
         data = _decoded(array.text or "" if form == "binary" else path.read_bytes()[offset:].decode("latin-1"))
     if compressor:
@@ -134,7 +134,7 @@ def _mapped(path: Path, shape: list[int], dtype: np.dtype, offset: int, count: n
         size = _length(stream.read(count.itemsize), count)
     present = max(0, min(size, path.stat().st_size - offset - count.itemsize))
     expect_bytes(path, present, shape, dtype)
-    return mapped_from(path, shape, dtype, offset + count.itemsize)
+    return uncompressed_from(path, shape, dtype, offset + count.itemsize)
 
 
 def _length(data: bytes, count: np.dtype) -> int:

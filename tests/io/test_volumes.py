@@ -186,7 +186,7 @@ def test_numpy_refusals(tmp_path):
     np.save(tmp_path / "objects.npy", np.full(SHAPE, None), allow_pickle=True)
     load("objects.npy", "no readable .npy array")
     np.save(tmp_path / "none.npy", np.zeros((0, 2, 2)))
-    load("none.npy", "no readable .npy|at least one voxel")
+    load("none.npy", "no readable .npy|every size must be above 0")
     for name in ("two.npz", "flat.npy"):
         content = (tmp_path / name).read_bytes()
         (tmp_path / name).write_bytes(content[: len(content) - 20])

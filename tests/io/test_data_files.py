@@ -1,0 +1,65 @@
+"""Files that belong to a volume: which ones a header may name, and what becomes of a volume whose file changes."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from holotorch.io.volumes import load_volume
+
+SHAPE = (4, 5, 6)
+VOXELS = np.arange(120, dtype=np.uint8).reshape(SHAPE)
+HEADERS = {
+    "a.mhd": "NDims = 3\nDimSize = 6 5 4\nElementType = MET_UCHAR\nElementSpacing = 1 1 1\nElementDataFile = {name}\n",
+    "a.nhdr": "NRRD0004\ntype: uint8\ndimension: 3\nsizes: 6 5 4\nspacings: 1 1 1\nencoding: raw\n"
+    "data file: {name}\n\n",
+}
+
+
+def header(folder: Path, kind: str, name: str) -> Path:
+    (folder / kind).write_text(HEADERS[kind].format(name=name))
+    return folder / kind
+
+
+@pytest.mark.parametrize("kind", HEADERS)
+def test_a_header_names_files_of_its_own_folder_only(tmp_path, kind):
+    folder = tmp_path / "scan"
+    (folder / "data").mkdir(parents=True)
+    VOXELS.tofile(tmp_path / "secret.raw")
+    VOXELS.tofile(folder / "data" / "a.raw")
+    (folder / "link.raw").symlink_to(tmp_path / "secret.raw")
+    (folder / "below").symlink_to(tmp_path)
+    (folder / "same.raw").symlink_to("data/a.raw")
+    for name in (
+        str(tmp_path / "secret.raw"),
+        "../secret.raw",
+        "data/../../secret.raw",
+        "link.raw",
+        "below/secret.raw",
+    ):
+        with pytest.raises(ValueError, match="lies outside the header's folder; move it .* beside the header, or load"):
+            load_volume(header(folder, kind, name))
+    for name in ("data/a.raw", "same.raw", "./data/../data/a.raw", str(folder / "data" / "a.raw")):
+        assert np.array_equal(load_volume(header(folder, kind, name)).values.numpy(), VOXELS)
+    with pytest.raises(ValueError, match="which .* names, is no file"):
+        load_volume(header(folder, kind, "data"))
+
+
+CUT = """
+import os, sys
+from holotorch.io.volumes import load_volume
+volume = load_volume(sys.argv[1], spacing=1, unit="relative")
+os.truncate(sys.argv[1], 200)
+print(int(volume.values.sum()))
+"""
+
+
+@pytest.mark.parametrize("name", ["a_64x64x64_uint8.raw", "a.npy"])
+def test_a_volume_outlives_its_file(tmp_path, name):
+    """A mapped file that is cut short ends the program; what is not larger than memory is read."""
+    values = np.ones((64, 64, 64), np.uint8)
+    np.save(tmp_path / name, values) if name.endswith("npy") else values.tofile(tmp_path / name)
+    done = subprocess.run([sys.executable, "-c", CUT, str(tmp_path / name)], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, f"{64**3}\n"), done.stderr
