@@ -130,7 +130,7 @@ class TrialLog:
         self.header = json.loads(json.dumps({"format": FORMAT, "version": VERSION, **header}, allow_nan=False))
         self.trials: list[dict[str, Any]] = []
         self._size = 0  # of the whole lines, in bytes
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)  # answers of a person
         try:
             self._lock()
             # A crash may have come before the header was whole.

@@ -24,10 +24,12 @@ from holotorch.experiments.config_study import StudySettings, beyond_screen, bui
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.perception_design import Design
 from holotorch.experiments.perception_frames import quantisation
-from holotorch.experiments.perception_log import TrialLog, is_number
+from holotorch.experiments.perception_log import TrialLog
+from holotorch.experiments.perception_result import checked_result
 from holotorch.io.files import write_json
 
 _LARGEST = 10_000  # bytes of a request; a result has about 200
+_CONNECTIONS = 64  # at once, each a thread; a browser opens six
 
 
 class StudyServer(ThreadingHTTPServer):
@@ -55,11 +57,26 @@ class StudyServer(ThreadingHTTPServer):
         self.script = script
         self.holder: str | None = None  # the window that asked last
         self.guard = threading.Lock()
+        self._free = threading.BoundedSemaphore(_CONNECTIONS)
         try:
             super().__init__(("127.0.0.1", port), _Handler)
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or str(error)
             raise ConfigError([f"port {port}: {reason}; choose another with --port, or leave it out"]) from None
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Give the connection a thread, or close it where there are too many."""
+        if self._free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Serve the connection until it ends or says nothing for ``_Handler.timeout``."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
 
     @property
     def address(self) -> str:
@@ -87,7 +104,7 @@ class StudyServer(ThreadingHTTPServer):
         """Append a result of the page, and say which trial is next; a result that came before is not written again."""
         with self.guard:
             try:
-                index, window, values = _checked(result)
+                index, window, values = checked_result(result)
             except ValueError as error:
                 return HTTPStatus.BAD_REQUEST, {"error": str(error)}
             # After a restart the window that is there goes on.
@@ -120,37 +137,40 @@ class StudyServer(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
+    timeout = 10.0  # seconds without a byte, after which a connection is closed
     server: StudyServer  # type: ignore[assignment]
 
     def do_GET(self) -> None:
-        """The page, or the session of a window."""
-        path, _, query = self.path.partition("?")
+        """The page."""
         if not self._local():
             return
-        if path == "/":
+        if self.path.partition("?")[0] == "/":
             self._send(HTTPStatus.OK, page(self.server.script).encode(), "text/html; charset=utf-8")
-        elif path == "/session" and query:
-            self._json(HTTPStatus.OK, self.server.session(query))
         else:
             self._json(HTTPStatus.NOT_FOUND, {"error": f"nothing at {self.path}"})
 
     def do_POST(self) -> None:
-        """A result."""
+        """The session of a window, or a result."""
         length = self.headers.get("Content-Length", "")
-        if not self._local():
+        if not self._local() or not self._same_origin():
             return
         # Other pages may send forms here unasked, but JSON only by permission, which is not given.
-        if self.path != "/trial" or self.headers.get_content_type() != "application/json":
+        if self.path not in ("/session", "/trial") or self.headers.get_content_type() != "application/json":
             self.close_connection = True
-            return self._json(HTTPStatus.NOT_FOUND, {"error": "expected JSON at /trial"})
+            return self._json(HTTPStatus.NOT_FOUND, {"error": "expected JSON at /session or /trial"})
         if not length.isdecimal() or int(length) > _LARGEST:
             self.close_connection = True
             return self._json(HTTPStatus.BAD_REQUEST, {"error": f"expected at most {_LARGEST} bytes"})
         try:
-            result = json.loads(self.rfile.read(int(length)))
+            value = json.loads(self.rfile.read(int(length)))
         except (ValueError, RecursionError):
             return self._json(HTTPStatus.BAD_REQUEST, {"error": "not JSON"})
-        self._json(*self.server.record(result))
+        if self.path == "/session":
+            window = value.get("window") if isinstance(value, dict) else None
+            if not isinstance(window, str) or not window:
+                return self._json(HTTPStatus.BAD_REQUEST, {"error": "expected the name of the window"})
+            return self._json(HTTPStatus.OK, self.server.session(window))
+        self._json(*self.server.record(value))
         if self.server.complete:  # only after the answer; and not in here, as shutdown waits for the serving loop
             threading.Thread(target=self.server.shutdown, daemon=True).start()
 
@@ -166,6 +186,16 @@ class _Handler(BaseHTTPRequestHandler):
         self._json(HTTPStatus.FORBIDDEN, {"error": f"open {self.server.address}"})
         return False
 
+    def _same_origin(self) -> bool:
+        """Whether the study's own page asks, as far as the browser says; programs that are no browser say nothing."""
+        origin = self.headers.get("Origin")
+        site = self.headers.get("Sec-Fetch-Site", "same-origin")
+        if site == "same-origin" and origin in (None, f"http://{self.headers.get('Host', '')}"):
+            return True
+        self.close_connection = True
+        self._json(HTTPStatus.FORBIDDEN, {"error": f"another page asks; open {self.server.address}"})
+        return False
+
     def _json(self, status: HTTPStatus, value: dict[str, Any]) -> None:
         self._send(status, json.dumps(value).encode(), "application/json")
 
@@ -174,6 +204,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(body)))
         self.send_header("Cache-Control", "no-store")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.send_header("Content-Security-Policy", "frame-ancestors 'none'")
         self.end_headers()
         self.wfile.write(body)
 
@@ -257,37 +289,3 @@ def _summary(path: Path, log: TrialLog, total: int) -> str:
     lines = [f"{len(log.trials)} of {total} trials in {path}; without practice {right} of {len(trials)} right"]
     steps = quantisation([trial["frame_s"] for trial in log.trials])
     return "\n".join(lines + ([str(steps)] if steps else []))
-
-
-def _checked(result: Any) -> tuple[int, str, dict[str, Any]]:
-    """Index, window and measured values of a result; ValueError for anything else."""
-    if not isinstance(result, dict) or type(result.get("index")) is not int or result["index"] < 0:
-        raise ValueError("expected a result with the index of its trial")
-    if not isinstance(result.get("window"), str):
-        raise ValueError("expected the name of the window")
-    values: dict[str, float | None] = {}
-    for name in ("onset_s", "frame_s", "response_s"):
-        value = result.get(name)
-        if value is None and name == "response_s":
-            values[name] = None
-        elif not is_number(value) or value < 0:
-            raise ValueError(f"{name}: expected seconds, got {str(value)[:20]}")
-        else:
-            values[name] = float(value)
-    response, onset = values["response_s"], values["onset_s"]
-    if not values["frame_s"]:
-        raise ValueError("frame_s: expected more than 0 seconds")
-    reaction = None if response is None or onset is None else round(response - onset, 6)
-    if reaction is not None and reaction < 0:
-        raise ValueError("response_s: expected a time after onset_s")
-    counts = {name: result.get(name, 0) for name in ("early", "dropped_frames")}
-    if any(type(count) is not int or count < 0 for count in counts.values()):
-        raise ValueError("early, dropped_frames: expected counts")
-    device = result.get("device")
-    if device not in (None, "key", "pointer", "gamepad"):
-        raise ValueError("device: expected key, pointer or gamepad")
-    return (
-        result["index"],
-        result["window"],
-        {"responded": response is not None, **values, "reaction_s": reaction, **counts, "device": device},
-    )

@@ -1,8 +1,11 @@
 import http.client
 import json
+import os
+import socket
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -77,7 +80,7 @@ class Runner:
 
 def test_a_session_is_recorded_goes_on_and_ends(tmp_path, monkeypatch, capsys):
     first = Runner(tmp_path, monkeypatch)
-    status, session = first.ask("GET", "/session?w")
+    status, session = first.ask("POST", "/session", {"window": "w"})
     assert status == 200 and session["next"] == 0 and len(session["trials"]) == 1 + 2
     assert session["participant"] == 1 and session["screen"]["kind"] == "flat"
     assert first.send(0) == (200, {"next": 1})
@@ -114,8 +117,8 @@ def test_two_programs_and_two_windows_for_one_participant(tmp_path, monkeypatch)
     pytest.importorskip("fcntl")
     with pytest.raises(ConfigError, match="participant 1 is being recorded by another program"):
         run_study_server(tmp_path / "tiny.yaml", participant=1, out=tmp_path)
-    runner.ask("GET", "/session?one")
-    runner.ask("GET", "/session?two")
+    runner.ask("POST", "/session", {"window": "one"})
+    runner.ask("POST", "/session", {"window": "two"})
     assert runner.send(0, "one") == (409, {"error": "the study was opened in another window; close this one"})
     assert runner.send(0, "two")[0] == 200
     runner.stop()
@@ -147,10 +150,46 @@ def test_results_that_cannot_be_are_refused(tmp_path, monkeypatch):
     assert runner.ask("POST", "/trial", {}, **{"Content-Type": "text/plain"})[0] == 404  # what a foreign page can send
     assert runner.ask("GET", "/../secrets")[0] == 404
     for foreign in ("evil.example:80", "evil.example", ""):
-        assert runner.ask("GET", "/session?x", Host=foreign)[0] == 403
+        assert runner.ask("POST", "/session", {"window": "x"}, Host=foreign)[0] == 403
     assert runner.ask("GET", "/", Host="127.0.0.1")[0] == 200  # as a browser asks at port 80
     runner.stop()
     assert read_log(runner.log).trials == []
+
+
+def test_no_other_page_takes_the_session_over(tmp_path, monkeypatch):
+    runner = Runner(tmp_path, monkeypatch)
+    own = f"127.0.0.1:{runner.server.server_address[1]}"
+    assert runner.ask("POST", "/session", {"window": "mine"}, Origin=f"http://{own}", Host=own)[0] == 200
+    assert runner.ask("GET", "/session?theirs")[0] == 404
+    for headers in ({"Origin": "http://example.org"}, {"Origin": "null"}, {"Sec-Fetch-Site": "cross-site"}):
+        assert runner.ask("POST", "/session", {"window": "theirs"}, **headers)[0] == 403
+        assert runner.ask("POST", "/trial", {"window": "theirs"}, **headers)[0] == 403
+    assert runner.ask("POST", "/session", {"window": "theirs"}, **{"Content-Type": "text/plain"})[0] == 404
+    assert runner.ask("POST", "/session", {"window": 3})[0] == 400
+    assert runner.send(0, "mine")[0] == 200  # still the window whose results count
+    runner.stop()
+
+
+def test_idle_connections_end_and_hold_few_threads(tmp_path, monkeypatch):
+    monkeypatch.setattr(perception_server._Handler, "timeout", 1.0)
+    runner = Runner(tmp_path, monkeypatch)
+    before = threading.active_count()
+    idle = [socket.create_connection(("127.0.0.1", runner.server.server_address[1])) for _ in range(200)]
+    time.sleep(0.5)
+    assert threading.active_count() - before <= 64
+    time.sleep(1.5)
+    assert threading.active_count() - before <= 2
+    assert runner.ask("GET", "/")[0] == 200
+    for link in idle:
+        link.close()
+    runner.stop()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="permissions of POSIX")
+def test_the_answers_of_a_person_are_readable_by_the_owner_only(tmp_path, monkeypatch):
+    runner = Runner(tmp_path, monkeypatch)
+    assert runner.log.stat().st_mode & 0o777 == 0o600
+    runner.stop()
 
 
 def test_a_disk_that_is_full_keeps_the_trial_for_later(tmp_path, monkeypatch):
