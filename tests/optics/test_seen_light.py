@@ -6,7 +6,7 @@ from holotorch.optics.eye import Eye
 from holotorch.optics.followed import seen_light
 
 
-@pytest.mark.parametrize("radius", [10e-3, 30e-3, 100e-3, 10.0])
+@pytest.mark.parametrize("radius", [10e-3, 30e-3, 50e-3])
 def test_a_pupil_wider_than_all_light_changes_nothing(radius):
     """The window limits the light: 5 mm already take in all of it."""
     grid, display = Grid((128, 96), (3.74e-6, 5e-6)), Display(30e-3, 20e-3, 50e-3)
