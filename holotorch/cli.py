@@ -3,9 +3,11 @@
 import argparse
 import re
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 from holotorch import __version__
+from holotorch.experiments.signals import interruptible
 from holotorch.experiments.study_commands import add_study
 from holotorch.experiments.tracking_commands import add_tracking
 
@@ -18,7 +20,9 @@ def main(arguments: list[str] | None = None) -> int:
     from holotorch.experiments.errors import ConfigError
 
     try:
-        return options.action(options)
+        # Servers and streams have ends of their own.
+        with interruptible() if options.action in (_run, _resume, _demo, _chart, _export_slm) else nullcontext():
+            return options.action(options)
     except ConfigError as error:
         print(error, file=sys.stderr)
         return BAD_INPUT
@@ -40,30 +44,9 @@ def _run(options: argparse.Namespace) -> int:
     from holotorch.experiments.config import load_config
 
     settings = load_config(options.config, options.overrides)
-    name = Path(options.config).stem
-    if settings.experiment == "pec_study":
-        from holotorch.experiments.study import run_study
+    from holotorch.experiments.run import start
 
-        return _finish(*run_study(settings, options.out, name))
-    if settings.experiment == "volume":
-        from holotorch.experiments.volume_run import run_volume
-
-        return _finish(*run_volume(settings, options.out, name))
-    if settings.experiment == "eye":
-        from holotorch.experiments.eye_run import run_observer
-
-        return _finish(*run_observer(settings, options.out, name))
-    if settings.experiment == "perception_layout":
-        from holotorch.experiments.perception_layout import run_layout
-
-        return _finish(*run_layout(settings, options.out, name))
-    if settings.experiment == "perception_analysis":
-        from holotorch.experiments.perception_analysis_run import run_analysis
-
-        return _finish(*run_analysis(settings, options.out, name))
-    from holotorch.experiments.run import run
-
-    return _finish(*run(settings, options.out, name))
+    return _finish(*start(settings, options.out, Path(options.config).stem))
 
 
 def _resume(options: argparse.Namespace) -> int:
@@ -107,7 +90,8 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 def _finish(folder: Path, complete: bool) -> int:
-    print(folder / "report.html")
+    page = folder / "report.html"
+    print(page if page.is_file() else folder)
     return OK if complete else INTERRUPTED
 
 

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from torch import Tensor
 from tqdm import tqdm
 
@@ -14,24 +13,27 @@ from holotorch.experiments.chart import write_table
 from holotorch.experiments.config import load_config
 from holotorch.experiments.config_eye import ObserverSettings
 from holotorch.experiments.config_volume import VolumeSettings
-from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.eye import Observer, observer, realisations
 from holotorch.experiments.eye_plan import plan, plan_text, too_large
 from holotorch.experiments.eye_report import by_wavelength
 from holotorch.experiments.eye_tradeoff import fitted_prefactor, in_words, tradeoff
+from holotorch.experiments.fingerprint import Fingerprint, fingerprint
 from holotorch.experiments.markup import plain
 from holotorch.experiments.memory import peak_memory
 from holotorch.experiments.report import write_report
-from holotorch.experiments.run_folder import claim
-from holotorch.experiments.signals import deferred, interruptible
+from holotorch.experiments.run_folder import Run, conclude, open_run
+from holotorch.experiments.saving import Checkpoint, Results
+from holotorch.experiments.signals import deferred
+from holotorch.experiments.volume_run import described
 from holotorch.io.bundled import find_config
 from holotorch.io.colour_tables import srgb_matrix, white_balance
-from holotorch.io.files import save_array, write_bytes, write_json, write_text
+from holotorch.io.files import save_array, write_bytes, write_json
 from holotorch.io.images import encode_png
 from holotorch.optics.colour import desaturated, linear_srgb
 from holotorch.optics.exposure import equal_power, exposed
 
+_SAVE_EVERY = 30.0  # seconds between two checkpoints
 _BRIGHT = 0.995  # of the reference's pixels are at most as bright as what is shown white
 
 
@@ -53,44 +55,131 @@ def run_observer(settings: ObserverSettings, out: Path | None, name: str) -> tup
     print(values["text"], flush=True)
     if text := too_large(values):
         raise ConfigError([text])
-    folder = claim(out, name)
-    for part in ("arrays", "images"):
-        (folder / part).mkdir(exist_ok=True)
-    write_text(folder / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
-    write_json(folder / "plan.json", values)
-    write_bytes(folder / "images" / "geometry.png", eye_geometry.draw(eye))
-    write_json(folder / "env.json", environment(settings.seed, eye.scene.device))
-    started = time.perf_counter()
-    references, own = realisations(8 * settings.seeds, reference=True), realisations(settings.seeds, reference=False)
-    sources, focus = settings.light.sources, eye.focus
-    reference, seen = torch.zeros(()), []
-    total = len(references) * (1 + len(focus)) + len(own) * (1 + len(focus) * len(sources))
-    with interruptible() as pressed, tqdm(total=total, desc="looking", unit="picture", dynamic_ncols=True) as bar:
-        try:
-            for seed in references:
-                hologram = _hologram(eye, seed, bar)
-                reference = reference + torch.stack([_seen(eye, hologram, None, depth, bar) for depth in focus])
-            reference = reference / len(references)
-            for seed in own:
-                hologram = _hologram(eye, seed, bar)
-                rows = [torch.stack([_seen(eye, hologram, source, at, bar) for at in focus]) for source in sources]
-                seen.append(torch.stack(rows))
-        except KeyboardInterrupt:
-            if not seen:
+    with open_run(out, name, settings, eye.scene.device, settings.seed) as opened:
+        (opened.path / "arrays").mkdir(exist_ok=True)
+        write_json(opened.path / "plan.json", values)
+        return opened.path, _fill(opened, eye, values)
+
+
+def _fill(opened: Run, eye: Observer, values: dict[str, Any]) -> bool:
+    settings, folder, files, done = eye.settings, opened.path, Results(), False
+    files.write(write_bytes, folder / "images" / "geometry.png", eye_geometry.draw(eye))
+    looked = _Looked(eye, Checkpoint(folder / "checkpoint.pt", _fingerprint(eye)))
+    try:
+        looked.look(opened.pressed)
+        if settings.sweep:
+            sweep = eye_focus.focus_sweep(eye, settings.sweep)
+            files.write(write_table, folder / "focus.csv", [band.row for band in sweep.bands])
+            files.write(write_bytes, folder / "images" / "focus.png", eye_focus.draw(sweep))
+            print("\n".join(eye_focus.in_words(sweep)))
+        if settings.tradeoff:
+            cases = tradeoff(settings, eye.scene.settings, settings.tradeoff)
+            files.write(write_table, folder / "tradeoff.csv", [case.row(fitted_prefactor(cases)) for case in cases])
+            print("\n".join(in_words(cases)))
+        done = True
+    except KeyboardInterrupt:
+        if not looked.references:
+            raise
+    with deferred(opened.pressed):
+        summary = {"experiment": "eye", "status": "", "realisations": len(looked.seen)}
+        if not looked.seen:
+            return conclude(opened, summary, files, None, done=False, checkpoint=looked.checkpoint)
+        summary |= _write(folder, eye, looked, values, files)
+        summary |= {"seconds": round(looked.seconds, 2), "peak_memory_bytes": peak_memory()}
+        return conclude(
+            opened, summary, files, lambda path: write_report([folder], path), done=done, checkpoint=looked.checkpoint
+        )
+
+
+def _fingerprint(eye: Observer) -> Fingerprint:
+    """Realisations may be added, and what is done after all pictures may change."""
+    settings, inputs, free = described(eye.scene)
+    scene = fingerprint(settings, inputs, {*free, "report"})
+    own = fingerprint(eye.settings, {}, {"seeds", "sweep", "tradeoff", "scene"})
+    return own | {f"scene.{key}": value for key, value in scene.items()}
+
+
+class _Looked:
+    """What was seen so far, on disk now and then: sums of references, and pictures of each realisation.
+
+    Attributes:
+        total: Sum of the references [F, 3, h, w].
+        references: How many are in it.
+        seen: [sources, F, 3, h, w] of each realisation.
+        checkpoint: Where they are kept.
+    """
+
+    def __init__(self, eye: Observer, checkpoint: Checkpoint):
+        self.eye, self.checkpoint = eye, checkpoint
+        self.total, self.references = torch.zeros(()), 0
+        self.seen: list[Tensor] = []
+        self._before, self._started = 0.0, time.perf_counter()
+        self._saved = self._started
+        if content := checkpoint.load():
+            try:
+                self.total, self.references = content["total"], content["references"]
+                self.seen, self._before = content["seen"], content["seconds"]
+            except KeyError as error:
+                raise checkpoint.unreadable(error) from None
+        if len(self.seen) > (seeds := eye.settings.seeds):
+            config = checkpoint.path.parent / "config.yaml"
+            cure = f"set it to that in {config}, or run into a new folder"
+            raise ConfigError([f"seeds: expected at least the {len(self.seen)} done, got {seeds}; {cure}"])
+
+    @property
+    def seconds(self) -> float:
+        """Spent so far, also before an interruption."""
+        return self._before + time.perf_counter() - self._started
+
+    @property
+    def reference(self) -> Tensor:
+        """Mean of the references."""
+        return self.total / self.references
+
+    def look(self, pressed: list[int]) -> None:
+        """See what is still to be seen. KeyboardInterrupt, with all whole realisations saved, where a signal comes."""
+        eye, sources, focus = self.eye, self.eye.settings.light.sources, self.eye.focus
+        seeds = eye.settings.seeds
+        references, own = realisations(8 * seeds, reference=True), realisations(seeds, reference=False)
+        each = [1 + len(focus), 1 + len(focus) * len(sources)]
+        before = self.references * each[0] + len(self.seen) * each[1]
+        total = len(references) * each[0] + len(own) * each[1]
+        with tqdm(total=total, initial=before, desc="looking", unit="picture", dynamic_ncols=True) as bar:
+            try:
+                for seed in references[self.references :]:
+                    hologram = _hologram(eye, seed, bar)
+                    pictures = torch.stack([_seen(eye, hologram, None, depth, bar) for depth in focus])
+                    with deferred(pressed):
+                        self.total, self.references = self.total + pictures, self.references + 1
+                    self._keep(pressed)
+                for seed in own[len(self.seen) :]:
+                    hologram = _hologram(eye, seed, bar)
+                    rows = [torch.stack([_seen(eye, hologram, source, at, bar) for at in focus]) for source in sources]
+                    self.seen.append(torch.stack(rows))
+                    self._keep(pressed)
+            except Exception:
+                self._save()
                 raise
-        with deferred(pressed):
-            _write(folder, eye, reference, torch.stack(seen), values, time.perf_counter() - started, not pressed)
-    if settings.sweep and not pressed:
-        sweep = eye_focus.focus_sweep(eye, settings.sweep)
-        write_table(folder / "focus.csv", [band.row for band in sweep.bands])
-        write_bytes(folder / "images" / "focus.png", eye_focus.draw(sweep))
-        print("\n".join(eye_focus.in_words(sweep)))
-        write_report([folder], folder / "report.html")
-    if settings.tradeoff and not pressed:
-        cases = tradeoff(settings, scene_settings(settings), settings.tradeoff)
-        write_table(folder / "tradeoff.csv", [case.row(fitted_prefactor(cases)) for case in cases])
-        print("\n".join(in_words(cases)))
-    return folder, not pressed
+            except KeyboardInterrupt:
+                with deferred(pressed):
+                    self._save()
+                raise
+            with deferred(pressed):
+                self._save()
+            if pressed:
+                raise KeyboardInterrupt
+
+    def _keep(self, pressed: list[int]) -> None:
+        if pressed:  # it came while it was held back
+            raise KeyboardInterrupt
+        if time.perf_counter() - self._saved > _SAVE_EVERY:
+            self._save()
+
+    def _save(self) -> None:
+        content = {"total": self.total, "references": self.references, "seen": self.seen, "seconds": self.seconds}
+        if self.references:
+            self.checkpoint.save(content)
+        self._saved = time.perf_counter()
 
 
 def _hologram(eye: Observer, seed: int, bar: tqdm) -> Tensor:
@@ -106,13 +195,12 @@ def _seen(eye: Observer, hologram: Tensor, source: str | None, depth: float, bar
     return picture
 
 
-def _write(
-    out: Path, eye: Observer, reference: Tensor, seen: Tensor, values: dict[str, Any], seconds: float, complete: bool
-) -> None:
-    """``reference`` [F, 3, h, w], ``seen`` [S, sources, F, 3, h, w]."""
+def _write(out: Path, eye: Observer, looked: _Looked, values: dict[str, Any], files: Results) -> dict[str, Any]:
+    """Arrays, pictures and the table of what was seen; returns its numbers."""
+    reference, seen = looked.reference, torch.stack(looked.seen)  # [F, 3, h, w], [S, sources, F, 3, h, w]
     sources, focus = eye.settings.light.sources, eye.focus
-    save_array(out / "arrays" / "retina.npy", seen[0])
-    save_array(out / "arrays" / "reference.npy", reference)
+    files.write(save_array, out / "arrays" / "retina.npy", seen[0])
+    files.write(save_array, out / "arrays" / "reference.npy", reference)
     # Sources are set so that equal values are neutral grey, and each colour's light is that of the rendering.
     waves = eye.scene.settings.wavelengths
     matrix = srgb_matrix(waves, white_balance(waves)).float()
@@ -125,7 +213,7 @@ def _write(
         for s, source in enumerate(("reference", *sources)):
             light = reference[f] if s == 0 else equal_power(seen[0, s - 1, f], reference[f])
             picture = exposed(desaturated(linear_srgb(light, matrix)), peak=peak)
-            write_bytes(out / "images" / f"{source}_{f}.png", encode_png(picture))
+            files.write(write_bytes, out / "images" / f"{source}_{f}.png", encode_png(picture))
             shown.append(picture)
             kind = ", synthetic" if values["synthetic"] else ""
             captions.append(f"{source.replace('_', ' ')}, focus {depth * 1e3:.4g} mm{kind}")
@@ -134,7 +222,7 @@ def _write(
         pictures.comparison(shown[k : k + columns], captions[k : k + columns]) for k in range(0, len(shown), columns)
     ]
     for f, data in enumerate(rows):
-        write_bytes(out / "images" / f"comparison_{f}.png", data)
+        files.write(write_bytes, out / "images" / f"comparison_{f}.png", data)
     found = [
         eye.row(source, depth, seen[:, s, f], reference[f])
         for s, source in enumerate(sources)
@@ -142,16 +230,5 @@ def _write(
     ]
     lengths = [wave * 1e9 for wave in waves]
     flat = [by_wavelength(row, lengths) for row in found]
-    write_table(out / "table.csv", [{key: plain(value) for key, value in row.items()} for row in flat])
-    summary = {
-        "experiment": "eye",
-        "status": "complete" if complete else "interrupted",
-        "synthetic": values["synthetic"],
-        "wavelengths_nm": lengths,
-        "realisations": len(seen),
-        "rows": found,
-        "seconds": round(seconds, 2),
-        "peak_memory_bytes": peak_memory(),
-    }
-    write_json(out / ("summary.json" if complete else "interrupted.json"), summary)
-    write_report([out], out / "report.html")
+    files.write(write_table, out / "table.csv", [{key: plain(value) for key, value in row.items()} for row in flat])
+    return {"synthetic": values["synthetic"], "wavelengths_nm": lengths, "rows": found}

@@ -13,10 +13,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from holotorch.experiments.pec_bench import Bench, Track
 from holotorch.experiments.pec_volume import SLICES, focal_sweep
+from holotorch.experiments.study_cases import Cases
 from holotorch.modulator import ThermalCrosstalk, quantised
 
 Row = dict[str, Any]
@@ -24,14 +24,14 @@ PI = math.pi
 VOLUME = f"synthetic volume, {SLICES} slices in turn"
 
 
-def reproduction(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
+def reproduction(bench: Bench, sigmas: Sequence[float], steps: int, done: Cases) -> list[Row]:
     """Sec. 4.4.3.3, 4.4.5.3, 4.5.2.2: every method against sigma, in the far field and in the periodic near field."""
-    rows: list[Row] = []
+    rows = done.rows
     printed = {("fourier", "PPEC", 1.5): 0.48, ("fourier", "PPEC", 2.0): 0.30}
     # FPEC; the thesis does not say where it starts, and only nearly flat phases, which need less heat, come so far.
     printed |= {("fresnel", "PPEC, cool start", 1.5): 0.57, ("fresnel", "PPEC, cool start", 2.0): 0.34}
     for kind in ("fourier", "fresnel"):
-        for sigma in tqdm(sigmas, desc=f"reproduction, {kind}", unit="sigma"):
+        for sigma in done.each(sigmas, desc=f"reproduction, {kind}", unit="sigma"):
             own = replace(bench, sigma_px=sigma, kind=kind)
             more = ("PPEC, cool start",) if kind == "fresnel" else ()
             for name, phase, seconds in _methods(own, steps, (*_ALL, *more)):
@@ -42,20 +42,20 @@ def reproduction(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]
     return rows
 
 
-def lowpass(bench: Bench, cutoffs: Sequence[float], steps: int) -> list[Row]:
+def lowpass(bench: Bench, cutoffs: Sequence[float], steps: int, done: Cases) -> list[Row]:
     """Fig. 4.12: low-pass targets; the thesis's claim is that IPEC gains from them and PPEC needs none."""
-    rows = []
-    for cutoff in tqdm(cutoffs, desc="low-pass targets", unit="cut-off"):
+    rows = done.rows
+    for cutoff in done.each(cutoffs, desc="low-pass targets", unit="cut-off"):
         own = replace(bench, lowpass=cutoff)
         for name, phase, seconds in _methods(own, steps, ("basic IPEC", "IPEC", "PPEC", "ours")):
             rows.append(_row(own, name, own.scores(phase), seconds) | {"setting": f"cut-off {cutoff:g} cycles/px"})
     return rows
 
 
-def multiplexing(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
+def multiplexing(bench: Bench, sigmas: Sequence[float], steps: int, done: Cases) -> list[Row]:
     """Figs. 4.13, 4.14: ten IPEC runs shown in turn, a signal region, and frames that are solved for together."""
-    rows = []
-    for sigma in tqdm(sigmas, desc="multiplexing", unit="sigma"):
+    rows = done.rows
+    for sigma in done.each(sigmas, desc="multiplexing", unit="sigma"):
         own = replace(bench, sigma_px=sigma)
         region = replace(own, region=own.size // 2)
         for count in (1, 10):
@@ -76,10 +76,10 @@ def multiplexing(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]
     return rows
 
 
-def iterations(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
+def iterations(bench: Bench, sigmas: Sequence[float], steps: int, done: Cases) -> list[Row]:
     """Fig. 4.15: SSIM after so many steps, by Algorithm 2 and by ours."""
-    rows = []
-    for sigma in tqdm(sigmas, desc="iterations", unit="sigma"):
+    rows = done.rows
+    for sigma in done.each(sigmas, desc="iterations", unit="sigma"):
         own = replace(bench, sigma_px=sigma)
         for name in ("PPEC", "ours"):
             every = max(1, steps // 40)
@@ -94,22 +94,22 @@ def iterations(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
     return rows
 
 
-def scaling(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
+def scaling(bench: Bench, sigmas: Sequence[float], steps: int, done: Cases) -> list[Row]:
     """Figs. 4.10, 4.11: seconds against sigma and against resolution, in one process."""
-    rows = []
+    rows = done.rows
     cases = [(bench.size, sigma) for sigma in sigmas] + [(size, bench.sigma_px) for size in (64, 128, 256, 512)]
-    for size, sigma in tqdm(cases, desc="time", unit="case"):
+    for size, sigma in done.each(cases, desc="time", unit="case"):
         own = replace(bench, size=size, sigma_px=sigma)
         for name, phase, seconds in _methods(own, steps, ("basic IPEC", "IPEC", "PPEC", "ours")):
             rows.append(_row(own, name, own.scores(phase), seconds) | {"setting": f"{size} px"})
     return rows
 
 
-def focus(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
+def focus(bench: Bench, sigmas: Sequence[float], steps: int, done: Cases) -> list[Row]:
     """Fig. 4.18 and Sec. 6.3.2: a scene at three depths, as the thesis's stack of slices and as one hologram."""
-    rows = []
+    rows = done.rows
     depths = (0.08, 0.10, 0.12)
-    for sigma in tqdm(sigmas, desc="depths", unit="sigma"):
+    for sigma in done.each(sigmas, desc="depths", unit="sigma"):
         own = replace(bench, kind="fresnel", distances=depths, sigma_px=sigma)
         started = time.perf_counter()
         stack, weights = _slices(own, steps)
@@ -133,10 +133,10 @@ def focus(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
     return rows
 
 
-def limits(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
+def limits(bench: Bench, sigmas: Sequence[float], steps: int, done: Cases) -> list[Row]:
     """SSIM against the temperature allowed, a wrong sigma, a weight on heating power, and the heaters' bits."""
-    rows = []
-    for sigma in tqdm(sigmas, desc="limits", unit="sigma"):
+    rows = done.rows
+    for sigma in done.each(sigmas, desc="limits", unit="sigma"):
         own = replace(bench, sigma_px=sigma)
         for turns in (1, 2, 4, 8):
             for frames in (1, 4):
@@ -157,9 +157,9 @@ def limits(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
     return rows
 
 
-def targets(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
+def targets(bench: Bench, sigmas: Sequence[float], steps: int, done: Cases) -> list[Row]:
     """What a device can show: cases with a limit on the heat, frames, a region or depths; ``sigmas`` is not used."""
-    rows = []
+    rows = done.rows
     near, alone = replace(bench, kind="fresnel"), replace(bench, kind="isolated")
     depths, region = replace(near, distances=(0.08, 0.10, 0.12)), replace(bench, region=bench.size // 2)
     # (what, bench, sigmas, start, frames, limit in pi, SSIM that research/prototypes reached)
@@ -178,7 +178,7 @@ def targets(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
         ("three depths, one hologram", depths, (0.66, 1.0, 1.5), "cool", 1, None, (0.95, 0.82, 0.44)),
         ("three depths, 4 joint frames", depths, (0.66, 1.0, 1.5), "cool", 4, None, (0.97,) * 3),
     ]
-    for what, where, widths, start, frames, limit, goals in tqdm(cases, desc="targets", unit="case"):
+    for what, where, widths, start, frames, limit, goals in done.each(cases, desc="targets", unit="case"):
         for i, sigma in enumerate(widths):
             own = replace(where, sigma_px=sigma)
             started = time.perf_counter()
@@ -194,7 +194,7 @@ def targets(bench: Bench, sigmas: Sequence[float], steps: int) -> list[Row]:
     return rows
 
 
-STUDIES: dict[str, Callable[[Bench, Sequence[float], int], list[Row]]] = {
+STUDIES: dict[str, Callable[[Bench, Sequence[float], int, Cases], list[Row]]] = {
     "reproduction": reproduction,
     "lowpass": lowpass,
     "multiplexing": multiplexing,

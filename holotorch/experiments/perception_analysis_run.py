@@ -8,14 +8,12 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 from pydantic import ValidationError
 from tqdm import tqdm
 
 from holotorch.experiments import perception_figures as figures
 from holotorch.experiments.chart import write_table
 from holotorch.experiments.config_analysis import AnalysisSettings
-from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.markup import element, figure, table
 from holotorch.experiments.perception_analysis import (
@@ -39,7 +37,8 @@ from holotorch.experiments.perception_statistics import (
     one_way,
     repeated_measures,
 )
-from holotorch.experiments.run_folder import claim
+from holotorch.experiments.run_folder import Run, conclude, open_run
+from holotorch.experiments.saving import Results
 from holotorch.io.files import save_array, write_bytes, write_json, write_text
 
 LEFT_OUT = (
@@ -113,6 +112,12 @@ def run_analysis(settings: AnalysisSettings, out: Path | None, name: str) -> tup
                 with_slope(settings.simulation, alpha, sum(settings.range_deg) / 2)
             except ValidationError as error:
                 raise ConfigError([f"power.slopes: {alpha:g}: {error.errors()[0]['msg']}"]) from None
+    with open_run(out, name, settings, torch.device("cpu"), settings.seed) as opened:
+        return opened.path, _fill(opened, settings, started)
+
+
+def _fill(opened: Run, settings: AnalysisSettings, started: float) -> bool:
+    folder, files = opened.path, Results()
     if settings.logs:
         responses = read_responses(settings.logs)
     else:
@@ -132,17 +137,15 @@ def run_analysis(settings: AnalysisSettings, out: Path | None, name: str) -> tup
     if settings.repeated_measures is None and not _beside(settings):
         text += f"\nLeft out   {LEFT_OUT}"
     print(text, flush=True)
-    folder = claim(out, name)
-    for part in ("arrays", "images"):
-        (folder / part).mkdir(exist_ok=True)
-    write_text(folder / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
-    write_json(folder / "plan.json", {"rule": settings.cleaning.model_dump(), "counts": times.counts})
-    write_json(folder / "env.json", environment(settings.seed, torch.device("cpu")))
-    save_array(folder / "arrays" / "times.npy", torch.from_numpy(times.seconds))
-    save_array(folder / "arrays" / "scales.npy", torch.from_numpy(np.stack([f.scales.degrees for f in found])))
-    write_table(folder / "metrics.csv", rows)
-    write_table(folder / "conditions.csv", _conditions(times))
-    write_table(folder / "curves.csv", _curves(times, curves))
+    (folder / "arrays").mkdir(exist_ok=True)
+    files.write(write_json, folder / "plan.json", {"rule": settings.cleaning.model_dump(), "counts": times.counts})
+    files.write(save_array, folder / "arrays" / "times.npy", torch.from_numpy(times.seconds))
+    files.write(
+        save_array, folder / "arrays" / "scales.npy", torch.from_numpy(np.stack([f.scales.degrees for f in found]))
+    )
+    files.write(write_table, folder / "metrics.csv", rows)
+    files.write(write_table, folder / "conditions.csv", _conditions(times))
+    files.write(write_table, folder / "curves.csv", _curves(times, curves))
     drawn = [figures.Shown(f.name, curves.eccentricities, f.line) for f in found]
     place = int(np.flatnonzero(times.participants == shown)[0])
     images = {
@@ -156,20 +159,19 @@ def run_analysis(settings: AnalysisSettings, out: Path | None, name: str) -> tup
     if settings.power:
         total = len(settings.power.slopes) * len(settings.power.participants)
         power = list(tqdm(power_rows(settings, settings.power), total=total, desc="power", dynamic_ncols=True))
-        write_table(folder / "power.csv", power)
+        files.write(write_table, folder / "power.csv", power)
         images["power"] = figures.power_curves(power, settings.confidence)
         said = needed(power)
         text += "\n" + "\n".join(f"Power      {line}" for line in said)
         print("\n".join(said), flush=True)
     for key, data in images.items():
-        write_bytes(folder / "images" / f"{key}.png", data)
+        files.write(write_bytes, folder / "images" / f"{key}.png", data)
     body = "<h1>Perception in the far periphery</h1>" + element("pre", text) + _table(rows)
     body += "".join(figure(f"images/{key}.png", _CAPTIONS[key], "wide") for key in images)
     body += _table(power) if power else ""
-    write_text(folder / "report.html", f"<!DOCTYPE html><meta charset='utf-8'><title>perception</title>{body}")
     summary = {
         "experiment": "perception_analysis",
-        "status": "complete",
+        "status": "",
         "simulated": times.simulated,
         "repeated_measures": _beside(settings),
         "participants": len(times.participants),
@@ -179,8 +181,8 @@ def run_analysis(settings: AnalysisSettings, out: Path | None, name: str) -> tup
         "power": power,
         "seconds": round(time.perf_counter() - started, 2),
     }
-    write_json(folder / "summary.json", summary)
-    return folder, True
+    page = f"<!DOCTYPE html><meta charset='utf-8'><title>perception</title>{body}"
+    return conclude(opened, summary, files, lambda path: write_text(path, page), done=True)
 
 
 def _conditions(times: Times) -> list[dict[str, Any]]:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -18,13 +17,13 @@ from torch import Tensor
 
 from holotorch.experiments.chart import write_table
 from holotorch.experiments.config_perception import ItemSettings, LayoutSettings
-from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.markup import element, figure, table
 from holotorch.experiments.perception_icons import draw_ground, draw_icon
 from holotorch.experiments.report import page
-from holotorch.experiments.run_folder import claim
-from holotorch.io.files import write_bytes, write_json, write_text
+from holotorch.experiments.run_folder import Run, conclude, open_run
+from holotorch.experiments.saving import Results
+from holotorch.io.files import write_bytes, write_text
 from holotorch.perception import (
     FITTED_DEG,
     TABLE_2_1,
@@ -77,20 +76,23 @@ def layout_text(settings: LayoutSettings) -> str:
 
 
 def run_layout(settings: LayoutSettings, out: Path | None, name: str) -> tuple[Path, bool]:
-    """Draw the layouts and fill a folder as :func:`holotorch.experiments.run.run` does; False never comes back."""
+    """Draw the layouts and fill a folder ; returns and raises as :func:`holotorch.experiments.run.run`."""
     layouts = scaled(settings)
-    text = layout_text(settings)
-    folder = claim(out, name)
-    (folder / "images").mkdir(exist_ok=True)
-    write_text(folder / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
-    write_json(folder / "env.json", environment(0, torch.device("cpu")))
+    with open_run(out, name, settings, torch.device("cpu")) as opened:
+        complete = _fill(opened, settings, layouts, name)
+    print(layout_text(settings))
+    return opened.path, complete
+
+
+def _fill(opened: Run, settings: LayoutSettings, layouts: list[tuple[str, ScaledLayout]], name: str) -> bool:
+    folder, files, text = opened.path, Results(), layout_text(settings)
     rows = [row for title, layout in layouts for row in _rows(settings, title, layout)]
-    write_table(folder / "layout.csv", rows)
+    files.write(write_table, folder / "layout.csv", rows)
     picture = _picture(settings, layouts)
-    write_bytes(folder / "images" / "layout.png", picture)
+    files.write(write_bytes, folder / "images" / "layout.png", picture)
     displays = _displays(settings)
-    write_table(folder / "displays.csv", displays)
-    write_text(folder / "report.html", _report(name, text, picture, rows, displays, folder))
+    files.write(write_table, folder / "displays.csv", displays)
+    page = _report(name, text, picture, rows, displays, folder)
     flags = {
         title: {
             "fitted": int(layout.fitted.sum()),
@@ -101,12 +103,8 @@ def run_layout(settings: LayoutSettings, out: Path | None, name: str) -> tuple[P
         }
         for title, layout in layouts
     }
-    write_json(
-        folder / "summary.json",
-        {"experiment": settings.experiment, "status": "complete", "targets": flags, "items": rows},
-    )
-    print(text)
-    return folder, True
+    summary = {"experiment": settings.experiment, "status": "", "targets": flags, "items": rows}
+    return conclude(opened, summary, files, lambda path: write_text(path, page), done=True)
 
 
 def _centres(settings: LayoutSettings) -> Tensor:

@@ -12,7 +12,7 @@ from holotorch.correction import Solution
 from holotorch.experiments.judge import quality
 from holotorch.experiments.memory import peak_memory
 from holotorch.experiments.pec import PECExperiment
-from holotorch.experiments.run_folder import Checkpoint
+from holotorch.experiments.saving import Checkpoint
 
 _CHECK_EVERY = 10  # steps between two measurements of quality, which cost about as much as a step
 _SAVE_EVERY = 30.0  # seconds between two checkpoints

@@ -3,18 +3,16 @@
 import signal
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import yaml
 from torch import Tensor
 
 from holotorch.correction import Solution
 from holotorch.experiments import pictures
 from holotorch.experiments.baselines import baseline
 from holotorch.experiments.config import PECSettings, load_config
-from holotorch.experiments.config_volume import VolumeSettings
-from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.fingerprint import Fingerprint, fingerprint
 from holotorch.experiments.judge import Result, judge
@@ -24,8 +22,10 @@ from holotorch.experiments.perception_weight import ZONES, eccentricities, weigh
 from holotorch.experiments.plan import plan, plan_text, shortage
 from holotorch.experiments.progress import Log
 from holotorch.experiments.report import write_report
-from holotorch.experiments.run_folder import Checkpoint, Results, claim, conclude, kept
-from holotorch.experiments.signals import deferred, interruptible
+from holotorch.experiments.run_folder import Run, conclude, open_run
+from holotorch.experiments.saving import Checkpoint, Results
+from holotorch.experiments.settings import Settings
+from holotorch.experiments.signals import deferred
 from holotorch.experiments.source import read_source
 from holotorch.io.files import save_array, write_bytes, write_json, write_text
 from holotorch.io.images import encode_png
@@ -45,6 +45,8 @@ _CAPTIONS = {
 def run(settings: PECSettings, out: Path | None, name: str = "run") -> tuple[Path, bool]:
     """Carry a run out and fill a folder: ``out``, or the next free ``runs/NAME-001``.
 
+    An ``out`` that holds an unfinished run of the same settings is gone on with.
+
     Returns:
         The folder, and whether the run is complete; if it was interrupted, what it had found is in the folder.
 
@@ -57,16 +59,32 @@ def run(settings: PECSettings, out: Path | None, name: str = "run") -> tuple[Pat
     print(plan_text(experiment, values), flush=True)
     if text := shortage(values):
         raise ConfigError([text])
-    folder = claim(out, name)
-    with kept(folder):
-        return folder, _fill(folder, experiment, values)
+    with open_run(out, name, settings, experiment.device, settings.seed) as opened:
+        return opened.path, _fill(opened, experiment, values)
+
+
+def start(settings: Settings, out: Path | None, name: str) -> tuple[Path, bool]:
+    """Carry out the run of any kind that the settings are of; returns and raises as :func:`run`."""
+    module, function = _KINDS[settings.experiment]  # type: ignore[attr-defined]
+    return getattr(import_module(f"holotorch.experiments.{module}"), function)(settings, out, name)
+
+
+_KINDS = {
+    "pec": ("run", "run"),
+    "pec_study": ("study", "run_study"),
+    "volume": ("volume_run", "run_volume"),
+    "eye": ("eye_run", "run_observer"),
+    "perception_layout": ("perception_layout", "run_layout"),
+    "perception_analysis": ("perception_analysis_run", "run_analysis"),
+}
 
 
 def resume(folder: Path) -> tuple[Path, bool]:
     """Go on with an interrupted run in its folder, as if it had never stopped; returns as :func:`run`.
 
     Raises:
-        ConfigError: The folder holds no run of this program, or its configuration no longer works.
+        ConfigError: The folder holds no run of this program, or its configuration no longer works, or is no longer that
+            of its checkpoint.
     """
     config = folder / "config.yaml"
     held = read_source(config, []).data if config.is_file() else {}
@@ -75,34 +93,20 @@ def resume(folder: Path) -> tuple[Path, bool]:
         frames = f", the frames that it kept by: holotorch track {folder / 'recording'}"
         frames = frames if (folder / "recording").is_dir() else ""
         raise ConfigError([f"{folder} holds a tracking run, which is not resumed: {again}{frames}"])
-    if not config.is_file() or not (folder / "plan.json").is_file():
-        raise ConfigError([f"{folder} holds no run to resume: config.yaml and plan.json are not both there"])
+    if not config.is_file() or not (folder / "env.json").is_file():
+        raise ConfigError([f"{folder} holds no run to resume: config.yaml and env.json are not both there"])
     if (folder / "summary.json").is_file():
         print("this run is complete; nothing is left to do")
         return folder, True
-    settings = load_config(config)
-    if isinstance(settings, VolumeSettings):
-        from holotorch.experiments.volume_run import resume_volume
-
-        return resume_volume(folder)
-    if not isinstance(settings, PECSettings):
-        raise ConfigError([f"{folder} holds a study, which cannot be resumed; run it again"])
-    experiment = build(settings)
-    with kept(folder, new=False):
-        return folder, _fill(folder, experiment, plan(experiment))
+    return start(load_config(config), folder, folder.resolve().name)
 
 
-def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
-    settings = experiment.settings
-    for part in ("arrays", "images"):
-        (out / part).mkdir(exist_ok=True)
-    if not (out / "config.yaml").is_file():
-        write_text(out / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
-    write_json(out / "env.json", environment(settings.seed, experiment.device))
+def _fill(opened: Run, experiment: PECExperiment, values: dict[str, Any]) -> bool:
+    settings, out, pressed = experiment.settings, opened.path, opened.pressed
+    (out / "arrays").mkdir(exist_ok=True)
     write_json(out / "plan.json", values)
-
     log, files = Log(experiment, Checkpoint(out / "checkpoint.pt", _fingerprint(experiment))), Results()
-    with interruptible() as pressed, log.saved_on_failure():
+    with log.saved_on_failure():
         try:
             solution = experiment.solve(log, log.resume)
         except KeyboardInterrupt:
@@ -132,8 +136,8 @@ def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
             except ValueError as error:
                 print(f"{name} is left out: {error}", file=sys.stderr)
         with deferred(pressed):
-            if pressed and not log.save():
-                files.fail(log.checkpoint.failure)
+            if pressed:
+                log.save()
             _write_results(out, experiment, results, log, solution, files)
             summary = {
                 "experiment": settings.experiment,
@@ -142,11 +146,7 @@ def _fill(out: Path, experiment: PECExperiment, values: dict[str, Any]) -> bool:
                 "peak_memory_bytes": peak_memory(),
             }
             page, done = (lambda path: write_report([out], path)), not pressed
-            complete = conclude(out, summary, files, log.checkpoint, pressed, page, done=done)
-    if not complete:
-        steps = int(solution.steps.max())
-        print(f"interrupted; saved what {steps} steps have found; go on with: holotorch resume {out}", file=sys.stderr)
-    return complete
+            return conclude(opened, summary, files, page, done=done, checkpoint=log.checkpoint)
 
 
 def _fingerprint(experiment: PECExperiment) -> Fingerprint:

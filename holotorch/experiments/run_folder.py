@@ -1,20 +1,25 @@
 """The folder of a run: claimed by one run alone, and never emptied of what was computed, whatever fails."""
 
+import os
 import re
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
-from tqdm import tqdm
+import yaml
+from pydantic import BaseModel
 
+from holotorch.experiments.config import load_config
+from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.fingerprint import Fingerprint, differences
-from holotorch.experiments.signals import Pressed
-from holotorch.io.files import replacing, write_json
+from holotorch.experiments.fingerprint import differences, fingerprint
+from holotorch.experiments.saving import Checkpoint, Results
+from holotorch.experiments.signals import Pressed, deferred, interruptible
+from holotorch.io.files import write_json, write_text
 
 _SETUP = {"config.yaml", "env.json", "plan.json"}  # what is written before anything is computed
 
@@ -48,15 +53,102 @@ def claim(out: Path | None, name: str) -> Path:
     return out
 
 
-@contextmanager
-def kept(folder: Path, *, new: bool = True) -> Iterator[None]:
-    """Fill ``folder`` within this block. Where that fails, it says where the results so far are and how to go on.
+@dataclass(frozen=True)
+class Run:
+    """A run at work in its folder.
 
-    A ``new`` folder that holds nothing computed yet is removed, so that a corrected run can have it.
+    Attributes:
+        path: The folder.
+        pressed: Signals that have come.
     """
+
+    path: Path
+    pressed: Pressed
+
+
+@contextmanager
+def open_run(out: Path | None, name: str, settings: BaseModel, device: torch.device, seed: int = 0) -> Iterator[Run]:
+    """Fill a folder within this block: a new one, or ``out`` where that holds an unfinished run of the same settings.
+
+    The folder is this run's alone, on systems that can lock one, and gets config.yaml and env.json at once. Within the
+    block the first signal raises KeyboardInterrupt. Where the block fails, the folder keeps what was computed; a new
+    one in which nothing was is removed, so that a corrected run can have it.
+
+    Raises:
+        ConfigError: The folder is in use, holds something else, or cannot be written.
+    """
+    with interruptible() as pressed, ExitStack() as stack:
+        if out is not None:
+            with suppress(OSError):  # the claim says what is wrong
+                out.mkdir(parents=True, exist_ok=True)
+            if out.is_dir():
+                stack.enter_context(_locked(out))
+        new = out is None or not _unfinished(out, settings)
+        folder = claim(out, name) if new or out is None else out
+        if out is None:
+            stack.enter_context(_locked(folder))
+        with _kept(folder, new):
+            (folder / "images").mkdir(exist_ok=True)
+            write_json(folder / "env.json", environment(seed, device))
+            if new:
+                write_text(folder / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
+            yield Run(folder, pressed)
+
+
+def _unfinished(folder: Path, settings: BaseModel) -> bool:
+    """Whether a folder holds a run of these settings that is not complete; ConfigError for one of other settings.
+
+    What a killed run leaves is cleared away: half-written files, and folders without a file.
+    """
+    if not folder.is_dir():
+        return False
+    files = {path.name for path in folder.rglob("*") if not path.is_dir()}
+    if files <= {"env.json"}:
+        with suppress(OSError):  # the claim says what is wrong
+            (folder / "env.json").unlink(missing_ok=True)
+            for path in (folder / "arrays", folder / "images"):
+                if path.is_dir():
+                    path.rmdir()
+    if "summary.json" in files or not files >= {"env.json", "config.yaml"}:
+        return False
+    try:
+        held = load_config(folder / "config.yaml")
+    except ConfigError:
+        return False
+    if changed := differences(fingerprint(held, {}), fingerprint(settings, {})):
+        cure = f"choose another --out, or go on with that one: holotorch resume {folder}"
+        raise ConfigError([f"{folder} holds an unfinished run of another configuration: {', '.join(changed)}; {cure}"])
+    for path in folder.rglob(".*.partial"):
+        path.unlink()
+    return True
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep other runs out of a folder until the block, or the process, ends. ConfigError where one is in it."""
+    try:
+        import fcntl
+    except ImportError:  # not on Windows
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # of a network's file system without locks
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ConfigError([f"{folder} is in use by another run; choose another --out"]) from None
+        yield
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def _kept(folder: Path, new: bool) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
+        print(f"interrupted; start it again with: holotorch resume {folder}", file=sys.stderr)
         raise
     except BaseException as error:
         files = [path for path in folder.rglob("*") if not path.is_dir()]
@@ -82,119 +174,24 @@ def _remove(folder: Path, files: list[Path]) -> None:
                 path.rmdir()
 
 
-class Checkpoint:
-    """What it takes to go on with a run. A failure to write it is told once per cause, and is no reason to stop.
-
-    Attributes:
-        path: The file; the one before stays until a new one is complete.
-        fingerprint: Of the configuration and inputs of the run; what another one has left is refused.
-        failure: Why the last :meth:`save` wrote nothing, or None.
-    """
-
-    def __init__(self, path: Path, fingerprint: Fingerprint):
-        self.path, self.fingerprint = path, fingerprint
-        self.failure: OSError | None = None
-        self._told: set[int | None] = set()
-
-    def load(self) -> dict[str, Any] | None:
-        """What was saved last; None where nothing was. ConfigError for one of another configuration, or damaged."""
-        if not self.path.is_file():
-            return None
-        try:
-            content = torch.load(self.path, weights_only=True)
-            if not isinstance(content, dict):
-                raise ValueError("not a checkpoint")
-        except Exception as error:  # what damaged bytes raise when unpickled is anyone's guess
-            raise self.unreadable(error) from None
-        self._check(content.get("fingerprint"))
-        return content
-
-    def _check(self, before: Fingerprint | None) -> None:
-        config = self.path.parent / "config.yaml"
-        cure = f"run into a new folder: holotorch run {config} --out NEW"
-        if not isinstance(before, dict):
-            words = f"{self.path} does not say which configuration it belongs to, as those of older versions do not"
-            raise ConfigError([f"{words}; {cure}"])
-        if changed := differences(before, self.fingerprint):
-            words = f"{self.path} belongs to another configuration: {', '.join(changed)}"
-            raise ConfigError([f"{words}; undo that in {config}, or {cure}"])
-
-    def unreadable(self, error: Exception) -> ConfigError:
-        """What to say of a checkpoint whose content is not what it should be."""
-        reason = error.strerror if isinstance(error, OSError) else "it is damaged"
-        return ConfigError([f"{self.path} cannot be read: {reason}; delete the folder and run again"])
-
-    def save(self, content: dict[str, Any]) -> bool:
-        """Write tensors and plain values; False where that is not possible."""
-        self.failure = None
-        try:
-            with replacing(self.path, needed=_bytes(content)) as stream:
-                try:
-                    torch.save(content | {"fingerprint": self.fingerprint}, stream)
-                except RuntimeError as error:  # torch's own, raised while it handled the one of the disk
-                    raise error.__context__ if isinstance(error.__context__, OSError) else error from None
-        except (OSError, RuntimeError) as error:
-            is_disk = isinstance(error, OSError)
-            self.failure = error if is_disk else OSError(None, str(error), str(self.path))
-            if self.failure.errno not in self._told:
-                self._told.add(self.failure.errno)
-                left = "that of before stays" if self.path.is_file() else "there is none before it"
-                _warn(f"{self.path} cannot be written: {self.failure.strerror}; {left}, and the run goes on")
-        return self.failure is None
-
-    def remove(self) -> None:
-        """Delete it, as the run is complete."""
-        self.path.unlink(missing_ok=True)
-
-
-class Results:
-    """Files of results. One that cannot be written is told, once per cause, and the others are written all the same.
-
-    Attributes:
-        failure: The first error.
-    """
-
-    def __init__(self):
-        self.failure: OSError | None = None
-        self._told: set[int | None] = set()
-
-    def fail(self, error: OSError | None) -> None:
-        """Take note of an error that was told already."""
-        self.failure = self.failure or error
-
-    def write(self, write: Callable[..., Any], *words: Any) -> bool:
-        """Call ``write(*words)``; False where the disk does not take it."""
-        try:
-            write(*words)
-            return True
-        except OSError as error:
-            if error.errno not in self._told:
-                self._told.add(error.errno)
-                _warn(f"{error.filename} cannot be written: {error.strerror}; the other results are written")
-            self.fail(error)
-            return False
-
-
 def conclude(
-    folder: Path,
+    run: Run,
     summary: dict[str, Any],
     results: Results,
-    checkpoint: Checkpoint,
-    pressed: Pressed,
-    page: Callable[[Path], Any],
+    page: Callable[[Path], Any] | None,
     *,
     done: bool,
+    checkpoint: Checkpoint | None = None,
 ) -> bool:
     """Write the numbers of a run, last of all: what has summary.json is complete, what has interrupted.json is not.
 
     Args:
-        folder: Of the run.
-        summary: With a ``status`` that is set here.
+        run: The run, whose signals no longer count once it is complete.
+        summary: Numbers, with a ``status`` that is set here.
         results: Files written so far.
-        checkpoint: Removed from a complete run.
-        pressed: Settled once the run is complete: signals that come later no longer count.
-        page: Writes the report of the folder to a path.
+        page: Writes report.html, to a path; last, as it may show what is in the folder.
         done: Whether all was computed.
+        checkpoint: Removed from a complete run. Of one that is not done, that it was written.
 
     Returns:
         Whether the run is complete.
@@ -202,28 +199,23 @@ def conclude(
     Raises:
         OSError: A file could not be written; everything else is.
     """
-    complete = done and results.failure is None
-    summary["status"] = "complete" if complete else "interrupted"
-    if results.failure is not None:
-        summary["failure"] = f"{results.failure.filename}: {results.failure.strerror}"
-    if results.write(write_json, folder / ("summary.json" if complete else "interrupted.json"), summary):
-        if complete:
-            pressed.settled = True
-            checkpoint.remove()
-            (folder / "interrupted.json").unlink(missing_ok=True)
-        results.write(page, folder / "report.html")
-    if results.failure is not None:
-        raise results.failure
+    with deferred(run.pressed):
+        if not done and checkpoint is not None:
+            results.fail(checkpoint.failure)
+        complete = done and results.failure is None
+        summary["status"] = "complete" if complete else "interrupted"
+        if results.failure is not None:
+            summary["failure"] = f"{results.failure.filename}: {results.failure.strerror}"
+        name = "summary.json" if complete else "interrupted.json"
+        if results.write(write_json, run.path / name, summary):
+            if complete:
+                run.pressed.settled = True
+                for path in (run.path / "checkpoint.pt", run.path / "interrupted.json"):
+                    path.unlink(missing_ok=True)
+            if page is not None:
+                results.write(page, run.path / "report.html")
+        if results.failure is not None:
+            raise results.failure
+    if not complete:
+        print(f"interrupted; what was computed is saved; go on with: holotorch resume {run.path}", file=sys.stderr)
     return complete
-
-
-def _warn(text: str) -> None:
-    tqdm.write(f"warning: {text}", file=sys.stderr)  # beside a progress bar
-
-
-def _bytes(content: Any) -> int:
-    """Of the tensors in a checkpoint; what else is in it is small."""
-    if isinstance(content, Tensor):
-        return content.nbytes
-    values = content.values() if isinstance(content, dict) else content if isinstance(content, list | tuple) else ()
-    return sum(map(_bytes, values))

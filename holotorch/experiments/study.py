@@ -1,58 +1,69 @@
 """A study as a run: a folder with its table, a picture, and what it says in words."""
 
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
-import yaml
+import torch
 
 from holotorch.experiments.chart import write_table
 from holotorch.experiments.config import StudySettings
-from holotorch.experiments.environment import environment
+from holotorch.experiments.fingerprint import fingerprint
 from holotorch.experiments.markup import element
 from holotorch.experiments.memory import peak_memory
 from holotorch.experiments.pec_bench import Bench
 from holotorch.experiments.pec_claims import with_claims
 from holotorch.experiments.pec_studies import STUDIES
 from holotorch.experiments.pictures import curves
-from holotorch.experiments.run_folder import claim
-from holotorch.io.files import write_bytes, write_json, write_text
+from holotorch.experiments.run_folder import Run, conclude, open_run
+from holotorch.experiments.saving import Checkpoint, Results
+from holotorch.experiments.study_cases import Cases
+from holotorch.io.files import write_bytes, write_text
 from holotorch.metrics import PerceptualSimilarity
 
 
 def run_study(settings: StudySettings, out: Path | None, name: str) -> tuple[Path, bool]:
-    """Carry a study out and fill a folder as :func:`holotorch.experiments.run.run` does; False never comes back."""
-    import torch
+    """Carry a study out and fill a folder; returns and raises as :func:`holotorch.experiments.run.run`.
 
-    folder = claim(out, name)
-    (folder / "images").mkdir(exist_ok=True)
-    write_text(folder / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
-    write_json(folder / "env.json", environment(settings.seed, torch.device("cpu")))
-    started = time.perf_counter()
+    An interrupted one goes on after the last case that is complete.
+    """
     bench = Bench(images=settings.images, size=settings.size, perceptual=_perceptual())
-    rows = with_claims(settings.study, STUDIES[settings.study](bench, settings.sweep, settings.max_steps))
-    write_table(folder / "table.csv", rows)
-    picture = curves(rows, f"{settings.study}: mean of {', '.join(settings.images)} at {settings.size} px")
-    write_bytes(folder / "images" / "table.png", picture)
+    with open_run(out, name, settings, torch.device("cpu"), settings.seed) as opened:
+        return opened.path, _fill(opened, settings, bench)
+
+
+def _fill(opened: Run, settings: StudySettings, bench: Bench) -> bool:
+    folder, files = opened.path, Results()
+    inputs = {"images": (bench.image,), "perceptual": ("none" if bench.perceptual is None else "LPIPS",)}
+    cases = Cases(Checkpoint(folder / "checkpoint.pt", fingerprint(settings, inputs)))
+    try:
+        rows = with_claims(settings.study, STUDIES[settings.study](bench, settings.sweep, settings.max_steps, cases))
+    except KeyboardInterrupt:
+        if not cases.saved:
+            raise
+        summary = {"experiment": settings.experiment, "study": settings.study, "status": "", "cases": cases.saved}
+        return conclude(opened, summary, files, None, done=False, checkpoint=cases.checkpoint)
+    files.write(write_table, folder / "table.csv", rows)
     text = table_text(rows)
-    write_text(folder / "table.txt", text)
+    files.write(write_text, folder / "table.txt", text)
+    picture = curves(rows, f"{settings.study}: mean of {', '.join(settings.images)} at {settings.size} px")
+    files.write(write_bytes, folder / "images" / "table.png", picture)
     page = element("title", settings.study) + element("h1", settings.study)
     page += "<img src='images/table.png'>" + element("pre", text)
-    write_text(folder / "report.html", f"<!DOCTYPE html><meta charset='utf-8'>{page}")
     verdicts = [row["verdict"].split(":")[0] for row in rows if row["verdict"]]
     summary = {
         "experiment": settings.experiment,
         "study": settings.study,
-        "status": "complete",
+        "status": "",
         "rows": len(rows),
         "verdicts": {verdict: verdicts.count(verdict) for verdict in dict.fromkeys(verdicts)},
-        "seconds": round(time.perf_counter() - started, 1),
+        "seconds": round(cases.seconds, 1),
         "peak_memory_bytes": peak_memory(),
     }
-    write_json(folder / "summary.json", summary)
+    page = f"<!DOCTYPE html><meta charset='utf-8'>{page}"
+    complete = conclude(opened, summary, files, lambda path: write_text(path, page), done=True)
     print(text)
-    return folder, True
+    return complete
 
 
 def _perceptual() -> PerceptualSimilarity | None:

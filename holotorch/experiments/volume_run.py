@@ -5,26 +5,24 @@ import io
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from torch import Tensor
 from tqdm import tqdm
 
 from holotorch.experiments import pictures
-from holotorch.experiments.config import load_config
 from holotorch.experiments.config_volume import VolumeSettings
-from holotorch.experiments.environment import environment
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.fingerprint import fingerprint
 from holotorch.experiments.memory import peak_memory
 from holotorch.experiments.plan import shortage
 from holotorch.experiments.report import write_report
-from holotorch.experiments.run_folder import Checkpoint, Results, claim, conclude, kept
-from holotorch.experiments.signals import Pressed, deferred, interruptible
+from holotorch.experiments.run_folder import Run, conclude, open_run
+from holotorch.experiments.saving import Checkpoint, Results
+from holotorch.experiments.signals import deferred, interruptible
 from holotorch.experiments.volume import Part, VolumeExperiment, build
 from holotorch.experiments.volume_judge import VolumeJudge
 from holotorch.experiments.volume_plan import plan, plan_text
@@ -50,36 +48,25 @@ def run_volume(settings: VolumeSettings, out: Path | None, name: str) -> tuple[P
             print(plan_text(experiment, values), flush=True)
             if text := shortage(values):
                 raise ConfigError([text])
-            out = claim(out, name)
-            for part in ("arrays", "images"):
-                (out / part).mkdir(exist_ok=True)
-            with kept(out):
-                write_text(out / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
-                write_json(out / "plan.json", values)
-                return _fill(out, experiment, rank, count)
-        return _fill(Path(), experiment, rank, count)
+            with open_run(out, name, settings, experiment.device, settings.seed) as opened:
+                (opened.path / "arrays").mkdir(exist_ok=True)
+                write_json(opened.path / "plan.json", values)
+                return opened.path, _fill(opened, experiment, rank, count)
+        with interruptible() as pressed:
+            return Path(), _fill(Run(Path(), pressed), experiment, rank, count)
 
 
-def resume_volume(folder: Path) -> tuple[Path, bool]:
-    """Go on with an interrupted run after its last complete realisation; equal to one that never stopped."""
-    settings = load_config(folder / "config.yaml")
-    with _processes() as (rank, count), kept(folder, new=False) if rank == 0 else nullcontext():
-        return _fill(folder, build(settings), rank, count)
-
-
-def _fill(out: Path, experiment: VolumeExperiment, rank: int, count: int) -> tuple[Path, bool]:
-    settings, planes = experiment.settings, len(experiment.depths)
-    if rank == 0:
-        write_json(out / "env.json", environment(settings.seed, experiment.device))
+def _fill(opened: Run, experiment: VolumeExperiment, rank: int, count: int) -> bool:
+    settings, planes, pressed = experiment.settings, len(experiment.depths), opened.pressed
     judge = VolumeJudge(experiment) if rank == 0 else None
-    state = _State(out, experiment, judge)
+    state = _State(opened.path, experiment, judge)
     start = _shared(torch.tensor(state.done)) if count > 1 else torch.tensor(state.done)
     part = Part(rank, count, planes) if count > 1 else None
     total = planes * settings.report.seeds
     bar = tqdm(
         total=total, initial=int(start) * planes, desc="rendering", unit="plane", disable=rank > 0, dynamic_ncols=True
     )
-    with interruptible() as pressed, bar:
+    with bar:
         try:
             for seed in range(int(start), settings.report.seeds):
                 started = time.perf_counter()
@@ -101,12 +88,12 @@ def _fill(out: Path, experiment: VolumeExperiment, rank: int, count: int) -> tup
         except KeyboardInterrupt:
             pass
         if rank > 0:
-            return out, not pressed
+            return not pressed
         assert judge is not None
         if not judge.count:
             raise KeyboardInterrupt
         with deferred(pressed):
-            return out, _write(out, experiment, judge, state, pressed)
+            return _write(opened, experiment, judge, state)
 
 
 def described(experiment: VolumeExperiment) -> tuple[VolumeSettings, dict[str, tuple[Any, ...]], set[str]]:
@@ -155,10 +142,9 @@ class _State:
         self.checkpoint.save({"sums": self.judge.sums, "count": self.judge.count, "rows": self.rows})
 
 
-def _write(out: Path, experiment: VolumeExperiment, judge: VolumeJudge, state: _State, pressed: Pressed) -> bool:
+def _write(opened: Run, experiment: VolumeExperiment, judge: VolumeJudge, state: _State) -> bool:
+    out = opened.path
     files, done = Results(), state.done == experiment.settings.report.seeds
-    if not done:
-        files.fail(state.checkpoint.failure)
     text = io.StringIO()
     writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
     writer.writeheader()
@@ -194,7 +180,9 @@ def _write(out: Path, experiment: VolumeExperiment, judge: VolumeJudge, state: _
         "refocus_seconds": round(sum(row["refocus_seconds"] for row in state.rows), 3),
         "peak_memory_bytes": peak_memory(),
     }
-    return conclude(out, summary, files, state.checkpoint, pressed, lambda path: write_report([out], path), done=done)
+    return conclude(
+        opened, summary, files, lambda path: write_report([out], path), done=done, checkpoint=state.checkpoint
+    )
 
 
 @contextmanager

@@ -116,9 +116,8 @@ def test_stopped_twice_and_resumed_twice_is_still_the_same(monkeypatch, tmp_path
     folder = stopped(monkeypatch, tmp_path / "a", 3, *overrides)
     press_in(monkeypatch, 8)
     assert resume(folder) == 130
-    assert f"interrupted; saved what 8 steps have found; go on with: holotorch resume {folder}" in (
-        capsys.readouterr().err
-    )
+    words = f"interrupted; what was computed is saved; go on with: holotorch resume {folder}"
+    assert words in capsys.readouterr().err
     press_in(monkeypatch, 0)  # before its first step: the older checkpoint stays
     assert resume(folder) == 130
     press_in(monkeypatch, None)
@@ -227,11 +226,11 @@ def refused(folder: Path, capsys) -> str:
     return lines[0]
 
 
-@pytest.mark.parametrize("missing", [["config.yaml", "plan.json"], ["config.yaml"], ["plan.json"]])
+@pytest.mark.parametrize("missing", [["config.yaml", "env.json"], ["config.yaml"], ["env.json"]])
 def test_a_folder_without_a_run_is_refused(broken, capsys, missing):
     for name in missing:
         (broken / name).unlink()
-    assert refused(broken, capsys) == f"{broken} holds no run to resume: config.yaml and plan.json are not both there"
+    assert refused(broken, capsys) == f"{broken} holds no run to resume: config.yaml and env.json are not both there"
     assert "holds no run to resume" in refused(broken / "nowhere", capsys)
 
 

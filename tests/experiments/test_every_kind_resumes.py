@@ -1,0 +1,232 @@
+"""Runs of every kind: signals, exit statuses, one run a folder, and going on by ``resume`` or by the same ``run``."""
+
+import csv
+import json
+import re
+import shutil
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from holotorch.cli import main
+from holotorch.experiments import eye, eye_run, pec_bench, perception_analysis_run, perception_layout, volume_run
+from holotorch.experiments.progress import Log
+from holotorch.io import files
+
+pytestmark = pytest.mark.usefixtures("tiny")
+CONFIGS = Path(__file__).parents[2] / "configs"
+VOLUME = [
+    "volume={phantom: shells, samples: 8}",
+    "transfer={points: [[20, 1, 0.2, 0, 0], [255, 0.2, 0.9, 1, 0.9]], unit_distance: 0.05}",
+    "hologram={shape: [32, 32], pitch: 3.74 um, distance: 3 mm, depths: 2, rays: 16}",
+]
+SCENE = (
+    "scene={config: configs/volume/c60.yaml, change: ['volume={phantom: c60, samples: 16}', "
+    "'hologram={shape: [64, 64], pitch: 3.74 um, distance: 2 mm, depths: 4, rays: 32}']}"
+)
+EYE = [SCENE, "display={kind: planar, distance: 4 mm}", "eye={pupil_radius: 0.1 mm, axial_length: 2 mm}"]
+ITEMS = "items=[{icon: boat, azimuth_deg: 50}]"
+TIMES = "[{seconds: 0.45}]"
+# Words of each command; a setting that makes it another run; where and in which call of it the signal comes; how many
+# calls resuming needs, where it does not start over.
+KINDS = {
+    "pec": (
+        ["pec/fourier.yaml", "grid.shape=[24,20]", "report.baselines=[]", "solver={kind: lbfgs, max_steps: 8}"],
+        ("seed=9", "seed was 7 and is 9"),
+        (Log, "__call__", 3, 6),
+    ),
+    "volume": (
+        ["volume/tooth.yaml", *VOLUME, "device=cpu", "report.seeds=3"],
+        ("view.azimuth_deg=9", "view.azimuth_deg was 0.0 and is 9.0"),
+        (volume_run.VolumeExperiment, "hologram", 3, 1),
+    ),
+    "eye": (
+        ["eye/teapot.yaml", *EYE, "seeds=1", "light={sources: [laser]}", "focus=[2 mm]", "tolerance=0.1"],
+        ("eye.chromatic=true", "eye.chromatic was false and is true"),
+        (eye.Observer, "seen", 9, 1),
+    ),
+    "study": (
+        ["pec/studies/lowpass.yaml", "images=[camera]", "size=24", "max_steps=4", "sweep=[0.1,0.2]"],
+        ("max_steps=5", "max_steps was 4 and is 5"),
+        (pec_bench.Bench, "scores", 6, 4),
+    ),
+    "layout": (
+        ["perception/layout.yaml", ITEMS],
+        ("extrapolate=true", "extrapolate was false and is true"),
+        (perception_layout, "_picture", 1, 1),
+    ),
+    "analysis": (
+        ["perception/analysis.yaml", f"targets={TIMES}", "resamples=100", "repeated_measures=false", "power=null"],
+        ("resamples=101", "resamples was 100 and is 101"),
+        (perception_analysis_run, "_conditions", 1, 1),
+    ),
+}
+AGAIN = {"count", "seconds", "rendering_seconds", "refocus_seconds", "peak_memory_bytes"}  # measured anew each time
+
+
+def command(kind: str, folder: Path, *more: str) -> list[str]:
+    config, *words = KINDS[kind][0]
+    return ["run", str(CONFIGS / config), *words, *more, "--out", str(folder)]
+
+
+def pressed(patch, kind: str, number: int) -> None:
+    """The signal comes in the middle of the run."""
+    owner, name, call, _ = KINDS[kind][2]
+    calls, original = [], getattr(owner, name)
+
+    def noted(*words, **more):
+        calls.append(1)
+        if len(calls) == call:
+            signal.raise_signal(number)
+        return original(*words, **more)
+
+    patch.setattr(owner, name, noted)
+
+
+def counted(patch, kind: str) -> list[int]:
+    owner, name, _, _ = KINDS[kind][2]
+    calls, original = [], getattr(owner, name)
+    patch.setattr(owner, name, lambda *words, **more: (calls.append(1), original(*words, **more))[1])
+    return calls
+
+
+def without(value, names=AGAIN):
+    """Nested values without what is measured anew."""
+    if isinstance(value, dict):
+        return {key: without(each) for key, each in value.items() if key not in names}
+    return [without(each) for each in value] if isinstance(value, list) else value
+
+
+def results(folder: Path) -> dict[str, object]:
+    """All that an interruption must not change."""
+    found: dict[str, object] = {"summary": without(json.loads((folder / "summary.json").read_text()))}
+    for path in sorted(folder.rglob("*.*")):
+        name = str(path.relative_to(folder))
+        if path.suffix == ".npy":
+            found[name] = (np.load(path).shape, np.load(path).tobytes())
+        elif path.suffix == ".csv":
+            with open(path, newline="") as stream:
+                found[name] = without(list(csv.DictReader(stream)))
+        elif path.suffix == ".png":
+            found[name] = path.read_bytes()
+        else:
+            found[name] = "there"
+    return found
+
+
+@pytest.fixture(scope="module")
+def whole(tiny, tmp_path_factory):
+    """Each kind's run without an interruption, done when asked for."""
+    place, done = tmp_path_factory.mktemp("whole"), {}
+
+    def of(kind: str):
+        if kind not in done:
+            assert main(command(kind, place / kind)) == 0
+            done[kind] = results(place / kind)
+        return done[kind]
+
+    return of
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_signal_leaves_a_folder_that_two_commands_complete(kind, whole, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(eye_run, "_SAVE_EVERY", -1.0, raising=False)
+    folder = tmp_path / "a"
+    with monkeypatch.context() as patch:
+        pressed(patch, kind, signal.SIGTERM)
+        assert main(command(kind, folder)) == 130
+    assert f"holotorch resume {folder}" in capsys.readouterr().err and not (folder / "summary.json").exists()
+    if kind not in ("layout", "analysis"):
+        assert (folder / "checkpoint.pt").exists() and (folder / "interrupted.json").exists()
+    (folder / ".checkpoint.pt.1.partial").write_bytes(b"of a killed process")
+    shutil.copytree(folder, tmp_path / "b")
+    for copy, words in ((folder, ["resume", str(folder)]), (tmp_path / "b", command(kind, tmp_path / "b"))):
+        with monkeypatch.context() as patch:
+            calls = counted(patch, kind)
+            assert main(words) == 0
+        assert len(calls) == KINDS[kind][2][3]  # what was done is not done again
+        assert results(copy) == whole(kind)
+        assert not list(copy.glob(".*")) and not (copy / "checkpoint.pt").exists()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_run_of_other_settings_is_refused(kind, tmp_path, capsys, monkeypatch):
+    folder, (word, said) = tmp_path / "a", KINDS[kind][1]
+    with monkeypatch.context() as patch:
+        pressed(patch, kind, signal.SIGINT)
+        assert main(command(kind, folder)) == 130
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    capsys.readouterr()
+    assert main(command(kind, folder, word)) == 2
+    cure = f"choose another --out, or go on with that one: holotorch resume {folder}"
+    assert f"{folder} holds an unfinished run of another configuration: {said}; {cure}" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_signal_after_the_last_number_changes_nothing(kind, tmp_path, monkeypatch, capsys):
+    """It comes while the page is written, when summary.json says that the run is complete."""
+    replace = files.os.replace
+
+    def late(source, target):
+        if Path(target).name == "summary.json":
+            replace(source, target)
+            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(signal.SIGINT)
+        else:
+            replace(source, target)
+
+    monkeypatch.setattr(files.os, "replace", late)
+    assert main(command(kind, tmp_path / "a")) == 0
+    assert (tmp_path / "a" / "report.html").is_file() and "interrupted" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["eye", "study", "layout", "analysis"])
+def test_a_picture_that_cannot_be_written_takes_nothing_along(kind, whole, tmp_path, monkeypatch, capsys):
+    write = files.replacing
+
+    def full(path, **more):
+        if path.suffix == ".png":
+            raise OSError(28, "No space left on device", str(path))
+        return write(path, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "replacing", full)
+        assert main(command(kind, tmp_path / "a")) == 1
+    error = capsys.readouterr().err
+    assert len(re.findall("warning: .*png cannot be written", error)) == 1 and "Traceback" not in error
+    assert "png: No space left" in json.loads((tmp_path / "a" / "interrupted.json").read_text())["failure"]
+    kept = {name for name in whole(kind) if name.endswith((".npy", ".csv"))}
+    assert kept and all((tmp_path / "a" / name).is_file() for name in kept)
+    assert main(["resume", str(tmp_path / "a")]) == 0
+    assert results(tmp_path / "a") == whole(kind)
+
+
+def test_two_runs_never_share_a_folder(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("fcntl", reason="folders cannot be locked here")
+    original, codes = perception_layout._picture, []
+
+    def meanwhile(*words):
+        monkeypatch.setattr(perception_layout, "_picture", original)
+        codes.extend([main(["resume", str(tmp_path / "a")]), main(command("layout", tmp_path / "a"))])
+        return original(*words)
+
+    monkeypatch.setattr(perception_layout, "_picture", meanwhile)
+    assert main(command("layout", tmp_path / "a")) == 0 and codes == [2, 2]
+    assert capsys.readouterr().err.count("is in use by another run; choose another --out") == 2
+
+
+def test_what_a_kill_at_the_start_leaves_is_no_obstacle(tmp_path):
+    (tmp_path / "a" / "images").mkdir(parents=True)
+    assert main(command("layout", tmp_path / "a")) == 0
+
+
+def test_other_peoples_folders_are_left_alone(tmp_path, capsys):
+    (tmp_path / "a").mkdir()
+    for name, text in (("config.yaml", "experiment: other"), ("env.json", "{}"), (".x.partial", "mine")):
+        (tmp_path / "a" / name).write_text(text)
+    assert main(command("layout", tmp_path / "a")) == 2
+    assert "holds files already; choose another --out or delete it" in capsys.readouterr().err
+    assert len(list((tmp_path / "a").iterdir())) == 3
