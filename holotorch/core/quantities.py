@@ -110,7 +110,7 @@ ACCOMMODATION = Quantity("accommodation", "m", 1e-3, math.inf, (0.05, 10.0), inf
 WAVEFRONT_ERROR = Quantity("wavefront error", "m", 0.0, 1e-3, (1e-9, 10e-6), zero=True, negative=True)
 SOFTNESS = Quantity("softness", "m", 0.0, 10e-3, (1e-6, 1e-3), zero=True)
 # Voxels of a scan: atoms to a room.
-VOXEL = Quantity("volume spacing", "m", 1e-11, 0.1, (1e-6, 5e-3))
+VOXEL = Quantity("volume spacing", "m", 1e-12, 0.1, (1e-6, 5e-3))
 # Cauchy's b of a birefringence; 0.0085 um^2 is 8.5e-15.
 CAUCHY_B = Quantity("b", "square metres", 0.0, 1e-12, (1e-16, 1e-13), zero=True, negative=True)
 # Crosstalk of heaters; beyond it the kernel is singular to double precision.
