@@ -139,7 +139,7 @@ def test_boards_by_their_words():
         ("", "chessboard 9x6 25mm"),
         ("chess 9x6 25mm", "chessboard 9x6 25mm"),
         ("chessboard 9 25mm", "expected chessboard"),
-        ("chessboard 9x6 25", "25 mm are 0.025"),
+        ("chessboard 9x6 25", "25 looks like millimetres: pass 25e-3"),
         ("chessboard 9x6 -25mm", "--board: square must be above zero in metres, got -0.025"),
         ("chessboard 9x6 25foot", "expected a length"),
         ("chessboard 9x6 25mm 3mm", "expected chessboard"),
