@@ -40,7 +40,7 @@ class Quantity:
         """What is wrong with ``value``, as the end of a sentence that begins with its name; None if nothing is."""
         size = abs(value)
         if math.isnan(value) or (math.isinf(value) and not self.infinite):
-            return f"must be finite{self._in()}, got {value!r}"
+            return f"must be finite{self._in()}{', or infinite' * self.infinite}, got {value!r}"
         if (value < 0 and not self.negative) or (value == 0 and not self.zero):
             wanted = "other than zero" if self.negative else "at least zero" if self.zero else "above zero"
             return f"must be {wanted}{self._in()}, got {value!r}"
@@ -52,13 +52,16 @@ class Quantity:
     def range(self) -> str:
         """The range in words, such as "between 1 nm and 2 mm"."""
         low, high = shown(self.low, self.unit), shown(self.high, self.unit)
-        ends = f"within {low} .. {high}" if self.high < math.inf else f"at {low} or more"
+        if self.high == math.inf:
+            return f"at {low} or more"
         if self.low == 0:
-            ends = f"at {high} or less"
-        return ends + " in magnitude" * self.negative + " or be 0" * (self.zero and self.low > 0)
+            return f"within {'-' * self.negative}{high if self.negative else low} .. {high}"
+        return f"within {low} .. {high}" + " in magnitude" * self.negative + " or be 0" * self.zero
 
     def cure(self, value: float) -> str:
         """What to change, such as the prefix that was forgotten."""
+        if value == 0 or (value < 0 and not self.negative):
+            return ""
         for name, scale in _PREFIXES if self.unit == "m" else ():
             if self.usual[0] <= abs(value) * scale * (1 + 1e-9) and abs(value) * scale <= self.usual[1] * (1 + 1e-9):
                 short = 0.1 <= abs(value) < 1e5
@@ -88,15 +91,19 @@ def shown(value: float, unit: str) -> str:
 WAVELENGTH = Quantity("wavelength", "m", 10e-9, 300e-6, (200e-9, 20e-6))
 # Full width of a spectrum, or a difference of wavelengths: the line of a stabilised laser to white light.
 BANDWIDTH = Quantity("fwhm", "m", 1e-15, 100e-6, (0.1e-9, 500e-9))
+WAVELENGTH_CHANGE = Quantity("change", "m", 0.0, 100e-6, (0.1e-9, 500e-9), zero=True, negative=True)
 # Samples of a plane: of a wave in fine detail, to a wall some metres away. Pixels in micrometres or millimetres
 # (8, 8e-3) lie above.
 PITCH = Quantity("pitch", "m", 1e-9, 2e-3, (100e-9, 200e-6))
 # Along the axis that light travels on a bench, in a room or through the open air, to either side.
 DISTANCE = Quantity("distance", "m", 0.0, 1e3, (1e-3, 3.0), zero=True, negative=True)
-# From a hologram to something in front of it.
+# Of pictures and planes of an experiment on either side of a hologram.
+PLANE = Quantity("distance", "m", 0.0, 10.0, (1e-3, 3.0), zero=True, negative=True)
+# From a hologram, or an eye, to something in front of it.
 DEPTH = Quantity("depth", "m", 1e-9, 100.0, (1e-3, 3.0))
 # Across the axis: sizes and positions on a plane.
 WIDTH = Quantity("width", "m", 1e-9, 10.0, (1e-3, 0.5))
+SPREAD = Quantity("spread", "m", 1e-9, 1e3, (1e-6, 0.1))
 OFFSET = Quantity("offset", "m", 0.0, 10.0, (1e-6, 0.1), zero=True, negative=True)
 # A microlens to a weak spectacle lens.
 FOCAL_LENGTH = Quantity("focal_length", "m", 1e-6, 100.0, (1e-3, 1.0), negative=True, infinite=True)
@@ -121,6 +128,9 @@ TOOL_LENGTH = Quantity("length", "m", 1e-3, 3.0, (10e-3, 2.0))
 TOOL_POSITION = Quantity("position", "m", 0.0, 3.0, (5e-3, 2.0), zero=True, negative=True)
 EDGE_DEVIATION = Quantity("deviation", "pixels", 1e-9, 1e6, (0.01, 2.0))
 TOOL_OFFSET = Quantity("offset", "m", 0.0, 50e-3, (0.1e-3, 20e-3), zero=True, negative=True)
+TOOL_DEVIATION = Quantity("deviation", "m", 1e-9, 1.0, (0.1e-3, 50e-3))
 # In front of a camera, beside a tool or on a headset.
 POSITION = Quantity("position", "m", 0.0, 10.0, (10e-3, 5.0), zero=True, negative=True)
+SCREEN = Quantity("size", "m", 1e-3, 100.0, (0.05, 5.0))  # of a display that is looked at, to a planetarium
+CAMERA_DEPTH = Quantity("depth", "m", 1e-3, 10.0, (10e-3, 5.0))
 BOARD_SQUARE = Quantity("square", "m", 10e-6, 1.0, (1e-3, 0.2))

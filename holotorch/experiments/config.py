@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
+from holotorch.core.quantities import SIGMA_PX
 from holotorch.experiments.config_analysis import AnalysisSettings
 from holotorch.experiments.config_eye import ObserverSettings
 from holotorch.experiments.config_perception import LayoutSettings
@@ -22,6 +23,7 @@ from holotorch.experiments.settings import (
     Wavelength,
     number,
     pair,
+    plausible,
     several,
 )
 from holotorch.experiments.source import Key, read_source
@@ -83,7 +85,7 @@ class ModulatorSettings(Settings):
     ``power_weight``: of the sum of the heater phases in the loss, whose other part is a squared error of the image.
     """
 
-    sigma_px: Annotated[Number, Field(ge=0, le=100)]
+    sigma_px: Annotated[Number, plausible(SIGMA_PX)]
     kernel_size: Annotated[Count, Field(le=401)] | None = None
     max_phase: Annotated[Number, Field(ge=0.1, le=1000)] | None = None
     bits: Annotated[Count, Field(le=16)] | None = None

@@ -5,7 +5,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
-from holotorch.experiments.settings import Count, Length, Number, Settings, number, several, within
+from holotorch.core.quantities import DEPTH, EYE_LENGTH, FOCAL_LENGTH, PUPIL_RADIUS, SPACING
+from holotorch.experiments.settings import Count, Length, Number, Settings, number, plausible, several
 from holotorch.io.bundled import find_config
 
 Source = Literal["laser", "narrow_sled", "sled", "led"]
@@ -40,24 +41,24 @@ class MagnifyingSettings(Settings):
     """
 
     kind: Literal["magnifying"]
-    focal_length: Positive = 20e-3
-    eye_distance: Positive = 50e-3
-    focus_distance: Positive = 120e-3
-    lens_distance: Positive | None = None
+    focal_length: Annotated[Positive, plausible(FOCAL_LENGTH)] = 20e-3
+    eye_distance: Annotated[Positive, plausible(SPACING)] = 50e-3
+    focus_distance: Annotated[Positive, plausible(DEPTH)] = 120e-3
+    lens_distance: Annotated[Positive, plausible(SPACING)] | None = None
 
 
 class PlanarSettings(Settings):
     """No eyepiece: the eye looks at the hologram from ``distance``."""
 
     kind: Literal["planar"]
-    distance: Positive = 250e-3
+    distance: Annotated[Positive, plausible(SPACING)] = 250e-3
 
 
 class EyeSettings(Settings):
     """The eye: radius of its pupil, distance of its retina, and whether it has the colour error of human eyes."""
 
-    pupil_radius: Annotated[Positive, within(1e-5, 2e-2, "the radius of a pupil, 10 um to 20 mm")] = 1.5e-3
-    axial_length: Annotated[Positive, within(1e-3, 0.2, "the length of an eye, 1 mm to 0.2 m; 24 mm is usual")] = 24e-3
+    pupil_radius: Annotated[Length, plausible(PUPIL_RADIUS)] = 1.5e-3
+    axial_length: Annotated[Length, plausible(EYE_LENGTH)] = 24e-3
     chromatic: bool = False
 
 
@@ -104,8 +105,8 @@ class ObserverSettings(Settings):
     display: Annotated[MagnifyingSettings | PlanarSettings, Field(discriminator="kind")]
     eye: EyeSettings = EyeSettings()
     light: LightSettings = LightSettings()
-    focus: Annotated[tuple[Positive, ...], BeforeValidator(several)] | None = None
+    focus: Annotated[tuple[Annotated[Positive, plausible(DEPTH)], ...], BeforeValidator(several)] | None = None
     seeds: Annotated[Count, Field(le=64)] = 2
     tolerance: Annotated[Number, Field(gt=0, lt=1)] = 0.03
     sweep: SweepSettings | None = None
-    tradeoff: Annotated[tuple[Positive, ...], BeforeValidator(several)] = ()
+    tradeoff: Annotated[tuple[Annotated[Positive, plausible(DEPTH)], ...], BeforeValidator(several)] = ()

@@ -11,10 +11,11 @@ from pydantic import AfterValidator, BeforeValidator, Discriminator, Field
 from pydantic_core import PydanticCustomError
 from torch import Tensor
 
+from holotorch.core.quantities import SCREEN
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.messages import validated
 from holotorch.experiments.perception_design import Design, make_design
-from holotorch.experiments.settings import Count, Length, Number, Settings, Side, number, several, within
+from holotorch.experiments.settings import Count, Length, Number, Settings, Side, number, plausible, several, within
 from holotorch.experiments.source import Key, read_source
 from holotorch.perception.geometry import CurvedScreen, FlatScreen
 
@@ -22,7 +23,7 @@ Eccentricity = Annotated[
     Number, within(0, 120, "an eccentricity between 0 and 120 deg (left and right are drawn by the design)")
 ]
 Size = Annotated[Number, within(0.1, 80, "a size between 0.1 and 80 deg")]
-Metres = Annotated[Length, within(1e-2, 100, "a length between 1 cm and 100 m")]
+Metres = Annotated[Length, plausible(SCREEN)]
 Seconds = Annotated[Number, within(0.02, 60, "a time between 0.02 and 60 seconds, not milliseconds")]
 Whole = Annotated[int, BeforeValidator(number), Field(ge=0)]
 _SLACK_PX = 0.5

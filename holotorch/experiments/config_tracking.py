@@ -9,9 +9,10 @@ import yaml
 from pydantic import BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
+from holotorch.core.quantities import TOOL_LENGTH, TOOL_POSITION, TOOL_RADIUS
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.messages import validated
-from holotorch.experiments.settings import Count, Length, Number, Settings, Side, number, within
+from holotorch.experiments.settings import Count, Length, Number, Settings, Side, number, plausible
 from holotorch.experiments.source import Source, read_source
 from holotorch.io.files import write_text
 from holotorch.tracking.alignment import Alignment
@@ -75,10 +76,10 @@ class CameraSettings(Settings):
 class CatheterSettings(Settings):
     """A catheter; see ``Catheter``. ``edges``: distances of the band edges from the tip; ``colours``: sRGB triples."""
 
-    edges: Annotated[tuple[Length, ...], Field(min_length=4)]
+    edges: Annotated[tuple[Annotated[Length, plausible(TOOL_POSITION)], ...], Field(min_length=4)]
     colours: tuple[tuple[Level, Level, Level], ...]
-    radius: Annotated[Length, within(1e-5, 0.05, "a radius between 10 um and 50 mm")]
-    length: Length
+    radius: Annotated[Length, plausible(TOOL_RADIUS)]
+    length: Annotated[Length, plausible(TOOL_LENGTH)]
 
 
 class HeadsetSettings(Settings):

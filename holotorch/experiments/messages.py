@@ -71,8 +71,10 @@ def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
     wanted = next((text for start, text in _EXPECTED.items() if kind.startswith(start)), None)
     wanted = wanted or entry["msg"].replace("Input should be ", "").removeprefix("expected ")
     near = difflib.get_close_matches(str(given)[:100], re.findall(r"'([^']+)'", wanted), 1)
+    # A length with a unit, such as "8 m", has not lost one.
+    cure = entry["ctx"]["cure"] if kind == "quantity" and not isinstance(given, str) else ""
     shown = "nothing" if given is None else "NaN" if isinstance(given, float) and math.isnan(given) else short(given)
-    return source.mistake(key, f"expected {wanted}, got {shown}" + (f"; did you mean {near[0]!r}?" if near else ""))
+    return source.mistake(key, f"expected {wanted}, got {shown}" + (f"; did you mean {near[0]!r}?" if near else cure))
 
 
 def _unknown(model: type[BaseModel], location: tuple[str | int, ...], name: str) -> str:

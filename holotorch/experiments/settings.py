@@ -7,6 +7,8 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
+from holotorch.core.quantities import PITCH, PLANE, WAVELENGTH, Quantity
+
 _POWERS = {"m": 0, "cm": -2, "mm": -3, "um": -6, "µm": -6, "μm": -6, "nm": -9}  # of ten, in metres
 # No two parts of it match the same characters, so that a text that fits in no way takes linear time.
 _LENGTH = re.compile(r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-zµμ]*)")
@@ -45,6 +47,19 @@ def within(least: float, most: float, words: str) -> AfterValidator:
     return AfterValidator(check)
 
 
+def plausible(kind: Quantity) -> AfterValidator:
+    """The range of a quantity, in the words of :mod:`holotorch.core.quantities`."""
+
+    def check(value: float) -> float:
+        if kind.problem(value):
+            what = "a length" if kind.unit == "m" else f"a number of {kind.words}"
+            words = {"words": f"{what} {kind.range}", "cure": kind.cure(value) if kind.unit == "m" else ""}
+            raise PydanticCustomError("quantity", "expected {words}", words)
+        return value
+
+    return AfterValidator(check)
+
+
 def pair(value: Any) -> Any:
     """One value for both axes."""
     return value if isinstance(value, list | tuple) else (value, value)
@@ -58,11 +73,9 @@ def several(value: Any) -> Any:
 Number = Annotated[float, BeforeValidator(number), Field(allow_inf_nan=False)]
 Count = Annotated[int, BeforeValidator(number), Field(ge=1)]
 Length = Annotated[float, BeforeValidator(metres), Field(allow_inf_nan=False)]
-# Ranges that catch a forgotten unit: 530 is no wavelength in metres and 9 no pitch.
-Wavelength = Annotated[Length, within(1e-7, 2e-5, "a wavelength between 100 nm and 20 um")]
-# Of an image or a plane, either side of the hologram.
-Distance = Annotated[Length, within(-10, 10, "a distance of at most 10 m; 360 mm is 0.36")]
-Pitch = Annotated[Length, within(1e-9, 1e-3, "a pitch between 1 nm and 1 mm")]
+Wavelength = Annotated[Length, plausible(WAVELENGTH)]
+Distance = Annotated[Length, plausible(PLANE)]  # of an image or a plane, either side of the hologram
+Pitch = Annotated[Length, plausible(PITCH)]
 Side = Annotated[Count, Field(le=16384)]
 
 

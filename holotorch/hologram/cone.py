@@ -18,6 +18,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import DEPTH
 from holotorch.optics.geometry import lateral_spread
 from holotorch.optics.kernels import carrier, turns_phasor
 
@@ -73,15 +74,14 @@ def check_scene(grid: Grid, wavelength: float, depths, stride: int) -> tuple[flo
 
     Raises:
         TypeError: Not numbers.
-        ValueError: No depth, or one that is not finite and above zero: all points must lie before the hologram.
+        ValueError: No depth, or one that is not above zero (all points lie before the hologram) or beyond 100 m.
     """
     wavelength = checks.wavelengths(wavelength)[0]
     items = depths.tolist() if isinstance(depths, Tensor) else list(depths)
     if not items:
         raise ValueError("depths must hold at least one distance in metres, got none")
     for depth in items:
-        if not checks.finite("depth", depth, "metres") > 0:
-            raise ValueError(f"depths must be above zero, before the hologram, got {depth!r}; move the scene away")
+        checks.quantity(DEPTH, depth, "depth of a plane")
     return wavelength, tuple(map(float, items)), checks.whole("stride", stride, 1)
 
 

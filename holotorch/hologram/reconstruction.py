@@ -9,6 +9,7 @@ from holotorch.core import checks
 from holotorch.core.complex import intensity
 from holotorch.core.fourier import fft2, ifft2
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import DEPTH
 from holotorch.hologram.cone import taper
 from holotorch.optics.propagate import propagate
 
@@ -19,7 +20,7 @@ def refocused(hologram: Tensor, grid: Grid, wavelength: float, depth: float, *, 
     The hologram holds waves exp(+ikr) that come from there, so the light is followed back (Sec. 5.5.1). Brightness is
     that of the waves: a source of amplitude A in focus has about A times a constant of the grid.
     """
-    return propagate(hologram, grid, wavelength, -checks.positive("depth", depth, "metres"), tolerance=tolerance)
+    return propagate(hologram, grid, wavelength, -checks.quantity(DEPTH, depth), tolerance=tolerance)
 
 
 def focal_stack(

@@ -3,6 +3,7 @@
 import math
 
 from holotorch.core import checks
+from holotorch.core.quantities import DEPTH, DISTANCE, WAVELENGTH_CHANGE
 from holotorch.optics.quadrature import correlation
 from holotorch.optics.spectrum import Spectrum
 
@@ -28,7 +29,7 @@ def path_difference(distance: float, aperture: float, *, tilt: float = 0.0) -> f
 
     Paraxial to the order of lambda f; at a sine of 0.1 it is short by 1 %.
     """
-    distance = abs(checks.finite("distance", distance, "metres"))
+    distance = abs(checks.quantity(DISTANCE, distance))
     aperture, tilt = checks.positive("aperture", aperture), abs(checks.finite("tilt", tilt))
     if aperture + tilt > 1:
         raise ValueError(f"aperture and tilt are sines and must add up to at most 1, got {aperture:g} and {tilt:g}")
@@ -72,7 +73,7 @@ def chromatic_defocus(distance: float, wavelength: float, change: float) -> floa
     A hologram is a diffractive lens, whose power is proportional to the wavelength.
     """
     wavelength = checks.wavelengths(wavelength)[0]
-    return -checks.finite("distance", distance, "metres") * checks.finite("change", change, "metres") / wavelength
+    return -checks.quantity(DISTANCE, distance) * checks.quantity(WAVELENGTH_CHANGE, change) / wavelength
 
 
 def depth_of_focus(wavelength: float, aperture: float) -> float:
@@ -95,5 +96,5 @@ def optimum_fwhm(wavelength: float, aperture: float, distance: float, *, defocus
         distance: From the hologram to the depth in focus, in metres, above 0.
         defocus: Depths of focus by which the half width may move the focus.
     """
-    distance, defocus = checks.positive("distance", distance, "metres"), checks.positive("defocus", defocus)
+    distance, defocus = checks.quantity(DEPTH, distance, "distance"), checks.positive("defocus", defocus)
     return 2 * defocus * depth_of_focus(wavelength, aperture) * checks.wavelengths(wavelength)[0] / distance

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import OFFSET, SPREAD
 
 _MIXTURES = 24
 
@@ -38,7 +39,7 @@ def described(
 ) -> Content:
     """Content by its ``band``, or by its ``spread``: how far (y, x) in metres it travels sideways over the distance."""
     for rim in margin:
-        if checks.finite("margin", rim, "metres") < 0:
+        if checks.quantity(OFFSET, rim, "margin") < 0:
             raise ValueError(f"margin must be at least 0 metres, got {rim!r}")
     nyquist = [0.5 / pitch for pitch in grid.pitch]
     if band is not None and spread is not None:
@@ -47,7 +48,7 @@ def described(
     if band is not None:
         limits = [checks.positive("band", limit, "cycles per metre") for limit in band]
     elif spread is not None:
-        reaches = [checks.positive("spread", reach, "metres") for reach in spread]
+        reaches = [checks.quantity(SPREAD, reach) for reach in spread]
         if distance:
             limits = [reach / math.hypot(reach, distance) / wavelength for reach in reaches]
     y, x = (min(limit, top) for limit, top in zip(limits, nyquist, strict=True))

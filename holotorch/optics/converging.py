@@ -11,6 +11,7 @@ from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.fourier import filter_spectrum, good_length
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import DISTANCE, FOCAL_LENGTH, OFFSET
 from holotorch.optics.kernels import carrier, turns_phasor
 from holotorch.optics.lens_taps import lens_matrices
 from holotorch.optics.taps import fresnel_taps, tap_indices
@@ -116,14 +117,13 @@ class ConvergingFresnel(nn.Module):
     ):
         super().__init__()
         self.grid, self.wavelengths = grid, checks.wavelengths(wavelengths)
-        self.distance = checks.finite("distance", distance, "metres")
-        unbent = isinstance(focus, float) and math.isinf(focus)
-        self.focus = focus if unbent else checks.finite("focus", focus, "metres, or infinite")
-        self.offset = checks.pair("offset", offset, "metres")
+        self.distance = checks.quantity(DISTANCE, distance)
+        self.focus = checks.quantity(FOCAL_LENGTH, focus, "focus")
+        unbent = math.isinf(self.focus)
+        y, x = checks.pair("offset", offset, "metres")
+        self.offset = checks.quantity(OFFSET, y), checks.quantity(OFFSET, x)
         if self.distance == 0:
             raise ValueError("distance must not be 0; at 0 multiply the field by the phase of the lens")
-        if self.focus == 0:
-            raise ValueError("focus must not be 0; use float('inf') for no lens")
         self.magnification = 1.0 if unbent else (self.focus - self.distance) / self.focus
         self.out_grid = out_grid or self._default_grid()
         self.scaled = self._is_scaled()

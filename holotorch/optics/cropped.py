@@ -7,6 +7,7 @@ import torch
 from holotorch.core import checks
 from holotorch.core.fourier import good_length
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import DISTANCE
 from holotorch.optics.candidates import FINEST, crop_length
 from holotorch.optics.passage import passage, shifts
 from holotorch.optics.predict import AxisContent
@@ -47,7 +48,7 @@ class CroppedKernel(SpectralFilter):
         paraxial: bool = False,
         offset: tuple[float, float] = (0.0, 0.0),
     ):
-        distance = checks.finite("distance", distance, "metres")
+        distance = checks.quantity(DISTANCE, distance)
         waves = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
         longest = waves.max().item()
         path = passage(grid, None, offset, (0.0, 0.0), waves.tolist())

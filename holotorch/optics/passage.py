@@ -9,6 +9,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import OFFSET
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ def passage(
     """
     if out is not None and not isinstance(out, Grid):
         raise TypeError(f"out_grid must be a Grid, such as Grid((256, 256), pitch=8e-6), got {out!r}")
-    y, x = checks.pair("offset", offset, "metres")
+    y, x = (checks.quantity(OFFSET, each) for each in checks.pair("offset", offset, "metres"))
     sines = tilt.detach().reshape(-1).tolist() if isinstance(tilt, Tensor) else tilt
     sy, sx = checks.pair("tilt", sines, "sines of the carrier's direction")
     if sy or sx:

@@ -8,6 +8,7 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.core.grid import Grid
 from holotorch.core.plan import Plan
+from holotorch.core.quantities import DISTANCE
 from holotorch.optics.candidates import Candidate, candidates
 from holotorch.optics.content import described, measured
 from holotorch.optics.passage import Passage, passage
@@ -56,7 +57,7 @@ def plan_propagation(
     found = find(
         path,
         waves,
-        [checks.finite("distance", z, "metres") for z in _listed(distance)],
+        [checks.quantity(DISTANCE, z) for z in _listed(distance)],
         band=band,
         spread=spread,
         margin=margin,

@@ -12,6 +12,7 @@ from holotorch.core.checks import SamplingWarning
 from holotorch.core.fourier import fft2, ifft2, multiplied
 from holotorch.core.grid import Grid
 from holotorch.core.plan import Plan
+from holotorch.core.quantities import DISTANCE, WAVELENGTH
 from holotorch.optics.candidates import FINEST, Candidate
 from holotorch.optics.kernels import carrier
 from holotorch.optics.passage import Passage, passage
@@ -172,7 +173,7 @@ class Propagator(nn.Module):
     ):
         super().__init__()
         self.wavelengths = checks.wavelengths(wavelengths)
-        self.distance = checks.finite("distance", distance, "metres")
+        self.distance = checks.quantity(DISTANCE, distance)
         path = passage(grid, out_grid, offset, tilt, self.wavelengths)
         self.grid, self.out_grid, self.offset, self.tilt = grid, path.out, path.offset, path.tilt
         content: dict[str, Any] = {"band": band, "spread": spread, "margin": margin, "field": example}
@@ -241,10 +242,9 @@ def kernel_of(
 
 
 def _float64(name: str, value: float | Tensor, field: Tensor) -> Tensor:
+    kind = WAVELENGTH if name == "wavelength" else DISTANCE
     if not isinstance(value, Tensor):
-        value = torch.tensor(checks.finite(name, value, "metres"), dtype=torch.float64)
+        value = torch.tensor(checks.quantity(kind, value), dtype=torch.float64)
     value = value.to(field.device, torch.float64)
-    checks.all_finite(name, value.detach())
-    if name == "wavelength":
-        checks.wavelengths(value.detach().reshape(-1).tolist() or 1.0)  # none at all is no mistake
+    checks.quantities(kind, value)
     return value

@@ -11,6 +11,7 @@ from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.fourier import centred_fft2, centred_ifft2, filter_spectrum
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import DISTANCE
 from holotorch.optics.geometry import least_padding
 from holotorch.optics.kernels import angular_spectrum_kernel, carrier, fresnel_kernel
 
@@ -92,7 +93,7 @@ class AngularSpectrum(SpectralFilter):
         pad: float | tuple[float, float] = 2,
         band_limit: bool = True,
     ):
-        distance = checks.finite("distance", distance, "metres")
+        distance = checks.quantity(DISTANCE, distance)
         waves = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
         padded = grid.padded(pad)
         kernel = angular_spectrum_kernel(padded, waves, distance, band_limit=band_limit)
@@ -116,7 +117,7 @@ class Fresnel(SpectralFilter):
         *,
         pad: float | tuple[float, float] = 2,
     ):
-        distance = checks.finite("distance", distance, "metres")
+        distance = checks.quantity(DISTANCE, distance)
         waves = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
         kernel = fresnel_kernel(grid.padded(pad), waves, distance)
         super().__init__(grid, wavelengths, kernel * carrier(waves, distance)[:, None, None])

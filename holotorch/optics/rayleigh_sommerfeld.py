@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import DISTANCE, OFFSET
 
 _CHUNK = 4_000_000  # kernel values at a time: 64 MB of complex128
 
@@ -47,8 +48,9 @@ class RayleighSommerfeld(nn.Module):
         super().__init__()
         self.grid, self.out_grid = grid, out_grid or grid
         self.wavelengths = checks.wavelengths(wavelengths)
-        self.distance = checks.finite("distance", distance, "metres")
-        self.offset = checks.pair("offset", offset, "metres")
+        self.distance = checks.quantity(DISTANCE, distance)
+        y, x = checks.pair("offset", offset, "metres")
+        self.offset = checks.quantity(OFFSET, y), checks.quantity(OFFSET, x)
         if self.distance == 0:
             raise ValueError("distance must not be 0 for a sum over point sources")
         self._check_sampling()

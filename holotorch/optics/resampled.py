@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from holotorch.core import checks
 from holotorch.core.fourier import fft2, good_length, ifft2, multiplied
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import DISTANCE
 from holotorch.optics.candidates import FINEST, resampling_rim
 from holotorch.optics.kernels import carrier
 from holotorch.optics.passage import Passage, passage
@@ -110,7 +111,7 @@ class ResampledKernel(nn.Module):
     ):
         super().__init__()
         self.grid, self.out_grid, self.wavelengths = grid, out_grid, checks.wavelengths(wavelengths)
-        self.distance = checks.finite("distance", distance, "metres")
+        self.distance = checks.quantity(DISTANCE, distance)
         path = passage(grid, out_grid, offset, tilt, self.wavelengths)
         self.offset = path.offset
         if self.distance == 0:

@@ -7,6 +7,7 @@ with its image s1 in front of it (virtual, on the same side), eye d_eye behind i
 import math
 
 from holotorch.core import checks
+from holotorch.core.quantities import DEPTH, DISTANCE, FOCAL_LENGTH, PITCH, PUPIL_RADIUS, WAVELENGTH, WIDTH
 
 
 def planar_fov(pitch: float, wavelength: float) -> float:
@@ -21,7 +22,7 @@ def magnified_fov(width: float, focal_length: float) -> float:
     light that leaves the hologram. What of the scene fills it is :func:`scene_fov`, what passes the iris
     :func:`vignetting`.
     """
-    return 2 * math.atan(checks.positive("width", width, "metres") / (2 * _positive_focal_length(focal_length)))
+    return 2 * math.atan(checks.quantity(WIDTH, width) / (2 * _positive_focal_length(focal_length)))
 
 
 def image_distance(object_distance: float, focal_length: float) -> float:
@@ -30,7 +31,7 @@ def image_distance(object_distance: float, focal_length: float) -> float:
     Raises:
         ValueError: The object is farther than the focal length: its image is real, behind the lens.
     """
-    s0, f = checks.positive("object_distance", object_distance, "metres"), _positive_focal_length(focal_length)
+    s0, f = checks.quantity(DEPTH, object_distance, "object_distance"), _positive_focal_length(focal_length)
     if math.isinf(f):
         return s0
     if s0 > f:
@@ -43,7 +44,7 @@ def object_distance(image_distance: float, focal_length: float) -> float:
     f = _positive_focal_length(focal_length)
     if image_distance == math.inf:
         return f
-    s1 = checks.positive("image_distance", image_distance, "metres")
+    s1 = checks.quantity(DEPTH, image_distance, "image_distance")
     return 1 / (1 / s1 + 1 / f)
 
 
@@ -56,7 +57,7 @@ def eyepiece_distance(volume_distance: float, focus_distance: float, focal_lengt
         ValueError: The focus lies between eyepiece and eye.
     """
     s1 = _before_eyepiece(focus_distance, eye_distance)
-    return checks.finite("volume_distance", volume_distance, "metres") + object_distance(s1, focal_length)
+    return checks.quantity(DISTANCE, volume_distance, "volume_distance") + object_distance(s1, focal_length)
 
 
 def scene_fov(size: float, object_distance: float, focal_length: float, eye_distance: float) -> float:
@@ -66,7 +67,7 @@ def scene_fov(size: float, object_distance: float, focal_length: float, eye_dist
     """
     image_distance(object_distance, focal_length)
     across = object_distance + eye_distance * (1 - object_distance / focal_length)
-    return 2 * math.atan(checks.positive("size", size, "metres") / (2 * across))
+    return 2 * math.atan(checks.quantity(WIDTH, size, "size") / (2 * across))
 
 
 def volume_size(fov: float, focus_distance: float, focal_length: float, eye_distance: float) -> float:
@@ -93,7 +94,7 @@ def accommodation_range(
 
 def region_apex(width: float, pitch: float, wavelength: float) -> float:
     """Distance in metres at which regions I and III of Sec. 5.6.2 touch on the axis: w / (2 tan(theta))."""
-    return checks.positive("width", width, "metres") / (2 * _tangent(pitch, wavelength))
+    return checks.quantity(WIDTH, width) / (2 * _tangent(pitch, wavelength))
 
 
 def region(height: float, distance: float, width: float, pitch: float, wavelength: float) -> int:
@@ -116,7 +117,7 @@ def placement(size: float, width: float, pitch: float, wavelength: float, depth:
     (V + w) / (2 tan(theta)) + depth / 2, a cube by default. The thesis's 157.81 mm is for 455 nm: blue, with the
     narrowest cone, decides.
     """
-    near = (checks.positive("size", size, "metres") + width) / (2 * _tangent(pitch, wavelength))
+    near = (checks.quantity(WIDTH, size, "size") + width) / (2 * _tangent(pitch, wavelength))
     return near + (size if depth is None else depth) / 2
 
 
@@ -149,7 +150,7 @@ def vignetting(height: float, first: float, second: float, pupil_radius: float, 
     """
     half = abs(second) * sine
     low, high = max(-pupil_radius, first * height - half), min(pupil_radius, first * height + half)
-    return max(0.0, high - low) / (2 * checks.positive("pupil_radius", pupil_radius, "metres"))
+    return max(0.0, high - low) / (2 * checks.quantity(PUPIL_RADIUS, pupil_radius))
 
 
 def visible_half_width(first: float, second: float, pupil_radius: float, sine: float) -> float:
@@ -168,7 +169,8 @@ def eye_box(size: float, first: float, second: float, sine: float) -> float:
 
 def fresnel_number(radius: float, wavelength: float, distance: float) -> float:
     """w^2 / (wavelength z) of an aperture of half width w (thesis Fig. 4.2)."""
-    return radius**2 / (wavelength * checks.positive("distance", distance, "metres"))
+    number = fresnel_distance(radius, wavelength, 1.0)
+    return number / checks.positive("distance", checks.quantity(DISTANCE, distance), "metres")
 
 
 def fresnel_distance(radius: float, wavelength: float, number: float) -> float:
@@ -177,11 +179,12 @@ def fresnel_distance(radius: float, wavelength: float, number: float) -> float:
     Fig. 4.2: for w = 1 mm and 530 nm it is below 30, where the thesis takes Fresnel's model, from 62.89 mm on, and
     below 1 from 1886.79 mm on, far beyond which it takes Fraunhofer's.
     """
-    return radius**2 / (wavelength * checks.positive("number", number))
+    square = checks.quantity(WIDTH, radius, "radius") ** 2
+    return square / (checks.quantity(WAVELENGTH, wavelength) * checks.positive("number", number))
 
 
 def _sine(pitch: float, wavelength: float) -> float:
-    return min(1.0, checks.positive("wavelength", wavelength, "m") / (2 * checks.positive("pitch", pitch, "m")))
+    return min(1.0, checks.quantity(WAVELENGTH, wavelength) / (2 * checks.quantity(PITCH, pitch)))
 
 
 def _tangent(pitch: float, wavelength: float) -> float:
@@ -192,7 +195,9 @@ def _tangent(pitch: float, wavelength: float) -> float:
 
 
 def _positive_focal_length(value: float) -> float:
-    return math.inf if value == math.inf else checks.positive("focal_length", value, "metres")
+    if checks.quantity(FOCAL_LENGTH, value) < 0:
+        raise ValueError(f"focal_length must be above zero in metres, got {value!r}")
+    return float(value)
 
 
 def _before_eyepiece(focus_distance: float, eye_distance: float) -> float:

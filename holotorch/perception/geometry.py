@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.quantities import DEPTH, SCREEN
 from holotorch.perception import angles
 
 
@@ -114,8 +115,8 @@ class _Screen(Display):
     def __post_init__(self):
         super().__post_init__()
         for side in checks.pair("size", self.size, "metres"):
-            checks.positive("size", side, "metres")
-        checks.positive("distance", self.distance, "metres")
+            checks.quantity(SCREEN, side, "size")
+        checks.quantity(DEPTH, self.distance, "distance")
 
     @property
     def pitch(self) -> tuple[float, float]:
@@ -185,7 +186,7 @@ class CurvedScreen(_Screen):
 
     def __post_init__(self):
         super().__post_init__()
-        checks.positive("radius", self.radius, "metres")
+        checks.quantity(SCREEN, self.radius, "radius")
         if self.size[1] > 2 * math.pi * self.radius * (1 + 1e-12):
             raise ValueError(f"the arc must be at most a full turn of {self.radius:g} m radius, got {self.size[1]:g} m")
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.core.complex import phasor
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import DEPTH
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +37,7 @@ class SourceLayers:
     phase: Tensor | None = None
 
     def __post_init__(self) -> None:
-        depths = tuple(checks.positive("depth of a layer", depth, "metres") for depth in self.depths)
+        depths = tuple(checks.quantity(DEPTH, depth, "depth of a layer") for depth in self.depths)
         if not depths:
             raise ValueError("depths must hold at least one distance from the hologram in metres, got none")
         object.__setattr__(self, "depths", depths)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.quantities import WIDTH
 from holotorch.scene.volume import Volume
 
 Shape = int | tuple[int, int, int]
@@ -154,7 +155,7 @@ def _sampled(
     if not (dtype.is_floating_point or dtype == torch.uint8):
         raise TypeError(f"phantoms are floating-point or torch.uint8, got {dtype}")
     sizes = _sizes(shape)
-    scale = 1.0 if width is None else checks.positive("width", width, "metres") / 2
+    scale = 1.0 if width is None else checks.quantity(WIDTH, width) / 2
     z, y, x = ((2 * torch.arange(n, dtype=torch.float64) + 1) / n - 1 for n in sizes)
     values = torch.empty(sizes, dtype=dtype)
     # Slice by slice: float64 for exactness, without float64 temporaries of the whole.

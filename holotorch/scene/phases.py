@@ -13,6 +13,7 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.core.fourier import filter_real
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import WIDTH
 
 _WINDOWS = 64  # places of a window along each axis
 
@@ -33,7 +34,7 @@ def smooth_phase(
         spread: Expected standard deviation in radians. Directions of light spread to wavelength spread / (2 pi length).
         generator: Of the noise.
     """
-    length, spread = checks.positive("length", length, "metres"), checks.positive("spread", spread, "radians")
+    length, spread = checks.quantity(WIDTH, length, "length"), checks.positive("spread", spread, "radians")
     noise = torch.randn(grid.shape, generator=generator, device=_device(generator))
     fy, fx = grid.frequencies(noise.device)
     square = fy.square() + fx[:, : grid.shape[1] // 2 + 1].square()

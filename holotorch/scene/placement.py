@@ -10,6 +10,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import DEPTH, DISTANCE
 from holotorch.scene.volume import Triple, Volume
 
 # A ray that lies in a face of the box belongs to it, whatever rounding says.
@@ -183,7 +184,7 @@ def check_planes(
     depths: Sequence[float], boundaries: Sequence[float] | None
 ) -> tuple[tuple[float, ...], tuple[float, ...] | None]:
     """Depths and boundaries as tuples, or ValueError unless both rise or both fall and enclose one another."""
-    found = tuple(checks.positive("depth of a plane", depth, "metres") for depth in depths)
+    found = tuple(checks.quantity(DEPTH, depth, "depth of a plane") for depth in depths)
     if not found:
         raise ValueError("depths must hold at least one distance from the hologram in metres, got none")
     sign = -1 if len(found) > 1 and found[1] < found[0] else 1
@@ -192,7 +193,7 @@ def check_planes(
             raise ValueError(f"depths must rise or fall throughout, front to back, got {a:g} before {b:g} m")
     if boundaries is None:
         return found, None
-    edges = tuple(checks.finite("boundary of a slab", edge, "metres") for edge in boundaries)
+    edges = tuple(checks.quantity(DISTANCE, edge, "boundary of a slab") for edge in boundaries)
     if len(edges) != len(found) + 1:
         raise ValueError(f"boundaries must be one more than the {len(found)} depths, got {len(edges)}")
     if len(found) == 1 and edges[1] < edges[0]:

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from holotorch.core import checks
 from holotorch.core.complex import phasor
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import DEPTH, WIDTH
 from holotorch.scene.compositing import safe_sqrt
 from holotorch.scene.layers import SourceLayers
 from holotorch.scene.lighting import Lighting
@@ -79,9 +80,9 @@ class DVRSampler(nn.Module):
         super().__init__()
         self.transfer, self.grid, self.lighting, self.phase = transfer, rays, lighting, phase
         self.depths, self.boundaries = check_planes(depths, boundaries)
-        self.width = checks.positive("width", width, "metres")
+        self.width = checks.quantity(WIDTH, width)
         middle = (self.depths[0] + self.depths[-1]) / 2
-        self.distance = checks.positive("distance", middle if distance is None else distance, "metres")
+        self.distance = checks.quantity(DEPTH, middle if distance is None else distance, "distance")
         self.rotation = check_rotation(rotation)
         self.eye = None if eye is None else checks.finite("eye", eye, "metres")
         if not 0 <= checks.finite("early", early) < 1:

@@ -52,7 +52,7 @@ class Volume:
     def _checked_spacing(self, step: float) -> float:
         if self.unit == "m":
             return checks.quantity(VOXEL, step)
-        return checks.positive("volume spacing", step, "the unit of a relative volume")
+        return checks.positive("volume spacing", step, self.unit)
 
     @property
     def shape(self) -> tuple[int, int, int]:

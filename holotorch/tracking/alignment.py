@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from holotorch.core import checks
+from holotorch.core import checks, quantities
 
 TOOL_LENGTH = 0.127  # metres: the thesis's alignment uses the tip and the middle of the bands, 127 mm behind it
 _FEWEST = 3
@@ -32,11 +32,12 @@ class Alignment:
 
 def tool_points(tip: Tensor, direction: Tensor, length: float = TOOL_LENGTH) -> Tensor:
     """[..., 2, 3]: a tool's tip and the point ``length`` metres behind it; ``direction`` [..., 3] is normalised."""
-    checks.positive("length", length, "metres")
+    checks.quantity(quantities.TOOL_LENGTH, length)
     for name, value in (("tip", tip), ("direction", direction)):
         if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape[-1:] != (3,):
             raise ValueError(f"{name} must be a floating tensor [..., 3], got {getattr(value, 'shape', value)}")
         checks.all_finite(name, value)
+    checks.quantities(quantities.POSITION, tip, "tip")
     size = direction.norm(dim=-1, keepdim=True)
     if bool((size.detach() < 1e-6).any()):
         raise ValueError("direction must not be a null vector")
@@ -68,7 +69,7 @@ def headset_from_camera(camera: Tensor, headset: Tensor) -> Alignment:
             raise TypeError(f"{name} must be a floating tensor, got {getattr(value, 'dtype', type(value).__name__)}")
         if value.ndim != 3 or value.shape[1:] != (2, 3):
             raise ValueError(f"{name} must be of shape [n, 2, 3], two points for each alignment, got {value.shape}")
-        checks.all_finite(name, value)
+        checks.quantities(quantities.POSITION, value, name)
         points.append(value.to(torch.float64))
     source, target = points
     if len(source) != len(target):

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.quantities import TOOL_DEVIATION
 from holotorch.tracking.alignment import rigid_map
 
 _UNKNOWN = (math.nan, math.nan, math.nan)
@@ -224,7 +225,7 @@ def wrong_poses(tips: Tensor, truth: Tensor, limit: float = 5e-3) -> WrongPoses:
         limit: Greatest error in metres of an answer that is not wrong.
     """
     tips, truth = _rows("tips", tips), _rows("truth", truth, like=tips)
-    checks.positive("limit", limit, "metres")
+    checks.quantity(TOOL_DEVIATION, limit, "limit")
     known, present = _answered(tips), _answered(truth)
     wrong = (tips - truth).norm(dim=-1) > limit  # NaN compares as not above
     return WrongPoses(

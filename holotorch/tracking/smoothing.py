@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.quantities import TOOL_LENGTH
 from holotorch.tracking.status import Pose, Status
 
 
@@ -54,7 +55,7 @@ class OneEuro:
             raise ValueError(f"beta must not be negative, got {beta!r}")
         self.derivative_cutoff = checks.positive("derivative_cutoff", derivative_cutoff, "Hz")
         self.longest_gap = checks.positive("longest_gap", longest_gap, "seconds")
-        self.arm = checks.positive("arm", arm, "metres")
+        self.arm = checks.quantity(TOOL_LENGTH, arm, "arm")
         self.reset()
 
     def reset(self) -> None:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.quantities import TOOL_DEVIATION
 from holotorch.tracking.bands import Stretches
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import Catheter
@@ -84,7 +85,7 @@ class CatheterTracker:
         self, camera: Camera, catheter: Catheter, *, most_sd: float = 2e-3, channels: ChannelOrder | None = None
     ):
         self.camera, self.catheter = camera, catheter
-        self.most_sd = checks.positive("most_sd", most_sd, "m")
+        self.most_sd = checks.quantity(TOOL_DEVIATION, most_sd, "most_sd")
         self.table = ColourTable(camera, catheter)
         self.channels = stated_order(channels, camera, catheter)
         self.lens = Lens(camera)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.quantities import CAMERA_DEPTH
 from holotorch.tracking import scenery
 from holotorch.tracking.camera import Camera
 from holotorch.tracking.catheter import THESIS, Catheter
@@ -129,7 +130,7 @@ class World:
             TypeError, ValueError: ``depth`` not above 0, ``point`` not finite, or the bands' middle not in front of the
                 camera.
         """
-        checks.positive("depth", depth, "metres")
+        checks.quantity(CAMERA_DEPTH, depth)
         direction = aimed(tilt, roll)
         middle = (self.catheter.edges[0] + self.catheter.edges[-1]) / 2
         ahead = depth + (0.0 if point is None else (middle - checks.finite("point", point)) * float(direction[2]))

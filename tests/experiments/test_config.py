@@ -112,8 +112,8 @@ solver: {kind: apg, tolerance: .nan, start: warm}
         "3:10: target.image: no such picture: 'cofee'; did you mean 'coffee'? give a path, or one of "
         "astronaut, brick, camera, chelsea, coffee, coins, grass, moon, page, text",
         "4:20: grid.shape.1: expected a whole number, got 48.5",
-        "4:27: grid.pitch: expected a pitch between 1 nm and 1 mm, got '-9 um'",
-        "5:23: wavelengths.1: expected a wavelength between 100 nm and 20 um, got 0",
+        "4:27: grid.pitch: expected a length within 1 nm .. 2 mm, got '-9 um'",
+        "5:23: wavelengths.1: expected a length within 10 nm .. 300 um, got 0",
         "5:26: wavelengths.2: expected a length such as 530 nm, 3.74 um, 100 mm or a number of metres, "
         "got '445 parsec'",
         "6:13: modulator.sigma_px: expected a number, got 'wide'",
@@ -128,13 +128,13 @@ solver: {kind: apg, tolerance: .nan, start: warm}
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("wavelengths=0 nm", "wavelengths: expected a wavelength between 100 nm and 20 um, got '0 nm'"),
-        ("wavelengths=530", "wavelengths: expected a wavelength between 100 nm and 20 um, got 530"),
-        ("grid.pitch=9", "grid.pitch: expected a pitch between 1 nm and 1 mm, got 9"),
+        ("wavelengths=0 nm", "wavelengths: expected a length within 10 nm .. 300 um, got '0 nm'"),
+        ("wavelengths=530", "wavelengths: expected a length within 10 nm .. 300 um, got 530"),
+        ("grid.pitch=9", "grid.pitch: expected a length within 1 nm .. 2 mm, got 9"),
         ("propagator={kind: fresnel, distance: 0}", "propagator.distance: expected a distance of 1 um or more"),
         ("solver.learning_rate=1", "a setting of kind adam, not of apg; to change the kind give the whole section"),
         ("seed=2001-99-99", "seed: not a value: month must be in 1..12"),
-        ("grid.pitch=-1um", "grid.pitch: expected a pitch between 1 nm and 1 mm, got '-1um'"),
+        ("grid.pitch=-1um", "grid.pitch: expected a length within 1 nm .. 2 mm, got '-1um'"),
         ("modulator.sgima_px=1", "modulator.sgima_px: unknown setting; did you mean 'sigma_px'?"),
         ("modulator.kernel_size=33", "expected at most 32, the smaller side of the grid, got 33"),
         ("modulator.kernel_size=8", "expected an odd number of taps, got 8; use 9"),

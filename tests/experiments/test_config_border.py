@@ -60,15 +60,23 @@ def mistakes(path: Path, *overrides: str) -> list[str]:
         (
             CORRECTION,
             "propagator={kind: fresnel, distance: 1e308}",
-            "expected a distance of at most 10 m; 360 mm is 0.36",
+            "propagator.distance: expected a length within -10 m .. 10 m",
         ),
         (VOLUME, "hologram.depths=[]", "hologram.depths: expected a number of planes, or one distance at least"),
-        (VOLUME, "hologram.distance=360", "hologram.distance: expected a distance of at most 10 m; 360 mm is 0.36"),
+        (
+            VOLUME,
+            "hologram.distance=360",
+            "hologram.distance: expected a length within -10 m .. 10 m, got 360; 360 looks like millimetres",
+        ),
         (VOLUME, "volume.dtype=cpu", "volume.dtype: expected a type of number, such as uint8, float32"),
         (VOLUME, "volume.dtype=O", "volume.dtype: expected a type of number"),
         (VOLUME, "volume.dtype='i4,i4'", "volume.dtype: expected a type of number"),
-        (EYE, "eye.pupil_radius=100mm", "eye.pupil_radius: expected the radius of a pupil, 10 um to 20 mm"),
-        (EYE, "eye.axial_length=24", "eye.axial_length: expected the length of an eye, 1 mm to 0.2 m"),
+        (EYE, "eye.pupil_radius=100mm", "eye.pupil_radius: expected a length within 10 um .. 50 mm, got '100mm'"),
+        (
+            EYE,
+            "eye.axial_length=24",
+            "eye.axial_length: expected a length within 1 mm .. 200 mm, got 24; 24 looks like millimetres",
+        ),
     ],
 )
 def test_values_beyond_all_use_are_mistakes_of_their_key(written, text, change, message):

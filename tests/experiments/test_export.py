@@ -180,7 +180,7 @@ def test_every_panel_of_the_project_loads(path):
         ("calibration=[{wavelength: 530 nm, lut: [[0, 0], [0, 6]]}]", "expected levels that rise from row to row"),
         ("calibration=[{wavelength: 530 nm, full_turn: 9, lut: [[0, 0], [255, 6]]}]", "expected one of full_turn, lut"),
         ("calibration=[{wavelength: 530 nm, full_turn: -1}]", "calibration.0.full_turn: expected greater than 0"),
-        ("calibration=[{wavelength: 530}]", "expected a wavelength between 100 nm and 20 um"),
+        ("calibration=[{wavelength: 530}]", "expected a length within 10 nm .. 300 um"),
         ("dispersion={a: 0.18}", "expected both a and b"),
         ("dispersion={table: [[500 nm, 0.2], [600 nm, 0.19]]}", "lie outside the birefringence table, 500 to 600 nm"),
         ("dispersion={a: 0.18, b: 0.0085, table: [[500 nm, 0.2], [600 nm, 0.19]]}", "not both"),

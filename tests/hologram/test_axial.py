@@ -180,7 +180,7 @@ def test_complex64_is_good_to_a_millionth():
     ("change", "message"),
     [
         ({"cone": "box"}, "works in frequency, with cone='taper' or 'band', got 'box'"),
-        ({"depths": [0.0]}, "depths must be above zero"),
+        ({"depths": [0.0]}, "depth of a plane must be above zero"),
         ({"tolerance": 0.0}, "tolerance must be above zero"),
     ],
 )

@@ -129,9 +129,9 @@ def test_direct_counts_its_pairs():
     ("change", "error", "message"),
     [
         ({"depths": []}, ValueError, "at least one distance"),
-        ({"depths": [1e-3, 0.0]}, ValueError, "depths must be above zero, before the hologram, got 0.0"),
-        ({"depths": [-1e-3]}, ValueError, "depths must be above zero"),
-        ({"depths": [float("nan")]}, ValueError, "depth must be finite"),
+        ({"depths": [1e-3, 0.0]}, ValueError, "depth of a plane must be above zero in metres, got 0.0"),
+        ({"depths": [-1e-3]}, ValueError, "depth of a plane must be above zero"),
+        ({"depths": [float("nan")]}, ValueError, "depth of a plane must be finite"),
         ({"wavelength": 0.0}, ValueError, "wavelength must be above zero"),
         ({"stride": 0}, ValueError, "stride must be at least 1"),
     ],

@@ -14,5 +14,5 @@ def test_far_planes_are_planned_in_seconds():
 
 
 def test_planes_beyond_all_memory_are_refused():
-    with pytest.raises(ValueError, match="too far for pixels of 3.74e-06 m: .* use nearer planes or a larger pitch"):
-        plan_hologram(Grid(256, 3.74e-6), 520e-9, [1e6], (128, 128), stride=2)
+    with pytest.raises(ValueError, match="too far for pixels of 2e-06 m: .* use nearer planes or a larger pitch"):
+        plan_hologram(Grid(256, 2e-6), 520e-9, [99.0], (128, 128), stride=2)

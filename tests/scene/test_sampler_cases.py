@@ -163,7 +163,7 @@ def test_empty_volume_is_exactly_dark():
 def test_one_voxel(name):
     """A cube of one value: paths are those through its box, whatever the planes."""
     made = sampler(transfer((0.3, 0.3, 0.3)), **GEOMETRIES[name])
-    _, opacity = made.render(Volume(torch.full((1, 1, 1), 0.4, dtype=torch.float64), (2.0, 2.0, 2.0), "m"))
+    _, opacity = made.render(Volume(torch.full((1, 1, 1), 0.4, dtype=torch.float64), (2e-3, 2e-3, 2e-3), "m"))
     if name == "parallel":
         y, x = GRID.coordinates()
         inside = (y.abs() <= WIDTH / 2 * (1 + 1e-9)) & (x.abs() <= WIDTH / 2 * (1 + 1e-9))
