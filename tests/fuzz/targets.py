@@ -1,0 +1,6 @@
+"""All targets by their names."""
+
+from fuzz import configurations, files
+from fuzz.engine import Target
+
+TARGETS: dict[str, Target] = {target.name: target for target in (*configurations.TARGETS, *files.TARGETS)}
