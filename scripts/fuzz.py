@@ -1,4 +1,6 @@
-"""Mutated inputs for every parser: python scripts/fuzz.py [TARGET ...] --seconds 600 --seed 1
+"""Mutated inputs for every parser.
+
+Usage: python scripts/fuzz.py [TARGET ...] --seconds 600 --seed 1
 
 Each target runs for so many seconds. What fails is kept in OUT/failures/TARGET-NUMBER, with its symptom, and made again
 by: python scripts/fuzz.py TARGET --seed SEED --first NUMBER --inputs 1

@@ -42,7 +42,5 @@ def without_figures() -> Iterator[None]:
 def files(folder: Path, *, below: str = "") -> Input:
     """All files of a folder as an input, within a folder ``below``."""
     return {
-        str(below / path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
+        str(below / path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()
     }

@@ -82,7 +82,9 @@ def _words(rng: Random, made: Input, other: Input) -> Input:
     words = []
     for _ in range(rng.choice((1, 1, 2, 3))):
         key = rng.choice(_keys(yaml.safe_load(made["config.yaml"])))
-        value = rng.choice((*NUMBERS, *LENGTHS, "[]", "{}", "[[]]", "null", "true", "x", "[1, 2]", "*a", "&a [*a]", "{", "'"))
+        value = rng.choice(
+            (*NUMBERS, *LENGTHS, "[]", "{}", "[[]]", "null", "true", "x", "[1, 2]", "*a", "&a [*a]", "{", "'")
+        )
         key = rng.choice((key, key, key, key, key + ".x", "x." + key, "." + key, key + ".", ""))
         words.append(f"{key}={value}" if rng.random() < 0.95 else key)
     return made | {"words.json": json.dumps(words).encode()}

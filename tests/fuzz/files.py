@@ -46,7 +46,7 @@ def _nrrd(_: Path) -> list[Input]:
     import gzip
 
     head = b"NRRD0004\ntype: uint8\ndimension: 3\nsizes: 7 6 5\nspace: left-posterior-superior\n"
-    head += b"space directions: (0.5,0,0) (0,0.5,0) (0,0,1)\nspace units: \"mm\" \"mm\" \"mm\"\nspace origin: (0,1,2)\n"
+    head += b'space directions: (0.5,0,0) (0,0.5,0) (0,0,1)\nspace units: "mm" "mm" "mm"\nspace origin: (0,1,2)\n'
     voxels = _VOXELS.tobytes()
     text = " ".join(map(str, _VOXELS.ravel())).encode()
     import bz2
@@ -60,7 +60,9 @@ def _nrrd(_: Path) -> list[Input]:
 
 def _metaimage(_: Path) -> list[Input]:
     head = b"ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\nDimSize = 7 6 5\n"
-    head += b"ElementSpacing = 0.5 0.5 1\nTransformMatrix = 1 0 0 0 1 0 0 0 1\nOffset = 0 1 2\nElementType = MET_UCHAR\n"
+    head += (
+        b"ElementSpacing = 0.5 0.5 1\nTransformMatrix = 1 0 0 0 1 0 0 0 1\nOffset = 0 1 2\nElementType = MET_UCHAR\n"
+    )
     voxels, deflated = _VOXELS.tobytes(), zlib.compress(_VOXELS.tobytes())
     wide = head.replace(b"UCHAR", b"SHORT").replace(b"7 6 5", b"7 3 5") + b"HeaderSize = -1\n"
     return [
@@ -86,9 +88,14 @@ def _vti(_: Path) -> list[Input]:
 
     voxels = _VOXELS.tobytes()
     about = 'Name="v" NumberOfComponents="1" type="UInt8"'
-    head = '<?xml version="1.0"?>\n<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt32"{}>\n'
+    kind = 'type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt32"'
+    head = f'<?xml version="1.0"?>\n<VTKFile {kind}{{}}>\n'
     image = '<ImageData WholeExtent="0 6 0 5 0 4" Origin="0 0 0" Spacing="0.5 0.5 1">\n<Piece Extent="0 6 0 5 0 4">\n'
-    image = head + image + '<PointData Scalars="v">\n<DataArray {}{}</DataArray></PointData></Piece></ImageData>{}</VTKFile>'
+    image = (
+        head
+        + image
+        + '<PointData Scalars="v">\n<DataArray {}{}</DataArray></PointData></Piece></ImageData>{}</VTKFile>'
+    )
     size = len(voxels).to_bytes(4, "little")
     block = zlib.compress(voxels)
     table = b"".join(number.to_bytes(4, "little") for number in (1, len(voxels), len(voxels), len(block)))
@@ -115,7 +122,15 @@ def _vti(_: Path) -> list[Input]:
 _ENTITIES = b'<!DOCTYPE a [<!ENTITY a "xxxxxxxxxx"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;&a;">' + b"".join(
     f'<!ENTITY {chr(99 + i)} "{f"&{chr(98 + i)};" * 10}">'.encode() for i in range(8)
 )
-_XML = (b'format="raw"', b'type="Float64"', b"&j;", _ENTITIES + b"]>", b'byte_order="BigEndian"', b'Extent="0 1"', b"<Piece/>")
+_XML = (
+    b'format="raw"',
+    b'type="Float64"',
+    b"&j;",
+    _ENTITIES + b"]>",
+    b'byte_order="BigEndian"',
+    b'Extent="0 1"',
+    b"<Piece/>",
+)
 
 
 def _arrays(_: Path) -> list[Input]:
@@ -145,8 +160,8 @@ def _raw_mutated(rng: Random, made: Input, other: Input) -> Input:
 
 
 def _tiff(_: Path) -> list[Input]:
-    _, data = cv2.imencodemulti(".tiff", [_VOXELS[0], _VOXELS[1]])
-    _, wide = cv2.imencodemulti(".tiff", [_VOXELS[0].astype(np.uint16)], [cv2.IMWRITE_TIFF_COMPRESSION, 8])
+    data = cv2.imencodemulti(".tiff", [_VOXELS[0], _VOXELS[1]])[1]
+    wide = cv2.imencodemulti(".tiff", [_VOXELS[0].astype(np.uint16)], [cv2.IMWRITE_TIFF_COMPRESSION, 8])[1]
     return [{"volume.tif": data.tobytes()}, {"volume.tif": wide.tobytes()}]
 
 
@@ -156,7 +171,7 @@ def _slices(_: Path) -> list[Input]:
 
 
 def _volume(folder: Path) -> None:
-    path = next((p for p in sorted(folder.iterdir()) if not p.name.startswith("data")))
+    path = next(p for p in sorted(folder.iterdir()) if not p.name.startswith("data"))
     volume = load_volume(path, spacing=(1e-3, 1e-3, 1e-3)) if path.suffix != ".mhd" else load_volume(path)
     assert volume.values.ndim == 3 and min(volume.spacing) > 0
     float(volume.values.double().sum())  # reads what is mapped
@@ -171,7 +186,11 @@ def _encoded(suffix: str, words: tuple[int, ...], _: Path) -> list[Input]:
 def _exr(folder: Path) -> list[Input]:
     made, values = [], _PICTURE.astype(np.float32) / 255
     for index, (form, channels) in enumerate(
-        [("ZIP", {"RGB": values}), ("PIZ", {"Y": values[..., 0].copy()}), ("NO", {"RGBA": np.dstack([values, values[..., 0]])})]
+        [
+            ("ZIP", {"RGB": values}),
+            ("PIZ", {"Y": values[..., 0].copy()}),
+            ("NO", {"RGBA": np.dstack([values, values[..., 0]])}),
+        ]
     ):
         header = {"compression": getattr(OpenEXR, f"{form}_COMPRESSION"), "type": OpenEXR.scanlineimage}
         path = folder / f"{index}.exr"
@@ -210,7 +229,9 @@ def _panel(folder: Path) -> None:
     assert values.ndim == 2 and isinstance(facts, dict)
 
 
-_TRUTH = b"frame,time_s,tip_x_m,tip_y_m,tip_z_m,along_x,along_y,along_z\n0,0.0,0.1,0.2,0.5,0,0,1\n1,0.1,0.1,0.2,0.5,0,0,1\n"
+_TRUTH = (
+    b"frame,time_s,tip_x_m,tip_y_m,tip_z_m,along_x,along_y,along_z\n0,0.0,0.1,0.2,0.5,0,0,1\n1,0.1,0.1,0.2,0.5,0,0,1\n"
+)
 
 
 def _recording(folder: Path) -> list[Input]:

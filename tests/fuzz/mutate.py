@@ -14,7 +14,7 @@ _WIDTHS = (1, 2, 4, 8)
 
 
 def mutated(rng: Random, data: bytes, other: bytes, tokens: tuple[bytes, ...] = ()) -> bytes:
-    """``data`` after one to six mutations; ``other`` is a second valid file, ``tokens`` mean something in the format."""
+    """``data`` after one to six mutations; ``other`` is a second valid file, ``tokens`` are words of the format."""
     for _ in range(rng.choice((1, 1, 1, 2, 3, 6))):
         change = rng.choice(_TEXT if rng.random() < 0.3 else _CHANGES)
         data = change(rng, data)
@@ -72,7 +72,9 @@ def _twice(rng: Random, data: bytes) -> bytes:
 
 def _inserted(rng: Random, data: bytes) -> bytes:
     place = rng.randint(0, len(data))
-    what = rng.choice((rng.randbytes(rng.choice((1, 4, 100))), b"\0" * 8, b"\xff" * 8, b"\r", b"\n\n", b"\x00", b"\xc3"))
+    what = rng.choice(
+        (rng.randbytes(rng.choice((1, 4, 100))), b"\0" * 8, b"\xff" * 8, b"\r", b"\n\n", b"\x00", b"\xc3")
+    )
     return data[:place] + what + data[place:]
 
 

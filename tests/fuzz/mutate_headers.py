@@ -12,7 +12,20 @@ from fuzz.mutate import NUMBERS, headed, mutated
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _FIELD = re.compile(rb"^([\w ]+?)(\s*:=?\s*|\s*=\s*)(.*)$")
-_OTHERS = (b"raw", b"gzip", b"bzip2", b"ascii", b"hex", b"LIST", b"LOCAL", b"little", b"big", b"True", b"False", b"uint8")
+_OTHERS = (
+    b"raw",
+    b"gzip",
+    b"bzip2",
+    b"ascii",
+    b"hex",
+    b"LIST",
+    b"LOCAL",
+    b"little",
+    b"big",
+    b"True",
+    b"False",
+    b"uint8",
+)
 
 
 def fields_mutated(rng: Random, data: bytes, other: bytes, end: bytes) -> bytes:
@@ -92,8 +105,12 @@ def png_mutated(rng: Random, data: bytes, other: bytes) -> bytes:
             packed_rows = zlib.compress(bytes(10**7), 9) if rng.random() < 0.5 else body
             chunks = [(name, packed_rows if name == b"IDAT" else part) for name, part in chunks]
         case _:
-            name = rng.choice((b"iTXt", b"zTXt", b"iCCP", b"gAMA", b"tRNS", b"PLTE", b"eXIf", b"acTL", b"fdAT", b"IEND"))
-            chunks.insert(rng.randrange(1, len(chunks) + 1), (name, rng.choice((b"", body, zlib.compress(bytes(10**6))))))
+            name = rng.choice(
+                (b"iTXt", b"zTXt", b"iCCP", b"gAMA", b"tRNS", b"PLTE", b"eXIf", b"acTL", b"fdAT", b"IEND")
+            )
+            chunks.insert(
+                rng.randrange(1, len(chunks) + 1), (name, rng.choice((b"", body, zlib.compress(bytes(10**6)))))
+            )
     made = bytearray(_PNG)
     for name, part in chunks:
         length = len(part) if rng.random() < 0.97 else rng.choice((0, 2**31 - 1, 2**32 - 1, 4 * 10**9))

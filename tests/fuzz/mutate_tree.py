@@ -10,13 +10,56 @@ import yaml
 from fuzz.engine import FULL
 from fuzz.mutate import NUMBERS, mutated
 
-LENGTHS = ("360", "1e99999999nm", "-1e99999999 nm", "1e-99999999nm", "0 mm", "-5 mm", "1e5 m", "nan mm", "inf m", "5 px")
+LENGTHS = (
+    "360",
+    "1e99999999nm",
+    "-1e99999999 nm",
+    "1e-99999999nm",
+    "0 mm",
+    "-5 mm",
+    "1e5 m",
+    "nan mm",
+    "inf m",
+    "5 px",
+)
 _VALUES: tuple[Any, ...] = (
-    *([], {}, None, True, False, "", " ", 0, -1, 1, 2, 3, 7, 16384, 10**9, 10**10, -(10**9), 2**31, 2**63, 2**64, 10**400),
+    *(
+        [],
+        {},
+        None,
+        True,
+        False,
+        "",
+        " ",
+        0,
+        -1,
+        1,
+        2,
+        3,
+        7,
+        16384,
+        10**9,
+        10**10,
+        -(10**9),
+        2**31,
+        2**63,
+        2**64,
+        10**400,
+    ),
     *(0.0, -0.0, 1e-9, 1e9, 1e15, 1e300, 1e-300, math.nan, math.inf, -math.inf, 360, 0.5, 530, 100.0),
     *([[]], [{}], [None], [0], [1, 2, 3, 4], ["a"], {"a": 1}, {"kind": "x"}, [[1, 2], [3]], [1] * 3000),
     *("x", "none", "null", "auto", "cpu", "cuda", "\0", "\ud7ff", "é" * 300, "../../etc/passwd", "/dev/zero", ".", "/"),
-    *("a" * 20000, "1" * 20000, "[" * 3000, "{}" * 500, "1e" * 4000, " " * 9000 + "x", "%s%s%n", "<script>", "\x1b[31m"),
+    *(
+        "a" * 20000,
+        "1" * 20000,
+        "[" * 3000,
+        "{}" * 500,
+        "1e" * 4000,
+        " " * 9000 + "x",
+        "%s%s%n",
+        "<script>",
+        "\x1b[31m",
+    ),
     *LENGTHS,
     *NUMBERS,
 )
@@ -103,7 +146,9 @@ def _borrowed(rng: Random, holder: Any, key: Any, other: Any) -> None:
 
 def _renamed(rng: Random, holder: Any, key: Any, other: Any) -> None:
     if isinstance(holder, dict):
-        holder[rng.choice((f"{key}x", key[:-1], key.upper(), "", "kind", "a.b", "1", "\0", "é", "__class__"))] = holder.pop(key)
+        holder[rng.choice((f"{key}x", key[:-1], key.upper(), "", "kind", "a.b", "1", "\0", "é", "__class__"))] = (
+            holder.pop(key)
+        )
     else:
         holder.append(holder[key])
 
@@ -129,18 +174,22 @@ def yaml_mutated(rng: Random, text: bytes, other: bytes) -> bytes:
         lines.insert(rng.randint(0, len(lines)), rng.choice(_SNIPPETS))
         return "".join(lines).encode("utf-8", "surrogatepass")
     changed = tree_mutated(rng, yaml.safe_load(text), yaml.safe_load(other))
-    made = yaml.safe_dump(changed, sort_keys=False, default_flow_style=rng.choice((None, True, False)), allow_unicode=True)
+    made = yaml.safe_dump(
+        changed, sort_keys=False, default_flow_style=rng.choice((None, True, False)), allow_unicode=True
+    )
     return made.encode("utf-8", "surrogatepass")[:FULL]
 
 
 def json_mutated(rng: Random, text: bytes, other: bytes) -> bytes:
     """A JSON file: its values changed, or its bytes; NaN and infinity as Python writes them."""
     if rng.random() < 0.15:
-        return mutated(rng, text, other, (b"[" * 100_000, b'{"a":' * 100_000, b"1e999", b"NaN", b"-Infinity", b"\\ud800"))
-    try:
-        return json.dumps(tree_mutated(rng, json.loads(text), json.loads(other)), ensure_ascii=rng.random() < 0.5).encode(
-            "utf-8", "surrogatepass"
+        return mutated(
+            rng, text, other, (b"[" * 100_000, b'{"a":' * 100_000, b"1e999", b"NaN", b"-Infinity", b"\\ud800")
         )
+    try:
+        return json.dumps(
+            tree_mutated(rng, json.loads(text), json.loads(other)), ensure_ascii=rng.random() < 0.5
+        ).encode("utf-8", "surrogatepass")
     except RecursionError:
         return b"[" * 100_000
 

@@ -114,5 +114,6 @@ def band_limited_sum(
         read.append(np.exp(2j * np.pi * np.outer(reached, f)) * (weight / 2))
         square = square + np.expand_dims((wavelength * f + tilt[axis]) ** 2, 1 - axis)
     spectrum = sent[0] @ source @ sent[1].T
-    spectrum = spectrum * np.exp(2j * np.pi * distance / wavelength * np.sqrt(1 - square + 0j))
+    root = np.sqrt(1 - square + 0j)  # evanescent waves decay for either sign of the distance
+    spectrum = spectrum * np.exp(2j * np.pi / wavelength * (distance * root.real + 1j * abs(distance) * root.imag))
     return read[0] @ spectrum @ read[1].T
