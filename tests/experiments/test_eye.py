@@ -220,7 +220,7 @@ def test_interrupted_runs_keep_what_was_seen(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("eye={pupil_radius: 0}", "eye.pupil_radius: expected a length above zero"),
+        ("eye={pupil_radius: 0}", "eye.pupil_radius: expected a length within 10 um .. 50 mm"),
         ("display={kind: magnifying, focal_length: -1 mm}", "display.*focal_length: expected a length above zero"),
         ("light={sources: [lamp]}", "light.sources"),
         ("light={sources: [lazer]}", "did you mean 'laser'"),

@@ -66,9 +66,9 @@ def test_slopes_are_central_differences():
 
 
 def test_a_flat_step_is_a_thousandth_of_the_range():
-    volume = Volume(torch.tensor([[[0, 200]]], dtype=torch.uint8), (2.0, 1.0, 0.5), "m")
+    volume = Volume(torch.tensor([[[0, 200]]], dtype=torch.uint8), (0.02, 0.01, 0.005), "m")
     assert flat_steps(volume) == pytest.approx((0.8, 0.4, 0.2))
-    assert flat_steps(Volume(torch.ones(2, 2, 2), (1.0, 1.0, 1.0), "m")) == (1, 1, 1)
+    assert flat_steps(Volume(torch.ones(2, 2, 2), (0.01, 0.01, 0.01), "m")) == (1, 1, 1)
 
 
 def sampler(lighting, **options) -> DVRSampler:
