@@ -200,7 +200,11 @@ CATHETER = "edges: [70 mm, 108 mm, 146 mm, 184 mm]\ncolours: [[200, 40, 45], [40
         (load_camera, CAMERA + "tone: [0, 0.5, 1]\n", "the light of the 256 levels"),
         (load_camera, CAMERA + "distortion: [0, 0]\n", "a.yaml:5:1: distortion: expected"),
         (load_camera, CAMERA + "distortion: [0, .nan, 0, 0, 0]\n", "a.yaml:5:17: distortion.1: expected a finite"),
-        (load_catheter, CATHETER + "radius: 1\nlength: 0.4\n", "a.yaml:3:1: radius: expected a radius between"),
+        (
+            load_catheter,
+            CATHETER + "radius: 1\nlength: 0.4\n",
+            "a.yaml:3:1: radius: expected a length within 10 um .. 50 mm",
+        ),
         (load_catheter, CATHETER + "radius: 1 mm\nlength: 0.1\n", "a.yaml:4:1: length: must reach the last edge"),
         (load_catheter, CATHETER.replace("108", "60") + "radius: 1 mm\nlength: 0.4\n", "a.yaml:1:1: edges: must be"),
         (load_catheter, CATHETER.replace("200", "300") + "radius: 1 mm\nlength: 0.4\n", "a.yaml:2:12: colours.0.0: "),

@@ -120,7 +120,9 @@ def test_other_contents_of_a_file_are_refused(tiny, tmp_path, capsys, picture, s
     own = Path(shutil.copy(given, tmp_path / given.name))
     folder = interrupted(tmp_path / "a", {"pec": pec, "volume": volume}[kind](own))
     if kind == "pec":
-        cv2.imwrite(str(own), cv2.imread(str(own))[::-1])
+        upright = cv2.imread(str(own))
+        assert upright is not None
+        cv2.imwrite(str(own), upright[::-1])
     else:
         np.save(own, np.load(own)[::-1])
     assert main(["resume", str(folder)]) == 2

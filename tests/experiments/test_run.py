@@ -24,6 +24,7 @@ from holotorch.experiments.pec import PECExperiment, build
 from holotorch.experiments.plan import plan, plan_text
 from holotorch.experiments.run import run
 from holotorch.experiments.run_folder import claim
+from holotorch.experiments.saving import Checkpoint
 from holotorch.io.images import load_image
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -153,7 +154,7 @@ def test_one_black_colour_stays_dark_and_does_not_disturb_the_others(tmp_path):
 class StopAfter:
     """Presses Ctrl-C in the given step."""
 
-    def __init__(self, experiment: PECExperiment, checkpoint: Path, step: int):
+    def __init__(self, experiment: PECExperiment, checkpoint: Checkpoint, step: int):
         self.log, self.step = LOG(experiment, checkpoint), step
 
     def __getattr__(self, name: str):

@@ -19,7 +19,7 @@ LOSSY = ["jpg", "jpeg", "webp"]
 
 
 def painted(mode: str = "RGB") -> Image.Image:
-    return Image.new("RGB", SHAPE[::-1], COLOUR).convert(mode)
+    return Image.new("RGB", (SHAPE[1], SHAPE[0]), COLOUR).convert(mode)
 
 
 def red(pixels: torch.Tensor | None, scale: float = 1.0) -> None:

@@ -109,4 +109,4 @@ def test_polynomials_of_no_index_are_refused():
     y = x = torch.zeros(1)
     for index, error in ((-1, ValueError), (-3, ValueError), (1.0, TypeError), (True, TypeError)):
         with pytest.raises(error, match="Zernike index must be"):
-            zernike(index, y, x)
+            zernike(index, y, x)  # type: ignore[arg-type]

@@ -115,5 +115,7 @@ def band_limited_sum(
         square = square + np.expand_dims((wavelength * f + tilt[axis]) ** 2, 1 - axis)
     spectrum = sent[0] @ source @ sent[1].T
     root = np.sqrt(1 - square + 0j)  # evanescent waves decay for either sign of the distance
-    spectrum = spectrum * np.exp(2j * np.pi / wavelength * (distance * root.real + 1j * abs(distance) * root.imag))
+    spectrum = spectrum * np.exp(
+        2j * np.pi / wavelength * (distance * np.real(root) + 1j * abs(distance) * np.imag(root))
+    )
     return read[0] @ spectrum @ read[1].T

@@ -56,8 +56,13 @@ class Bench:
             self.number += 1
         return given
 
+    def newest(self) -> int | None:
+        packet = self.receiver.latest()
+        return None if packet is None else packet.sequence
+
     def compare_clocks(self):
         echo = decode(self.asked[-1])
+        assert isinstance(echo, Echo)
         here = (echo.asked + self.time) / 2 + self.apart
         self.receiver.datagram_received(encode(Echo(echo.stream, echo.number, echo.asked, here, here, True)), SENDER)
         assert self.statistics.offset == pytest.approx(self.apart, abs=1e-6)
@@ -107,7 +112,7 @@ def test_one_forged_number_changes_nothing(monkeypatch, number, compared):
     if compared:
         bench.compare_clocks()
     bench.hear(number)
-    assert bench.receiver.latest().sequence == 9
+    assert bench.newest() == 9
     assert bench.genuine(50) == 50
     assert (bench.statistics.jumped, bench.statistics.lost, bench.statistics.duplicated) == (1, 0, 0)
     assert "not continuing the stream 1" in "\n".join(statistics_text(bench.receiver))
@@ -122,7 +127,7 @@ def test_a_forged_number_that_fits_costs_a_few_poses_at_most(monkeypatch, sent, 
     if compared:
         bench.compare_clocks()
     bench.hear(1024 + 9, sent=sent, captured=sent - 0.01)
-    assert bench.receiver.latest().sequence == 1033
+    assert bench.newest() == 1033
     given = bench.genuine(50)
     assert 45 <= given < 50
 
@@ -167,7 +172,7 @@ def test_a_long_silence_and_a_burst_after_a_hold_up_are_no_forgery(monkeypatch):
     bench.time += 0.9
     for i in range(45):  # what was held up for 0.9 s comes at once, the newest is given
         bench.hear(base + i, sent=-0.9 + 0.02 * i, captured=-0.91 + 0.02 * i)
-    assert bench.receiver.latest().sequence == base + 44 and bench.statistics.jumped == 0
+    assert bench.newest() == base + 44 and bench.statistics.jumped == 0
 
 
 def test_a_future_packet_in_a_pause_does_not_take_the_stream_over(monkeypatch):
@@ -184,6 +189,7 @@ def test_a_clock_reply_from_before_its_request_is_not_believed(monkeypatch):
     bench = Bench(monkeypatch)
     bench.genuine()
     echo = decode(bench.asked[-1])
+    assert isinstance(echo, Echo)
     forged = Echo(echo.stream, echo.number, echo.asked, 1000.0, 1e9, reply=True)
     bench.receiver.datagram_received(encode(forged), SENDER)
     assert bench.statistics.offset is None and "a clock reply that took -1e+09 s" in bench.statistics.last_error
