@@ -47,6 +47,7 @@ class StudyServer(ThreadingHTTPServer):
     """
 
     daemon_threads = True
+    request_queue_size = 128  # 5 by default: those beyond wait a second and more until they ask again
     # On Linux it lets a server restart on a port that was just used; on Windows it would let two share it.
     allow_reuse_address = os.name != "nt"
 
