@@ -1,22 +1,29 @@
 """Speed as ratios: contenders take turns in one process, and the median of their times is divided by the baseline's.
 
-Usage: python scripts/bench.py [SUBJECT ...]; without a subject, all of them.
+Usage: python scripts/bench.py [--against CHECKOUT] [SUBJECT ...]; without a subject, all of them. With ``--against``,
+every contender of this checkout takes turns with the same one of another, whose times are the baseline.
 """
 
+import argparse
+import os
 import statistics
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import torch
 from torch.nn import functional
 
 from holotorch import Grid
 from holotorch.core.complex import intensity
+from holotorch.hologram import AxialHologram, ConvolutionHologram, plan_hologram
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import AngularSpectrum, Propagator, propagate
 
 ROUNDS = 15
+WARM_UP = 2  # rounds before those that count
 Contenders = dict[str, Callable[[], object]]
 
 
@@ -114,39 +121,122 @@ def tracking() -> Iterator[tuple[str, Contenders]]:
         yield case.name, {name: lambda t=track, f=frame, c=case: t(f, c) for name, track in trackers.items()}
 
 
+def holograms() -> Iterator[tuple[str, Contenders]]:
+    """Holograms of 16 planes of sources; one convolution per plane is the baseline."""
+    for size, depths in ((128, (0.02, 0.03)), (256, (0.05, 0.06))):
+        grid, listed = Grid(size, 8e-6), torch.linspace(*depths, 16, dtype=torch.float64).tolist()
+        sources = torch.randn(16, size, size, dtype=torch.complex64)
+        convolution, axial = ConvolutionHologram(grid, 530e-9, listed), AxialHologram(grid, 530e-9, listed)
+        yield (
+            f"{size} px, 16 planes",
+            {
+                "convolution": lambda m=convolution, s=sources: m(s),
+                "axial nodes": lambda m=axial, s=sources: m(s),
+                "plan": lambda g=grid, z=listed, n=size: plan_hologram(g, 530e-9, z, (n, n)),
+            },
+        )
+
+
 SUBJECTS = {
     "crosstalk": crosstalk,
     "propagation": propagation,
     "distances": distances,
     "peer": peer,
+    "holograms": holograms,
     "tracking": tracking,
 }
+
+
+def seconds(call: Callable[[], object]) -> float:
+    """Of one call."""
+    started = time.perf_counter()
+    call()
+    return time.perf_counter() - started
 
 
 def measure(contenders: Contenders) -> dict[str, float]:
     """Median seconds of each contender over ROUNDS rounds in which all of them take one turn."""
     times: dict[str, list[float]] = {name: [] for name in contenders}
-    for turn in range(ROUNDS + 2):
+    for turn in range(WARM_UP + ROUNDS):
         for name, call in contenders.items():
-            started = time.perf_counter()
-            call()
-            if turn >= 2:  # the first rounds warm up
-                times[name].append(time.perf_counter() - started)
+            taken = seconds(call)
+            if turn >= WARM_UP:
+                times[name].append(taken)
     return {name: statistics.median(values) for name, values in times.items()}
+
+
+def answer(names: list[str]) -> None:
+    """Serve :func:`compare`: state every contender, then time one call of it for every line that comes."""
+    for name in names:
+        for case, contenders in SUBJECTS[name]():
+            for contender, call in contenders.items():
+                print(f"{name}\t{case}\t{contender}", flush=True)
+                for line in sys.stdin:
+                    if line == "next\n":
+                        break
+                    print(seconds(call), flush=True)
+
+
+def compare(names: list[str], other: Path) -> None:
+    """Print one line per contender and case: its time here, and that over its time in the other checkout."""
+    checkouts = (Path(__file__).resolve().parents[1], other.resolve())
+    sides = []
+    for checkout in checkouts:
+        command = [sys.executable, __file__, "--answer", *names]
+        environment = os.environ | {"PYTHONPATH": str(checkout)}
+        sides.append(
+            subprocess.Popen(command, env=environment, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        )
+    print(
+        f"torch {torch.__version__}; medians of {ROUNDS} rounds in which {checkouts[0]} and {checkouts[1]} take turns"
+    )
+
+    def ask(side: subprocess.Popen[str], what: str) -> str:
+        assert side.stdin is not None and side.stdout is not None
+        side.stdin.write(what)
+        side.stdin.flush()
+        return side.stdout.readline()
+
+    ratios = []
+    stated = [ask(side, "") for side in sides]
+    while all(stated):
+        if stated[0] != stated[1]:
+            sys.exit(f"the checkouts' contenders differ: {stated[0]!r} and {stated[1]!r}")
+        rounds = [[float(ask(side, "go\n")) for side in sides] for _ in range(WARM_UP + ROUNDS)][WARM_UP:]
+        here, there = (statistics.median(times) for times in zip(*rounds, strict=True))
+        ratios.append(statistics.median(one / two for one, two in rounds))
+        name, case, contender = stated[0].rstrip("\n").split("\t")
+        print(
+            f"{name:12} {case:30} {contender:30} {here * 1e3:9.3f} ms, {there * 1e3:9.3f} ms there: {ratios[-1]:6.3f}",
+            flush=True,
+        )
+        stated = [ask(side, "next\n") for side in sides]
+    print(f"median of {len(ratios)} ratios: {statistics.median(ratios):.3f}")
 
 
 def main() -> None:
     """Print one line per contender and case."""
-    names = sys.argv[1:] or list(SUBJECTS)
+    parser = argparse.ArgumentParser(description="Speed as ratios.")
+    parser.add_argument("subjects", nargs="*", help=f"of {', '.join(SUBJECTS)}; all of them by default")
+    parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="another checkout of this project")
+    parser.add_argument("--answer", action="store_true", help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    names = asked.subjects or list(SUBJECTS)
     unknown = [name for name in names if name not in SUBJECTS]
     if unknown:
         sys.exit(f"unknown subject {', '.join(unknown)}; known: {', '.join(SUBJECTS)}")
+    if asked.answer:
+        return answer(names)
+    if asked.against:
+        if not (asked.against / "holotorch").is_dir():
+            sys.exit(f"--against expects a checkout with a folder holotorch, got {asked.against}")
+        return compare(names, asked.against)
     print(f"torch {torch.__version__}, {torch.get_num_threads()} threads; medians of {ROUNDS} interleaved rounds")
     for name in names:
         for case, contenders in SUBJECTS[name]():
-            seconds = measure(contenders)
-            base = next(iter(seconds.values()))
-            for contender, value in seconds.items():
+            medians = measure(contenders)
+            base = next(iter(medians.values()))
+            for contender, value in medians.items():
                 print(f"{name:12} {case:30} {contender:30} {value * 1e3:9.3f} ms  {value / base:6.3f} of the baseline")
 
 
