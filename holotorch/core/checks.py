@@ -59,6 +59,12 @@ def quantity(kind: Quantity, value: float, name: str = "") -> float:
     return number
 
 
+def meant(kind: Quantity, value: Tensor | float, name: str = "") -> None:
+    """Raise as :func:`quantity` for a number; a tensor, which may be learned, compiled or mapped over, passes."""
+    if not isinstance(value, Tensor):
+        quantity(kind, value, name)
+
+
 def quantities(kind: Quantity, values: Tensor, name: str = "") -> None:
     """Raise ValueError for an element of ``values``, of any shape and with or without gradient, as :func:`quantity`."""
     size = values.detach().abs() if kind.negative else values.detach()

@@ -2,7 +2,9 @@
 
 import math
 
+from holotorch.core import checks
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import DISTANCE, WAVELENGTH
 
 
 def diffraction_angle(grid: Grid, wavelength: float) -> tuple[float, float]:
@@ -10,6 +12,7 @@ def diffraction_angle(grid: Grid, wavelength: float) -> tuple[float, float]:
 
     pi / 2 where the pitch is at or below half a wavelength: light then leaves in every direction.
     """
+    wavelength = checks.quantity(WAVELENGTH, wavelength)
     y, x = (math.asin(min(1.0, wavelength / (2 * pitch))) for pitch in grid.pitch)
     return y, x
 
@@ -20,6 +23,7 @@ def lateral_spread(grid: Grid, wavelength: float, distance: float, *, paraxial: 
     Infinite where the pitch is at or below half a wavelength. ``paraxial`` gives z sin(angle), which is what a Fresnel
     kernel does with that light.
     """
+    wavelength, distance = checks.quantity(WAVELENGTH, wavelength), checks.quantity(DISTANCE, distance)
     if distance == 0:
         return 0.0, 0.0
     sines = [wavelength / (2 * pitch) for pitch in grid.pitch]
@@ -37,8 +41,8 @@ def least_padding(grid: Grid, wavelength: float, distance: float, *, paraxial: b
     full-band field still wraps, in the tails of its samples; ``CroppedKernel`` has none of that. Infinite where light
     can travel at 90 degrees (a pitch of half a wavelength or less); 1 at distance 0.
     """
-    edge = 3 * math.sqrt(wavelength * abs(distance))
     spread = lateral_spread(grid, wavelength, distance, paraxial=paraxial)
+    edge = 3 * math.sqrt(wavelength * abs(distance))
     y, x = (1 + (reach + edge) / extent for reach, extent in zip(spread, grid.extent, strict=True))
     return y, x
 
@@ -49,5 +53,6 @@ def unaliased_distance(grid: Grid, wavelength: float, pad: float) -> float:
     It is 2 (pad - 1) L pitch / wavelength for isolated light, and for ``pad`` = 1, the periodic model, the distance
     L pitch / wavelength up to which the kernel's phase is sampled.
     """
+    wavelength = checks.quantity(WAVELENGTH, wavelength)
     windows = 1 if pad == 1 else 2 * (pad - 1)
     return windows * min(extent * pitch for extent, pitch in zip(grid.extent, grid.pitch, strict=True)) / wavelength

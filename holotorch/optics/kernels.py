@@ -1,11 +1,16 @@
-"""Transfer functions of free space: pure functions, float64 inside, differentiable in wavelength and distance."""
+"""Transfer functions of free space: pure functions, float64 inside, differentiable in wavelength and distance.
+
+Numbers that cannot be meant are refused; tensors, which may be learned or mapped over, are taken as they are.
+"""
 
 import math
 
 import torch
 from torch import Tensor
 
+from holotorch.core import checks
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import DISTANCE, WAVELENGTH
 
 
 def carrier(wavelength: Tensor | float, distance: Tensor | float) -> Tensor:
@@ -13,7 +18,7 @@ def carrier(wavelength: Tensor | float, distance: Tensor | float) -> Tensor:
 
     k z reaches 1e6 rad and more, where float32 steps by 0.1 rad; whole turns are taken off in float64 first.
     """
-    return turns_phasor(_float64(distance) / _float64(wavelength))
+    return turns_phasor(_distance(distance) / _wavelength(wavelength))
 
 
 def angular_spectrum_kernel(
@@ -35,7 +40,7 @@ def angular_spectrum_kernel(
 
     k_z - k is written -k s^2 / (1 + cos), s the sine of the angle, which does not cancel. Source: Goodman, Sec. 3.10.
     """
-    wavelength, distance = _float64(wavelength)[..., None, None], _float64(distance)[..., None, None]
+    wavelength, distance = _wavelength(wavelength)[..., None, None], _distance(distance)[..., None, None]
     fy, fx = grid.frequencies(distance.device)
     sine2 = (wavelength * fy).square() + (wavelength * fx).square()
     travels, decays = sine2 < 1, sine2 > 1
@@ -63,7 +68,7 @@ def fresnel_kernel(grid: Grid, wavelength: Tensor | float, distance: Tensor | fl
     exact one. Built from one exponential per axis. Source: thesis Eq. 4.49;
     Goodman, Sec. 4.2.
     """
-    product = (_float64(wavelength) * _float64(distance))[..., None, None]
+    product = (_wavelength(wavelength) * _distance(distance))[..., None, None]
     fy, fx = grid.frequencies(product.device)
     return turns_phasor(-product / 2 * fy.square()) * turns_phasor(-product / 2 * fx.square())
 
@@ -112,5 +117,11 @@ def turns_phasor(turns: Tensor) -> Tensor:
     return torch.complex(torch.cos(phase), torch.sin(phase))
 
 
-def _float64(value: Tensor | float) -> Tensor:
+def _wavelength(value: Tensor | float) -> Tensor:
+    checks.meant(WAVELENGTH, value)
+    return torch.as_tensor(value, dtype=torch.float64)
+
+
+def _distance(value: Tensor | float) -> Tensor:
+    checks.meant(DISTANCE, value)
     return torch.as_tensor(value, dtype=torch.float64)

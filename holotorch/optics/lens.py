@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.grid import Grid
-from holotorch.core.quantities import APERTURE_RADIUS, FOCAL_LENGTH
+from holotorch.core.quantities import APERTURE_RADIUS, FOCAL_LENGTH, PITCH, WAVELENGTH
 from holotorch.optics.kernels import turns_phasor
 
 
@@ -29,7 +29,12 @@ def lens_phase(
 
     Returns:
         float64, shape [..., H, W], not wrapped.
+
+    Raises:
+        ValueError: A number that cannot be meant; tensors are taken as they are.
     """
+    checks.meant(WAVELENGTH, wavelength)
+    checks.meant(FOCAL_LENGTH, focal_length)
     return 2 * math.pi * _turns(grid, wavelength, focal_length, paraxial)
 
 
@@ -43,8 +48,10 @@ def pupil(grid: Grid, radius: Tensor | float, *, softness: float = 0.0) -> Tenso
             edge has a gradient in the radius; about a pitch is enough.
 
     Raises:
-        ValueError: ``radius`` carries a gradient but the edge is hard, so that the gradient would be 0.
+        ValueError: ``radius`` carries a gradient but the edge is hard, so that the gradient would be 0; or it is a
+            number that cannot be meant.
     """
+    checks.meant(APERTURE_RADIUS, radius, "radius")
     radius = torch.as_tensor(radius, dtype=torch.float64)
     y, x = grid.coordinates(radius.device)
     return opening(y.square() + x.square(), radius[..., None, None], softness)
@@ -67,7 +74,8 @@ def lens_limit(pitch: float, wavelength: float, focal_length: float, *, paraxial
     for the spherical phase. Light that is tilted, or not flat, brings a slope of its own that adds to the lens's: a
     band of sine s leaves (wavelength / (2 pitch) - s) f.
     """
-    sine = wavelength / (2 * pitch)
+    sine = checks.quantity(WAVELENGTH, wavelength) / (2 * checks.quantity(PITCH, pitch))
+    checks.quantity(FOCAL_LENGTH, focal_length)
     if paraxial:
         return abs(focal_length) * sine
     return abs(focal_length) * sine / math.sqrt(1 - sine**2) if sine < 1 else math.inf

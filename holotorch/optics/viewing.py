@@ -7,7 +7,18 @@ with its image s1 in front of it (virtual, on the same side), eye d_eye behind i
 import math
 
 from holotorch.core import checks
-from holotorch.core.quantities import DEPTH, DISTANCE, FOCAL_LENGTH, PITCH, PUPIL_RADIUS, WAVELENGTH, WIDTH
+from holotorch.core.quantities import (
+    ACCOMMODATION,
+    DEPTH,
+    DISTANCE,
+    FOCAL_LENGTH,
+    OFFSET,
+    PITCH,
+    PUPIL_RADIUS,
+    SPACING,
+    WAVELENGTH,
+    WIDTH,
+)
 
 
 def planar_fov(pitch: float, wavelength: float) -> float:
@@ -66,6 +77,7 @@ def scene_fov(size: float, object_distance: float, focal_length: float, eye_dist
     Written V / (2 (s0 + d_eye (1 - s0 / f))), which is finite for an image at infinity (thesis Sec. 5.6.2).
     """
     image_distance(object_distance, focal_length)
+    checks.quantity(SPACING, eye_distance, "eye_distance")
     across = object_distance + eye_distance * (1 - object_distance / focal_length)
     return 2 * math.atan(checks.quantity(WIDTH, size, "size") / (2 * across))
 
@@ -103,7 +115,7 @@ def region(height: float, distance: float, width: float, pitch: float, wavelengt
     The point's cone cuts the hologram's plane in z tan(theta) to both sides. 1: all of it is hologram, finest spots.
     3: the hologram is all within it, spots grow with distance only. 2: part of either.
     """
-    cone, half = abs(distance) * _tangent(pitch, wavelength), width / 2
+    cone, half = _cone(height, distance, width, pitch, wavelength), width / 2
     if abs(height) + cone <= half:
         return 1
     if cone - abs(height) >= half:
@@ -117,13 +129,14 @@ def placement(size: float, width: float, pitch: float, wavelength: float, depth:
     (V + w) / (2 tan(theta)) + depth / 2, a cube by default. The thesis's 157.81 mm is for 455 nm: blue, with the
     narrowest cone, decides.
     """
-    near = (checks.quantity(WIDTH, size, "size") + width) / (2 * _tangent(pitch, wavelength))
-    return near + (size if depth is None else depth) / 2
+    across = checks.quantity(WIDTH, size, "size") + checks.quantity(WIDTH, width)
+    deep = size if depth is None else checks.quantity(SPACING, depth, "depth")
+    return across / (2 * _tangent(pitch, wavelength)) + deep / 2
 
 
 def section(height: float, distance: float, width: float, pitch: float, wavelength: float) -> float:
     """Length in metres, along one axis, of the part of the hologram whose cones hold a point."""
-    cone = abs(distance) * _tangent(pitch, wavelength)
+    cone = _cone(height, distance, width, pitch, wavelength)
     return max(0.0, min(width / 2, height + cone) - max(-width / 2, height - cone))
 
 
@@ -132,7 +145,8 @@ def smallest_spot(wavelength: float, distance: float, section: float) -> float:
 
     ``section`` is that of :func:`section`; 0 gives infinity.
     """
-    return wavelength * abs(distance) / section if section > 0 else math.inf
+    longest = checks.quantity(WAVELENGTH, wavelength) * abs(checks.quantity(DISTANCE, distance))
+    return longest / section if section > 0 else math.inf
 
 
 def vignetting(height: float, first: float, second: float, pupil_radius: float, sine: float) -> float:
@@ -148,6 +162,7 @@ def vignetting(height: float, first: float, second: float, pupil_radius: float, 
     The light spans A y +- B sine on the pupil's plane. Rays only: where it misses the pupil 0.5 % still arrive by
     diffraction in the thesis's display. A is 0, and nothing is lost, with the eye at the focal point of the eyepiece.
     """
+    checks.quantity(OFFSET, height, "height")
     half = abs(second) * sine
     low, high = max(-pupil_radius, first * height - half), min(pupil_radius, first * height + half)
     return max(0.0, high - low) / (2 * checks.quantity(PUPIL_RADIUS, pupil_radius))
@@ -155,7 +170,7 @@ def vignetting(height: float, first: float, second: float, pupil_radius: float, 
 
 def visible_half_width(first: float, second: float, pupil_radius: float, sine: float) -> float:
     """Height in metres from which no light reaches the pupil: (r + B sine) / A, infinite for A = 0."""
-    reach = pupil_radius + abs(second) * sine
+    reach = checks.quantity(PUPIL_RADIUS, pupil_radius) + abs(second) * sine
     return reach / abs(first) if first else math.inf
 
 
@@ -164,7 +179,7 @@ def eye_box(size: float, first: float, second: float, sine: float) -> float:
 
     2 (B sine - A size / 2); arguments as for :func:`vignetting`.
     """
-    return max(0.0, 2 * abs(second) * sine - abs(first) * size)
+    return max(0.0, 2 * abs(second) * sine - abs(first) * checks.quantity(WIDTH, size, "size"))
 
 
 def fresnel_number(radius: float, wavelength: float, distance: float) -> float:
@@ -194,6 +209,13 @@ def _tangent(pitch: float, wavelength: float) -> float:
     return math.tan(math.asin(sine))
 
 
+def _cone(height: float, distance: float, width: float, pitch: float, wavelength: float) -> float:
+    """Half-width in metres of the light of a point on the hologram's plane, all lengths checked."""
+    checks.quantity(OFFSET, height, "height")
+    checks.quantity(WIDTH, width)
+    return abs(checks.quantity(DISTANCE, distance)) * _tangent(pitch, wavelength)
+
+
 def _positive_focal_length(value: float) -> float:
     if checks.quantity(FOCAL_LENGTH, value) < 0:
         raise ValueError(f"focal_length must be above zero in metres, got {value!r}")
@@ -201,6 +223,8 @@ def _positive_focal_length(value: float) -> float:
 
 
 def _before_eyepiece(focus_distance: float, eye_distance: float) -> float:
+    checks.quantity(ACCOMMODATION, focus_distance, "focus_distance")
+    checks.quantity(SPACING, eye_distance, "eye_distance")
     if not focus_distance > eye_distance:
         raise ValueError(f"focus_distance must exceed the eye's distance from the eyepiece, {eye_distance:g} m, got "
                          f"{focus_distance!r} m")  # fmt: skip
