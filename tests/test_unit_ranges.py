@@ -174,7 +174,7 @@ ENTRIES = [
     Entry("lens_limit: pitch", lambda v: lens_limit(v, WAVE, 0.1), q.PITCH, 8e-6, (NANO, MICRO, MILLI)),
     Entry("pupil: radius", lambda v: pupil(GRID, v), q.APERTURE_RADIUS, 1e-3),
     Entry("placement: width", lambda v: placement(1e-2, v, 8e-6, WAVE), q.WIDTH, 8e-3, (NANO, MICRO)),
-    Entry("eye_box: size", lambda v: eye_box(v, 0.5, 0.1, 0.03), q.WIDTH, 8e-3, (NANO, MICRO)),
+    Entry("eye_box: size", lambda v: eye_box(v, 0.5, 0.1, 0.03), q.SPACING, 8e-3, (NANO, MICRO)),
     Entry(
         "visible_half_width: pupil_radius",
         lambda v: visible_half_width(0.5, 0.1, v, 0.03),

@@ -177,9 +177,9 @@ def visible_half_width(first: float, second: float, pupil_radius: float, sine: f
 def eye_box(size: float, first: float, second: float, sine: float) -> float:
     """Width in metres of the box in the pupil's plane that light of every point within ``size`` reaches, at least 0.
 
-    2 (B sine - A size / 2); arguments as for :func:`vignetting`.
+    2 (B sine - A size / 2); arguments as for :func:`vignetting`. A ``size`` of 0 is a point on the axis.
     """
-    return max(0.0, 2 * abs(second) * sine - abs(first) * checks.quantity(WIDTH, size, "size"))
+    return max(0.0, 2 * abs(second) * sine - abs(first) * checks.quantity(SPACING, size, "size"))
 
 
 def fresnel_number(radius: float, wavelength: float, distance: float) -> float:
