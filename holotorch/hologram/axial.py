@@ -1,6 +1,7 @@
 """AxialHologram: any number of planes by a few transforms, their spectra gathered on the way along the axis."""
 
 import math
+import warnings
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -17,6 +18,7 @@ from holotorch.hologram.layered import LayerHologram
 from holotorch.hologram.nodes import axial_range, choose_nodes
 from holotorch.hologram.raster import Raster, lit
 from holotorch.hologram.waves import AxialDesign, Waves
+from holotorch.optics.candidates import FINEST
 
 _GROUP = 16  # planes that are spread at once, by a matrix product per line instead of a pass for each
 
@@ -32,13 +34,17 @@ class AxialHologram(LayerHologram):
         grid: Pixels of the hologram.
         wavelength: In metres.
         depths: Of the planes, in metres, above 0; any order and spacing.
-        cone: "taper" (soft rim) or "band" (sharp), both in frequency; see ``holotorch.hologram.cone``. Where the cone
-            is wider than all pairs of source and pixel they agree with every other definition that is not tapered.
+        cone: "taper", "band" or "full", see ``holotorch.hologram.cone``; "full" only where every pixel lies within the
+            cone of every source, since steeper light is left out.
         stride: Pixels between neighbouring sources of a plane.
         tolerance: Relative L2 error to stay below for sources like noise; 1e-6 at least in complex64.
 
     Raises:
-        TypeError, ValueError: Impossible arguments; in a call: layers that are not complex [..., D, h, w].
+        TypeError, ValueError: Impossible arguments; in a call: layers that are not complex [..., D, h, w], or so wide
+            that ``full`` does not hold.
+
+    Warns:
+        SamplingWarning: In a call, where the predicted error exceeds the tolerance.
 
     Source: Sec. 5.3.2 of the thesis for the sum; Weyl's expansion exp(ikr)/r = i int exp(2 pi i (f x + z w)) / w df.
     """
@@ -54,8 +60,13 @@ class AxialHologram(LayerHologram):
         tolerance: float = 1e-3,
     ):
         super().__init__(grid, wavelength, depths, cone, stride)
-        if cone not in ("taper", "band"):
-            raise ValueError(f"AxialHologram works in frequency, with cone='taper' or 'band', got {cone!r}")
+        if cone in ("box", "disc"):
+            raise ValueError(f"AxialHologram works in frequency, with cone='taper', 'band' or 'full', got {cone!r}")
+        if min(grid.pitch) < FINEST * self.wavelength:
+            raise ValueError(
+                f"AxialHologram needs a pitch of at least {FINEST} wavelengths, {FINEST * self.wavelength:.3g} m, got "
+                f"{min(grid.pitch):g} m: use ConvolutionHologram"
+            )
         self.tolerance = checks.positive("tolerance", tolerance)
         self._designs: dict[tuple[int, int], AxialDesign] = {}
 
@@ -63,6 +74,12 @@ class AxialHologram(LayerHologram):
         """Nodes and lengths for layers of ``shape`` (h, w)."""
         if shape not in self._designs:
             axes = self._axes(shape)
+            if self.cone == "full" and not all(axis.within_band for axis in axes):
+                raise ValueError(
+                    f"cone='full' leaves out no light only where every pixel lies within every source's cone, from "
+                    f"{max(axis.apart * axis.pitch / axis.steepest for axis in axes):.3g} m on for layers of {shape}; "
+                    f"the nearest depth is {min(self.depths):.3g} m: use cone='taper' or ConvolutionHologram"
+                )
             (height, ey), (width, ex) = (choose_length(axis, 0.4 * self.tolerance) for axis in axes)
             steepest = axes[0].fade(height)[1], axes[1].fade(width)[1]
             low, high = axial_range(self.grid, self.wavelength, steepest)
@@ -74,6 +91,13 @@ class AxialHologram(LayerHologram):
     def waves(self, shape: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Waves:
         """Factors in frequency for layers of ``shape``."""
         design = self.design(shape)
+        if not design.adequate:
+            warnings.warn(
+                f"the hologram's relative error is about {design.predicted_error:.1e}, and its tolerance "
+                f"{self.tolerance:.1e}: use ConvolutionHologram, cone='taper' or a larger tolerance",
+                checks.SamplingWarning,
+                stacklevel=2,
+            )
         raster = Raster(self.grid, shape, self.stride, design.size)
         return Waves(self.grid, self.wavelength, design, self._axes(shape), raster, dtype, device)
 

@@ -1,17 +1,21 @@
 """What a point of light sends to a sampled hologram: the spherical wave, and the cone of it that the pixels can carry.
 
 The wave of a point is exp(+i k r) / r (thesis Eqs. 5.1, 5.13). A pitch p carries sines up to wavelength / (2 p) per
-axis only; beyond, the samples alias. How the rest is kept apart is a definition, not an approximation:
+axis only; beyond, the samples alias. What is kept of the wave is a definition, the same for all holograms:
 
-- ``full``: nothing is. It aliases where the cone is narrower than the pixels (Algorithm 4 as printed).
-- ``box``: a sharp pyramid, |x| <= z tan(theta) and |y| <= z tan(theta): the thesis's K_z of Sec. 5.6.1.
-- ``disc``: a sharp cone of the same half angle.
-- ``taper``: the pyramid with a soft rim, from 0.7 of the highest frequency on, so that no light rings at its edge.
+- ``full``: all of it. It aliases where the cone is narrower than the pixels (Algorithm 4 as printed).
+- ``box``: a sharp pyramid in space, |x| <= z tan(theta) and |y| <= z tan(theta): the thesis's K_z of Sec. 5.6.1.
+- ``disc``: a sharp cone in space, of the same half angle.
 - ``band``: the wave whose spectrum ends sharply at the highest frequency, all that a display with square pixels emits.
+- ``taper``: the wave whose spectrum falls to 0 over the last 30 % of the band of each axis, so that no edge rings.
+
+Where every pixel lies well inside the cone of every source, ``taper`` is the plain wave, as are ``full``, ``box`` and
+``disc``: :func:`is_plain` says from where on. The ringing of ``band`` reaches farther: it is 0.6 / sqrt(K) of the wave
+on the axis, K the samples that the cone covers.
 """
 
 import math
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -19,17 +23,36 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import DEPTH
+from holotorch.optics.candidates import FINEST
 from holotorch.optics.geometry import lateral_spread
 from holotorch.optics.kernels import carrier, turns_phasor
 
 Cone = Literal["full", "box", "disc", "taper", "band"]
-_SOFT = 0.7  # of the highest frequency: where the taper begins
+TAPER_BEGIN = 0.7  # of the highest frequency
+_TAPER_RINGING = 2.0  # times sqrt(K) / n^3, K and n in samples; measured 0.9 to 2.5, with both ends of the band
 
 
 def taper(part: Tensor) -> Tensor:
     """1 up to 0.7, a half cosine down to 0 at 1, of a frequency's part of the highest one."""
-    edge = ((part.abs() - _SOFT) / (1 - _SOFT)).clamp(0, 1)
+    edge = ((part.abs() - TAPER_BEGIN) / (1 - TAPER_BEGIN)).clamp(0, 1)
     return (1 + torch.cos(math.pi * edge)) / 2
+
+
+def taper_margin(cone: float, error: float) -> float:
+    """Samples beside an end of the taper at which it changes the wave by a part ``error`` of it.
+
+    The taper's second derivative steps at its ends, which adds light of sqrt(K) / n^3 of the wave n samples from where
+    the geometry puts those ends; K = 2 ``cone`` samples is what the whole cone covers.
+    """
+    return (_TAPER_RINGING * math.sqrt(2 * cone) / error) ** (1 / 3)
+
+
+def is_plain(grid: Grid, wavelength: float, depth: float, apart: tuple[int, int], error: float) -> bool:
+    """Whether the taper changes the wave by a part below ``error`` at all displacements up to ``apart`` samples."""
+    return all(
+        math.isinf(cone) or TAPER_BEGIN * cone - distance >= taper_margin(cone, error / 2)
+        for cone, distance in zip(cone_samples(grid, wavelength, depth), apart, strict=True)
+    )
 
 
 def cone_samples(grid: Grid, wavelength: float, depth: float) -> tuple[float, float]:
@@ -47,21 +70,19 @@ def spherical_wave(dy: Tensor, dx: Tensor, pitch: tuple[float, float], wavelengt
         pitch: (y, x) of the hologram in metres, from which the cone follows.
         wavelength: In metres.
         depth: z > 0 in metres; r^2 = z^2 + dy^2 + dx^2.
-        cone: Any of the definitions above but ``band``, which has no closed form in space.
+        cone: "full", "box" or "disc"; the others have no closed form in space, see ``band_limited_wave``.
 
     Returns:
         complex128. k r is written k z + k s / (r + z), s = dy^2 + dx^2, whose second term does not cancel; whole turns
         of the first are taken off in float64.
     """
     square = dy.square() + dx.square()
-    far = torch.sqrt(depth**2 + square)
-    wave = turns_phasor(square / (far + depth) / wavelength) * (carrier(wavelength, depth).to(far.device) / far)
+    distance = torch.sqrt(depth**2 + square)
+    wave = turns_phasor(square / (distance + depth) / wavelength) * (
+        carrier(wavelength, depth).to(distance.device) / distance
+    )
     if cone == "full":
         return wave
-    if cone == "taper":
-        parts = (2 * step * aside / (wavelength * far) for step, aside in zip(pitch, (dy, dx), strict=True))
-        y, x = (taper(part) for part in parts)
-        return wave * (y * x)
     spread = lateral_spread(Grid(1, pitch), wavelength, depth)
     # A pixel on the border belongs to the cone, whatever its position was rounded to.
     y, x = (aside.abs() / (limit * (1 + 1e-12)) for aside, limit in zip((dy, dx), spread, strict=True))
@@ -69,20 +90,36 @@ def spherical_wave(dy: Tensor, dx: Tensor, pitch: tuple[float, float], wavelengt
     return torch.where(inside, wave, 0)
 
 
+def check_cone(cone: Cone, pitch: tuple[float, float], wavelength: float) -> None:
+    """Raise ValueError unless ``cone`` is one of the definitions, and one that a pitch so fine can have."""
+    if cone not in get_args(Cone):
+        raise ValueError(f"cone must be one of {', '.join(map(repr, get_args(Cone)))}, got {cone!r}")
+    if cone in ("taper", "band") and min(pitch) < FINEST * wavelength:
+        raise ValueError(
+            f"cone={cone!r} needs a pitch of at least {FINEST} wavelengths, {FINEST * wavelength:.3g} m, got "
+            f"{min(pitch):g} m: use cone='box' of ConvolutionHologram"
+        )
+
+
 def check_scene(grid: Grid, wavelength: float, depths, stride: int) -> tuple[float, tuple[float, ...], int]:
     """Checked wavelength, depths and stride of a hologram's sources.
 
     Raises:
         TypeError: Not numbers.
-        ValueError: No depth, or one that is not above zero (all points lie before the hologram) or beyond 100 m.
+        ValueError: Several wavelengths; no depth, or one that is not above zero (all points lie before the hologram)
+            or beyond 100 m.
     """
-    wavelength = checks.wavelengths(wavelength)[0]
+    first, *others = checks.wavelengths(wavelength)
+    if others:
+        raise ValueError(
+            f"wavelength must be one length in metres, got {1 + len(others)}: make one hologram per colour"
+        )
     items = depths.tolist() if isinstance(depths, Tensor) else list(depths)
     if not items:
         raise ValueError("depths must hold at least one distance in metres, got none")
     for depth in items:
         checks.quantity(DEPTH, depth, "depth of a plane")
-    return wavelength, tuple(map(float, items)), checks.whole("stride", stride, 1)
+    return first, tuple(map(float, items)), checks.whole("stride", stride, 1)
 
 
 def check_layers(layers: Tensor, count: int) -> None:

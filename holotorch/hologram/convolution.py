@@ -9,12 +9,14 @@ from torch import Tensor
 from holotorch.core.complex import phasor
 from holotorch.core.fourier import even_fft2, multiply_even
 from holotorch.core.grid import Grid
-from holotorch.hologram.cone import Cone, cone_samples, spherical_wave
+from holotorch.hologram.band_limited import point_spectrum
+from holotorch.hologram.cone import Cone, cone_samples, is_plain, spherical_wave, taper, taper_margin
 from holotorch.hologram.layered import LayerHologram
 from holotorch.hologram.raster import Raster, lit, span, strided_length
-from holotorch.optics.candidates import FINEST
 from holotorch.optics.passage import passage
 from holotorch.optics.transfer import transfer_function
+
+TAPER_ERROR = 2e-7  # part of the wave that wraps around, or by which the taper may differ from the plain wave
 
 
 class ConvolutionHologram(LayerHologram):
@@ -29,8 +31,9 @@ class ConvolutionHologram(LayerHologram):
         grid: Pixels of the hologram.
         wavelength: In metres.
         depths: Of the planes, in metres, above 0; any order and spacing.
-        cone: What is kept of each wave, see ``holotorch.hologram.cone``. ``band`` has no closed form in space; its wave
-            is that of ``CroppedKernel``, exact but for about 2 s^2 / sqrt(N), s the sine of the steepest light.
+        cone: What is kept of each wave, see ``holotorch.hologram.cone``. ``taper`` is applied in frequency, on arrays
+            so long that 2e-7 of a wave wraps around. The wave of ``band`` is that of ``CroppedKernel``, exact but for
+            about 2 s^2 / sqrt(N), s the sine of the steepest light.
         stride: Pixels between neighbouring sources of a plane.
 
     Raises:
@@ -39,40 +42,71 @@ class ConvolutionHologram(LayerHologram):
 
     def __init__(self, grid: Grid, wavelength: float, depths: Sequence[float], *, cone: Cone = "box", stride: int = 1):
         super().__init__(grid, wavelength, depths, cone, stride)
-        if cone == "band" and min(grid.pitch) < FINEST * self.wavelength:
-            raise ValueError(f"cone='band' needs a pitch of at least {FINEST} wavelengths, got {min(grid.pitch):g} m")
 
     def padded(self, shape: tuple[int, int]) -> tuple[int, int]:
         """Samples of the transforms for layers of ``shape`` (h, w)."""
         apart, least = span(self.grid, shape, self.stride)
-        cone = self._cone(max(self.depths), apart)
+        extents = [self._extent(depth, apart) for depth in self.depths]
         # Longer by one than the farthest pair and the farthest wave: no wave wraps around into a pair.
         y, x = (
-            strided_length(max(length, far + wide + 1), self.stride)
-            for length, far, wide in zip(least, apart, cone, strict=True)
+            strided_length(max(length, distance + max(wide) + 1), self.stride)
+            for length, distance, wide in zip(least, apart, zip(*extents, strict=True), strict=True)
         )
         return y, x
 
-    def _cone(self, depth: float, apart: tuple[int, int]) -> tuple[int, int]:
+    def _extent(self, depth: float, apart: tuple[int, int]) -> tuple[int, int]:
         """Farthest displacement (y, x) that the kernel of a depth has, in samples."""
-        if self.cone in ("full", "band"):
+        if self._in_frequency(depth, apart):
+            sines = [self.wavelength / (2 * pitch) for pitch in self.grid.pitch]
+            widest = depth / math.sqrt(1 - sines[0] ** 2 - sines[1] ** 2)
+            y, x = (
+                math.ceil(widest * sine / pitch + taper_margin(widest * sine / pitch, TAPER_ERROR))
+                for sine, pitch in zip(sines, self.grid.pitch, strict=True)
+            )
+            return y, x
+        if self.cone not in ("box", "disc"):
             return apart
         half = cone_samples(self.grid, self.wavelength, depth)
         y, x = (math.floor(min(reach, wide * (1 + 1e-12))) for reach, wide in zip(apart, half, strict=True))
         return y, x
+
+    def kernel_samples(self, depth: float, shape: tuple[int, int]) -> tuple[int, int]:
+        """Samples (y, x) of the quadrant of a plane's wave that are computed, for layers of ``shape`` (h, w)."""
+        apart, size = span(self.grid, shape, self.stride)[0], self.padded(shape)
+        if self._in_frequency(depth, apart):
+            return size[0] // 2 + 1, size[1] // 2 + 1
+        y, x = (min(wide, length // 2) + 1 for wide, length in zip(self._extent(depth, apart), size, strict=True))
+        return y, x
+
+    def _in_frequency(self, depth: float, apart: tuple[int, int]) -> bool:
+        """Whether a plane's wave is tapered somewhere, and so made in frequency."""
+        return self.cone == "taper" and not is_plain(self.grid, self.wavelength, depth, apart, TAPER_ERROR)
 
     def _kernel(self, depth: float, raster: Raster, layers: Tensor) -> Tensor:
         """A quadrant of the transform of a plane's wave."""
         apart, _ = span(self.grid, raster.shape, self.stride)
         if self.cone == "band":
             return self._limited(depth, raster, apart).to(layers.device, layers.dtype)
-        cone = self._cone(depth, apart)
+        if self._in_frequency(depth, apart):
+            return self._tapered(depth, raster, layers.device).to(layers.dtype)
+        extent = self._extent(depth, apart)
         dy, dx = (
             torch.arange(min(far, size // 2) + 1, dtype=torch.float64, device=layers.device) * pitch
-            for far, size, pitch in zip(cone, raster.size, self.grid.pitch, strict=True)
+            for far, size, pitch in zip(extent, raster.size, self.grid.pitch, strict=True)
         )
-        wave = spherical_wave(dy[:, None], dx[None], self.grid.pitch, self.wavelength, depth, self.cone)
+        cone: Cone = self.cone if self.cone in ("box", "disc") else "full"
+        wave = spherical_wave(dy[:, None], dx[None], self.grid.pitch, self.wavelength, depth, cone)
         return even_fft2(wave.to(layers.dtype), raster.size)
+
+    def _tapered(self, depth: float, raster: Raster, device: torch.device) -> Tensor:
+        """The quadrant for ``taper``, per area of a sample."""
+        fy, fx = (
+            torch.arange(size // 2 + 1, dtype=torch.float64, device=device) / (size * pitch)
+            for size, pitch in zip(raster.size, self.grid.pitch, strict=True)
+        )
+        weights = taper(2 * self.grid.pitch[0] * fy)[:, None] * taper(2 * self.grid.pitch[1] * fx)
+        spectrum = point_spectrum(fy[:, None], fx[None], self.wavelength, depth)
+        return spectrum * (weights / math.prod(self.grid.pitch))
 
     def _limited(self, depth: float, raster: Raster, apart: tuple[int, int]) -> Tensor:
         """The quadrant for ``band``: propagation of band-limited samples, times Weyl's i / w, per area of a sample."""

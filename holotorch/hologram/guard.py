@@ -2,8 +2,8 @@
 
 A transfer function that is sampled in frequency is periodic in space. Light that leaves the array comes back on the
 other side, and the rim of the band rings as far as it likes. Two cures: frequencies whose light no pixel can meet are
-faded out, and the array is made longer. What is left is measured: the axis' kernel against one on a far longer array,
-weighted by how many pairs of source and pixel lie so far apart.
+faded out, and the array is made longer. What is left, of both, is measured on one axis: its kernel against the wave
+that ``cone`` defines, weighted by how many pairs of source and pixel lie so far apart.
 """
 
 import math
@@ -12,6 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 import torch
+from scipy.special import hankel1e
 from torch import Tensor
 
 from holotorch.core.fourier import good_length
@@ -33,7 +34,7 @@ class Axis:
         wavelength: In metres.
         nearest: Depth of the first plane in metres.
         farthest: Depth of the last.
-        cone: "band" or "taper".
+        cone: "full", "taper" or "band", see ``holotorch.hologram.cone``.
     """
 
     sources: int
@@ -60,13 +61,13 @@ class Axis:
         """Tangents between which light is faded out: met by no pixel of the nearest plane, not wrapping from any."""
         begin = self.apart * self.pitch / self.nearest
         end = (length - self.apart) * self.pitch / self.farthest
-        # Where the band ends beyond all pairs its sharp edge need not ring.
-        return begin, min(end, self.steepest) if self.far else end
+        # The plain wave has no end: that of the band need not ring.
+        return begin, min(end, self.steepest) if self.cone == "full" else end
 
     @property
-    def far(self) -> bool:
-        """Whether the band ends beyond all pairs, at every depth: then all cones agree on what is exact."""
-        return self.steepest * self.nearest > 1.02 * self.apart * self.pitch
+    def within_band(self) -> bool:
+        """Whether the band holds the light of every pair, at every depth."""
+        return self.steepest * self.nearest > self.apart * self.pitch
 
     def least(self) -> int:
         """Shortest length at which no light of a ray's straight path wraps around into a pair."""
@@ -78,33 +79,48 @@ class Axis:
         return max(self._error(length, depth) for depth in {self.nearest, self.farthest})
 
     def _error(self, length: int, depth: float) -> float:
-        spread = self.apart + self.steepest * depth / self.pitch
-        # The reference's own tails wrap too: four times the length leaves a quarter of them.
-        longer = good_length(math.ceil(4 * max(length, spread)))
         displacement = np.arange(self.apart + 1)
-        taps, exact = self._taps(length, depth, True)[displacement % length], _exact_taps(self, longer, depth)
+        faded = self._spectrum(length, depth) * self._fading(length)
+        taps, exact = np.fft.ifft(faded)[displacement % length], _exact_taps(self, self._longer(length, depth), depth)
         pairs = np.clip(self.apart - displacement, 0, min(self.sources, self.pixels)) + 1.0
         pairs[1:] *= 2
         return math.sqrt((pairs * np.abs(taps - exact) ** 2).sum() / (pairs * np.abs(exact) ** 2).sum())
 
-    def _taps(self, length: int, depth: float, faded: bool) -> np.ndarray:
-        part = 2 * self.pitch * np.fft.fftfreq(length, self.pitch)
-        sine = part * self.wavelength / (2 * self.pitch)
+    def _longer(self, length: int, depth: float) -> int:
+        """Length of the array that stands for an endless one: what wraps around there is a quarter of it or less."""
+        return good_length(math.ceil(4 * max(length, self.apart + self.steepest * depth / self.pitch)))
+
+    def _sines(self, length: int) -> np.ndarray:
+        return np.fft.fftfreq(length, self.pitch) * self.wavelength
+
+    def _spectrum(self, length: int, depth: float) -> np.ndarray:
+        """Of the wave in samples of frequency, without carrier."""
+        sine = self._sines(length)
         travels = np.abs(sine) < 0.999
         cosine = np.sqrt(np.where(travels, 1 - sine**2, 1))
         turns = -depth / self.wavelength * sine**2 / (1 + cosine)
         kernel = np.where(travels, np.exp(2j * math.pi * (turns - np.rint(turns))), 0)
         if self.cone == "taper":
-            kernel = kernel * taper(torch.from_numpy(part)).numpy()
-        begin, end = self.fade(length) if faded else (self.apart * self.pitch / depth, self.steepest)
-        if faded or self.far:
-            kernel = kernel * faded_out(torch.from_numpy(sine / cosine), begin, end).numpy()
-        return np.fft.ifft(kernel)
+            kernel = kernel * taper(torch.from_numpy(sine * (2 * self.pitch / self.wavelength))).numpy()
+        return kernel
+
+    def _fading(self, length: int) -> np.ndarray:
+        sine = np.clip(self._sines(length), -0.999, 0.999)
+        return faded_out(torch.from_numpy(sine / np.sqrt(1 - sine**2)), *self.fade(length)).numpy()
+
+    def _plain(self, depth: float) -> np.ndarray:
+        """The wave that no cone limits, integral of exp(2 pi i (f x + z w)) over f, at displacements from 0 on."""
+        aside, k = np.arange(self.apart + 1) * self.pitch, 2 * math.pi / self.wavelength
+        distance = np.hypot(aside, depth)
+        wave = 0.5j * k * depth / distance * hankel1e(1, k * distance)
+        return self.pitch * wave * np.exp(1j * k * (aside**2 / (distance + depth)))
 
 
 @lru_cache(maxsize=8)  # far away it is the same for every length that is tried, and longer than all of them
 def _exact_taps(axis: Axis, length: int, depth: float) -> np.ndarray:
-    return axis._taps(length, depth, False)[: axis.apart + 1].copy()
+    if axis.cone == "full":
+        return axis._plain(depth)
+    return np.fft.ifft(axis._spectrum(length, depth))[: axis.apart + 1].copy()
 
 
 def faded_out(values: Tensor, begin: float, end: float) -> Tensor:

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from holotorch.core.grid import Grid
 from holotorch.core.operator import linear
-from holotorch.hologram.cone import Cone, check_layers, check_scene
+from holotorch.hologram.cone import Cone, check_cone, check_layers, check_scene
 
 
 class LayerHologram(nn.Module):
@@ -29,6 +29,7 @@ class LayerHologram(nn.Module):
         super().__init__()
         self.grid = grid
         self.wavelength, self.depths, self.stride = check_scene(grid, wavelength, depths, stride)
+        check_cone(cone, grid.pitch, self.wavelength)
         self.cone: Cone = cone
 
     def forward(self, layers: Tensor) -> Tensor:

@@ -10,8 +10,9 @@ from torch import nn
 from holotorch.core import checks
 from holotorch.core.grid import Grid
 from holotorch.hologram.axial import AxialHologram
-from holotorch.hologram.cone import Cone, check_scene, cone_samples
-from holotorch.hologram.convolution import ConvolutionHologram
+from holotorch.hologram.cone import Cone, check_scene, cone_samples, is_plain
+from holotorch.hologram.convolution import TAPER_ERROR, ConvolutionHologram
+from holotorch.hologram.raster import span
 from holotorch.optics.candidates import FINEST
 
 _ROUNDING = {torch.complex64: 5e-7, torch.complex128: 1e-12}
@@ -27,7 +28,8 @@ class HologramPlan:
     Attributes:
         method: "convolution" or "axial nodes".
         cone: Definition of the waves, see ``holotorch.hologram.cone``.
-        near: Whether the cone is narrower than the window somewhere, so that definitions differ.
+        near: Whether some pixel lies so near the rim of some source's cone, or beyond it, that definitions differ by
+            more than the tolerance.
         transforms: Of the sources, one per plane or per node.
         size: Samples (y, x) of the whole spectrum.
         predicted_error: Expected relative L2 error for sources like noise, against that definition.
@@ -76,8 +78,8 @@ def plan_hologram(
         shape: Sources of a plane; only those that are lit need be counted.
         stride: Pixels between neighbouring sources.
         tolerance: Relative L2 error that is wanted.
-        cone: Definition of the waves. By default a soft rim, "taper", which costs least and rings least; far away,
-            where the cone is wider than the window, all are the same.
+        cone: Definition of the waves, which is kept. By default a soft rim, "taper", which costs least and rings least
+            ("box" at pitches below 0.9 wavelengths). Far away, where ``near`` is False, all but "band" are the same.
         dtype: complex64 or complex128.
         memory_limit: In bytes.
 
@@ -88,19 +90,19 @@ def plan_hologram(
     tolerance = checks.positive("tolerance", tolerance)
     if dtype not in _ROUNDING:
         raise TypeError(f"dtype must be torch.complex64 or torch.complex128, got {dtype}")
-    found = []
-    if cone != "band" or min(grid.pitch) >= FINEST * wavelength:
-        exact = ConvolutionHologram(grid, wavelength, listed, cone=cone or "taper", stride=stride)
-        found.append(_convolution(exact, shape, dtype))
-    if cone in (None, "taper", "band") or not _near(grid, wavelength, listed, shape, stride):
-        limited: Cone = "band" if cone == "band" else "taper"
+    asked: Cone = cone or ("taper" if min(grid.pitch) >= FINEST * wavelength else "box")
+    exact = ConvolutionHologram(grid, wavelength, listed, cone=asked, stride=stride)
+    found = [_convolution(exact, shape, dtype)]
+    apart, _ = span(grid, shape, stride)
+    limited = _in_frequency(grid, wavelength, min(listed), apart, asked)
+    if limited:
         axial = AxialHologram(grid, wavelength, listed, cone=limited, stride=stride, tolerance=tolerance)
         found.append(_axial(axial, shape, dtype))
     adequate = [way for way in found if way["predicted_error"] <= tolerance]
     if not adequate:
         best = min(found, key=lambda way: way["predicted_error"])
         raise ValueError(
-            f"no way reaches a tolerance of {tolerance:.1e} for cone={best['cone']!r}: {best['method']} comes to "
+            f"no way reaches a tolerance of {tolerance:.1e} for cone={asked!r}: {best['method']} comes to "
             f"{best['predicted_error']:.1e}; use cone='taper' or a larger tolerance"
         )
     ordered = sorted(adequate, key=lambda way: way["flops"])
@@ -119,17 +121,20 @@ def plan_hologram(
         other = others[0]
         why = f"{other['flops'] / best['flops']:.1f} times the work" if other in adequate else "not accurate enough"
         runner_up = f"{other['method']}: {other['transforms']} transforms, {other['predicted_error']:.0e}, {why}"
-    near = _near(grid, wavelength, listed, shape, stride)
-    return HologramPlan(
-        **best, near=near, runner_up=runner_up, notes=_notes(grid, wavelength, listed, near), adequate=True
-    )
+    near = not is_plain(grid, wavelength, min(listed), apart, tolerance)
+    notes = _notes(grid, wavelength, listed, near)
+    return HologramPlan(**best, cone=asked, near=near, runner_up=runner_up, notes=notes, adequate=True)
 
 
-def _near(grid: Grid, wavelength: float, depths: Sequence[float], shape: tuple[int, int], stride: int) -> bool:
-    half = cone_samples(grid, wavelength, min(depths))
-    return any(
-        wide < (count * stride + pixels) / 2 for wide, count, pixels in zip(half, shape, grid.shape, strict=True)
-    )
+def _in_frequency(grid: Grid, wavelength: float, nearest: float, apart: tuple[int, int], asked: Cone) -> Cone | None:
+    """What an axial hologram is to be asked for, to do what ``asked`` defines; None if it cannot."""
+    if min(grid.pitch) < FINEST * wavelength:
+        return None
+    if asked in ("taper", "band"):
+        return asked
+    # Where the sharp cone holds every pair, its wave is the plain one.
+    y, x = (distance / half for distance, half in zip(apart, cone_samples(grid, wavelength, nearest), strict=True))
+    return "full" if max(y, x) < 1 and (asked != "disc" or math.hypot(y, x) < 1) else None
 
 
 def _transform(samples: float) -> float:
@@ -139,35 +144,26 @@ def _transform(samples: float) -> float:
 def _convolution(operator: ConvolutionHologram, shape: tuple[int, int], dtype: torch.dtype) -> dict:
     size, count = operator.padded(shape), len(operator.depths)
     samples, sources = math.prod(size), math.prod(size) / operator.stride**2
-    waves = 0.0
-    for depth in operator.depths:
-        cone = cone_samples(operator.grid, operator.wavelength, depth)
-        waves += math.prod(min(wide, length / 2) for wide, length in zip(cone, size, strict=True))
-    flops = count * (_transform(sources) + _transform(samples) / 2 + 3 * _PASS * samples) + _WAVE * waves
+    waves = [math.prod(operator.kernel_samples(depth, shape)) for depth in operator.depths]
+    flops = count * (_transform(sources) + _transform(samples) / 2 + 3 * _PASS * samples) + _WAVE * sum(waves)
     bytes_ = dtype.itemsize
-    largest = math.prod(
-        min(wide, length / 2) + 1
-        for wide, length in zip(
-            cone_samples(operator.grid, operator.wavelength, max(operator.depths)), size, strict=True
-        )
-    )
     return {
         "method": "convolution",
-        "cone": operator.cone,
         "transforms": count,
         "size": size,
-        "predicted_error": _limited_error(operator, size) if operator.cone == "band" else _ROUNDING[dtype],
-        "memory_bytes": round(bytes_ * (3.3 * samples + sources) + 80 * largest),
+        "predicted_error": _convolution_error(operator, size, dtype),
+        "memory_bytes": round(bytes_ * (3.3 * samples + sources) + 80 * max(waves)),
         "flops": flops + _transform(samples),
         "reason": f"{count} planes, each with a transform of its sources and half of one for its wave; exact",
         "operator": operator,
     }
 
 
-def _limited_error(operator: ConvolutionHologram, size: tuple[int, int]) -> float:
-    """Of a convolution with the band's own wave, as ``CroppedKernel`` derives it, for noise."""
-    sine = operator.wavelength / (2 * min(operator.grid.pitch))
-    return 2 * sine**2 / math.sqrt(min(size) / 2)
+def _convolution_error(operator: ConvolutionHologram, size: tuple[int, int], dtype: torch.dtype) -> float:
+    if operator.cone == "band":  # of the band's own wave, as ``CroppedKernel`` derives it, for noise
+        sine = operator.wavelength / (2 * min(operator.grid.pitch))
+        return 2 * sine**2 / math.sqrt(min(size) / 2)
+    return math.hypot(_ROUNDING[dtype], TAPER_ERROR if operator.cone == "taper" else 0)
 
 
 def _axial(operator: AxialHologram, shape: tuple[int, int], dtype: torch.dtype) -> dict:
@@ -180,7 +176,6 @@ def _axial(operator: AxialHologram, shape: tuple[int, int], dtype: torch.dtype) 
     what = "planes as their own nodes" if design.nodes.width == 1 else f"{planes} planes on {nodes} nodes"
     return {
         "method": "axial nodes",
-        "cone": operator.cone,
         "transforms": nodes,
         "size": design.size,
         "predicted_error": max(design.predicted_error, _ROUNDING[dtype] * math.sqrt(nodes) / 2),
@@ -200,8 +195,8 @@ def _notes(grid: Grid, wavelength: float, depths: Sequence[float], near: bool) -
         )
     if near:
         notes.append(
-            "the cone of light is narrower than the window: definitions of its rim differ by several percent, and "
-            "sources see part of the hologram only"
+            "the rim of the cone of light falls on pixels: definitions of it differ by more than the tolerance, up to "
+            "several percent, and sources may see part of the hologram only"
         )
     if min(grid.pitch) <= wavelength / 2:
         notes.append("the pitch is at or below half a wavelength: light leaves in every direction")

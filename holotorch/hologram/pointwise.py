@@ -1,13 +1,16 @@
 """DirectHologram: every light source on every pixel, the slow sum that judges the fast ones."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor
 
 from holotorch.core.grid import Grid
-from holotorch.hologram.cone import Cone, cone_samples, spherical_wave
+from holotorch.hologram.band_limited import band_limited_wave
+from holotorch.hologram.cone import Cone, cone_samples, is_plain, spherical_wave
 from holotorch.hologram.layered import LayerHologram
+
+_EXACT = 1e-8  # part of the wave by which the taper may change it where the closed form is taken
 
 
 class DirectHologram(LayerHologram):
@@ -21,7 +24,8 @@ class DirectHologram(LayerHologram):
         grid: Pixels of the hologram.
         wavelength: In metres.
         depths: Of the planes, in metres, above 0; any order and spacing.
-        cone: What is kept of each wave, see ``holotorch.hologram.cone``; not ``band``.
+        cone: What is kept of each wave, see ``holotorch.hologram.cone``. ``taper`` and ``band`` are integrated over
+            frequencies, exact to 1e-8.
         stride: Pixels between neighbouring sources of a plane.
 
     Raises:
@@ -30,15 +34,13 @@ class DirectHologram(LayerHologram):
 
     def __init__(self, grid: Grid, wavelength: float, depths: Sequence[float], *, cone: Cone = "box", stride: int = 1):
         super().__init__(grid, wavelength, depths, cone, stride)
-        if cone == "band":
-            raise ValueError("a direct sum has no cone='band'; use ConvolutionHologram for it")
 
     def pairs(self, layers: Tensor) -> int:
         """How many pairs of a lit source and a pixel inside its cone ``layers`` [D, h, w] have."""
         total = 0
         for plane, depth in zip(layers, self.depths, strict=True):
             half = cone_samples(self.grid, self.wavelength, depth)
-            if self.cone == "full":
+            if self.cone not in ("box", "disc"):
                 half = (float("inf"), float("inf"))
             counts = []
             for axis in (0, 1):
@@ -96,17 +98,30 @@ class DirectHologram(LayerHologram):
         self, depth: float, shape: Sequence[int], columns: tuple[int, int], places: Tensor
     ) -> Iterator[tuple[int, Tensor]]:
         """For each distance between rows: the waves from a row's columns, last to first, to all pixels [w', W]."""
-        (height, width), (py, px), stride = self.grid.shape, self.grid.pitch, self.stride
+        (height, width), stride = self.grid.shape, self.stride
         low, high = columns
         farthest = max(height - 1 - int(places.min()), int(places.max()))
-        if self.cone != "full":
+        if self.cone in ("box", "disc"):
             farthest = int(min(farthest, cone_samples(self.grid, self.wavelength, depth)[0] + 1))
         # Pixel b and source a lie b - W // 2 - (a - w // 2) stride samples apart; the last source comes first.
         first = -(width // 2) - (high - 1 - shape[1] // 2) * stride
-        dx = (torch.arange((high - low - 1) * stride + width, dtype=torch.float64) + first)[None] * px
-        dx = dx.to(places.device)
+        index = torch.arange((high - low - 1) * stride + width, device=places.device) + first
+        waves = self._waves(depth, farthest, int(index.abs().max()), index.device)
         for aside in range(farthest + 1):
-            dy = torch.full((1, 1), aside * py, dtype=torch.float64, device=dx.device)
-            wave = spherical_wave(dy, dx, self.grid.pitch, self.wavelength, depth, self.cone)[0]
+            wave = waves(aside)[index.abs()]
             if wave.any():
                 yield aside, wave.as_strided((high - low, width), (stride, 1)).clone()
+
+    def _waves(self, depth: float, rows: int, columns: int, device: torch.device) -> Callable[[int], Tensor]:
+        """What gives a row of the quadrant of a point's wave: [columns + 1], by the row's distance in samples."""
+        pitch = self.grid.pitch
+        dy, dx = (
+            torch.arange(count + 1, dtype=torch.float64, device=device) * step
+            for count, step in zip((rows, columns), pitch, strict=True)
+        )
+        plain = self.cone == "taper" and is_plain(self.grid, self.wavelength, depth, (rows, columns), _EXACT)
+        if self.cone in ("taper", "band") and not plain:
+            quadrant = band_limited_wave(dy, dx, pitch, self.wavelength, depth, soft=self.cone == "taper")
+            return lambda aside: quadrant[aside]
+        cone: Cone = "full" if plain else self.cone
+        return lambda aside: spherical_wave(dy[aside], dx, pitch, self.wavelength, depth, cone)

@@ -52,8 +52,8 @@ def test_a_run_is_what_its_parts_give(tmp_path):
     for c, wave in enumerate(experiment.settings.wavelengths):
         exact = ConvolutionHologram(experiment.grid, wave, experiment.depths, cone="taper", stride=2)(layers[:, c])
         error = (torch.from_numpy(saved[c]) - exact).norm() / exact.norm()
-        assert error < 0.15  # the taper in frequency or in space: two definitions, see tests/hologram/test_axial.py
-    exact = build(settings("tolerance=1e-6"))
+        assert error < 3e-3  # the tolerance of a run
+    exact = build(settings("tolerance=1e-6", "hologram.cone=box"))
     assert {each.method for each in exact.plans} == {"convolution"}
     numbers, layout = summary(folder), json.loads((folder / "layers.json").read_text())
     assert numbers["synthetic"] == "a phantom was asked for" and numbers["realisations"] == 2

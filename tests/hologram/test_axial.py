@@ -1,6 +1,7 @@
 """AxialHologram against its own definition, near and far; what it predicts; planes as they come."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -8,7 +9,8 @@ import torch
 from oracles import holograms
 
 from holotorch import Grid
-from holotorch.hologram import AxialHologram, ConvolutionHologram, DirectHologram
+from holotorch.core.checks import SamplingWarning
+from holotorch.hologram import AxialHologram, DirectHologram
 from holotorch.hologram.nodes import Nodes, choose_nodes
 
 WAVE = 520e-9
@@ -41,10 +43,10 @@ FAR = [
 
 
 @pytest.mark.parametrize(("name", "depths", "stride"), FAR, ids=lambda value: value if isinstance(value, str) else "")
-@pytest.mark.parametrize("cone", ["taper", "band"])
+@pytest.mark.parametrize("cone", ["taper", "full"])
 @pytest.mark.parametrize("tolerance", [3e-3, 1e-4])
 def test_far_away_it_is_the_direct_sum(name, depths, stride, cone, tolerance):
-    """Where the cone is wider than all pairs every definition is the same."""
+    """Where the cone is much wider than all pairs the taper is the plain wave."""
     grid, layers = Grid((64, 48), PITCH), sources(len(depths), 24, 30)
     operator = AxialHologram(grid, WAVE, depths, cone=cone, stride=stride, tolerance=tolerance)
     error = relative(operator(layers), DirectHologram(grid, WAVE, depths, cone="full", stride=stride)(layers))
@@ -63,28 +65,47 @@ NEAR = [("taper", 3e-3), ("taper", 1e-4), ("taper", 1e-5), ("band", 3e-3)]
 def test_near_it_is_its_own_definition(cone, tolerance, depths):
     grid, layers = Grid((64, 48), PITCH), sources(len(depths), 32, 20)
     operator = AxialHologram(grid, WAVE, depths, cone=cone, stride=2, tolerance=tolerance)
-    wanted = holograms.limited_in_frequency(
-        layers.numpy(), grid.shape, grid.pitch, WAVE, depths, cone, stride=2, period=3072 if cone == "band" else 1024
-    )
+    wanted = holograms.direct(layers.numpy(), grid.shape, grid.pitch, WAVE, depths, cone, stride=2)
     error, design = relative(operator(layers), wanted), operator.design((32, 20))
     assert error < tolerance and design.adequate
     assert error / 3 < design.predicted_error < 3 * error or design.predicted_error < 1e-7
 
 
-def test_a_taper_in_frequency_is_nearly_one_in_space():
-    """Two definitions of one soft cone: they differ by what diffracts at its rim, less where it spans more of it."""
-    grid, layers = Grid(256, PITCH), sources(1, 64, 64)
-    apart = []
-    for depth in (1.5e-3, 6e-3):
-        frequency = AxialHologram(grid, WAVE, [depth])(layers)
-        apart.append(relative(frequency, ConvolutionHologram(grid, WAVE, [depth], cone="taper")(layers)))
-        assert relative(frequency, ConvolutionHologram(grid, WAVE, [depth], cone="box")(layers)) > 0.2
-    assert apart[1] < 0.6 * apart[0] < 0.1
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-4])
+@pytest.mark.parametrize("shape", [(32, 32), (13, 40)])
+def test_it_keeps_its_definition_around_the_border(tolerance, shape):
+    """From a cone half as wide as all pairs to one three times as wide, where the taper changes less and less."""
+    grid = Grid((40, 33), PITCH)
+    for part in (0.5, 1.0, 1.2, 1.5, 2.0, 3.0):
+        depth = part * 36 * PITCH / math.tan(math.asin(WAVE / 2 / PITCH))
+        layers = sources(1, *shape)
+        operator = AxialHologram(grid, WAVE, [depth], tolerance=tolerance)
+        direct = DirectHologram(grid, WAVE, [depth], cone="taper")(layers)
+        assert relative(operator(layers), direct) < tolerance
+
+
+def test_the_plain_wave_is_judged_as_such():
+    """Beyond the border the fading of steep light is an error, which is foreseen; within it ``full`` is refused."""
+    grid, layers = Grid(48, PITCH), sources(1, 48, 48)
+    border = 48 * PITCH / math.tan(math.asin(WAVE / 2 / PITCH))
+    for part in (1.02, 1.1, 1.3, 1.6, 2.5):
+        operator = AxialHologram(grid, WAVE, [part * border], cone="full", tolerance=1e-3)
+        predicted = operator.design((48, 48)).predicted_error
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            error = relative(operator(layers), DirectHologram(grid, WAVE, [part * border], cone="full")(layers))
+        assert error / 3 < predicted < 3 * error
+        assert part > 1.1 or not operator.design((48, 48)).adequate
+    with pytest.raises(ValueError, match="within every source's cone, from 0.00258 m on for layers of .48, 48."):
+        AxialHologram(grid, WAVE, [0.9 * border], cone="full")(layers)
 
 
 def test_what_a_sharp_band_cannot_reach_is_said():
-    design = AxialHologram(Grid(64, PITCH), WAVE, [1e-3], cone="band", tolerance=1e-5).design((64, 64))
+    operator = AxialHologram(Grid(64, PITCH), WAVE, [1e-3], cone="band", tolerance=1e-5)
+    design = operator.design((64, 64))
     assert not design.adequate and design.predicted_error > 1e-5
+    with pytest.warns(SamplingWarning, match="relative error is about .*, and its tolerance 1.0e-05: use Conv"):
+        operator(sources(1, 64, 64))
 
 
 def test_nodes_do_not_grow_with_the_planes():
@@ -133,13 +154,13 @@ def test_the_window_is_the_transform_it_is_said_to_be():
 @pytest.mark.parametrize("depths", [even(1e-3, 2e-3, 3), uneven(1e-3, 1.3e-3, 20)], ids=["own nodes", "spread"])
 def test_adjoint_and_gradients(cone, depths):
     grid = Grid((20, 17), PITCH)
-    operator = AxialHologram(grid, WAVE, depths, cone=cone, stride=2, tolerance=1e-2)
+    operator = AxialHologram(grid, WAVE, depths, cone=cone, stride=2, tolerance=3e-2)
     layers, field = sources(2, len(depths), 6, 5), sources(2, *grid.shape)
     formed, back = operator(layers), operator.adjoint(field, (6, 5))
     left, right = (formed.conj() * field).sum(), (layers.conj() * back).sum()
     assert (left - right).abs() < 1e-12 * formed.norm() * field.norm()
     assert relative(formed[1], operator(layers[1])) < 1e-14
-    small = AxialHologram(Grid(4, PITCH), WAVE, depths[:3], cone=cone, tolerance=1e-2)
+    small = AxialHologram(Grid(4, PITCH), WAVE, depths[:3], cone=cone, tolerance=0.1)
     assert torch.autograd.gradcheck(small, sources(3, 3, 2).requires_grad_())
 
 
@@ -179,7 +200,7 @@ def test_complex64_is_good_to_a_millionth():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"cone": "box"}, "works in frequency, with cone='taper' or 'band', got 'box'"),
+        ({"cone": "box"}, "works in frequency, with cone='taper', 'band' or 'full', got 'box'"),
         ({"depths": [0.0]}, "depth of a plane must be above zero"),
         ({"tolerance": 0.0}, "tolerance must be above zero"),
     ],
@@ -189,7 +210,7 @@ def test_impossible_arguments_are_named(change, message):
         AxialHologram(**{"grid": Grid(8, PITCH), "wavelength": WAVE, "depths": [1e-3], **change})
 
 
-def test_a_pitch_below_half_a_wavelength_stays_finite():
-    grid, layers = Grid(32, 0.2e-6), sources(2, 8, 8)
-    field = AxialHologram(grid, WAVE, [5e-6, 6e-6], tolerance=0.3)(layers)
-    assert field.isfinite().all() and field.norm() > 0
+def test_a_pitch_below_the_wavelength_is_refused():
+    for cone in ("taper", "full"):
+        with pytest.raises(ValueError, match="needs a pitch of at least 0.9 wavelengths, .* ConvolutionHologram"):
+            AxialHologram(Grid(32, 0.4e-6), WAVE, [5e-6, 6e-6], cone=cone)
