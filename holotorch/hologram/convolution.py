@@ -70,9 +70,9 @@ class ConvolutionHologram(LayerHologram):
         y, x = (math.floor(min(reach, wide * (1 + 1e-12))) for reach, wide in zip(apart, half, strict=True))
         return y, x
 
-    def kernel_samples(self, depth: float, shape: tuple[int, int]) -> tuple[int, int]:
-        """Samples (y, x) of the quadrant of a plane's wave that are computed, for layers of ``shape`` (h, w)."""
-        apart, size = span(self.grid, shape, self.stride)[0], self.padded(shape)
+    def kernel_samples(self, depth: float, shape: tuple[int, int], size: tuple[int, int]) -> tuple[int, int]:
+        """Samples (y, x) of the quadrant of a plane's wave that are computed, for layers [h, w] padded to ``size``."""
+        apart, _ = span(self.grid, shape, self.stride)
         if self._in_frequency(depth, apart):
             return size[0] // 2 + 1, size[1] // 2 + 1
         y, x = (min(wide, length // 2) + 1 for wide, length in zip(self._extent(depth, apart), size, strict=True))

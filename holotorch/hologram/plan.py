@@ -144,7 +144,7 @@ def _transform(samples: float) -> float:
 def _convolution(operator: ConvolutionHologram, shape: tuple[int, int], dtype: torch.dtype) -> dict:
     size, count = operator.padded(shape), len(operator.depths)
     samples, sources = math.prod(size), math.prod(size) / operator.stride**2
-    waves = [math.prod(operator.kernel_samples(depth, shape)) for depth in operator.depths]
+    waves = [math.prod(operator.kernel_samples(depth, shape, size)) for depth in operator.depths]
     flops = count * (_transform(sources) + _transform(samples) / 2 + 3 * _PASS * samples) + _WAVE * sum(waves)
     bytes_ = dtype.itemsize
     return {
