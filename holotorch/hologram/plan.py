@@ -28,8 +28,8 @@ class HologramPlan:
     Attributes:
         method: "convolution" or "axial nodes".
         cone: Definition of the waves, see ``holotorch.hologram.cone``.
-        near: Whether some pixel lies so near the rim of some source's cone, or beyond it, that definitions differ by
-            more than the tolerance.
+        near: Whether some pixel lies so near the rim of some source's cone, or beyond it, that definitions may differ
+            by more than the tolerance there.
         transforms: Of the sources, one per plane or per node.
         size: Samples (y, x) of the whole spectrum.
         predicted_error: Expected relative L2 error for sources like noise, against that definition.
@@ -195,8 +195,8 @@ def _notes(grid: Grid, wavelength: float, depths: Sequence[float], near: bool) -
         )
     if near:
         notes.append(
-            "the rim of the cone of light falls on pixels: definitions of it differ by more than the tolerance, up to "
-            "several percent, and sources may see part of the hologram only"
+            "the rim of the cone of light falls on pixels: definitions of it may differ by more than the tolerance, by "
+            "up to tens of percent, and sources may light part of the hologram only"
         )
     if min(grid.pitch) <= wavelength / 2:
         notes.append("the pitch is at or below half a wavelength: light leaves in every direction")

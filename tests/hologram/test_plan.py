@@ -60,3 +60,31 @@ def test_borders_of_validity_are_said():
     assert plan_hologram(Grid(32, PITCH), WAVE, [0.1], (32, 32)).notes == ()
     fine = plan_hologram(Grid(16, 0.2e-6), WAVE, [5e-6], (8, 8), cone="box")
     assert any("half a wavelength" in note for note in fine.notes)
+
+
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-4])
+def test_definitions_agree_to_the_tolerance_where_the_plan_says_so(tolerance):
+    """Across the border, which lies where 0.7 of the cone holds all pairs; all of it does from 11.2 mm on."""
+    grid, layers = Grid(256, PITCH), torch.randn(1, 256, 256, dtype=torch.complex128)
+    near = {}
+    for depth in (11.8e-3, 13e-3, 16e-3, 16.6e-3, 17.2e-3, 18e-3, 20e-3):
+        plan = plan_hologram(grid, 636e-9, [depth], (256, 256), tolerance=tolerance)
+        exact = ConvolutionHologram(grid, 636e-9, [depth], cone="full")(layers)
+        error = (plan.operator(layers) - exact).norm() / exact.norm()
+        near[depth] = plan.near
+        assert plan.near or error < 1.5 * tolerance
+        if depth < 14e-3:
+            assert plan.near and error > 0.04
+            assert "definitions of it may differ by more than the tolerance" in plan.notes[0]
+    assert near[16e-3] and near[20e-3] == (tolerance < 1e-3)
+
+
+def test_a_cone_that_was_asked_for_is_kept_just_beyond_its_border():
+    """A box that holds every pair may be made in frequency, a disc whose corners do not must not."""
+    grid, layers = Grid(64, PITCH), torch.randn(1, 64, 64, dtype=torch.complex128)
+    border = 64 * PITCH / math.tan(math.asin(WAVE / 2 / PITCH))
+    for cone in ("full", "box", "disc"):
+        for part in (0.9, 1.01, 1.1, 1.3, 1.5, 2.0):
+            plan = plan_hologram(grid, WAVE, [part * border], (64, 64), cone=cone, tolerance=1e-3)
+            exact = DirectHologram(grid, WAVE, [part * border], cone=cone)(layers)
+            assert plan.cone == cone and (plan.operator(layers) - exact).norm() < 1.5e-3 * exact.norm()
