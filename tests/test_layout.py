@@ -26,6 +26,7 @@ ONLY_IN = {
     "yaml": {"experiments"},
     "matplotlib": {"experiments"},
     "pydantic": {"experiments"},
+    "aiohttp": {"experiments"},
     "cv2": {"io", "tracking"},
     "OpenEXR": {"io", "experiments"},
 }

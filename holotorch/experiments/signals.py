@@ -2,7 +2,7 @@
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -44,7 +44,7 @@ def interruptible() -> Iterator[Pressed]:
 
     _current = pressed
     try:
-        with _handling(note):
+        with handling(note):
             yield pressed
     finally:
         _current = outer
@@ -53,12 +53,13 @@ def interruptible() -> Iterator[Pressed]:
 @contextmanager
 def deferred(pressed: list[int]) -> Iterator[None]:
     """Only note that one of the signals has come."""
-    with _handling(lambda number, _: pressed.append(number)):
+    with handling(lambda number, _: pressed.append(number)):
         yield
 
 
 @contextmanager
-def _handling(handler) -> Iterator[None]:
+def handling(handler: Callable[[int, Any], object]) -> Iterator[None]:
+    """Have ``handler`` called for each of the signals, with its number first."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -13,6 +13,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
+from study_client import Client
 
 from holotorch.experiments.config_study import CurvedSettings, FlatSettings, build_screen, load_study
 from holotorch.experiments.perception_log import read_log
@@ -31,7 +32,7 @@ timing: {{wait_s: [0.04, 0.08], show_s: 0.25, feedback_s: 0.04}}
 SERVE = """
 import sys
 from pathlib import Path
-from holotorch.experiments.perception_server import run_study_server
+from holotorch.experiments.perception_run import run_study_server
 config, port, out, script = sys.argv[1:]
 sys.exit(run_study_server(config, port=int(port), participant=2, out=Path(out), script=Path(script).read_text()))
 """
@@ -164,7 +165,7 @@ def test_a_scripted_participant_takes_the_study_and_the_server_is_killed_on_the_
     assert len(kept) >= 7
     with open(log, "ab") as stream:  # as if it had been killed while it was writing
         stream.write(b'{"participant": 2, "round')
-    server, _ = serve(int(page.rsplit(":", 1)[1].strip("/")))
+    server, _ = serve(Client(page).port)
     assert server.wait(60) == 0
     said = server.stdout.read()
 

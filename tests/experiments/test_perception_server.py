@@ -1,85 +1,31 @@
-import http.client
 import json
 import os
-import socket
+import signal
 import subprocess
 import sys
 import threading
 import time
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
+from study_client import TINY, Client, Runner, closed
 
-from holotorch.experiments import perception_server
+from holotorch.cli import main
+from holotorch.experiments import perception_log, perception_run, perception_server
 from holotorch.experiments.config_study import beyond_screen, build_screen, load_study
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.perception_design import THESIS_CONDITIONS, Design
 from holotorch.experiments.perception_log import read_log
-from holotorch.experiments.perception_server import page, run_study_server
+from holotorch.experiments.perception_run import run_study_server
+from holotorch.experiments.perception_server import page
 
-CONFIG = Path(__file__).parents[2] / "configs" / "perception" / "study.yaml"
-TINY = """
-seed: 1
-screen: {kind: flat, shape: [600, 800], size: [0.3, 0.4], distance: 0.25}
-patterns: [{eccentricities_deg: 20, sizes_deg: 6}]
-repeats: {target: 1, distraction: 0}
-practice: 1
-"""
+ROOT = Path(__file__).parents[2]
+CONFIG = ROOT / "configs" / "perception" / "study.yaml"
 
 
-class Runner:
-    """The study in a thread, and a client of it."""
-
-    def __init__(self, folder: Path, monkeypatch, participant: int = 1):
-        ready = threading.Event()
-
-        servers: list[perception_server.StudyServer] = []
-
-        class Server(perception_server.StudyServer):
-            def __init__(self, *words):
-                super().__init__(*words)
-                servers.append(self)
-                ready.set()
-
-        monkeypatch.setattr(perception_server, "StudyServer", Server)
-        (folder / "tiny.yaml").write_text(TINY)
-        self.status: int | None = None
-        self.error: Exception | None = None
-
-        def run():
-            try:
-                self.status = run_study_server(folder / "tiny.yaml", participant=participant, out=folder)
-            except Exception as error:
-                self.error = error
-                ready.set()
-
-        self.thread = threading.Thread(target=run, daemon=True)
-        self.thread.start()
-        assert ready.wait(30) and self.error is None, self.error
-        (self.server,) = servers
-        self.log = folder / f"participant-{participant:03d}.jsonl"
-
-    def ask(self, method: str, path: str, value=None, **headers) -> tuple[int, dict]:
-        body = None if value is None else value if isinstance(value, bytes) else json.dumps(value).encode()
-        link = http.client.HTTPConnection("127.0.0.1", self.server.server_address[1], timeout=10)
-        link.request(method, path, body, {"Content-Type": "application/json", **headers})
-        answer = link.getresponse()
-        text = answer.read()
-        link.close()
-        return answer.status, json.loads(text) if text.startswith(b"{") else {"text": text.decode()}
-
-    def send(self, number: int, window="w", **change) -> tuple[int, dict]:
-        facts = {"index": number, "window": window, "onset_s": 1.0, "response_s": 1.25, "frame_s": 0.0167}
-        return self.ask("POST", "/trial", facts | {"early": 1, "dropped_frames": 0, "device": "key"} | change)
-
-    def stop(self) -> int | None:
-        self.server.shutdown()
-        self.thread.join(10)
-        return self.status
-
-
-def test_a_session_is_recorded_goes_on_and_ends(tmp_path, monkeypatch, capsys):
-    first = Runner(tmp_path, monkeypatch)
+def test_a_session_is_recorded_goes_on_and_ends(tmp_path, capsys):
+    first = Runner(tmp_path)
     status, session = first.ask("POST", "/session", {"window": "w"})
     assert status == 200 and session["next"] == 0 and len(session["trials"]) == 1 + 2
     assert session["participant"] == 1 and session["screen"]["kind"] == "flat"
@@ -93,7 +39,7 @@ def test_a_session_is_recorded_goes_on_and_ends(tmp_path, monkeypatch, capsys):
     assert lines[1]["eccentricity_deg"] == 20 and lines[1]["side"] == design.trials[1].side and lines[1]["early"] == 1
     assert lines[1]["reaction_s"] == 0.25 and lines[0]["practice"] and lines[1]["design"] == design.name
 
-    second = Runner(tmp_path, monkeypatch)
+    second = Runner(tmp_path)
     assert second.send(2, window="kept its page open") == (200, {"next": 3})
     second.thread.join(10)
     assert second.status == 0
@@ -104,16 +50,16 @@ def test_a_session_is_recorded_goes_on_and_ends(tmp_path, monkeypatch, capsys):
         run_study_server(tmp_path / "tiny.yaml", participant=1, out=tmp_path)
 
 
-def test_a_changed_study_does_not_go_on(tmp_path, monkeypatch):
-    Runner(tmp_path, monkeypatch).stop()
+def test_a_changed_study_does_not_go_on(tmp_path):
+    Runner(tmp_path).stop()
     for change, name in ((("seed: 1", "seed: 2"), "design"), (("0.25", "0.3"), "screen")):
         (tmp_path / "tiny.yaml").write_text(TINY.replace(*change))
         with pytest.raises(ConfigError, match=f"begun with another {name}.*restore the configuration"):
             run_study_server(tmp_path / "tiny.yaml", participant=1, out=tmp_path)
 
 
-def test_two_programs_and_two_windows_for_one_participant(tmp_path, monkeypatch):
-    runner = Runner(tmp_path, monkeypatch)
+def test_two_programs_and_two_windows_for_one_participant(tmp_path):
+    runner = Runner(tmp_path)
     pytest.importorskip("fcntl")
     with pytest.raises(ConfigError, match="participant 1 is being recorded by another program"):
         run_study_server(tmp_path / "tiny.yaml", participant=1, out=tmp_path)
@@ -125,8 +71,8 @@ def test_two_programs_and_two_windows_for_one_participant(tmp_path, monkeypatch)
     assert len(read_log(runner.log).trials) == 1
 
 
-def test_results_that_cannot_be_are_refused(tmp_path, monkeypatch):
-    runner = Runner(tmp_path, monkeypatch)
+def test_results_that_cannot_be_are_refused(tmp_path):
+    runner = Runner(tmp_path)
     cases = [
         ({"onset_s": None}, "onset_s: expected seconds"),
         ({"onset_s": True}, "onset_s: expected seconds"),
@@ -156,9 +102,9 @@ def test_results_that_cannot_be_are_refused(tmp_path, monkeypatch):
     assert read_log(runner.log).trials == []
 
 
-def test_no_other_page_takes_the_session_over(tmp_path, monkeypatch):
-    runner = Runner(tmp_path, monkeypatch)
-    own = f"127.0.0.1:{runner.server.server_address[1]}"
+def test_no_other_page_takes_the_session_over(tmp_path):
+    runner = Runner(tmp_path)
+    own = f"127.0.0.1:{runner.port}"
     assert runner.ask("POST", "/session", {"window": "mine"}, Origin=f"http://{own}", Host=own)[0] == 200
     assert runner.ask("GET", "/session?theirs")[0] == 404
     for headers in ({"Origin": "http://example.org"}, {"Origin": "null"}, {"Sec-Fetch-Site": "cross-site"}):
@@ -170,37 +116,112 @@ def test_no_other_page_takes_the_session_over(tmp_path, monkeypatch):
     runner.stop()
 
 
-def test_idle_connections_end_and_hold_few_threads(tmp_path, monkeypatch):
-    monkeypatch.setattr(perception_server._Handler, "timeout", 1.0)
-    runner = Runner(tmp_path, monkeypatch)
-    before = threading.active_count()
-    idle = [socket.create_connection(("127.0.0.1", runner.server.server_address[1])) for _ in range(200)]
-    time.sleep(0.5)
-    assert threading.active_count() - before <= 64
-    time.sleep(1.5)
-    assert threading.active_count() - before <= 2
+def test_all_but_the_page_needs_the_token(tmp_path):
+    runner = Runner(tmp_path)
+    runner.ask("POST", "/session", {"window": "w"})
+    token = runner.token
+    for wrong in ("", token, f"Bearer {token[:-1]}", f"Bearer {token}x", f"bearer {token}", "Bearer ", "Bearer \xe9"):
+        for method, path in (("POST", "/session"), ("POST", "/trial"), ("GET", "/trial"), ("GET", "/x"), ("PUT", "/")):
+            assert runner.ask(method, path, {"window": "other"}, Authorization=wrong)[0] == 403
+    assert token not in runner.ask("GET", "/", Authorization="")[1]["text"]
+    assert runner.ask("GET", f"/?{token}", Authorization="", Cookie=f"token={token}")[0] == 200
+    assert runner.send(0)[0] == 200  # still the window whose results count
+    runner.stop()
+    other = Runner(tmp_path, participant=2)
+    assert other.token != token
+    other.stop()
+
+
+def test_an_open_page_goes_on_after_a_restart_until_the_study_is_complete(tmp_path, capsys):
+    first, file = Runner(tmp_path), tmp_path / "participant-001.token"
+    first.send(0)
+    first.stop()
+    assert f"pixels): {first.server.address}#{file.read_text()}\n" in capsys.readouterr().out
+    second = Runner(tmp_path)
+    assert second.token == first.token
+    second.stop()
+    for spoiled in ("", "x", "\xe9" * 43):
+        file.write_text(spoiled)
+        third = Runner(tmp_path)
+        assert len(third.token) == 43 and third.token == file.read_text()
+        third.stop()
+    if os.name != "nt":  # others may have read it
+        file.chmod(0o644)
+        Runner(tmp_path).stop()
+        assert file.read_text() != third.token and file.stat().st_mode & 0o777 == 0o600
+    last = Runner(tmp_path)
+    last.send(1)
+    last.send(2)
+    last.thread.join(10)
+    assert last.status == 0 and not file.exists()
+
+
+def test_eight_hundred_idle_connections_keep_nobody_from_answering(tmp_path):
+    resource = pytest.importorskip("resource")
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(limits[0], min(2000, limits[1])), limits[1]))
+    runner = Runner(tmp_path)
+    threads = threading.active_count()
+    idle = [runner.connect(data) for data in 400 * [b"", b"POST /trial HTTP/1.1\r\n"]]
+    assert runner.send(0) == (200, {"next": 1})
     assert runner.ask("GET", "/")[0] == 200
+    assert sum(not closed(link) for link in idle) <= 64 and threading.active_count() == threads
     for link in idle:
+        link.close()
+    assert runner.stop() == 130
+    resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+
+
+def test_no_connection_lasts_however_slowly_it_sends(tmp_path, monkeypatch):
+    monkeypatch.setattr(perception_server, "_SECONDS", 0.5)
+    runner = Runner(tmp_path)
+    bearer = f"Content-Type: application/json\r\nAuthorization: Bearer {runner.token}"
+    start = f"POST /trial HTTP/1.1\r\nHost: localhost:{runner.port}\r\n{bearer}\r\nContent-Length: 300\r\n"
+    links = [runner.connect(), runner.connect(start.encode()), runner.connect(f"{start}\r\n".encode())]
+    links.append(runner.connect(f"{start.replace('Bearer', 'wrong')}\r\n".encode()))  # answered, body to come
+    begin = time.monotonic()
+    slow = set(links[1:])
+    while slow and time.monotonic() - begin < 5:
+        time.sleep(0.05)
+        for link in list(slow):
+            try:
+                link.sendall(b" ")
+            except OSError:
+                slow.discard(link)
+    assert 0.4 < time.monotonic() - begin < 3 and closed(links[0])
+    assert runner.send(0) == (200, {"next": 1})
+    for link in links:
         link.close()
     runner.stop()
 
 
+def test_the_end_waits_for_no_connection(tmp_path):
+    runner = Runner(tmp_path)
+    links = [runner.connect(), runner.connect(b"GET / HTTP/1.1\r\n")]
+    assert runner.send(0)[0] == 200
+    begin = time.monotonic()
+    assert runner.stop() == 130 and time.monotonic() - begin < 2
+    for link in links:
+        link.close()
+
+
 @pytest.mark.skipif(os.name == "nt", reason="permissions of POSIX")
-def test_the_answers_of_a_person_are_readable_by_the_owner_only(tmp_path, monkeypatch):
-    runner = Runner(tmp_path, monkeypatch)
-    assert runner.log.stat().st_mode & 0o777 == 0o600
+def test_the_answers_of_a_person_are_readable_by_the_owner_only(tmp_path):
+    runner = Runner(tmp_path)
+    for suffix in (".jsonl", ".token"):
+        assert runner.log.with_suffix(suffix).stat().st_mode & 0o777 == 0o600
     runner.stop()
 
 
 def test_a_disk_that_is_full_keeps_the_trial_for_later(tmp_path, monkeypatch):
-    runner = Runner(tmp_path, monkeypatch)
+    runner = Runner(tmp_path)
     with monkeypatch.context() as full:
 
         def write(handle, data):
             real(handle, bytes(data[:20]))
             raise OSError(28, "No space left on device")
 
-        real = perception_server.os.write
+        real = perception_log.os.write
         full.setattr("os.write", write)
         status, answer = runner.send(0)
     assert status == 503 and "No space left" in answer["error"]
@@ -209,9 +230,9 @@ def test_a_disk_that_is_full_keeps_the_trial_for_later(tmp_path, monkeypatch):
     assert len(read_log(runner.log).trials) == 1
 
 
-def test_ports(tmp_path, monkeypatch):
-    runner = Runner(tmp_path, monkeypatch)
-    taken = runner.server.server_address[1]
+def test_ports(tmp_path):
+    runner = Runner(tmp_path)
+    taken = runner.port
     for port in (taken, 70_000):
         with pytest.raises(ConfigError, match=f"port {port}: .*--port"):
             run_study_server(tmp_path / "tiny.yaml", participant=2, port=port, out=tmp_path)
@@ -223,11 +244,42 @@ def test_only_a_test_puts_a_script_into_the_page():
     assert page("ours()").count("<script>") == 2
 
 
-def test_the_browser_part_is_loaded_by_its_command_only():
-    code = "import sys, holotorch, holotorch.cli, holotorch.perception;"
-    code += "print([name for name in sys.modules if 'perception_server' in name or name == 'http.server'])"
+def test_the_browser_part_is_loaded_by_its_command_only(tmp_path):
+    (tmp_path / "tiny.yaml").write_text(TINY)
+    code = f"""
+import sys, holotorch, holotorch.cli, holotorch.perception
+status = holotorch.cli.main(["check", {str(ROOT / "configs" / "demo.yaml")!r}])
+print(status, [name for name in sys.modules if "perception_server" in name or name in ("aiohttp", "http.server")])
+"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert done.stdout.splitlines()[-1] == "0 []"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_signals_end_the_study_and_the_next_start_goes_on(tmp_path, monkeypatch, capsys, name):
+    def take_a_trial(address):
+        assert Client(address).send(0) == (200, {"next": 1})
+        for _ in range(2):  # the second changes nothing
+            signal.pthread_kill(threading.main_thread().ident or 0, getattr(signal, name))
+
+    class Server(perception_run.StudyServer):
+        @asynccontextmanager
+        async def listening(self, port=0):
+            async with super().listening(port):
+                threading.Thread(target=take_a_trial, args=(f"{self.address}#{self.token}",)).start()
+                yield
+
+    (tmp_path / "tiny.yaml").write_text(TINY)
+    with monkeypatch.context() as patch:
+        patch.setattr(perception_run, "StudyServer", Server)
+        assert main(["study", str(tmp_path / "tiny.yaml"), "--out", str(tmp_path)]) == 130
+    said = capsys.readouterr().out
+    assert "interrupted\n1 of 3 trials in" in said and "(60 Hz) over 1 trials" in said
+    runner = Runner(tmp_path)
+    assert f"#{runner.token}" in said
+    assert runner.ask("POST", "/session", {"window": "w"})[1]["next"] == 1
+    runner.stop()
 
 
 def test_the_study_of_the_thesis():
