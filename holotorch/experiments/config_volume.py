@@ -154,6 +154,9 @@ def contradictions(settings: VolumeSettings) -> list[tuple[tuple[str | int, ...]
         found.append((("transfer", "points"), "expected at least 2 points"))
     if hologram.depths == ():
         found.append((("hologram", "depths"), "expected a number of planes, or one distance at least, got none"))
+    if isinstance(hologram.depths, tuple) and len(set(hologram.depths)) < len(hologram.depths):
+        twice = next(depth for k, depth in enumerate(hologram.depths) if depth in hologram.depths[:k])
+        found.append((("hologram", "depths"), f"expected distances that all differ, got {twice:g} m twice"))
     if len(settings.wavelengths) != 3:
         found.append((("wavelengths",), f"expected 3 (red, green, blue), got {len(settings.wavelengths)}"))
     side, rays = hologram.shape, hologram.rays

@@ -100,6 +100,10 @@ class Observer:
             # Two errors that know nothing of each other: of the sum, and of making most of it from few wavelengths.
             eye, tolerance, reach = self.eye(depth), self.settings.light.tolerance / math.sqrt(2), self.scene.width / 2
             away = seen_light(self.scene.grid, wave, self.display, eye, reach=reach).path_difference
+            if not away:
+                words = f"no light of {wave * 1e9:.4g} nm of the scene reaches the pupil when the eye looks at"
+                cure = "change the distances of display, or the pupil"
+                raise ConfigError([f"display: {words} {depth * 1e3:.4g} mm from the hologram; {cure}"])
             places, weights = PRESETS[source](wave).samples(tolerance=tolerance, path_difference=away, iris=False)
             count = least_followed(places, weights, tolerance, self.scene.grid, self.display, eye, reach=reach)
             self._rules[key] = places, weights, count

@@ -8,11 +8,10 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from holotorch.experiments.errors import ConfigError, short
-from holotorch.experiments.source import Key, Source
+from holotorch.experiments.source import MOST_MISTAKES, Key, Source
 
 Model = TypeVar("Model", bound=BaseModel)
 
-_MOST = 50  # mistakes that are listed
 _EXPECTED = {
     "int_": "a whole number",
     "float_": "a number",
@@ -34,9 +33,10 @@ def validated(source: Source, model: type[Model]) -> Model:
         return model.model_validate(source.data)
     except ValidationError as error:
         entries = error.errors()
-        listed = entries[:_MOST]
+        listed = entries[:MOST_MISTAKES]
         mistakes = dict.fromkeys(describe(source, model, e) for e in listed if not _follows(e, listed))
-        more = [f"{source.path}: and {len(entries) - _MOST} more mistakes"] if len(entries) > _MOST else []
+        left = len(entries) - MOST_MISTAKES
+        more = [f"{source.path}: and {left} more mistakes"] if left > 0 else []
         raise ConfigError([*sorted(mistakes, key=position), *more]) from None
 
 

@@ -11,6 +11,7 @@ from holotorch.experiments.errors import ConfigError, short
 Key = tuple[str | int, ...]
 _LARGEST = 1 << 17  # bytes of a file, which take up to 4 s to parse
 _MOST = 100_000  # values of a file, more than one of that size can write out
+MOST_MISTAKES = 50  # that are listed
 
 
 @dataclass
@@ -58,7 +59,8 @@ def read_source(path: Path, overrides: list[str], wanted: str = "settings such a
         for word in overrides:
             _override(source, word, mistakes)
     if mistakes:
-        raise ConfigError(mistakes)
+        more = [f"{path}: and {len(mistakes) - MOST_MISTAKES} more mistakes"] if len(mistakes) > MOST_MISTAKES else []
+        raise ConfigError([*mistakes[:MOST_MISTAKES], *more])
     return source
 
 

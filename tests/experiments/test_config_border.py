@@ -124,3 +124,17 @@ def test_aliases_of_ordinary_use_stay(written):
 def test_a_thousand_mistakes_are_counted_not_listed(written):
     found = mistakes(written(CORRECTION + "".join(f"k{i}: 1\n" for i in range(1000))))
     assert len(found) == 51 and found[-1].endswith(": and 950 more mistakes")
+
+
+def test_keys_written_twice_a_thousand_times_are_listed_up_to_fifty(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text("experiment: pec\n" + "seed: 1\n" * 1001)
+    with pytest.raises(ConfigError) as refused:
+        load_config(path)
+    lines = str(refused.value).splitlines()
+    assert len(lines) == 51 and lines[-1] == f"{path}: and 950 more mistakes"
+
+
+def test_planes_at_one_distance_are_a_mistake_of_their_key():
+    with pytest.raises(ConfigError, match=r"hologram.depths: expected distances that all differ, got 0.004 m twice"):
+        load_config(Path("configs/volume/c60.yaml"), ["hologram.depths=[4 mm, 5 mm, 4 mm]"])

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from holotorch.experiments.config import load_config
+from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.eye import observer
 from holotorch.experiments.eye_geometry import draw, geometry, in_words
 from holotorch.experiments.eye_run import scene_settings
@@ -61,3 +62,9 @@ def test_the_drawing_shows_all_three_parts(display):
     for left, right in ((0, 0.41), (0.41, 0.71), (0.71, 1)):
         part = picture[:, int(left * picture.shape[1]) : int(right * picture.shape[1])]
         assert ((part.max(-1) - part.min(-1)) > 100).sum() > 500  # coloured lines or areas
+
+
+def test_an_eye_that_no_light_reaches_is_said():
+    eye = looking(size=128, distance="5 m")
+    with pytest.raises(ConfigError, match="display: no light of 636 nm of the scene reaches the pupil when the eye"):
+        eye.samples("narrow_sled", 636e-9, 5.0)
