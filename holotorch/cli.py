@@ -30,7 +30,8 @@ def main(arguments: list[str] | None = None) -> int:
         # torch raises RuntimeError or a subclass of it, on the CPU and on CUDA.
         if isinstance(error, RuntimeError) and not re.search(r"(?i)can.t allocate memory|out of memory", str(error)):
             raise
-        print("out of memory; use a smaller grid", file=sys.stderr)
+        refused = str(error) if isinstance(error, MemoryError) else ""  # by an operation that knows its own needs
+        print(refused or "out of memory; use a smaller grid", file=sys.stderr)
         return FAILED
     except OSError as error:
         print(f"{error.filename or 'file'}: {error.strerror or error}", file=sys.stderr)

@@ -8,7 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from holotorch.core import memory
 from holotorch.core.quantities import WAVELENGTH, Quantity
+
+_UNASKED = 64 << 20  # bytes that are taken without reading how much memory is available, which takes 0.1 ms
 
 
 class SamplingWarning(UserWarning):
@@ -136,6 +139,24 @@ def all_finite(name: str, value: Tensor) -> None:
         index = tuple(int(i) for i in bad.nonzero()[0])
         count = int(bad.sum())
         raise ValueError(f"{name} must be finite, but element {index} is {value[index].item()} ({count} in all)")
+
+
+def affordable(needed: float, what: str, cure: str, device: torch.device | str = "cpu") -> None:
+    """Raise MemoryError before an operation that needs more memory than is available.
+
+    Args:
+        needed: Largest extra memory of the operation, in bytes.
+        what: What needs it, with the sizes that decide it.
+        cure: What to change, as an imperative.
+        device: Where it is allocated.
+    """
+    if needed <= _UNASKED or torch.compiler.is_compiling():
+        return
+    available = memory.available_memory(device)
+    if available is not None and needed > available:
+        raise MemoryError(
+            f"{what} needs about {needed / 1e9:.3g} GB of memory and {available / 1e9:.3g} GB are available; {cure}"
+        )
 
 
 def _number(name: str, value: Any, unit: str) -> float:

@@ -1,12 +1,11 @@
 """What a run will do, what it will cost and what its physics says, before it starts."""
 
 import math
-import re
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from holotorch.core.grid import Grid
+from holotorch.core.memory import available_memory
 from holotorch.experiments.baselines import PASSES
 from holotorch.experiments.config import NearFieldSettings
 from holotorch.experiments.pec import PECExperiment
@@ -58,11 +57,9 @@ def plan(experiment: PECExperiment) -> dict[str, Any]:
 
 def shortage(values: dict[str, Any]) -> str | None:
     """A line that says that the planned run does not fit into the memory that is free, or None."""
-    needed, meminfo = values["predicted_peak_bytes"], Path("/proc/meminfo")
-    match = re.search(r"MemAvailable:\s+(\d+) kB", meminfo.read_text()) if meminfo.is_file() else None
-    if not match or needed <= int(match[1]) * 1024:
+    needed, free = values["predicted_peak_bytes"], available_memory()
+    if free is None or needed <= free:
         return None
-    free = int(match[1]) * 1024
     return f"the run needs about {needed / 1e9:.1f} GB and {free / 1e9:.1f} GB are free; use a smaller grid"
 
 

@@ -95,6 +95,7 @@ class ConvergingFresnel(nn.Module):
         ValueError: A wavelength that is not positive, a distance or focus that is 0, or no ``out_grid`` so close to the
             focus that the scaled window is smaller than one sample of the field and one spot of its light; in a call:
             a field of another shape.
+        MemoryError: An ``out_grid`` whose matrices need more memory than is available.
 
     Warns:
         SamplingWarning: ``beyond_fresnel`` exceeds 0.1 rad.
@@ -132,6 +133,13 @@ class ConvergingFresnel(nn.Module):
         if self.scaled:
             columns, rows = (self._spectrum(axis, waves) for axis in (0, 1))
         else:
+            weights = sum(n * m for n, m in zip(grid.shape, self.out_grid.shape, strict=True)) * len(waves)
+            checks.affordable(
+                35 * weights,  # measured
+                f"ConvergingFresnel from {grid.shape[0]} x {grid.shape[1]} to {self.out_grid.shape[0]} x "
+                f"{self.out_grid.shape[1]} samples, by dense matrices,",
+                "use a smaller grid or out_grid",
+            )
             columns, rows = lens_matrices(grid, waves, far, lens, self.out_grid, self.offset)
         self._keep("columns", columns)
         self._keep("rows", rows)

@@ -12,7 +12,7 @@ from holotorch.core.grid import Grid
 from holotorch.core.quantities import ACCOMMODATION, EYE_LENGTH, PUPIL_RADIUS, SOFTNESS, WAVEFRONT_ERROR
 from holotorch.optics.display import Length, inverse, number
 from holotorch.optics.kernels import turns_phasor
-from holotorch.optics.lens import Transmission, lens_phase, opening, warn_if_coarse
+from holotorch.optics.lens import Transmission, affordable, lens_phase, opening, warn_if_coarse
 
 _HIGHEST = 27  # OSA index, sixth order
 
@@ -95,12 +95,16 @@ class Eye:
 class EyeLens(Transmission):
     """Lens of an :class:`Eye` with its pupil and errors, as an element of an ``OpticalPath``.
 
+    Raises:
+        MemoryError: The grid has more samples than memory is available for.
+
     Warns:
         SamplingWarning: As :class:`Lens`, within the pupil.
     """
 
     def __init__(self, grid: Grid, wavelengths: float | Sequence[float], eye: Eye):
         waves = checks.wavelengths(wavelengths)
+        affordable("the lens of an eye", grid, len(waves))
         y, x = grid.coordinates()
         length = number(eye.focal_length)
         values = [

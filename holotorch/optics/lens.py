@@ -131,6 +131,7 @@ class Lens(Transmission):
 
     Raises:
         ValueError: A focal length of 0, or a length that cannot be meant, such as one in millimetres.
+        MemoryError: The grid has more samples than memory is available for.
 
     Warns:
         SamplingWarning: The grid is too coarse for the phase at the rim, or at the end of the window where there is
@@ -155,8 +156,8 @@ class Lens(Transmission):
             raise ValueError(f"focal_length must be one number or one per wavelength ({len(waves)}), got {len(given)}")
         lengths = [checks.quantity(FOCAL_LENGTH, each) for each in given]
         rim = None if radius is None else checks.quantity(APERTURE_RADIUS, radius, "radius")
-        turns = _turns(grid, _doubles(waves), _doubles(lengths), paraxial)
-        values = turns_phasor(turns)
+        affordable("a lens", grid, len(waves))
+        values = turns_phasor(_turns(grid, _doubles(waves), _doubles(lengths), paraxial))
         if rim is not None:
             values = values * pupil(grid, rim)
         super().__init__(grid, waves, values)
@@ -178,6 +179,7 @@ class Aperture(Transmission):
 
     Raises:
         ValueError: A radius that cannot be meant, a mask of another shape or with values outside 0 .. 1.
+        MemoryError: The grid has more samples than memory is available for.
     """
 
     def __init__(self, grid: Grid, wavelengths: float | Sequence[float], shape: float | Tensor):
@@ -187,8 +189,20 @@ class Aperture(Transmission):
             if mask.ndim != 2 or not bool(((mask >= 0) & (mask <= 1)).all()):
                 raise ValueError(f"aperture must be [H, W] with values in 0 .. 1, got {tuple(mask.shape)}")
         else:
-            mask = pupil(grid, checks.quantity(APERTURE_RADIUS, float(shape)))
+            radius = checks.quantity(APERTURE_RADIUS, float(shape))
+            affordable("an aperture", grid, 1)
+            mask = pupil(grid, radius)
         super().__init__(grid, wavelengths, torch.complex(mask.double(), torch.zeros_like(mask.double()))[None])
+
+
+def affordable(what: str, grid: Grid, channels: int) -> None:
+    """MemoryError if memory for a thin element on ``grid``, 48 bytes per sample and channel (measured), is lacking."""
+    height, width = grid.shape
+    checks.affordable(
+        48 * channels * height * width,
+        f"{what} on {height} x {width} samples in {channels} channel(s)",
+        "use a smaller grid",
+    )
 
 
 def _turns(grid: Grid, wavelength: Tensor | float, focal_length: Tensor | float, paraxial: bool) -> Tensor:

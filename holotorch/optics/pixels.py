@@ -38,6 +38,7 @@ class PixelShape(nn.Module):
     Raises:
         TypeError: ``orders`` is no integer or ``fill`` no number; in a call: a real field.
         ValueError: ``orders`` below 0 or ``fill`` outside its range; in a call: a field of another shape.
+        MemoryError: In a call: the result needs more memory than is available.
 
     Source: Goodman, Sec. 2.4 (sampled functions) and 4.4 (rectangular aperture).
     """
@@ -58,6 +59,13 @@ class PixelShape(nn.Module):
     def forward(self, field: Tensor) -> Tensor:
         """Emit from pixel values ``field``, complex [..., C, H, W]; returns [..., C, sH, sW] in the same dtype."""
         checks.field("field", field, self.grid.shape)
+        height, width = self.out_grid.shape
+        checks.affordable(
+            5.5 * field.dtype.itemsize * (2 * self.orders + 1) ** 2 * field.numel(),  # measured
+            f"PixelShape with orders={self.orders} on {height} x {width} samples",
+            "use fewer orders, a smaller grid, or fewer fields at once",
+            field.device,
+        )
         for kernel in self._kernels_for(field):
             # Columns first: each turn brings the other axis to the end, and two bring both home.
             field = _spread(field.transpose(-1, -2), kernel)

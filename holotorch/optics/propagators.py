@@ -76,6 +76,7 @@ class AngularSpectrum(SpectralFilter):
 
     Raises:
         ValueError: A wavelength that is not positive, a distance that is not finite, ``pad`` below 1.
+        MemoryError: The padded kernel needs more memory than is available.
 
     Warns:
         SamplingWarning: The padding does not serve the grid's whole band at this distance; the message names the
@@ -95,7 +96,7 @@ class AngularSpectrum(SpectralFilter):
     ):
         distance = checks.quantity(DISTANCE, distance)
         waves = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
-        padded = grid.padded(pad)
+        padded = _affordable(type(self).__name__, grid.padded(pad), len(waves), 90)
         kernel = angular_spectrum_kernel(padded, waves, distance, band_limit=band_limit)
         super().__init__(grid, wavelengths, kernel * carrier(waves, distance)[:, None, None])
         self.distance = distance
@@ -119,7 +120,8 @@ class Fresnel(SpectralFilter):
     ):
         distance = checks.quantity(DISTANCE, distance)
         waves = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
-        kernel = fresnel_kernel(grid.padded(pad), waves, distance)
+        padded = _affordable(type(self).__name__, grid.padded(pad), len(waves), 40)
+        kernel = fresnel_kernel(padded, waves, distance)
         super().__init__(grid, wavelengths, kernel * carrier(waves, distance)[:, None, None])
         self.distance = distance
         _warn_if_short(self, least_padding(grid, max(self.wavelengths), distance, paraxial=True), wraps=True)
@@ -149,6 +151,17 @@ class Fraunhofer(nn.Module):
         """Apply the conjugate transpose, which is the inverse; same shapes as :meth:`forward`."""
         checks.field("field", field, (len(self.wavelengths), *self.grid.shape))
         return centred_ifft2(field)
+
+
+def _affordable(name: str, padded: Grid, channels: int, each: int) -> Grid:
+    """``padded``, or MemoryError if its kernel, which takes ``each`` bytes per sample (measured), is not affordable."""
+    height, width = padded.shape
+    checks.affordable(
+        each * channels * height * width,
+        f"the kernel of {name} on {height} x {width} samples in {channels} channel(s)",
+        "use a smaller grid or less padding",
+    )
+    return padded
 
 
 def _warn_if_short(module: AngularSpectrum | Fresnel, needed: tuple[float, float], *, wraps: bool) -> None:

@@ -15,7 +15,7 @@ from holotorch.core.grid import Grid
 from holotorch.optics.display import Display, Length, inverse, number
 from holotorch.optics.elements import ElementSampling, least_oversampling, through_elements
 from holotorch.optics.eye import Eye
-from holotorch.optics.imaging import CollapseSampling, collapse_sampling, imaged, retinal_scale
+from holotorch.optics.imaging import CollapseSampling, collapse_sampling, imaged, pupil_bands, retinal_scale
 
 # Error of a pupil with a hard rim, times its samples across. Measured: 1.1 to 3.2 for the collapse of points with 1360
 # samples, 0.6 to 3.4 for noise with 42 to 55, 0.4 to 1.3 for elements with 3800.
@@ -99,16 +99,14 @@ def plan_retina(
         )
         across = abs(number(display.matrix(plane)[1])) / (2 * number(eye.pupil_radius))  # spot per wavelength
         rim = _RIM * max(max(waves) * across / (n * p) for n, p in zip(short.window, grid.pitch, strict=True) if n > 1)
-        # Measured: the kernel of the way to the plane while it is built, or four copies of the chirp-z lines.
-        lines = short.fine[1] * (short.fine[0] + short.padded[0])
-        memory = max(math.prod(short.padded) * 110, lines * 4.2 * size)
-        found.append((short.flops, "collapse", short, math.hypot(error, rim), math.ceil(memory)))
+        passed = max(math.prod(pupil_bands(grid, w, display, eye, plane)) for w in waves) * math.prod(short.window)
+        found.append((short.flops, "collapse", short, math.hypot(error, rim), short.memory_bytes(passed, size)))
     except ValueError as reason:
         refused = f"collapse is impossible here: {reason}"
     long = least_oversampling(grid, waves, display, eye, plane=plane)
     step = max(p / m for n, p, m in zip(grid.shape, grid.pitch, long.oversampling, strict=True) if n > 1)
     rim = min(1.0, _RIM * step / (2 * number(eye.pupil_radius)))
-    found.append((long.flops, "elements", long, rim, math.prod(long.fine) * (2 * size + 132)))
+    found.append((long.flops, "elements", long, rim, long.memory_bytes(size)))
     limit = math.inf if memory_limit is None else memory_limit
     fitting = [way for way in found if way[4] <= limit]
     if not fitting:
