@@ -41,12 +41,15 @@ from holotorch.optics import (
     RayleighSommerfeld,
     ResampledKernel,
     Spectrum,
+    accommodation_range,
     angular_spectrum_kernel,
     carrier,
     chromatic_defocus,
+    converging_fresnel,
     depth_of_focus,
     diffraction_angle,
     eye_box,
+    eyepiece_distance,
     fresnel_distance,
     fresnel_kernel,
     fresnel_number,
@@ -65,6 +68,7 @@ from holotorch.optics import (
     pupil,
     region,
     retinal_image,
+    retinal_scale,
     section,
     smallest_spot,
     tilted_wave,
@@ -91,6 +95,10 @@ PIXELS = torch.tensor([[[100.0, 100.0], [150, 150], [200, 200], [250, 250]]], dt
 EDGES = (0.070, 0.108, 0.146, 0.184)
 COLOURS = ((200, 40, 45), (40, 150, 70), (40, 70, 190))
 NANO, MICRO, MILLI = 1e9, 1e6, 1e3
+
+
+def double(values: Any) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,6 +181,56 @@ ENTRIES = [
     Entry("lens_limit: focal_length", lambda v: lens_limit(8e-6, WAVE, v), q.FOCAL_LENGTH, 0.1, (NANO, MICRO)),
     Entry("lens_limit: pitch", lambda v: lens_limit(v, WAVE, 0.1), q.PITCH, 8e-6, (NANO, MICRO, MILLI)),
     Entry("pupil: radius", lambda v: pupil(GRID, v), q.APERTURE_RADIUS, 1e-3),
+    wavelength("angular_spectrum_kernel, tensor", lambda v: angular_spectrum_kernel(GRID, double(v), 1e-3)),
+    wavelength("fresnel_kernel, tensor", lambda v: fresnel_kernel(GRID, double([WAVE, v]), 1e-3)),
+    wavelength("carrier, tensor", lambda v: carrier(double(v), 1e-3)),
+    wavelength("lens_phase, tensor", lambda v: lens_phase(GRID, double(v), 0.1)),
+    wavelength("converging_fresnel", lambda v: converging_fresnel(FIELD[0], GRID, v, 1e-2, 2e-2, GRID)),
+    wavelength("converging_fresnel, tensor", lambda v: converging_fresnel(FIELD, GRID, double([v]), 1e-2, 2e-2, GRID)),
+    distance("angular_spectrum_kernel, tensor", lambda v: angular_spectrum_kernel(GRID, WAVE, double(v))),
+    distance("carrier, tensor", lambda v: carrier(WAVE, double([v]))),
+    distance("converging_fresnel", lambda v: converging_fresnel(FIELD[0], GRID, WAVE, v, 2e-2, GRID)),
+    distance("converging_fresnel, tensor", lambda v: converging_fresnel(FIELD, GRID, WAVE, double([v]), 2e-2, GRID)),
+    Entry(
+        "converging_fresnel: focus",
+        lambda v: converging_fresnel(FIELD[0], GRID, WAVE, 1e-2, v, GRID),
+        q.FOCAL_LENGTH,
+        0.2,
+        (MICRO,),
+    ),
+    Entry(
+        "converging_fresnel: offset",
+        lambda v: converging_fresnel(FIELD[0], GRID, WAVE, 1e-2, 2e-2, GRID, offset=(0.0, v)),
+        q.OFFSET,
+        1e-3,
+        (NANO, MICRO),
+    ),
+    Entry("pupil: radius, tensor", lambda v: pupil(GRID, double([v, 1e-3])), q.APERTURE_RADIUS, 1e-3),
+    Entry("pupil: softness", lambda v: pupil(GRID, 1e-3, softness=v), q.SOFTNESS, 20e-6, (MILLI, MICRO)),
+    Entry(
+        "lens_phase: focal_length, tensor", lambda v: lens_phase(GRID, WAVE, double(v)), q.FOCAL_LENGTH, 0.1, (NANO,)
+    ),
+    Entry("retinal_scale: plane", lambda v: retinal_scale(VIEW, Eye(), v), q.PLANE, 30e-3, (NANO, MICRO, MILLI)),
+    Entry("imaged: plane", lambda v: imaged(FIELD, GRID, WAVE, VIEW, Eye(), plane=v), q.PLANE, 2e-3, (NANO, MICRO)),
+    Entry("plan_retina: reach", lambda v: plan_retina(GRID, WAVE, VIEW, Eye(), reach=v), q.WIDTH, 8e-3, (NANO, MICRO)),
+    Entry("eyepiece_distance", lambda v: eyepiece_distance(v, 0.12, 0.01, 0.05), q.PLANE, 30e-3, (NANO, MICRO, MILLI)),
+    Entry(
+        "accommodation_range: near",
+        lambda v: accommodation_range(v, 36e-3, 45e-3, 50e-3, 50e-3),
+        q.PLANE,
+        20e-3,
+        (NANO, MICRO, MILLI),
+    ),
+    Entry(
+        "accommodation_range: eyepiece_distance",
+        lambda v: accommodation_range(20e-3, 30e-3, v, 50e-3, 50e-3),
+        q.SPACING,
+        45e-3,
+        (NANO, MICRO, MILLI),
+    ),
+    Entry("smallest_spot: section", lambda v: smallest_spot(WAVE, 0.1, v), q.SPACING, 8e-3, (NANO, MICRO)),
+    Entry("vignetting: second", lambda v: vignetting(1e-3, 0.5, v, 2e-3, 0.03), q.PLANE, 0.1, (NANO, MICRO)),
+    Entry("visible_half_width: second", lambda v: visible_half_width(0.5, v, 2e-3, 0.03), q.PLANE, 0.1, (NANO, MICRO)),
     Entry("placement: width", lambda v: placement(1e-2, v, 8e-6, WAVE), q.WIDTH, 8e-3, (NANO, MICRO)),
     Entry("eye_box: size", lambda v: eye_box(v, 0.5, 0.1, 0.03), q.SPACING, 8e-3, (NANO, MICRO)),
     Entry(
@@ -195,7 +253,7 @@ ENTRIES = [
     distance("CroppedKernel", lambda v: CroppedKernel(GRID, WAVE, v)),
     distance("Propagator", lambda v: Propagator(GRID, WAVE, v)),
     distance("propagate", lambda v: propagate(FIELD, GRID, WAVE, v)),
-    distance("propagate, tensor", lambda v: propagate(FIELD, GRID, WAVE, torch.tensor(v))),
+    distance("propagate, tensor", lambda v: propagate(FIELD, GRID, WAVE, double(v))),
     distance("plan_propagation", lambda v: plan_propagation(GRID, WAVE, v)),
     distance("path_difference", lambda v: path_difference(v, 0.05)),
     distance("fresnel_number", lambda v: fresnel_number(1e-3, WAVE, v), dataclasses.replace(q.DISTANCE, zero=False)),

@@ -1,7 +1,9 @@
 """Argument checks in one voice: what was expected, what came, what to change."""
 
+import contextlib
 import math
 import numbers
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,10 +14,15 @@ from holotorch.core import memory
 from holotorch.core.quantities import WAVELENGTH, Quantity
 
 _UNASKED = 64 << 20  # bytes that are taken without reading how much memory is available, which takes 0.1 ms
+_TURNED = 0.01  # rad: 1 % of a field
 
 
 class SamplingWarning(UserWarning):
     """A grid is too coarse or too small for what it is asked to carry; the message says what would do."""
+
+
+class PrecisionWarning(UserWarning):
+    """A number was given with fewer digits than the phase of light needs; the message says which type would do."""
 
 
 def positive(name: str, value: float, unit: str = "") -> float:
@@ -63,9 +70,38 @@ def quantity(kind: Quantity, value: float, name: str = "") -> float:
 
 
 def meant(kind: Quantity, value: Tensor | float, name: str = "") -> None:
-    """Raise as :func:`quantity` for a number; a tensor, which may be learned, compiled or mapped over, passes."""
+    """Raise as :func:`quantity` for a number and as :func:`quantities` for a tensor, which may be learned.
+
+    Tensors that are compiled or mapped over hold no values yet, and those on another device are not waited for.
+    """
     if not isinstance(value, Tensor):
         quantity(kind, value, name)
+    elif value.device.type == "cpu" and not torch.compiler.is_compiling():
+        with contextlib.suppress(RuntimeError):  # of vmap and of fake tensors, where a value would decide
+            quantities(kind, value, name)
+
+
+def precise(wavelength: Tensor | float, distance: Tensor | float) -> None:
+    """PrecisionWarning where the rounding of a tensor below float64 turns the phase of exp(ikz) by 0.01 rad or more."""
+    coarse = {
+        name: value.dtype
+        for name, value in (("wavelength", wavelength), ("distance", distance))
+        if isinstance(value, Tensor) and value.is_floating_point() and value.dtype != torch.float64
+    }
+    given = [value for value in (wavelength, distance) if isinstance(value, Tensor)]
+    if not coarse or torch.compiler.is_compiling() or any(value.device.type != "cpu" for value in given):
+        return
+    rounding = sum(torch.finfo(dtype).eps / 2 for dtype in coarse.values())
+    with contextlib.suppress(RuntimeError):
+        cycles = torch.as_tensor(distance).detach().double() / torch.as_tensor(wavelength).detach().double()
+        turned = 2 * math.pi * rounding * float(cycles.abs().max()) if cycles.numel() else 0.0
+        if turned >= _TURNED:
+            which = " and ".join(f"{name} is {str(dtype).removeprefix('torch.')}" for name, dtype in coarse.items())
+            warnings.warn(
+                f"{which}, whose rounding turns the phase of exp(ikz) by up to {turned:.2g} rad here; pass float64",
+                PrecisionWarning,
+                stacklevel=3,
+            )
 
 
 def quantities(kind: Quantity, values: Tensor, name: str = "") -> None:

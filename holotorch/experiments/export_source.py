@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -16,6 +17,9 @@ from holotorch.experiments.config import PECSettings, load_config
 from holotorch.experiments.config_volume import VolumeSettings
 from holotorch.experiments.errors import ConfigError
 from holotorch.hologram import double_phase, encoding_loss, error_diffused, kinoform, refocused
+
+if TYPE_CHECKING:
+    from holotorch.experiments.pec import PECExperiment
 
 ENCODINGS: dict[str, Callable[[Tensor], Tensor]] = {
     "double_phase": double_phase,
@@ -72,8 +76,9 @@ def _from_pec(folder: Path, settings: PECSettings) -> Wanted:
 
     experiment = build(settings)
     colours = len(settings.wavelengths)
-    heaters = _array(folder / "arrays" / "phase.npy", (settings.frames, colours, *settings.grid.shape))
+    heaters = _array(folder / "arrays" / "phase.npy", (settings.frames, colours, *settings.grid.shape), "(F, C, H, W)")
     checks.all_finite("phase", heaters)
+    _check_axes(folder, experiment, heaters)
     phase = experiment.array.crosstalk(heaters[:, experiment.lit].double()).float()
 
     def picture(fields: Tensor) -> Tensor:
@@ -87,7 +92,8 @@ def _from_pec(folder: Path, settings: PECSettings) -> Wanted:
 def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> Wanted:
     height, width = (size // settings.scale for size in settings.hologram.shape)
     grid = Grid((height, width), settings.hologram.pitch)
-    hologram = _array(folder / "arrays" / "hologram.npy", (len(settings.wavelengths), height, width))
+    shape = (len(settings.wavelengths), height, width)
+    hologram = _array(folder / "arrays" / "hologram.npy", shape, "(C, H, W)")
     checks.all_finite("hologram", torch.view_as_real(hologram))
     depth = _depth(folder, settings)
 
@@ -104,17 +110,43 @@ def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> Wante
     return Wanted(phase[None], settings.wavelengths, grid, encoding, picture, losses)
 
 
+def _check_axes(folder: Path, experiment: "PECExperiment", heaters: Tensor) -> None:
+    """ValueError if the axes of heater phases [F, C, H, W] have changed places, which no shape tells where F = C.
+
+    The heating power of each colour tells it, which the run's summary holds.
+    """
+    numbers = _summary(folder).get("methods", {}).get("corrected", {}).get("heating_power_K_per_pixel")
+    if not len(heaters) == heaters.shape[1] > 1 or numbers is None:
+        return
+    wanted = torch.tensor(numbers, dtype=torch.float64)
+
+    def fits(phases: Tensor) -> bool:
+        power = experiment.array.temperature(phases[:, experiment.lit].double()).mean((0, -2, -1))
+        return torch.allclose(power, wanted[experiment.lit], rtol=1e-3)
+
+    if not fits(heaters) and fits(heaters.transpose(0, 1)):
+        raise ValueError(
+            f"phase.npy holds [C, F, H, W], colours before frames, by the heating power of each colour in the run's "
+            f"summary, and [F, C, H, W] is wanted; as F = C = {len(heaters)}, its shape does not tell: swap its first "
+            "two axes"
+        )
+
+
 def _depth(folder: Path, settings: VolumeSettings) -> float:
     """The middle one of the depths at which the run's report looks."""
+    depths = _summary(folder).get("refocused_m") or []
+    return depths[len(depths) // 2] if depths else settings.hologram.distance / settings.scale
+
+
+def _summary(folder: Path) -> dict[str, Any]:
+    """What the run says of itself; empty before it has ended."""
     for name in ("summary.json", "interrupted.json"):
         if (folder / name).is_file():
-            depths = json.loads((folder / name).read_text()).get("refocused_m") or []
-            if depths:
-                return depths[len(depths) // 2]
-    return settings.hologram.distance / settings.scale
+            return json.loads((folder / name).read_text())
+    return {}
 
 
-def _array(path: Path, shape: tuple[int, ...]) -> Tensor:
+def _array(path: Path, shape: tuple[int, ...], axes: str) -> Tensor:
     if not path.is_file():
         raise ValueError(f"{path.name} is not in its arrays; the run has not come so far: holotorch resume")
     try:
@@ -122,5 +154,5 @@ def _array(path: Path, shape: tuple[int, ...]) -> Tensor:
     except Exception as error:  # what damaged bytes raise is anyone's guess
         raise ValueError(f"{path.name} cannot be read: {error}") from None
     if found.shape != shape:
-        raise ValueError(f"{path.name} must have the shape {shape} of its configuration, got {found.shape}")
+        raise ValueError(f"{path.name} must have the shape {axes} = {shape} of its configuration, got {found.shape}")
     return torch.from_numpy(found)

@@ -39,7 +39,11 @@ class PhasedArray(nn.Module):
         return tuple(REFERENCE_RESPONSE * REFERENCE_WAVELENGTH / wavelength for wavelength in self.wavelengths)
 
     def forward(self, phase: Tensor) -> Tensor:
-        """Emitted field, complex [..., C, H, W], for heater phases in rad, real [..., C, H, W]."""
+        """Emitted field, complex [..., C, H, W], for heater phases in rad, real [..., C, H, W].
+
+        Frames are [F, C, H, W]: phases [C, F, H, W] are refused, but where F = C no shape tells them apart.
+        """
+        self._check(phase)
         return phasor(self.crosstalk(phase))
 
     def temperature(self, phase: Tensor) -> Tensor:
@@ -50,8 +54,14 @@ class PhasedArray(nn.Module):
         """Phase in rad that a temperature rise in kelvin, [..., C, H, W], gives; inverse of :meth:`temperature`."""
         return temperature * self._response_like(temperature)
 
-    def _response_like(self, value: Tensor) -> Tensor:
+    def _check(self, value: Tensor) -> None:
         checks.real("phase or temperature", value)
         if value.ndim < 3 or value.shape[-3] != len(self.wavelengths):
-            raise ValueError(f"expected (C, H, W) with C = {len(self.wavelengths)}, got {tuple(value.shape)}")
+            raise ValueError(
+                f"phase or temperature must end in (C, H, W) with C = {len(self.wavelengths)}, one per wavelength, got "
+                f"{tuple(value.shape)}; frames go in front, [F, C, H, W]"
+            )
+
+    def _response_like(self, value: Tensor) -> Tensor:
+        self._check(value)
         return torch.tensor(self.response, dtype=value.dtype, device=value.device)[:, None, None]

@@ -11,7 +11,7 @@ from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.fourier import filter_spectrum, good_length
 from holotorch.core.grid import Grid
-from holotorch.core.quantities import DISTANCE, FOCAL_LENGTH, OFFSET
+from holotorch.core.quantities import DISTANCE, FOCAL_LENGTH, OFFSET, WAVELENGTH
 from holotorch.optics.kernels import carrier, turns_phasor
 from holotorch.optics.lens_taps import lens_matrices
 from holotorch.optics.taps import fresnel_taps, tap_indices
@@ -48,16 +48,20 @@ def converging_fresnel(
         ValueError: Wrong shape, a wavelength that is not positive, a distance or focus of 0.
     """
     checks.field("field", field, grid.shape)
+    for kind, value, name in (
+        (WAVELENGTH, wavelength, "wavelength"),
+        (DISTANCE, distance, "distance"),
+        (FOCAL_LENGTH, focus, "focus"),
+    ):
+        checks.meant(kind, value, name)
+    y, x = checks.pair("offset", offset, "metres")
+    offset = checks.quantity(OFFSET, y), checks.quantity(OFFSET, x)
+    checks.precise(wavelength, distance)
     waves, far, lens = (
         torch.as_tensor(value, dtype=torch.float64, device=field.device) for value in (wavelength, distance, focus)
     )
-    if not torch.compiler.is_compiling():
-        for name, values, wrong in (("wavelength", waves, waves <= 0), ("distance", far, far == 0)):
-            checks.all_finite(name, values.detach())
-            if wrong.any():
-                raise ValueError(f"{name} must be {'above' if name == 'wavelength' else 'other than'} zero in metres")
-        if (lens.isnan() | (lens == 0)).any():
-            raise ValueError("focus must be other than zero in metres, infinite for no lens")
+    if not torch.compiler.is_compiling() and (far == 0).any():
+        raise ValueError("distance must be other than zero in metres")
     columns, rows = (matrix.to(field.dtype) for matrix in lens_matrices(grid, waves, far, lens, out_grid, offset))
     return columns @ field @ rows.transpose(-1, -2)
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
-from holotorch.core.quantities import APERTURE_RADIUS, FOCAL_LENGTH, SPACING
+from holotorch.core.quantities import APERTURE_RADIUS, FOCAL_LENGTH, PLANE, SPACING
 
 Length = float | Tensor
 Matrix = tuple[Length, Length, Length, Length]
@@ -59,6 +59,13 @@ class Display:
         power, s0 = inverse(self.focal_length), self.lens_distance - plane
         back = 1 - s0 * power
         return 1 - self.eye_distance * power, s0 + self.eye_distance * back, -power, back
+
+    def object_plane(self, plane: Length | None, accommodation: Length) -> Length:
+        """``plane`` in metres from the hologram, or without one that in focus; ValueError if it cannot be meant."""
+        if plane is None:
+            return self.focus_plane(accommodation)
+        checks.quantity(PLANE, number(plane), "plane")
+        return plane
 
     def focus_plane(self, accommodation: Length) -> Length:
         """Distance in metres from the hologram of the plane that an eye focused at ``accommodation`` sees sharply.

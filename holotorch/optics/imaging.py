@@ -128,7 +128,7 @@ def imaged(
     """
     waves = checks.wavelengths(wavelengths)
     checks.field("field", field, (len(waves), *grid.shape))
-    plane = display.focus_plane(eye.accommodation) if plane is None else plane
+    plane = display.object_plane(plane, eye.accommodation)
     least = collapse_sampling(grid, waves, display, eye, plane)
     sizes = sampling or least
     if any(have < want * (1 - 1e-9) for have, want in zip(sizes.oversampling, least.oversampling, strict=True)):
@@ -155,7 +155,7 @@ def imaged(
 
 def retinal_scale(display: Display, eye: Eye, plane: Length | None = None) -> Length:
     """Metres on the retina per metre in the object plane, -d_r / B: negative, since the image is upside down."""
-    plane = display.focus_plane(eye.accommodation) if plane is None else plane
+    plane = display.object_plane(plane, eye.accommodation)
     return -eye.axial_length / display.matrix(plane)[1]
 
 

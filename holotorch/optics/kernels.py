@@ -1,6 +1,6 @@
 """Transfer functions of free space: pure functions, float64 inside, differentiable in wavelength and distance.
 
-Numbers that cannot be meant are refused; tensors, which may be learned or mapped over, are taken as they are.
+Numbers and tensors that cannot be meant are refused; tensors that are compiled or mapped over are taken as they are.
 """
 
 import math
@@ -16,9 +16,12 @@ from holotorch.core.quantities import DISTANCE, WAVELENGTH
 def carrier(wavelength: Tensor | float, distance: Tensor | float) -> Tensor:
     """exp(i k z), complex128 of the broadcast shape.
 
-    k z reaches 1e6 rad and more, where float32 steps by 0.1 rad; whole turns are taken off in float64 first.
+    k z reaches 1e6 rad and more, where float32 steps by 0.1 rad; whole turns are taken off in float64 first. A tensor
+    of float32 is rounded already: PrecisionWarning where that turns the phase by 0.01 rad or more.
     """
-    return turns_phasor(_distance(distance) / _wavelength(wavelength))
+    turns = _distance(distance) / _wavelength(wavelength)
+    checks.precise(wavelength, distance)
+    return turns_phasor(turns)
 
 
 def angular_spectrum_kernel(

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.grid import Grid
-from holotorch.core.quantities import APERTURE_RADIUS, FOCAL_LENGTH, PITCH, WAVELENGTH
+from holotorch.core.quantities import APERTURE_RADIUS, FOCAL_LENGTH, PITCH, SOFTNESS, WAVELENGTH
 from holotorch.optics.kernels import turns_phasor
 
 
@@ -31,7 +31,7 @@ def lens_phase(
         float64, shape [..., H, W], not wrapped.
 
     Raises:
-        ValueError: A number that cannot be meant; tensors are taken as they are.
+        ValueError: A length that cannot be meant.
     """
     checks.meant(WAVELENGTH, wavelength)
     checks.meant(FOCAL_LENGTH, focal_length)
@@ -48,10 +48,11 @@ def pupil(grid: Grid, radius: Tensor | float, *, softness: float = 0.0) -> Tenso
             edge has a gradient in the radius; about a pitch is enough.
 
     Raises:
-        ValueError: ``radius`` carries a gradient but the edge is hard, so that the gradient would be 0; or it is a
-            number that cannot be meant.
+        ValueError: ``radius`` carries a gradient but the edge is hard, so that the gradient would be 0; or a length
+            that cannot be meant.
     """
     checks.meant(APERTURE_RADIUS, radius, "radius")
+    checks.quantity(SOFTNESS, softness)
     radius = torch.as_tensor(radius, dtype=torch.float64)
     y, x = grid.coordinates(radius.device)
     return opening(y.square() + x.square(), radius[..., None, None], softness)

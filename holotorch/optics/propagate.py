@@ -72,6 +72,7 @@ def propagate(
 
     Warns:
         SamplingWarning: No way meets the tolerance; the most accurate one is used and its expected error named.
+        PrecisionWarning: A wavelength or distance in float32, whose rounding turns the phase by 0.01 rad or more.
 
     A gradient in the pitch, say a factor s on it and on the output's: nothing changes when all lengths are scaled, so
     ``propagate(field, grid, wavelength / s, distance / s)`` is the field on a grid of s times the pitch.
@@ -80,6 +81,7 @@ def propagate(
     if not torch.compiler.is_compiling():
         checks.all_finite("field", torch.view_as_real(field.detach().resolve_conj()))
     waves, distances = _float64("wavelength", wavelength, field), _float64("distance", distance, field)
+    checks.precise(wavelength, distance)
     listed = [values.detach().reshape(-1).tolist() for values in (waves, distances)]
     path = passage(grid, out_grid, offset, tilt, listed[0])
     slanted = tilt.to(field.device, torch.float64) if isinstance(tilt, Tensor) else None

@@ -12,6 +12,7 @@ from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import intensity
 from holotorch.core.grid import Grid
+from holotorch.core.quantities import WIDTH
 from holotorch.optics.display import Display, Length, inverse, number
 from holotorch.optics.elements import ElementSampling, least_oversampling, through_elements
 from holotorch.optics.eye import Eye
@@ -86,8 +87,10 @@ def plan_retina(
     """
     waves = checks.wavelengths(wavelengths)
     tolerance = checks.positive("tolerance", tolerance)
-    plane = display.focus_plane(eye.accommodation) if plane is None else plane
-    reach = max(n * p for n, p in zip(grid.shape, grid.pitch, strict=True) if n > 1) / 2 if reach is None else reach
+    plane = display.object_plane(plane, eye.accommodation)
+    if reach is None:
+        reach = max(n * p for n, p in zip(grid.shape, grid.pitch, strict=True) if n > 1) / 2
+    checks.quantity(WIDTH, reach, "reach")
     found: list[tuple[float, str, CollapseSampling | ElementSampling, float, int]] = []
     heights = [reach * i / (_HEIGHTS - 1) for i in range(_HEIGHTS)]
     size, refused = 8 if dtype == torch.complex64 else 16, ""

@@ -14,6 +14,7 @@ from holotorch.core.quantities import (
     FOCAL_LENGTH,
     OFFSET,
     PITCH,
+    PLANE,
     PUPIL_RADIUS,
     SPACING,
     WAVELENGTH,
@@ -68,7 +69,7 @@ def eyepiece_distance(volume_distance: float, focus_distance: float, focal_lengt
         ValueError: The focus lies between eyepiece and eye.
     """
     s1 = _before_eyepiece(focus_distance, eye_distance)
-    return checks.quantity(DISTANCE, volume_distance, "volume_distance") + object_distance(s1, focal_length)
+    return checks.quantity(PLANE, volume_distance, "volume_distance") + object_distance(s1, focal_length)
 
 
 def scene_fov(size: float, object_distance: float, focal_length: float, eye_distance: float) -> float:
@@ -100,6 +101,10 @@ def accommodation_range(
 
     ``near`` and ``far`` are distances from the hologram towards the eyepiece. Differences of 1 / distance are dioptres.
     """
+    for name, plane in (("near", near), ("far", far)):
+        checks.quantity(PLANE, plane, name)
+    checks.quantity(SPACING, eyepiece_distance, "eyepiece_distance")
+    checks.quantity(SPACING, eye_distance, "eye_distance")
     seen = [image_distance(eyepiece_distance - z, focal_length) + eye_distance for z in (near, far)]
     return min(seen), max(seen)
 
@@ -145,6 +150,7 @@ def smallest_spot(wavelength: float, distance: float, section: float) -> float:
 
     ``section`` is that of :func:`section`; 0 gives infinity.
     """
+    checks.quantity(SPACING, section, "section")
     longest = checks.quantity(WAVELENGTH, wavelength) * abs(checks.quantity(DISTANCE, distance))
     return longest / section if section > 0 else math.inf
 
@@ -163,15 +169,16 @@ def vignetting(height: float, first: float, second: float, pupil_radius: float, 
     diffraction in the thesis's display. A is 0, and nothing is lost, with the eye at the focal point of the eyepiece.
     """
     checks.quantity(OFFSET, height, "height")
-    half = abs(second) * sine
+    checks.finite("first", first)
+    half = _light_reach(second, sine)
     low, high = max(-pupil_radius, first * height - half), min(pupil_radius, first * height + half)
     return max(0.0, high - low) / (2 * checks.quantity(PUPIL_RADIUS, pupil_radius))
 
 
 def visible_half_width(first: float, second: float, pupil_radius: float, sine: float) -> float:
     """Height in metres from which no light reaches the pupil: (r + B sine) / A, infinite for A = 0."""
-    reach = checks.quantity(PUPIL_RADIUS, pupil_radius) + abs(second) * sine
-    return reach / abs(first) if first else math.inf
+    reach = checks.quantity(PUPIL_RADIUS, pupil_radius) + _light_reach(second, sine)
+    return reach / abs(first) if checks.finite("first", first) else math.inf
 
 
 def eye_box(size: float, first: float, second: float, sine: float) -> float:
@@ -214,6 +221,13 @@ def _cone(height: float, distance: float, width: float, pitch: float, wavelength
     checks.quantity(OFFSET, height, "height")
     checks.quantity(WIDTH, width)
     return abs(checks.quantity(DISTANCE, distance)) * _tangent(pitch, wavelength)
+
+
+def _light_reach(second: float, sine: float) -> float:
+    """Half width in metres, B sine, of the light of a point on the pupil's plane, both numbers checked."""
+    if checks.nonnegative("sine", sine) > 1:
+        raise ValueError(f"sine must be at most 1, got {sine!r}")
+    return abs(checks.quantity(PLANE, second, "second")) * sine
 
 
 def _positive_focal_length(value: float) -> float:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import warnings
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ import torch
 from holotorch.core import checks, quantities
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import Quantity, shown
+from holotorch.optics import carrier, converging_fresnel, propagate
 
 TABLE = {name: value for name, value in vars(quantities).items() if isinstance(value, Quantity)}
 NAN, INFINITE = math.nan, math.inf
@@ -85,3 +87,38 @@ def test_grids_refuse_a_pitch_in_other_units():
         ):
             Grid(8, pitch)
     assert dataclasses.asdict(Grid(8, 3.74e-6))["pitch"] == (3.74e-6, 3.74e-6)
+
+
+def test_tensors_that_hold_no_values_yet_are_taken_as_they_are():
+    """Mapped over or compiled: whether they can be meant is asked where they hold values."""
+    waves = torch.tensor([450e-9, 530.0], dtype=torch.float64)
+    mapped = torch.vmap(lambda wave: carrier(wave, 1e-3))(waves)
+    assert mapped.shape == (2,)
+    with pytest.raises(ValueError, match="wavelength must lie within"):
+        carrier(waves, 1e-3)
+    checks.meant(quantities.WAVELENGTH, torch.empty(3, device="meta"))
+
+
+@pytest.mark.parametrize("shape", [(), (2,)])
+def test_a_phase_that_float32_turns_is_warned_of(shape):
+    """0.1 m / 530 nm is 1.9e5 cycles, of which float32 rounds away up to 6e-8: 0.07 rad."""
+    field, grid = torch.ones(2, 8, 8, dtype=torch.complex128), Grid(8, 8e-6)
+    distance = torch.full(shape, 0.1)
+    calls = {
+        "carrier": lambda far: carrier(530e-9, far),
+        "propagate": lambda far: propagate(field, grid, 530e-9, far, tolerance=0.09),
+        "converging_fresnel": lambda far: converging_fresnel(field, grid, 530e-9, far, 0.2, grid),
+    }
+    for call in calls.values():
+        with pytest.warns(
+            checks.PrecisionWarning, match="distance is float32, .* by up to 0.071 rad here; pass float64"
+        ):
+            coarse = call(distance)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", checks.PrecisionWarning)
+            exact = call(distance.double().fill_(0.1))  # and with as many digits as there are
+            call(distance / 1e3)  # too short for it to show
+        turned = (coarse.flatten()[0] * exact.flatten()[0].conj()).angle().abs().item()
+        assert 0.005 < turned < 0.071  # it is there, and within what the warning says
+    with pytest.warns(checks.PrecisionWarning, match="wavelength is float32, .* by up to 0.071 rad"):
+        carrier(torch.full(shape, 530e-9), 0.1)

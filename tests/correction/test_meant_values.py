@@ -24,6 +24,8 @@ SECOND_ONLY = torch.stack([torch.zeros(GRID.shape), torch.ones(GRID.shape)])
         ({"limit_weight": math.nan}, "limit_weight must be finite, got nan"),
         ({"power_weight": -1e-3}, "power_weight must be at least zero, got -0.001"),
         ({"power_weight": math.inf}, "power_weight must be finite, got inf"),
+        ({"limit": math.inf}, "limit must be finite, but element"),
+        ({"limit": torch.tensor([1.0, math.nan])}, r"limit must be finite, but element \(1, 0, 0\) is nan"),
         ({"mask": torch.zeros(6, 7)}, "mask is zero everywhere in channel 0: nothing is left to compare"),
         ({"mask": SECOND_ONLY}, "mask is zero everywhere in channel 0"),
         ({"mask": torch.full((6, 7), math.nan)}, "mask must be finite"),

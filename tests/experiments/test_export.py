@@ -208,6 +208,30 @@ def test_what_does_not_fit_is_refused_and_nothing_is_left(pec, tmp_path, words, 
     assert not (tmp_path / "a").exists()
 
 
+def test_colours_before_frames_are_refused_where_no_shape_tells(pec, tmp_path):
+    """As many frames as colours: the heating power of each colour, of which the run has told, does."""
+    copy = tmp_path / "run"
+    shutil.copytree(pec, copy)
+    two = np.load(copy / "arrays" / "phase.npy")
+    three = np.concatenate([two, two[:1] / 2])
+    config, summary = copy / "config.yaml", copy / "summary.json"
+    config.write_text(config.read_text().replace("frames: 2", "frames: 3"))
+    numbers = json.loads(summary.read_text())
+    told = numbers["methods"]["corrected"]
+    power = np.array(told["heating_power_K_per_pixel"])
+    told["heating_power_K_per_pixel"] = (power * three.mean((0, 2, 3)) / two.mean((0, 2, 3))).tolist()
+    summary.write_text(json.dumps(numbers))
+    np.save(copy / "arrays" / "phase.npy", three)
+    assert load_wanted(copy).phase.shape == (3, 3, 32, 24)
+    np.save(copy / "arrays" / "phase.npy", three.swapaxes(0, 1))
+    with pytest.raises(
+        ConfigError, match=r"phase.npy holds \[C, F, H, W\], .* and \[F, C, H, W\] is wanted; as F = C = 3"
+    ):
+        load_wanted(copy)
+    np.save(copy / "arrays" / "phase.npy", three * 2)  # another solution of neither order is taken at its word
+    assert load_wanted(copy).phase.shape == (3, 3, 32, 24)
+
+
 def test_damaged_runs_are_refused(pec, tmp_path):
     copy = tmp_path / "run"
     shutil.copytree(pec, copy)
@@ -217,7 +241,9 @@ def test_damaged_runs_are_refused(pec, tmp_path):
     with pytest.raises(ConfigError, match=r"phase must be finite, but element \(1, 2, 3, 4\) is nan"):
         export_slm(copy, PANEL, overrides=SMALL)
     np.save(copy / "arrays" / "phase.npy", phase[:1])
-    with pytest.raises(ConfigError, match=r"must have the shape \(2, 3, 32, 24\) of its configuration"):
+    with pytest.raises(
+        ConfigError, match=r"must have the shape \(F, C, H, W\) = \(2, 3, 32, 24\) of its configuration"
+    ):
         export_slm(copy, PANEL, overrides=SMALL)
     (copy / "arrays" / "phase.npy").unlink()
     with pytest.raises(ConfigError, match="phase.npy is not in its arrays"):

@@ -33,5 +33,8 @@ def test_temperature_and_phase_undo_each_other(dtype):
 
 
 def test_refuses_other_channel_counts():
-    with pytest.raises(ValueError, match=r"\(C, H, W\) with C = 3, got \(2, 4, 5\)"):
-        PhasedArray(WAVES, ThermalCrosstalk(0)).temperature(torch.rand(2, 4, 5))
+    array = PhasedArray(WAVES, ThermalCrosstalk(0))
+    for call in (array, array.temperature, array.phase):
+        for shape in ((2, 4, 5), (3, 2, 4, 5), (4, 5)):  # (3, 2, 4, 5): colours before frames
+            with pytest.raises(ValueError, match=r"\(C, H, W\) with C = 3, one per wavelength, got .* \[F, C, H, W\]"):
+                call(torch.rand(shape))
