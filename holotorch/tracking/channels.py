@@ -63,7 +63,8 @@ def ambiguities(camera: Camera, catheter: Catheter) -> tuple[ChannelOrder, ...]:
 
     With the thesis's red, green and blue bands that is BGR: red and blue change places, and the bands read as the same
     ones from the other end. Read so, three bands fit a pose whatever their lengths are (the cross-ratio of four edges
-    is the same in reverse), and only the tube's width may contradict it; so it is the colours that must tell.
+    is the same in reverse), and only the tube's width may contradict it, or the lengths of tube beyond the bands where
+    they lie on the frame (:func:`holotorch.tracking.ends.shows_reversed`); so it is the colours that must tell.
 
     A mirrored frame is not among these: of a straight tube it is a possible frame, with any colours and lengths, and
     only the scene beside the tube tells.
@@ -100,8 +101,9 @@ def ambiguity_text(orders: Sequence[ChannelOrder]) -> str:
     names = " or ".join(order.value for order in orders)
     return names and (
         f"frames with channels in the order {names} show this catheter's bands as another pose, with a small stated "
-        "deviation, and no single one tells: make sure that what is red is red in the frames, or paint bands that no "
-        "exchange of channels makes the same, as in configs/tracking/catheter_distinct.yaml"
+        "deviation, and only the tube beyond its bands tells, where it is on the frame: make sure that what is red is "
+        "red in the frames, or paint bands that no exchange of channels makes the same, as in "
+        "configs/tracking/catheter_distinct.yaml"
     )
 
 

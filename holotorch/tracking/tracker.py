@@ -20,6 +20,7 @@ from holotorch.tracking.catheter import Catheter
 from holotorch.tracking.channels import ChannelOrder, need_frames, stated_order
 from holotorch.tracking.coarse import find_segments
 from holotorch.tracking.colours import ColourTable
+from holotorch.tracking.ends import shows_reversed
 from holotorch.tracking.footprint import axis_on_plane, bulge_px, width_px
 from holotorch.tracking.lens import Lens
 from holotorch.tracking.measure import BLURRED, Edges, find_bands, halfway, measure_edges
@@ -46,6 +47,7 @@ _BLUR = 0.9  # pixels, to begin with
 _BENT = 0.1  # pixels by which fronts bulge more or less than was thought, beyond which they want another look
 _FLAT = 0.05  # pixels of a bulge that change the tube's width by nothing
 _ASTRAY = 16.0  # pixels aside of a segment that its tube may show, the glow of one out of focus included
+_EXCHANGED = "a frame whose red and blue are exchanged looks so; state the order of its channels (ChannelOrder)"
 _MOVED = 30.0  # pixels that a catheter may move between two frames
 
 
@@ -57,7 +59,8 @@ class CatheterTracker:
     the pose by :func:`pose_on_line`. With a previous pose only the strip around it is read, 30 pixels to each side:
     what has left it is refused, and found again on a frame that comes without one. The work for a frame is bounded.
 
-    Without a previous pose the tube's width, measured by itself, must agree with the pose; with one, what was found is
+    Without a previous pose the tube's width, measured by itself, must agree with the pose, and the tube must not show
+    where only the bands read from the other end would put it (:func:`shows_reversed`); with one, what was found is
     taken for the same catheter.
 
     Frames may be on any device; what is read of them (every second pixel of every second row, or with a previous pose
@@ -113,8 +116,7 @@ class CatheterTracker:
         try:
             if found is None:
                 return self._anywhere(sampler)
-            line, stretches = self._shown(sampler, *self._expected(found), _MOVED, onward=True)
-            return self._along(sampler, line, stretches, found)
+            return self._along(sampler, *self._near(sampler, found), found)
         except Refusal as refusal:
             return Pose.refused(refusal.status, refusal.reason)
 
@@ -138,6 +140,21 @@ class CatheterTracker:
             else:  # only one line is measured: what shows the bands in their order is seldom something else
                 return self._along(sampler, *shown, None)
         raise Refusal(*furthest)
+
+    def _near(self, sampler: Sampler, found: Found) -> tuple[Line, Stretches]:
+        """The line near a previous pose, and which bands it shows; a Refusal says so where they lie the other way."""
+        line, half = self._expected(found)
+        try:
+            return self._shown(sampler, line, half, _MOVED, onward=True)
+        except Refusal as refusal:
+            try:
+                turned = Line(line.origin, -line.along, line.scale)
+                self._shown(sampler, turned, half, _MOVED, onward=True)
+            except Refusal:
+                raise refusal from None
+            raise Refusal(
+                refusal.status, f"the bands lie along the previous line, in the other direction: {_EXCHANGED}"
+            ) from None
 
     def _expected(self, found: Found) -> tuple[Line, float]:
         """Where the bands of a pose lie, and half their length with room to move."""
@@ -196,7 +213,11 @@ class CatheterTracker:
             with self._timed("edges"):
                 edges = measure_edges(sampler, lens, axis, edges.t, stretches.doubtful, edges.blur, curve)
         with self._timed("pose"):
-            return self._judged(self._solved(axis, edges), width, edges, cold=before is None)
+            found = self._solved(axis, edges)
+            pose = self._judged(found, width, edges, cold=before is None)
+            if before is None and shows_reversed(sampler, lens, found, self.catheter):
+                raise Refusal(Status.INCONSISTENT, f"the tube goes on beyond its end on one side only: {_EXCHANGED}")
+            return pose
 
     def _rough(self, line: Line, places: np.ndarray) -> Found | None:
         """A first pose, from where the colours change; None where one of these places may be no edge."""

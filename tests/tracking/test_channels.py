@@ -6,6 +6,7 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import pytest
 import torch
 from tracked import TRACKER, WORLD, at, refused, right, scenes, truth
@@ -34,15 +35,41 @@ def test_orders_are_undone():
 
 
 def test_the_thesis_s_catheter_is_its_own_mirror_image_in_bgr():
-    """What no frame tells: a pose that is stated to a third of a millimetre, a quarter of a metre off."""
+    """What the bands do not tell: a pose that is stated to a third of a millimetre, a quarter of a metre off."""
     assert ambiguities(WORLD.camera, THESIS) == (ChannelOrder.BGR,)
     case, frame = scenes()["plain"]
     for order in OTHERS:
-        pose = TRACKER(reordered(frame, order)[None])[0]
-        if order is ChannelOrder.BGR:
-            assert pose.status is Status.OK and float((pose.tip - truth(case)[0]).norm()) > 0.2
-        else:
-            assert not pose.answered
+        assert not TRACKER(reordered(frame, order)[None])[0].answered
+    as_long = replace(THESIS, length=sum(THESIS.edges[:1] + THESIS.edges[-1:]))  # on both sides of the bands
+    pose = CatheterTracker(WORLD.camera, as_long)(reordered(frame, ChannelOrder.BGR)[None])[0]
+    assert pose.status is Status.OK and float((pose.tip - truth(case)[0]).norm()) > 0.2
+
+
+def test_the_tube_beyond_the_bands_tells():
+    """It is longer behind them, where it lies on the frame: a wrong pose is refused, and a right one is not."""
+    for name in ("plain", "far", "roll 0", "roll 205", "slanted"):
+        case, frame = scenes()[name]
+        right(TRACKER(frame[None])[0], case)
+        pose = TRACKER(reordered(frame, ChannelOrder.BGR)[None])[0]
+        refused(pose, Status.INCONSISTENT)
+        assert "red and blue are exchanged" in pose.reason and "ChannelOrder" in pose.reason
+
+
+def test_no_single_sign_of_the_tube_refuses_a_pose():
+    """Something in line with the tip, or a hand around the rear: only both together say that the ends are exchanged."""
+    case, frame = scenes()["plain"]
+    tip, direction = truth(case)
+    ahead, behind = (tip + torch.tensor(part)[:, None] * direction for part in ([-0.1, -0.002], [0.2, 0.37]))
+
+    def covered(frame, points, wide, colour):
+        (x0, y0), (x1, y1) = WORLD.camera.project(points).round().int().tolist()
+        drawn = frame.movedim(0, -1).contiguous().numpy().copy()
+        return torch.from_numpy(cv2.line(drawn, (x0, y0), (x1, y1), colour, wide)).movedim(-1, 0)
+
+    wire, hand = covered(frame, ahead, 4, (235, 235, 235)), covered(frame, behind, 60, (205, 150, 125))
+    right(TRACKER(wire[None])[0], case)
+    right(TRACKER(hand[None])[0], case)
+    refused(TRACKER(covered(wire, behind, 60, (205, 150, 125))[None])[0], Status.INCONSISTENT)
 
 
 @pytest.mark.parametrize("make", [CatheterTracker, ThesisTracker])
@@ -55,11 +82,15 @@ def test_an_order_that_is_stated_is_undone(make):
 
 
 def test_a_previous_pose_tells():
-    """The bands' sequence is looked for in the direction that is known."""
+    """The bands' sequence is looked for in the direction that is known; that it lies the other way is no movement."""
     case, frame = scenes()["plain"]
     before = TRACKER(frame[None])
     right(TRACKER(frame[None], before)[0], case)
-    refused(TRACKER(reordered(frame, ChannelOrder.BGR)[None], before)[0], Status.BANDS_MISSING)
+    pose = TRACKER(reordered(frame, ChannelOrder.BGR)[None], before)[0]
+    refused(pose, Status.BANDS_MISSING)
+    assert pose.reason.startswith("the bands lie along the previous line, in the other direction: a frame whose red")
+    gone = TRACKER(WORLD.desk()[None], before)[0]  # and of a frame without them nothing of the kind is said
+    assert not gone.answered and "direction" not in gone.reason
 
 
 def test_a_catheter_whose_colours_tell_is_never_found_wrongly():
