@@ -1,6 +1,10 @@
 #!/usr/bin/env bash
-# Sets everything up and runs the tests; arguments go to pytest.
+# Sets everything up and runs the tests: all of them in one process per core, or in one process what arguments to pytest
+# choose.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . scripts/setup.sh "[dev]"
+export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"  # threads of several processes wait for each other
+# The tests of a file share what it sets up; each process takes 1 to 2 GB.
+[ $# -gt 0 ] || set -- -p no:benchmark --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 exec .venv/bin/python -m pytest "$@"

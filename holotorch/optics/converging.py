@@ -54,6 +54,8 @@ def converging_fresnel(
         (FOCAL_LENGTH, focus, "focus"),
     ):
         checks.meant(kind, value, name)
+        if isinstance(value, Tensor) and value.is_cuda and not torch.compiler.is_compiling():
+            checks.quantities(kind, value, name)
     y, x = checks.pair("offset", offset, "metres")
     offset = checks.quantity(OFFSET, y), checks.quantity(OFFSET, x)
     checks.precise(wavelength, distance)
