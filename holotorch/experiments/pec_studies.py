@@ -21,6 +21,7 @@ from holotorch.modulator import ThermalCrosstalk, quantised
 
 Row = dict[str, Any]
 PI = math.pi
+SIZES = (64, 128, 256, 512)  # pixels along a side, whose times are compared
 VOLUME = f"synthetic volume, {SLICES} slices in turn"
 
 
@@ -97,7 +98,7 @@ def iterations(bench: Bench, sigmas: Sequence[float], steps: int, done: Cases) -
 def scaling(bench: Bench, sigmas: Sequence[float], steps: int, done: Cases) -> list[Row]:
     """Figs. 4.10, 4.11: seconds against sigma and against resolution, in one process."""
     rows = done.rows
-    cases = [(bench.size, sigma) for sigma in sigmas] + [(size, bench.sigma_px) for size in (64, 128, 256, 512)]
+    cases = [(bench.size, sigma) for sigma in sigmas] + [(size, bench.sigma_px) for size in SIZES]
     for size, sigma in done.each(cases, desc="time", unit="case"):
         own = replace(bench, size=size, sigma_px=sigma)
         for name, phase, seconds in _methods(own, steps, ("basic IPEC", "IPEC", "PPEC", "ours")):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from holotorch.cli import main
-from holotorch.experiments import chart_pec
+from holotorch.experiments import chart_pec, pec_studies
 from holotorch.experiments.pec_bench import Bench, Track, butterworth, grey
 from holotorch.experiments.pec_studies import STUDIES
 
@@ -15,7 +15,8 @@ SWEEP = {"lowpass": "[0.2]"}
 
 
 @pytest.mark.parametrize("study", STUDIES)
-def test_every_study_fills_its_folder(study, tmp_path, capsys):
+def test_every_study_fills_its_folder(study, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(pec_studies, "SIZES", (16, 32))
     words = [f"configs/pec/studies/{study}.yaml", "images=[camera,coffee]", "size=24", "max_steps=6"]
     words.append(f"sweep={SWEEP.get(study, '[0.66]')}")
     assert main(["run", *words, "--out", str(tmp_path / "s")]) == 0
@@ -46,7 +47,7 @@ def test_check_says_what_a_study_does(study, capsys):
 def test_a_small_chart_of_pec_is_complete(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(chart_pec, "SIGMAS", (0.66,))
     monkeypatch.setattr(chart_pec, "SIZE", 32)
-    monkeypatch.setattr(chart_pec, "STEPS", 60)
+    monkeypatch.setattr(chart_pec, "STEPS", 24)
     monkeypatch.setattr(chart_pec, "GOALS", {0.66: (0.3, 0.6)})
     assert main(["chart", "pec", "--out", str(tmp_path / "c")]) == 0
     assert {path.name for path in (tmp_path / "c").iterdir()} == {
