@@ -78,9 +78,9 @@ class PECProblem(nn.Module):
         if limit is not None:
             # One value per channel, against [C, H, W] or [C, F, H, W].
             limit = torch.as_tensor(limit, dtype=target.dtype).reshape(-1, *[1] * (3 if frames else 2))
-            checks.all_finite("limit", limit)
             if not (limit > 0).all():
                 raise ValueError("limit must be above zero in rad")
+            checks.all_finite("limit", limit)
             if len(limit) not in (1, len(target)):
                 raise ValueError(f"limit must be a number or one per channel, {len(target)}, got {len(limit)}")
         self.register_buffer("limit", limit, persistent=False)

@@ -99,7 +99,7 @@ def test_a_neighbour_equals_the_wavelength_itself(elements, paraxial):
     """Away from the edges, through a soft pupil: 4 nm beside the green, where no speckle is left as it was."""
     grid, eye = Grid((72, 64), 8e-6), Eye(1e-3, 24e-3, 60e-3, softness=60e-6)
     display, other = Display.planar(80e-3), GREEN + 4e-9
-    field, way = random_phase(grid)[None], through_elements if elements else imaged
+    field, way = random_phase(grid, torch.complex64)[None], through_elements if elements else imaged
     image, wanted = (way(field, grid, wave, display, eye, paraxial=paraxial)[0] for wave in (GREEN, other))
     (got,) = neighbours(image, grid, GREEN, [other], display, eye, elements=elements)
     got, before, wanted = (each[12:-12, 12:-12].abs().square() for each in (got, image, wanted))
@@ -113,7 +113,11 @@ def test_the_errors_of_the_eye_are_those_of_each_wavelength(elements):
     """Half a wave of defocus and coma, and the colour error that the eye has besides."""
     grid, display = Grid((72, 64), 8e-6), Display.planar(80e-3)
     eye = Eye(1e-3, 24e-3, 60e-3, {4: 0.2e-6, 8: 0.1e-6}, chromatic_reference=GREEN, softness=60e-6)
-    field, way, other = random_phase(grid)[None], through_elements if elements else imaged, GREEN + 4e-9
+    field, way, other = (
+        random_phase(grid, torch.complex64)[None],
+        through_elements if elements else imaged,
+        GREEN + 4e-9,
+    )
     image, wanted = (way(field, grid, wave, display, eye, paraxial=True)[0] for wave in (GREEN, other))
     (got,) = neighbours(image, grid, GREEN, [other], display, eye, elements=elements)
     perfect = Eye(1e-3, 24e-3, 60e-3, softness=60e-6)

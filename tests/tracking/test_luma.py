@@ -198,11 +198,13 @@ def test_slanted_rings_of_coarse_colours_are_where_their_light_shows_them(monkey
     Over 16 rolls the mean has a standard error of its own: within three of it, and farther without.
     """
 
+    poses = [WORLD.pose(0.45, math.radians(30), i * math.pi / 8) for i in range(16)]
+    cases = [WORLD.case(f"slanted {i}", pose) for i, pose in enumerate(poses)]
+    frames = [coded(case.frame(), "jpeg 95")[None] for case in cases]
+
     def deviations() -> float:
-        missed = []
-        for i in range(16):
-            case = WORLD.case(f"slanted {i}", WORLD.pose(0.45, math.radians(30), i * math.pi / 8))
-            missed.append(float((TRACKER(coded(case.frame(), "jpeg 95")[None])[0].tip - truth(case)[0])[2]))
+        both = zip(cases, frames, strict=True)
+        missed = [float((TRACKER(frame)[0].tip - truth(case)[0])[2]) for case, frame in both]
         return float(abs(np.mean(missed)) / (np.std(missed, ddof=1) / math.sqrt(len(missed))))
 
     assert deviations() < 3
