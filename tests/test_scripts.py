@@ -99,6 +99,15 @@ def test_installs_once_and_again_when_the_constraints_change(checkout):
     assert installs() == [".", ".[dev]", "."]
 
 
+def test_all_tests_run_in_several_processes_and_chosen_ones_in_one(checkout):
+    stand_in(checkout, WORKING.replace("PIP", 'echo "$*, threads: $OMP_NUM_THREADS" >> ../calls'))
+    assert call(checkout, "test.sh").returncode == 0
+    assert call(checkout, "test.sh", "-k", "name", "tests/core").returncode == 0
+    whole, chosen = (checkout / "calls").read_text().splitlines()[-2:]
+    assert whole.startswith("-m pytest ") and "--numprocesses auto" in whole and "--dist loadfile" in whole
+    assert chosen == "-m pytest -k name tests/core, threads: 1"
+
+
 def test_scripts_are_executable():
     for name in ("scripts/demo.sh", "scripts/test.sh", ".ci/run"):
         assert os.access(ROOT / name, os.X_OK)
