@@ -118,7 +118,8 @@ def proximal_pec(
         crosstalk: P.
         propagator: F, as for ``PECProblem``.
         target: Wanted intensity.
-        start: Heater phases in rad, real [..., C, H, W].
+        start: Heater phases in rad, real [..., C, H, W]; with ``frames=True`` the unknown [..., C, F, H, W] that
+            ``PECProblem.unknown`` makes of heater phases [..., F, C, H, W].
         solver: ``APG()`` by default.
         callback: Sees the state after every step.
         options: Further keywords of ``PECProblem``.
