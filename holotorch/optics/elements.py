@@ -46,7 +46,7 @@ class ElementSampling:
         return 4 * whole + zoom
 
     def memory_bytes(self, itemsize: int = 8, batch: int = 1) -> int:
-        """Largest extra memory of images of one wavelength, within 5 % of what was measured at 1.4 GB and more.
+        """Largest extra memory of images of one wavelength, within 3 % of what was measured at 1.4 to 2.4 GB.
 
         Args:
             itemsize: Bytes of a sample: 8 for complex64, 16 for complex128.

@@ -203,6 +203,7 @@ class Retina(nn.Module):
 
     Raises:
         ValueError: As :func:`plan_retina`.
+        MemoryError: In a call, before anything is allocated: the field needs more memory than is available.
 
     Warns:
         SamplingWarning: No way meets the tolerance; the most accurate one that fits is used.
