@@ -1,6 +1,7 @@
 """The ``holotorch`` command. Each subcommand loads only what it needs; ``--help`` loads nothing."""
 
 import argparse
+import errno
 import re
 import sys
 from contextlib import nullcontext
@@ -35,7 +36,7 @@ def main(arguments: list[str] | None = None) -> int:
         return FAILED
     except OSError as error:
         print(f"{error.filename or 'file'}: {error.strerror or error}", file=sys.stderr)
-        return FAILED
+        return BAD_INPUT if error.errno == errno.ENAMETOOLONG else FAILED
     except KeyboardInterrupt:
         print("interrupted before anything could be saved", file=sys.stderr)
         return INTERRUPTED

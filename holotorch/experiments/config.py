@@ -21,6 +21,7 @@ from holotorch.experiments.settings import (
     Settings,
     Side,
     Wavelength,
+    existing,
     number,
     pair,
     plausible,
@@ -36,12 +37,11 @@ def _not_zero(value: float) -> float:
     return value
 
 
-def _picture(value: Any) -> Any:
-    if isinstance(value, str) and value not in BUNDLED_IMAGES and not Path(value).is_file():
-        raise PydanticCustomError("picture", "{message}", {"message": no_such_picture(value)})
-    return value
+def _is_picture(value: str) -> bool:
+    return value in BUNDLED_IMAGES or Path(value).is_file()
 
 
+Picture = Annotated[str, existing(_is_picture, no_such_picture)]
 # "hot": phases uniform on [0, 2 pi); "cool": their spread is; "flat": on [0, 1); "quadratic": a lens, after spreading;
 # "retrieved": phases of Gerchberg-Saxton, deconvolved.
 Start = Literal["hot", "cool", "flat", "quadratic", "retrieved"]
@@ -70,7 +70,7 @@ class TargetSettings(Settings):
     much an error counts where.
     """
 
-    image: Annotated[str, BeforeValidator(_picture)]
+    image: Picture
     fit: Literal["crop", "pad"] = "crop"
     region: Annotated[tuple[Side, Side], BeforeValidator(pair)] | None = None
     depths: Literal["bands", "full"] = "bands"
@@ -180,9 +180,7 @@ class StudySettings(Settings):
 
     experiment: Literal["pec_study"]
     study: Literal["reproduction", "lowpass", "multiplexing", "iterations", "time", "focus", "limits", "targets"]
-    images: Annotated[
-        tuple[Annotated[str, BeforeValidator(_picture)], ...], BeforeValidator(several), Field(min_length=1)
-    ]
+    images: Annotated[tuple[Picture, ...], BeforeValidator(several), Field(min_length=1)]
     size: Annotated[Count, Field(ge=24, le=1024)] = 128
     sweep: Annotated[tuple[Annotated[Number, Field(gt=0, le=3)], ...], BeforeValidator(several), Field(min_length=1)]
     max_steps: Count = 400

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from holotorch.experiments.settings import Count, Number, Settings, number, several
+from holotorch.experiments.settings import Count, ExistingPath, Number, Settings, number, several
 
 Angle = Annotated[Number, Field(ge=0, le=180)]
 Size = Annotated[Number, Field(gt=0, le=180)]
@@ -131,7 +131,7 @@ class AnalysisSettings(Settings):
 
     experiment: Literal["perception_analysis"]
     seed: Seed = 0
-    logs: Annotated[tuple[str, ...], BeforeValidator(several)] = ()
+    logs: Annotated[tuple[ExistingPath, ...], BeforeValidator(several)] = ()
     simulation: SimulationSettings = SimulationSettings()
     cleaning: CleaningSettings = CleaningSettings()
     targets: Annotated[tuple[TargetTimeSettings, ...], BeforeValidator(several), Field(min_length=1)]

@@ -1,12 +1,13 @@
 """What the configuration of an observer's view may say."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
 from holotorch.core.quantities import DEPTH, EYE_LENGTH, FOCAL_LENGTH, PUPIL_RADIUS, SPACING
-from holotorch.experiments.settings import Count, Length, Number, Settings, number, plausible, several
+from holotorch.experiments.errors import short
+from holotorch.experiments.settings import Count, Length, Number, Settings, existing, number, plausible, several
 from holotorch.io.bundled import find_config
 
 Source = Literal["laser", "narrow_sled", "sled", "led"]
@@ -18,10 +19,8 @@ def _above_zero(value: float) -> float:
     return value
 
 
-def _there(value: Any) -> Any:
-    if isinstance(value, str) and find_config(value) is None:
-        raise PydanticCustomError("file", "expected a configuration file of a volume that exists")
-    return value
+def _no_scene(value: str) -> str:
+    return f"expected a configuration file of a volume that exists, got {short(value)}"
 
 
 Positive = Annotated[Length, AfterValidator(_above_zero)]
@@ -30,7 +29,7 @@ Positive = Annotated[Length, AfterValidator(_above_zero)]
 class SceneSettings(Settings):
     """The hologram that is looked at: a volume's configuration, with settings to change as on the command line."""
 
-    config: Annotated[str, BeforeValidator(_there)]
+    config: Annotated[str, existing(find_config, _no_scene)]
     change: Annotated[tuple[str, ...], BeforeValidator(several)] = ()
 
 

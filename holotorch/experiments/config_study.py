@@ -14,7 +14,7 @@ from torch import Tensor
 from holotorch.core.quantities import SCREEN
 from holotorch.experiments.errors import ConfigError
 from holotorch.experiments.messages import validated
-from holotorch.experiments.perception_design import Design, make_design
+from holotorch.experiments.perception_design import MOST_TRIALS, Design, make_design, too_many
 from holotorch.experiments.settings import Count, Length, Number, Settings, Side, number, plausible, several, within
 from holotorch.experiments.source import Key, read_source
 from holotorch.perception.geometry import CurvedScreen, FlatScreen
@@ -102,6 +102,12 @@ class StudySettings(Settings):
         """All pairs of eccentricity and size in degrees."""
         return tuple((e, s) for group in self.patterns for e in group.eccentricities_deg for s in group.sizes_deg)
 
+    @property
+    def trials(self) -> int:
+        """How many each participant has after the practice."""
+        conditions = sum(len(group.eccentricities_deg) * len(group.sizes_deg) for group in self.patterns)
+        return 2 * conditions * (self.repeats.target + self.repeats.distraction)
+
     def design(self, participant: int) -> Design:
         """The trials of one participant."""
         return make_design(
@@ -141,6 +147,8 @@ def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudySettings
             found.append((("screen", "distance"), "expected an eye inside the cylinder: less than twice the radius"))
         if screen.size[1] > 2 * math.pi * screen.radius:
             found.append((("screen", "size"), "expected an arc of one turn at most: 2 pi times the radius"))
+    if settings.trials > MOST_TRIALS:  # not to be listed
+        raise ConfigError([source.mistake(("repeats",), too_many(settings.trials))])
     seen: set[tuple[float, float]] = set()
     for i, group in enumerate(settings.patterns):
         for pair in [(e, s) for e in group.eccentricities_deg for s in group.sizes_deg]:

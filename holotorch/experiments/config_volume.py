@@ -1,6 +1,5 @@
 """What the configuration of a volume's hologram may say."""
 
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -10,6 +9,8 @@ from pydantic_core import PydanticCustomError
 from holotorch.experiments.settings import (
     Count,
     Distance,
+    ExistingArray,
+    ExistingPath,
     GridSettings,
     Number,
     Settings,
@@ -20,12 +21,6 @@ from holotorch.experiments.settings import (
 
 Scene = Literal["tooth", "teapot", "bonsai", "engine", "c60", "hand"]
 Phantom = Literal["shells", "c60", "marschner_lobb", "gaussian_ball"]
-
-
-def _file(value: Any) -> Any:
-    if isinstance(value, str) and not Path(value.split("::")[0]).exists():
-        raise PydanticCustomError("file", "expected a file or folder that exists")
-    return value
 
 
 def _number_type(value: Any) -> Any:
@@ -56,7 +51,7 @@ class VolumeSource(Settings):
     ``directory``: where scenes are kept once fetched.
     """
 
-    path: Annotated[str, BeforeValidator(_file)] | None = None
+    path: ExistingArray | None = None
     scene: Scene | None = None
     phantom: Phantom | None = None
     samples: Annotated[Count, Field(ge=4, le=1024)] = 128
@@ -77,7 +72,7 @@ class TransferSettings(Settings):
     preset: Literal["bone", "soft_tissue", "vessels", "industrial"] | None = None
     low: Number | None = None
     high: Number | None = None
-    file: Annotated[str, BeforeValidator(_file)] | None = None
+    file: ExistingPath | None = None
     points: tuple[tuple[Number, Number, Number, Number, Number], ...] | None = None
     unit_distance: Annotated[Number, Field(gt=0, le=1)] = 1 / 256
 

@@ -62,7 +62,7 @@ def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
         got = given.get("kind", "none") if isinstance(given, dict) else given
         hint = nearest(str(got), options)
         return source.mistake((*key, "kind"), f"expected one of {', '.join(options)}, got {short(got)}{hint}")
-    if kind == "picture":
+    if kind == "path":
         return source.mistake(key, entry["msg"])
     if kind in ("too_short", "too_long"):
         bound, name = ("least", "min_length") if kind == "too_short" else ("most", "max_length")

@@ -19,6 +19,7 @@ ORDERS = ("thesis", "williams")
 THESIS_CONDITIONS = tuple((float(e), float(s)) for e in (0, 10, 20, 30) for s in (5, 10, 15)) + tuple(
     (float(e), float(s)) for e in (40, 50, 60, 70, 80) for s in (5, 8, 11, 14, 17, 20, 23, 26)
 )
+MOST_TRIALS = 10_000  # of a participant; at 2.5 s each, seven hours
 _ROUNDS: tuple[tuple[Pattern, int], ...] = (("cross", 1), ("circle", 1), ("cross", 2), ("circle", 2))
 
 
@@ -145,7 +146,7 @@ def make_design(
 
     Raises:
         ValueError: A participant below 1, no condition, the same one twice, negative or impossible angles, counts or
-            times.
+            times, or more trials than ``MOST_TRIALS``.
     """
     if isinstance(participant, bool) or participant < 1:
         raise ValueError(f"participant: expected a number from 1, got {participant}")
@@ -172,6 +173,11 @@ def make_design(
     return Design(participant, tuple(trials))
 
 
+def too_many(trials: int) -> str:
+    """What to say of more trials than ``MOST_TRIALS``."""
+    return f"expected at most {MOST_TRIALS} trials for a participant, got {trials}; lower the repeats or conditions"
+
+
 def _shuffled(
     rng: random.Random, conditions, goal: Pattern, targets: int, distractions: int, sides: str
 ) -> list[_Appearance]:
@@ -196,6 +202,8 @@ def _wait(rng: random.Random, bounds: tuple[float, float]) -> float:
 def _check(conditions, targets: int, distractions: int, practice: int, wait_s: tuple[float, float]) -> None:
     if not conditions:
         raise ValueError("conditions: expected at least one pair of eccentricity and size, got none")
+    if (trials := 2 * len(conditions) * (targets + distractions)) > MOST_TRIALS:
+        raise ValueError(too_many(trials))
     if len(set(conditions)) < len(conditions):
         twice = next(pair for pair in conditions if list(conditions).count(pair) > 1)
         raise ValueError(f"conditions: {twice[0]:g} deg with size {twice[1]:g} deg is there twice; raise the repeats")

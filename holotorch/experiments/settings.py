@@ -1,13 +1,16 @@
 """Building blocks of configurations: units, ranges, and sections that all kinds share."""
 
 import re
+from collections.abc import Callable
 from decimal import Decimal
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
 from holotorch.core.quantities import PITCH, PLANE, WAVELENGTH, Quantity
+from holotorch.experiments.errors import short
 
 _POWERS = {"m": 0, "cm": -2, "mm": -3, "um": -6, "µm": -6, "μm": -6, "nm": -9}  # of ten, in metres
 # No two parts of it match the same characters, so that a text that fits in no way takes linear time.
@@ -70,12 +73,35 @@ def several(value: Any) -> Any:
     return value if isinstance(value, list | tuple) else (value,)
 
 
+def existing(there: Callable[[str], object], missing: Callable[[str], str]) -> BeforeValidator:
+    """A path that ``there`` accepts; ``missing`` words the refusal of any other, such as a name too long for a file."""
+
+    def check(value: Any) -> Any:
+        reason = ""
+        try:
+            if not isinstance(value, str) or there(value):
+                return value
+        except OSError as error:
+            reason = f" ({error.strerror})"
+        except ValueError:  # a zero byte
+            reason = " (no file can have this name)"
+        raise PydanticCustomError("path", "{message}", {"message": missing(value) + reason})
+
+    return BeforeValidator(check)
+
+
+def _no_path(value: str) -> str:
+    return f"expected a file or folder that exists, got {short(value)}"
+
+
 Number = Annotated[float, BeforeValidator(number), Field(allow_inf_nan=False)]
 Count = Annotated[int, BeforeValidator(number), Field(ge=1)]
 Length = Annotated[float, BeforeValidator(metres), Field(allow_inf_nan=False)]
 Wavelength = Annotated[Length, plausible(WAVELENGTH)]
 Distance = Annotated[Length, plausible(PLANE)]  # of an image or a plane, either side of the hologram
 Pitch = Annotated[Length, plausible(PITCH)]
+ExistingPath = Annotated[str, existing(lambda value: Path(value).exists(), _no_path)]
+ExistingArray = Annotated[str, existing(lambda value: Path(value.split("::")[0]).exists(), _no_path)]
 Side = Annotated[Count, Field(le=16384)]
 
 

@@ -11,7 +11,8 @@ def no_such_picture(source: str) -> str:
     """Message for a picture that is neither bundled nor a file, with the nearest name."""
     near = difflib.get_close_matches(source, BUNDLED_IMAGES, 1)
     hint = f"did you mean {near[0]!r}? " if near else ""
-    return f"no such picture: {source!r}; {hint}give a path, or one of {', '.join(BUNDLED_IMAGES)}"
+    shown = repr(source) if len(source) < 200 else f"{source[:200]!r}... ({len(source)} characters)"
+    return f"no such picture: {shown}; {hint}give a path, or one of {', '.join(BUNDLED_IMAGES)}"
 
 
 def find_config(name: str | Path) -> Path | None:

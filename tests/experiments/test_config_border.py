@@ -1,11 +1,14 @@
 """What no configuration means is a mistake of its key, found in no time."""
 
+import re
 import time
 from pathlib import Path
 
 import pytest
 
+from holotorch.cli import main
 from holotorch.experiments.config import load_config
+from holotorch.experiments.config_study import load_study
 from holotorch.experiments.errors import ConfigError
 
 CORRECTION = """\
@@ -138,3 +141,48 @@ def test_keys_written_twice_a_thousand_times_are_listed_up_to_fifty(tmp_path):
 def test_planes_at_one_distance_are_a_mistake_of_their_key():
     with pytest.raises(ConfigError, match=r"hologram.depths: expected distances that all differ, got 0.004 m twice"):
         load_config(Path("configs/volume/c60.yaml"), ["hologram.depths=[4 mm, 5 mm, 4 mm]"])
+
+
+STUDY = "experiment: pec_study\nstudy: lowpass\nimages: [camera]\nsweep: [0.1]\n"
+ANALYSIS = "experiment: perception_analysis\ntargets: [{seconds: 0.45}]\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        (CORRECTION, "target.image"),
+        (STUDY, "images"),
+        (VOLUME, "volume.path"),
+        (VOLUME, "transfer.file"),
+        (EYE, "scene.config"),
+        (ANALYSIS, "logs"),
+    ],
+)
+def test_a_name_too_long_for_a_file_is_a_mistake_of_its_key(written, text, key):
+    (found,) = mistakes(written(text), f"{key}={'a' * 20_000}")
+    place, _, message = found[found.index("': ") :].partition(f"{key}: ")
+    assert place == "': " and re.search(r"no such picture|that exists", message) and "File name too long" in message
+    assert len(message) < 500
+
+
+def test_a_folder_that_may_not_be_looked_into_is_a_mistake_of_its_key(written, tmp_path, monkeypatch):
+    def closed(path: Path) -> bool:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "exists", closed)
+    (found,) = mistakes(written(VOLUME), "volume.path=secret/a.nrrd")
+    assert "volume.path: expected a file or folder that exists, got 'secret/a.nrrd' (Permission denied)" in found
+
+
+def test_the_command_line_takes_a_name_too_long_for_a_file_as_bad_input(written, capsys):
+    assert main(["run", str(written(CORRECTION)), "--out", "b" * 20_000]) == 2
+    assert "File name too long" in capsys.readouterr().err
+
+
+def test_a_study_of_more_trials_than_anyone_sits_through_is_refused_at_once(tmp_path):
+    text = (Path(__file__).parents[2] / "configs/perception/study.yaml").read_text()
+    (tmp_path / "study.yaml").write_text(text)
+    wide = [1 + i / 1000 for i in range(5000)]  # 25 million pairs
+    for change in ("repeats.target=5000000000000", f"patterns=[{{eccentricities_deg: {wide}, sizes_deg: {wide}}}]"):
+        with pytest.raises(ConfigError, match="repeats: expected at most 10000 trials for a participant, got"):
+            load_study(tmp_path / "study.yaml", [change])

@@ -106,6 +106,7 @@ def test_seeds_and_json():
         ({"order": "random"}, "order: expected one of thesis, williams, got 'random'"),
         ({"sides": "up"}, "sides: expected left, right or both"),
         ({"wait_s": (2.0, 1.0)}, "wait_s"),
+        ({"target_repeats": 5 * 10**12}, "at most 10000 trials for a participant, got 520000000000208"),
         ({"wait_s": (800, 1600)}, "between 0 and 60 s"),
     ],
 )
