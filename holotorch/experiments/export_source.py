@@ -1,6 +1,5 @@
 """What a finished run wants a panel to show: phases, and the way to the picture that they form."""
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ from holotorch.experiments.config import PECSettings, load_config
 from holotorch.experiments.config_volume import VolumeSettings
 from holotorch.experiments.errors import ConfigError
 from holotorch.hologram import double_phase, encoding_loss, error_diffused, kinoform, refocused
+from holotorch.io.files import read_json
 
 if TYPE_CHECKING:
     from holotorch.experiments.pec import PECExperiment
@@ -142,7 +142,7 @@ def _summary(folder: Path) -> dict[str, Any]:
     """What the run says of itself; empty before it has ended."""
     for name in ("summary.json", "interrupted.json"):
         if (folder / name).is_file():
-            return json.loads((folder / name).read_text())
+            return read_json(folder / name)
     return {}
 
 

@@ -2,7 +2,6 @@
 
 import base64
 import html
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from holotorch.experiments.eye_report import eye_section
 from holotorch.experiments.markup import element, figure, heading, plain, table
 from holotorch.experiments.volume_report import volume_section
 from holotorch.experiments.zone_table import zone_rows
-from holotorch.io.files import write_text
+from holotorch.io.files import read_json, write_text
 
 _PICTURES = {
     "target": "Target",
@@ -71,13 +70,13 @@ class _Run:
             cure = f"; finish it with: holotorch resume {folder}" if (folder / "plan.json").is_file() else ""
             raise ConfigError([f"{folder} holds no run: neither summary.json nor interrupted.json is there{cure}"])
         try:
-            self.summary = json.loads((folder / names[0]).read_text())
+            self.summary = read_json(folder / names[0])
             kind = str(self.summary["experiment"])
             if kind not in _KINDS:
                 raise ConfigError([_other(folder, kind)])
-            self.plan = json.loads((folder / "plan.json").read_text())
-            self.env = json.loads((folder / "env.json").read_text())
-            self.config = (folder / "config.yaml").read_text()
+            self.plan = read_json(folder / "plan.json")
+            self.env = read_json(folder / "env.json")
+            self.config = (folder / "config.yaml").read_text(encoding="utf-8")
             self.methods: dict[str, dict[str, Any]] = self.summary["methods"] if kind == "pec" else {}
             if kind == "pec":
                 parts = _section(self)

@@ -30,6 +30,8 @@ def decode(path: Path, flags: int, *, data: bytes | None = None, memory: int = _
 
     data = path.read_bytes() if data is None else data
     height, width = picture_size(path, data)
+    if data.startswith(PNG):
+        data = data[: _png_end(data)]
     affordable(path, height * width * memory, len(data))
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -84,12 +86,23 @@ def check_exr(path: Path, *, memory: int) -> None:
 
 
 def _png_size(data: bytes) -> tuple[int, int]:
-    # Decoders allocate what a chunk states before they look for it.
-    place = len(PNG)
-    while data[place + 4 : place + 8] != b"IEND":
-        place += 12 + struct.unpack_from(">I", data, place)[0]
+    _png_end(data)
     width, height = struct.unpack_from(">II", data, len(PNG) + 8)
     return height, width
+
+
+def _png_end(data: bytes) -> int:
+    """Bytes up to the end of a PNG; an exception where a chunk is longer than the data.
+
+    Decoders allocate what a chunk states before they look for it, also in what follows the last one.
+    """
+    place, kind = len(PNG), b""
+    while kind != b"IEND":
+        length, kind = struct.unpack_from(">I4s", data, place)
+        place += 12 + length
+    if place > len(data):
+        raise ValueError("a chunk is longer than the file")
+    return place
 
 
 def _webp_size(data: bytes) -> tuple[int, int]:

@@ -74,6 +74,14 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
 
+def read_json(path: Path) -> Any:
+    """What a JSON file holds; ValueError for damage of any kind, a nesting without end among it."""
+    try:
+        return json.loads(path.read_bytes().decode("utf-8"))
+    except RecursionError:
+        raise ValueError("nested too deeply to be read") from None
+
+
 def save_array(path: Path, tensor: Tensor) -> None:
     """Write a tensor as .npy in its own precision, whole or not at all."""
     buffer = io.BytesIO()

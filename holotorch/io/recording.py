@@ -16,7 +16,6 @@ shows them.
 
 import csv
 import io
-import json
 import math
 import shutil
 import zlib
@@ -29,7 +28,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
-from holotorch.io.files import append, write_bytes, write_json
+from holotorch.io.files import append, read_json, write_bytes, write_json
 from holotorch.io.video import Frame, Frames
 
 _FORMAT = 1
@@ -194,7 +193,7 @@ def free_bytes(folder: Path) -> int:
 def _facts(folder: Path) -> dict[str, Any]:
     path = folder / "recording.json"
     try:
-        facts = json.loads(path.read_text(encoding="utf-8"))
+        facts = read_json(path)
         version = checks.whole("format", facts["format"], 1)
         for name in ("height", "width"):
             checks.whole(name, facts[name], 1)

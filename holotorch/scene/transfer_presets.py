@@ -83,7 +83,7 @@ def transfer_from_json(text: str, *, unit_distance: float = UNIT_DISTANCE) -> Tr
     """
     try:
         content = json.loads(text)
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:  # of brackets without end
         raise ValueError(f"a transfer function must be JSON text, got {text[:40]!r}: {error}") from None
     first = content[0] if isinstance(content, list) and content else content
     if isinstance(first, dict) and "RGBPoints" in first:

@@ -91,6 +91,7 @@ def bombs(tmp_path_factory) -> dict[str, tuple[str, str]]:
     folder = tmp_path_factory.mktemp("bombs")
     members, blocks = bz2.compress(ZEROS) * 20, [zlib.compress(ZEROS, 9)] * 40
     zipped = gzip.compress(ZEROS, 9) * 40
+    headless = png(16, 16, b"")[: 8 + 25]  # a signature and a header
     words = b" ".join([b"1"] * 2000 + [b"1" * 400_000])
     files = {
         "bzip2.nrrd": (nrrd("bzip2", members * 10), "holds more than the expected 336 bytes"),
@@ -109,6 +110,11 @@ def bombs(tmp_path_factory) -> dict[str, tuple[str, str]]:
         "marks.vti": (b"<AppendedData " * 60_000, "no readable VTK XML"),
         "stack.tif": (tiff(3000, 2000), "asks for 24 GB of memory"),
         "false.png": (png(16, 16, bytes(784), more=chunk(b"tEXt", b"a", 0xFFFFFFF0)), "is not a readable picture"),
+        "levels_end.png": (png(16, 16, bytes(784))[:-12] + chunk(b"IEND", b"", 0xFFFFFFF0), "not a readable picture"),
+        "levels_after.png": (
+            headless + chunk(b"IEND", b"") + chunk(b"IDAT", b"a", 0x7FFFFFFF),
+            "not a readable picture",
+        ),
         "flat.png": (flat_png(32_000), "asks for 57.3 GB of memory"),
         "wide.png": (png(32_000, 32_000, b""), "asks for 57.3 GB of memory"),
         "wide.bmp": (bmp(30_000, 30_000), "asks for 50.4 GB of memory"),

@@ -173,6 +173,13 @@ def test_what_cannot_be_recorded_or_replayed_says_why(tmp_path):
     assert free_bytes(tmp_path / "not" / "yet") > 0
 
 
+def test_facts_nested_without_end_are_damage(tmp_path):
+    recorded(tmp_path / "a", noise(1))
+    (tmp_path / "a" / "recording.json").write_text('{"a":' * 100_000)
+    with pytest.raises(ValueError, match="recording.json is damaged: ValueError nested too deeply"):
+        open_recording(tmp_path / "a")
+
+
 def test_a_carriage_return_in_the_times_is_damage_with_its_line(tmp_path):
     recorded(tmp_path / "made", noise(3))
     times = tmp_path / "made" / "times.csv"

@@ -103,6 +103,7 @@ PART = ["volumeProperties", 0, "components", 0]
     ("text", "message"),
     [
         ("{", "must be JSON text"),
+        ("[" * 100_000, "must be JSON text"),
         ("[]", "'RGBPoints' or a 3D Slicer file with 'volumeProperties', got list"),
         (changed(PARAVIEW, ["ColorSpace"], "Lab"), "ColorSpace must be RGB.*got 'Lab'"),
         (changed(PARAVIEW, ["Points"], None), "Points must be a list that is not empty, got nothing"),
