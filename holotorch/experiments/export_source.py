@@ -76,7 +76,8 @@ def _from_pec(folder: Path, settings: PECSettings) -> Wanted:
 
     experiment = build(settings)
     colours = len(settings.wavelengths)
-    heaters = _array(folder / "arrays" / "phase.npy", (settings.frames, colours, *settings.grid.shape), "(F, C, H, W)")
+    shape = (settings.frames, colours, *settings.grid.shape)
+    heaters = _array(folder / "arrays" / "phase.npy", shape, "(F, C, H, W)", "float32")
     checks.all_finite("phase", heaters)
     _check_axes(folder, experiment, heaters)
     phase = experiment.array.crosstalk(heaters[:, experiment.lit].double()).float()
@@ -93,8 +94,10 @@ def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> Wante
     height, width = (size // settings.scale for size in settings.hologram.shape)
     grid = Grid((height, width), settings.hologram.pitch)
     shape = (len(settings.wavelengths), height, width)
-    hologram = _array(folder / "arrays" / "hologram.npy", shape, "(C, H, W)")
+    hologram = _array(folder / "arrays" / "hologram.npy", shape, "(C, H, W)", "complex64")
     checks.all_finite("hologram", torch.view_as_real(hologram))
+    # Near 1, by a power of two that changes no digit: losses are of fourth power, which float32 may not hold.
+    hologram = hologram * 2.0 ** -torch.frexp(hologram.abs().amax()).exponent.double().item()
     depth = _depth(folder, settings)
 
     def views(colour: int) -> Callable[[Tensor], Tensor]:
@@ -115,14 +118,17 @@ def _check_axes(folder: Path, experiment: "PECExperiment", heaters: Tensor) -> N
 
     The heating power of each colour tells it, which the run's summary holds.
     """
-    numbers = _summary(folder).get("methods", {}).get("corrected", {}).get("heating_power_K_per_pixel")
-    if not len(heaters) == heaters.shape[1] > 1 or numbers is None:
+    try:
+        numbers = _summary(folder).get("methods", {}).get("corrected", {}).get("heating_power_K_per_pixel")
+        wanted = None if numbers is None else torch.tensor(numbers, dtype=torch.float64)[experiment.lit]
+    except (ValueError, AttributeError, TypeError, LookupError, RuntimeError):
+        raise ValueError("the summary is damaged: it does not say the heating power of each colour") from None
+    if not len(heaters) == heaters.shape[1] > 1 or wanted is None:
         return
-    wanted = torch.tensor(numbers, dtype=torch.float64)
 
     def fits(phases: Tensor) -> bool:
         power = experiment.array.temperature(phases[:, experiment.lit].double()).mean((0, -2, -1))
-        return torch.allclose(power, wanted[experiment.lit], rtol=1e-3)
+        return torch.allclose(power, wanted, rtol=1e-3)
 
     if not fits(heaters) and fits(heaters.transpose(0, 1)):
         raise ValueError(
@@ -134,8 +140,11 @@ def _check_axes(folder: Path, experiment: "PECExperiment", heaters: Tensor) -> N
 
 def _depth(folder: Path, settings: VolumeSettings) -> float:
     """The middle one of the depths at which the run's report looks."""
-    depths = _summary(folder).get("refocused_m") or []
-    return depths[len(depths) // 2] if depths else settings.hologram.distance / settings.scale
+    try:
+        depths = _summary(folder).get("refocused_m") or [settings.hologram.distance / settings.scale]
+        return checks.finite("refocused_m", depths[len(depths) // 2], "metres")
+    except (ValueError, AttributeError, TypeError, LookupError):
+        raise ValueError("the summary is damaged: it does not say at which depths the run has looked") from None
 
 
 def _summary(folder: Path) -> dict[str, Any]:
@@ -146,13 +155,15 @@ def _summary(folder: Path) -> dict[str, Any]:
     return {}
 
 
-def _array(path: Path, shape: tuple[int, ...], axes: str) -> Tensor:
+def _array(path: Path, shape: tuple[int, ...], axes: str, dtype: str) -> Tensor:
     if not path.is_file():
         raise ValueError(f"{path.name} is not in its arrays; the run has not come so far: holotorch resume")
     try:
-        found = np.load(path, allow_pickle=False)
+        found = np.load(path, mmap_mode="r", allow_pickle=False)  # which compares sizes before it takes memory
+        stated = found.shape, str(found.dtype)
     except Exception as error:  # what damaged bytes raise is anyone's guess
         raise ValueError(f"{path.name} cannot be read: {error}") from None
-    if found.shape != shape:
-        raise ValueError(f"{path.name} must have the shape {axes} = {shape} of its configuration, got {found.shape}")
-    return torch.from_numpy(found)
+    if stated != (shape, dtype):
+        wanted = f"the shape {axes} = {shape} of its configuration in {dtype}"
+        raise ValueError(f"{path.name} must have {wanted}, got {stated[0]} in {stated[1]}")
+    return torch.from_numpy(found.copy())

@@ -1,6 +1,9 @@
 """Checkpoints and results on a disk that may be full: what cannot be written is told, and the rest is written."""
 
+import hashlib
+import math
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -33,9 +36,13 @@ class Checkpoint:
         if not self.path.is_file():
             return None
         try:
+            with zipfile.ZipFile(self.path) as archive:
+                if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
+                    raise ValueError("packed, which may take any memory to unpack, and torch packs nothing")
             content = torch.load(self.path, weights_only=True)
-            if not isinstance(content, dict):
-                raise ValueError("not a checkpoint")
+            stated = content.pop("checksum", None)
+            if "fingerprint" in content and stated != checksum(content, self.path.stat().st_size):
+                raise ValueError("changed after it was written")
         except Exception as error:  # what damaged bytes raise when unpickled is anyone's guess
             raise self.unreadable(error) from None
         self._check(content.get("fingerprint"))
@@ -62,7 +69,8 @@ class Checkpoint:
         try:
             with replacing(self.path, needed=_bytes(content)) as stream:
                 try:
-                    torch.save(content | {"fingerprint": self.fingerprint}, stream)
+                    content = content | {"fingerprint": self.fingerprint}
+                    torch.save(content | {"checksum": checksum(content)}, stream)
                 except RuntimeError as error:  # torch's own, raised while it handled the one of the disk
                     raise error.__context__ if isinstance(error.__context__, OSError) else error from None
         except (OSError, RuntimeError) as error:
@@ -101,6 +109,33 @@ class Results:
                 _warn(f"{error.filename} cannot be written: {error.strerror}; the other results are written")
             self.fail(error)
             return False
+
+
+def checksum(content: Any, most: float = math.inf) -> str:
+    """Of tensors and plain values, nested as they may be; ValueError for others, and for tensors beyond ``most`` bytes.
+
+    torch checks nothing that it reads: a run would go on from damaged numbers as if they were its own.
+    """
+    total = hashlib.blake2b(digest_size=16)
+
+    def add(value: Any) -> None:
+        if isinstance(value, Tensor):
+            if value.layout != torch.strided or value.nbytes > most:
+                raise ValueError(f"a tensor {list(value.shape)} that no run has saved")
+            total.update(f"{tuple(value.shape)} {value.dtype}".encode())
+            flat = value.detach().cpu().contiguous().reshape(-1)
+            total.update(flat.view(torch.uint8).numpy().data if len(flat) else b"")
+        elif isinstance(value, dict | list | tuple):
+            total.update(f"{'{' if isinstance(value, dict) else '['}{len(value)}".encode())
+            for each in value.items() if isinstance(value, dict) else value:
+                add(each)
+        elif value is None or isinstance(value, str | int | float):
+            total.update(f"{value!r};".encode())
+        else:
+            raise ValueError(f"a value of {type(value).__name__} that no run has saved")
+
+    add(content)
+    return total.hexdigest()
 
 
 def _warn(text: str) -> None:

@@ -251,6 +251,37 @@ def test_damaged_runs_are_refused(pec, tmp_path):
     assert not (copy / "slm").exists()
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda values: abs(values).astype(np.int32), "in complex64, got .* 'int32'"),
+        (lambda values: values.real.copy(), "in complex64, got .* 'float32'"),
+        (lambda values: np.array([{}]), "hologram.npy cannot be read"),
+        (lambda values: [" "], "summary.json is damaged: it does not say at which depths"),
+        (lambda values: 3.0, "summary.json is damaged"),
+    ],
+)
+def test_a_volume_of_someone_else_is_refused_by_its_files(volume, tmp_path, change, message):
+    folder = shutil.copytree(volume, tmp_path / "run")
+    made = change(np.load(folder / "arrays" / "hologram.npy"))
+    if isinstance(made, np.ndarray):
+        np.save(folder / "arrays" / "hologram.npy", made, allow_pickle=True)
+    else:
+        summary = json.loads((folder / "summary.json").read_text())
+        (folder / "summary.json").write_text(json.dumps(summary | {"refocused_m": made}))
+    with pytest.raises(ConfigError, match=message):
+        load_wanted(folder)
+
+
+def test_a_field_of_any_strength_is_exported_alike(volume, tmp_path):
+    folder = shutil.copytree(volume, tmp_path / "run")
+    values = np.load(folder / "arrays" / "hologram.npy")
+    before = load_wanted(folder)
+    np.save(folder / "arrays" / "hologram.npy", values * np.float32(2.0**60))  # its fourth power is beyond float32
+    after = load_wanted(folder)
+    assert torch.equal(after.phase, before.phase) and after.losses == before.losses
+
+
 def test_a_failed_export_leaves_no_files(pec, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device", "frame")

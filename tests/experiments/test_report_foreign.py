@@ -3,11 +3,11 @@
 import json
 import shutil
 from collections.abc import Iterator
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import pytest
+from foreign import ATTACK, foreign
 
 from holotorch.experiments.config import load_config
 from holotorch.experiments.errors import ConfigError
@@ -18,7 +18,6 @@ from holotorch.experiments.track_report import write_page
 from holotorch.experiments.volume_run import run_volume
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-ATTACK = '"><script>alert(1)</script><img src=x onerror=alert(1)>'
 SCENE = "hologram={shape: [32, 32], pitch: 3.74 um, distance: 5 mm, depths: 4}"
 EYE = [
     "scene={config: configs/volume/c60.yaml, change: ['volume={phantom: c60, samples: 16}', "
@@ -26,23 +25,6 @@ EYE = [
     *("display={kind: planar, distance: 4 mm}", "eye={pupil_radius: 0.1 mm, axial_length: 2 mm}"),
     *("seeds=1", "light={sources: [laser]}", "focus=[2 mm]"),
 ]
-
-
-class Foreign(HTMLParser):
-    """Counts elements that no report has."""
-
-    def __init__(self):
-        super().__init__()
-        self.count = 0
-
-    def handle_starttag(self, tag, attrs):
-        self.count += tag == "script" or any(name.startswith("on") or value == "x" for name, value in attrs)
-
-
-def foreign(page: str) -> int:
-    parser = Foreign()
-    parser.feed(page)
-    return parser.count + page.count("<script")
 
 
 @pytest.fixture(scope="module")

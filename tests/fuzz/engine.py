@@ -94,7 +94,9 @@ def fuzz(
     for failed, symptom in count.failures.items():
         kept = folder / "failures" / f"{target.name}-{failed}"
         shutil.rmtree(kept, ignore_errors=True)
-        write(kept, target.input(samples, seed, failed))
+        with contextlib.suppress(Exception):  # one that cannot be made
+            write(kept, target.input(samples, seed, failed))
+        kept.mkdir(parents=True, exist_ok=True)
         (kept / "SYMPTOM.txt").write_text(f"seed {seed}, input {failed}\n{symptom}\n")
     shutil.rmtree(work)
     return count
@@ -123,10 +125,14 @@ def _watch(
     child = os.fork()
     if child == 0:
         os.close(reading)
+        status = 0
         try:
             _work(target, samples, work, seed, numbers, end, writing)
+        except BaseException:
+            status = 1
+            (work / "own.txt").write_text(traceback.format_exc())
         finally:
-            os._exit(0)
+            os._exit(status)
     os.close(writing)
     number, begun, spent, base, told, symptom = numbers[0], time.monotonic(), _used(child), _resident(child), b"", ""
     while True:
@@ -155,6 +161,8 @@ def _watch(
     where = work / "where.txt"
     if os.WIFSIGNALED(status) and not symptom:
         symptom = f"the process was ended by {signal.Signals(os.WTERMSIG(status)).name}"
+    elif status and not symptom:
+        symptom = f"the input cannot be made: {(work / 'own.txt').read_text()}"
     if symptom:
         found = where.read_text(errors="replace") if where.is_file() else ""
         count.failures[number] = f"{symptom}\n{found}"

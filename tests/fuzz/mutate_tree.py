@@ -1,5 +1,6 @@
 """Mutations of what YAML and JSON hold: values of another kind, keys left out, lists without end."""
 
+import copy
 import json
 import math
 from collections.abc import Callable
@@ -91,10 +92,14 @@ def tree_mutated(rng: Random, data: Any, other: Any) -> Any:
     for _ in range(rng.choice((1, 1, 1, 2, 5))):
         places = list(_places(data))
         if not places:
-            return rng.choice(_VALUES)
+            return _value(rng)
         holder, key = rng.choice(places)
         rng.choice(_CHANGES)(rng, holder, key, other)
     return data
+
+
+def _value(rng: Random) -> Any:
+    return copy.deepcopy(rng.choice(_VALUES))  # what is put into one input must not change in another
 
 
 def _places(data: Any) -> Any:
@@ -105,7 +110,7 @@ def _places(data: Any) -> Any:
 
 
 def _replaced(rng: Random, holder: Any, key: Any, other: Any) -> None:
-    holder[key] = rng.choice(_VALUES)
+    holder[key] = _value(rng)
 
 
 def _scaled(rng: Random, holder: Any, key: Any, other: Any) -> None:
@@ -115,7 +120,7 @@ def _scaled(rng: Random, holder: Any, key: Any, other: Any) -> None:
         try:
             holder[key] = f"{float(text) * factor!r} {unit}"
         except ValueError:
-            holder[key] = rng.choice(_VALUES)
+            holder[key] = _value(rng)
     else:
         holder[key] = type(value)(value * factor) if abs(value) < 1e100 else 0
 
@@ -173,10 +178,12 @@ def yaml_mutated(rng: Random, text: bytes, other: bytes) -> bytes:
         lines = text.decode().splitlines(keepends=True)
         lines.insert(rng.randint(0, len(lines)), rng.choice(_SNIPPETS))
         return "".join(lines).encode("utf-8", "surrogatepass")
-    changed = tree_mutated(rng, yaml.safe_load(text), yaml.safe_load(other))
-    made = yaml.safe_dump(
-        changed, sort_keys=False, default_flow_style=rng.choice((None, True, False)), allow_unicode=True
-    )
+    style = rng.choice((None, True, False))
+    try:
+        changed = tree_mutated(rng, yaml.safe_load(text), yaml.safe_load(other))
+        made = yaml.safe_dump(changed, sort_keys=False, default_flow_style=style, allow_unicode=True)
+    except RecursionError:  # of what is nested too deeply to be written by the library
+        made = text.decode() + "deep: " + "[" * 1000 + "]" * 1000
     return made.encode("utf-8", "surrogatepass")[:FULL]
 
 

@@ -11,7 +11,18 @@ from fuzz.targets import TARGETS
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="forks and reads /proc")
 
 
-@pytest.mark.parametrize("name", ["volume-nrrd", "volume-metaimage", "image-png", "image-bmp", "config-camera"])
+QUICK = ["volume-nrrd", "volume-metaimage", "image-png", "image-bmp", "config-camera", "packets", "poses", "logs"]
+FOLDERS = ["report", "resume", "export"]
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_mutated_folders_of_runs_are_used_or_refused(name, tmp_path):
+    count = fuzz(TARGETS[name], tmp_path, seconds=60, inputs=20)
+    assert not count.failures
+    assert count.accepted and count.refused
+
+
+@pytest.mark.parametrize("name", QUICK)
 def test_mutated_files_are_read_or_refused(name, tmp_path):
     count = fuzz(TARGETS[name], tmp_path, seconds=60, inputs=30)
     assert not count.failures
@@ -28,6 +39,17 @@ def _fails(folder: Path) -> None:
         raise UnicodeDecodeError("utf-8", b"x", 0, 1, "derived from a refusal, leaked through")
     if data == b"4":
         raise ValueError("expected 0")
+
+
+def test_an_input_that_cannot_be_made_is_a_failure_and_no_end(tmp_path):
+    def mutate(rng, made, other):
+        assert rng.random() < 0.8
+        return made
+
+    target = Target("toy", lambda _: [{"a": b"0"}], mutate, lambda _: None)
+    count = fuzz(target, tmp_path, seconds=60, inputs=40)
+    assert count.inputs == 40 and 0 < len(count.failures) < 20
+    assert all("the input cannot be made" in text for text in count.failures.values())
 
 
 def test_failures_are_counted_and_kept(tmp_path):
