@@ -182,7 +182,8 @@ def _fill(opened: Run, settings: AnalysisSettings, started: float) -> bool:
         "seconds": round(time.perf_counter() - started, 2),
     }
     page = f"<!DOCTYPE html><meta charset='utf-8'><title>perception</title>{body}"
-    return conclude(opened, summary, files, lambda path: write_text(path, page), done=True)
+    files.write(write_text, opened.path / "report.html", page)
+    return conclude(opened, summary, files, None, done=True)
 
 
 def _conditions(times: Times) -> list[dict[str, Any]]:

@@ -104,7 +104,8 @@ def _fill(opened: Run, settings: LayoutSettings, layouts: list[tuple[str, Scaled
         for title, layout in layouts
     }
     summary = {"experiment": settings.experiment, "status": "", "targets": flags, "items": rows}
-    return conclude(opened, summary, files, lambda path: write_text(path, page), done=True)
+    files.write(write_text, folder / "report.html", page)
+    return conclude(opened, summary, files, None, done=True)
 
 
 def _centres(settings: LayoutSettings) -> Tensor:

@@ -86,7 +86,7 @@ class _Run:
             self.section = "\n".join(parts + _repeat(self))
         except ConfigError:
             raise
-        except (OSError, KeyError, IndexError, ValueError, TypeError, AttributeError) as error:
+        except (OSError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
             raise ConfigError([f"{folder} holds a run that cannot be read: {type(error).__name__} {error}"]) from None
 
     def picture(self, name: str) -> str:

@@ -22,7 +22,7 @@ from holotorch.experiments.perception_weight import ZONES, eccentricities, weigh
 from holotorch.experiments.plan import plan, plan_text, shortage
 from holotorch.experiments.progress import Log
 from holotorch.experiments.report import write_report
-from holotorch.experiments.run_folder import Run, conclude, open_run
+from holotorch.experiments.run_folder import Run, conclude, open_run, tidied
 from holotorch.experiments.saving import Checkpoint, Results
 from holotorch.experiments.settings import Settings
 from holotorch.experiments.signals import deferred
@@ -97,6 +97,8 @@ def resume(folder: Path) -> tuple[Path, bool]:
         raise ConfigError([f"{folder} holds no run to resume: config.yaml and env.json are not both there"])
     if (folder / "summary.json").is_file():
         print("this run is complete; nothing is left to do")
+        if tidied(folder) and held.get("experiment") in ("pec", "volume", "eye"):
+            write_report([folder], folder / "report.html")
         return folder, True
     return start(load_config(config), folder, folder.resolve().name)
 

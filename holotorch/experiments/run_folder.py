@@ -123,6 +123,18 @@ def _unfinished(folder: Path, settings: BaseModel) -> bool:
     return True
 
 
+def tidied(folder: Path) -> bool:
+    """Clear away what a run that was killed after its last number has left; whether its page is missing.
+
+    ConfigError where a run is in the folder.
+    """
+    with _locked(folder):
+        for path in (*folder.rglob(".*.partial"), folder / "checkpoint.pt", folder / "interrupted.json"):
+            with suppress(OSError):  # what cannot be removed does no harm
+                path.unlink(missing_ok=True)
+        return not (folder / "report.html").is_file()
+
+
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
     """Keep other runs out of a folder until the block, or the process, ends. ConfigError where one is in it."""

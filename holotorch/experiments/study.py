@@ -61,7 +61,8 @@ def _fill(opened: Run, settings: StudySettings, bench: Bench) -> bool:
         "peak_memory_bytes": peak_memory(),
     }
     page = f"<!DOCTYPE html><meta charset='utf-8'>{page}"
-    complete = conclude(opened, summary, files, lambda path: write_text(path, page), done=True)
+    files.write(write_text, folder / "report.html", page)
+    complete = conclude(opened, summary, files, None, done=True)
     print(text)
     return complete
 

@@ -2,6 +2,7 @@
 
 import io
 import math
+import re
 import struct
 import warnings
 from pathlib import Path
@@ -11,6 +12,10 @@ import numpy as np
 from holotorch.io.limits import affordable
 
 PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG = b"\xff\xd8"
+_MOST_SCANS = 100  # of a progressive JPEG; a scan of a few bytes may stand for all of a picture
+_MARKER = re.compile(rb"\xff+([^\x00\xff])")
+_BARE = frozenset((0x01, *range(0xD0, 0xD9)))  # markers without a segment: restarts, the beginning
 _DECODED = 8  # bytes of a pixel, four channels of 16 bits
 
 
@@ -32,6 +37,11 @@ def decode(path: Path, flags: int, *, data: bytes | None = None, memory: int = _
     height, width = picture_size(path, data)
     if data.startswith(PNG):
         data = data[: _png_end(data)]
+    if data.startswith(_JPEG) and (scans := _scans(data)) > _MOST_SCANS:
+        raise ValueError(
+            f"{path} is a JPEG of {scans} scans, each of which takes the time of a whole picture; ordinary ones have "
+            f"about ten and {_MOST_SCANS} are read: save it again"
+        )
     affordable(path, height * width * memory, len(data))
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -48,7 +58,7 @@ def picture_size(path: Path, data: bytes) -> tuple[int, int]:
     from PIL.JpegImagePlugin import JpegImageFile
     from PIL.TiffImagePlugin import TiffImageFile
 
-    readers = {b"\xff\xd8": JpegImageFile, b"BM": BmpImageFile, b"II": TiffImageFile, b"MM": TiffImageFile}
+    readers = {_JPEG: JpegImageFile, b"BM": BmpImageFile, b"II": TiffImageFile, b"MM": TiffImageFile}
     try:
         if data.startswith(PNG):
             return _png_size(data)
@@ -83,6 +93,17 @@ def check_exr(path: Path, *, memory: int) -> None:
     except Exception as error:  # the library raises bare RuntimeError and others
         raise ValueError(f"{path} is not a readable EXR file: {error}") from None
     affordable(path, needed, path.stat().st_size)
+
+
+def _scans(data: bytes) -> int:
+    """How many scans a JPEG has, those of a thumbnail in its metadata not counted."""
+    count, place = 0, 2
+    while (match := _MARKER.search(data, place)) and (kind := match[1][0]) != 0xD9:
+        count += kind == 0xDA
+        place = match.end()
+        if kind not in _BARE:  # two bytes of length, which count themselves
+            place += max(2, int.from_bytes(data[place : place + 2], "big"))
+    return count
 
 
 def _png_size(data: bytes) -> tuple[int, int]:

@@ -6,6 +6,8 @@ import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
+from holotorch.core.memory import available_memory
+
 MEMORY_LIMIT = 1 << 30  # bytes that a small file may take when unpacked
 RATIO = 500  # memory by size of a larger file; photographs and scans stay below 300, a file of zeros has 1000
 VARIABLE = "HOLOTORCH_MEMORY_LIMIT"  # of the environment: bytes in place of MEMORY_LIMIT
@@ -32,6 +34,11 @@ def affordable(source: Path | str, needed: int, stored: int) -> None:
             f"{source} has {stored} bytes and asks for {needed / 1e9:.3g} GB of memory, more than the limit of "
             f"{limit / 1e9:.3g} GB; if it is what it should be, set the environment variable {VARIABLE}={needed}"
         )
+
+
+def readable_at_once(size: int) -> bool:
+    """Whether so many bytes are read rather than mapped: up to :data:`MEMORY_LIMIT`, or half of the free memory."""
+    return size <= max(MEMORY_LIMIT, (available_memory() or 0) // 2)
 
 
 def unzipped(path: Path, size: int, offset: int = 0, *, kind: str = "gzip") -> bytearray:

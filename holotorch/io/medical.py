@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from holotorch.io.limits import MEMORY_LIMIT, affordable
+from holotorch.io.limits import affordable, readable_at_once
 from holotorch.io.scan import Scan, extra, placed, readable, three_axes
 
 _NIFTI_METRES = {"unknown": 1e-3, "mm": 1e-3, "meter": 1.0, "micron": 1e-6}
@@ -22,7 +22,7 @@ def read_nifti(path: Path) -> Scan:
     """
     nibabel = extra("nibabel", "reading NIfTI")
     with readable(path, "NIfTI file"):
-        image = nibabel.load(path, mmap=path.stat().st_size > MEMORY_LIMIT)
+        image = nibabel.load(path, mmap=not readable_at_once(path.stat().st_size))
         scaled = 8 if image.dataobj.slope != 1 or image.dataobj.inter != 0 else image.get_data_dtype().itemsize
         affordable(path, math.prod(image.shape) * scaled, path.stat().st_size)
         values = np.asanyarray(image.dataobj)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from holotorch.io.limits import MEMORY_LIMIT, affordable
+from holotorch.io.limits import affordable, readable_at_once
 from holotorch.scene.volume import IDENTITY, Triple
 
 _MAP_NORESERVE = 0x4000  # of Linux; Python has no name for it before 3.13
@@ -104,8 +104,12 @@ def named(header: Path, name: str) -> Path:
 
 
 def _not_empty(path: Path, where: str, *, file: bool = False) -> Path:
-    if not path.exists():
-        raise ValueError(f"{where} does not exist")
+    try:
+        path.stat()
+    except FileNotFoundError:
+        raise ValueError(f"{where} does not exist") from None
+    except OSError as error:  # a name that no file can have, a folder that may not be looked into
+        raise ValueError(f"{where} cannot be read: {error.strerror}") from None
     if file and not path.is_file():
         raise ValueError(f"{where} is no file")
     if path.is_file() and not path.stat().st_size:
@@ -147,13 +151,13 @@ def uncompressed(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int 
 
 
 def uncompressed_from(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int) -> np.ndarray:
-    """Voxels from ``offset`` bytes on: read, or mapped where they are more than the memory limit of a small file.
+    """Voxels from ``offset`` bytes on: read, or mapped where they are over 1 GiB and more than half of the free memory.
 
     A mapped voxel is read when it is touched, and the system ends the program where the file has been cut short since.
     So only volumes that may be larger than memory are mapped. What is written to them never reaches the file.
     """
     size = math.prod(shape) * dtype.itemsize
-    if size <= MEMORY_LIMIT:
+    if readable_at_once(size):
         values = np.fromfile(path, dtype, math.prod(shape), offset=offset)
         expect_bytes(path, values.nbytes, shape, dtype)
         return values.reshape(tuple(shape))

@@ -55,8 +55,9 @@ def load_volume(
         unit: Unit of ``spacing``: "m" (default), or "relative" for a volume that has proportions but no size.
 
     Returns:
-        Voxels [D, H, W]. More than 1 GiB of them are mapped into memory where the file holds them in native byte order
-        without compression: such a file is read as it is used and never written, and must not be cut short meanwhile.
+        Voxels [D, H, W]. Where they take over 1 GiB and over half of the free memory, they are mapped if the file holds
+        them in native byte order without compression: such a file is read as it is used and never written, and must
+        not be cut short meanwhile, as the system then ends the program.
         Floating-point values are not searched for NaN here, which would read it all: see :meth:`Volume.check_finite`.
 
     Raises:

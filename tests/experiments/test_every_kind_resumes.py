@@ -1,14 +1,13 @@
 """Runs of every kind: signals, exit statuses, one run a folder, and going on by ``resume`` or by the same ``run``."""
 
-import csv
 import json
 import re
 import shutil
 import signal
 from pathlib import Path
 
-import numpy as np
 import pytest
+from tiny_runs import command, results
 
 from holotorch.cli import main
 from holotorch.experiments import eye, eye_run, pec_bench, perception_analysis_run, perception_layout, volume_run
@@ -16,64 +15,39 @@ from holotorch.experiments.progress import Log
 from holotorch.io import files
 
 pytestmark = pytest.mark.usefixtures("tiny")
-CONFIGS = Path(__file__).parents[2] / "configs"
-VOLUME = [
-    "volume={phantom: shells, samples: 8}",
-    "transfer={points: [[20, 1, 0.2, 0, 0], [255, 0.2, 0.9, 1, 0.9]], unit_distance: 0.05}",
-    "hologram={shape: [32, 32], pitch: 3.74 um, distance: 3 mm, depths: 2, rays: 16}",
-]
-SCENE = (
-    "scene={config: configs/volume/c60.yaml, change: ['volume={phantom: c60, samples: 16}', "
-    "'hologram={shape: [64, 64], pitch: 3.74 um, distance: 2 mm, depths: 4, rays: 32}']}"
-)
-EYE = [SCENE, "display={kind: planar, distance: 4 mm}", "eye={pupil_radius: 0.1 mm, axial_length: 2 mm}"]
-ITEMS = "items=[{icon: boat, azimuth_deg: 50}]"
-TIMES = "[{seconds: 0.45}]"
-# Words of each command; a setting that makes it another run; where and in which call of it the signal comes; how many
+# A setting that makes it another run; where and in which call of it the signal comes; how many
 # calls resuming needs, where it does not start over.
 KINDS = {
     "pec": (
-        ["pec/fourier.yaml", "grid.shape=[24,20]", "report.baselines=[]", "solver={kind: lbfgs, max_steps: 8}"],
         ("seed=9", "seed was 7 and is 9"),
         (Log, "__call__", 3, 6),
     ),
     "volume": (
-        ["volume/tooth.yaml", *VOLUME, "device=cpu", "report.seeds=3"],
         ("view.azimuth_deg=9", "view.azimuth_deg was 0.0 and is 9.0"),
         (volume_run.VolumeExperiment, "hologram", 3, 1),
     ),
     "eye": (
-        ["eye/teapot.yaml", *EYE, "seeds=1", "light={sources: [laser]}", "focus=[2 mm]", "tolerance=0.1"],
         ("eye.chromatic=true", "eye.chromatic was false and is true"),
         (eye.Observer, "seen", 9, 1),
     ),
     "study": (
-        ["pec/studies/lowpass.yaml", "images=[camera]", "size=24", "max_steps=4", "sweep=[0.1,0.2]"],
         ("max_steps=5", "max_steps was 4 and is 5"),
         (pec_bench.Bench, "scores", 6, 4),
     ),
     "layout": (
-        ["perception/layout.yaml", ITEMS],
         ("extrapolate=true", "extrapolate was false and is true"),
         (perception_layout, "_picture", 1, 1),
     ),
     "analysis": (
-        ["perception/analysis.yaml", f"targets={TIMES}", "resamples=100", "repeated_measures=false", "power=null"],
         ("resamples=101", "resamples was 100 and is 101"),
         (perception_analysis_run, "_conditions", 1, 1),
     ),
 }
-AGAIN = {"count", "seconds", "rendering_seconds", "refocus_seconds", "peak_memory_bytes"}  # measured anew each time
-
-
-def command(kind: str, folder: Path, *more: str) -> list[str]:
-    config, *words = KINDS[kind][0]
-    return ["run", str(CONFIGS / config), *words, *more, "--out", str(folder)]
 
 
 def pressed(patch, kind: str, number: int) -> None:
     """The signal comes in the middle of the run."""
-    owner, name, call, _ = KINDS[kind][2]
+    owner, name, call, _ = KINDS[kind][1]
     calls, original = [], getattr(owner, name)
 
     def noted(*words, **more):
@@ -86,34 +60,10 @@ def pressed(patch, kind: str, number: int) -> None:
 
 
 def counted(patch, kind: str) -> list[int]:
-    owner, name, _, _ = KINDS[kind][2]
+    owner, name, _, _ = KINDS[kind][1]
     calls, original = [], getattr(owner, name)
     patch.setattr(owner, name, lambda *words, **more: (calls.append(1), original(*words, **more))[1])
     return calls
-
-
-def without(value, names=AGAIN):
-    """Nested values without what is measured anew."""
-    if isinstance(value, dict):
-        return {key: without(each) for key, each in value.items() if key not in names}
-    return [without(each) for each in value] if isinstance(value, list) else value
-
-
-def results(folder: Path) -> dict[str, object]:
-    """All that an interruption must not change."""
-    found: dict[str, object] = {"summary": without(json.loads((folder / "summary.json").read_text()))}
-    for path in sorted(folder.rglob("*.*")):
-        name = str(path.relative_to(folder))
-        if path.suffix == ".npy":
-            found[name] = (np.load(path).shape, np.load(path).tobytes())
-        elif path.suffix == ".csv":
-            with open(path, newline="") as stream:
-                found[name] = without(list(csv.DictReader(stream)))
-        elif path.suffix == ".png":
-            found[name] = path.read_bytes()
-        else:
-            found[name] = "there"
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -146,14 +96,14 @@ def test_a_signal_leaves_a_folder_that_two_commands_complete(kind, whole, tmp_pa
         with monkeypatch.context() as patch:
             calls = counted(patch, kind)
             assert main(words) == 0
-        assert len(calls) == KINDS[kind][2][3]  # what was done is not done again
+        assert len(calls) == KINDS[kind][1][3]  # what was done is not done again
         assert results(copy) == whole(kind)
         assert not list(copy.glob(".*")) and not (copy / "checkpoint.pt").exists()
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_run_of_other_settings_is_refused(kind, tmp_path, capsys, monkeypatch):
-    folder, (word, said) = tmp_path / "a", KINDS[kind][1]
+    folder, (word, said) = tmp_path / "a", KINDS[kind][0]
     with monkeypatch.context() as patch:
         pressed(patch, kind, signal.SIGINT)
         assert main(command(kind, folder)) == 130
@@ -221,6 +171,29 @@ def test_two_runs_never_share_a_folder(tmp_path, monkeypatch, capsys):
 def test_what_a_kill_at_the_start_leaves_is_no_obstacle(tmp_path):
     (tmp_path / "a" / "images").mkdir(parents=True)
     assert main(command("layout", tmp_path / "a")) == 0
+
+
+@pytest.mark.parametrize("kind", ["pec", "layout"])
+def test_a_kill_after_the_last_number_leaves_a_run_that_resume_tidies(kind, whole, tmp_path, monkeypatch, capsys):
+    class Killed(BaseException):
+        """Ends everything at once; what would be written after it is not."""
+
+    replace = files.os.replace
+
+    def late(source, target):
+        if Path(target).name == "summary.json":
+            shutil.copy(source, Path(target).with_name(".report.html.1.partial"))
+            replace(source, target)
+            raise Killed
+        replace(source, target)
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(files.os, "replace", late)
+        main(command(kind, tmp_path / "a"))
+    (tmp_path / "a" / "checkpoint.pt").write_bytes(b"which is removed after that")
+    assert main(["resume", str(tmp_path / "a")]) == 0
+    assert "this run is complete" in capsys.readouterr().out
+    assert results(tmp_path / "a") == whole(kind) and not list((tmp_path / "a").glob(".*"))
 
 
 def test_other_peoples_folders_are_left_alone(tmp_path, capsys):

@@ -74,6 +74,16 @@ def test_no_file_of_a_run_writes_into_its_page(runs, tmp_path, kind):
     assert foreign(page.read_text()) == 0
 
 
+@pytest.mark.parametrize("value", [10**400, "deep"])
+def test_numbers_beyond_all_are_damage(runs, tmp_path, value):
+    folder = shutil.copytree(runs["pec"], tmp_path / "run", ignore=shutil.ignore_patterns("*.png", "*.npy"))
+    summary = json.loads((folder / "summary.json").read_text()) | {"peak_memory_bytes": value}
+    text = json.dumps(summary).replace('"deep"', "[" * 100_000)
+    (folder / "summary.json").write_text(text)
+    with pytest.raises(ConfigError, match="holds a run that cannot be read: (OverflowError|ValueError)"):
+        write_report([folder], tmp_path / "report.html")
+
+
 def test_no_source_of_a_track_writes_into_its_page(tmp_path, monkeypatch):
     monkeypatch.setattr("holotorch.experiments.track_report.drawn_track", lambda _: None)
     monkeypatch.setattr("holotorch.experiments.track_report._png", lambda _: b"")

@@ -1,5 +1,6 @@
 """Files that belong to a volume: which ones a header may name, and what becomes of a volume whose file changes."""
 
+import mmap
 import subprocess
 import sys
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from holotorch.io.scan import uncompressed_from
 from holotorch.io.volumes import load_volume
 
 SHAPE = (4, 5, 6)
@@ -47,9 +49,17 @@ def test_a_header_names_files_of_its_own_folder_only(tmp_path, kind):
         load_volume(header(folder, kind, "data"))
 
 
+@pytest.mark.parametrize("kind", HEADERS)
+def test_a_name_too_long_for_a_file_is_no_data_file(tmp_path, kind):
+    with pytest.raises(ValueError, match="the data file .* names, cannot be read: File name too long"):
+        load_volume(header(tmp_path, kind, "d" * 5000))
+
+
 CUT = """
 import os, sys
+from holotorch.io import limits
 from holotorch.io.volumes import load_volume
+limits.MEMORY_LIMIT = 1000  # as if it were a large one
 volume = load_volume(sys.argv[1], spacing=1, unit="relative")
 os.truncate(sys.argv[1], 200)
 print(int(volume.values.sum()))
@@ -58,8 +68,18 @@ print(int(volume.values.sum()))
 
 @pytest.mark.parametrize("name", ["a_64x64x64_uint8.raw", "a.npy"])
 def test_a_volume_outlives_its_file(tmp_path, name):
-    """A mapped file that is cut short ends the program; what is not larger than memory is read."""
+    """A mapped file that is cut short ends the program; what is less than half of the free memory is read."""
     values = np.ones((64, 64, 64), np.uint8)
     np.save(tmp_path / name, values) if name.endswith("npy") else values.tofile(tmp_path / name)
     done = subprocess.run([sys.executable, "-c", CUT, str(tmp_path / name)], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, f"{64**3}\n"), done.stderr
+
+
+def test_a_volume_larger_than_the_free_memory_is_mapped(tmp_path, monkeypatch):
+    path = tmp_path / "a_64x64x64_uint8.raw"
+    np.ones((64, 64, 64), np.uint8).tofile(path)
+    monkeypatch.setattr("holotorch.io.limits.MEMORY_LIMIT", 1000)
+    for free, mapped in ((None, True), (2 * 64**3 - 1, True), (2 * 64**3, False)):
+        monkeypatch.setattr("holotorch.io.limits.available_memory", lambda free=free: free)
+        values = uncompressed_from(path, (64, 64, 64), np.dtype(np.uint8), 0)
+        assert values.sum() == 64**3 and isinstance(values.base, mmap.mmap | np.memmap) == mapped

@@ -79,6 +79,14 @@ def metaimage(size: str, data: str, more: str = "") -> bytes:
     return f"NDims = 3\nDimSize = {size}\nElementType = MET_UCHAR\n{more}ElementDataFile = {data}\n".encode()
 
 
+def jpeg_scans(side: int, most: int) -> bytes:
+    """A progressive picture whose last scan, of a few bytes, comes again and again."""
+    options = [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
+    data = cv2.imencode(".jpg", np.full((side, side), 90, np.uint8), options)[1].tobytes()
+    last = data[data.rindex(b"\xff\xda") : -2]
+    return data[:-2] + last * ((most - len(data)) // len(last)) + data[-2:]
+
+
 def npz(path: Path, shape: tuple[int, ...]) -> None:
     header = f"{{'descr': '|u1', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -119,6 +127,7 @@ def bombs(tmp_path_factory) -> dict[str, tuple[str, str]]:
         "wide.png": (png(32_000, 32_000, b""), "asks for 57.3 GB of memory"),
         "wide.bmp": (bmp(30_000, 30_000), "asks for 50.4 GB of memory"),
         "broken.bmp": (bmp(3, 1 << 21), "is not a readable picture"),
+        "scans.jpg": (jpeg_scans(4000, 1 << 20), "scans, each of which takes the time of a whole picture"),
         "cut.bmp": (bmp(300, 300), "is not a readable picture"),
         "levels.png": (png(32_000, 32_000, b""), "asks for 16.4 GB of memory"),
         "levels.bmp": (bmp(300, 300), "is not a readable picture"),
@@ -140,7 +149,7 @@ resource.setrlimit(resource.RLIMIT_AS, (12 << 30, 12 << 30))  # where it fails, 
 for path in json.loads(sys.argv[1]):
     name, began = path.rsplit("/", 1)[1], time.perf_counter()
     read = load_volume
-    if name.endswith((".png", ".bmp")):
+    if name.endswith((".png", ".bmp", ".jpg")):
         read = read_levels if name.startswith("levels") else load_image
     try:
         error = repr(read(path if read is not read_levels else __import__("pathlib").Path(path)))
@@ -209,6 +218,7 @@ def test_whole_contents_come_back(tmp_path, kind, size):
         (".png", []),
         (".bmp", []),
         (".jpg", []),
+        (".jpg", [cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_RST_INTERVAL, 2]),
         (".tif", []),
         (".webp", [cv2.IMWRITE_WEBP_QUALITY, 80]),
         (".webp", [cv2.IMWRITE_WEBP_QUALITY, 101]),
