@@ -62,28 +62,50 @@ class FocusSweep:
     bands: tuple[Band, ...]
 
 
-def focus_sweep(eye: Observer, settings: SweepSettings) -> FocusSweep:
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """The visible surface of a scene.
+
+    Attributes:
+        rendering: [3, h, w].
+        opaque: Rays that show it, [h, w].
+        depth: Where they do, in metres from the hologram, [h, w].
+        ends: Depths at which it begins and ends, but for the outermost rays.
+    """
+
+    rendering: Tensor
+    opaque: Tensor
+    depth: Tensor
+    ends: tuple[float, float]
+
+
+def visible_surface(eye: Observer) -> Surface:
+    """The surface that a sweep needs; ValueError for a scene without one, or with one at a single depth."""
+    sampler = eye.scene.sampler()
+    with torch.no_grad():
+        rendering, opacity = (part.cpu() for part in sampler.render(eye.scene.volume))
+        depth = sampler.depth_map(eye.scene.volume).cpu()
+    opaque = opacity > _SEEN
+    shown = depth[opaque].sort().values
+    if len(shown) < _LEAST:
+        raise ValueError(f"a sweep needs a surface: {len(shown)} of the rays are {_SEEN:.0%} opaque, not {_LEAST}")
+    low, high = (shown[round(part * (len(shown) - 1))].item() for part in _ENDS)
+    if not high > low:
+        raise ValueError(f"the whole surface lies at {1e3 * low:.4g} mm: there is nothing to sweep")
+    return Surface(rendering, opaque, depth, (low, high))
+
+
+def focus_sweep(eye: Observer, settings: SweepSettings, surface: Surface | None = None) -> FocusSweep:
     """Look at an observer's scene with the eye focused at one depth after another, in light of one wavelength each.
 
     The scene's visible surface is cut into bands of depth. Of each band the fine detail of the picture is correlated
     with that of the volume's rendering, which has no focus: an eye that accommodates rightly sees a band best when it
     is focused at it.
 
-    Raises:
-        ValueError: A scene without a surface, or with one at a single depth.
+    ``surface``: of :func:`visible_surface`, which is called without it, and raises what it does.
     """
-    scene = eye.scene
-    sampler = scene.sampler()
-    with torch.no_grad():
-        rendering, opacity = (part.cpu() for part in sampler.render(scene.volume))
-        depth = sampler.depth_map(scene.volume).cpu()
-    seen = opacity > _SEEN
-    surface = depth[seen].sort().values
-    if len(surface) < _LEAST:
-        raise ValueError(f"a sweep needs a surface: {len(surface)} of the rays are {_SEEN:.0%} opaque, not {_LEAST}")
-    low, high = (surface[round(part * (len(surface) - 1))].item() for part in _ENDS)
-    if not high > low:
-        raise ValueError(f"the whole surface lies at {1e3 * low:.4g} mm: there is nothing to sweep")
+    scene, surface = eye.scene, surface or visible_surface(eye)
+    rendering, seen, depth, (low, high) = surface.rendering, surface.opaque, surface.depth, surface.ends
     room = 0.1 * (high - low)
     focus = torch.linspace(low - room, high + room, settings.steps).tolist()
     total = torch.zeros(len(focus), *rendering.shape)

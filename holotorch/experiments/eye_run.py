@@ -55,20 +55,24 @@ def run_observer(settings: ObserverSettings, out: Path | None, name: str) -> tup
     print(values["text"], flush=True)
     if text := too_large(values):
         raise ConfigError([text])
+    try:
+        surface = eye_focus.visible_surface(eye) if settings.sweep else None
+    except ValueError as error:  # said before hours of work, not after it
+        raise ConfigError([f"sweep: {error}; leave it out"]) from None
     with open_run(out, name, settings, eye.scene.device, settings.seed) as opened:
         (opened.path / "arrays").mkdir(exist_ok=True)
         write_json(opened.path / "plan.json", values)
-        return opened.path, _fill(opened, eye, values)
+        return opened.path, _fill(opened, eye, values, surface)
 
 
-def _fill(opened: Run, eye: Observer, values: dict[str, Any]) -> bool:
+def _fill(opened: Run, eye: Observer, values: dict[str, Any], surface: eye_focus.Surface | None) -> bool:
     settings, folder, files, done = eye.settings, opened.path, Results(), False
     files.write(write_bytes, folder / "images" / "geometry.png", eye_geometry.draw(eye))
     looked = _Looked(eye, Checkpoint(folder / "checkpoint.pt", _fingerprint(eye)))
     try:
         looked.look(opened.pressed)
         if settings.sweep:
-            sweep = eye_focus.focus_sweep(eye, settings.sweep)
+            sweep = eye_focus.focus_sweep(eye, settings.sweep, surface)
             files.write(write_table, folder / "focus.csv", [band.row for band in sweep.bands])
             files.write(write_bytes, folder / "images" / "focus.png", eye_focus.draw(sweep))
             print("\n".join(eye_focus.in_words(sweep)))

@@ -175,8 +175,12 @@ def _fill(folder: Path, given: Given, settings: dict[str, Any], truth: dict[str,
                 except OSError as error:
                     failure = failure or error
             if not log.statuses:
-                if failure is None or recorder is None or not recorder.frames:  # a frame that fails is kept
-                    shutil.rmtree(folder)  # claimed empty a moment ago: only this run's own files are in it
+                if (recorder is None or not recorder.frames) and not _poses(folder):
+                    shutil.rmtree(folder)  # claimed empty a moment ago, and without a frame or a pose
+                else:
+                    print(
+                        f"no frame was tracked to its end; what there is of the first is in {folder}", file=sys.stderr
+                    )
                 raise failure or KeyboardInterrupt
             complete = failure is None and (not pressed or frames.live)
             summary = summarised(log, frames, settings["method"], settings["still"])
@@ -220,6 +224,12 @@ def _append(table: IO[bytes], cells: Sequence[str]) -> None:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerow(cells)
     append(table, text.getvalue().encode("utf-8", "replace"))
+
+
+def _poses(folder: Path) -> bool:
+    """Whether there is a pose, or the refusal of one, in the table."""
+    path = folder / "poses.csv"
+    return path.is_file() and path.read_bytes().count(b"\n") > 1
 
 
 def _announced(frames: Frames, out: Path | None, record: bool) -> list[str]:

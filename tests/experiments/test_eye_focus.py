@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from holotorch.cli import main
 from holotorch.experiments.config import load_config
 from holotorch.experiments.config_eye import SweepSettings
 from holotorch.experiments.eye import observer
@@ -58,6 +59,17 @@ def test_a_run_with_a_sweep_writes_its_table_and_picture(tmp_path, capsys):
     assert complete and rows and all(math.isfinite(float(row["depth_of_focus_mm"])) for row in rows)
     assert (folder / "images" / "focus.png").read_bytes().startswith(b"\x89PNG")
     assert capsys.readouterr().out.count("looks sharpest") == len(rows)
+
+
+def test_a_scene_without_a_surface_is_a_mistake_of_the_sweep_before_the_work(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("holotorch.experiments.eye.Observer.seen", lambda *_: pytest.fail("looked already"))
+    small = PHANTOM.replace("256", "64")
+    words = [small, "focus=[6 mm]", "sweep={bands: 2, steps: 5, realisations: 1}", "light={sources: [laser]}"]
+    monkeypatch.setattr("holotorch.experiments.eye_focus._SEEN", 1.1)  # which no ray is opaque to
+    assert main(["run", str(CONFIG), *words, "--out", str(tmp_path / "a")]) == 2
+    error = capsys.readouterr().err
+    assert "sweep: a sweep needs a surface: 0 of the rays" in error and "leave it out" in error
+    assert not (tmp_path / "a").exists()
 
 
 def test_without_a_surface_there_is_nothing_to_sweep(monkeypatch):

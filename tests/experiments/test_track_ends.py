@@ -162,9 +162,34 @@ def test_ctrl_c_while_the_first_frame_is_tracked_leaves_the_folder_free(tmp_path
     source = pictures(tmp_path / "in", [9, 12])
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(track_source, "make_tracker", lambda *_: pressed)
-        tracked(tmp_path, source, record=True)
+        tracked(tmp_path, source)
     assert not (tmp_path / "out").exists()
-    assert tracked(tmp_path, source, record=True)[1]
+    assert tracked(tmp_path, source)[1]
+
+
+def test_ctrl_c_while_the_first_frame_is_tracked_keeps_what_was_recorded(tmp_path, tracker, monkeypatch, capsys):
+    def pressed(frames, previous=None):
+        signal.raise_signal(signal.SIGINT)
+        return tracker(frames, previous)
+
+    monkeypatch.setattr(track_source, "make_tracker", lambda *_: pressed)
+    with pytest.raises(KeyboardInterrupt):
+        tracked(tmp_path, pictures(tmp_path / "in", [9, 12]), record=True)
+    assert len(list(open_recording(tmp_path / "out" / "recording"))) == 1
+    assert (
+        f"no frame was tracked to its end; what there is of the first is in {tmp_path / 'out'}"
+        in capsys.readouterr().err
+    )
+
+
+def test_a_pose_whose_picture_cannot_be_written_is_kept(tmp_path, tracker, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("holotorch.experiments.track_report.write_bytes", full)
+    with pytest.raises(OSError, match="No space left"):
+        tracked(tmp_path, pictures(tmp_path / "in", [9, 12]))
+    assert [row["status"] for row in read(tmp_path / "out")] == ["OK"]
 
 
 def test_a_frame_that_the_tracker_fails_on_is_kept(tmp_path, tracker, monkeypatch):

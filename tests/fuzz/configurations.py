@@ -41,7 +41,7 @@ KINDS: dict[str, list[tuple[str, dict[str, Any]]]] = {
     "eye": [
         ("eye/tooth.yaml", {"scene": {"config": "scene.yaml"}}),
         ("eye/focus.yaml", {"scene": {"config": "scene.yaml"}}),
-        ("eye/tooth.yaml", {"scene": {"config": "scene.yaml"}, "display": {"kind": "planar", "distance": "250 mm"}}),
+        ("eye/tooth.yaml", {"scene": {"config": "scene.yaml"}, "display": {"kind": "planar", "distance": "30 mm"}}),
     ],
     "layout": [("perception/layout.yaml", {})],
     "analysis": [("perception/analysis.yaml", {})],
