@@ -38,8 +38,16 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"{error.filename or 'file'}: {error.strerror or error}", file=sys.stderr)
         return BAD_INPUT if error.errno == errno.ENAMETOOLONG else FAILED
     except KeyboardInterrupt:
-        print("interrupted before anything could be saved", file=sys.stderr)
+        print(_before(options), file=sys.stderr)
         return INTERRUPTED
+
+
+def _before(options: argparse.Namespace) -> str:
+    """What to say of an interruption that came before the work; what a run before it has saved is untouched."""
+    folder = options.folder if options.action is _resume else getattr(options, "out", None)
+    if folder is not None and (folder / "config.yaml").is_file() and not (folder / "summary.json").is_file():
+        return f"interrupted before it went on; start it again with: holotorch resume {folder}"
+    return "interrupted before anything could be saved"
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -21,6 +21,7 @@ from holotorch.experiments.saving import Checkpoint, Results
 from holotorch.experiments.signals import Pressed, deferred, interruptible
 from holotorch.io.files import write_json, write_text
 
+_HALF = re.compile(r"\.(env\.json|config\.yaml)\.\d+\.partial")  # the first files of a run that was killed at once
 _SETUP = {"config.yaml", "env.json", "plan.json"}  # what is written before anything is computed
 
 
@@ -103,9 +104,11 @@ def _unfinished(folder: Path, settings: BaseModel) -> bool:
     if not folder.is_dir():
         return False
     files = {path.name for path in folder.rglob("*") if not path.is_dir()}
-    if files <= {"env.json"}:
+    halves = {name for name in files if _HALF.fullmatch(name)}
+    if files - halves <= {"env.json"}:
         with suppress(OSError):  # the claim says what is wrong
-            (folder / "env.json").unlink(missing_ok=True)
+            for name in (*halves, "env.json"):
+                (folder / name).unlink(missing_ok=True)
             for path in (folder / "arrays", folder / "images"):
                 if path.is_dir():
                     path.rmdir()

@@ -177,11 +177,11 @@ def _fill(folder: Path, given: Given, settings: dict[str, Any], truth: dict[str,
             if not log.statuses:
                 if (recorder is None or not recorder.frames) and not _poses(folder):
                     shutil.rmtree(folder)  # claimed empty a moment ago, and without a frame or a pose
-                else:
-                    print(
-                        f"no frame was tracked to its end; what there is of the first is in {folder}", file=sys.stderr
-                    )
-                raise failure or KeyboardInterrupt
+                    raise failure or KeyboardInterrupt
+                print(f"no frame was tracked to its end; what there is of the first is in {folder}", file=sys.stderr)
+                if failure is not None:
+                    raise failure
+                return folder, False
             complete = failure is None and (not pressed or frames.live)
             summary = summarised(log, frames, settings["method"], settings["still"])
             if found := errors(folder / "poses.csv", truth):

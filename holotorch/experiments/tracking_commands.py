@@ -71,7 +71,8 @@ def _track(options: argparse.Namespace) -> int:
         still=options.still,
         rate=options.rate,
     )
-    print(folder / "report.html")
+    page = folder / "report.html"
+    print(page if page.is_file() else folder)
     return OK if complete else INTERRUPTED
 
 

@@ -170,6 +170,8 @@ def test_two_runs_never_share_a_folder(tmp_path, monkeypatch, capsys):
 
 def test_what_a_kill_at_the_start_leaves_is_no_obstacle(tmp_path):
     (tmp_path / "a" / "images").mkdir(parents=True)
+    (tmp_path / "a" / "env.json").write_text("{}")
+    (tmp_path / "a" / ".config.yaml.123.partial").write_text("experiment: perc")
     assert main(command("layout", tmp_path / "a")) == 0
 
 
@@ -194,6 +196,20 @@ def test_a_kill_after_the_last_number_leaves_a_run_that_resume_tidies(kind, whol
     assert main(["resume", str(tmp_path / "a")]) == 0
     assert "this run is complete" in capsys.readouterr().out
     assert results(tmp_path / "a") == whole(kind) and not list((tmp_path / "a").glob(".*"))
+
+
+def test_a_signal_before_a_run_goes_on_says_that_it_is_still_there(tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "a"
+    with monkeypatch.context() as patch:
+        pressed(patch, "pec", signal.SIGTERM)
+        assert main(command("pec", folder)) == 130
+    capsys.readouterr()
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    monkeypatch.setattr("holotorch.experiments.run.build", lambda _: signal.raise_signal(signal.SIGINT))
+    for words in (["resume", str(folder)], command("pec", folder)):
+        assert main(words) == 130
+        assert capsys.readouterr().err.strip().endswith(f"start it again with: holotorch resume {folder}")
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
 def test_other_peoples_folders_are_left_alone(tmp_path, capsys):
