@@ -76,10 +76,13 @@ def test_track_the_synthetic_source_renders_it_first(monkeypatch, capsys):
     assert abs(float(row["tip_z_m"]) - float(true["tip_z_m"])) < 1.5e-3
 
 
-def test_track_says_an_interruption_by_its_status(monkeypatch, capsys):
-    monkeypatch.setattr(track, "run_tracking", lambda *_, **__: (Path("here"), False))
+def test_track_says_an_interruption_by_its_status(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(track, "run_tracking", lambda *_, **__: (tmp_path, False))
     assert main(["track", "video.mp4", *FILES]) == 130
-    assert capsys.readouterr().out.splitlines()[-1] == "here/report.html"
+    assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path)
+    (tmp_path / "report.html").touch()
+    assert main(["track", "video.mp4", *FILES]) == 130
+    assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "report.html")
 
 
 def test_track_hands_its_arguments_on(monkeypatch):

@@ -297,7 +297,7 @@ def _check_end(status: int, shot: Shot, out: Path, place: Path) -> None:
         if begun and not ("holotorch resume" in text or (out / "interrupted.json").is_file()):
             raise Failed(f"status 130 does not say how to go on: {text[-1000:]}")
     elif status in (_EARLY, -shot.number) and shot.number != signal.SIGKILL:
-        if begun and not complete:
+        if begun and not complete and text.strip():  # an earlier run's folder, of which nothing was done yet
             raise Failed(f"{shot} is not handled, status {status}: {text[-1000:]}")
     elif status != -shot.number:
         raise Failed(f"status {status}: {text[-3000:]}")
