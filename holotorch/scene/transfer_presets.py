@@ -1,7 +1,7 @@
 """Ready transfer functions, and those that ParaView and 3D Slicer save as JSON."""
 
 import json
-import math
+import sys
 from typing import Any
 
 import numpy as np
@@ -204,7 +204,8 @@ def _objects(name: str, value: Any) -> list[dict[str, Any]]:
 
 
 def _number(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    # An integer beyond all floats compares exactly; NaN compares as not within.
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
         raise ValueError(f"{name} must be a number, got {value!r}")
     return float(value)
 

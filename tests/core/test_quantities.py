@@ -122,3 +122,11 @@ def test_a_phase_that_float32_turns_is_warned_of(shape):
         assert 0.005 < turned < 0.071  # it is there, and within what the warning says
     with pytest.warns(checks.PrecisionWarning, match="wavelength is float32, .* by up to 0.071 rad"):
         carrier(torch.full(shape, 530e-9), 0.1)
+
+
+def test_a_whole_number_beyond_all_floats_is_not_finite():
+    for value in (10**400, -(10**400)):
+        with pytest.raises(ValueError, match="x must be finite"):
+            checks.finite("x", value)
+        with pytest.raises(ValueError, match="x must be"):
+            checks.positive("x", value)

@@ -104,6 +104,7 @@ PART = ["volumeProperties", 0, "components", 0]
     [
         ("{", "must be JSON text"),
         ("[" * 100_000, "must be JSON text"),
+        (changed(PARAVIEW, ["RGBPoints", 1], 10**400), r"RGBPoints\[1\] must be a number, got 1000"),
         ("[]", "'RGBPoints' or a 3D Slicer file with 'volumeProperties', got list"),
         (changed(PARAVIEW, ["ColorSpace"], "Lab"), "ColorSpace must be RGB.*got 'Lab'"),
         (changed(PARAVIEW, ["Points"], None), "Points must be a list that is not empty, got nothing"),
