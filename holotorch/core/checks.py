@@ -203,7 +203,7 @@ def _number(name: str, value: Any, unit: str) -> float:
             raise TypeError
         return float(value)
     except OverflowError:  # an integer beyond all floats
-        return math.inf if value > 0 else -math.inf
+        return math.inf if int(value) > 0 else -math.inf
     except (TypeError, ValueError):
         raise TypeError(f"{name} must be a number{_in(unit)}, got {type(value).__name__} {value!r}") from None
 

@@ -122,7 +122,7 @@ def _check_axes(folder: Path, experiment: "PECExperiment", heaters: Tensor) -> N
         numbers = _summary(folder).get("methods", {}).get("corrected", {}).get("heating_power_K_per_pixel")
         wanted = None if numbers is None else torch.tensor(numbers, dtype=torch.float64)[experiment.lit]
     except (ValueError, AttributeError, TypeError, LookupError, RuntimeError):
-        raise ValueError("the summary is damaged: it does not say the heating power of each colour") from None
+        raise ValueError("summary.json is damaged: it does not say the heating power of each colour") from None
     if not len(heaters) == heaters.shape[1] > 1 or wanted is None:
         return
 
@@ -144,7 +144,7 @@ def _depth(folder: Path, settings: VolumeSettings) -> float:
         depths = _summary(folder).get("refocused_m") or [settings.hologram.distance / settings.scale]
         return checks.finite("refocused_m", depths[len(depths) // 2], "metres")
     except (ValueError, AttributeError, TypeError, LookupError):
-        raise ValueError("the summary is damaged: it does not say at which depths the run has looked") from None
+        raise ValueError("summary.json is damaged: it does not say at which depths the run has looked") from None
 
 
 def _summary(folder: Path) -> dict[str, Any]:
