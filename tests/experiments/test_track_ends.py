@@ -173,7 +173,10 @@ def test_ctrl_c_while_the_first_frame_is_tracked_keeps_what_was_recorded(tmp_pat
         return tracker(frames, previous)
 
     monkeypatch.setattr(track_source, "make_tracker", lambda *_: pressed)
-    folder, complete = tracked(tmp_path, pictures(tmp_path / "in", [9, 12]), record=True)
+    try:
+        folder, complete = tracked(tmp_path, pictures(tmp_path / "in", [9, 12]), record=True)
+    except KeyboardInterrupt:
+        pytest.fail("the recorded frame is not spoken of")
     assert not complete and len(list(open_recording(folder / "recording"))) == 1
     told = f"no frame was tracked to its end; what there is of the first is in {folder}"
     assert told in capsys.readouterr().err
