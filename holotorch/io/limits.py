@@ -30,8 +30,9 @@ def affordable(source: Path | str, needed: int, stored: int) -> None:
     except ValueError:
         raise ValueError(f"{VARIABLE} must be a number of bytes, got {os.environ[VARIABLE]!r}") from None
     if needed > max(limit, RATIO * stored):
+        size = min(needed, 10**300) / 1e9  # a header may state more than a float holds
         raise ValueError(
-            f"{source} has {stored} bytes and asks for {needed / 1e9:.3g} GB of memory, more than the limit of "
+            f"{source} has {stored} bytes and asks for {size:.3g} GB of memory, more than the limit of "
             f"{limit / 1e9:.3g} GB; if it is what it should be, set the environment variable {VARIABLE}={needed}"
         )
 

@@ -15,8 +15,8 @@ from holotorch.experiments.progress import Log
 from holotorch.io import files
 
 pytestmark = pytest.mark.usefixtures("tiny")
-# A setting that makes it another run; where and in which call of it the signal comes; how many
-# calls resuming needs, where it does not start over.
+# A setting that makes it another run; where and in which call of it the signal comes; how many calls resuming needs,
+# where it does not start over.
 KINDS = {
     "pec": (
         ("seed=9", "seed was 7 and is 9"),

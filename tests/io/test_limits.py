@@ -232,3 +232,8 @@ def test_sizes_are_those_of_the_decoded_picture(tmp_path, suffix, options):
     assert decode(tmp_path / "a", cv2.IMREAD_COLOR).shape == (37, 52, 3)
     with pytest.raises(ValueError, match="is not a readable picture"):
         decode(tmp_path / "a", cv2.IMREAD_COLOR, data=data.tobytes()[:20])
+
+
+def test_a_size_beyond_all_floats_is_refused_like_other_large_ones(tmp_path):
+    with pytest.raises(ValueError, match=r"has 10 bytes and asks for 1e\+291 GB of memory, more than the limit"):
+        affordable(tmp_path / "a.vti", 10**400, 10)
