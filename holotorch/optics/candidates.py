@@ -19,6 +19,7 @@ CROP_PAD = 2.25  # of CroppedKernel
 _PADS = (1.0, 1.03125, 1.0625, 1.125, 1.25, 1.5)
 _WIDE_PADS = (2.0, 3.0, 4.0, 6.0, 8.0)
 _CROP_PADS = (2.0, CROP_PAD)
+_TAILS = (0.125, 0.5, 1.5)  # of resampled_padding
 _PRODUCT_SPEED = 4.0  # arithmetic of a dense product that takes the time of 1 in an FFT
 
 
@@ -32,6 +33,8 @@ class Candidate:
         padded: Samples of the transforms.
         paraxial: Whether the factor beyond Fresnel is left out.
         predict: Gives the expected relative L2 error.
+        captured: Gives the share of the energy of the content that is expected to land in the window, of several
+            wavelengths and distances the least.
         flops: Arithmetic of one call.
         memory: Bytes.
         cost: What candidates are ranked by: ``flops``, those of dense products counted at their speed.
@@ -42,6 +45,7 @@ class Candidate:
     padded: tuple[int, int]
     paraxial: bool
     predict: Callable[[], float]
+    captured: Callable[[], float]
     flops: float
     memory: int
     cost: float
@@ -66,11 +70,11 @@ def candidates(
     ways = [_identity(scenes)] if path.straight else []
     if far == 0 and path.straight:
         return ways
+    wide = min(path.grid.pitch) < FINEST * longest
     if not path.same_pitch:
-        dense = [_resampled(path, scenes, dtype, paraxial=paraxial) for paraxial in (True, False)]
+        dense = [] if wide else [_resampled(path, scenes, dtype, tails) for tails in (None, *_TAILS)]
         pairs = zip(*(_lengths(axis, _PADS + _WIDE_PADS) for axis in scenes[0]), strict=False)
         return dense + [_zoomed(path, scenes, pair, dtype) for pair in pairs]
-    wide = min(path.grid.pitch) < FINEST * longest
     alike = scenes[0][0] is scenes[0][1]
     tilted = any(path.tilt)
     pads = _PADS + (_WIDE_PADS if wide or tilted or path.out != path.grid else ())
@@ -103,6 +107,10 @@ def _axes(path: Passage, wavelength: float, distance: float, content: Content) -
         )
         path = Passage(path.grid, Grid((height, width), path.grid.pitch), path.offset, path.tilt)
     places = shifts(path, torch.tensor(distance, dtype=torch.float64), torch.tensor(path.tilt, dtype=torch.float64))
+    # Light that travels back is the conjugate of light that travels on in the mirrored direction.
+    back = distance < 0
+    signals = [each.conj() if back else each for each in content.signals or ()]
+    sines = [-sine if back else sine for sine in path.tilt]
     y, x = (
         AxisContent(
             path.grid.shape[axis],
@@ -113,8 +121,8 @@ def _axes(path: Passage, wavelength: float, distance: float, content: Content) -
             content.margin[axis],
             path.out.shape[axis],
             places[axis].item() if path == asked else round(places[axis].item()) + 0.25,
-            (path.tilt[axis], path.tilt[1 - axis]),
-            content.signals[axis] if content.signals else None,
+            (sines[axis], sines[1 - axis]),
+            signals[axis] if signals else None,
         )
         for axis in (0, 1)
     )
@@ -144,14 +152,19 @@ def _identity(scenes: list[Axes]) -> Candidate:
 
     size = (y.size, x.size)
     work = float(math.prod(size))
-    return Candidate("identity", (True, True), size, False, predict, work, 0, work)
+    return Candidate("identity", (True, True), size, False, predict, lambda: 1.0, work, 0, work)
 
 
 def _sampled(scenes: list[Axes], padded: tuple[int, ...], dtype: torch.dtype) -> Candidate:
     """The exact transfer function, sampled on both axes."""
+    tilted = any(scenes[0][0].tilt)
+    wide = not tilted and any(axis.pitch < FINEST * axis.wavelength for axis in scenes[0])
 
     def predict(axes: Axes) -> float:
-        energies = [axis.wrapped(length) for axis, length in zip(axes, padded, strict=True)]
+        energies = [
+            axis.wrapped_slices(length, other, limited=wide) if tilted or wide else axis.wrapped(length)
+            for axis, other, length in zip(axes, axes[::-1], padded, strict=True)
+        ]
         return math.hypot(math.sqrt(sum(energies)), _rounding(axes, (True, True), dtype))
 
     return _way("angular spectrum", (True, True), (padded[0], padded[1]), False, scenes, predict, dtype)
@@ -175,6 +188,11 @@ def _cropped(scenes: list[Axes], mask: tuple[bool, bool], room: float | None, dt
     lengths = length(0), length(1)
 
     def predict(axes: Axes) -> float:
+        if any(axes[0].tilt):
+            # A measured field has its light in few places, where what both axes crop together may weigh more.
+            mixing = 1 if axes[0].measured is None else 1 + sum(sine != 0 for sine in axes[0].tilt)
+            taps = mixing * math.sqrt(_tilted_taps(axes, lengths, paraxial=False))
+            return math.hypot(_rounding(axes, mask, dtype), taps)
         energies = [_rounding(axes, mask, dtype) ** 2, 0.0]
         if room is None:
             energies[1] = max(rms_beyond_fresnel(list(axes)) ** 2, sum(axis.paraxial() for axis in axes))
@@ -186,29 +204,34 @@ def _cropped(scenes: list[Axes], mask: tuple[bool, bool], room: float | None, dt
             elif room is not None:
                 # The cross frequency of rms size stands for the whole of the other axis.
                 energies.append(axis.cropped(padded, math.sqrt(other.moment(2))))
-        # What a tilt mixes of the two axes is not seen on one of them; measured, up to this factor.
-        mixing = 1 + sum(sine != 0 for sine in axes[0].tilt)
-        return mixing * math.sqrt(sum(energies))
+        return math.sqrt(sum(energies))
 
     method = ("Fresnel" if room is None else "cropped kernel") + (", one axis sampled" if any(mask) else "")
     return _way(method, mask, lengths, room is None, scenes, predict, dtype)
 
 
-def _resampled(path: Passage, scenes: list[Axes], dtype: torch.dtype, *, paraxial: bool) -> Candidate:
-    """Dense taps between any two grids; the factor beyond Fresnel applied first, on a window with a rim for it."""
+def _resampled(path: Passage, scenes: list[Axes], dtype: torch.dtype, tails: float | None) -> Candidate:
+    """Dense taps between any two grids; the factor beyond Fresnel applied first, with room for its ``tails``.
+
+    None leaves that factor out.
+    """
     height, width = path.grid.shape
     wavelength, far = scenes[0][0].wavelength, max(axes[0].distance for axes in scenes)
-    rims = (0, 0) if paraxial else tuple(resampling_rim(path, axis, wavelength, far) for axis in (0, 1))
-    padded = tuple(n if paraxial else good_length(n + 2 * rim) for n, rim in zip((height, width), rims, strict=True))
+    padded = path.grid.shape if tails is None else resampled_padding(path, wavelength, far, tails)
+    rims = (padded[0] - height) // 2, (padded[1] - width) // 2
+    paraxial, tilted = tails is None, any(path.tilt)
 
     def predict(axes: Axes) -> float:
         error = _rounding(axes, (False, False), dtype) ** 2
+        pairs = list(zip(axes, axes[::-1], padded, strict=True))
+        if tilted and paraxial:
+            return math.sqrt(error + _tilted_taps(axes, padded, paraxial=True))
+        if tilted:
+            return math.sqrt(error + sum(axis.resampled_slices(length, other) for axis, other, length in pairs))
         if paraxial:
             return math.sqrt(error + max(rms_beyond_fresnel(list(axes)) ** 2, sum(axis.paraxial() for axis in axes)))
-        for axis, other, rim in zip(axes, axes[::-1], rims, strict=True):
-            # The rim holds the short kernel as the room beyond twice the window does for the cropped one, but its tails
-            # wrap round sooner: measured, half to 3.7 times.
-            error += 9 * axis.cropped(good_length(axis.size + axis.window + 2 * rim), math.sqrt(other.moment(2)))
+        for axis, other, length in pairs:
+            error += axis.resampled(length, math.sqrt(other.moment(2)))
         return math.sqrt(error)
 
     tall, broad = height + 2 * rims[0], width + 2 * rims[1]
@@ -224,9 +247,10 @@ def _resampled(path: Passage, scenes: list[Axes], dtype: torch.dtype, *, paraxia
     return Candidate(
         method,
         (False, False),
-        (padded[0], padded[1]),
+        padded,
         paraxial,
         lambda: max(predict(axes) for axes in scenes),
+        lambda: _captured(scenes),
         products + transforms,
         memory,
         products / _PRODUCT_SPEED + transforms,
@@ -245,14 +269,19 @@ def _zoomed(path: Passage, scenes: list[Axes], padded: tuple[int, ...], dtype: t
     return replace(way, method="angular spectrum, zoomed", flops=flops, cost=flops, memory=memory)
 
 
-def resampling_rim(path: Passage, axis: int, wavelength: float, distance: float) -> int:
-    """Samples on each side for what the factor beyond Fresnel moves, and an eighth of the window for its tails."""
-    pitch = path.grid.pitch[axis]
-    sine = min(wavelength * math.hypot(*(0.5 / step for step in path.grid.pitch)), 0.99)
-    reach = path.grid.extent[axis] + path.out.extent[axis] + 2 * abs(path.offset[axis])
-    sine = min(sine, reach / math.hypot(reach, distance))
-    moved = distance * (sine / math.sqrt(1 - sine * sine) - sine)
-    return math.ceil(path.grid.shape[axis] / 8 + moved / pitch)
+def resampled_padding(path: Passage, wavelength: float, distance: float, tails: float = 0.125) -> tuple[int, int]:
+    """Samples that hold the window, and on each side what the factor beyond Fresnel moves and its tails.
+
+    ``tails``: their room, as a part of the window.
+    """
+    steepest = wavelength * math.hypot(*(0.5 / step for step in path.grid.pitch))
+    sizes = []
+    for axis, size in enumerate(path.grid.shape):
+        reach = path.grid.extent[axis] + path.out.extent[axis] + 2 * abs(path.offset[axis])
+        sine = min(steepest, 0.99, reach / math.hypot(reach, distance))
+        moved = distance * (sine / math.sqrt(1 - sine * sine) - sine) / path.grid.pitch[axis]
+        sizes.append(good_length(size + 2 * math.ceil(size * tails + moved)))
+    return sizes[0], sizes[1]
 
 
 def crop_length(axis: AxisContent, room: float = CROP_PAD) -> int:
@@ -290,5 +319,24 @@ def _way(
     flops = _transforms(samples)
     memory = 4 * samples * dtype.itemsize
     return Candidate(
-        method, sampled, padded, paraxial, lambda: max(predict(axes) for axes in scenes), flops, memory, flops
+        method,
+        sampled,
+        padded,
+        paraxial,
+        lambda: max(predict(axes) for axes in scenes),
+        lambda: _captured(scenes),
+        flops,
+        memory,
+        flops,
     )
+
+
+def _tilted_taps(axes: Axes, lengths: tuple[int, ...], *, paraxial: bool) -> float:
+    return sum(
+        axis.tilted_taps(length, other, paraxial=paraxial)
+        for axis, other, length in zip(axes, axes[::-1], lengths, strict=True)
+    )
+
+
+def _captured(scenes: list[Axes]) -> float:
+    return min(math.prod(axis.captured for axis in axes) for axes in scenes)

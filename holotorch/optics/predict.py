@@ -1,6 +1,7 @@
 """What a kernel on a transform of finite length gets wrong, computed on one axis before any field is propagated."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -9,9 +10,13 @@ from torch import Tensor
 
 from holotorch.core.fourier import good_length
 from holotorch.optics.kernels import turns_phasor
-from holotorch.optics.taps import fresnel_taps, remainder_kernel, tap_indices
+from holotorch.optics.taps import fresnel_taps, levelling_shift, remainder_kernel, tap_indices, tilted_turns
 
 _TONES = 17
+_SLICES = 9  # frequencies of the other axis that stand for all, where its light changes this axis' kernel
+_QUANTILES = (0.02, 0.1, 0.25, 0.4, 0.6, 0.75, 0.9, 0.98)  # of a measured axis' energy, where there are more of them
+_LONGER = 4  # times source and window: a transform whose own wrapping is small beside that of the padding
+_LONGEST = 1 << 18  # samples of such a transform; light that is spread farther is taken as lost
 
 
 @dataclass(frozen=True)
@@ -45,6 +50,7 @@ class AxisContent:
     shift: float = 0.0
     tilt: tuple[float, float] = (0.0, 0.0)
     measured: Tensor | None = field(default=None, compare=False)
+    _exact: list[Tensor | None] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
     def nyquist(self) -> float:
@@ -76,9 +82,8 @@ class AxisContent:
         if self.measured is None:
             top = min(self.band, limit)
             return top**power / (power + 1)
-        # Twice the window: on the window alone the field would repeat, and a uniform one would have no edges.
-        frequency = torch.fft.fftfreq(2 * self.size, self.pitch, dtype=torch.float64).abs().clamp(max=limit)
-        weight = torch.fft.fft(self.measured, 2 * self.size).abs().square().sum(0)
+        frequency, weight = self._power
+        frequency = frequency.abs().clamp(max=limit)
         return ((weight * frequency**power).sum() / weight.sum().clamp(min=1e-300)).item()
 
     def standing(self) -> float:
@@ -101,6 +106,146 @@ class AxisContent:
         repeated = torch.fft.ifft(turns_phasor(turns))
         return self._energy(repeated[self._shifts % padded] - self._taps) / self.captured
 
+    def wrapped_slices(self, padded: int, other: "AxisContent", *, limited: bool) -> float:
+        """:meth:`wrapped` with the exact kernel, for light steep enough that the other axis changes it.
+
+        Slices of the transfer function at frequencies of the ``other`` axis stand for all of it. ``limited`` drops the
+        frequencies that :func:`angular_spectrum_kernel` drops on ``padded`` points.
+        """
+        if any(self.tilt) and self._spread(other) > 2 * padded:
+            return 1.0  # as much light wraps as arrives
+        return self._from_exact(self._slices(padded, other, padded * self.pitch if limited else math.inf), other)
+
+    def tilted_taps(self, padded: int, other: "AxisContent", *, paraxial: bool) -> float:
+        """Error of cropped taps about a tilted carrier, which mixes the axes: by slices at frequencies of the other.
+
+        ``paraxial`` leaves out the factor beyond Fresnel.
+        """
+        if paraxial:
+            return self._from_exact(self._taps * self._across(other), other)
+        wavelength, distance, tilt = self._scene
+        shift = levelling_shift((self.nyquist, other.nyquist), wavelength, distance, tilt, 0)
+        return self._from_exact(self._levelled(padded, other, shift.expand(len(other.slices), 1)), other)
+
+    def _from_exact(self, given: Tensor, other: "AxisContent") -> float:
+        """Error of taps [K, n + m - 1] at the slices of the other axis."""
+        exact = self._exact_slices(other)
+        if exact is None:
+            return 1.0
+        weights = other.shares
+        lost, whole = (
+            sum(w * self._energy(each) for w, each in zip(weights, taps, strict=True))
+            for taps in (given - exact, exact)
+        )
+        return lost / max(whole, 1e-300)
+
+    def _exact_slices(self, other: "AxisContent") -> Tensor | None:
+        if not self._exact:
+            self._exact.append(self._long_slices(other))
+        return self._exact[0]
+
+    def _long_slices(self, other: "AxisContent") -> Tensor | None:
+        """Taps [K, n + m - 1] at the slices of the other axis, not wrapped; None where no transform holds them."""
+        padded = _LONGER * (self.size + self.window)
+        if not any(self.tilt):
+            return self._slices(4 * padded, other, math.inf)  # of which some are evanescent, with a singularity
+        padded = good_length(max(padded, 2 * self._spread(other)), odd=True)
+        if padded > _LONGEST:
+            return None
+        # Each slice is levelled exactly: nothing jumps where the band closes upon itself.
+        wavelength, distance, tilt = self._scene
+        ends = torch.tensor((self.nyquist, -self.nyquist), dtype=torch.float64)
+        turns = tilted_turns(ends, other.slices, wavelength, distance, tilt, squares=False)
+        return self._levelled(padded, other, (turns[:, :1] - turns[:, 1:]) / (2 * self.nyquist))
+
+    def _levelled(self, padded: int, other: "AxisContent", shift: Tensor) -> Tensor:
+        """Taps [K, n + m - 1]: Fresnel's, moved by ``shift`` [K, 1] metres, times what is beyond them less that."""
+        index = tap_indices(padded, self.size, self.window)
+        taps = torch.stack([self._fresnel(index + each / self.pitch) for each in shift[:, 0]])
+        factor = self._levelled_factor(padded, other, shift)
+        return torch.fft.ifft(torch.fft.fft(taps) * factor)[:, self._shifts % padded]
+
+    def _levelled_factor(self, padded: int, other: "AxisContent", shift: Tensor) -> Tensor:
+        """What is beyond Fresnel less a shift in metres, at the slices of the other axis: [K, padded]."""
+        wavelength, distance, tilt = self._scene
+        frequency = torch.fft.fftfreq(padded, self.pitch, dtype=torch.float64)
+        turns = tilted_turns(frequency, other.slices, wavelength, distance, tilt, squares=False)
+        return turns_phasor(turns - frequency * shift) * self._across(other)
+
+    def _across(self, other: "AxisContent") -> Tensor:
+        """What the other axis does to its own frequencies [K, 1], the same for all of this one."""
+        own, across = self.tilt
+        bent = self.distance * (1 - own**2) / (1 - own**2 - across**2) ** 1.5
+        return turns_phasor(-self.wavelength * bent / 2 * other.slices.square())
+
+    @property
+    def _scene(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Wavelength, distance, tilt."""
+        wavelength, distance, *tilt = torch.tensor((self.wavelength, self.distance, *self.tilt), dtype=torch.float64)
+        return wavelength, distance, torch.stack(tilt)
+
+    @cached_property
+    def slices(self) -> Tensor:
+        """Frequencies [K, 1] of this axis, in cycles per metre, that stand for its content where it changes the other.
+
+        From end to end of the band; if the content was measured, also where most of its energy is.
+        """
+        even = torch.linspace(-1, 1, _SLICES, dtype=torch.float64) * self.band
+        if self.measured is None:
+            return even[:, None]
+        frequency, energy = self._power
+        order = frequency.argsort()
+        shares = energy[order].cumsum(0) / energy.sum().clamp(min=1e-300)
+        strongest = torch.searchsorted(shares, torch.tensor(_QUANTILES, dtype=torch.float64)).clamp(max=len(order) - 1)
+        return torch.cat([even, frequency[order][strongest]]).unique()[:, None]
+
+    @property
+    def _power(self) -> tuple[Tensor, Tensor]:
+        """Frequencies of measured content and its energy at them.
+
+        Twice the window: on the window alone the field would repeat, and a uniform one would have no edges.
+        """
+        assert self.measured is not None
+        frequency = torch.fft.fftfreq(2 * self.size, self.pitch, dtype=torch.float64)
+        return frequency, torch.fft.fft(self.measured, 2 * self.size).abs().square().sum(0)
+
+    def _spread(self, other: "AxisContent") -> int:
+        """Samples over which a tilted axis spreads the light of one point, what the other axis does to it included."""
+        own, across = (
+            self.wavelength * torch.tensor((-axis.nyquist, 0.0, axis.nyquist), dtype=torch.float64) + sine
+            for axis, sine in zip((self, other), self.tilt, strict=True)
+        )
+        tangents = own[:, None] / torch.sqrt((1 - own[:, None].square() - across.square()).clamp(min=1e-3))
+        places = self.distance * tangents / self.pitch
+        return math.ceil((places.max() - places.min()).item()) + self.size + self.window
+
+    @cached_property
+    def shares(self) -> list[float]:
+        """Shares of the energy of the content that each of :attr:`slices` stands for."""
+        if self.measured is None:
+            parts = torch.ones(_SLICES, dtype=torch.float64)
+            parts[[0, -1]] = 0.5
+        else:
+            frequency, energy = self._power
+            nearest = (frequency[:, None] - self.slices[:, 0]).abs().argmin(1)
+            parts = torch.zeros(len(self.slices), dtype=torch.float64).index_add(0, nearest, energy)
+        return (parts / parts.sum().clamp(min=1e-300)).tolist()
+
+    def _slices(self, padded: int, other: "AxisContent", extent: float) -> Tensor:
+        """Taps [K, n + m - 1] of the exact kernel sampled at ``padded`` frequencies, for slices of the other axis."""
+        wavelength, distance, tilt = self._scene
+        frequency = torch.fft.fftfreq(padded, self.pitch, dtype=torch.float64)
+        moved = frequency * self.shift * self.pitch
+        if any(self.tilt):
+            kernel = turns_phasor(tilted_turns(frequency, other.slices, wavelength, distance, tilt) + moved)
+        else:
+            root = torch.sqrt(1 - (wavelength * frequency).square() - (wavelength * other.slices).square() + 0j)
+            kernel = turns_phasor(distance / wavelength * (root.real - 1) + moved)
+            kernel = kernel * torch.exp(-2 * math.pi * distance / wavelength * root.imag)
+            steep = 2 * distance * wavelength * frequency.abs() > extent * root.abs()
+            kernel = torch.where(steep, 0.0, kernel)
+        return torch.fft.ifft(kernel)[:, self._shifts % padded]
+
     def _wrapped_rays(self, padded: int) -> float:
         """Share of the light that travels sideways past the padding but not past the window behind it."""
         steepest = self.wavelength * self.bent * self.band / self.pitch  # samples
@@ -117,9 +262,46 @@ class AxisContent:
         """
         if self._moved > padded / 4:
             return self._rim()
-        longer = max(2 * (self.size + self.window), 2 * padded if any(self.tilt) else 0)
-        far = self._beyond_fresnel(good_length(longer, odd=any(self.tilt)), cross)
+        far = self._beyond_fresnel(good_length(2 * (self.size + self.window)), cross)
         return self._energy(self._beyond_fresnel(padded, cross) - far) / self.captured
+
+    def resampled(self, padded: int, cross: float) -> float:
+        """Error of the factor beyond Fresnel applied first, on ``padded`` samples around the window.
+
+        ``cross`` as in :meth:`cropped`.
+        """
+        if self._moved > padded / 4:
+            return self._rim()
+        given = self._filtered_first(self._remainder(padded, cross), self._fresnel)
+        far = self._beyond_fresnel(good_length(max(2 * (self.size + self.window), 4 * padded)), cross)
+        return ((given - self._arriving(far)).abs().square().sum() / self.size).item() / self.captured
+
+    def resampled_slices(self, padded: int, other: "AxisContent") -> float:
+        """:meth:`resampled` about a tilted carrier, as in :meth:`tilted_taps`."""
+        exact = self._exact_slices(other)
+        if exact is None:
+            return 1.0
+        wavelength, distance, tilt = self._scene
+        shift = levelling_shift((self.nyquist, other.nyquist), wavelength, distance, tilt, 0)
+        lost = whole = 0.0
+        for factor, taps, weight in zip(self._levelled_factor(padded, other, shift), exact, other.shares, strict=True):
+            given = self._filtered_first(factor, lambda index: self._fresnel(index + shift / self.pitch))
+            wanted = self._arriving(taps)
+            lost += weight * (given - wanted).abs().square().sum().item()
+            whole += weight * wanted.abs().square().sum().item()
+        return lost / max(whole, 1e-300)
+
+    def _filtered_first(self, factor: Tensor, taps: Callable[[Tensor], Tensor]) -> Tensor:
+        """The content times ``factor`` [P], its middle P samples convolved with the ``taps`` at given places."""
+        padded = len(factor)
+        rim = (padded - self.size) // 2
+        kept = self.size + 2 * rim
+        near = torch.fft.ifft(torch.fft.fft(self._signals, padded) * factor)
+        near = near[:, torch.arange(-rim, self.size + rim) % padded]
+        weights = taps(torch.arange(-(self.size + rim - 1), self.window + rim))
+        length = good_length(kept + len(weights) - 1)
+        given = torch.fft.ifft(torch.fft.fft(near, length) * torch.fft.fft(weights, length))
+        return given[:, kept - 1 : kept - 1 + self.window]
 
     def paraxial(self) -> float:
         """Error of leaving out the factor beyond Fresnel, for light that travels along this axis only."""
@@ -157,26 +339,32 @@ class AxisContent:
         return fresnel_taps(index.to(torch.float64) + self.shift, self.pitch, wavelength, bent)
 
     def _beyond_fresnel(self, padded: int, cross: float) -> Tensor:
-        index = tap_indices(padded, self.size, self.window)
+        taps = self._fresnel(tap_indices(padded, self.size, self.window))
+        return torch.fft.ifft(torch.fft.fft(taps) * self._remainder(padded, cross))[self._shifts % padded]
+
+    def _remainder(self, padded: int, cross: float) -> Tensor:
+        """Factor beyond Fresnel [padded] at the frequency ``cross`` of the other axis."""
         frequency = torch.fft.fftfreq(padded, self.pitch, dtype=torch.float64)
         wavelength, distance, other = (
             torch.tensor(value, dtype=torch.float64) for value in (self.wavelength, self.distance, cross)
         )
-        tilt = torch.tensor(self.tilt[::-1], dtype=torch.float64) if any(self.tilt) else None
-        factor = remainder_kernel(other, frequency, wavelength, distance, tilt)
-        return torch.fft.ifft(torch.fft.fft(self._fresnel(index)) * factor)[self._shifts % padded]
+        return remainder_kernel(other, frequency, wavelength, distance)
 
     @cached_property
-    def _tones(self) -> Tensor:
-        """Spectra of the content, long enough for the samples of the result to be free of wrapping."""
-        length = good_length(self.size + self.window - 1)
+    def _signals(self) -> Tensor:
+        """The content [K, size]."""
         if self.measured is not None:
-            return torch.fft.fft(self.measured, length)
+            return self.measured
         n = torch.arange(self.size, dtype=torch.float64)
         frequencies = torch.linspace(-1, 1, _TONES, dtype=torch.float64) * self.band * self.pitch
         tones = self._fade(n) * turns_phasor(frequencies[:, None] * n)
         tones[[0, -1]] *= math.sqrt(0.5)  # trapezoidal rule over the band
-        return torch.fft.fft(tones / math.sqrt(_TONES - 1), length)
+        return tones / math.sqrt(_TONES - 1)
+
+    @cached_property
+    def _tones(self) -> Tensor:
+        """Spectra of the content, long enough for the samples of the result to be free of wrapping."""
+        return torch.fft.fft(self._signals, good_length(self.size + self.window - 1))
 
     def _fade(self, n: Tensor) -> Tensor:
         """1 inside, infinitely smooth to 0 over the margin at both ends."""
@@ -188,9 +376,12 @@ class AxisContent:
 
     def _energy(self, taps: Tensor) -> float:
         """Energy per sample of the source that a convolution with ``taps`` [n + m - 1] gives of the content."""
+        return (self._arriving(taps).abs().square().sum() / self.size).item()
+
+    def _arriving(self, taps: Tensor) -> Tensor:
+        """The content convolved with ``taps`` [n + m - 1], in the window of the result."""
         spectrum = self._tones * torch.fft.fft(taps, self._tones.shape[-1])
-        kept = torch.fft.ifft(spectrum)[:, self.size - 1 : self.size - 1 + self.window]
-        return (kept.abs().square().sum() / self.size).item()
+        return torch.fft.ifft(spectrum)[:, self.size - 1 : self.size - 1 + self.window]
 
 
 def rms_beyond_fresnel(axes: list[AxisContent]) -> float:

@@ -1,5 +1,6 @@
 """propagate and Propagator: the planned way, which picks method and padding and says why."""
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -24,6 +25,8 @@ from holotorch.optics.zoomed import ZoomedFilter, chirps, zoomed
 
 _ZOOMED = "angular spectrum, zoomed"
 _UNUSABLE = 0.1  # expected error from which a result is refused
+_DIM = 1e-5  # share of the light below which both axes together decide what lands, which measured lines do not tell
+_DIMMER = 5.0  # times the tolerance: the error of what is left of the light from which a dim result is warned of
 
 
 def propagate(
@@ -71,15 +74,16 @@ def propagate(
             error is below 0.1.
 
     Warns:
-        SamplingWarning: No way meets the tolerance; the most accurate one is used and its expected error named.
+        SamplingWarning: No way meets the tolerance; the most accurate one is used and its expected error named. Or so
+            little of the light lands in the window of the result that the error is large beside it. The second is not
+            looked for while compiling, and :class:`Propagator`, which sees no result, does not warn of it.
         PrecisionWarning: A wavelength or distance in float32, whose rounding turns the phase by 0.01 rad or more.
 
     A gradient in the pitch, say a factor s on it and on the output's: nothing changes when all lengths are scaled, so
     ``propagate(field, grid, wavelength / s, distance / s)`` is the field on a grid of s times the pitch.
     """
     checks.field("field", field, grid.shape)
-    if not torch.compiler.is_compiling():
-        checks.all_finite("field", torch.view_as_real(field.detach().resolve_conj()))
+    sent = None if torch.compiler.is_compiling() else _finite_norms(field)
     waves, distances = _float64("wavelength", wavelength, field), _float64("distance", distance, field)
     checks.precise(wavelength, distance)
     listed = [values.detach().reshape(-1).tolist() for values in (waves, distances)]
@@ -99,10 +103,13 @@ def propagate(
                 padded = Grid(way.padded, grid.pitch)
                 kernel = kernel_of(_read_along(path), way, wave, far, field.dtype, slanted)
                 return zoomed(each, kernel, chirps(grid, padded, path.out, path.offset, field.device))
-            factors = resampling_factors(path, wave, far, paraxial=way.paraxial, tilt=slanted, dtype=field.dtype)
+            room = None if way.paraxial else way.padded
+            factors = resampling_factors(path, wave, far, padded=room, tilt=slanted, dtype=field.dtype)
             return resample(each, factors)
 
-        return _one_by_one(field, waves, distances, path.out.shape, elsewhere)
+        result = _one_by_one(field, waves, distances, path.out.shape, elsewhere)
+        _judge_light(way, tolerance, path, sent, result, measured=measure)
+        return result
 
     def filtered(each: Tensor, wave: Tensor, far: Tensor) -> Tensor:
         kernel = kernel_of(path, way, wave, far, field.dtype, slanted)
@@ -110,7 +117,9 @@ def propagate(
         product = multiplied(each, kernel) if waves.numel() * distances.numel() == 1 else each * kernel
         return ifft2(product, path.out.shape)
 
-    return _one_by_one(fft2(field, way.padded), waves, distances, path.out.shape, filtered)
+    result = _one_by_one(fft2(field, way.padded), waves, distances, path.out.shape, filtered)
+    _judge_light(way, tolerance, path, sent, result, measured=measure)
+    return result
 
 
 def _one_by_one(
@@ -184,8 +193,9 @@ class Propagator(nn.Module):
         way = _best(found, tolerance)
         if not path.same_pitch and way.method != _ZOOMED:
             self.operator = ResampledKernel(
-                grid, self.wavelengths, self.distance, path.out, offset=offset, tilt=tilt, paraxial=way.paraxial
-            )
+                grid, self.wavelengths, self.distance, path.out,
+                offset=offset, tilt=tilt, paraxial=way.paraxial, padded=way.padded,
+            )  # fmt: skip
             return
         waves, far = (torch.tensor(value, dtype=torch.float64) for value in (self.wavelengths, self.distance))
         if path.same_pitch:
@@ -222,6 +232,43 @@ def _best(found: list[Candidate], tolerance: float) -> Candidate:
     return best
 
 
+def _norms(field: Tensor) -> Tensor:
+    return torch.linalg.vector_norm(torch.view_as_real(field.detach().resolve_conj()), dim=(-3, -2, -1))
+
+
+def _finite_norms(field: Tensor) -> Tensor:
+    """L2 norms [...] of ``field``; ValueError for elements that are not finite."""
+    norms = _norms(field)
+    if not bool(torch.isfinite(norms).all()):  # or squares that overflow
+        checks.all_finite("field", torch.view_as_real(field.detach().resolve_conj()))
+    return norms
+
+
+def _judge_light(
+    way: Candidate, tolerance: float, path: Passage, sent: Tensor | None, result: Tensor, *, measured: bool
+) -> None:
+    """Warn where so much less light arrives than was expected that the error of the plan is large beside it."""
+    if sent is None or 0 in result.shape or way.error > tolerance:  # of which _best has warned
+        return
+    cells = math.prod(path.out.pitch) / math.prod(path.grid.pitch)
+    shares = torch.where(sent > 0, (_norms(result) / sent).square() * cells, 1.0)
+    dimmest = float(torch.where(torch.isfinite(shares), shares, 1.0).min())
+    allowed = _DIMMER * tolerance
+    # All light is the most that can be expected: most calls end here, without asking what is.
+    if way.error <= allowed * math.sqrt(dimmest):
+        return
+    expected = 1.0 if measured and dimmest < _DIM else way.captured()
+    left = way.error * math.sqrt(expected / max(dimmest, 1e-300))
+    if left > allowed:
+        warnings.warn(
+            f"only {dimmest:.2g} of the light lands in the window of the result, and the error of {way.method} may be "
+            f"{left:.1e} of what lands, more than the tolerance of {tolerance:.1e}. Move the window to the light, or "
+            f"ask for a tolerance below {tolerance * allowed / left:.1e}",
+            SamplingWarning,
+            stacklevel=3,
+        )
+
+
 def _read_along(path: Passage) -> Passage:
     """The same light on the source's samples: where it is read elsewhere is left to the reading."""
     return Passage(path.grid, path.grid, (0.0, 0.0), path.tilt)
@@ -233,7 +280,8 @@ def kernel_of(
     """Transfer function of a chosen way, carrier included: [..., H, W] of its padded grid, in ``dtype``."""
     grid = path.grid
     padded = Grid(way.padded, grid.pitch)
-    if way.method in ("angular spectrum", _ZOOMED) and min(grid.pitch) < FINEST * waves.detach().max().item():
+    sampled = way.method in ("angular spectrum", _ZOOMED)
+    if sampled and not any(path.tilt) and min(grid.pitch) < FINEST * waves.detach().max().item():
         return wide_transfer_function(path, padded, waves, distances, dtype=dtype)
     if way.method == "identity":
         ones = torch.ones(*torch.broadcast_shapes(waves.shape, distances.shape), *grid.shape, dtype=dtype)

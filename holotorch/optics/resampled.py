@@ -6,13 +6,13 @@ import torch
 from torch import Tensor, nn
 
 from holotorch.core import checks
-from holotorch.core.fourier import fft2, good_length, ifft2, multiplied
+from holotorch.core.fourier import fft2, ifft2, multiplied
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import DISTANCE
-from holotorch.optics.candidates import FINEST, resampling_rim
-from holotorch.optics.kernels import carrier
+from holotorch.optics.candidates import FINEST, resampled_padding
+from holotorch.optics.kernels import carrier, turns_phasor
 from holotorch.optics.passage import Passage, passage
-from holotorch.optics.taps import fresnel_taps, remainder_kernel
+from holotorch.optics.taps import fresnel_taps, levelling_shift, remainder_kernel, tilted_turns
 
 Factors = tuple[Tensor, Tensor, Tensor | None]
 
@@ -22,38 +22,47 @@ def resampling_factors(
     wavelength: Tensor,
     distance: Tensor,
     *,
-    paraxial: bool = False,
+    padded: tuple[int, int] | None,
     tilt: Tensor | None = None,
     dtype: torch.dtype = torch.complex128,
 ) -> Factors:
-    """Dense weights of both axes and the factor beyond Fresnel (None if ``paraxial``), differentiable in all tensors.
+    """Dense weights of both axes and the factor beyond Fresnel, differentiable in all tensors.
 
-    Wavelength and distance are float64 of shape [...] that broadcast, the distance nowhere 0. Returns columns
+    That factor is applied on ``padded`` samples, whose excess is shared between both ends of the window; None leaves it
+    out. Wavelength and distance are float64 of shape [...] that broadcast, the distance nowhere 0. Returns columns
     [..., H', H + rims] with the carrier, rows [..., W', W + rims] and the factor [..., P, Q] in FFT order.
     """
     wavelength, distance = torch.broadcast_tensors(wavelength, distance)
     if tilt is None:
         tilt = torch.tensor(path.tilt, dtype=torch.float64, device=distance.device)
     cosine2 = 1 - tilt.square().sum()
-    longest, far = wavelength.detach().max().item(), distance.detach().abs().max().item()
-    rims = [0 if paraxial else resampling_rim(path, axis, longest, far) for axis in (0, 1)]
+    rims = [(room - size) // 2 for room, size in zip(padded or path.grid.shape, path.grid.shape, strict=True)]
+    # What the taps take over from the factor beyond Fresnel.
+    top = 0.5 / path.grid.pitch[0], 0.5 / path.grid.pitch[1]
+    levels = [torch.zeros_like(distance)] * 2
+    if padded is not None and any(path.tilt):
+        levels = [levelling_shift(top, wavelength, distance, tilt, axis) for axis in (0, 1)]
     matrices = []
     for axis, rim in enumerate(rims):
         pitch, size = path.grid.pitch[axis], path.grid.shape[axis]
         source = torch.arange(-rim, size + rim, dtype=torch.float64, device=distance.device) - size // 2
         reached = path.out.coordinates(distance.device)[axis].reshape(-1) + path.offset[axis]
-        aside = distance * tilt[axis] / torch.sqrt(cosine2)
+        aside = distance * tilt[axis] / torch.sqrt(cosine2) - levels[axis]
         place = (reached[:, None] - aside[..., None, None]) / pitch - source
         bent = distance * (1 - tilt[1 - axis].square()) / cosine2**1.5
         weights = fresnel_taps(place.flatten(-2), pitch, wavelength, bent)
         matrices.append(weights.unflatten(-1, place.shape[-2:]))
     columns = matrices[0] * carrier(wavelength, distance * torch.sqrt(cosine2))[..., None, None]
     beyond = None
-    if not paraxial:
-        sizes = [good_length(size + 2 * rim) for size, rim in zip(path.grid.shape, rims, strict=True)]
-        fy, fx = Grid((sizes[0], sizes[1]), path.grid.pitch).frequencies(distance.device)
-        slanted = tilt if any(path.tilt) else None
-        beyond = remainder_kernel(fy, fx, wavelength[..., None, None], distance[..., None, None], slanted).to(dtype)
+    if padded is not None:
+        fy, fx = Grid(padded, path.grid.pitch).frequencies(distance.device)
+        wave, far = wavelength[..., None, None], distance[..., None, None]
+        if any(path.tilt):
+            turns = tilted_turns(fy, fx, wave, far, tilt, squares=False)
+            turns = turns - fy * levels[0][..., None, None] - fx * levels[1][..., None, None]
+            beyond = turns_phasor(turns).to(dtype)
+        else:
+            beyond = remainder_kernel(fy, fx, wave, far).to(dtype)
     return columns.to(dtype), matrices[1].to(dtype), beyond
 
 
@@ -88,6 +97,8 @@ class ResampledKernel(nn.Module):
         offset: Where (y, x) in metres the axis of the result lies beside that of the field.
         tilt: Sines (y, x) of the direction of a carrier that is taken out, as in ``propagate``.
         paraxial: Leave out the correction beyond the Fresnel approximation.
+        padded: Samples of the transforms that apply that correction; by default the window, an eighth on each side and
+            room for what the correction moves.
 
     Raises:
         ValueError: A wavelength that is not positive, a distance that is 0 or not finite, a pitch below 0.9
@@ -108,6 +119,7 @@ class ResampledKernel(nn.Module):
         offset: tuple[float, float] = (0.0, 0.0),
         tilt: tuple[float, float] = (0.0, 0.0),
         paraxial: bool = False,
+        padded: tuple[int, int] | None = None,
     ):
         super().__init__()
         self.grid, self.out_grid, self.wavelengths = grid, out_grid, checks.wavelengths(wavelengths)
@@ -121,7 +133,9 @@ class ResampledKernel(nn.Module):
             raise ValueError(f"pitch must be at least {FINEST} wavelengths of {longest:g} m, got {min(grid.pitch):g} m")
         waves = torch.tensor(self.wavelengths, dtype=torch.float64)
         far = torch.tensor(self.distance, dtype=torch.float64)
-        factors = resampling_factors(path, waves, far, paraxial=paraxial)
+        if padded is None and not paraxial:
+            padded = resampled_padding(path, longest, abs(self.distance))
+        factors = resampling_factors(path, waves, far, padded=None if paraxial else padded)
         for name, values in zip(("columns", "rows", "beyond"), factors, strict=True):
             pair = None if values is None else torch.view_as_real(values).contiguous()
             self.register_buffer(name, pair, persistent=False)

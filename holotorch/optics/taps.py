@@ -54,19 +54,13 @@ def tap_indices(padded: int, size: int, out: int) -> Tensor:
     return torch.where(index > out - 1 + (padded - (size + out - 1)) // 2, index - padded, index)
 
 
-def remainder_kernel(
-    fy: Tensor, fx: Tensor, wavelength: Tensor, distance: Tensor, tilt: Tensor | None = None
-) -> Tensor:
+def remainder_kernel(fy: Tensor, fx: Tensor, wavelength: Tensor, distance: Tensor) -> Tensor:
     """What the exact transfer function has on top of the paraxial one: exp(-i pi z s^4 / (wavelength (1 + cos)^2)).
 
     s is the sine of the angle, frequencies in cycles per metre broadcast against wavelength and distance; complex128.
-    Evanescent waves decay with abs(distance), and their paraxial phase is taken back.
-
-    With ``tilt``, the sines (y, x) [2] of a carrier, frequencies are counted from the carrier's, and what is left out
-    are the linear part and the squares of the expansion about it, see :func:`tilted_turns`; all light must travel.
+    Evanescent waves decay with abs(distance), and their paraxial phase is taken back. :func:`tilted_turns` has the same
+    about a tilted carrier.
     """
-    if tilt is not None:
-        return turns_phasor(tilted_turns(fy, fx, wavelength, distance, tilt, squares=False))
     sine2 = (wavelength * fy).square() + (wavelength * fx).square()
     travels = sine2 < 1
     cosine = torch.where(travels, torch.sqrt(torch.where(travels, 1 - sine2, 1)), 0)
@@ -99,3 +93,18 @@ def tilted_turns(
     if not squares:
         bent = bent + (y.square() * (1 - sx.square()) + x.square() * (1 - sy.square())) / (2 * cosine**3)
     return distance / wavelength * bent
+
+
+def levelling_shift(top: tuple[float, float], wavelength: Tensor, distance: Tensor, tilt: Tensor, axis: int) -> Tensor:
+    """Shift in metres, shape [...], that the taps of a tilted axis take over from the factor beyond Fresnel.
+
+    That factor has an odd part, which would jump where the band closes upon itself. The shift that makes both ends
+    meet, for the rms frequency of the other axis, leaves a fifth of the jump. ``top``: ends (y, x) of the band, in
+    cycles per metre.
+    """
+    ends = [torch.full((), limit / 3**0.5, dtype=torch.float64, device=tilt.device) for limit in top]
+    turns = []
+    for sign in (1, -1):
+        ends[axis] = torch.full((), sign * top[axis], dtype=torch.float64, device=tilt.device)
+        turns.append(tilted_turns(ends[0], ends[1], wavelength, distance, tilt, squares=False))
+    return (turns[0] - turns[1]) / (2 * top[axis])

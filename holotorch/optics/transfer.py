@@ -7,7 +7,7 @@ from holotorch.core.fourier import multiply_even
 from holotorch.core.grid import Grid
 from holotorch.optics.kernels import angular_spectrum_kernel, carrier, turns_phasor
 from holotorch.optics.passage import Passage, shifts
-from holotorch.optics.taps import fresnel_taps, remainder_kernel, tap_indices, tilted_turns
+from holotorch.optics.taps import fresnel_taps, levelling_shift, remainder_kernel, tap_indices, tilted_turns
 
 
 def transfer_function(
@@ -106,20 +106,9 @@ def _sampled_tilted(padded: Grid, wavelength: Tensor, distance: Tensor, tilt: Te
 
 
 def _level(axis: int, padded: Grid, wavelength: Tensor, distance: Tensor, tilt: Tensor) -> Tensor:
-    """Samples of shift that the taps of a tilted axis take over from the factor beyond Fresnel, shape [...].
-
-    That factor has an odd part, which would jump where the band closes upon itself; the shift that makes both ends
-    meet, for the rms frequency of the other axis, leaves a fifth of the jump.
-    """
-    ends = [torch.zeros((), dtype=torch.float64, device=tilt.device)] * 2
-    top = 0.5 / padded.pitch[axis]
-    ends[1 - axis] = ends[1 - axis] + 0.5 / padded.pitch[1 - axis] / 3**0.5
-    turns = []
-    for sign in (1, -1):
-        ends[axis] = torch.tensor(sign * top, dtype=torch.float64, device=tilt.device)
-        turns.append(tilted_turns(ends[0], ends[1], wavelength, distance, tilt, squares=False))
-    # Turns per cycle per metre, over the pitch.
-    return (turns[0] - turns[1]) / (2 * top) / padded.pitch[axis]
+    """:func:`levelling_shift` in samples."""
+    top = 0.5 / padded.pitch[0], 0.5 / padded.pitch[1]
+    return levelling_shift(top, wavelength, distance, tilt, axis) / padded.pitch[axis]
 
 
 def _axis_factor(

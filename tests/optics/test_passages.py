@@ -88,7 +88,7 @@ def test_every_way_into_a_window_errs_as_predicted(window, crossovers):
             kernel = kernel_of(Passage(GRID, GRID), way, waves, far, torch.complex128)
             got = zoomed(field, kernel, chirps(GRID, Grid(way.padded, GRID.pitch), out, offset))
         else:
-            got = resample(field, resampling_factors(path, waves, far, paraxial=way.paraxial))
+            got = resample(field, resampling_factors(path, waves, far, padded=None if way.paraxial else way.padded))
         checked += 1
         assert way.error / 10 <= error(got, wanted) <= 3 * way.error, way
     assert checked >= 2
@@ -107,7 +107,7 @@ def test_tilted_light_arrives_as_predicted(tilt, crossovers):
     assert ways
     for way in ways:
         got = filter_spectrum(field, kernel_of(path, way, waves, far, torch.complex128))
-        assert way.error / 20 <= error(got, wanted) <= 3 * way.error, way
+        assert way.error / 6 <= error(got, wanted) <= 3 * way.error, way
     if crossovers == 0.1:
         got = propagate(field, GRID, WAVE, distance, tolerance=3e-3, tilt=sines, offset=offset)
         assert error(got, wanted) <= 2 * 3e-3
