@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -114,7 +114,7 @@ def _video(path: Path, rate: float | None) -> Frames:
     if not (math.isfinite(stated) and stated > 0):
         stated = _ASSUMED_RATE if rate is None else rate
         notes.append(f"{path.name} states no rate; {stated:g} frames per second assumed")
-    fine, first = capture.read()
+    fine, first = _taken(capture.read)
     if not fine:
         code = int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
         codec = code.to_bytes(4, "little").decode("ascii", "replace").strip("\0 ") or "unknown"
@@ -134,7 +134,7 @@ def _video(path: Path, rate: float | None) -> Frames:
             yield Frame(seconds, _rgb(picture)) if picture is not None else Frame(seconds, None, "not decodable")
             if not capture.grab():
                 break
-            fine, picture = capture.retrieve()
+            fine, picture = _taken(capture.retrieve)
             picture = picture if fine else None
         if guessed:
             notes.append(f"{guessed} of {count} frames have no time of their own; counted at {stated:g} per second")
@@ -143,6 +143,16 @@ def _video(path: Path, rate: float | None) -> Frames:
 
     total = announced if announced > 0 else None
     return Frames(path.name, first.shape[:2], total, stated, frames(), notes, close=capture.release)
+
+
+def _taken(take: Callable[[], tuple[bool, Any]]) -> tuple[bool, Any]:
+    """A frame, or (False, None) where OpenCV's own demuxer stumbles over what a damaged file says of it."""
+    import cv2
+
+    try:
+        return take()
+    except cv2.error:
+        return False, None
 
 
 def _folder(folder: Path, rate: float | None) -> Frames:

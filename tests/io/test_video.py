@@ -205,3 +205,22 @@ def test_frames_without_times_of_their_own_are_counted_and_that_is_said(tmp_path
     assert [frame.seconds for frame in found] == pytest.approx([0.0, 0.02, 0.05, 0.07])
     assert found[1].problem == "not decodable"
     assert frames.notes[0].endswith("50 frames per second assumed") and frames.notes[1].startswith("2 of 4 frames")
+
+
+class Stumbling(StandIn):
+    """OpenCV's own reader of AVI files throws where a damaged one states a frame of more than 64 MB."""
+
+    def retrieve(self):
+        if self.pictures[self.at] is None:
+            raise cv2.error("chunk.m_size <= 67108864 in function 'readFrame'")
+        return super().retrieve()
+
+
+def test_a_frame_over_which_opencv_stumbles_is_a_problem_of_that_frame(tmp_path, monkeypatch):
+    (tmp_path / "a.avi").write_bytes(b"anything")
+    monkeypatch.setattr(cv2, "VideoCapture", lambda _: Stumbling([bgr(1), None, bgr(3)], [0.0, 20.0, 40.0]))
+    found = list(open_frames(tmp_path / "a.avi", rate=50))
+    assert [frame.problem for frame in found] == ["", "not decodable", ""]
+    monkeypatch.setattr(cv2, "VideoCapture", lambda _: Stumbling([None], [0.0]))
+    with pytest.raises(ValueError, match="no frame could be decoded"):
+        open_frames(tmp_path / "a.avi")
