@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from holotorch import __version__
-from holotorch.experiments.signals import interruptible
+from holotorch.experiments.runs.signals import interruptible
 from holotorch.experiments.study_commands import add_study
 from holotorch.experiments.tracking_commands import add_tracking
 
@@ -18,7 +18,7 @@ OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 def main(arguments: list[str] | None = None) -> int:
     """Run one subcommand and return its exit status: 0 done, 2 bad input, 1 failure, 130 interrupted and saved."""
     options = _parser().parse_args(arguments)
-    from holotorch.experiments.errors import ConfigError
+    from holotorch.experiments.config.errors import ConfigError
 
     try:
         # Servers and streams have ends of their own.
@@ -51,52 +51,24 @@ def _before(options: argparse.Namespace) -> str:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from holotorch.experiments.config import load_config
+    from holotorch.experiments.registry import load_config
 
     settings = load_config(options.config, options.overrides)
-    from holotorch.experiments.run import start
+    from holotorch.experiments.execute import execute
 
-    return _finish(*start(settings, options.out, Path(options.config).stem))
+    return _finish(*execute(settings, options.out, Path(options.config).stem))
 
 
 def _resume(options: argparse.Namespace) -> int:
-    from holotorch.experiments.run import resume
+    from holotorch.experiments.execute import resume
 
     return _finish(*resume(options.folder))
 
 
 def _demo(options: argparse.Namespace) -> int:
-    from holotorch.experiments.config import load_config
-    from holotorch.experiments.perception_layout import run_layout
-    from holotorch.experiments.report import write_report
-    from holotorch.experiments.run import run
-    from holotorch.experiments.run_folder import claim
-    from holotorch.experiments.synthetic import write_synthetic
-    from holotorch.experiments.track import run_tracking
-    from holotorch.experiments.volume_run import run_volume
-    from holotorch.io.bundled import find_config
+    from holotorch.experiments.demo import demo
 
-    names = ("demo", "demo_volume", "perception/layout")
-    paths = [find_config(f"configs/{name}.yaml") for name in names]
-    image, scene, layout = (load_config(path) for path in paths if path is not None)
-    folder = claim(options.out, "demo")
-    if (folder / "images").is_dir():
-        (folder / "images").rmdir()  # the claim's; each run has a folder of its own
-    parts = []
-    for work, settings, name in ((run, image, "correction"), (run_volume, scene, "volume")):
-        part, complete = work(settings, folder / name, name)
-        parts.append(part)
-        if not complete:
-            break
-    more = {}
-    if complete:
-        recording = write_synthetic(folder / "recording", 10)
-        _, complete = run_tracking(recording, out=folder / "tracking")
-        run_layout(layout, folder / "layout", "layout")
-        more["Catheter tracking, in a synthetic recording"] = "tracking/report.html"
-        more["Icons over a wide field, as large as they must be"] = "layout/report.html"
-    write_report(parts, folder / "report.html", more)
-    return _finish(folder, len(parts) == 2 and complete)
+    return _finish(*demo(options.out))
 
 
 def _finish(folder: Path, complete: bool) -> int:
@@ -106,53 +78,32 @@ def _finish(folder: Path, complete: bool) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from holotorch.experiments.config import load_config
-    from holotorch.experiments.errors import ConfigError
+    from holotorch.experiments.config.errors import ConfigError
+    from holotorch.experiments.registry import load_config
 
     settings = load_config(options.config, options.overrides)
-    if settings.experiment == "pec_study":
-        print(f"Study      {settings.study} of {', '.join(settings.images)} on {settings.size} x {settings.size} px")
-        print(f"Sweep      {', '.join(f'{value:g}' for value in settings.sweep)}; {settings.max_steps} steps at most")
-        return OK
-    if settings.experiment == "eye":
-        from holotorch.experiments import eye_plan
-        from holotorch.experiments.eye import observer
-        from holotorch.experiments.eye_run import scene_settings
+    from holotorch.experiments.execute import check
 
-        looking = observer(settings, scene_settings(settings))
-        values = eye_plan.plan(looking)
-        print(eye_plan.plan_text(looking, values))
-        if text := eye_plan.too_large(values):
-            raise ConfigError([text])
-        return OK
-    if settings.experiment == "perception_layout":
-        from holotorch.experiments.perception_layout import layout_text
+    plan = check(settings)
+    print(plan.text)
+    if plan.shortage:
+        raise ConfigError([plan.shortage])
+    return OK
 
-        print(layout_text(settings))
-        return OK
-    if settings.experiment == "perception_analysis":
-        source = (
-            f"{len(settings.logs)} logs" if settings.logs else f"{settings.simulation.participants} simulated people"
-        )
-        print("Analysis   of {}, lines over {:g} .. {:g} deg".format(source, *settings.range_deg))
-        return OK
-    from holotorch.experiments.plan import shortage
 
-    if settings.experiment == "volume":
-        from holotorch.experiments import volume, volume_plan
+def _new(options: argparse.Namespace) -> int:
+    from holotorch.experiments.beginnings import write_example
 
-        scene = volume.build(settings)
-        values = volume_plan.plan(scene)
-        print(volume_plan.plan_text(scene, values))
-    else:
-        from holotorch.experiments.pec import build
-        from holotorch.experiments.plan import plan, plan_text
+    out = options.out or Path(f"{options.kind}.yaml")
+    write_example(options.kind, out)
+    print(f"{out}; look at what it will do with: holotorch check {out}")
+    return OK
 
-        experiment = build(settings)
-        values = plan(experiment)
-        print(plan_text(experiment, values))
-    if text := shortage(values):
-        raise ConfigError([text])
+
+def _schema(options: argparse.Namespace) -> int:
+    from holotorch.experiments.beginnings import schema
+
+    print(schema(options.kind))
     return OK
 
 
@@ -181,7 +132,7 @@ def _doctor(_: argparse.Namespace) -> int:
 
 
 def _export_slm(options: argparse.Namespace) -> int:
-    from holotorch.experiments.export import export_slm, export_text
+    from holotorch.experiments.panel.export import export_slm, export_text
 
     out, report = export_slm(
         options.folder,
@@ -217,6 +168,15 @@ def _parser() -> argparse.ArgumentParser:
     check = commands.add_parser("check", help="validate a configuration, print its plan and physics, compute nothing")
     _add_config(check)
     check.set_defaults(action=_check)
+
+    new = commands.add_parser("new", help="a configuration to begin with: an example of a kind of experiment")
+    new.add_argument("kind", metavar="KIND", help="such as pec, volume, eye")
+    new.add_argument("--out", type=Path, help="file to write (default: KIND.yaml)")
+    new.set_defaults(action=_new)
+
+    schema = commands.add_parser("schema", help="JSON Schema of the configurations of a kind, for editors")
+    schema.add_argument("kind", metavar="KIND", help="such as pec, volume, eye")
+    schema.set_defaults(action=_schema)
 
     report = commands.add_parser("report", help="one HTML page for one or more run folders")
     report.add_argument("folders", nargs="+", type=Path, metavar="DIR")

@@ -110,9 +110,9 @@ def peer() -> Iterator[tuple[str, Contenders]]:
 
 def tracking() -> Iterator[tuple[str, Contenders]]:
     """Catheters on synthetic 1080p frames; the thesis's pipeline in OpenCV is the baseline."""
-    from holotorch.experiments.tracking_methods import as_camera, methods
-    from holotorch.tracking.trials import conditions
-    from holotorch.tracking.world import World
+    from holotorch.experiments.tracking_benchmark.methods import as_camera, methods
+    from holotorch.tracking.simulation.trials import conditions
+    from holotorch.tracking.simulation.world import World
 
     world = World()
     trackers = methods(world)

@@ -6,5 +6,5 @@ cd "$(dirname "$0")/.."
 . scripts/setup.sh "[dev]"
 export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"  # threads of several processes wait for each other
 # By files, whose tests share what they set up; at most 8, as each process holds torch and the largest test's memory.
-[ $# -gt 0 ] || set -- -p no:benchmark --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+[ $# -gt 0 ] || set -- --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 exec .venv/bin/python -m pytest "$@"

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import torch
 
-from holotorch.experiments.track import run_tracking
+from holotorch.experiments.tracking.run import run_tracking
 from holotorch.tracking import Camera, Pose, Status
 
 SIZE = (48, 64)

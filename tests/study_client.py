@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from holotorch.experiments import perception_run
+from holotorch.experiments.perception.study import run as perception_run
 
 TINY = """
 seed: 1

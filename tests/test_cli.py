@@ -142,7 +142,7 @@ def test_a_full_disk_is_a_failure_without_a_traceback(monkeypatch, capsys):
     def full(*_):
         raise OSError(28, "No space left on device", "runs/a/arrays/phase.npy")
 
-    monkeypatch.setattr("holotorch.experiments.run.save_array", full)
+    monkeypatch.setattr("holotorch.experiments.pec.run.save_array", full)
     assert main(["run", CONFIG, *TINY]) == 1
     assert "runs/a/arrays/phase.npy: No space left on device" in capsys.readouterr().err
     (folder,) = Path("runs").iterdir()  # with all that could be written
@@ -155,7 +155,7 @@ def test_out_of_memory_is_a_failure_without_a_traceback(monkeypatch, capsys):
 
         return torch.empty(2**60, dtype=torch.float32)
 
-    monkeypatch.setattr("holotorch.experiments.pec.PECExperiment.solve", greedy)
+    monkeypatch.setattr("holotorch.experiments.pec.experiment.PECExperiment.solve", greedy)
     assert main(["run", CONFIG, *TINY]) == 1
     assert capsys.readouterr().err.splitlines()[-1] == "out of memory; use a smaller grid"
 

@@ -82,8 +82,8 @@ from holotorch.scene import SourceLayers, Volume
 from holotorch.scene.phantoms import shells
 from holotorch.scene.phases import smooth_phase
 from holotorch.tracking import Camera, Catheter, solve_pose
-from holotorch.tracking.alignment import tool_points
-from holotorch.tracking.boards import Chessboard
+from holotorch.tracking.camera.boards import Chessboard
+from holotorch.tracking.pose.alignment import tool_points
 
 pytestmark = pytest.mark.filterwarnings("ignore::holotorch.core.checks.SamplingWarning")
 

@@ -7,10 +7,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from holotorch.tracking.catheter import THESIS
-from holotorch.tracking.status import Pose, Status
-from holotorch.tracking.tracker import CatheterTracker
-from holotorch.tracking.world import Case, World
+from holotorch.tracking.detection.tracker import CatheterTracker
+from holotorch.tracking.pose.catheter import THESIS
+from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.simulation.world import Case, World
 
 SIZE = (540, 960)
 WORLD = World(SIZE)

@@ -15,6 +15,6 @@ def add_study(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -
 
 
 def _study(options: argparse.Namespace) -> int:
-    from holotorch.experiments.perception_run import run_study_server
+    from holotorch.experiments.perception.study.run import run_study_server
 
     return run_study_server(options.config, port=options.port, participant=options.participant, out=options.out)

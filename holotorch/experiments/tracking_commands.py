@@ -52,11 +52,11 @@ def _port(text: str) -> int:
 
 
 def _track(options: argparse.Namespace) -> int:
-    from holotorch.experiments.track import run_tracking
+    from holotorch.experiments.tracking.run import run_tracking
 
     source = options.source
     if source == "synthetic":
-        from holotorch.experiments.synthetic import write_synthetic
+        from holotorch.experiments.tracking.synthetic import write_synthetic
 
         source = str(write_synthetic(None, camera=options.camera, catheter=options.catheter))
         print(source)
@@ -77,7 +77,7 @@ def _track(options: argparse.Namespace) -> int:
 
 
 def _calibrate(options: argparse.Namespace) -> int:
-    from holotorch.experiments.calibrate import BOARD, calibrate_photographs, calibration_text
+    from holotorch.experiments.tracking.calibrate import BOARD, calibrate_photographs, calibration_text
 
     board = options.board or BOARD
     found, missing = calibrate_photographs(options.files, options.out, board)
@@ -90,15 +90,15 @@ def _stream(options: argparse.Namespace) -> int:
     if options.check or options.view:
         _listens(options)
     if options.check:
-        from holotorch.experiments.stream_check import check
+        from holotorch.experiments.streaming.check import check
 
         return OK if check(options.port) else FAILED
-    from holotorch.experiments import stream
+    from holotorch.experiments.streaming import stream
 
     if options.view:
         stream.view(options.port)
         return OK
-    from holotorch.experiments.track import live
+    from holotorch.experiments.tracking.run import live
     from holotorch.io.video import is_camera
 
     found = stream.stream(
@@ -118,7 +118,7 @@ def _stream(options: argparse.Namespace) -> int:
 
 def _listens(options: argparse.Namespace) -> None:
     """ConfigError for what the two ways of ``stream`` that send no poses of the user's would leave unused."""
-    from holotorch.experiments.errors import ConfigError
+    from holotorch.experiments.config.errors import ConfigError
 
     chosen = "--check" if options.check else "--view"
     unused = ["SOURCE"] if options.sources else []

@@ -18,7 +18,7 @@ from holotorch.hologram.layered import LayerHologram
 from holotorch.hologram.nodes import axial_range, choose_nodes
 from holotorch.hologram.raster import Raster, lit
 from holotorch.hologram.waves import AxialDesign, Waves
-from holotorch.optics.candidates import FINEST
+from holotorch.optics.free_space.padding import FINEST
 
 _GROUP = 16  # planes that are spread at once, by a matrix product per line instead of a pass for each
 

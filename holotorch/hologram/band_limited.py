@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from holotorch.hologram.cone import TAPER_BEGIN, taper
-from holotorch.optics.kernels import carrier, turns_phasor
+from holotorch.optics.free_space.kernels import carrier, turns_phasor
 
 _RULE = np.polynomial.legendre.leggauss(64)
 _CYCLES = 10.0  # of the integrand per 64 nodes of the rule, which is exact to rounding up to about 15

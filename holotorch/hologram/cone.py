@@ -23,9 +23,9 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import DEPTH
-from holotorch.optics.candidates import FINEST
-from holotorch.optics.geometry import lateral_spread
-from holotorch.optics.kernels import carrier, turns_phasor
+from holotorch.optics.free_space.geometry import lateral_spread
+from holotorch.optics.free_space.kernels import carrier, turns_phasor
+from holotorch.optics.free_space.padding import FINEST
 
 Cone = Literal["full", "box", "disc", "taper", "band"]
 TAPER_BEGIN = 0.7  # of the highest frequency

@@ -13,8 +13,8 @@ from holotorch.hologram.band_limited import point_spectrum
 from holotorch.hologram.cone import Cone, cone_samples, is_plain, spherical_wave, taper, taper_margin
 from holotorch.hologram.layered import LayerHologram
 from holotorch.hologram.raster import Raster, lit, span, strided_length
-from holotorch.optics.passage import passage
-from holotorch.optics.transfer import transfer_function
+from holotorch.optics.free_space.passage import passage
+from holotorch.optics.free_space.transfer import transfer_function
 
 TAPER_ERROR = 2e-7  # part of the wave that wraps around, or by which the taper may differ from the plain wave
 

@@ -13,7 +13,7 @@ from holotorch.hologram.axial import AxialHologram
 from holotorch.hologram.cone import Cone, check_scene, cone_samples, is_plain
 from holotorch.hologram.convolution import TAPER_ERROR, ConvolutionHologram
 from holotorch.hologram.raster import span
-from holotorch.optics.candidates import FINEST
+from holotorch.optics.free_space.padding import FINEST
 
 _ROUNDING = {torch.complex64: 5e-7, torch.complex128: 1e-12}
 # Arithmetic of a wave's sample in float64, measured against that of a transform; of passing over an array once.

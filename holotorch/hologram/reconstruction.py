@@ -11,7 +11,7 @@ from holotorch.core.fourier import fft2, ifft2
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import DEPTH
 from holotorch.hologram.cone import taper
-from holotorch.optics.propagate import propagate
+from holotorch.optics.planning.propagate import propagate
 
 
 def refocused(hologram: Tensor, grid: Grid, wavelength: float, depth: float, *, tolerance: float = 1e-3) -> Tensor:

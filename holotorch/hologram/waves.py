@@ -12,7 +12,7 @@ from holotorch.hologram.cone import taper
 from holotorch.hologram.guard import Axis, faded_out
 from holotorch.hologram.nodes import Nodes
 from holotorch.hologram.raster import Raster
-from holotorch.optics.kernels import turns_phasor
+from holotorch.optics.free_space.kernels import turns_phasor
 
 
 @dataclass(frozen=True)

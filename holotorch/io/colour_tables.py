@@ -40,7 +40,8 @@ def srgb_matrix(
 
     Args:
         wavelengths: In metres.
-        weights: Power of each, 1 by default, such as the weights of :class:`~holotorch.optics.spectrum.Spectrum` rules.
+        weights: Power of each, 1 by default, such as the weights of the rules of
+            :class:`~holotorch.optics.light.spectrum.Spectrum`.
         white: Intensities [K] of a picture's white, for a luminance of 1; all ones by default.
 
     The colours are those of the light itself: equal intensities of three sources show the white of equal energy of the

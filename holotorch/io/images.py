@@ -8,7 +8,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.io.bundled import BUNDLED_IMAGES, no_such_picture
-from holotorch.io.decoding import check_exr, decode
+from holotorch.io.formats.decoding import check_exr, decode
 
 _MEMORY = 56  # bytes of a pixel in load_image: three numbers of 8 bytes, their copy and the decoded ones
 SMALLEST_SIDE = 11  # pixels; the window of ssim
@@ -24,8 +24,8 @@ def load_image(source: str | Path) -> Tensor:
         maximum where that exceeds 1. Transparency shows black.
 
     Raises:
-        ValueError: No such picture, not decodable, beyond the memory limit of :mod:`holotorch.io.limits`, smaller than
-            11 px on a side, NaN, negative, or black throughout.
+        ValueError: No such picture, not decodable, beyond the memory limit of :mod:`holotorch.io.formats.limits`,
+            smaller than 11 px on a side, NaN, negative, or black throughout.
     """
     path = Path(source)
     if str(source) in BUNDLED_IMAGES:

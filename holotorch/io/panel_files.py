@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
-from holotorch.io.decoding import PNG, check_exr, decode
 from holotorch.io.files import write_bytes
+from holotorch.io.formats.decoding import PNG, check_exr, decode
 
 _KEY = "holotorch"  # of the PNG text chunk and the EXR attribute that hold the metadata as JSON
 

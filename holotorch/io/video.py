@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
-from holotorch.io.decoding import decode
+from holotorch.io.formats.decoding import decode
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _CODECS = {".mp4": "mp4v", ".avi": "MJPG"}

@@ -9,8 +9,8 @@ from numpy.typing import DTypeLike
 
 from holotorch.core import checks
 from holotorch.core.quantities import VOXEL
-from holotorch.io import array_files, medical, raw_volumes, slices, vti
-from holotorch.io.scan import Scan, existing, number_type, split_member, triple
+from holotorch.io.formats import array_files, medical, raw_volumes, slices, vti
+from holotorch.io.formats.scan import Scan, existing, number_type, split_member, triple
 from holotorch.scene.volume import Volume
 
 _READERS: dict[str, Callable[[Path], Scan]] = {
@@ -63,7 +63,7 @@ def load_volume(
     Raises:
         ValueError: No such file, a format or geometry that is not known or not stated, a file that does not have the
             size its header says, more than one number per voxel, compressed voxels beyond the memory limit of
-            :mod:`holotorch.io.limits`.
+            :mod:`holotorch.io.formats.limits`.
         ImportError: The library for the format is not installed; the message has the line that installs it.
     """
     file, member = split_member(path)

@@ -1,6 +1,18 @@
 """Propagation of light, lenses and eyes, and what a display shows."""
 
-from holotorch.optics.coherence import (
+from holotorch.optics.elements.converging import ConvergingFresnel, converging_fresnel
+from holotorch.optics.elements.lens import Aperture, Lens, lens_limit, lens_phase, pupil
+from holotorch.optics.elements.path import OpticalPath
+from holotorch.optics.elements.pixels import PixelShape, order_efficiency
+from holotorch.optics.free_space.cropped import CroppedKernel
+from holotorch.optics.free_space.depths import DepthStack
+from holotorch.optics.free_space.geometry import diffraction_angle, least_padding, unaliased_distance
+from holotorch.optics.free_space.kernels import angular_spectrum_kernel, carrier, fresnel_kernel
+from holotorch.optics.free_space.propagators import AngularSpectrum, Fraunhofer, Fresnel, SpectralFilter
+from holotorch.optics.free_space.rayleigh_sommerfeld import RayleighSommerfeld
+from holotorch.optics.free_space.resampled import ResampledKernel
+from holotorch.optics.free_space.zoomed import ZoomedFilter
+from holotorch.optics.light.coherence import (
     chromatic_defocus,
     depth_of_focus,
     optimum_fwhm,
@@ -8,31 +20,15 @@ from holotorch.optics.coherence import (
     predicted_contrast,
     samples_needed,
 )
-from holotorch.optics.colour import desaturated, linear_srgb
-from holotorch.optics.converging import ConvergingFresnel, converging_fresnel
-from holotorch.optics.cropped import CroppedKernel
-from holotorch.optics.depths import DepthStack
-from holotorch.optics.display import Display
-from holotorch.optics.elements import least_oversampling, through_elements
-from holotorch.optics.exposure import equal_power, exposed
-from holotorch.optics.eye import Eye, EyeLens, chromatic_refraction, zernike
-from holotorch.optics.followed import least_followed, neighbour_error, seen_light
-from holotorch.optics.geometry import diffraction_angle, least_padding, unaliased_distance
-from holotorch.optics.imaging import imaged, retinal_scale
-from holotorch.optics.incoherent import disc_source, incoherent_sum, tilted_wave
-from holotorch.optics.kernels import angular_spectrum_kernel, carrier, fresnel_kernel
-from holotorch.optics.lens import Aperture, Lens, lens_limit, lens_phase, pupil
-from holotorch.optics.path import OpticalPath
-from holotorch.optics.pixels import PixelShape, order_efficiency
-from holotorch.optics.plan import plan_propagation
-from holotorch.optics.propagate import Propagator, propagate
-from holotorch.optics.propagators import AngularSpectrum, Fraunhofer, Fresnel, SpectralFilter
-from holotorch.optics.rayleigh_sommerfeld import RayleighSommerfeld
-from holotorch.optics.resampled import ResampledKernel
-from holotorch.optics.retina import Retina, plan_retina, retinal_image
-from holotorch.optics.spectral import neighbours, spectral_image
-from holotorch.optics.spectrum import Spectrum
-from holotorch.optics.viewing import (
+from holotorch.optics.light.incoherent import disc_source, incoherent_sum, tilted_wave
+from holotorch.optics.light.spectral import neighbours, spectral_image
+from holotorch.optics.light.spectrum import Spectrum
+from holotorch.optics.light.wavelength_sampling import least_followed, neighbour_error, seen_light
+from holotorch.optics.picture import desaturated, equal_power, exposed, linear_srgb
+from holotorch.optics.planning.plan import plan_propagation
+from holotorch.optics.planning.propagate import Propagator, propagate
+from holotorch.optics.viewing.display import Display
+from holotorch.optics.viewing.display_geometry import (
     accommodation_range,
     eye_box,
     eyepiece_distance,
@@ -52,7 +48,10 @@ from holotorch.optics.viewing import (
     visible_half_width,
     volume_size,
 )
-from holotorch.optics.zoomed import ZoomedFilter
+from holotorch.optics.viewing.elementwise import least_oversampling, through_elements
+from holotorch.optics.viewing.eye import Eye, EyeLens, chromatic_refraction, zernike
+from holotorch.optics.viewing.imaging import imaged, retinal_scale
+from holotorch.optics.viewing.retina import Retina, plan_retina, retinal_image
 
 __all__ = [
     "AngularSpectrum",

@@ -1,17 +1,17 @@
 """Where the hidden tip of a catheter is, from one camera that sees its coloured bands."""
 
-from holotorch.tracking.alignment import headset_from_camera
-from holotorch.tracking.band_edges import fit_band_edges
-from holotorch.tracking.camera import Camera
-from holotorch.tracking.catheter import THESIS, Catheter
-from holotorch.tracking.channels import ChannelOrder, ambiguities
-from holotorch.tracking.pose import closed_form, solve_pose
-from holotorch.tracking.smoothing import OneEuro
-from holotorch.tracking.status import Pose, Status
-from holotorch.tracking.stream import PoseReceiver, PoseSender
-from holotorch.tracking.thesis import ThesisTracker
-from holotorch.tracking.tone import tone_curve
-from holotorch.tracking.tracker import CatheterTracker
+from holotorch.tracking.camera.camera import Camera
+from holotorch.tracking.camera.tone import tone_curve
+from holotorch.tracking.detection.channels import ChannelOrder, ambiguities
+from holotorch.tracking.detection.tracker import CatheterTracker
+from holotorch.tracking.pose.alignment import headset_from_camera
+from holotorch.tracking.pose.band_edges import fit_band_edges
+from holotorch.tracking.pose.catheter import THESIS, Catheter
+from holotorch.tracking.pose.pose import closed_form, solve_pose
+from holotorch.tracking.pose.smoothing import OneEuro
+from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.streaming.stream import PoseReceiver, PoseSender
+from holotorch.tracking.thesis.tracker import ThesisTracker
 
 __all__ = [
     "THESIS",

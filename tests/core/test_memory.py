@@ -28,8 +28,8 @@ from holotorch.optics import (
     spectral_image,
     through_elements,
 )
-from holotorch.optics.elements import ElementSampling
-from holotorch.optics.imaging import CollapseSampling, collapse_sampling, pupil_bands
+from holotorch.optics.viewing.elementwise import ElementSampling
+from holotorch.optics.viewing.imaging import CollapseSampling, collapse_sampling, pupil_bands
 
 pytestmark = pytest.mark.filterwarnings("ignore::holotorch.core.checks.SamplingWarning")
 WAVE, HUGE = 530e-9, Grid(10**7, 8e-6)

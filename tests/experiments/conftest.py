@@ -2,8 +2,9 @@ import pytest
 import torch
 from stand_in import CAMERA, SIZE, StandIn
 
-from holotorch.experiments import pictures, track_source
-from holotorch.experiments.config_tracking import save_camera, save_catheter
+from holotorch.experiments.runs import pictures
+from holotorch.experiments.tracking import source as track_source
+from holotorch.experiments.tracking.config import save_camera, save_catheter
 from holotorch.tracking import THESIS
 
 

@@ -8,8 +8,9 @@ import pytest
 import torch
 from oracles import boards as oracle
 
-from holotorch.experiments.calibrate import calibrate_photographs, calibration_text, parse_board
-from holotorch.experiments.config_tracking import (
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.tracking.calibrate import calibrate_photographs, calibration_text, parse_board
+from holotorch.experiments.tracking.config import (
     build_camera,
     build_catheter,
     build_headset,
@@ -20,11 +21,10 @@ from holotorch.experiments.config_tracking import (
     save_catheter,
     save_headset,
 )
-from holotorch.experiments.errors import ConfigError
 from holotorch.io.video import PICTURES
 from holotorch.tracking import THESIS, Camera
-from holotorch.tracking.alignment import headset_from_camera, tool_points
-from holotorch.tracking.boards import Charuco, Chessboard
+from holotorch.tracking.camera.boards import Charuco, Chessboard
+from holotorch.tracking.pose.alignment import headset_from_camera, tool_points
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "tracking"
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "calibration"

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from oracles import array
 
-from holotorch.experiments import run as run_module
-from holotorch.experiments.config import load_config
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.progress import Log
-from holotorch.experiments.run import run
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.execute import execute
+from holotorch.experiments.pec import run as run_module
+from holotorch.experiments.pec.progress import Log
+from holotorch.experiments.registry import load_config
 
 pytestmark = pytest.mark.usefixtures("tiny")
 CONFIG = Path(__file__).parents[2] / "configs" / "pec" / "capped.yaml"
@@ -24,7 +24,7 @@ WAVES = np.array([630e-9, 530e-9, 445e-9])
 def limited(folder: Path, *overrides: str, complete: bool = True):
     """A run's phases, their spread by the oracle, and the settings, numbers and number of taps that it saved."""
     settings = load_config(CONFIG, [*SMALL, *overrides])
-    assert run(settings, folder)[1] == complete
+    assert execute(settings, folder)[1] == complete
     phase = np.load(folder / "arrays" / "phase.npy").astype(np.float64)
     taps = json.loads((folder / "plan.json").read_text())["crosstalk"]["taps"]
     summary = json.loads((folder / ("summary.json" if complete else "interrupted.json")).read_text())
@@ -138,15 +138,15 @@ def test_four_frames_within_four_pi_form_a_photograph(tmp_path):
 def test_a_weight_on_the_heating_power_lowers_it(tmp_path):
     powers = []
     for weight in (0.0, 1.0):
-        run(load_config(CONFIG, [*SMALL, f"modulator.power_weight={weight}"]), tmp_path / str(weight))
+        execute(load_config(CONFIG, [*SMALL, f"modulator.power_weight={weight}"]), tmp_path / str(weight))
         numbers = json.loads((tmp_path / str(weight) / "summary.json").read_text())["methods"]["corrected"]
         powers.append(sum(numbers["heating_power_K_per_pixel"]))
     assert powers[1] < 0.9 * powers[0]
 
 
 def test_a_report_says_which_methods_show_fewer_frames(tmp_path):
-    run(load_config(CONFIG, [*SMALL, "frames=2", "report.baselines=[none]"]), tmp_path / "two")
+    execute(load_config(CONFIG, [*SMALL, "frames=2", "report.baselines=[none]"]), tmp_path / "two")
     page = (tmp_path / "two" / "report.html").read_text()
     assert "<th>frames</th>" in page and "compared with show a single frame" in page
-    run(load_config(CONFIG, [*SMALL, "report.baselines=[none]"]), tmp_path / "one")
+    execute(load_config(CONFIG, [*SMALL, "report.baselines=[none]"]), tmp_path / "one")
     assert "single frame" not in (tmp_path / "one" / "report.html").read_text()

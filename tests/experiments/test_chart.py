@@ -5,8 +5,8 @@ import csv
 import pytest
 
 from holotorch.cli import main
-from holotorch.experiments import chart_propagation
-from holotorch.experiments.chart import interleaved
+from holotorch.experiments.propagation import chart as chart_propagation
+from holotorch.experiments.timing import interleaved
 
 
 def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):

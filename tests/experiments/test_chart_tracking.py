@@ -7,17 +7,21 @@ import pytest
 import torch
 
 from holotorch.cli import main
-from holotorch.experiments import chart_tracking, tracking_bench, tracking_methods, tracking_picture, tracking_timing
-from holotorch.experiments.chart_tracking import Amount
-from holotorch.experiments.tracking_bound import Bounds, tip_bounds
-from holotorch.experiments.tracking_methods import BASE, COLD, FEWER, LITERAL, PRIOR, Answer, before, methods
-from holotorch.experiments.tracking_timing import KORNIA
+from holotorch.experiments.tracking_benchmark import bench as tracking_bench
+from holotorch.experiments.tracking_benchmark import chart as chart_tracking
+from holotorch.experiments.tracking_benchmark import methods as tracking_methods
+from holotorch.experiments.tracking_benchmark import picture as tracking_picture
+from holotorch.experiments.tracking_benchmark import timing as tracking_timing
+from holotorch.experiments.tracking_benchmark.bound import Bounds, tip_bounds
+from holotorch.experiments.tracking_benchmark.chart import Amount
+from holotorch.experiments.tracking_benchmark.methods import BASE, COLD, FEWER, LITERAL, PRIOR, Answer, before, methods
+from holotorch.experiments.tracking_benchmark.timing import KORNIA
 from holotorch.io.images import encode_png
-from holotorch.tracking.camera import Camera
-from holotorch.tracking.pose import solve_pose
-from holotorch.tracking.render import Look
-from holotorch.tracking.status import Pose, Status
-from holotorch.tracking.world import World, aimed
+from holotorch.tracking.camera.camera import Camera
+from holotorch.tracking.pose.pose import solve_pose
+from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.simulation.render import Look
+from holotorch.tracking.simulation.world import World, aimed
 
 TILT = math.radians(20)
 

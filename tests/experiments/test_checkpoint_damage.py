@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.saving import Checkpoint
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.runs.saving import Checkpoint
 
 STATE = {"x": torch.arange(1000, dtype=torch.float64) / 7, "active": torch.ones(3, dtype=torch.bool)}
 CONTENT = {"state": STATE, "rows": [["0", "1.5"]], "seconds": 1.25, "nothing": None, "empty": torch.empty(0)}

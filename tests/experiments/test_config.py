@@ -5,10 +5,10 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
-from holotorch.experiments.config import load_config
-from holotorch.experiments.config_eye import ObserverSettings
-from holotorch.experiments.config_volume import VolumeSettings
-from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.eye.config import ObserverSettings
+from holotorch.experiments.registry import load_config
+from holotorch.experiments.volume.config import VolumeSettings
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 KINDS = "pec, pec_study, volume, eye, perception_layout, perception_analysis"
@@ -275,7 +275,7 @@ def test_validation_needs_no_torch(tmp_path):
     import subprocess
 
     code = (
-        "import sys; from holotorch.experiments.config import load_config; load_config(sys.argv[1]);"
+        "import sys; from holotorch.experiments.registry import load_config; load_config(sys.argv[1]);"
         "assert not {'torch', 'cv2', 'kornia', 'matplotlib'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code, str(CONFIGS / "demo.yaml")], check=True, cwd=tmp_path)

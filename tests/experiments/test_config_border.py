@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from holotorch.cli import main
-from holotorch.experiments.config import load_config
-from holotorch.experiments.config_study import load_study
-from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.perception.study.config import load_study
+from holotorch.experiments.registry import load_config
 
 CORRECTION = """\
 experiment: pec

@@ -10,8 +10,13 @@ import pytest
 from tiny_runs import command, results
 
 from holotorch.cli import main
-from holotorch.experiments import eye, eye_run, pec_bench, perception_analysis_run, perception_layout, volume_run
-from holotorch.experiments.progress import Log
+from holotorch.experiments.eye import experiment as eye
+from holotorch.experiments.eye import run as eye_run
+from holotorch.experiments.pec.progress import Log
+from holotorch.experiments.pec_study import bench as pec_bench
+from holotorch.experiments.perception.analysis import run as perception_analysis_run
+from holotorch.experiments.perception.layout import run as perception_layout
+from holotorch.experiments.volume import run as volume_run
 from holotorch.io import files
 
 pytestmark = pytest.mark.usefixtures("tiny")
@@ -205,7 +210,7 @@ def test_a_signal_before_a_run_goes_on_says_that_it_is_still_there(tmp_path, mon
         assert main(command("pec", folder)) == 130
     capsys.readouterr()
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    monkeypatch.setattr("holotorch.experiments.run.build", lambda _: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr("holotorch.experiments.pec.experiment.build", lambda _: signal.raise_signal(signal.SIGINT))
     for words in (["resume", str(folder)], command("pec", folder)):
         assert main(words) == 130
         assert capsys.readouterr().err.strip().endswith(f"start it again with: holotorch resume {folder}")

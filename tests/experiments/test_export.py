@@ -12,13 +12,12 @@ import torch
 from oracles import panel as oracle
 
 from holotorch.cli import main
-from holotorch.experiments.config import load_config
-from holotorch.experiments.config_panel import build_panel, load_panel
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.export import export_slm, resimulate
-from holotorch.experiments.export_source import load_wanted
-from holotorch.experiments.run import run
-from holotorch.experiments.volume_run import run_volume
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.execute import execute
+from holotorch.experiments.panel.config import build_panel, load_panel
+from holotorch.experiments.panel.export import export_slm, resimulate
+from holotorch.experiments.panel.source import load_wanted
+from holotorch.experiments.registry import load_config
 from holotorch.io.panel_files import read_levels, read_phases
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -45,14 +44,14 @@ def by_others(path: Path) -> np.ndarray:
 def pec(tiny, tmp_path_factory):
     folder = tmp_path_factory.mktemp("pec") / "a"
     overrides = ["grid.shape=[32,24]", "grid.pitch=9 um", "solver.max_steps=12", "target.image=coffee", "frames=2"]
-    assert run(load_config(CONFIGS / "pec" / "fourier.yaml", [*overrides, "multiplexing=independent"]), folder)[1]
+    assert execute(load_config(CONFIGS / "pec" / "fourier.yaml", [*overrides, "multiplexing=independent"]), folder)[1]
     return folder
 
 
 @pytest.fixture(scope="module")
 def volume(tiny, tmp_path_factory):
     folder = tmp_path_factory.mktemp("volume") / "a"
-    assert run_volume(load_config(CONFIGS / "volume" / "tooth.yaml", VOLUME), folder, "a")[1]
+    assert execute(load_config(CONFIGS / "volume" / "tooth.yaml", VOLUME), folder, "a")[1]
     return folder
 
 
@@ -286,7 +285,7 @@ def test_a_failed_export_leaves_no_files(pec, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device", "frame")
 
-    monkeypatch.setattr("holotorch.experiments.export.write_levels", full)
+    monkeypatch.setattr("holotorch.experiments.panel.export.write_levels", full)
     with pytest.raises(OSError, match="No space left"):
         export_slm(pec, PANEL, tmp_path / "a", overrides=SMALL)
     assert not (tmp_path / "a").exists()

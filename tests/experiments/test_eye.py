@@ -10,15 +10,17 @@ import pytest
 import torch
 
 from holotorch.cli import main
-from holotorch.experiments import eye as eye_module
-from holotorch.experiments import eye_plan, pictures
-from holotorch.experiments.config import load_config
-from holotorch.experiments.config_eye import ObserverSettings
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.eye import observer
-from holotorch.experiments.eye_plan import plan, plan_text
-from holotorch.experiments.eye_run import run_observer, scene_settings
-from holotorch.optics import spectral
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.execute import execute
+from holotorch.experiments.eye import experiment as eye_module
+from holotorch.experiments.eye import plan as eye_plan
+from holotorch.experiments.eye.config import ObserverSettings
+from holotorch.experiments.eye.experiment import observer
+from holotorch.experiments.eye.plan import plan_text, plan_values
+from holotorch.experiments.eye.run import scene_settings
+from holotorch.experiments.registry import load_config
+from holotorch.experiments.runs import pictures
+from holotorch.optics.light import spectral
 
 CONFIG = Path(__file__).parents[2] / "configs" / "eye" / "teapot.yaml"
 SCENE = (
@@ -44,7 +46,7 @@ def settings(*overrides: str):
 def test_a_run_shows_less_speckle_under_wider_sources(tmp_path, monkeypatch):
     captions = []
     monkeypatch.setattr(pictures, "comparison", lambda images, words: captions.extend(words) or b"")
-    folder, complete = run_observer(settings(), tmp_path / "a", "a")
+    folder, complete = execute(settings(), tmp_path / "a", "a")
     names = {path.name for path in folder.iterdir()}
     assert complete and names == {
         *("arrays", "config.yaml", "env.json", "images", "plan.json", "report.html", "summary.json", "table.csv")
@@ -117,7 +119,7 @@ def test_the_eye_sees_sharply_where_it_is_focused():
 
 def test_the_plan_says_how_the_scene_is_seen():
     found = observer(settings(), scene_settings(settings()))
-    values = plan(found)
+    values = plan_values(found)
     text = plan_text(found, values)
     assert "synthetic: a phantom was asked for" in text and "laser: " in text
     assert values["accommodation_mm"][0] == pytest.approx(120, rel=1e-6)  # the middle, where the display puts it
@@ -142,7 +144,7 @@ def test_the_run_goes_the_way_that_its_plan_says(tolerance, method, tmp_path, mo
             spectral, way, lambda *words, name=name, **more: called.append(name) or collapse(*words, **more)
         )
     given = load_config(CONFIG, [*TINY, f"tolerance={tolerance}"])
-    folder, _ = run_observer(given, tmp_path / "a", "a")
+    folder, _ = execute(given, tmp_path / "a", "a")
     planned = json.loads((folder / "plan.json").read_text())
     assert [way["method"] for way in planned["retina"]] == [method] and planned["tolerance"] == tolerance
     assert set(called) == {method} and len(called) == planned["images"]
@@ -153,7 +155,7 @@ def test_what_observers_see_is_put_on_one_page(tmp_path, tiny):
     names = ("one", "two")
     for name, source in zip(names, ("laser", "led"), strict=True):
         words = [*TINY, f"light={{sources: [{source}]}}", "tolerance=0.1"]
-        run_observer(load_config(CONFIG, words), tmp_path / name, name)
+        execute(load_config(CONFIG, words), tmp_path / name, name)
     assert main(["report", *(str(tmp_path / name) for name in names), "--out", str(tmp_path / "both.html")]) == 0
     page = (tmp_path / "both.html").read_text()
     for words in (
@@ -178,7 +180,7 @@ def test_both_ways_show_the_same_and_the_plan_tells_their_costs():
     ways = [found.retina(2e-3) for found in (short, long)]
     assert [way.method for way in ways] == ["collapse", "elements"]
     assert error < sum(way.predicted_error for way in ways)
-    predicted = [plan(found)["predicted_seconds"] for found in (short, long)]
+    predicted = [plan_values(found)["predicted_seconds"] for found in (short, long)]
     assert predicted[1] > 2 * predicted[0]
 
 
@@ -212,7 +214,7 @@ def test_interrupted_runs_keep_what_was_seen(tmp_path, monkeypatch):
         return original(self, hologram, source, depth)
 
     monkeypatch.setattr(eye_module.Observer, "seen", pressed)
-    folder, complete = run_observer(settings("seeds=2"), tmp_path / "a", "a")
+    folder, complete = execute(settings("seeds=2"), tmp_path / "a", "a")
     saved = json.loads((folder / "interrupted.json").read_text())
     assert not complete and saved["realisations"] == 1 and not (folder / "summary.json").exists()
 

@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from holotorch.experiments.config import load_config
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.eye import observer
-from holotorch.experiments.eye_plan import plan, plan_text
-from holotorch.experiments.eye_run import scene_settings
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.eye.experiment import observer
+from holotorch.experiments.eye.plan import plan_text, plan_values
+from holotorch.experiments.eye.run import scene_settings
+from holotorch.experiments.registry import load_config
 from holotorch.metrics import sharpness, speckle_contrast
 
 CONFIG = Path(__file__).parents[2] / "configs" / "eye" / "teapot.yaml"
@@ -47,10 +47,10 @@ def test_directions_are_half_a_spot_apart():
     assert sum(shares) == pytest.approx(1, rel=1e-12) and max(y * y + x * x for y, x in tilts) < 2e-3**2
     assert 12e-3 * 2e-3 / rings <= wave / (2 * eye.aperture(12e-3)) < 12e-3 * 2e-3 / (rings - 1)
     assert looking(0.0).points(wave, 12e-3) == ([(0.0, 0.0)], [1.0])
-    values = plan(eye)
+    values = plan_values(eye)
     assert values["directions"] == [len(eye.points(each, 12e-3)[0]) for each in eye.scene.settings.wavelengths]
     assert "directions" in plan_text(eye, values)
-    assert values["images"] > 4 * plan(looking(0.0))["images"] / 3
+    assert values["images"] > 4 * plan_values(looking(0.0))["images"] / 3
 
 
 def test_an_extent_of_too_many_directions_is_refused():

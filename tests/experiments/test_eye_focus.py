@@ -8,11 +8,12 @@ import pytest
 import torch
 
 from holotorch.cli import main
-from holotorch.experiments.config import load_config
-from holotorch.experiments.config_eye import SweepSettings
-from holotorch.experiments.eye import observer
-from holotorch.experiments.eye_focus import focus_sweep, in_words
-from holotorch.experiments.eye_run import run_observer, scene_settings
+from holotorch.experiments.execute import execute
+from holotorch.experiments.eye.config import SweepSettings
+from holotorch.experiments.eye.experiment import observer
+from holotorch.experiments.eye.focus import focus_sweep, in_words
+from holotorch.experiments.eye.run import scene_settings
+from holotorch.experiments.registry import load_config
 
 CONFIG = Path(__file__).parents[2] / "configs" / "eye" / "focus.yaml"
 BONSAI = Path(__file__).parents[3] / "shared" / "data" / "volumes" / "bonsai.nrrd"
@@ -53,7 +54,7 @@ def test_a_run_with_a_sweep_writes_its_table_and_picture(tmp_path, capsys):
     small = PHANTOM.replace("256", "128").replace("6 mm", "8 mm")
     sweep = "sweep={bands: 2, steps: 5, realisations: 1}"
     settings = load_config(CONFIG, [small, "focus=[8 mm]", "light={sources: [laser]}", sweep])
-    folder, complete = run_observer(settings, tmp_path / "a", "a")
+    folder, complete = execute(settings, tmp_path / "a", "a")
     with open(folder / "focus.csv", newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert complete and rows and all(math.isfinite(float(row["depth_of_focus_mm"])) for row in rows)
@@ -62,10 +63,10 @@ def test_a_run_with_a_sweep_writes_its_table_and_picture(tmp_path, capsys):
 
 
 def test_a_scene_without_a_surface_is_a_mistake_of_the_sweep_before_the_work(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("holotorch.experiments.eye.Observer.seen", lambda *_: pytest.fail("looked already"))
+    monkeypatch.setattr("holotorch.experiments.eye.experiment.Observer.seen", lambda *_: pytest.fail("looked already"))
     small = PHANTOM.replace("256", "64")
     words = [small, "focus=[6 mm]", "sweep={bands: 2, steps: 5, realisations: 1}", "light={sources: [laser]}"]
-    monkeypatch.setattr("holotorch.experiments.eye_focus._SEEN", 1.1)  # which no ray is opaque to
+    monkeypatch.setattr("holotorch.experiments.eye.focus._SEEN", 1.1)  # which no ray is opaque to
     assert main(["run", str(CONFIG), *words, "--out", str(tmp_path / "a")]) == 2
     error = capsys.readouterr().err
     assert "sweep: a sweep needs a surface: 0 of the rays" in error and "leave it out" in error

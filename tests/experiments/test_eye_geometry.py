@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from holotorch.experiments.config import load_config
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.eye import observer
-from holotorch.experiments.eye_geometry import draw, geometry, in_words
-from holotorch.experiments.eye_run import scene_settings
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.eye.experiment import observer
+from holotorch.experiments.eye.geometry import draw, geometry, in_words
+from holotorch.experiments.eye.run import scene_settings
+from holotorch.experiments.registry import load_config
 
 CONFIG = Path(__file__).parents[2] / "configs" / "eye" / "tooth.yaml"
 SCENE = (

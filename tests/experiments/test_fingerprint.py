@@ -13,11 +13,11 @@ import torch
 import yaml
 
 from holotorch.cli import main
-from holotorch.experiments import fingerprint as module
-from holotorch.experiments import volume_run
-from holotorch.experiments.config import load_config
-from holotorch.experiments.fingerprint import differences, fingerprint
-from holotorch.experiments.progress import Log
+from holotorch.experiments.pec.progress import Log
+from holotorch.experiments.registry import load_config
+from holotorch.experiments.runs import fingerprint as module
+from holotorch.experiments.runs.fingerprint import differences, fingerprint
+from holotorch.experiments.volume import run as volume_run
 
 pytestmark = pytest.mark.usefixtures("tiny")
 CONFIGS = Path(__file__).parents[2] / "configs"

@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from holotorch.cli import main
-from holotorch.experiments import progress, volume_run
-from holotorch.experiments import run as run_module
-from holotorch.experiments.progress import Log
+from holotorch.experiments.pec import progress
+from holotorch.experiments.pec import run as run_module
+from holotorch.experiments.pec.progress import Log
+from holotorch.experiments.volume import run as volume_run
 from holotorch.io import files
 
 pytestmark = pytest.mark.usefixtures("tiny")
@@ -174,7 +175,9 @@ def test_a_real_disk_that_fills_up(tmp_path, whole):
     if shutil.which("mount") is None or subprocess.run(["mount", *words, disk], capture_output=True).returncode:
         pytest.skip("no file system can be mounted here")
     try:
-        code = "from holotorch.experiments import progress; progress._SAVE_EVERY = -1.0; import sys, holotorch.cli; "
+        code = (
+            "from holotorch.experiments.pec import progress; progress._SAVE_EVERY = -1.0; import sys, holotorch.cli; "
+        )
         start = [sys.executable, "-c", code + "sys.exit(holotorch.cli.main())"]
         done = subprocess.run([*start, *command("pec", disk / "a")], capture_output=True, text=True)
         assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr

@@ -3,14 +3,14 @@
 import json
 from pathlib import Path
 
-from holotorch.experiments.config import load_config
-from holotorch.experiments.run import run
+from holotorch.experiments.execute import execute
+from holotorch.experiments.registry import load_config
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
 
 def methods(tmp_path, config: str, *overrides: str):
-    assert run(load_config(CONFIGS / config, list(overrides)), tmp_path / "a")[1]
+    assert execute(load_config(CONFIGS / config, list(overrides)), tmp_path / "a")[1]
     return json.loads((tmp_path / "a" / "summary.json").read_text())["methods"]
 
 

@@ -5,22 +5,23 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from holotorch.experiments.config_analysis import (
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.execute import execute
+from holotorch.experiments.perception.analysis.config import (
     AnalysisSettings,
     CleaningSettings,
     SimulationSettings,
     TargetTimeSettings,
 )
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.perception_analysis import (
+from holotorch.experiments.perception.analysis.curves import (
     Responses,
     equal_efficiency,
     fit_curves,
     perception_times,
     read_responses,
 )
-from holotorch.experiments.perception_analysis_run import find, on_frames, run_analysis
-from holotorch.experiments.perception_simulation import simulate
+from holotorch.experiments.perception.analysis.run import find, on_frames
+from holotorch.experiments.perception.analysis.simulation import simulate
 
 RULE = CleaningSettings()
 SIZES = (5.0, 8, 11, 14, 17, 20, 23, 26)
@@ -244,12 +245,12 @@ def test_a_run_of_logs(tmp_path):
             for k, (e, s) in enumerate(cells, 1)
         ]
         write(tmp_path / f"participant-{person}.jsonl", rows, person)
-    folder, _ = run_analysis(settings(logs=[str(tmp_path)], shown=2), tmp_path / "run", "analysis")
+    folder, _ = execute(settings(logs=[str(tmp_path)], shown=2), tmp_path / "run", "analysis")
     summary = json.loads((folder / "summary.json").read_text())
     (row,) = summary["rows"]
     assert not summary["simulated"] and "true_alpha" not in row
     assert (row["alpha"], row["beta"]) == pytest.approx((0.5, -15))
     assert row["alpha_low"] is None  # two people
     with pytest.raises(ConfigError, match="shown: no participant 9; there are 1, 2"):
-        run_analysis(settings(logs=[str(tmp_path)], shown=9), tmp_path / "other", "analysis")
+        execute(settings(logs=[str(tmp_path)], shown=9), tmp_path / "other", "analysis")
     assert not (tmp_path / "other").exists()

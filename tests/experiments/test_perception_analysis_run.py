@@ -9,9 +9,9 @@ import pytest
 import yaml
 from scipy import stats
 
-from holotorch.experiments.config_analysis import AnalysisSettings
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.perception_analysis_run import run_analysis
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.execute import execute
+from holotorch.experiments.perception.analysis.config import AnalysisSettings
 
 
 def settings(**changes):
@@ -29,7 +29,7 @@ def test_a_run_of_simulated_people_fills_its_folder(tmp_path, capsys):
         targets=[{"size_deg": 5, "eccentricity_deg": 10}, {"seconds": 0.45}],
         power={"slopes": [0.4], "participants": [6], "studies": 10, "resamples": 100},
     )
-    folder, complete = run_analysis(chosen, tmp_path / "run", "analysis")
+    folder, complete = execute(chosen, tmp_path / "run", "analysis")
     assert complete and folder == tmp_path / "run"
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     pictures = {"time_surface", "time_map", "participant", "time_slices", "scale_lines", "power"}
@@ -67,7 +67,7 @@ def test_without_statsmodels_the_rest_runs_and_says_what_is_left_out(tmp_path, c
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     few = {"simulation": {"participants": 6}, "targets": [{"seconds": 0.45}], "resamples": 100}
     given = AnalysisSettings.model_validate({"experiment": "perception_analysis", **few})
-    folder, complete = run_analysis(given, tmp_path / "a", "a")
+    folder, complete = execute(given, tmp_path / "a", "a")
     words = "repeated measures and the mixed model, which need statsmodels: pip install 'holotorch[stats]'"
     assert complete and words in capsys.readouterr().out
     assert words in html.unescape((folder / "report.html").read_text())
@@ -75,13 +75,13 @@ def test_without_statsmodels_the_rest_runs_and_says_what_is_left_out(tmp_path, c
     assert not summary["repeated_measures"] and "repeated_f" not in summary["rows"][0]
     # Asked for in so many words, it is refused; not wanted, nothing is missed.
     with pytest.raises(ConfigError, match=r"statsmodels is missing: pip install 'holotorch\[stats\]', or leave it out"):
-        run_analysis(settings(repeated_measures=True, **few), tmp_path / "b", "b")
-    run_analysis(settings(repeated_measures=False, **few), tmp_path / "c", "c")
+        execute(settings(repeated_measures=True, **few), tmp_path / "b", "b")
+    execute(settings(repeated_measures=False, **few), tmp_path / "c", "c")
     assert "Left out" not in capsys.readouterr().out
 
 
 def test_a_power_study_that_cannot_be_is_refused_before_the_folder(tmp_path):
     chosen = settings(power={"slopes": [1.5], "participants": [6]})
     with pytest.raises(ConfigError, match="power.slopes: 1.5: expected alpha and beta with sizes above zero"):
-        run_analysis(chosen, tmp_path / "run", "analysis")
+        execute(chosen, tmp_path / "run", "analysis")
     assert not (tmp_path / "run").exists()

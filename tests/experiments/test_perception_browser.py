@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 from study_client import Client
 
-from holotorch.experiments.config_study import CurvedSettings, FlatSettings, build_screen, load_study
-from holotorch.experiments.perception_log import read_log
+from holotorch.experiments.perception.study.config import CurvedSettings, FlatSettings, build_screen, load_study
+from holotorch.experiments.perception.study.log import read_log
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 PARTICIPANT = Path(__file__).with_name("perception_participant.js")
@@ -32,7 +32,7 @@ timing: {{wait_s: [0.04, 0.08], show_s: 0.25, feedback_s: 0.04}}
 SERVE = """
 import sys
 from pathlib import Path
-from holotorch.experiments.perception_run import run_study_server
+from holotorch.experiments.perception.study.run import run_study_server
 config, port, out, script = sys.argv[1:]
 sys.exit(run_study_server(config, port=int(port), participant=2, out=Path(out), script=Path(script).read_text()))
 """

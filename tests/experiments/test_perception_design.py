@@ -3,7 +3,7 @@ from collections import Counter
 
 import pytest
 
-from holotorch.experiments.perception_design import THESIS_CONDITIONS, Design, make_design, round_orders, williams
+from holotorch.experiments.perception.study.design import THESIS_CONDITIONS, Design, make_design, round_orders, williams
 
 
 def test_the_thesis_has_nine_eccentricities_and_52_conditions():

@@ -6,11 +6,11 @@ import pytest
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from holotorch.experiments import perception_figures as figures
-from holotorch.experiments.config_analysis import CleaningSettings, SimulationSettings
-from holotorch.experiments.perception_analysis import Times, equal_efficiency, fit_curves, perception_times
-from holotorch.experiments.perception_simulation import simulate
-from holotorch.experiments.perception_statistics import fit_line
+from holotorch.experiments.perception.analysis import figures
+from holotorch.experiments.perception.analysis.config import CleaningSettings, SimulationSettings
+from holotorch.experiments.perception.analysis.curves import Times, equal_efficiency, fit_curves, perception_times
+from holotorch.experiments.perception.analysis.simulation import simulate
+from holotorch.experiments.perception.analysis.statistics import fit_line
 
 POWER = [{"alpha": 0.2, "participants": n, "power": 0.5, "error": 0.1} for n in (8, 16)]
 

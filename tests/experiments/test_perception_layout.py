@@ -11,12 +11,12 @@ from skimage.metrics import structural_similarity
 
 from holotorch.cli import _parser, main
 from holotorch.correction import PECProblem
-from holotorch.experiments import perception_layout
-from holotorch.experiments.config import load_config
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.pec import build
-from holotorch.experiments.perception_weight import weight_map, zone_scores
-from holotorch.experiments.run import run
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.execute import execute
+from holotorch.experiments.pec.experiment import build
+from holotorch.experiments.pec.weight import weight_map, zone_scores
+from holotorch.experiments.perception.layout import run as perception_layout
+from holotorch.experiments.registry import load_config
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 LAYOUT, PEC = CONFIGS / "perception" / "layout.yaml", CONFIGS / "pec" / "peripheral.yaml"
@@ -55,7 +55,7 @@ def test_extrapolation_and_small_lines_are_flagged(capsys):
     assert main(["check", str(LAYOUT), "items=[{icon: boat, azimuth_deg: 10}]"]) == 0
     assert "As soon as 5 deg at 10 deg: 0 icons on the line, 1 keep their size, none" in capsys.readouterr().out
     with pytest.raises(ConfigError, match=r"targets\.0: Table 2\.2 has no target of 7"):
-        from holotorch.experiments.perception_layout import scaled
+        from holotorch.experiments.perception.layout.run import scaled
 
         scaled(load_config(LAYOUT, ["targets=[{size_deg: 7, eccentricity_deg: 10}]"]))
     with pytest.raises(ConfigError, match=r"items\.0\.azimuth_deg.*180"):
@@ -143,7 +143,7 @@ def test_zones_are_scored_by_their_own_pixels():
 
 def test_error_moves_from_the_middle_to_the_far_periphery(tmp_path, tiny):
     words = ["grid.shape=[32,64]", "solver.max_steps=80", "report.baselines=[unweighted]"]
-    folder, complete = run(load_config(PEC, words), tmp_path / "a")
+    folder, complete = execute(load_config(PEC, words), tmp_path / "a")
     assert complete
     methods = read(folder)["methods"]
     weighted, alike = ({row["zone"]: row for row in methods[name]["zones"]} for name in ("corrected", "unweighted"))

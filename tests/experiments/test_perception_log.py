@@ -6,9 +6,9 @@ import sys
 
 import pytest
 
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.perception_frames import quantisation
-from holotorch.experiments.perception_log import TrialLog, read_log, read_logs
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.perception.study.frames import quantisation
+from holotorch.experiments.perception.study.log import TrialLog, read_log, read_logs
 
 HEADER = {"participant": 4, "design": "abc", "screen": {"shape": (600, 800)}}
 
@@ -60,7 +60,7 @@ def test_kill_9_loses_no_trial_that_was_appended(path):
     code = """
 import json, os, sys
 from pathlib import Path
-from holotorch.experiments.perception_log import TrialLog
+from holotorch.experiments.perception.study.log import TrialLog
 log = TrialLog(Path(sys.argv[1]), json.loads(sys.argv[2]))
 for number in range(1, 10**6):
     log.append(json.loads(sys.argv[3]) | {"trial": number})

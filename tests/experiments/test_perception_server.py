@@ -12,13 +12,15 @@ import pytest
 from study_client import TINY, Client, Runner, closed
 
 from holotorch.cli import main
-from holotorch.experiments import perception_log, perception_run, perception_server
-from holotorch.experiments.config_study import beyond_screen, build_screen, load_study
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.perception_design import THESIS_CONDITIONS, Design
-from holotorch.experiments.perception_log import read_log
-from holotorch.experiments.perception_run import run_study_server
-from holotorch.experiments.perception_server import page
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.perception.study import log as perception_log
+from holotorch.experiments.perception.study import run as perception_run
+from holotorch.experiments.perception.study import server as perception_server
+from holotorch.experiments.perception.study.config import beyond_screen, build_screen, load_study
+from holotorch.experiments.perception.study.design import THESIS_CONDITIONS, Design
+from holotorch.experiments.perception.study.log import read_log
+from holotorch.experiments.perception.study.run import run_study_server
+from holotorch.experiments.perception.study.server import page
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / "configs" / "perception" / "study.yaml"

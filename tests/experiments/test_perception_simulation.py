@@ -5,17 +5,17 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from holotorch.experiments.config_analysis import (
+from holotorch.experiments.perception.analysis.config import (
     AnalysisSettings,
     CleaningSettings,
     PowerSettings,
     SimulationSettings,
     TargetTimeSettings,
 )
-from holotorch.experiments.perception_analysis import equal_efficiency, fit_curves, perception_times
-from holotorch.experiments.perception_power import needed, power_rows, with_slope
-from holotorch.experiments.perception_simulation import inner_seconds, simulate, true_line
-from holotorch.experiments.perception_statistics import fit_line, one_way
+from holotorch.experiments.perception.analysis.curves import equal_efficiency, fit_curves, perception_times
+from holotorch.experiments.perception.analysis.power import needed, power_rows, with_slope
+from holotorch.experiments.perception.analysis.simulation import inner_seconds, simulate, true_line
+from holotorch.experiments.perception.analysis.statistics import fit_line, one_way
 
 EXACT = SimulationSettings(
     participants=4,

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from oracles import anova
 
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.perception_statistics import fit_line, mixed_model, one_way, repeated_measures
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.perception.analysis.statistics import fit_line, mixed_model, one_way, repeated_measures
 from holotorch.perception.scale import EqualEfficiencyScale
 
 # Six participants, three places. By hand: means 5, 9, 10 and 8 in all; between 6 (9 + 1 + 4) = 84, within 16 + 24 + 28

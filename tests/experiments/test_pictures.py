@@ -9,9 +9,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from holotorch import Grid
 from holotorch.correction import LBFGS, PECProblem, limited, run_stages
-from holotorch.experiments import pictures
-from holotorch.experiments.config import load_config
-from holotorch.experiments.perception_weight import eccentricities, weight_map
+from holotorch.experiments.pec.weight import eccentricities, weight_map
+from holotorch.experiments.registry import load_config
+from holotorch.experiments.runs import pictures
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import Fraunhofer
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from holotorch.cli import main
-from holotorch.experiments.config import load_config
-from holotorch.experiments.errors import ConfigError
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.execute import execute
+from holotorch.experiments.registry import load_config
 from holotorch.experiments.report import write_report
-from holotorch.experiments.run import run
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 VOID = {"meta", "img", "br"}
@@ -36,7 +36,7 @@ def folders(tmp_path_factory):
     base = tmp_path_factory.mktemp("runs")
     words = ["grid.shape=[16,16]", "solver.max_steps=3"]
     for name, config in (("first <b>", "fourier"), ("second", "fresnel")):
-        run(load_config(CONFIGS / "pec" / f"{config}.yaml", words), base / name)
+        execute(load_config(CONFIGS / "pec" / f"{config}.yaml", words), base / name)
     return [base / "first <b>", base / "second"]
 
 

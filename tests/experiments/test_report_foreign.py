@@ -9,13 +9,12 @@ from typing import Any
 import pytest
 from foreign import ATTACK, foreign
 
-from holotorch.experiments.config import load_config
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.eye_run import run_observer
+from holotorch.cli import main
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.execute import execute
+from holotorch.experiments.registry import load_config
 from holotorch.experiments.report import write_report
-from holotorch.experiments.run import run
-from holotorch.experiments.track_report import write_page
-from holotorch.experiments.volume_run import run_volume
+from holotorch.experiments.tracking.report import write_page
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 SCENE = "hologram={shape: [32, 32], pitch: 3.74 um, distance: 5 mm, depths: 4}"
@@ -31,10 +30,10 @@ EYE = [
 def runs(tmp_path_factory, tiny) -> dict[str, Path]:
     base = tmp_path_factory.mktemp("runs")
     words = ["grid.shape=[16,16]", "solver.max_steps=2", "report.metrics=[psnr]"]
-    run(load_config(CONFIGS / "pec" / "fourier.yaml", words), base / "pec")
+    execute(load_config(CONFIGS / "pec" / "fourier.yaml", words), base / "pec")
     volume = [SCENE, "volume.samples=8", "report.seeds=1"]
-    run_volume(load_config(CONFIGS / "demo_volume.yaml", volume), base / "volume", "volume")
-    run_observer(load_config(CONFIGS / "eye" / "teapot.yaml", EYE), base / "eye", "eye")
+    execute(load_config(CONFIGS / "demo_volume.yaml", volume), base / "volume", "volume")
+    execute(load_config(CONFIGS / "eye" / "teapot.yaml", EYE), base / "eye", "eye")
     return {kind: base / kind for kind in ("pec", "volume", "eye")}
 
 
@@ -74,6 +73,15 @@ def test_no_file_of_a_run_writes_into_its_page(runs, tmp_path, kind):
     assert foreign(page.read_text()) == 0
 
 
+def test_half_a_surrogate_pair_is_shown_as_a_question_mark(runs, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(runs["pec"], folder)
+    env = json.loads((folder / "env.json").read_text())
+    (folder / "env.json").write_text(json.dumps(env | {"machine": "half \ud800 pair"}))
+    assert main(["report", str(folder)]) == 0
+    assert "half ? pair" in (folder / "report.html").read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("value", [10**400, "deep"])
 def test_numbers_beyond_all_are_damage(runs, tmp_path, value):
     folder = shutil.copytree(runs["pec"], tmp_path / "run", ignore=shutil.ignore_patterns("*.png", "*.npy"))
@@ -85,8 +93,8 @@ def test_numbers_beyond_all_are_damage(runs, tmp_path, value):
 
 
 def test_no_source_of_a_track_writes_into_its_page(tmp_path, monkeypatch):
-    monkeypatch.setattr("holotorch.experiments.track_report.drawn_track", lambda _: None)
-    monkeypatch.setattr("holotorch.experiments.track_report._png", lambda _: b"")
+    monkeypatch.setattr("holotorch.experiments.tracking.report.drawn_track", lambda _: None)
+    monkeypatch.setattr("holotorch.experiments.tracking.report._png", lambda _: b"")
     (tmp_path / "images").mkdir()
     summary = {
         "source": ATTACK,

@@ -13,12 +13,12 @@ import pytest
 import torch
 
 from holotorch.cli import main
-from holotorch.experiments import run as run_module
-from holotorch.experiments.config import load_config
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.progress import Log
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.execute import execute
+from holotorch.experiments.pec import run as run_module
+from holotorch.experiments.pec.progress import Log
+from holotorch.experiments.registry import load_config
 from holotorch.experiments.report import write_report
-from holotorch.experiments.run import run
 
 pytestmark = pytest.mark.usefixtures("tiny")
 CONFIG = Path(__file__).parents[2] / "configs" / "pec" / "fourier.yaml"
@@ -48,7 +48,7 @@ def press_in(monkeypatch, step: int | None) -> None:
 
 def stopped(monkeypatch, folder: Path, step: int, *overrides: str) -> Path:
     press_in(monkeypatch, step)
-    assert not run(settings(*overrides), folder)[1]
+    assert not execute(settings(*overrides), folder)[1]
     press_in(monkeypatch, None)
     assert (folder / "checkpoint.pt").is_file() and (folder / "interrupted.json").is_file()
     return folder
@@ -100,7 +100,7 @@ def assert_same(folder: Path, whole: Path) -> None:
     ids=lambda words: ",".join(map(str, words)),
 )
 def test_a_run_stopped_once_gives_the_same_bits(monkeypatch, tmp_path, capsys, overrides, steps):
-    assert run(settings(*overrides), tmp_path / "whole")[1]
+    assert execute(settings(*overrides), tmp_path / "whole")[1]
     for step in steps:
         folder = stopped(monkeypatch, tmp_path / str(step), step, *overrides)
         assert json.loads((folder / "interrupted.json").read_text())["status"] == "interrupted"
@@ -112,7 +112,7 @@ def test_a_run_stopped_once_gives_the_same_bits(monkeypatch, tmp_path, capsys, o
 
 def test_stopped_twice_and_resumed_twice_is_still_the_same(monkeypatch, tmp_path, capsys):
     overrides = [*CAPPED, "frames=2"]
-    run(settings(*overrides), tmp_path / "whole")
+    execute(settings(*overrides), tmp_path / "whole")
     folder = stopped(monkeypatch, tmp_path / "a", 3, *overrides)
     press_in(monkeypatch, 8)
     assert resume(folder) == 130
@@ -128,7 +128,7 @@ def test_stopped_twice_and_resumed_twice_is_still_the_same(monkeypatch, tmp_path
 @pytest.mark.parametrize("moment", ["judge", "baseline", "encode_png"])
 def test_stopped_after_the_solver_is_the_same(monkeypatch, tmp_path, moment):
     words = [LBFGS, "report.baselines=[none]"]
-    run(settings(*words), tmp_path / "whole")
+    execute(settings(*words), tmp_path / "whole")
     original = getattr(run_module, moment)
 
     def pressed(*arguments, **more):
@@ -137,16 +137,16 @@ def test_stopped_after_the_solver_is_the_same(monkeypatch, tmp_path, moment):
 
     with monkeypatch.context() as patch:
         patch.setattr(run_module, moment, pressed)
-        assert not run(settings(*words), tmp_path / "a")[1]
+        assert not execute(settings(*words), tmp_path / "a")[1]
     assert resume(tmp_path / "a") == 0
     assert_same(tmp_path / "a", tmp_path / "whole")
 
 
 def test_stopped_before_anything_was_found_starts_anew(monkeypatch, tmp_path):
-    run(settings(LBFGS), tmp_path / "whole")
+    execute(settings(LBFGS), tmp_path / "whole")
     press_in(monkeypatch, 0)
     with pytest.raises(KeyboardInterrupt):
-        run(settings(LBFGS), tmp_path / "a")
+        execute(settings(LBFGS), tmp_path / "a")
     with pytest.raises(ConfigError, match="finish it with: holotorch resume .*a$"):
         write_report([tmp_path / "a"], tmp_path / "report.html")
     press_in(monkeypatch, None)
@@ -158,9 +158,9 @@ def test_stopped_before_anything_was_found_starts_anew(monkeypatch, tmp_path):
 KILLED = """
 import os, signal, sys, torch
 from pathlib import Path
-from holotorch.experiments import progress
-from holotorch.experiments.config import load_config
-from holotorch.experiments.run import run
+from holotorch.experiments.pec import progress
+from holotorch.experiments.registry import load_config
+from holotorch.experiments.execute import execute
 torch.set_num_threads(1)
 progress._SAVE_EVERY, save, done = -1.0, torch.save, []
 def killed(content, stream):
@@ -171,7 +171,7 @@ def killed(content, stream):
         os.kill(os.getpid(), signal.SIGKILL)
     save(content, stream)
 torch.save = killed
-run(load_config(sys.argv[1], sys.argv[3:]), Path(sys.argv[2]))
+execute(load_config(sys.argv[1], sys.argv[3:]), Path(sys.argv[2]))
 """
 
 
@@ -181,7 +181,7 @@ def test_killed_while_it_saves_goes_on_from_the_checkpoint_before(tmp_path):
     assert subprocess.run(command, capture_output=True).returncode == -signal.SIGKILL
     assert (folder / "checkpoint.pt").is_file()
     assert not (folder / "interrupted.json").exists() and not (folder / "summary.json").exists()
-    run(load_config(CONFIG, words), tmp_path / "whole")
+    execute(load_config(CONFIG, words), tmp_path / "whole")
     seen = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Log, "__call__", lambda self, solution, call=Log.__call__: (seen.append(0), call(self, solution)))

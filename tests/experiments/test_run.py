@@ -17,14 +17,15 @@ from oracles import dense
 from skimage.metrics import structural_similarity
 
 from holotorch.correction import Solution
-from holotorch.experiments import run as run_module
-from holotorch.experiments.config import load_config
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.pec import PECExperiment, build
-from holotorch.experiments.plan import plan, plan_text
-from holotorch.experiments.run import run
-from holotorch.experiments.run_folder import claim
-from holotorch.experiments.saving import Checkpoint
+from holotorch.experiments import execute as execute_module
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.execute import execute
+from holotorch.experiments.pec import run as run_module
+from holotorch.experiments.pec.experiment import PECExperiment, build
+from holotorch.experiments.pec.plan import plan_text, plan_values
+from holotorch.experiments.registry import load_config
+from holotorch.experiments.runs.folder import claim
+from holotorch.experiments.runs.saving import Checkpoint
 from holotorch.io.images import load_image
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -39,7 +40,7 @@ def settings(config: str = "pec/fourier.yaml", *overrides: str):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run") / "a"
-    assert run(settings(), folder)[1]
+    assert execute(settings(), folder)[1]
     return folder
 
 
@@ -111,7 +112,7 @@ def test_scores_follow_from_the_saved_phase_alone(finished):
     ids=lambda overrides: " ".join(overrides),
 )
 def test_every_kind_runs_and_improves_on_its_baselines(overrides, tmp_path):
-    assert run(settings(*overrides), tmp_path / "a")[1]
+    assert execute(settings(*overrides), tmp_path / "a")[1]
     methods = read(tmp_path / "a")["methods"]
     near = "fresnel" in overrides[0]
     periodic = any("periodic" in word for word in overrides)
@@ -124,14 +125,14 @@ def test_every_kind_runs_and_improves_on_its_baselines(overrides, tmp_path):
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_does_not(finished, tmp_path):
-    run(settings(), tmp_path / "b")
-    run(settings("pec/fourier.yaml", "seed=8"), tmp_path / "c")
+    execute(settings(), tmp_path / "b")
+    execute(settings("pec/fourier.yaml", "seed=8"), tmp_path / "c")
     a, b, c = (np.load(folder / "arrays" / "phase.npy") for folder in (finished, tmp_path / "b", tmp_path / "c"))
     assert np.array_equal(a, b) and not np.array_equal(a, c)
 
 
 def test_the_resolved_configuration_repeats_the_run(finished, tmp_path):
-    run(load_config(finished / "config.yaml"), tmp_path / "again")
+    execute(load_config(finished / "config.yaml"), tmp_path / "again")
     assert np.array_equal(
         np.load(finished / "arrays" / "phase.npy"), np.load(tmp_path / "again" / "arrays" / "phase.npy")
     )
@@ -142,7 +143,7 @@ def test_one_black_colour_stays_dark_and_does_not_disturb_the_others(tmp_path):
     pixels[..., 0] = 0  # blue, as OpenCV orders
     cv2.imwrite(str(tmp_path / "yellow.png"), pixels)
     picture = f"target.image={tmp_path / 'yellow.png'}"
-    assert run(settings("pec/fourier.yaml", picture, "grid.shape=[24,24]"), tmp_path / "a")[1]
+    assert execute(settings("pec/fourier.yaml", picture, "grid.shape=[24,24]"), tmp_path / "a")[1]
     numbers = read(tmp_path / "a")["methods"]["corrected"]
     assert numbers["ssim"][2] == 1 and numbers["psnr"][2] is None
     assert numbers["heating_power_K_per_pixel"][2] == 0 and numbers["efficiency"][2] == 0
@@ -171,7 +172,7 @@ LOG = run_module.Log
 
 def test_ctrl_c_saves_what_was_found(monkeypatch, tmp_path):
     monkeypatch.setattr(run_module, "Log", lambda experiment, path: StopAfter(experiment, path, 5))
-    assert not run(settings(), tmp_path / "a")[1]
+    assert not execute(settings(), tmp_path / "a")[1]
     assert not (tmp_path / "a" / "summary.json").exists()
     saved = read(tmp_path / "a", "interrupted.json")
     assert saved["status"] == "interrupted" and saved["methods"]["corrected"]["steps"] == [5, 5, 5]
@@ -183,7 +184,7 @@ def test_ctrl_c_saves_what_was_found(monkeypatch, tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("moment", ["judge", "save_array", "encode_png", "write_report", "baseline"])
 def test_ctrl_c_after_the_solver_loses_nothing(monkeypatch, tmp_path, moment, number):
-    where = run_module
+    where = execute_module if moment == "write_report" else run_module
     original = getattr(where, moment)
 
     def pressed(*words, **more):
@@ -192,7 +193,7 @@ def test_ctrl_c_after_the_solver_loses_nothing(monkeypatch, tmp_path, moment, nu
 
     monkeypatch.setattr(where, moment, pressed)
     handlers = [signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)]
-    run(settings(), tmp_path / "a")
+    execute(settings(), tmp_path / "a")
     assert handlers == [signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)]
     # Pressed in the last step of all, the summary is written already and the run is complete.
     name, other = ("summary", "interrupted") if moment == "write_report" else ("interrupted", "summary")
@@ -203,13 +204,13 @@ def test_ctrl_c_after_the_solver_loses_nothing(monkeypatch, tmp_path, moment, nu
 
 def test_a_run_outside_the_main_thread_works(tmp_path):
     with ThreadPoolExecutor(1) as pool:
-        assert pool.submit(run, settings(), tmp_path / "a").result()[1]
+        assert pool.submit(execute, settings(), tmp_path / "a").result()[1]
 
 
 def test_a_folder_is_never_overwritten(finished):
     before = {path: path.stat().st_mtime_ns for path in finished.rglob("*")}
     with pytest.raises(ConfigError, match="holds files already; choose another --out or delete it"):
-        run(settings(), finished)
+        execute(settings(), finished)
     assert {path: path.stat().st_mtime_ns for path in finished.rglob("*")} == before
 
 
@@ -217,14 +218,14 @@ def test_an_output_that_cannot_be_written_is_refused_before_the_work(tmp_path, m
     monkeypatch.setattr(PECExperiment, "solve", lambda *_: pytest.fail("computed before the folder was checked"))
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="cannot write to .*: Not a directory; choose another place with --out"):
-        run(settings(), tmp_path / "file" / "a")
+        execute(settings(), tmp_path / "file" / "a")
 
 
 def test_a_run_that_does_not_fit_is_refused_before_anything_is_allocated(tmp_path, monkeypatch):
     monkeypatch.setattr(PECExperiment, "image", property(lambda _: pytest.fail("resampled before the check")))
     giant = settings("pec/fresnel.yaml", "grid.shape=[16384,16384]")
     with pytest.raises(ConfigError, match=r"needs about \d+\.\d GB and .* GB are free; use a smaller grid"):
-        run(giant, tmp_path / "a")
+        execute(giant, tmp_path / "a")
     assert not (tmp_path / "a").exists()
 
 
@@ -232,16 +233,16 @@ def test_a_run_that_fails_before_anything_is_computed_leaves_no_folder(tmp_path,
     def broken(*_):
         raise OSError(28, "No space left on device", "plan.json")
 
-    monkeypatch.setattr(run_module, "write_json", broken)
+    monkeypatch.setattr(execute_module, "write_json", broken)
     with pytest.raises(OSError, match="No space left"):
-        run(settings(), tmp_path / "a")
+        execute(settings(), tmp_path / "a")
     assert not (tmp_path / "a").exists()
 
 
 def test_a_solver_that_cannot_start_is_the_users_to_mend(tmp_path, monkeypatch):
     monkeypatch.setattr(PECExperiment, "start_phase", lambda self: torch.zeros(self.target.shape))
     with pytest.raises(ConfigError, match="the solver cannot start: the gradient vanishes"):
-        run(settings(), tmp_path / "a")
+        execute(settings(), tmp_path / "a")
     assert not (tmp_path / "a").exists()
 
 
@@ -281,7 +282,7 @@ def test_plan_warns_of_the_periodic_model_aliasing_and_lost_heat():
             ["propagator.boundary=periodic", "modulator={sigma_px: 2, kernel_size: 7}"],
         )
     )
-    values = plan(experiment)
+    values = plan_values(experiment)
     text = plan_text(experiment, values)
     assert "the array repeats without end" in text
     assert "undersampled beyond 49.6 mm at 630 nm" in text  # L pitch / wavelength = 2 mm * 15.625 um / 630 nm

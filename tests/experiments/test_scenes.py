@@ -10,10 +10,10 @@ import pytest
 import torch
 from oracles import array
 
-from holotorch.experiments.baselines import baseline
-from holotorch.experiments.config import load_config
-from holotorch.experiments.pec import build
-from holotorch.experiments.run import run
+from holotorch.experiments.execute import execute
+from holotorch.experiments.pec.baselines import baseline
+from holotorch.experiments.pec.experiment import build
+from holotorch.experiments.registry import load_config
 
 pytestmark = pytest.mark.usefixtures("tiny")
 CONFIGS = Path(__file__).parents[2] / "configs" / "pec"
@@ -28,7 +28,7 @@ def settings(*overrides: str):
 
 def solved(folder: Path, *overrides: str):
     """What a run saved: fields [F, C, H, W] of its phases by the oracle, target, picture, and numbers."""
-    assert run(settings(*overrides), folder)[1]
+    assert execute(settings(*overrides), folder)[1]
     phase, target, picture = (np.load(folder / "arrays" / f"{name}.npy") for name in ("phase", "target", "intensity"))
     assert phase.dtype == np.float32 and (phase >= 0).all()
     numbers = json.loads((folder / "summary.json").read_text())["methods"]["corrected"]
@@ -155,7 +155,7 @@ BASELINES = ("none", "chopping", "shifting", "nonnegative", "basic_ipec", "ipec"
 )
 def test_every_baseline_runs_and_is_reported(tmp_path, words, capsys):
     listed = f"report.baselines=[{','.join(BASELINES)}]"
-    assert run(settings("solver={kind: lbfgs, max_steps: 60}", *words, listed), tmp_path / "a")[1]
+    assert execute(settings("solver={kind: lbfgs, max_steps: 60}", *words, listed), tmp_path / "a")[1]
     methods = json.loads((tmp_path / "a" / "summary.json").read_text())["methods"]
     assert list(methods) == ["corrected", *BASELINES]
     page = (tmp_path / "a" / "report.html").read_text()
@@ -188,7 +188,7 @@ def test_a_baseline_without_an_inverse_is_left_out_and_said(tmp_path, capsys):
     # exp(-1 / sigma^2) = 2^(-1/2).
     words = ["grid.shape=[23,23]", f"modulator={{sigma_px: {(2 / math.log(2)) ** 0.5!r}, kernel_size: 3}}"]
     baselines = "report.baselines=[none, chopping, shifting, nonnegative]"
-    assert run(settings(*words, baselines), tmp_path / "a")[1]
+    assert execute(settings(*words, baselines), tmp_path / "a")[1]
     lines = [line for line in capsys.readouterr().err.splitlines() if "left out" in line]
     assert len(lines) == 2
     for name, line in zip(("chopping", "shifting"), lines, strict=True):

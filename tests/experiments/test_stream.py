@@ -11,15 +11,15 @@ import time
 import pytest
 import torch
 
-from holotorch.experiments import stream as module
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.stream import address, read_poses, replay, statistics_text, stream, view
-from holotorch.experiments.stream_check import check
-from holotorch.experiments.track_report import COLUMNS, Tracked, row
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.streaming import stream as module
+from holotorch.experiments.streaming.check import check
+from holotorch.experiments.streaming.stream import address, read_poses, replay, statistics_text, stream, view
+from holotorch.experiments.tracking.report import COLUMNS, Tracked, row
 from holotorch.io.video import Frame
-from holotorch.tracking.packet import PosePacket, decode, now
-from holotorch.tracking.status import Pose, Status
-from holotorch.tracking.stream import PoseReceiver
+from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.streaming.packet import PosePacket, decode, now
+from holotorch.tracking.streaming.stream import PoseReceiver
 
 
 def pose(x: float, status: Status = Status.OK) -> Pose:

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from holotorch.cli import main
-from holotorch.experiments import chart_pec, pec_studies
-from holotorch.experiments.pec_bench import Bench, Track, butterworth, grey
-from holotorch.experiments.pec_studies import STUDIES
+from holotorch.experiments.pec_study import chart as chart_pec
+from holotorch.experiments.pec_study import studies as pec_studies
+from holotorch.experiments.pec_study.bench import Bench, Track, butterworth, grey
+from holotorch.experiments.pec_study.studies import STUDIES
 
 SWEEP = {"lowpass": "[0.2]"}
 

@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 import torch
 
-from holotorch.experiments import synthetic, track
-from holotorch.experiments.config_tracking import build_camera, build_catheter, load_camera, load_catheter
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.synthetic import RATE, compared, errors, read_truth, write_synthetic
-from holotorch.experiments.track import run_tracking
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.tracking import run as track
+from holotorch.experiments.tracking import synthetic
+from holotorch.experiments.tracking.config import build_camera, build_catheter, load_camera, load_catheter
+from holotorch.experiments.tracking.run import run_tracking
+from holotorch.experiments.tracking.synthetic import RATE, compared, errors, read_truth, write_synthetic
 from holotorch.io.recording import is_recording, open_recording
-from holotorch.tracking.catheter import THESIS
-from holotorch.tracking.tracker import CatheterTracker
-from holotorch.tracking.world import synthetic_camera
+from holotorch.tracking.detection.tracker import CatheterTracker
+from holotorch.tracking.pose.catheter import THESIS
+from holotorch.tracking.simulation.world import synthetic_camera
 
 SIZE = (540, 960)
 

@@ -7,17 +7,18 @@ import torch
 import yaml
 from stand_in import CAMERA, SIZE, StandIn, grey, pictures, read, summary, tracked
 
-from holotorch.experiments import track, track_source
-from holotorch.experiments.config_tracking import save_camera, save_catheter
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.track import follow, live, run_tracking
-from holotorch.experiments.track_report import COLUMNS, Log, Tracked, drawn_track
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.tracking import run as track
+from holotorch.experiments.tracking import source as track_source
+from holotorch.experiments.tracking.config import save_camera, save_catheter
+from holotorch.experiments.tracking.report import COLUMNS, Log, Tracked, drawn_track
+from holotorch.experiments.tracking.run import follow, live, run_tracking
 from holotorch.io.files import write_bytes
 from holotorch.io.images import encode_png
 from holotorch.io.recording import is_recording, open_recording
 from holotorch.io.video import Frame, Frames, open_frames
 from holotorch.tracking import THESIS, Camera, Catheter, Status
-from holotorch.tracking.world import World
+from holotorch.tracking.simulation.world import World
 
 
 def test_every_frame_gets_a_pose_or_a_reason(tmp_path, tracker):

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from stand_in import SIZE, pictures, read, summary, tracked
 
-from holotorch.experiments import track, track_source
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.run import resume
-from holotorch.experiments.signals import deferred
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.execute import resume
+from holotorch.experiments.runs.signals import deferred
+from holotorch.experiments.tracking import run as track
+from holotorch.experiments.tracking import source as track_source
 from holotorch.io.recording import open_recording
 from holotorch.io.video import open_frames
 
@@ -186,7 +187,7 @@ def test_a_pose_whose_picture_cannot_be_written_is_kept(tmp_path, tracker, monke
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("holotorch.experiments.track_report.write_bytes", full)
+    monkeypatch.setattr("holotorch.experiments.tracking.report.write_bytes", full)
     with pytest.raises(OSError, match="No space left"):
         tracked(tmp_path, pictures(tmp_path / "in", [9, 12]))
     assert [row["status"] for row in read(tmp_path / "out")] == ["OK"]

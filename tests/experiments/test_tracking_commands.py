@@ -14,10 +14,13 @@ import numpy as np
 import pytest
 
 from holotorch.cli import main
-from holotorch.experiments import stream, stream_check, synthetic, track
-from holotorch.experiments.synthetic import write_synthetic
-from holotorch.tracking.packet import PosePacket, decode
-from holotorch.tracking.status import Status
+from holotorch.experiments.streaming import check as stream_check
+from holotorch.experiments.streaming import stream
+from holotorch.experiments.tracking import run as track
+from holotorch.experiments.tracking import synthetic
+from holotorch.experiments.tracking.synthetic import write_synthetic
+from holotorch.tracking.pose.status import Status
+from holotorch.tracking.streaming.packet import PosePacket, decode
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "tracking"
 FILES = ["--camera", str(CONFIGS / "camera.yaml"), "--catheter", str(CONFIGS / "catheter.yaml")]

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from holotorch.experiments import eye_tradeoff
-from holotorch.experiments.config import load_config
-from holotorch.experiments.eye_tradeoff import WIDTHS, Case, fitted_prefactor, in_words, tradeoff
+from holotorch.experiments.eye import tradeoff as eye_tradeoff
+from holotorch.experiments.eye.tradeoff import WIDTHS, Case, fitted_prefactor, in_words, tradeoff
+from holotorch.experiments.registry import load_config
 from holotorch.io.bundled import find_config
-from holotorch.optics.spectrum import Spectrum
+from holotorch.optics.light.spectrum import Spectrum
 
 
 def case(distance: float, wavelength: float, aperture: float, best: float, inside: bool = True) -> Case:

@@ -13,13 +13,14 @@ import pytest
 import torch
 
 from holotorch.cli import main
-from holotorch.experiments import pictures, volume_run
-from holotorch.experiments.config import load_config
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.volume import Part, build
-from holotorch.experiments.volume_judge import pooled
-from holotorch.experiments.volume_plan import plan, plan_text
-from holotorch.experiments.volume_run import run_volume
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.execute import execute
+from holotorch.experiments.registry import load_config
+from holotorch.experiments.runs import pictures
+from holotorch.experiments.volume import run as volume_run
+from holotorch.experiments.volume.experiment import Part, build
+from holotorch.experiments.volume.judge import pooled
+from holotorch.experiments.volume.plan import plan_text, plan_values
 from holotorch.hologram import ConvolutionHologram
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "volume"
@@ -43,7 +44,7 @@ def summary(folder: Path) -> dict:
 
 
 def test_a_run_is_what_its_parts_give(tmp_path):
-    folder, complete = run_volume(settings("tolerance=1e-4", "report.seeds=2"), tmp_path / "a", "a")
+    folder, complete = execute(settings("tolerance=1e-4", "report.seeds=2"), tmp_path / "a", "a")
     assert complete and sorted(path.name for path in folder.iterdir()) == sorted([*FILES, "summary.json"])
     saved = np.load(folder / "arrays" / "hologram.npy")
     assert saved.shape == (3, 64, 64) and saved.dtype == np.complex64
@@ -67,12 +68,12 @@ def test_a_run_is_what_its_parts_give(tmp_path):
 def test_the_map_of_depths_says_what_it_is_of(tmp_path, monkeypatch, tiny):
     labels = []
     monkeypatch.setattr(pictures, "channel_maps", lambda values, names, label, colours: labels.append(label) or b"")
-    run_volume(settings(), tmp_path / "a", "a")
+    execute(settings(), tmp_path / "a", "a")
     assert labels == ["mean depth behind the hologram (mm)"]
 
 
 def test_more_realisations_have_less_speckle(tmp_path):
-    run_volume(settings("report.seeds=8"), tmp_path / "a", "a")
+    execute(settings("report.seeds=8"), tmp_path / "a", "a")
     with open(tmp_path / "a" / "metrics.csv", newline="") as stream:
         contrasts = [float(row["speckle_contrast"]) for row in csv.DictReader(stream)]
     # Speckle of N independent pictures falls as 1 / sqrt(N), down to what is no speckle: blur of other depths.
@@ -91,10 +92,10 @@ def press_in(monkeypatch, realisation: int | None):
 
 
 def test_interrupted_and_resumed_is_the_same_to_the_bit(tmp_path, monkeypatch, capsys):
-    run_volume(settings("report.seeds=3"), tmp_path / "whole", "a")
+    execute(settings("report.seeds=3"), tmp_path / "whole", "a")
     with monkeypatch.context() as patch:
         press_in(patch, 2)
-        assert not run_volume(settings("report.seeds=3"), tmp_path / "a", "a")[1]
+        assert not execute(settings("report.seeds=3"), tmp_path / "a", "a")[1]
     assert (tmp_path / "a" / "interrupted.json").is_file() and (tmp_path / "a" / "checkpoint.pt").is_file()
     assert main(["resume", str(tmp_path / "a")]) == 0
     for name in ("hologram", "refocused", "rendering", "depth"):
@@ -106,7 +107,7 @@ def test_interrupted_and_resumed_is_the_same_to_the_bit(tmp_path, monkeypatch, c
     with monkeypatch.context() as patch:
         press_in(patch, 0)
         with pytest.raises(KeyboardInterrupt):
-            run_volume(settings(), tmp_path / "b", "b")
+            execute(settings(), tmp_path / "b", "b")
     assert main(["resume", str(tmp_path / "b")]) == 0
 
 
@@ -147,12 +148,12 @@ def test_the_thesis_scenes_have_its_numbers(name):
     assert small.grid.shape == (128, 128) and small.rays.shape == (64, 64) and small.stride == 2
     assert len(small.depths) == planes[name][1] // 16 and small.depths[0] > small.depths[-1]
     assert small.width == pytest.approx(128 * 3.74e-6) and small.distance == pytest.approx(planes[name][0] / 16e3)
-    text = plan_text(small, plan(small))
+    text = plan_text(small, plan_values(small))
     assert "synthetic: a phantom was asked for" in text and "GB of memory" in text
 
 
 def test_a_scene_that_cannot_be_had_is_said(monkeypatch):
-    from holotorch.experiments import volume
+    from holotorch.experiments.volume import experiment as volume
 
     def unreachable(name, directory):
         raise OSError("no network: " + "a long story of connections " * 9 + "\nput it at /cache/tooth.raw")
@@ -187,7 +188,7 @@ def test_a_file_is_read_and_a_broken_one_named(tmp_path):
 
 def test_an_empty_volume_is_black(tmp_path):
     np.save(tmp_path / "empty.npy", np.zeros((4, 4, 4), np.uint8))
-    folder, _ = run_volume(
+    folder, _ = execute(
         settings(f"volume={{path: {tmp_path / 'empty.npy'}, spacing: 1, unit: relative}}"), tmp_path / "a", "a"
     )
     assert not np.load(folder / "arrays" / "hologram.npy").any()
@@ -228,9 +229,9 @@ def test_light_beside_the_rays_is_said(tmp_path):
     np.save(tmp_path / "bar.npy", np.full((8, 8, 32), 200, np.uint8))
     source = f"volume={{path: {tmp_path / 'bar.npy'}, spacing: 1, unit: relative}}"
     wide = build(settings(source, "view={width: 0.48 mm}"))  # the rays cover 0.239 mm
-    (note,) = (note for note in plan(wide)["notes"] if "beside the rays" in note)
+    (note,) = (note for note in plan_values(wide)["notes"] if "beside the rays" in note)
     assert float(note.split(" %")[0]) == pytest.approx(50, abs=2)
-    assert not any("beside" in note for note in plan(build(settings(source)))["notes"])
+    assert not any("beside" in note for note in plan_values(build(settings(source)))["notes"])
 
 
 def test_cells_around_rays_do_not_wrap():

@@ -18,8 +18,8 @@ from fuzz.mutate import mutated
 from fuzz.mutate_headers import fields_mutated, packed, png_mutated, sized
 from fuzz.mutate_tree import json_mutated, table_mutated
 
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.synthetic import read_truth
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.tracking.synthetic import read_truth
 from holotorch.io.images import load_image
 from holotorch.io.panel_files import read_levels, read_phases, write_levels, write_phases
 from holotorch.io.recording import Recorder, open_recording

@@ -20,7 +20,7 @@ from fuzz.mutate_headers import png_mutated
 from fuzz.mutate_tree import json_mutated, table_mutated, yaml_mutated
 
 from holotorch.cli import main
-from holotorch.experiments.progress import Log
+from holotorch.experiments.pec.progress import Log
 
 _PEC = [
     "pec/fourier.yaml",

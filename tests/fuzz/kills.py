@@ -30,8 +30,11 @@ from stand_in import CAMERA, SIZE, StandIn
 from tiny_runs import RUNS, command, results
 
 from holotorch.cli import main
-from holotorch.experiments import eye_run, pictures, progress, track_source
-from holotorch.experiments.config_tracking import save_camera, save_catheter
+from holotorch.experiments.eye import run as eye_run
+from holotorch.experiments.pec import progress
+from holotorch.experiments.runs import pictures
+from holotorch.experiments.tracking import source as track_source
+from holotorch.experiments.tracking.config import save_camera, save_catheter
 from holotorch.io.images import encode_png
 from holotorch.io.recording import open_recording
 from holotorch.tracking import THESIS

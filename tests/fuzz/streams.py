@@ -16,21 +16,21 @@ from fuzz.engine import Input, Refused, Target
 from fuzz.mutate import mutated
 from fuzz.mutate_tree import json_mutated, table_mutated
 
-from holotorch.experiments.errors import ConfigError
-from holotorch.experiments.perception_log import TrialLog, read_log
-from holotorch.experiments.stream import _line, read_poses, statistics_text
-from holotorch.experiments.track_report import COLUMNS, Tracked, row
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.perception.study.log import TrialLog, read_log
+from holotorch.experiments.streaming.stream import _line, read_poses, statistics_text
+from holotorch.experiments.tracking.report import COLUMNS, Tracked, row
 from holotorch.io.video import Frame
-from holotorch.tracking.packet import Echo, PosePacket, encode
-from holotorch.tracking.status import Pose, Status
-from holotorch.tracking.stream import PoseReceiver
+from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.streaming.packet import Echo, PosePacket, encode
+from holotorch.tracking.streaming.stream import PoseReceiver
 
 _START = 1.7e9  # seconds since 1970
 _SENDER = ("127.0.0.1", 9)
 _STREAM = 7
 _DOUBLES = (math.nan, math.inf, -math.inf, -0.0, 1e308, -1e308, 5e-324, 1.0, 100.1, _START, _START + 1, _START + 1e9)
 _WHOLE = (0, 1, 2, 255, 2**15, 2**16 - 1, 2**31, 2**32 - 1, 2**53, 2**63 - 1, 2**63, 2**64 - 1)
-# Offset and format of the fields of a pose's datagram, from the table in ``holotorch.tracking.packet``.
+# Offset and format of the fields of a pose's datagram, from the table in ``holotorch.tracking.streaming.packet``.
 _FIELDS = (
     *((4, "<H"), (6, "<B"), (7, "<B"), (8, "<Q"), (16, "<Q"), (24, "<d"), (32, "<d"), (80, "<H"), (82, "<H")),
     *((84, "<f"), (384, "<d")),

@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 from study_client import Runner
 
-from holotorch.experiments import perception_server
-from holotorch.experiments.perception_log import read_log
+from holotorch.experiments.perception.study import server as perception_server
+from holotorch.experiments.perception.study.log import read_log
 
 PAUSE = 0.4  # seconds that the server gives a connection here
 OPEN = 48  # connections that wait for an answer meanwhile

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from holotorch.io.colour_tables import srgb_matrix, tristimulus, white_balance
-from holotorch.optics.colour import desaturated, linear_srgb
-from holotorch.optics.spectrum import Spectrum
+from holotorch.optics.light.spectrum import Spectrum
+from holotorch.optics.picture import desaturated, linear_srgb
 
 COLOURS = (636e-9, 520e-9, 455e-9)
 
@@ -68,5 +68,5 @@ def test_refusals():
 
 
 def test_the_tables_are_read_only_when_asked_for():
-    code = "import sys, holotorch.io.colour_tables, holotorch.optics.spectrum; assert 'colour' not in sys.modules"
+    code = "import sys, holotorch.io.colour_tables, holotorch.optics.light.spectrum; assert 'colour' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from holotorch.io.scan import uncompressed_from
+from holotorch.io.formats.scan import uncompressed_from
 from holotorch.io.volumes import load_volume
 
 SHAPE = (4, 5, 6)
@@ -57,7 +57,7 @@ def test_a_name_too_long_for_a_file_is_no_data_file(tmp_path, kind):
 
 CUT = """
 import os, sys
-from holotorch.io import limits
+from holotorch.io.formats import limits
 from holotorch.io.volumes import load_volume
 limits.MEMORY_LIMIT = 1000  # as if it were a large one
 volume = load_volume(sys.argv[1], spacing=1, unit="relative")
@@ -78,8 +78,8 @@ def test_a_volume_outlives_its_file(tmp_path, name):
 def test_a_volume_larger_than_the_free_memory_is_mapped(tmp_path, monkeypatch):
     path = tmp_path / "a_64x64x64_uint8.raw"
     np.ones((64, 64, 64), np.uint8).tofile(path)
-    monkeypatch.setattr("holotorch.io.limits.MEMORY_LIMIT", 1000)
+    monkeypatch.setattr("holotorch.io.formats.limits.MEMORY_LIMIT", 1000)
     for free, mapped in ((None, True), (2 * 64**3 - 1, True), (2 * 64**3, False)):
-        monkeypatch.setattr("holotorch.io.limits.available_memory", lambda free=free: free)
+        monkeypatch.setattr("holotorch.io.formats.limits.available_memory", lambda free=free: free)
         values = uncompressed_from(path, (64, 64, 64), np.dtype(np.uint8), 0)
         assert values.sum() == 64**3 and isinstance(values.base, mmap.mmap | np.memmap) == mapped

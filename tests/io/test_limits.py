@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import pytest
 
-from holotorch.io.decoding import decode, picture_size
+from holotorch.io.formats.decoding import decode, picture_size
+from holotorch.io.formats.limits import VARIABLE, affordable, unzipped
 from holotorch.io.images import load_image
-from holotorch.io.limits import VARIABLE, affordable, unzipped
 from holotorch.io.panel_files import read_levels
 
 MEMORY, SECONDS = 2 << 30, 10  # what any file below 1 MB may take, libraries included
@@ -176,7 +176,7 @@ def test_the_limit_can_be_raised_as_its_error_says(tmp_path, monkeypatch):
     path = tmp_path / "a.png"
     cv2.imwrite(str(path), np.full((40, 50), 7, np.uint8))
     monkeypatch.setenv(VARIABLE, "100")
-    monkeypatch.setattr("holotorch.io.limits.RATIO", 1)
+    monkeypatch.setattr("holotorch.io.formats.limits.RATIO", 1)
     with pytest.raises(
         ValueError, match=rf"a.png has \d+ bytes and asks for .* set the environment variable {VARIABLE}="
     ):

@@ -8,7 +8,7 @@ import torch
 from oracles.speckle import contrast_of_band, contrast_of_lorentzian, replayed
 
 from holotorch.metrics import speckle_contrast
-from holotorch.optics.coherence import (
+from holotorch.optics.light.coherence import (
     chromatic_defocus,
     depth_of_focus,
     optimum_fwhm,
@@ -16,8 +16,8 @@ from holotorch.optics.coherence import (
     predicted_contrast,
     samples_needed,
 )
-from holotorch.optics.quadrature import expected_error
-from holotorch.optics.spectrum import Spectrum
+from holotorch.optics.light.quadrature import expected_error
+from holotorch.optics.light.spectrum import Spectrum
 
 PITCH, DISTANCE, APERTURE = 3.74e-6, 0.03, 0.056
 PATH = path_difference(DISTANCE, APERTURE)

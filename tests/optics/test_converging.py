@@ -10,7 +10,7 @@ from oracles import converging as oracle
 from holotorch import Grid
 from holotorch.core.fourier import centred_fft2
 from holotorch.optics import CroppedKernel, Fresnel, carrier
-from holotorch.optics.converging import ConvergingFresnel, converging_fresnel
+from holotorch.optics.elements.converging import ConvergingFresnel, converging_fresnel
 
 # These grids are small, their lenses strong and their result compared with paraxial light.
 pytestmark = pytest.mark.filterwarnings("ignore::holotorch.core.checks.SamplingWarning")

@@ -10,7 +10,7 @@ from oracles import converging as oracle
 from holotorch import Grid
 from holotorch.core.checks import SamplingWarning
 from holotorch.optics import RayleighSommerfeld
-from holotorch.optics.converging import ConvergingFresnel, converging_fresnel
+from holotorch.optics.elements.converging import ConvergingFresnel, converging_fresnel
 
 WAVE, GRID = 530e-9, Grid((20, 24), (6e-6, 5e-6))
 FINE = Grid(129, 1.2e-6)  # carries rays of up to wavelength / (2 pitch) = 0.22

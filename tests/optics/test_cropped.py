@@ -7,7 +7,7 @@ from oracles import dense
 
 from holotorch import Grid
 from holotorch.optics import CroppedKernel, carrier
-from holotorch.optics.taps import fresnel_taps, remainder_kernel
+from holotorch.optics.free_space.impulse_response import fresnel_taps, remainder_kernel
 
 SHAPE = (20, 24)
 

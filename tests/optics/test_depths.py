@@ -3,7 +3,7 @@ import torch
 
 from holotorch import Grid
 from holotorch.optics import AngularSpectrum, CroppedKernel, DepthStack, Fraunhofer, Fresnel
-from holotorch.optics.propagators import SpectralFilter
+from holotorch.optics.free_space.propagators import SpectralFilter
 
 GRID, WAVES, DISTANCES = Grid((12, 17), (5e-6, 4e-6)), (630e-9, 530e-9), (50e-6, -80e-6, 2e-3)
 EXACT = 1e-12  # as for single operators: 204 samples, norms below 4

@@ -4,7 +4,7 @@ import pytest
 
 from holotorch import Grid
 from holotorch.optics import diffraction_angle, least_padding, unaliased_distance
-from holotorch.optics.geometry import lateral_spread
+from holotorch.optics.free_space.geometry import lateral_spread
 
 
 def test_field_of_view_of_the_thesis():

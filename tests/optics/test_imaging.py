@@ -20,9 +20,9 @@ from holotorch.optics import (
     retinal_scale,
     through_elements,
 )
-from holotorch.optics.elements import ElementSampling
-from holotorch.optics.imaging import CollapseSampling, collapse_sampling
-from holotorch.optics.retina import collapse_error
+from holotorch.optics.viewing.elementwise import ElementSampling
+from holotorch.optics.viewing.imaging import CollapseSampling, collapse_sampling
+from holotorch.optics.viewing.retina import collapse_error
 
 RED, PITCH, SIZE, FAR = 636e-9, 3.74e-6, 2048, 30e-3
 GRID = Grid((1, SIZE), PITCH)

@@ -6,12 +6,11 @@ import pytest
 import torch
 
 from holotorch import Grid
-from holotorch.optics.coherence import path_difference
-from holotorch.optics.colour import desaturated, linear_srgb
-from holotorch.optics.exposure import equal_power, exposed
-from holotorch.optics.incoherent import disc_source, incoherent_sum, tilted_wave
-from holotorch.optics.propagate import propagate
-from holotorch.optics.spectrum import Spectrum
+from holotorch.optics.light.coherence import path_difference
+from holotorch.optics.light.incoherent import disc_source, incoherent_sum, tilted_wave
+from holotorch.optics.light.spectrum import Spectrum
+from holotorch.optics.picture import desaturated, equal_power, exposed, linear_srgb
+from holotorch.optics.planning.propagate import propagate
 
 
 def test_the_sum_is_weighted_and_streams():

@@ -13,11 +13,11 @@ from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import phasor
 from holotorch.core.fourier import fft2, filter_spectrum, ifft2
 from holotorch.optics import CroppedKernel, Propagator, plan_propagation, propagate
-from holotorch.optics.passage import Passage, passage
-from holotorch.optics.plan import find
-from holotorch.optics.propagate import kernel_of
-from holotorch.optics.resampled import resample, resampling_factors
-from holotorch.optics.zoomed import chirps, zoomed
+from holotorch.optics.free_space.passage import Passage, passage
+from holotorch.optics.free_space.resampled import resample, resampling_factors
+from holotorch.optics.free_space.zoomed import chirps, zoomed
+from holotorch.optics.planning.plan import find
+from holotorch.optics.planning.propagate import kernel_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:no way reaches:holotorch.core.checks.SamplingWarning")
 GRID, WAVE = Grid((24, 20), (8e-6, 7e-6)), 530e-9

@@ -8,7 +8,7 @@ import torch
 from oracles import pixels
 
 from holotorch import Grid
-from holotorch.optics.pixels import PixelShape, order_efficiency
+from holotorch.optics.elements.pixels import PixelShape, order_efficiency
 
 GRID = Grid((12, 17), (5e-6, 4e-6))
 FILLS = [(1.0, 0.9), (0.3, 0.3), (1e-9, 1e-9)]

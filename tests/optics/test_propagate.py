@@ -12,9 +12,9 @@ from holotorch import Grid
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import phasor
 from holotorch.optics import CroppedKernel, Propagator, plan_propagation, propagate
-from holotorch.optics.passage import Passage
-from holotorch.optics.plan import find
-from holotorch.optics.propagate import kernel_of
+from holotorch.optics.free_space.passage import Passage
+from holotorch.optics.planning.plan import find
+from holotorch.optics.planning.propagate import kernel_of
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:no way reaches:holotorch.core.checks.SamplingWarning"),

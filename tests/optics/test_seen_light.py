@@ -1,9 +1,9 @@
 import pytest
 
 from holotorch.core.grid import Grid
-from holotorch.optics.display import Display
-from holotorch.optics.eye import Eye
-from holotorch.optics.followed import seen_light
+from holotorch.optics.light.wavelength_sampling import seen_light
+from holotorch.optics.viewing.display import Display
+from holotorch.optics.viewing.eye import Eye
 
 
 @pytest.mark.parametrize("radius", [10e-3, 30e-3, 50e-3])

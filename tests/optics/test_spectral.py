@@ -18,8 +18,8 @@ from holotorch.optics import (
     spectral_image,
     through_elements,
 )
-from holotorch.optics.followed import followed
-from holotorch.optics.quadrature import gauss_rule
+from holotorch.optics.light.quadrature import gauss_rule
+from holotorch.optics.light.wavelength_sampling import followed
 
 PITCH, GREEN, FAR = 3.74e-6, 520e-9, 30e-3
 GRID = Grid((128, 120), PITCH)

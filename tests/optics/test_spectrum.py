@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.integrate import quad
 
-from holotorch.optics.spectrum import Spectrum
+from holotorch.optics.light.spectrum import Spectrum
 
 GREEN = 520e-9
 PRESETS = {"laser": 1.4e-9, "narrow_sled": 5e-9, "sled": 10e-9, "led": 20e-9}

@@ -6,7 +6,7 @@ import torch
 
 from holotorch import Grid
 from holotorch.optics import Propagator, ResampledKernel, ZoomedFilter
-from holotorch.optics.zoomed import chirp, zoom, zoom_adjoint
+from holotorch.optics.free_space.zoomed import chirp, zoom, zoom_adjoint
 
 GRID, OUT, OFFSET = Grid((12, 17), (5e-6, 4e-6)), Grid((9, 14), (3e-6, 7e-6)), (11e-6, -30e-6)
 WAVES = (630e-9, 530e-9)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from holotorch.tracking.alignment import headset_from_camera, tool_points
+from holotorch.tracking.pose.alignment import headset_from_camera, tool_points
 
 
 def rotation(generator):

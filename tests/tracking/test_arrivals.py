@@ -6,10 +6,10 @@ import math
 import pytest
 import torch
 
-from holotorch.experiments.stream import _line, statistics_text
-from holotorch.tracking.packet import Echo, PosePacket, decode, encode, now
-from holotorch.tracking.status import Pose, Status
-from holotorch.tracking.stream import PoseReceiver
+from holotorch.experiments.streaming.stream import _line, statistics_text
+from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.streaming.packet import Echo, PosePacket, decode, encode, now
+from holotorch.tracking.streaming.stream import PoseReceiver
 
 PERIOD = 0.02  # seconds between poses of the genuine sender
 STREAM = 7
@@ -197,7 +197,7 @@ def test_a_clock_reply_from_before_its_request_is_not_believed(monkeypatch):
 
 
 def test_openigtlink_sends_no_pose_that_was_captured_in_the_future(monkeypatch):
-    igtl = pytest.importorskip("holotorch.tracking.igtl")
+    igtl = pytest.importorskip("holotorch.tracking.streaming.igtl")
     pytest.importorskip("pyigtl", reason="pip install 'holotorch[slicer]'")
     sent: list[bytes] = []
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from oracles import strips
 
-from holotorch.tracking.axis_fit import AxisFit, fit_axis
+from holotorch.tracking.detection.axis_fit import AxisFit, fit_axis
 
 T = np.linspace(-150, 150, 41)  # places along, on three bands of
 BAND = np.digitize(T, [-50, 50])

@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from holotorch.experiments.tracking_methods import before
+from holotorch.experiments.tracking_benchmark.methods import before
 from holotorch.io.images import load_image
-from holotorch.tracking.status import Status
-from holotorch.tracking.tracker import CatheterTracker
-from holotorch.tracking.trials import conditions
-from holotorch.tracking.world import World
+from holotorch.tracking.detection.tracker import CatheterTracker
+from holotorch.tracking.pose.status import Status
+from holotorch.tracking.simulation.trials import conditions
+from holotorch.tracking.simulation.world import World
 
 
 @pytest.fixture(scope="module")

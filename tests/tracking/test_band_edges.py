@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from holotorch.tracking import THESIS, Camera
-from holotorch.tracking.band_edges import fit_band_edges
+from holotorch.tracking.pose.band_edges import fit_band_edges
 
 CAMERA = Camera(
     torch.tensor([[1400.0, 0, 960], [0, 1400, 540], [0, 0, 1]]), torch.tensor([-0.1, 0.02, 0.001, -0.0005, 0])

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from holotorch.tracking.bands import find_stretches, order_scores
-from holotorch.tracking.catheter import THESIS, Catheter
-from holotorch.tracking.colours import ColourTable
-from holotorch.tracking.world import synthetic_camera
+from holotorch.tracking.detection.bands import find_stretches, order_scores
+from holotorch.tracking.detection.colours import ColourTable
+from holotorch.tracking.pose.catheter import THESIS, Catheter
+from holotorch.tracking.simulation.world import synthetic_camera
 
 CAMERA = synthetic_camera()
 TABLE = ColourTable(CAMERA, THESIS)

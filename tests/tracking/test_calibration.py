@@ -11,8 +11,8 @@ import torch
 from oracles import boards as oracle
 
 from holotorch.tracking import Camera
-from holotorch.tracking.boards import Charuco, Chessboard, View, find_board
-from holotorch.tracking.calibration import PARAMETERS, calibrate, reprojection
+from holotorch.tracking.camera.boards import Charuco, Chessboard, View, find_board
+from holotorch.tracking.camera.calibration import PARAMETERS, calibrate, reprojection
 
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "calibration"
 SHAPE = (300, 400)

@@ -7,7 +7,7 @@ from kornia.geometry.calibration import distort_points, undistort_points
 from oracles import tracking as oracle
 
 from holotorch.tracking import Camera, CatheterTracker, ThesisTracker
-from holotorch.tracking.world import THESIS
+from holotorch.tracking.simulation.world import THESIS
 
 MATRIX = torch.tensor([[1400.0, 0, 959.5], [0, 1350, 539.5], [0, 0, 1]], dtype=torch.float64)
 MILD = (-0.12, 0.05, 1e-3, -5e-4, -0.01)

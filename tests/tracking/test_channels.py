@@ -11,9 +11,9 @@ import pytest
 import torch
 from tracked import TRACKER, WORLD, at, refused, right, scenes, truth
 
-from holotorch.experiments.config_tracking import build_catheter, load_catheter
+from holotorch.experiments.tracking.config import build_catheter, load_catheter
 from holotorch.tracking import THESIS, CatheterTracker, ChannelOrder, Pose, Status, ThesisTracker, ambiguities
-from holotorch.tracking.channels import ChannelOrderWarning, ambiguity_text
+from holotorch.tracking.detection.channels import ChannelOrderWarning, ambiguity_text
 
 CONFIG = Path(__file__).parents[2] / "configs" / "tracking" / "catheter_distinct.yaml"
 DISTINCT = build_catheter(load_catheter(CONFIG))

@@ -8,12 +8,12 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from holotorch.tracking import coarse
-from holotorch.tracking.catheter import THESIS
-from holotorch.tracking.coarse import Segment, find_segments
-from holotorch.tracking.colours import ColourTable
-from holotorch.tracking.status import Refusal, Status
-from holotorch.tracking.world import synthetic_camera
+from holotorch.tracking.detection import coarse
+from holotorch.tracking.detection.coarse import Segment, find_segments
+from holotorch.tracking.detection.colours import ColourTable
+from holotorch.tracking.pose.catheter import THESIS
+from holotorch.tracking.pose.status import Refusal, Status
+from holotorch.tracking.simulation.world import synthetic_camera
 
 SIZE = (360, 640)
 TABLE = ColourTable(synthetic_camera(), THESIS)

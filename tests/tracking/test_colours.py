@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from holotorch.tracking.camera import Camera
-from holotorch.tracking.catheter import THESIS, Catheter
-from holotorch.tracking.colours import ColourTable
-from holotorch.tracking.world import synthetic_camera
+from holotorch.tracking.camera.camera import Camera
+from holotorch.tracking.detection.colours import ColourTable
+from holotorch.tracking.pose.catheter import THESIS, Catheter
+from holotorch.tracking.simulation.world import synthetic_camera
 
 CAMERA = synthetic_camera()
 TABLE = ColourTable(CAMERA, THESIS)

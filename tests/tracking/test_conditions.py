@@ -5,11 +5,11 @@ from functools import cache
 import pytest
 from torch import Tensor
 
-from holotorch.experiments.tracking_methods import as_camera, before
-from holotorch.tracking.status import Pose, Status
-from holotorch.tracking.tracker import CatheterTracker
-from holotorch.tracking.trials import conditions
-from holotorch.tracking.world import Case, World
+from holotorch.experiments.tracking_benchmark.methods import as_camera, before
+from holotorch.tracking.detection.tracker import CatheterTracker
+from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.simulation.trials import conditions
+from holotorch.tracking.simulation.world import Case, World
 
 WORLD = World()
 TRACKER = CatheterTracker(WORLD.camera, WORLD.catheter)

@@ -10,9 +10,9 @@ import scipy.stats
 import torch
 from oracles import boards as oracle
 
-from holotorch.tracking.boards import Charuco, Chessboard, View, find_board
-from holotorch.tracking.calibration import PARAMETERS, calibrate
-from holotorch.tracking.few_views import estimate
+from holotorch.tracking.camera.boards import Charuco, Chessboard, View, find_board
+from holotorch.tracking.camera.calibration import PARAMETERS, calibrate
+from holotorch.tracking.camera.few_views import estimate
 
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "calibration"
 SIZE = (480, 640)

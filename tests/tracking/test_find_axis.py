@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from holotorch.tracking.bands import find_axis
+from holotorch.tracking.detection.bands import find_axis
 
 
 def fan(offset, slope, thick=5.0, length=201, half=20, coloured=1.0, seed=7, every=1):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from oracles import strips
 
-from holotorch.tracking.fits import fit_edges, median
+from holotorch.tracking.detection.fits import fit_edges, median
 
 BEFORE = np.array([[0.40, 0.05, 0.06]] * 5)  # red, green: light of a row's three channels
 AFTER = np.array([[0.05, 0.30, 0.10]] * 5)

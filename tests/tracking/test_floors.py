@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
-from holotorch.experiments.tracking_methods import before
-from holotorch.tracking.status import Status
-from holotorch.tracking.tracker import CatheterTracker
-from holotorch.tracking.world import Case, World
+from holotorch.experiments.tracking_benchmark.methods import before
+from holotorch.tracking.detection.tracker import CatheterTracker
+from holotorch.tracking.pose.status import Status
+from holotorch.tracking.simulation.world import Case, World
 
 WORLD = World()
 TRACKER = CatheterTracker(WORLD.camera, WORLD.catheter)

@@ -7,12 +7,12 @@ import pytest
 import torch
 from oracles.strips import on_plane
 
-from holotorch.tracking.camera import Camera
-from holotorch.tracking.catheter import THESIS
-from holotorch.tracking.footprint import Front, bulge_px, width_px
-from holotorch.tracking.lens import Lens
-from holotorch.tracking.resection import Found
-from holotorch.tracking.strips import Line
+from holotorch.tracking.camera.camera import Camera
+from holotorch.tracking.camera.lens import Lens
+from holotorch.tracking.camera.strips import Line
+from holotorch.tracking.detection.footprint import Front, bulge_px, width_px
+from holotorch.tracking.pose.catheter import THESIS
+from holotorch.tracking.pose.resection import Found
 
 LENS = Lens(Camera(torch.tensor([[1400.0, 0, 960], [0, 1400, 540], [0, 0, 1]]), torch.zeros(5)))
 

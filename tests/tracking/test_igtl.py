@@ -10,8 +10,8 @@ import time
 import pytest
 import torch
 
-from holotorch.tracking.igtl import TransformServer, _Client, messages
-from holotorch.tracking.status import Pose, Status
+from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.streaming.igtl import TransformServer, _Client, messages
 
 HOME = "127.0.0.1"
 
@@ -153,5 +153,5 @@ def test_without_pyigtl_the_line_that_installs_it_is_said(monkeypatch):
 
 
 def test_pyigtl_is_loaded_when_used():
-    code = "import sys; import holotorch.tracking.igtl; sys.exit('pyigtl' in sys.modules)"
+    code = "import sys; import holotorch.tracking.streaming.igtl; sys.exit('pyigtl' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -10,15 +10,16 @@ from oracles import codec
 from torch import Tensor
 from tracked import truth
 
-from holotorch.tracking import luma, measure, scenery
-from holotorch.tracking.fits import EdgeFit, fit_edges
-from holotorch.tracking.footprint import Front
-from holotorch.tracking.luma import coarse_colours, fit_luma
-from holotorch.tracking.stations import variance_of
-from holotorch.tracking.status import Pose, Status
-from holotorch.tracking.strips import Sampler
-from holotorch.tracking.tracker import CatheterTracker
-from holotorch.tracking.world import Case, World
+from holotorch.tracking.camera.strips import Sampler
+from holotorch.tracking.detection import luma, measure
+from holotorch.tracking.detection.fits import EdgeFit, fit_edges
+from holotorch.tracking.detection.footprint import Front
+from holotorch.tracking.detection.luma import coarse_colours, fit_luma
+from holotorch.tracking.detection.stations import variance_of
+from holotorch.tracking.detection.tracker import CatheterTracker
+from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.simulation import scenery
+from holotorch.tracking.simulation.world import Case, World
 
 WORLD = World()
 TRACKER = CatheterTracker(WORLD.camera, WORLD.catheter)

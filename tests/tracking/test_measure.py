@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from holotorch.tracking.camera import Camera
-from holotorch.tracking.lens import Lens
-from holotorch.tracking.measure import halfway
-from holotorch.tracking.strips import Line
+from holotorch.tracking.camera.camera import Camera
+from holotorch.tracking.camera.lens import Lens
+from holotorch.tracking.camera.strips import Line
+from holotorch.tracking.detection.measure import halfway
 
 LENS = Lens(
     Camera(torch.tensor([[700.0, 0, 480], [0, 700, 270], [0, 0, 1]]), torch.tensor([-0.3, 0.1, 2e-3, -1e-3, 0]))

@@ -10,17 +10,17 @@ import torch
 from oracles.strips import on_plane
 from tracked import NEAR, SIZE, WORLD, at
 
-from holotorch.tracking.bands import Stretches
-from holotorch.tracking.catheter import THESIS
-from holotorch.tracking.fits import EdgeFit
-from holotorch.tracking.footprint import bulge_px
-from holotorch.tracking.lens import Lens
-from holotorch.tracking.measure import Edges, _across, measure_edges
-from holotorch.tracking.render import Occluder
-from holotorch.tracking.resection import Found
-from holotorch.tracking.stations import Axis, look_across, measure_axis
-from holotorch.tracking.status import Refusal, Status
-from holotorch.tracking.strips import Line, Sampler
+from holotorch.tracking.camera.lens import Lens
+from holotorch.tracking.camera.strips import Line, Sampler
+from holotorch.tracking.detection.bands import Stretches
+from holotorch.tracking.detection.fits import EdgeFit
+from holotorch.tracking.detection.footprint import bulge_px
+from holotorch.tracking.detection.measure import Edges, _across, measure_edges
+from holotorch.tracking.detection.stations import Axis, look_across, measure_axis
+from holotorch.tracking.pose.catheter import THESIS
+from holotorch.tracking.pose.resection import Found
+from holotorch.tracking.pose.status import Refusal, Status
+from holotorch.tracking.simulation.render import Occluder
 
 LENS = Lens(WORLD.camera)
 POSITIONS = THESIS.positions.numpy()

@@ -4,12 +4,12 @@ import math
 
 import pytest
 
-from holotorch.tracking import tracker
-from holotorch.tracking.catheter import THESIS
-from holotorch.tracking.status import Status
-from holotorch.tracking.tracker import CatheterTracker
-from holotorch.tracking.trials import negatives, occlusions
-from holotorch.tracking.world import World
+from holotorch.tracking.detection import tracker
+from holotorch.tracking.detection.tracker import CatheterTracker
+from holotorch.tracking.pose.catheter import THESIS
+from holotorch.tracking.pose.status import Status
+from holotorch.tracking.simulation.trials import negatives, occlusions
+from holotorch.tracking.simulation.world import World
 
 TRACKER = CatheterTracker(World().camera, THESIS)
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from holotorch.tracking import THESIS, Camera, Pose, Status, solve_pose
-from holotorch.tracking.overlay import ELLIPSE, ellipse_px, overlay
+from holotorch.tracking.pose.overlay import ELLIPSE, ellipse_px, overlay
 
 SIZE = (240, 320)
 CAMERA = Camera(torch.tensor([[300.0, 0, 160], [0, 310, 120], [0, 0, 1]]), torch.tensor([-0.1, 0.02, 1e-3, -1e-3, 0.0]))

@@ -10,8 +10,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from holotorch.tracking.packet import Echo, PacketError, PosePacket, decode, encode, now
-from holotorch.tracking.status import Pose, Status
+from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.streaming.packet import Echo, PacketError, PosePacket, decode, encode, now
 
 REFUSALS = [status for status in Status if not status.answered]
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from holotorch.tracking import Status
-from holotorch.tracking.latency import latency
-from holotorch.tracking.protocols import (
+from holotorch.tracking.evaluation.latency import latency
+from holotorch.tracking.evaluation.protocols import (
     chi_square_quantile,
     counts,
     coverage,

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from holotorch.tracking.camera import Camera
-from holotorch.tracking.catheter import Catheter
-from holotorch.tracking.render import Look, Occluder, render
+from holotorch.tracking.camera.camera import Camera
+from holotorch.tracking.pose.catheter import Catheter
+from holotorch.tracking.simulation.render import Look, Occluder, render
 
 SIZE = (240, 320)
 MATRIX = torch.tensor([[260.0, 0, 158], [0, 250.0, 121], [0, 0, 1]], dtype=torch.float64)

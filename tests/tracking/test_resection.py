@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from oracles.strips import on_plane
 
 from holotorch.tracking import THESIS, Camera, solve_pose
-from holotorch.tracking.lens import Lens
-from holotorch.tracking.resection import Found, pose_on_line
-from holotorch.tracking.strips import Line
+from holotorch.tracking.camera.lens import Lens
+from holotorch.tracking.camera.strips import Line
+from holotorch.tracking.pose.resection import Found, pose_on_line
 
 CAMERA = Camera(torch.tensor([[1400.0, 0, 959.5], [0, 1400, 539.5], [0, 0, 1]]), torch.zeros(5))
 LENS = Lens(CAMERA)

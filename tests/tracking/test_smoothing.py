@@ -8,8 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from holotorch.tracking.smoothing import OneEuro
-from holotorch.tracking.status import Pose, Status
+from holotorch.tracking.pose.smoothing import OneEuro
+from holotorch.tracking.pose.status import Pose, Status
 
 AXIS = torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
 ACROSS = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)  # square to AXIS: turns lead from it in a plane

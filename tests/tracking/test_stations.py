@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from holotorch.tracking import stations as module
-from holotorch.tracking.axis_fit import AxisFit
-from holotorch.tracking.bands import Stretches
-from holotorch.tracking.camera import Camera
-from holotorch.tracking.lens import Lens
-from holotorch.tracking.stations import THIRD, Stations, look_across, measure_axis, measure_width, narrowed
-from holotorch.tracking.status import Refusal, Status
-from holotorch.tracking.strips import Line
+from holotorch.tracking.camera.camera import Camera
+from holotorch.tracking.camera.lens import Lens
+from holotorch.tracking.camera.strips import Line
+from holotorch.tracking.detection import stations as module
+from holotorch.tracking.detection.axis_fit import AxisFit
+from holotorch.tracking.detection.bands import Stretches
+from holotorch.tracking.detection.stations import THIRD, Stations, look_across, measure_axis, measure_width, narrowed
+from holotorch.tracking.pose.status import Refusal, Status
 
 LENS = Lens(
     Camera(torch.tensor([[700.0, 0, 480], [0, 700, 270], [0, 0, 1]]), torch.tensor([-0.05, 0.02, 1e-3, -5e-4, 0]))

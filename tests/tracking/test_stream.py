@@ -7,10 +7,10 @@ import socket
 import pytest
 import torch
 
-from holotorch.tracking.arrivals import Statistics
-from holotorch.tracking.packet import PosePacket, decode, encode, now
-from holotorch.tracking.status import Pose, Status
-from holotorch.tracking.stream import Link, PoseReceiver, PoseSender
+from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.streaming.arrivals import Statistics
+from holotorch.tracking.streaming.packet import PosePacket, decode, encode, now
+from holotorch.tracking.streaming.stream import Link, PoseReceiver, PoseSender
 
 HOME = "127.0.0.1"
 REFUSED = Pose.refused(Status.NO_CATHETER, "none here")
@@ -227,7 +227,7 @@ def test_a_full_buffer_keeps_the_newest_only():
 
 
 def test_a_sender_answers_clock_requests_and_nothing_else():
-    from holotorch.tracking.packet import Echo
+    from holotorch.tracking.streaming.packet import Echo
 
     async def work():
         with socket.socket(type=socket.SOCK_DGRAM) as device:

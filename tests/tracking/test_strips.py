@@ -8,10 +8,10 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from holotorch.tracking.camera import Camera
-from holotorch.tracking.lens import Lens
-from holotorch.tracking.strips import Line, Sampler
-from holotorch.tracking.world import synthetic_camera
+from holotorch.tracking.camera.camera import Camera
+from holotorch.tracking.camera.lens import Lens
+from holotorch.tracking.camera.strips import Line, Sampler
+from holotorch.tracking.simulation.world import synthetic_camera
 
 CAMERA = Camera(
     torch.tensor([[700.0, 0, 480], [0, 700, 270], [0, 0, 1]]), torch.tensor([-0.3, 0.1, 2e-3, -1e-3, -0.02])

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from holotorch.tracking import thesis_stages as stages
-from holotorch.tracking.camera import Camera
-from holotorch.tracking.catheter import THESIS, Catheter
-from holotorch.tracking.pose import closed_form
-from holotorch.tracking.render import Look, Occluder, render
-from holotorch.tracking.status import Status
-from holotorch.tracking.thesis import ThesisTracker
+from holotorch.tracking.camera.camera import Camera
+from holotorch.tracking.pose.catheter import THESIS, Catheter
+from holotorch.tracking.pose.pose import closed_form
+from holotorch.tracking.pose.status import Status
+from holotorch.tracking.simulation.render import Look, Occluder, render
+from holotorch.tracking.thesis import stages
+from holotorch.tracking.thesis.tracker import ThesisTracker
 
 SIZE = (400, 640)
 CAMERA = Camera(

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from holotorch.tracking import Camera
-from holotorch.tracking.tone import tone_curve
+from holotorch.tracking.camera.tone import tone_curve
 
 LEVELS = np.arange(256) / 255
 EXPOSURES = torch.tensor([0.25, 0.5, 1, 2, 4])

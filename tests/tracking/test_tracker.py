@@ -7,11 +7,11 @@ import pytest
 import torch
 from tracked import NEAR, SIZE, TRACKER, WORLD, at, refused, right, scenes, truth
 
-from holotorch.tracking.catheter import THESIS
-from holotorch.tracking.render import Occluder
-from holotorch.tracking.status import Pose, Status
-from holotorch.tracking.tracker import CatheterTracker
-from holotorch.tracking.world import Case
+from holotorch.tracking.detection.tracker import CatheterTracker
+from holotorch.tracking.pose.catheter import THESIS
+from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.simulation.render import Occluder
+from holotorch.tracking.simulation.world import Case
 
 RED = THESIS.colours[0]
 

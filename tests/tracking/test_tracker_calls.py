@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 from tracked import SIZE, TRACKER, WORLD, at, refused, right, scenes, truth
 
-from holotorch.tracking import tracker as tracker_module
-from holotorch.tracking.catheter import THESIS
-from holotorch.tracking.coarse import Segment
-from holotorch.tracking.status import Pose, Status
-from holotorch.tracking.strips import Sampler
+from holotorch.tracking.camera.strips import Sampler
+from holotorch.tracking.detection import tracker as tracker_module
+from holotorch.tracking.detection.coarse import Segment
+from holotorch.tracking.pose.catheter import THESIS
+from holotorch.tracking.pose.status import Pose, Status
 
 SHORTER = replace(THESIS, edges=(0.070, 0.108, 0.127, 0.165))  # bands that no pose explains
 

@@ -7,12 +7,12 @@ import pytest
 import torch
 from tracked import SIZE, TRACKER, WORLD, at, refused, right, scenes, truth
 
-from holotorch.tracking.camera import Camera
-from holotorch.tracking.catheter import THESIS, Catheter
-from holotorch.tracking.render import Look
-from holotorch.tracking.status import Status
-from holotorch.tracking.tracker import CatheterTracker
-from holotorch.tracking.world import World, synthetic_camera
+from holotorch.tracking.camera.camera import Camera
+from holotorch.tracking.detection.tracker import CatheterTracker
+from holotorch.tracking.pose.catheter import THESIS, Catheter
+from holotorch.tracking.pose.status import Status
+from holotorch.tracking.simulation.render import Look
+from holotorch.tracking.simulation.world import World, synthetic_camera
 
 RED, GREEN, BLUE = THESIS.colours
 SIX = Catheter((0.050, 0.062, 0.080, 0.090, 0.108, 0.120, 0.135), (RED, GREEN, BLUE) * 2, 1.5e-3, 0.3)

@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from holotorch.tracking import scenery, trials
-from holotorch.tracking.catheter import THESIS, Catheter
-from holotorch.tracking.render import Look
-from holotorch.tracking.world import Case, World, synthetic_camera
+from holotorch.tracking.pose.catheter import THESIS, Catheter
+from holotorch.tracking.simulation import scenery, trials
+from holotorch.tracking.simulation.render import Look
+from holotorch.tracking.simulation.world import Case, World, synthetic_camera
 
 SIZE = (270, 480)
 WORLD = World(SIZE)

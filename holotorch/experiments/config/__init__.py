@@ -1,0 +1,1 @@
+"""YAML configurations: positions, fields, and mistakes in words."""

@@ -1,0 +1,138 @@
+"""Validation errors in words that say what was expected, what came and what to write instead."""
+
+import difflib
+import math
+import re
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from holotorch.experiments.config.errors import ConfigError, short
+from holotorch.experiments.config.source import MOST_MISTAKES, Key, Source
+
+Model = TypeVar("Model", bound=BaseModel)
+
+_EXPECTED = {
+    "int_": "a whole number",
+    "float_": "a number",
+    "finite_number": "a finite number",
+    "string_": "text",
+    "tuple_": "a list",
+    "model_": "settings, as in {key: value}",
+    "dict_": "settings, as in {key: value}",
+}
+
+
+def validated(source: Source, model: type[Model]) -> Model:
+    """The settings that a file holds.
+
+    Raises:
+        ConfigError: All mistakes, each a line once, in the order of the file.
+    """
+    try:
+        return model.model_validate(source.data)
+    except ValidationError as error:
+        entries = error.errors()
+        listed = entries[:MOST_MISTAKES]
+        mistakes = dict.fromkeys(describe(source, model, e) for e in listed if not _follows(e, listed))
+        left = len(entries) - MOST_MISTAKES
+        more = [f"{source.path}: and {left} more mistakes"] if left > 0 else []
+        raise ConfigError([*sorted(mistakes, key=position), *more]) from None
+
+
+def _follows(entry: Any, others: list[Any]) -> bool:
+    """Whether a list is too short only for pydantic, which does not count the entries that are wrong themselves."""
+    place = entry["loc"]
+    inside = (len(other["loc"]) > len(place) and other["loc"][: len(place)] == place for other in others)
+    return entry["type"] == "too_short" and any(inside)
+
+
+def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
+    """One line for one entry of ``ValidationError.errors()``: place, key, what was expected, what came, a hint."""
+    key = _written_key(source, entry["loc"])
+    kind, given = entry["type"], entry["input"]
+    if kind == "extra_forbidden":
+        return source.mistake(key, _unknown(model, entry["loc"], str(key[-1])))
+    if kind == "missing":
+        return source.mistake(key, "required, but missing")
+    if kind in ("union_tag_not_found", "union_tag_invalid"):
+        wanted = entry["ctx"].get("expected_tags", "")
+        options = re.findall(r"'([^']+)'", wanted)
+        options = options or [tag for option in _options_at(model, entry["loc"]) for tag in _tags(option)]
+        got = given.get("kind", "none") if isinstance(given, dict) else given
+        hint = nearest(str(got), options)
+        return source.mistake((*key, "kind"), f"expected one of {', '.join(options)}, got {short(got)}{hint}")
+    if kind == "path":
+        return source.mistake(key, entry["msg"])
+    if kind in ("too_short", "too_long"):
+        bound, name = ("least", "min_length") if kind == "too_short" else ("most", "max_length")
+        number, got = entry["ctx"][name], entry["ctx"]["actual_length"]
+        return source.mistake(key, f"expected at {bound} {number} {'entry' if number == 1 else 'entries'}, got {got}")
+    wanted = next((text for start, text in _EXPECTED.items() if kind.startswith(start)), None)
+    wanted = wanted or entry["msg"].replace("Input should be ", "").removeprefix("expected ")
+    near = difflib.get_close_matches(str(given)[:100], re.findall(r"'([^']+)'", wanted), 1)
+    # A length with a unit, such as "8 m", has not lost one.
+    cure = entry["ctx"]["cure"] if kind == "quantity" and not isinstance(given, str) else ""
+    shown = "nothing" if given is None else "NaN" if isinstance(given, float) and math.isnan(given) else short(given)
+    return source.mistake(key, f"expected {wanted}, got {shown}" + (f"; did you mean {near[0]!r}?" if near else cure))
+
+
+def _unknown(model: type[BaseModel], location: tuple[str | int, ...], name: str) -> str:
+    others = [
+        tag for option in _options_at(model, location[:-2]) if name in option.model_fields for tag in _tags(option)
+    ]
+    if others and len(location) > 2:
+        section, kind = location[-3], location[-2]
+        whole = f"to change the kind give the whole section, as in '{section}={{kind: {kind}}}'"
+        return f"a setting of kind {' and '.join(others)}, not of {kind}; {whole}"
+    return "unknown setting" + nearest(
+        name, [name for option in _options_at(model, location[:-1]) for name in option.model_fields]
+    )
+
+
+def position(mistake: str) -> tuple[int, int]:
+    """Line and column of a mistake, so that a file's mistakes come in its order and the arguments' after them."""
+    match = re.search(r":(\d+):(\d+): ", mistake)
+    return (int(match[1]), int(match[2])) if match else (2**31, 0)
+
+
+def _written_key(source: Source, location: tuple[str | int, ...]) -> Key:
+    """The location without the union tags that pydantic puts between a section and its settings."""
+    key: list[str | int] = []
+    value: Any = source.data
+    for i, part in enumerate(location):
+        tagged = isinstance(value, dict) and value.get("kind") == part and i < len(location) - 1
+        if tagged and part not in value:
+            continue
+        if isinstance(part, int) and not isinstance(value, list):
+            break  # a single value that stands for a list
+        key.append(part)
+        try:
+            value = value[part]  # type: ignore[index]
+        except (KeyError, IndexError, TypeError):
+            value = None
+    return tuple(key)
+
+
+def _options_at(model: type[BaseModel], location: tuple[str | int, ...]) -> list[type[BaseModel]]:
+    """The sections that may stand at ``location``: several where a ``kind`` chooses and it is not part of it."""
+    options: list[type[BaseModel]] = [model]
+    for part in location:
+        fields = [option.model_fields[str(part)] for option in options if str(part) in option.model_fields]
+        if not fields:  # a union tag
+            options = [option for option in options if part in _tags(option)]
+            continue
+        annotation = fields[0].annotation
+        parts = getattr(annotation, "__args__", (annotation,))
+        options = [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
+    return options
+
+
+def _tags(option: type[BaseModel]) -> tuple[str, ...]:
+    return getattr(option.model_fields["kind"].annotation, "__args__", ()) if "kind" in option.model_fields else ()
+
+
+def nearest(word: str, options: list[str]) -> str:
+    """A hint: the option nearest to ``word``, or all of them."""
+    near = difflib.get_close_matches(word, options, 1)
+    return f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(options)}" if options else ""

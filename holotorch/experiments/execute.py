@@ -1,0 +1,84 @@
+"""What the commands ``check``, ``run`` and ``resume`` do with an experiment of any kind."""
+
+from pathlib import Path
+from typing import Any
+
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.config.source import read_source
+from holotorch.experiments.registry import find_kind, load_config
+from holotorch.experiments.report import has_section, write_report
+from holotorch.experiments.runs.folder import RunFolder, open_run, tidied
+from holotorch.experiments.runs.plan import RunPlan
+from holotorch.experiments.runs.processes import joined_processes
+from holotorch.experiments.runs.signals import interruptible
+from holotorch.io.files import write_json
+
+
+def execute(settings: Any, out: Path | None, name: str = "run") -> tuple[Path, bool]:
+    """Carry a run out and fill a folder: ``out``, or the next free ``runs/NAME-001``.
+
+    An ``out`` that holds an unfinished run of the same settings is gone on with.
+
+    Args:
+        settings: Of any kind, as from :func:`~holotorch.experiments.registry.load_config`.
+        out: Folder of the run.
+        name: Of the run, where there is no ``out``.
+
+    Returns:
+        The folder, and whether the run is complete; if it was interrupted, what it had found is in the folder.
+
+    Raises:
+        ConfigError: The folder holds files already or cannot be written, an input cannot be used, the run does not fit
+            into memory, or it cannot start.
+    """
+    kind = find_kind(settings.experiment)
+    experiment = kind.build(settings)
+    plan = kind.plan(experiment)
+    with joined_processes(kind.parallel) as rank:
+        if rank > 0:  # the first process has the folder
+            with interruptible() as pressed:
+                return Path(), kind.run(experiment, RunFolder(Path(), name, plan, pressed))
+        if kind.announces:
+            print(plan.text, flush=True)
+        if plan.shortage:
+            raise ConfigError([plan.shortage])
+        kind.prepare(experiment)
+
+        def write_page(path: Path) -> None:
+            write_report([path.parent], path)
+
+        with open_run(out, name, settings, plan, kind.device(experiment)) as folder:
+            folder.write_page = write_page if has_section(settings.experiment) else None
+            if plan.values:
+                write_json(folder.path / "plan.json", plan.values)
+            return folder.path, kind.run(experiment, folder)
+
+
+def check(settings: Any) -> RunPlan:
+    """Plan a run, compute nothing."""
+    kind = find_kind(settings.experiment)
+    return kind.plan(kind.build(settings))
+
+
+def resume(folder: Path) -> tuple[Path, bool]:
+    """Go on with an interrupted run in its folder, as if it had never stopped; returns as :func:`execute`.
+
+    Raises:
+        ConfigError: The folder holds no run of this program, or its configuration no longer works, or is no longer that
+            of its checkpoint.
+    """
+    config = folder / "config.yaml"
+    held = read_source(config, []).data if config.is_file() else {}
+    if held.get("experiment") == "track":
+        again = f"its poses are kept, and all is tracked anew by: holotorch track {held.get('source', 'SOURCE')}"
+        frames = f", the frames that it kept by: holotorch track {folder / 'recording'}"
+        frames = frames if (folder / "recording").is_dir() else ""
+        raise ConfigError([f"{folder} holds a tracking run, which is not resumed: {again}{frames}"])
+    if not config.is_file() or not (folder / "env.json").is_file():
+        raise ConfigError([f"{folder} holds no run to resume: config.yaml and env.json are not both there"])
+    if (folder / "summary.json").is_file():
+        print("this run is complete; nothing is left to do")
+        if tidied(folder) and has_section(held.get("experiment")):
+            write_report([folder], folder / "report.html")
+        return folder, True
+    return execute(load_config(config), folder, folder.resolve().name)

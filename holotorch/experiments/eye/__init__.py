@@ -1,0 +1,1 @@
+"""What an observer sees of a volume's hologram."""

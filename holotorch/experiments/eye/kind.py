@@ -1,0 +1,54 @@
+"""The kind ``eye``: what an observer sees of a volume's hologram."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from holotorch.experiments.eye.config import ObserverSettings
+from holotorch.experiments.kind import ExperimentKind
+from holotorch.experiments.runs.plan import RunPlan
+
+if TYPE_CHECKING:
+    from holotorch.experiments.eye.experiment import Observer
+    from holotorch.experiments.runs.folder import RunFolder
+    from holotorch.experiments.runs.record import RunRecord
+
+
+class ObserverKind(ExperimentKind[ObserverSettings, "Observer"]):
+    """See :mod:`holotorch.experiments.kind`."""
+
+    settings = ObserverSettings
+    example = "configs/eye/teapot.yaml"
+
+    def build(self, settings: ObserverSettings) -> Observer:
+        from holotorch.experiments.eye.run import build_observer
+
+        return build_observer(settings)
+
+    def plan(self, experiment: Observer) -> RunPlan:
+        from holotorch.experiments.eye.plan import plan_text, plan_values, too_large
+
+        values = plan_values(experiment)
+        values["text"] = plan_text(experiment, values)
+        return RunPlan(values["text"], values, too_large(values))
+
+    def prepare(self, experiment: Observer) -> None:
+        from holotorch.experiments.eye.run import visible_surface
+
+        visible_surface(experiment)
+
+    def run(self, experiment: Observer, folder: RunFolder) -> bool:
+        from holotorch.experiments.eye.run import run_observer
+
+        return run_observer(experiment, folder)
+
+    def device(self, experiment: Observer) -> str:
+        return str(experiment.scene.device)
+
+    def section(self, record: RunRecord) -> list[str]:
+        from holotorch.experiments.eye.report import eye_section
+
+        return eye_section(record.title, record.summary, record.plan, record.picture)
+
+
+KIND = ObserverKind()

@@ -1,0 +1,170 @@
+"""What a finished run wants a panel to show: phases, and the way to the picture that they form."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+from holotorch.core.complex import intensity
+from holotorch.core.grid import Grid
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.pec.config import PECSettings
+from holotorch.experiments.registry import load_config
+from holotorch.experiments.volume.config import VolumeSettings
+from holotorch.hologram import double_phase, encoding_loss, error_diffused, kinoform, refocused
+from holotorch.io.files import read_json
+
+if TYPE_CHECKING:
+    from holotorch.experiments.pec.experiment import PECExperiment
+
+ENCODINGS: dict[str, Callable[[Tensor], Tensor]] = {
+    "double_phase": double_phase,
+    "kinoform": kinoform,
+    "error_diffusion": error_diffused,
+}
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a run wants a panel to show.
+
+    Attributes:
+        phase: float32 [F, C, H, W] in rad, not wrapped.
+        wavelengths: Of the C colours, in metres.
+        grid: Pixels of the hologram.
+        encoding: How the phases came from a field; "phase" where the run holds phases.
+        picture: Intensity [C, ...] that fields [F, C, H, W], one after another in time, form where it is looked at.
+        losses: Relative squared error of the picture by the encoding, one per colour, with no aperture, and by the
+            kinoform; empty for phases.
+    """
+
+    phase: Tensor
+    wavelengths: tuple[float, ...]
+    grid: Grid
+    encoding: str
+    picture: Callable[[Tensor], Tensor]
+    losses: dict[str, list[float]] = field(default_factory=dict)
+
+
+def load_wanted(folder: Path, encoding: str | None = None) -> Wanted:
+    """Phases and propagation of a run folder of kind ``pec`` or ``volume``. ConfigError where it cannot be used."""
+    if not (folder / "config.yaml").is_file():
+        raise ConfigError([f"{folder} holds no run: config.yaml is not there"])
+    if encoding is not None and encoding not in ENCODINGS:
+        raise ConfigError([f"expected one of {', '.join(ENCODINGS)} as the encoding, got {encoding!r}"])
+    settings = load_config(folder / "config.yaml")
+    try:
+        if isinstance(settings, PECSettings):
+            if encoding is not None:
+                raise ConfigError([f"{folder} holds phases already, which need no encoding; leave out --encoding"])
+            return _from_pec(folder, settings)
+        if isinstance(settings, VolumeSettings):
+            return _from_volume(folder, settings, encoding or "double_phase")
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError([f"{folder}: {error}"]) from error
+    raise ConfigError([f"{folder} holds a {settings.experiment}; only runs of kind pec and volume have a hologram"])
+
+
+def _from_pec(folder: Path, settings: PECSettings) -> Wanted:
+    from holotorch.experiments.pec.experiment import build
+
+    experiment = build(settings)
+    colours = len(settings.wavelengths)
+    shape = (settings.frames, colours, *settings.grid.shape)
+    heaters = _array(folder / "arrays" / "phase.npy", shape, "(F, C, H, W)", "float32")
+    checks.all_finite("phase", heaters)
+    _check_axes(folder, experiment, heaters)
+    phase = experiment.array.crosstalk(heaters[:, experiment.lit].double()).float()
+
+    def picture(fields: Tensor) -> Tensor:
+        device = experiment.device
+        formed = [intensity(experiment.propagator(each.to(device))) for each in fields]
+        return experiment.seen(torch.stack(formed).mean(0)).cpu()
+
+    return Wanted(phase, experiment.wavelengths, experiment.grid, "phase", picture)
+
+
+def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> Wanted:
+    height, width = (size // settings.scale for size in settings.hologram.shape)
+    grid = Grid((height, width), settings.hologram.pitch)
+    shape = (len(settings.wavelengths), height, width)
+    hologram = _array(folder / "arrays" / "hologram.npy", shape, "(C, H, W)", "complex64")
+    checks.all_finite("hologram", torch.view_as_real(hologram))
+    # Near 1, by a power of two that changes no digit: losses are of fourth power, which float32 may not hold.
+    hologram = hologram * 2.0 ** -torch.frexp(hologram.abs().amax()).exponent.double().item()
+    depth = _depth(folder, settings)
+
+    def views(colour: int) -> Callable[[Tensor], Tensor]:
+        return lambda light: refocused(light, grid, settings.wavelengths[colour], depth, tolerance=3e-3)
+
+    def picture(fields: Tensor) -> Tensor:
+        return torch.stack([intensity(views(c)(fields[:, c])).mean(0) for c in range(fields.shape[1])])
+
+    phase = torch.stack([ENCODINGS[encoding](each) for each in hologram])
+    losses = {}
+    for name, phases in ((encoding, phase), ("kinoform", kinoform(hologram))):
+        losses[name] = [encoding_loss(hologram[c], phases[c], views(c)).item() for c in range(len(hologram))]
+    return Wanted(phase[None], settings.wavelengths, grid, encoding, picture, losses)
+
+
+def _check_axes(folder: Path, experiment: "PECExperiment", heaters: Tensor) -> None:
+    """ValueError if the axes of heater phases [F, C, H, W] have changed places, which no shape tells where F = C.
+
+    The heating power of each colour tells it, which the run's summary holds.
+    """
+    try:
+        numbers = _summary(folder).get("methods", {}).get("corrected", {}).get("heating_power_K_per_pixel")
+        wanted = None if numbers is None else torch.tensor(numbers, dtype=torch.float64)[experiment.lit]
+    except (ValueError, AttributeError, TypeError, LookupError, RuntimeError):
+        raise ValueError("summary.json is damaged: it does not say the heating power of each colour") from None
+    if not len(heaters) == heaters.shape[1] > 1 or wanted is None:
+        return
+
+    def fits(phases: Tensor) -> bool:
+        power = experiment.array.temperature(phases[:, experiment.lit].double()).mean((0, -2, -1))
+        return torch.allclose(power, wanted, rtol=1e-3)
+
+    if not fits(heaters) and fits(heaters.transpose(0, 1)):
+        raise ValueError(
+            f"phase.npy holds [C, F, H, W], colours before frames, by the heating power of each colour in the run's "
+            f"summary, and [F, C, H, W] is wanted; as F = C = {len(heaters)}, its shape does not tell: swap its first "
+            "two axes"
+        )
+
+
+def _depth(folder: Path, settings: VolumeSettings) -> float:
+    """The middle one of the depths at which the run's report looks."""
+    try:
+        depths = _summary(folder).get("refocused_m") or [settings.hologram.distance / settings.scale]
+        return checks.finite("refocused_m", depths[len(depths) // 2], "metres")
+    except (ValueError, AttributeError, TypeError, LookupError):
+        raise ValueError("summary.json is damaged: it does not say at which depths the run has looked") from None
+
+
+def _summary(folder: Path) -> dict[str, Any]:
+    """What the run says of itself; empty before it has ended."""
+    for name in ("summary.json", "interrupted.json"):
+        if (folder / name).is_file():
+            return read_json(folder / name)
+    return {}
+
+
+def _array(path: Path, shape: tuple[int, ...], axes: str, dtype: str) -> Tensor:
+    if not path.is_file():
+        raise ValueError(f"{path.name} is not in its arrays; the run has not come so far: holotorch resume")
+    try:
+        found = np.load(path, mmap_mode="r", allow_pickle=False)  # which compares sizes before it takes memory
+        stated = found.shape, str(found.dtype)
+    except Exception as error:  # what damaged bytes raise is anyone's guess
+        raise ValueError(f"{path.name} cannot be read: {error}") from None
+    if stated != (shape, dtype):
+        wanted = f"the shape {axes} = {shape} of its configuration in {dtype}"
+        raise ValueError(f"{path.name} must have {wanted}, got {stated[0]} in {stated[1]}")
+    return torch.from_numpy(found.copy())

@@ -1,0 +1,1 @@
+"""Proximity effect correction of one picture."""

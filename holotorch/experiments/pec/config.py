@@ -1,0 +1,212 @@
+"""What the configuration of a proximity effect correction may say."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic_core import PydanticCustomError
+
+from holotorch.core.quantities import SIGMA_PX
+from holotorch.experiments.config.settings import (
+    Count,
+    Distance,
+    GridSettings,
+    Number,
+    Settings,
+    Side,
+    Wavelength,
+    existing,
+    number,
+    pair,
+    plausible,
+    several,
+)
+from holotorch.experiments.config.source import Key
+from holotorch.io.bundled import BUNDLED_IMAGES, no_such_picture
+
+
+def _not_zero(value: float) -> float:
+    if abs(value) < 1e-6:
+        raise PydanticCustomError("distance", "expected a distance of 1 um or more: closer, a phase forms no image")
+    return value
+
+
+def _is_picture(value: str) -> bool:
+    return value in BUNDLED_IMAGES or Path(value).is_file()
+
+
+Picture = Annotated[str, existing(_is_picture, no_such_picture)]
+# "hot": phases uniform on [0, 2 pi); "cool": their spread is; "flat": on [0, 1); "quadratic": a lens, after spreading;
+# "retrieved": phases of Gerchberg-Saxton, deconvolved.
+Start = Literal["hot", "cool", "flat", "quadratic", "retrieved"]
+
+
+class PeripheralWeightSettings(Settings):
+    """Squared errors weighed by what the eye can use of them: (1 + E / e2_deg)^-2 at the eccentricity E.
+
+    ``field_deg``: what the picture spans from left to right, at equal angles per pixel; ``gaze_deg``: elevation and
+    azimuth of the point that is looked at; ``least``: lower limit, relative to the weight at that point.
+    """
+
+    kind: Literal["peripheral"]
+    field_deg: Annotated[Number, Field(gt=0, le=360)]
+    gaze_deg: tuple[Annotated[Number, Field(ge=-90, le=90)], Annotated[Number, Field(ge=-180, le=180)]] = (0.0, 0.0)
+    e2_deg: Annotated[Number, Field(gt=0, le=180)] = 1.746  # Cowey and Rolls
+    least: Annotated[Number, Field(ge=0, le=1)] = 0.0
+
+
+class TargetSettings(Settings):
+    """A bundled photograph or a picture file, and how it is brought to the grid's aspect, or to that of a region of it.
+
+    ``region``: size in pixels of the middle of the image in which the picture is wanted; the rest is free (thesis
+    Eqs. 4.7, 4.8). ``depths``: with several distances, ``bands`` puts as many vertical bands of the picture in focus,
+    one at each, and leaves them free elsewhere; ``full`` wants the whole picture at every distance. ``weight``: how
+    much an error counts where.
+    """
+
+    image: Picture
+    fit: Literal["crop", "pad"] = "crop"
+    region: Annotated[tuple[Side, Side], BeforeValidator(pair)] | None = None
+    depths: Literal["bands", "full"] = "bands"
+    weight: PeripheralWeightSettings | None = None
+
+
+class ModulatorSettings(Settings):
+    """The phased array: width of the heat kernel in pixels, number of taps (chosen from the width if not given).
+
+    ``max_phase``: limit in rad on the phase after spreading, which the hottest pixel never passes (4 pi is 700 degC at
+    630 nm); no limit is the thesis's model. ``bits``: resolution of the heaters, between 0 and their largest phase.
+    ``power_weight``: of the sum of the heater phases in the loss, whose other part is a squared error of the image.
+    """
+
+    sigma_px: Annotated[Number, plausible(SIGMA_PX)]
+    kernel_size: Annotated[Count, Field(le=401)] | None = None
+    max_phase: Annotated[Number, Field(ge=0.1, le=1000)] | None = None
+    bits: Annotated[Count, Field(le=16)] | None = None
+    power_weight: Annotated[Number, Field(ge=0, le=1e6)] = 0.0
+
+
+class FraunhoferSettings(Settings):
+    """Image in the far field."""
+
+    kind: Literal["fraunhofer"]
+
+
+class NearFieldSettings(Settings):
+    """Image at one distance or more. ``isolated``: the array stands alone; ``periodic``: it repeats (the thesis)."""
+
+    kind: Literal["fresnel", "angular_spectrum"]
+    distance: Annotated[
+        tuple[Annotated[Distance, AfterValidator(_not_zero)], ...], BeforeValidator(several), Field(min_length=1)
+    ]
+    boundary: Literal["isolated", "periodic"] = "isolated"
+
+
+class APGSettings(Settings):
+    """Accelerated proximal gradient, thesis Algorithm 2."""
+
+    kind: Literal["apg"]
+    step: Annotated[Number, Field(ge=1e-6, le=1e6)] = 1.0
+    shrink: Annotated[Number, Field(gt=0, lt=1)] = 0.5
+    grow: Annotated[Number, Field(ge=1, le=10)] = 1.0
+    restart: bool = False
+    max_steps: Count = 400
+    tolerance: Annotated[Number, Field(ge=0)] = 1e-3
+    patience: Count = 10
+    start: Start | None = None
+
+
+class AdamSettings(Settings):
+    """Adam with projection onto phases >= 0."""
+
+    kind: Literal["adam"]
+    learning_rate: Annotated[Number, Field(ge=1e-6, le=10)] = 0.1
+    max_steps: Count = 400
+    tolerance: Annotated[Number, Field(ge=0)] = 1e-3
+    patience: Count = 10
+    start: Start | None = None
+
+
+class LBFGSSettings(Settings):
+    """Preconditioned L-BFGS, in stages: the amplitude's loss first, and a limit on the heat by penalties."""
+
+    kind: Literal["lbfgs"]
+    memory: Annotated[Count, Field(le=100)] = 3
+    max_steps: Count = 300
+    tolerance: Annotated[Number, Field(ge=0)] = 1e-4
+    patience: Count = 10
+    start: Start | None = None
+
+
+# "unweighted": the run's own solver without target.weight.
+Baseline = Literal["none", "basic_ipec", "ipec", "chopping", "shifting", "nonnegative", "unweighted"]
+
+
+class ReportSettings(Settings):
+    """What is measured and compared in the report."""
+
+    metrics: Annotated[tuple[Literal["ssim", "psnr"], ...], BeforeValidator(several), Field(min_length=1)] = (
+        "ssim",
+        "psnr",
+    )
+    baselines: Annotated[tuple[Baseline, ...], BeforeValidator(several)] = ("none", "basic_ipec")
+
+
+class PECSettings(Settings):
+    """Proximity effect correction of one picture on a thermally driven phased array."""
+
+    experiment: Literal["pec"]
+    seed: Annotated[int, BeforeValidator(number), Field(ge=0, lt=2**63)] = 0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    grid: GridSettings
+    wavelengths: Annotated[tuple[Wavelength, ...], BeforeValidator(several)]
+    target: TargetSettings
+    modulator: ModulatorSettings
+    propagator: Annotated[FraunhoferSettings | NearFieldSettings, Field(discriminator="kind")]
+    frames: Annotated[Count, Field(le=64)] = 1
+    multiplexing: Literal["joint", "independent"] = "joint"
+    solver: Annotated[APGSettings | AdamSettings | LBFGSSettings, Field(discriminator="kind")]
+    report: ReportSettings = ReportSettings()
+
+
+def contradictions(settings: PECSettings) -> list[tuple[Key, str]]:
+    """Settings that are fine one by one and not together."""
+    found: list[tuple[Key, str]] = []
+    smallest = min(settings.grid.shape)
+    if len(settings.wavelengths) not in (1, 3):
+        found.append((("wavelengths",), f"expected 1 (grey) or 3 (red, green, blue), got {len(settings.wavelengths)}"))
+    if "ssim" in settings.report.metrics and smallest < 11:
+        hint = "use a larger grid, or report.metrics: [psnr]"
+        found.append((("grid", "shape"), f"expected at least 11 x 11 px for ssim, got {settings.grid.shape}; {hint}"))
+    size = settings.modulator.kernel_size
+    if size is not None and size % 2 == 0:
+        found.append((("modulator", "kernel_size"), f"expected an odd number of taps, got {size}; use {size + 1}"))
+    elif size is not None and size > smallest:
+        key = ("modulator", "kernel_size")
+        found.append((key, f"expected at most {smallest}, the smaller side of the grid, got {size}"))
+    light, finest, longest = settings.propagator, min(settings.grid.pitch), max(settings.wavelengths, default=0.0)
+    if isinstance(light, NearFieldSettings) and finest < 0.9 * longest:
+        least = f"at least 0.9 of the longest wavelength, {0.9 * longest:.3g} m, for an image at a distance"
+        found.append((("grid", "pitch"), f"expected {least}, got {finest:g} m"))
+    smaller = settings.target.region
+    if smaller and (smaller[0] > settings.grid.shape[0] or smaller[1] > settings.grid.shape[1]):
+        found.append((("target", "region"), f"expected at most the grid, {settings.grid.shape}, got {smaller}"))
+    if smaller and "ssim" in settings.report.metrics and min(smaller) < 11:
+        found.append((("target", "region"), f"expected at least 11 x 11 px for ssim, got {smaller}"))
+    limit = settings.modulator.max_phase
+    if limit is not None and settings.solver.kind != "lbfgs":
+        hint = "'solver={kind: lbfgs}'"
+        found.append((("modulator", "max_phase"), f"only the solver lbfgs keeps a limit; use {hint}, or leave it out"))
+    several = isinstance(light, NearFieldSettings) and len(light.distance) > 1
+    if several and smaller:
+        found.append((("target", "region"), "expected one distance beside a region"))
+    if settings.target.weight and (several or smaller):
+        found.append((("target", "weight"), "expected one distance and no region beside a weight"))
+    if settings.target.weight:
+        rows, columns = settings.grid.shape
+        if (high := settings.target.weight.field_deg * rows / columns) > 360:
+            field = f"expected a picture of at most 360 deg in height as well, got {high:g}"
+            found.append((("target", "weight", "field_deg"), field))
+    if "unweighted" in settings.report.baselines and not settings.target.weight:
+        found.append((("report", "baselines"), "unweighted asks for a target.weight that can be left out"))
+    return found

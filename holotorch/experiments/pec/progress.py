@@ -1,0 +1,111 @@
+"""What is seen and kept of a solver at work: progress bar, metrics.csv, checkpoints."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from holotorch.correction import Solution
+from holotorch.experiments.pec.experiment import PECExperiment
+from holotorch.experiments.pec.judge import quality
+from holotorch.experiments.runs.memory import peak_memory
+from holotorch.experiments.runs.saving import Checkpoint
+
+_CHECK_EVERY = 10  # steps between two measurements of quality, which cost about as much as a step
+_SAVE_EVERY = 30.0  # seconds between two checkpoints
+
+
+class Log:
+    """Callback of the solver: progress bar, rows of metrics.csv, the last state, and a checkpoint now and then."""
+
+    def __init__(self, experiment: PECExperiment, checkpoint: Checkpoint):
+        self.experiment, self.checkpoint, self.last = experiment, checkpoint, None
+        self.rows: list[list[str]] = []
+        self.checked: list[tuple[int, float]] = []
+        self.before = self.seconds_spent = 0.0
+        self.resume: dict[str, torch.Tensor] | None = None
+        if content := checkpoint.load():
+            self._restore(content)
+        self.started = self.saved = time.perf_counter()
+        self.bar = tqdm(
+            total=experiment.settings.solver.max_steps,
+            initial=len(self.rows),
+            desc="correcting",
+            unit="step",
+            dynamic_ncols=True,
+        )
+
+    @property
+    def metric(self) -> str:
+        """Name of what is measured on the way."""
+        return self.experiment.settings.report.metrics[0]
+
+    @property
+    def seconds(self) -> float:
+        """Spent by the solver so far, an earlier run of it included and this log's own work left out."""
+        return self.before + time.perf_counter() - self.started - self.seconds_spent
+
+    def __call__(self, solution: Solution) -> None:
+        """Take note of a step."""
+        entered = time.perf_counter()
+        elapsed = self.before + entered - self.started - self.seconds_spent
+        step = len(solution.losses) - 1
+        shown, score = {}, ""
+        if step % _CHECK_EVERY == 0:
+            self.checked.append((step, quality(self.experiment, self.experiment.frames_of(solution.x))))
+            score = f"{self.checked[-1][1]:.6f}"
+        losses = solution.losses[-1].reshape(-1, len(self.experiment.wavelengths)).mean(0).tolist()
+        self.rows.append([str(step), str(solution.evaluations), f"{elapsed:.4f}", score, *map(repr, losses)])
+        self.last = solution
+        relative = (solution.losses[-1] / solution.losses[0].clamp(min=1e-30)).mean().item()
+        shown |= {"loss": f"{relative:.2e}", "mem": f"{peak_memory() / 1e9:.2f}GB"}
+        if self.checked:
+            shown[self.metric] = f"{self.checked[-1][1]:.4f}"
+        self.bar.set_postfix(shown, refresh=False)
+        self.bar.update()
+        if entered - self.saved > _SAVE_EVERY:
+            self.save()
+        self.seconds_spent += time.perf_counter() - entered
+
+    def save(self) -> bool:
+        """Write what it takes to go on from the last step; False where that is not possible."""
+        if self.last is None:
+            return True
+        content: dict[str, Any] = {
+            "state": self.last.state,
+            "rows": self.rows[: len(self.last.losses) - 1],  # an interruption may come between a row and its state
+            "checked": self.checked,
+            "seconds": self.seconds,
+        }
+        self.saved = time.perf_counter()  # the next try is not at once, either way
+        return self.checkpoint.save(content)
+
+    @contextmanager
+    def saved_on_failure(self) -> Iterator[None]:
+        """Save the last step also where the block fails, so that going on computes nothing again."""
+        try:
+            yield
+        except Exception:
+            if not (self.checkpoint.path.parent / "summary.json").is_file():
+                self.save()
+            raise
+
+    def close(self) -> None:
+        """End the progress bar."""
+        self.bar.close()
+
+    def table(self) -> str:
+        """The rows as CSV."""
+        colours = [f"loss_{wave * 1e9:.0f}nm" for wave in self.experiment.wavelengths]
+        header = ["step", "evaluations", "seconds", f"{self.metric}_mean", *colours]
+        return "\n".join(",".join(row) for row in [header, *self.rows]) + "\n"
+
+    def _restore(self, content: dict[str, Any]) -> None:
+        try:
+            self.resume, self.rows = content["state"], content["rows"]
+            self.checked, self.before = [tuple(pair) for pair in content["checked"]], content["seconds"]
+        except (KeyError, TypeError, ValueError) as error:
+            raise self.checkpoint.unreadable(error) from None

@@ -1,0 +1,129 @@
+"""The part of a report page that shows a correction, and the table of several."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from holotorch.experiments.pec.zones import zone_rows
+from holotorch.experiments.runs.markup import element, figure, heading, plain, table
+from holotorch.experiments.runs.record import RunRecord
+
+_PICTURES = {
+    "target": "Target",
+    "none": "No correction",
+    "chopping": "Matrix inverse, negative entries chopped",
+    "shifting": "Matrix inverse, shifted",
+    "nonnegative": "Non-negative deconvolution",
+    "basic_ipec": "Basic iterative correction",
+    "ipec": "Iterative correction",
+    "unweighted": "Corrected, all errors alike",
+    "corrected": "Corrected",
+    "isolated": "Corrected, on a chip that stands alone",
+}
+_FIGURES = {
+    "phase": "Heater phases, before the heat spreads",
+    "temperature": "Temperature of the chip above ambient, after the heat has spread",
+    "convergence": "Convergence of the solver",
+    "weight": "Weight of the squared error, mean 1",
+}
+_METHOD_NAMES = {
+    "none": "no correction",
+    "basic_ipec": "basic IPEC",
+    "ipec": "IPEC",
+    "unweighted": "corrected, all errors alike",
+}
+
+
+def comparison(runs: Sequence[RunRecord]) -> list[str]:
+    """HTML of a table of the corrections of several runs."""
+    rows = [[run.title, *_numbers(run.summary["methods"]["corrected"])] for run in runs]
+    return ["<h1>Runs</h1>" + table(["run", *_COLUMNS], rows)]
+
+
+def pec_section(run: RunRecord) -> list[str]:
+    """HTML of a run: scores by method, pictures side by side, figures and plan."""
+    methods: dict[str, Any] = run.summary["methods"]
+    parts = [heading(run.title, run.summary["status"])]
+    parts.append(table(["method", *_COLUMNS], [[_METHOD_NAMES.get(n, n), *_numbers(m)] for n, m in methods.items()]))
+    parts.append(element("p", _verdict(run)))
+    head, rows = zone_rows(methods)
+    if rows:
+        parts.append("<h2>By eccentricity</h2>" + table(head, rows))
+    parts.append('<div class="row">')
+    for name, caption in _PICTURES.items():
+        if source := run.picture(name):
+            parts.append(figure(source, f"{caption}{_score(run, name)}", "picture"))
+    parts.append("</div>")
+    for name, caption in _FIGURES.items():
+        if source := run.picture(name):
+            parts.append(figure(source, caption, "wide"))
+    parts.append("<h2>Plan</h2>" + table(["", ""], _plan_rows(run.plan), head=False))
+    return parts + [element("p", note, "warn") for note in run.plan["notes"]]
+
+
+_COLUMNS = (
+    "frames",
+    "SSIM",
+    "PSNR (dB)",
+    "SSIM between samples",
+    "SSIM, chip alone (exact)",
+    "light in window",
+    "hottest pixel (degC above ambient)",
+    "heating power (mean drive, K)",
+    "evaluations",
+    "seconds",
+)
+
+
+def _numbers(method: dict[str, Any]) -> list[str]:
+    return [
+        str(method["frames"]),
+        _fixed(method.get("ssim_mean"), 4),
+        _fixed(method.get("psnr_mean"), 1),
+        _fixed(method["between_samples"].get("ssim_mean"), 3),
+        _fixed(method.get("isolated", {}).get("ssim_mean"), 3),
+        f"{100 * _lit_mean(method['efficiency']):.0f} %",
+        _fixed(max(method["peak_temperature_rise_K"]), 0),
+        _fixed(_lit_mean(method["heating_power_K_per_pixel"]), 0),
+        str(method["evaluations"]),
+        _fixed(method["seconds"], 2),
+    ]
+
+
+def _verdict(run: RunRecord) -> str:
+    corrected = run.summary["methods"]["corrected"]
+    hottest = max(corrected["peak_temperature_rise_K"])
+    steps, done = max(corrected["steps"]), all(corrected["converged"])
+    stop = "met its stop rule" if done else "ran out of steps"
+    if any(corrected["stalled"]):
+        stop = "stopped where no step lowered the loss any more, at float precision or in a corner of the limit"
+    between = " (see 'between samples')"
+    if "isolated" not in corrected:
+        between = f"; half a sample off, a Fourier hologram is speckled{between}"
+    fewer = any(method["frames"] < corrected["frames"] for method in run.summary["methods"].values())
+    alone = " Methods that are compared with show a single frame." if fewer else ""
+    return (
+        f"The hottest pixel of the corrected hologram is {hottest:.0f} degC above ambient. The solver took {steps} "
+        f"steps and {stop}. Peak memory {run.summary['peak_memory_bytes'] / 1e9:.2f} GB. Heating power is the mean "
+        "temperature rise that the heaters alone would cause, before the heat spreads; times the number of pixels and "
+        "the chip's watts per kelvin it is the power in watts. Scores are of a float64 simulation of the phases. They "
+        f"are taken at the samples of the image, where the solver controls the light{between}.{alone}"
+    )
+
+
+def _plan_rows(plan: dict[str, Any]) -> list[list[str]]:
+    return [[name.replace("_", " "), plain(value)] for name, value in plan.items() if name != "notes"]
+
+
+def _score(run: RunRecord, name: str) -> str:
+    isolated = run.summary["methods"]["corrected"].get("isolated", {})
+    value = (isolated if name == "isolated" else run.summary["methods"].get(name, {})).get("ssim_mean")
+    return "" if value is None else f": SSIM {value:.3f}"
+
+
+def _fixed(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
+
+
+def _lit_mean(values: list[float]) -> float:
+    lit = [value for value in values if value > 0]
+    return sum(lit) / len(lit) if lit else 0.0

@@ -1,0 +1,67 @@
+"""The weight of errors over a wide picture, and scores by zones of the visual field."""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from holotorch.metrics import SSIM_WINDOW, ssim_map
+from holotorch.perception import Headset, LinearMagnification, peripheral_weight, separation
+
+if TYPE_CHECKING:
+    from holotorch.experiments.pec.config import PeripheralWeightSettings
+
+# Thesis Sec. 2.1: central vision, near, middle and far periphery.
+ZONES = ((0, 8), (8, 30), (30, 60), (60, 180))
+_NAMES = ("central", "near", "middle", "far")
+
+
+def eccentricities(settings: "PeripheralWeightSettings", shape: tuple[int, int]) -> Tensor:
+    """Of the pixels of a picture (H, W) from the point that is looked at, in degrees, float64 [H, W]."""
+    display = Headset(shape, shape[1] / settings.field_deg)
+    y, x = (torch.arange(side, dtype=torch.float64) for side in shape)
+    return separation(*display.angles(y[:, None], x), *settings.gaze_deg)
+
+
+def weight_map(settings: "PeripheralWeightSettings", shape: tuple[int, int]) -> Tensor:
+    """Weights of the squared errors, mean 1, float64 [H, W]."""
+    law = LinearMagnification(1.0, settings.e2_deg)
+    return peripheral_weight(eccentricities(settings, shape), law, least=settings.least)
+
+
+def zone_scores(
+    settings: "PeripheralWeightSettings", picture: Tensor, image: Tensor, lit: Tensor
+) -> list[dict[str, Any]]:
+    """PSNR and SSIM of pictures [C, H, W] in 0 .. 1 in each zone of the visual field that they reach, nearest first.
+
+    A zone's PSNR is that of its pixels, over all colours that are lit; its SSIM is the mean of the windows centred in
+    it, None where there is none. ``error`` is the zone's part of the whole squared error.
+    """
+    picture, image = picture[lit].clamp(0, 1), image[lit]
+    where = eccentricities(settings, (image.shape[-2], image.shape[-1]))
+    square = (picture - image).double().square().mean(0)
+    edge = SSIM_WINDOW // 2
+    middles = where[edge:-edge, edge:-edge]
+    windows = square[:0]
+    if min(where.shape) >= SSIM_WINDOW:
+        windows = ssim_map(picture, image, data_range=1.0).mean(0)
+    rows: list[dict[str, Any]] = []
+    for name, (low, high) in zip(_NAMES, ZONES, strict=True):
+        inside = (where >= low) & (where < high)
+        if not inside.any():
+            continue
+        error = square[inside].mean().item()
+        similar = windows[(middles >= low) & (middles < high)] if len(windows) else windows
+        rows.append(
+            {
+                "zone": name,
+                "from_deg": low,
+                "to_deg": high,
+                "pixels": int(inside.sum()),
+                "psnr": -10 * math.log10(error) if error > 0 else None,
+                "ssim": similar.mean().item() if similar.numel() else None,
+                "error": (square[inside].sum() / square.sum().clamp(min=1e-300)).item(),
+            }
+        )
+    return rows

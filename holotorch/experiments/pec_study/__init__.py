@@ -1,0 +1,1 @@
+"""Comparisons of methods of proximity effect correction over several photographs."""

@@ -1,0 +1,41 @@
+"""The kind ``pec_study``: methods of proximity effect correction over several photographs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from holotorch.experiments.kind import ExperimentKind
+from holotorch.experiments.pec_study.config import StudySettings
+from holotorch.experiments.runs.plan import RunPlan
+
+if TYPE_CHECKING:
+    from holotorch.experiments.pec_study.run import Study
+    from holotorch.experiments.runs.folder import RunFolder
+
+
+class StudyKind(ExperimentKind[StudySettings, "Study"]):
+    """See :mod:`holotorch.experiments.kind`."""
+
+    settings = StudySettings
+    example = "configs/pec/studies/targets.yaml"
+    announces = False
+
+    def build(self, settings: StudySettings) -> Study:
+        from holotorch.experiments.pec_study.run import build_study
+
+        return build_study(settings)
+
+    def plan(self, experiment: Study) -> RunPlan:
+        settings = experiment.settings
+        return RunPlan(
+            f"Study      {settings.study} of {', '.join(settings.images)} on {settings.size} x {settings.size} px\n"
+            f"Sweep      {', '.join(f'{value:g}' for value in settings.sweep)}; {settings.max_steps} steps at most"
+        )
+
+    def run(self, experiment: Study, folder: RunFolder) -> bool:
+        from holotorch.experiments.pec_study.run import run_study
+
+        return run_study(experiment, folder)
+
+
+KIND = StudyKind()

@@ -1,0 +1,90 @@
+"""A study as a run: a folder with its table, a picture, and what it says in words."""
+
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+from holotorch.experiments.pec_study.bench import Bench
+from holotorch.experiments.pec_study.cases import Cases
+from holotorch.experiments.pec_study.claims import with_claims
+from holotorch.experiments.pec_study.config import StudySettings
+from holotorch.experiments.pec_study.studies import STUDIES
+from holotorch.experiments.runs.fingerprint import fingerprint
+from holotorch.experiments.runs.folder import RunFolder, conclude
+from holotorch.experiments.runs.markup import element
+from holotorch.experiments.runs.memory import peak_memory
+from holotorch.experiments.runs.pictures import curves
+from holotorch.experiments.runs.saving import Checkpoint, Results
+from holotorch.experiments.runs.tables import write_table
+from holotorch.io.files import write_bytes, write_text
+from holotorch.metrics import PerceptualSimilarity
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study and the photographs that it is made on."""
+
+    settings: StudySettings
+    bench: Bench
+
+
+def build_study(settings: StudySettings) -> Study:
+    """Load the photographs."""
+    return Study(settings, Bench(images=settings.images, size=settings.size, perceptual=_perceptual()))
+
+
+def run_study(study: Study, opened: RunFolder) -> bool:
+    """Carry a study out and fill the folder; whether it is complete. It goes on after the last case that is."""
+    settings, bench = study.settings, study.bench
+    folder, files = opened.path, Results()
+    inputs = {"images": (bench.image,), "perceptual": ("none" if bench.perceptual is None else "LPIPS",)}
+    cases = Cases(Checkpoint(folder / "checkpoint.pt", fingerprint(settings, inputs)))
+    try:
+        rows = with_claims(settings.study, STUDIES[settings.study](bench, settings.sweep, settings.max_steps, cases))
+    except KeyboardInterrupt:
+        if not cases.saved:
+            raise
+        summary = {"experiment": settings.experiment, "study": settings.study, "status": "", "cases": cases.saved}
+        return conclude(opened, summary, files, done=False, checkpoint=cases.checkpoint)
+    files.write(write_table, folder / "table.csv", rows)
+    text = table_text(rows)
+    files.write(write_text, folder / "table.txt", text)
+    picture = curves(rows, f"{settings.study}: mean of {', '.join(settings.images)} at {settings.size} px")
+    files.write(write_bytes, folder / "images" / "table.png", picture)
+    page = element("title", settings.study) + element("h1", settings.study)
+    page += "<img src='images/table.png'>" + element("pre", text)
+    verdicts = [row["verdict"].split(":")[0] for row in rows if row["verdict"]]
+    summary = {
+        "experiment": settings.experiment,
+        "study": settings.study,
+        "status": "",
+        "rows": len(rows),
+        "verdicts": {verdict: verdicts.count(verdict) for verdict in dict.fromkeys(verdicts)},
+        "seconds": round(cases.seconds, 1),
+        "peak_memory_bytes": peak_memory(),
+    }
+    page = f"<!DOCTYPE html><meta charset='utf-8'>{page}"
+    files.write(write_text, folder / "report.html", page)
+    complete = conclude(opened, summary, files, done=True)
+    print(text)
+    return complete
+
+
+def _perceptual() -> PerceptualSimilarity | None:
+    """The learned similarity, if its extra is installed and its weights are at hand."""
+    try:
+        return PerceptualSimilarity()
+    except ImportError:
+        return None
+    except OSError as error:
+        print(f"LPIPS is left out: {error}", file=sys.stderr)
+        return None
+
+
+def table_text(rows: list[dict[str, Any]]) -> str:
+    """Rows as a table of fixed columns, without those that are empty throughout."""
+    names = [name for name in rows[0] if any(row[name] != "" for row in rows)]
+    cells = [names, *([str(row[name]) for name in names] for row in rows)]
+    widths = [max(len(line[i]) for line in cells) for i in range(len(names))]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in cells]
+    return "\n".join(lines) + "\n"

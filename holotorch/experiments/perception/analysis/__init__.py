@@ -1,0 +1,1 @@
+"""From the answers of a study to equal-efficiency scales."""

@@ -1,0 +1,220 @@
+"""Figures 2.3 to 2.7 of the thesis from the answers of a study, and the power of such studies: bytes of PNG files."""
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from holotorch.experiments.perception.analysis.curves import Curves, Times
+from holotorch.experiments.perception.analysis.statistics import Line
+
+_SLICES = ((5.0, "#c0392b"), (10.0, "#e08e0b"), (20.0, "#2867b2"))
+_LINES = ("#e63b2e", "#ff9d2e", "#ffe14a", "#ffffff", "#9be37c", "#f29bd4")
+_COLOURS = "viridis"
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What the pictures of one target time show.
+
+    Attributes:
+        name: The target, in words.
+        eccentricities: Degrees [K].
+        line: Its line and medians.
+    """
+
+    name: str
+    eccentricities: NDArray[np.float64]
+    line: Line
+
+
+def surface(times: Times, levels: Sequence[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Sizes [N] and quantiles over participants of the time in ms at them, [len(levels), E, N].
+
+    Between the sizes that were shown at an eccentricity the time is linear in ln S; beyond them it is NaN.
+    """
+    fine = np.linspace(times.sizes[0], times.sizes[-1], 64)
+    fine = np.unique(np.concatenate([fine, times.sizes, [s for s, _ in _SLICES if fine[0] <= s <= fine[-1]]]))
+    result = np.full((len(levels), len(times.eccentricities), len(fine)), np.nan)
+    for e in range(len(times.eccentricities)):
+        shown = np.isfinite(times.seconds[:, e]).any(0)
+        if shown.any():
+            values = np.nanquantile(times.seconds[:, e, shown], levels, axis=0)
+            for k in range(len(levels)):
+                result[k, e] = np.interp(
+                    np.log(fine), np.log(times.sizes[shown]), 1e3 * values[k], left=np.nan, right=np.nan
+                )
+    return fine, result
+
+
+def time_surface(times: Times) -> bytes:
+    """Fig. 2.3: quartiles of all participants as surfaces, and the median at three sizes on them."""
+    sizes, levels = surface(times, (0.25, 0.5, 0.75))
+    figure = Figure(figsize=(11, 4.6), layout="constrained", dpi=110)
+    low, high = np.nanmin(levels), np.nanmax(levels)
+    across, along = np.meshgrid(times.eccentricities, sizes, indexing="ij")
+    for panel, (which, title) in enumerate((((0, 1, 2), "25 %, 50 % and 75 % of the participants"), ((1,), "median"))):
+        axes: Any = figure.add_subplot(1, 2, panel + 1, projection="3d")
+        for k in which:
+            alpha = 0.9 if k == 1 and panel == 0 else 0.55
+            axes.plot_surface(
+                across, along, levels[k], cmap=_COLOURS, vmin=low, vmax=high, alpha=alpha, rstride=1, cstride=2, lw=0.2
+            )
+        if panel == 1:
+            for size, colour in _SLICES:
+                at = np.flatnonzero(np.isclose(sizes, size))
+                if len(at):
+                    here = np.full(len(times.eccentricities), size)
+                    axes.plot(
+                        times.eccentricities,
+                        here,
+                        levels[1, :, at[0]],
+                        color=colour,
+                        lw=2.5,
+                        label=f"{size:g}°",
+                        zorder=9,
+                    )
+            axes.legend(title="size", fontsize=8)
+        axes.set(xlabel="eccentricity (deg)", ylabel="size (deg)", zlabel="perception time (ms)")
+        axes.set_title(title, fontsize=10)
+        axes.view_init(22, -128)
+        axes.set_box_aspect((1.3, 1, 0.8), zoom=1.0)
+    return _png(figure, "Perception time", times)
+
+
+def time_map(times: Times, targets: Sequence[Shown], fitted: tuple[float, float], tested: tuple[float, float]) -> bytes:
+    """Fig. 2.4: the median time in colour, the conditions as dots, and lines of equal time."""
+    sizes, (median,) = surface(times, (0.5,))
+    figure = Figure(figsize=(7.6, 4.8), layout="constrained", dpi=110)
+    axes = figure.add_subplot()
+    # Each eccentricity has a column of its own, as none were shown between them.
+    drawn = axes.pcolormesh(times.eccentricities, sizes, median.T, cmap=_COLOURS, shading="nearest")
+    figure.colorbar(drawn, ax=axes, label="median perception time (ms)")
+    e, s = np.nonzero(np.isfinite(times.seconds).any(0))
+    axes.plot(times.eccentricities[e], times.sizes[s], ".", color="black", ms=3)
+    for k, target in enumerate(targets):
+        inside = np.array(fitted)
+        if not target.line.refused:
+            scale = target.line.alpha * inside + target.line.beta
+            axes.plot(inside, scale, color="black", lw=4)
+            axes.plot(inside, scale, color=_LINES[k % len(_LINES)], lw=2.4, label=target.name)
+    axes.set_facecolor("#dddddd")
+    axes.set(xlabel="eccentricity (deg)", ylabel="size (deg)", ylim=(0, max(tested[1], sizes[-1]) + 4))
+    if any(not target.line.refused for target in targets):
+        axes.legend(title="as fast as", fontsize=8, loc="upper left", facecolor="#bbbbbb")
+    return _png(figure, "Median perception time and scales of equal time", times)
+
+
+def single_participant(times: Times, curves: Curves, place: int) -> bytes:
+    """Fig. 2.5: times of one participant over the size at the last four eccentricities, and T(S) = a ln S + b."""
+    last = curves.eccentricities[-4:]
+    figure = Figure(figsize=(3.1 * len(last), 3.3), layout="constrained", dpi=110)
+    fine = np.geomspace(times.sizes[0], times.sizes[-1], 100)
+    first = None
+    for k, angle in enumerate(last):
+        axes = figure.add_subplot(1, len(last), k + 1, sharey=first)
+        first = first or axes
+        e, f = np.flatnonzero(times.eccentricities == angle)[0], len(curves.eccentricities) - len(last) + k
+        axes.plot(times.sizes, 1e3 * times.seconds[place, e], "o", color="#2867b2", ms=4)
+        a, b = 1e3 * curves.a[place, f], 1e3 * curves.b[place, f]
+        title = f"{angle:g}°: too few sizes"
+        if np.isfinite(a):
+            axes.plot(fine, a * np.log(fine) + b, color="#c0392b")
+            title = f"{angle:g}°: T = {a:.0f} ln S {b:+.0f} ms"
+        axes.set_title(title, fontsize=9)
+        axes.set_xlabel("size (deg)")
+        axes.grid(alpha=0.3)
+        if k == 0:
+            axes.set_ylabel("perception time (ms)")
+    return _png(figure, f"Participant {times.participants[place]}", times)
+
+
+def time_slices(times: Times) -> bytes:
+    """Fig. 2.6: the median time over the eccentricity for patterns of three sizes, and the middle half of people."""
+    sizes, levels = surface(times, (0.25, 0.5, 0.75))
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained", dpi=110)
+    axes = figure.add_subplot()
+    for size, colour in _SLICES:
+        at = np.flatnonzero(np.isclose(sizes, size))
+        if not len(at):
+            continue
+        low, middle, high = levels[:, :, at[0]]
+        axes.plot(times.eccentricities, middle, "o-", color=colour, ms=4, label=f"{size:g}° pattern")
+        axes.fill_between(times.eccentricities, low, high, color=colour, alpha=0.12, lw=0)
+    axes.set(xlabel="eccentricity (deg)", ylabel="perception time (ms)")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=9, title="median and middle half")
+    return _png(figure, "Perception time over eccentricity", times)
+
+
+def scale_lines(
+    times: Times, targets: Sequence[Shown], fitted: tuple[float, float], tested: tuple[float, float], confidence: float
+) -> bytes:
+    """Fig. 2.7: median scales with their intervals, the line through those in the range, and the sizes tested."""
+    columns = min(len(targets), 3)
+    rows = -(-len(targets) // columns)
+    figure = Figure(figsize=(4.2 * columns, 3.7 * rows), layout="constrained", dpi=110)
+    for k, target in enumerate(targets):
+        axes = figure.add_subplot(rows, columns, k + 1)
+        axes.axhspan(*tested, color="#27864a", alpha=0.1, lw=0, label="sizes tested")
+        _points(axes, target, fitted, confidence)
+        axes.set_title(f"as fast as {target.name}", fontsize=10)
+        axes.set(xlabel="eccentricity (deg)", ylabel="scale (deg)", ylim=(0, 62))
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=7, loc="upper left")
+    return _png(figure, "Equal-efficiency scales", times)
+
+
+def power_curves(rows: Sequence[dict[str, Any]], confidence: float) -> bytes:
+    """Share of simulated studies that see a slope, over the number of participants."""
+    figure = Figure(figsize=(6.2, 4), layout="constrained", dpi=110)
+    axes = figure.add_subplot()
+    for alpha in dict.fromkeys(row["alpha"] for row in rows):
+        own = [row for row in rows if row["alpha"] == alpha]
+        people, power = [row["participants"] for row in own], [row["power"] for row in own]
+        axes.errorbar(people, power, [2 * row["error"] for row in own], fmt="o-", ms=4, capsize=2, label=f"{alpha:g}")
+    axes.axhline(0.8, color="grey", lw=1, ls="--")
+    axes.set(xlabel="participants", ylabel=f"studies whose {100 * confidence:g} % interval excludes 0", ylim=(0, 1.03))
+    axes.grid(alpha=0.3)
+    axes.legend(title="slope (deg/deg)", fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
+    return _png(figure, "Power of the study (simulated participants)", None)
+
+
+def _points(axes: Axes, target: Shown, fitted: tuple[float, float], confidence: float) -> None:
+    line, where = target.line, target.eccentricities
+    inside = (where >= fitted[0]) & (where <= fitted[1])
+    below, above = line.median_intervals
+    for part, colour, words in ((inside, "#2867b2", ""), (~inside, "#999999", ", outside the range")):
+        if not part.any():
+            continue
+        ends = np.stack([line.medians - below, above - line.medians])[:, part]
+        interval = f" and {100 * confidence:g} % interval" if np.isfinite(ends).any() else ""  # too few people for one
+        axes.errorbar(
+            where[part],
+            line.medians[part],
+            np.maximum(ends, 0),
+            fmt="o",
+            color=colour,
+            ms=4,
+            capsize=3,
+            label=f"median{interval}{words}",
+        )
+    if line.refused:
+        return
+    ends = np.array(fitted)
+    label = f"{line.alpha:.3g} E {line.beta:+.3g}"
+    axes.plot(ends, line.alpha * ends + line.beta, color="#c0392b", label=label)
+
+
+def _png(figure: Figure, title: str, times: Times | None) -> bytes:
+    words = title + (" (simulated participants)" if times is not None and times.simulated else "")
+    figure.suptitle(words, fontsize=11)
+    buffer = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(buffer)
+    return buffer.getvalue()

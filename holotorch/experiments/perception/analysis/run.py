@@ -1,0 +1,223 @@
+"""A run of the analysis: logs, or simulated participants, to tables, pictures and a page."""
+
+import math
+import time
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import ValidationError
+from tqdm import tqdm
+
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.perception.analysis import figures
+from holotorch.experiments.perception.analysis.config import AnalysisSettings
+from holotorch.experiments.perception.analysis.curves import (
+    Curves,
+    Responses,
+    Times,
+    equal_efficiency,
+    fit_curves,
+    perception_times,
+    read_responses,
+)
+from holotorch.experiments.perception.analysis.finding import Finding, in_json, in_words
+from holotorch.experiments.perception.analysis.power import needed, power_rows, with_slope
+from holotorch.experiments.perception.analysis.simulation import simulate, true_line
+from holotorch.experiments.perception.analysis.statistics import (
+    fit_line,
+    has_statsmodels,
+    mixed_model,
+    need_statsmodels,
+    one_way,
+    repeated_measures,
+)
+from holotorch.experiments.perception.study.frames import quantisation
+from holotorch.experiments.runs.folder import RunFolder, conclude
+from holotorch.experiments.runs.markup import element, figure, table
+from holotorch.experiments.runs.saving import Results
+from holotorch.experiments.runs.tables import write_table
+from holotorch.io.files import save_array, write_bytes, write_json, write_text
+
+LEFT_OUT = (
+    "repeated measures and the mixed model, which need statsmodels: pip install 'holotorch[stats]' and run it again; "
+    "the one-way ANOVA takes the answers of one participant as independent"
+)
+_CAPTIONS = {
+    "time_surface": "Fig. 2.3: quartiles of the perception time",
+    "time_map": "Fig. 2.4: median perception time of all conditions",
+    "participant": "Fig. 2.5: times of one participant",
+    "time_slices": "Fig. 2.6: perception time over eccentricity",
+    "scale_lines": "Fig. 2.7: equal-efficiency scales",
+    "power": "Power of the study",
+}
+
+
+def find(settings: AnalysisSettings, times: Times, curves: Curves) -> list[Finding]:
+    """Analyse all target times. ConfigError for a target that was not shown, or where statsmodels is asked for."""
+    low, high = settings.range_deg
+    inside = (curves.eccentricities >= low) & (curves.eccentricities <= high)
+    found = []
+    beside = _beside(settings)
+    for k, target in enumerate(settings.targets):
+        scales = equal_efficiency(curves, times.of(target), settings.limits_deg)
+        line = fit_line(
+            curves.eccentricities,
+            scales.degrees,
+            np.random.default_rng([settings.seed, 2, k]),
+            inside=inside,
+            limits=settings.limits_deg,
+            resamples=settings.resamples,
+            confidence=settings.confidence,
+        )
+        known, there = scales.known[:, inside], np.isfinite(scales.degrees[:, inside])
+        found.append(
+            Finding(
+                str(target),
+                scales,
+                line,
+                one_way(known),
+                repeated_measures(known) if beside else None,
+                mixed_model(curves.eccentricities[inside], known, settings.confidence) if beside else None,
+                int((there & ~scales.defined[:, inside]).sum()),
+                int(scales.limited[:, inside].sum()),
+                int((~there).sum()),
+            )
+        )
+    return found
+
+
+def _beside(settings: AnalysisSettings) -> bool:
+    """Whether a repeated-measures analysis and a mixed model stand beside the line."""
+    return has_statsmodels() if settings.repeated_measures is None else settings.repeated_measures
+
+
+def on_frames(responses: Responses) -> float:
+    """Share of the reaction times within a tenth of a frame of a whole number of frames; 0.2 by chance."""
+    answered = np.isfinite(responses.reaction_s)
+    frames = responses.reaction_s[answered] / responses.frame_s[answered]
+    return float((np.abs(frames - np.round(frames)) <= 0.1).mean()) if len(frames) else math.nan
+
+
+def prepare_analysis(settings: AnalysisSettings) -> None:
+    """ConfigError for what the analysis would fail at."""
+    if settings.repeated_measures:
+        need_statsmodels()
+    if settings.power:
+        for alpha in settings.power.slopes:
+            try:
+                with_slope(settings.simulation, alpha, sum(settings.range_deg) / 2)
+            except ValidationError as error:
+                raise ConfigError([f"power.slopes: {alpha:g}: {error.errors()[0]['msg']}"]) from None
+
+
+def run_analysis(settings: AnalysisSettings, opened: RunFolder) -> bool:
+    """Carry an analysis out and fill the folder; whether it is complete."""
+    started = time.perf_counter()
+    folder, files = opened.path, Results()
+    if settings.logs:
+        responses = read_responses(settings.logs)
+    else:
+        responses = simulate(settings.simulation, np.random.default_rng([settings.seed, 0]))
+    times = perception_times(responses, settings.cleaning)
+    curves = fit_curves(times, settings.range_deg[0], settings.cleaning.sizes)
+    shown = int(times.participants[0]) if settings.shown is None else settings.shown
+    if shown not in times.participants:
+        raise ConfigError([f"shown: no participant {shown}; there are {', '.join(map(str, times.participants))}"])
+    found = find(settings, times, curves)
+    frames = quantisation(responses.frame_s.tolist())
+    assert frames is not None  # as there are trials
+    truths = [true_line(settings.simulation, target) if not settings.logs else None for target in settings.targets]
+    rows = [finding.row(truth) for finding, truth in zip(found, truths, strict=True)]
+    whole = on_frames(responses)
+    text = in_words(settings, times, curves, found, frames, whole)
+    if settings.repeated_measures is None and not _beside(settings):
+        text += f"\nLeft out   {LEFT_OUT}"
+    print(text, flush=True)
+    (folder / "arrays").mkdir(exist_ok=True)
+    files.write(write_json, folder / "plan.json", {"rule": settings.cleaning.model_dump(), "counts": times.counts})
+    files.write(save_array, folder / "arrays" / "times.npy", torch.from_numpy(times.seconds))
+    files.write(
+        save_array, folder / "arrays" / "scales.npy", torch.from_numpy(np.stack([f.scales.degrees for f in found]))
+    )
+    files.write(write_table, folder / "metrics.csv", rows)
+    files.write(write_table, folder / "conditions.csv", _conditions(times))
+    files.write(write_table, folder / "curves.csv", _curves(times, curves))
+    drawn = [figures.Shown(f.name, curves.eccentricities, f.line) for f in found]
+    place = int(np.flatnonzero(times.participants == shown)[0])
+    images = {
+        "time_surface": figures.time_surface(times),
+        "time_map": figures.time_map(times, drawn, settings.range_deg, settings.tested_deg),
+        "participant": figures.single_participant(times, curves, place),
+        "time_slices": figures.time_slices(times),
+        "scale_lines": figures.scale_lines(times, drawn, settings.range_deg, settings.tested_deg, settings.confidence),
+    }
+    power: list[dict[str, Any]] = []
+    if settings.power:
+        total = len(settings.power.slopes) * len(settings.power.participants)
+        power = list(tqdm(power_rows(settings, settings.power), total=total, desc="power", dynamic_ncols=True))
+        files.write(write_table, folder / "power.csv", power)
+        images["power"] = figures.power_curves(power, settings.confidence)
+        said = needed(power)
+        text += "\n" + "\n".join(f"Power      {line}" for line in said)
+        print("\n".join(said), flush=True)
+    for key, data in images.items():
+        files.write(write_bytes, folder / "images" / f"{key}.png", data)
+    body = "<h1>Perception in the far periphery</h1>" + element("pre", text) + _table(rows)
+    body += "".join(figure(f"images/{key}.png", _CAPTIONS[key], "wide") for key in images)
+    body += _table(power) if power else ""
+    summary = {
+        "experiment": "perception_analysis",
+        "status": "",
+        "simulated": times.simulated,
+        "repeated_measures": _beside(settings),
+        "participants": len(times.participants),
+        "counts": times.counts,
+        "quantisation": asdict(frames) | {"on_frames": in_json(whole)},
+        "rows": rows,
+        "power": power,
+        "seconds": round(time.perf_counter() - started, 2),
+    }
+    page = f"<!DOCTYPE html><meta charset='utf-8'><title>perception</title>{body}"
+    files.write(write_text, opened.path / "report.html", page)
+    return conclude(opened, summary, files, done=True)
+
+
+def _conditions(times: Times) -> list[dict[str, Any]]:
+    rows = []
+    for e, s in zip(*np.nonzero(np.isfinite(times.seconds).any(0)), strict=True):
+        low, middle, high = np.nanquantile(times.seconds[:, e, s], (0.25, 0.5, 0.75))
+        rows.append(
+            {
+                "eccentricity_deg": times.eccentricities[e],
+                "size_deg": times.sizes[s],
+                "participants": int(np.isfinite(times.seconds[:, e, s]).sum()),
+                "answers": int(times.kept[:, e, s].sum()),
+                "quartile_25_s": low,
+                "median_s": middle,
+                "quartile_75_s": high,
+            }
+        )
+    return rows
+
+
+def _curves(times: Times, curves: Curves) -> list[dict[str, Any]]:
+    return [
+        {
+            "participant": int(times.participants[p]),
+            "eccentricity_deg": float(curves.eccentricities[k]),
+            "a_s": in_json(curves.a[p, k]),
+            "a_deviation_s": in_json(curves.a_deviation[p, k]),
+            "b_s": in_json(curves.b[p, k]),
+        }
+        for p in range(len(times.participants))
+        for k in range(len(curves.eccentricities))
+    ]
+
+
+def _table(rows: list[dict[str, Any]]) -> str:
+    def cell(value: Any) -> str:
+        return "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+
+    return table([key.replace("_", " ") for key in rows[0]], [[cell(value) for value in row.values()] for row in rows])

@@ -1,0 +1,1 @@
+"""Layouts over a wide field, scaled for equal perception time."""

@@ -1,0 +1,39 @@
+"""The kind ``perception_layout``: icons over a wide field, scaled for equal perception time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from holotorch.experiments.kind import ExperimentKind
+from holotorch.experiments.perception.layout.config import LayoutSettings
+from holotorch.experiments.runs.plan import RunPlan
+
+if TYPE_CHECKING:
+    from holotorch.experiments.perception.layout.run import Layouts
+    from holotorch.experiments.runs.folder import RunFolder
+
+
+class LayoutKind(ExperimentKind[LayoutSettings, "Layouts"]):
+    """See :mod:`holotorch.experiments.kind`."""
+
+    settings = LayoutSettings
+    example = "configs/perception/layout.yaml"
+    announces = False  # its plan is its result
+
+    def build(self, settings: LayoutSettings) -> Layouts:
+        from holotorch.experiments.perception.layout.run import build_layouts
+
+        return build_layouts(settings)
+
+    def plan(self, experiment: Layouts) -> RunPlan:
+        from holotorch.experiments.perception.layout.run import layout_text
+
+        return RunPlan(layout_text(experiment.settings))
+
+    def run(self, experiment: Layouts, folder: RunFolder) -> bool:
+        from holotorch.experiments.perception.layout.run import run_layout
+
+        return run_layout(experiment, folder)
+
+
+KIND = LayoutKind()

@@ -1,0 +1,1 @@
+"""The study of perception time, in a browser."""

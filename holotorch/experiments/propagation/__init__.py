@@ -1,0 +1,1 @@
+"""Propagators side by side."""

@@ -1,0 +1,292 @@
+"""Propagation: error against time for every method, and predicted against true error."""
+
+import io
+import math
+import platform
+import warnings
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from torch import Tensor
+from tqdm import tqdm
+
+from holotorch.core.checks import SamplingWarning
+from holotorch.core.complex import phasor
+from holotorch.core.fourier import fft2, filter_spectrum, ifft2
+from holotorch.core.grid import Grid
+from holotorch.experiments.timing import interleaved
+from holotorch.optics import AngularSpectrum, CroppedKernel, Fresnel, Propagator, unaliased_distance
+from holotorch.optics.free_space.passage import Passage
+from holotorch.optics.planning.plan import find
+from holotorch.optics.planning.propagate import kernel_of
+
+WAVELENGTH = 530e-9
+DISTANCES = (1e-3, 5e-3, 20e-3, 60e-3, 200e-3, 2.0)
+CASES = ((256, 8e-6), (512, 8e-6), (1024, 8e-6), (2048, 8e-6), (256, 3.74e-6), (512, 3.74e-6), (1024, 3.74e-6))
+SHOWN = (512, 8e-6)  # the case whose error is drawn against its time
+FEW_DISTANCES, LARGE = (5e-3, 60e-3, 2.0), 2000  # px from which only these are measured
+PEER_LIMIT = 512  # px up to which torchoptics is measured: it takes minutes beyond
+SOURCES = ("smooth", "slm", "white", "hard edge")
+PREDICTION_CASES, TOLERANCE = 40, 1e-3
+
+
+def propagation() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
+    """Rows of the chart, rows of the prediction test, pictures by name, and the verdict."""
+    with warnings.catch_warnings(action="ignore", category=SamplingWarning):
+        rows = [row for size, pitch in CASES for row in _measure(size, pitch)]
+        prediction = _predictions()
+    pictures = {"chart": _draw(rows), "validity": _draw_validity(rows)}
+    return rows, prediction, pictures, _verdict(rows, prediction)
+
+
+def source(kind: str, grid: Grid) -> Tensor:
+    """Fields for tests, complex128 [H, W]: smooth, phase-only with smooth phase, white phase, and a bright disc."""
+    generator = torch.Generator().manual_seed(1)
+    y, x = grid.coordinates()
+    square = y**2 + x**2
+    random = torch.rand(grid.shape, dtype=torch.float64, generator=generator)
+    if kind == "smooth":
+        return torch.exp(-square / (0.1 * grid.extent[0]) ** 2).to(torch.complex128)
+    if kind == "hard edge":
+        return (square < (0.3 * grid.extent[0]) ** 2).to(torch.complex128)
+    if kind == "slm":
+        # White phase, blurred to a quarter of the band.
+        fy, fx = grid.frequencies()
+        low = torch.exp(-((fy * grid.pitch[0]) ** 2 + (fx * grid.pitch[1]) ** 2) / 0.06**2)
+        smooth = ifft2(fft2(random - 0.5) * low).real
+        return phasor(2 * smooth / smooth.std())
+    return phasor(2 * math.pi * random)
+
+
+def _measure(size: int, pitch: float) -> list[dict[str, Any]]:
+    grid, rows = Grid(size, pitch), []
+    fields = {kind: source(kind, grid) for kind in SOURCES}
+    wide = Grid(2 * size, pitch)
+    distances = [z for z in DISTANCES if size < LARGE or z in FEW_DISTANCES]
+    for distance in tqdm(distances, desc=f"{size} px, {pitch * 1e6:g} um", unit="distance"):
+        judge = CroppedKernel(wide, WAVELENGTH, distance)
+        pad = (0, size, 0, size)
+        exact = {kind: judge(torch.nn.functional.pad(f, pad)[None])[0, :size, :size] for kind, f in fields.items()}
+        methods = _methods(grid, distance)
+        work = {name: torch.complex128 if "complex128" in name else torch.complex64 for name in methods}
+        calls = {name: partial(call, fields["white"].to(work[name])) for name, call in methods.items()}
+        seconds = interleaved(calls, rounds=5 if size < LARGE else 3)
+        for name, call in methods.items():
+            for kind, field in fields.items():
+                error = (call(field.to(work[name])).to(torch.complex128) - exact[kind]).norm() / exact[kind].norm()
+                rows.append(
+                    {
+                        "size_px": size,
+                        "pitch_um": pitch * 1e6,
+                        "distance_m": distance,
+                        "crossovers": round(distance / unaliased_distance(grid, WAVELENGTH, 2), 4),
+                        "source": kind,
+                        "method": name,
+                        "error": f"{error.item():.3e}",
+                        "seconds": f"{seconds[name]:.3e}",
+                        "ratio_to_bare": round(seconds[name] / seconds["bare FFTs, pad 2, float32 kernel"], 3),
+                    }
+                )
+    return rows
+
+
+def _methods(grid: Grid, distance: float) -> dict[str, Callable[[Tensor], Tensor]]:
+    """Calls on a field [H, W]; everything that can be prepared is prepared."""
+    height, width = grid.shape
+    padded = grid.padded(2)
+    fy, fx = (f.float() for f in padded.frequencies())
+    root = torch.sqrt(torch.clamp(1 / WAVELENGTH**2 - fy**2 - fx**2, min=0))
+    naive = torch.exp(2j * math.pi * distance * root) / math.prod(
+        padded.shape
+    )  # all of it in float32, as is often seen
+
+    def bare(field: Tensor) -> Tensor:
+        # Not scaled: see core.fourier for why; the scale stands in the kernel.
+        return torch.fft.ifft2(torch.fft.fft2(field, s=padded.shape) * naive, norm="forward")[:height, :width]
+
+    modules = {
+        "planned, tolerance 1e-3": Propagator(grid, WAVELENGTH, distance, tolerance=TOLERANCE),
+        "planned, 1e-3, complex128": Propagator(grid, WAVELENGTH, distance, tolerance=TOLERANCE),
+        "cropped kernel": CroppedKernel(grid, WAVELENGTH, distance),
+        "angular spectrum, pad 1.125": AngularSpectrum(grid, WAVELENGTH, distance, pad=1.125),
+        "angular spectrum, pad 2": AngularSpectrum(grid, WAVELENGTH, distance, pad=2),
+        "angular spectrum, pad 4": AngularSpectrum(grid, WAVELENGTH, distance, pad=4),
+        "Fresnel, pad 2": Fresnel(grid, WAVELENGTH, distance, pad=2),
+    }
+    calls: dict[str, Callable[[Tensor], Tensor]] = {"bare FFTs, pad 2, float32 kernel": bare}
+    calls |= {name: (lambda field, m=module: m(field[None])[0]) for name, module in modules.items()}
+    if max(grid.shape) > PEER_LIMIT:
+        return calls
+    try:
+        from torchoptics import Field  # type: ignore[import-not-found]
+    except ImportError:
+        return calls
+
+    def peer(field: Tensor) -> Tensor:
+        return Field(field, wavelength=WAVELENGTH, z=0, spacing=grid.pitch).propagate_to_z(distance).data
+
+    return calls | {"torchoptics, automatic": peer}
+
+
+def _predictions() -> list[dict[str, Any]]:
+    """True and predicted error of every way, for random grids, distances and bands of noise."""
+    generator, rows = np.random.default_rng(11), []
+    for case in tqdm(range(PREDICTION_CASES), desc="predictions", unit="case"):
+        pitch, share = float(generator.choice([3.74e-6, 8e-6])), float(generator.uniform(0.2, 1.0))
+        grid = Grid((int(generator.integers(40, 120)), int(generator.integers(40, 120))), pitch)
+        wavelength = float(generator.choice([450e-9, 530e-9, 636e-9]))
+        distance = 10 ** generator.uniform(-2, 0.7) * 2 * max(grid.extent) * pitch / wavelength
+        field = _noise(grid, share, case)
+        wide = Grid((4 * grid.shape[0], 4 * grid.shape[1]), pitch)
+        large = torch.nn.functional.pad(field, (0, 3 * grid.shape[1], 0, 3 * grid.shape[0]))
+        exact = CroppedKernel(wide, wavelength, distance)(large[None])[0, : grid.shape[0], : grid.shape[1]]
+        path = Passage(grid, grid)
+        for way in find(path, [wavelength], [distance], band=(share / 2 / pitch, share / 2 / pitch)):
+            wave, far = (torch.tensor(value, dtype=torch.float64) for value in (wavelength, distance))
+            kernel = kernel_of(path, way, wave, far, torch.complex64)
+            out = filter_spectrum(field.to(torch.complex64), kernel).to(torch.complex128)
+            rows.append(
+                {
+                    "case": case,
+                    "method": way.method,
+                    "padded": f"{way.padded[0]}x{way.padded[1]}",
+                    "predicted": f"{way.error:.3e}",
+                    "true": f"{((out - exact).norm() / exact.norm()).item():.3e}",
+                    "flops": f"{way.flops:.3e}",
+                }
+            )
+    return rows
+
+
+def _noise(grid: Grid, share: float, seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    wide = [8 * size for size in grid.shape]
+    fy, fx = (torch.fft.fftfreq(size, dtype=torch.float64).abs() <= share / 2 for size in wide)
+    spectrum = torch.randn(*wide, dtype=torch.complex128, generator=generator) * fy[:, None] * fx
+    return ifft2(spectrum, grid.shape)
+
+
+def _verdict(rows: list[dict], prediction: list[dict]) -> list[str]:
+    lines = [
+        f"torch {torch.__version__}, {torch.get_num_threads()} threads, {platform.machine()}, complex64; errors "
+        "against the cropped kernel in complex128 on twice the window"
+    ]
+    names = list(dict.fromkeys(row["method"] for row in rows))
+    for name in names:
+        own = [row for row in rows if row["method"] == name]
+        worst = {kind: max(float(row["error"]) for row in own if row["source"] == kind) for kind in SOURCES}
+        ratio = np.median([row["ratio_to_bare"] for row in own])
+        lines.append(
+            f"{name}: worst error "
+            + ", ".join(f"{kind} {value:.0e}" for kind, value in worst.items())
+            + f"; median time {ratio:.2f} of bare FFTs"
+        )
+    peers = [row for row in rows if row["method"].startswith("torchoptics") and row["source"] == "white"]
+    if peers:
+        ours = {
+            (row["size_px"], row["pitch_um"], row["distance_m"]): row["ratio_to_bare"]
+            for row in rows
+            if row["method"].startswith("planned, tol")
+        }
+        ratios = [row["ratio_to_bare"] / ours[row["size_px"], row["pitch_um"], row["distance_m"]] for row in peers]
+        at_512 = [ratio for row, ratio in zip(peers, ratios, strict=True) if row["size_px"] == SHOWN[0]]
+        lines.append(
+            f"torchoptics takes {min(ratios):.1f} to {max(ratios):.1f} times as long as the planned way, at "
+            f"{SHOWN[0]} px at least {min(at_512):.1f} times"
+        )
+    checked = [row for row in prediction if 1e-6 < float(row["predicted"]) < 0.05]
+    factors = [float(row["true"]) / float(row["predicted"]) for row in checked]
+    best = 0
+    for case in range(PREDICTION_CASES):
+        ways = [row for row in prediction if row["case"] == case]
+        adequate = [float(row["flops"]) for row in ways if float(row["true"]) <= TOLERANCE]
+        chosen = [float(row["flops"]) for row in ways if float(row["predicted"]) <= TOLERANCE]
+        best += min(chosen) <= min(adequate) * 1.001
+    lines.append(
+        f"predicted error: true / predicted from {min(factors):.2f} to {max(factors):.2f} over {len(factors)} cases; "
+        f"the cheapest adequate way chosen in {best} of {PREDICTION_CASES}"
+    )
+    return lines
+
+
+def _draw(rows: list[dict]) -> bytes:
+    """Error against time, one panel per source and distance, at 512 px and 8 um."""
+    size, pitch = SHOWN
+    shown = [row for row in rows if row["size_px"] == size and row["pitch_um"] == pitch * 1e6]
+    names = list(dict.fromkeys(row["method"] for row in shown))
+    figure = Figure(figsize=(3.2 * len(DISTANCES), 2.6 * len(SOURCES)), layout="constrained")
+    panels = figure.subplots(len(SOURCES), len(DISTANCES), sharex=True, sharey=True)
+    for i, kind in enumerate(SOURCES):
+        for j, distance in enumerate(DISTANCES):
+            axes = panels[i][j]
+            for k, name in enumerate(names):
+                row = next(r for r in shown if (r["source"], r["distance_m"], r["method"]) == (kind, distance, name))
+                error = min(max(float(row["error"]), 1e-8), 10)
+                axes.loglog(row["ratio_to_bare"], error, "os^vD*PhX"[k % 9], color=f"C{k}", label=name, markersize=8)
+            crossovers = distance / unaliased_distance(Grid(size, pitch), WAVELENGTH, 2)
+            axes.set_title(f"{kind}, {distance * 1e3:g} mm = {crossovers:.2g} z_c", fontsize=9)
+            axes.grid(alpha=0.3)
+    figure.supxlabel(
+        f"time of one call / time of two bare FFTs at pad 2 ({size} px, {pitch * 1e6:g} um, 530 nm, complex64)"
+    )
+    figure.supylabel("relative L2 error")
+    handles, labels = panels[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=4, fontsize=9)
+    return _png(figure)
+
+
+def _draw_validity(rows: list[dict]) -> bytes:
+    """Error against distance, in cross-over distances; each method's own border of validity at the top."""
+    names = list(dict.fromkeys(row["method"] for row in rows))
+    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    panels = figure.subplots(1, 2)
+    for axes, kind in zip(panels, ("white", "smooth"), strict=True):
+        for k, name in enumerate(names):
+            own = sorted(
+                (row["crossovers"], min(float(row["error"]), 10))
+                for row in rows
+                if row["method"] == name and row["source"] == kind
+            )
+            axes.loglog(*zip(*own, strict=True), "os^vD*PhX"[k % 9], color=f"C{k}", label=name, alpha=0.8)
+        for k, name in enumerate(names):
+            for border in _borders(name):
+                axes.axvline(border, ymin=0.9, color=f"C{k}", linewidth=2)
+        axes.axvline(1, color="k", linestyle=":", linewidth=1)
+        axes.axhline(TOLERANCE, color="k", linestyle=":", linewidth=1)
+        axes.set_title(f"{kind} source, {len(CASES)} grids")
+        axes.set_xlabel("distance / cross-over distance z_c = 2 L pitch / wavelength")
+        axes.set_ylabel("relative L2 error")
+        axes.grid(alpha=0.3)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=4, fontsize=9)
+    return _png(figure)
+
+
+def _borders(name: str) -> list[float]:
+    """Distances, in cross-over distances of each grid, from which a method's own rule says that it errs.
+
+    Padding by P holds light up to (P - 1) z_c; Fresnel leaves out pi z s^4 / (4 wavelength), s up to the corner of the
+    band; float32 rounds k z to 6e-8 of it. The last two are drawn where they reach the tolerance.
+    """
+    if name.startswith("angular spectrum"):
+        return [float(name.split()[-1]) - 1]
+    grids = [Grid(size, pitch) for size, pitch in CASES]
+    if name.startswith("bare"):
+        distances = [TOLERANCE / 6e-8 * WAVELENGTH / (2 * math.pi)] * len(grids)
+    elif name.startswith("Fresnel"):
+        sines = [WAVELENGTH / (2 * grid.pitch[0]) for grid in grids]
+        distances = [TOLERANCE * 4 * WAVELENGTH / (math.pi * (2 * sine**2) ** 2) for sine in sines]
+    else:
+        return []
+    return [z / unaliased_distance(grid, WAVELENGTH, 2) for z, grid in zip(distances, grids, strict=True)]
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(buffer)
+    return buffer.getvalue()

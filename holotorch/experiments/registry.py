@@ -1,0 +1,43 @@
+"""The kinds of experiments by their names in YAML, and the configuration of any of them."""
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.config.messages import nearest, validated
+from holotorch.experiments.config.source import read_source
+from holotorch.experiments.kind import ExperimentKind
+
+# Where the module ``kind`` of each is; loaded when it is asked for.
+KINDS = {
+    "pec": "holotorch.experiments.pec",
+    "pec_study": "holotorch.experiments.pec_study",
+    "volume": "holotorch.experiments.volume",
+    "eye": "holotorch.experiments.eye",
+    "perception_layout": "holotorch.experiments.perception.layout",
+    "perception_analysis": "holotorch.experiments.perception.analysis",
+}
+
+
+def find_kind(name: str) -> ExperimentKind[Any, Any]:
+    """The kind of this name. KeyError for one that is not in ``KINDS``."""
+    return import_module(f"{KINDS[name]}.kind").KIND
+
+
+def load_config(path: Path | str, overrides: list[str] | None = None) -> Any:
+    """Read, override and check a configuration; returns the settings of its kind.
+
+    Raises:
+        ConfigError: Everything that is wrong with it, one line per mistake with its file, line and column.
+    """
+    source = read_source(Path(path), overrides or [])
+    name = source.data.get("experiment")
+    if not isinstance(name, str) or name not in KINDS:
+        got = f"got {name!r}" + nearest(str(name), list(KINDS)) if "experiment" in source.data else "it is missing"
+        raise ConfigError([source.mistake(("experiment",), f"expected one of {', '.join(KINDS)}, {got}")])
+    kind = find_kind(name)
+    settings = validated(source, kind.settings)
+    if mistakes := [source.mistake(key, message) for key, message in kind.contradictions(settings)]:
+        raise ConfigError(mistakes)
+    return settings

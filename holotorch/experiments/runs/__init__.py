@@ -1,0 +1,1 @@
+"""Run folders: claims, signals, checkpoints, tables, pictures and pages."""

@@ -1,0 +1,27 @@
+"""How much memory this process has used, and whether a run fits into what is free."""
+
+import re
+import resource
+import sys
+from pathlib import Path
+from typing import Any
+
+from holotorch.core.memory import available_memory
+
+
+def peak_memory() -> int:
+    """Largest resident size of this process so far, in bytes."""
+    status = Path("/proc/self/status")
+    # On Linux getrusage also counts the program that started this one.
+    if status.is_file() and (match := re.search(r"VmHWM:\s+(\d+) kB", status.read_text())):
+        return int(match[1]) * 1024
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+
+
+def shortage(values: dict[str, Any]) -> str | None:
+    """A line that says that the planned run does not fit into the memory that is free, or None."""
+    needed, free = values["predicted_peak_bytes"], available_memory()
+    if free is None or needed <= free:
+        return None
+    return f"the run needs about {needed / 1e9:.1f} GB and {free / 1e9:.1f} GB are free; use a smaller grid"

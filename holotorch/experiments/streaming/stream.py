@@ -1,0 +1,269 @@
+"""What ``holotorch stream`` does: send recorded or tracked poses, and show what arrives."""
+
+import asyncio
+import csv
+import math
+import socket
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AsyncExitStack, suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.tracking.report import COLUMNS
+from holotorch.tracking.pose.smoothing import OneEuro
+from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.streaming.igtl import TransformServer
+from holotorch.tracking.streaming.packet import PosePacket, encode, now
+from holotorch.tracking.streaming.stream import PORT, Link, PoseReceiver, PoseSender
+
+_PLACE, _SPREAD = COLUMNS[5:11], COLUMNS[11:17]  # tip and direction; covariance of the tip
+_COLUMNS = ("time_s", "status", "reason", *_PLACE, *_SPREAD, "chi_square", "freedom")
+
+
+class Streamed(NamedTuple):
+    """What became of a stream.
+
+    Attributes:
+        frames: Poses and refusals that were handed on.
+        complete: Whether it came to its end; False where the user ended it.
+        delivered: False where every packet to every receiver met an error, and no OpenIGTLink was served.
+    """
+
+    frames: int
+    complete: bool
+    delivered: bool
+
+
+def read_poses(path: Path) -> list[tuple[float, Pose]]:
+    """Capture times and poses of a poses.csv of ``holotorch track``; of its columns those that a packet has.
+
+    The table has no covariance of the direction. It becomes 1 along each axis: a unit vector that is not known at all.
+
+    Raises:
+        ConfigError: Not such a file, a line that cannot be read or sent, or times that do not rise.
+    """
+    try:
+        with open(path, newline="", encoding="utf-8") as stream:
+            table = csv.DictReader(stream)
+            if missing := [name for name in _COLUMNS if name not in (table.fieldnames or ())]:
+                raise ConfigError([f"{path}: not a table of poses, columns {', '.join(missing[:4])} ... are missing"])
+            found: list[tuple[float, Pose]] = []
+            for row in table:
+                try:
+                    found.append(_pose(row))
+                except (KeyError, TypeError, ValueError) as error:
+                    raise ConfigError([f"{path}:{table.line_num}: cannot be read as a pose: {error}"]) from None
+                if len(found) > 1 and found[-1][0] <= found[-2][0]:
+                    raise ConfigError([f"{path}:{table.line_num}: time_s must rise from line to line"])
+    except (UnicodeDecodeError, csv.Error):
+        raise ConfigError([f"{path}: no poses.csv as holotorch track writes it: not a text file"]) from None
+    except OSError as error:
+        raise ConfigError([f"{path}: {error.strerror or error}"]) from None
+    if not found:
+        raise ConfigError([f"{path}: no poses in it"])
+    return found
+
+
+def _pose(row: dict[str, str]) -> tuple[float, Pose]:
+    if None in row.values():
+        raise ValueError("the line is cut off")
+    captured, status, reason = float(row["time_s"]), Status[row["status"]], row["reason"]
+    if not math.isfinite(captured):
+        raise ValueError(f"time_s is {captured}")
+    if not status.answered:
+        return captured, Pose.refused(status, reason)
+    values = torch.tensor([float(row[name]) for name in (*_PLACE, *_SPREAD)], dtype=torch.float64)
+    if not bool(values.isfinite().all()):
+        raise ValueError(f"{status.name}, but not all its numbers are finite")
+    covariance, upper = torch.eye(6, dtype=torch.float64), torch.triu_indices(3, 3)
+    covariance[upper[0], upper[1]] = covariance[upper[1], upper[0]] = values[6:]
+    chi, freedom = torch.tensor([float(row[name]) for name in _COLUMNS[-2:]], dtype=torch.float64)
+    pose = Pose(values[:3], values[3:6], covariance, chi, freedom, status, reason)
+    encode(PosePacket(pose, 0.0, 0.0, 0))  # what cannot be sent is said now, with its line
+    return captured, pose
+
+
+def replay(poses: Sequence[tuple[float, Pose]], rate: float | None = None) -> Iterator[tuple[float, Pose]]:
+    """Give recorded poses with capture times moved to now, when they are due; ``rate`` in Hz replaces their pace."""
+    start, first = now(), poses[0][0]
+    for i, (captured, pose) in enumerate(poses):
+        yield start + (captured - first if rate is None else i / rate), pose
+
+
+def stream(
+    sources: Sequence[str],
+    to: Sequence[str] = (),
+    *,
+    igtl: int | None = None,
+    rate: float | None = None,
+    smooth: bool = False,
+    track: Callable[[Sequence[str]], Iterable[tuple[float, Pose]]] | None = None,
+    show: Callable[[str], None] = print,
+) -> Streamed:
+    """Send poses until they end or the user interrupts.
+
+    Args:
+        sources: One poses.csv, or what ``track`` understands: videos, folders, a camera's index.
+        to: Receivers, each ``HOST`` or ``HOST:PORT``.
+        igtl: Port for OpenIGTLink, where Slicer connects; None for no such server.
+        rate: Poses per second of a poses.csv, instead of the recorded pace.
+        smooth: Pass them through :class:`OneEuro`; packets then tell the lag.
+        track: From sources to capture times (by ``packet.now``) and poses, one after the other as frames come. One with
+            a time that is still to come is sent then.
+        show: Takes the lines to print.
+
+    Raises:
+        ConfigError: Nothing to send or nobody to send to, an address or a file that cannot be read, no pyigtl.
+    """
+    receivers = [address(text) for text in to]
+    if not receivers and igtl is None:
+        raise ConfigError([f"say to whom: --to HOST:PORT, such as --to 127.0.0.1:{PORT}, or --igtl 18944 for Slicer"])
+    if rate is not None and not (math.isfinite(rate) and rate > 0):
+        raise ConfigError([f"rate must be above 0 Hz, got {rate}"])
+    if len(sources) == 1 and sources[0].lower().endswith(".csv"):
+        poses: Iterable[tuple[float, Pose]] = replay(read_poses(Path(sources[0])), rate)
+    elif sources and track is not None:
+        poses = track(sources)
+    else:
+        raise ConfigError([f"expected one poses.csv or videos to track, got {' '.join(sources) or 'nothing'}"])
+    count, links, complete = [0], list[Link](), True
+    try:
+        asyncio.run(_send(iter(poses), receivers, igtl, OneEuro() if smooth else None, count, links, show))
+    except KeyboardInterrupt:
+        show("interrupted")
+        complete = False
+    except ImportError as error:
+        raise ConfigError([str(error)]) from None
+    except OSError as error:
+        raise _said(error) from None
+    failed = igtl is None and bool(links) and all(link.errors and not link.sent for link in links)
+    return Streamed(count[0], complete, not failed)
+
+
+def _said(error: OSError) -> Exception:
+    """A mistake of the user's if it is about an address or port; one about a file names the file as it is."""
+    return ConfigError([error.strerror or str(error)]) if error.filename is None else error
+
+
+async def _send(
+    poses: Iterator[tuple[float, Pose]],
+    receivers: list[tuple[str, int]],
+    igtl: int | None,
+    smoother: OneEuro | None,
+    count: list[int],
+    links: list[Link],
+    show: Callable[[str], None],
+) -> None:
+    async with AsyncExitStack() as stack:
+        sender = await stack.enter_async_context(PoseSender(receivers)) if receivers else None
+        server = await stack.enter_async_context(TransformServer(igtl)) if igtl is not None else None
+        links += sender.links if sender else ()
+        show(f"Sending    to {', '.join(f'{host}:{port}' for host, port in receivers) or 'OpenIGTLink clients'}")
+        if server:
+            show(f"Slicer     connects to {own_address()}, port {server.port}")
+        try:
+            # In a thread: a frame takes its time, and clock requests must not wait for it.
+            while (item := await asyncio.to_thread(next, poses, None)) is not None:
+                captured, pose = item
+                await asyncio.sleep(max(0.0, captured - now()))  # here Ctrl-C ends it; a thread would be waited for
+                pose = smoother(pose, captured) if smoother else pose
+                if sender:
+                    sender.send(pose, captured, lag=smoother.lag if smoother else 0.0)
+                if server:
+                    server.send(pose, captured)
+                count[0] += 1
+        finally:
+            show(f"Frames     {count[0]}")
+            if server and server.future:
+                show(f"Slicer     {server.future} sent as refusals: captured in the future")
+            for link in links:
+                text = f", {link.errors} failed: {link.last_error}" if link.errors else ""
+                show(f"Receiver   {link.host}:{link.port}: {link.sent} sent, {link.dropped} dropped for newer{text}")
+
+
+def view(port: int = PORT, *, seconds: float = math.inf, show: Callable[[str], None] = print) -> None:
+    """Print once a second what arrives at ``port``, at the end the statistics; ConfigError if the port is in use."""
+    state: list[PoseReceiver] = []
+    try:
+        with suppress(KeyboardInterrupt):
+            asyncio.run(_view(port, seconds, show, state))
+    except OSError as error:
+        raise _said(error) from None
+    if state:
+        for line in statistics_text(state[0]):
+            show(line)
+
+
+async def _view(port: int, seconds: float, show: Callable[[str], None], state: list[PoseReceiver]) -> None:
+    async with PoseReceiver(port) as receiver:
+        state.append(receiver)
+        show(f"Listening  at {own_address()}, UDP port {receiver.port}")
+        end = now() + seconds
+        while (left := end - now()) > 0:
+            await asyncio.sleep(min(1.0, left))
+            show(_line(receiver))
+
+
+def _line(receiver: PoseReceiver) -> str:
+    newest = receiver.packet
+    if newest is None:
+        bad = receiver.statistics
+        if bad.future:
+            return f"{bad.future} packets captured in the future, not used: compare the sender's clock and its camera's"
+        return f"{bad.invalid} unreadable packets, the last: {bad.last_error}" if bad.invalid else "nothing yet"
+    age = receiver.age()
+    if not newest.answered:
+        assert isinstance(newest.pose.status, Status)
+        return f"refused ({newest.pose.status.name}): {newest.pose.reason}; {age * 1e3:.0f} ms old"
+    if receiver.latest() is None:
+        return f"the newest pose is {age:.1f} s old and no longer given"
+    tip = ", ".join(f"{value * 1e3:.1f}" for value in newest.pose.tip.tolist())
+    return f"{newest.frame} tip {tip} mm, sd {float(newest.pose.tip_sd) * 1e3:.2f} mm, {age * 1e3:.0f} ms old"
+
+
+def statistics_text(receiver: PoseReceiver) -> list[str]:
+    """A receiver's statistics in a few lines."""
+    found = receiver.statistics
+    if not found.received:
+        text = f"Received   nothing; {found.invalid} unreadable packets {found.last_error}".rstrip()
+        return [f"{text}; {found.future} captured in the future" if found.future else text]
+    ms = {name: value * 1e3 for name, value in found.latency().items()}
+    clock = "not measured: transit counted from the fastest packet"
+    if found.offset is not None and found.round_trip is not None:
+        clock = f"sender's is {found.offset * 1e3:+.3f} ms ahead, within {found.round_trip * 5e2:.3f} ms"
+    return [
+        f"Received   {found.received}, lost {found.lost}, reordered {found.reordered}, repeated {found.duplicated}",
+        f"Of these   refused {found.refused}, late {found.late}",
+        f"Not used   unreadable {found.invalid}, foreign {found.foreign}, captured in the future {found.future}, "
+        f"not continuing the stream {found.jumped}",
+        f"Transit    median {ms['transit_median']:.2f} ms, p95 {ms['transit_p95']:.2f} ms, "
+        f"jitter {found.jitter * 1e3:.3f} ms",
+        f"Latency    median {ms['latency_median']:.2f} ms, p95 {ms['latency_p95']:.2f} ms since capture",
+        f"Clock      {clock}",
+    ]
+
+
+def address(text: str) -> tuple[str, int]:
+    """Host and port of ``HOST``, ``HOST:PORT`` or ``[IPv6]:PORT``; ConfigError otherwise."""
+    host, colon, port = text.rpartition(":") if not text.endswith("]") and text.count(":") else (text, "", "")
+    host = host.removeprefix("[").removesuffix("]")
+    number = int(port) if port.isascii() and port.isdigit() else 0
+    if colon and number > 65535:
+        raise ConfigError([f"expected a port from 1 to 65535, got {number} in {text!r}"])
+    if not host or (":" in host and not text.startswith("[")) or (colon and not number):
+        raise ConfigError([f"expected HOST:PORT, such as 192.168.1.20:{PORT}, got {text!r}"])
+    return host, number if colon else PORT
+
+
+def own_address() -> str:
+    """IPv4 address by which others may reach this computer; 127.0.0.1, for itself only, if there is no network."""
+    with socket.socket(type=socket.SOCK_DGRAM) as probe:
+        try:
+            # Sends nothing: it asks which way a packet to elsewhere would leave (RFC 5737 keeps this address unused).
+            probe.connect(("192.0.2.1", 9))
+            return probe.getsockname()[0]
+        except OSError:
+            return "127.0.0.1"

@@ -1,0 +1,1 @@
+"""Catheter tracking: recordings, cameras, runs."""

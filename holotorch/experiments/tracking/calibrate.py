@@ -1,0 +1,148 @@
+"""``holotorch calibrate``: photographs of a board in, a camera's file and a plain report out."""
+
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from pydantic_core import PydanticCustomError
+
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.config.settings import metres
+from holotorch.experiments.tracking.config import save_camera
+from holotorch.io.images import load_image, with_channels
+from holotorch.io.video import PICTURES
+from holotorch.tracking.camera.boards import Charuco, Chessboard, View, describe_board, find_board
+from holotorch.tracking.camera.calibration import PARAMETERS, Calibration, calibrate
+
+BOARD = ("chessboard", "9x6", "25mm")
+_KINDS = "chessboard 9x6 25mm (inner corners, square) or charuco 5x7 40mm 20mm DICT_6X6_250 (squares, square, marker)"
+
+
+def calibrate_photographs(
+    files: Sequence[Path], out: Path, board: Sequence[str] = BOARD
+) -> tuple[Calibration, dict[str, str]]:
+    """Calibrate a camera from photographs of a board and write it to ``out``.
+
+    Args:
+        files: Photographs, or folders of them, all of one size.
+        out: YAML file for the camera; not one that exists.
+        board: Words of :func:`parse_board`.
+
+    Returns:
+        The calibration, and the photographs in which no board was found, with the reason.
+
+    Raises:
+        ConfigError: Unreadable photographs, different sizes, none with a board, views that determine no camera.
+    """
+    wanted = parse_board(board)
+    if out.exists():
+        raise ConfigError([f"{out} exists already; choose another --out or delete it"])
+    paths = _listed(files)
+    mistakes: list[str] = []
+    missing: dict[str, str] = {}
+    views: list[View] = []
+    sizes: dict[str, tuple[int, int]] = {}
+    names = [path.name for path in paths]
+    for path in paths:
+        name = path.name if names.count(path.name) == 1 else str(path)
+        if not path.exists():
+            mistakes.append(f"{path}: no such file or folder")
+            continue
+        try:
+            grey = (with_channels(load_image(path), 1)[0] * 255).round().to(torch.uint8)
+        except (ValueError, OSError) as error:
+            mistakes.append(f"{path}: {getattr(error, 'strerror', None) or error}")
+            continue
+        sizes[name] = (grey.shape[0], grey.shape[1])
+        try:
+            views.append(find_board(grey, wanted, name))
+        except ValueError as error:
+            missing[name] = str(error)
+    if len(set(sizes.values())) > 1:
+        usual = max(set(sizes.values()), key=list(sizes.values()).count)
+        mistakes += [
+            f"{name}: {size[1]} x {size[0]} px, the others have {usual[1]} x {usual[0]}; a calibration takes "
+            "photographs of one size, not cropped or turned"
+            for name, size in sizes.items()
+            if size != usual
+        ]
+    if mistakes:
+        raise ConfigError(mistakes)
+    try:
+        found = calibrate(views, next(iter(sizes.values())))
+    except ValueError as error:
+        raise ConfigError([str(error), *(f"{name}: {reason}" for name, reason in missing.items())]) from None
+    out.parent.mkdir(parents=True, exist_ok=True)
+    save_camera(out, found)
+    return found, missing
+
+
+def parse_board(words: Sequence[str]) -> Chessboard | Charuco:
+    """The board that words of the command line name, quoted together or not; ConfigError says what is expected."""
+    kind, *rest = " ".join(words).split() or ("",)
+    sides = re.fullmatch(r"(\d{1,3})x(\d{1,3})", rest[0]) if rest else None
+    wanted = {"chessboard": 1, "charuco": 2}.get(kind, -1)
+    if not sides or len(rest) != (2 if wanted == 1 else 4) or wanted < 0:
+        raise ConfigError([f"--board: expected {_KINDS}, got {' '.join(words)!r}"])
+    try:
+        lengths = [float(metres(word)) for word in rest[1 : 1 + wanted]]
+        if wanted == 1:
+            return Chessboard(int(sides[1]), int(sides[2]), lengths[0])
+        return Charuco(int(sides[1]), int(sides[2]), *lengths, dictionary=rest[3])
+    except (PydanticCustomError, ValueError) as error:
+        raise ConfigError([f"--board: {error}"]) from None
+
+
+def calibration_text(found: Calibration, missing: dict[str, str], board: Sequence[str] = BOARD) -> str:
+    """What a calibration has given, in a few lines."""
+    matrix, distortion = found.camera.matrix, found.camera.distortion.tolist()
+    values = [matrix[0, 0].item(), matrix[1, 1].item(), matrix[0, 2].item(), matrix[1, 2].item(), *distortion]
+    words = [
+        f"{name} {_rounded(value, found.deviations[name])}" for name, value in zip(PARAMETERS, values, strict=True)
+    ]
+    seen = found.coverage
+    between = f", {math.degrees(seen.between):.0f} deg between boards at most" if len(found.views) > 1 else ""
+    low, high = (math.degrees(angle) for angle in seen.tilts)
+    lines = [
+        f"Camera     {', '.join(words[:4])} px, for frames of {found.size[1]} x {found.size[0]} px",
+        f"Distortion {', '.join(words[4:])}",
+        f"Board      {describe_board(parse_board(board))}, rms {found.rms_px:.2f} px, views: {len(found.views)}",
+        f"Coverage   {100 * seen.cells:.0f} % of the picture, {100 * seen.radius:.0f} % of the way to its corners, "
+        f"tilts of {low:.0f} to {high:.0f} deg{between}",
+    ]
+    lines += [f"View       {name}: {error:.2f} px" for name, error in found.views.items()]
+    lines += [
+        f"Left out   {name}: {error:.2f} px, more than 3 times the median and 0.5 px"
+        for name, error in found.left_out.items()
+    ]
+    lines += [f"Not used   {name}: {reason}" for name, reason in missing.items()]
+    lines += [f"Warning    {text}" for text in found.warnings]
+    return "\n".join(lines)
+
+
+def _rounded(value: float, deviation: float) -> str:
+    """Value and deviation, both to the second digit of the deviation."""
+    digits = max(0, 1 - math.floor(math.log10(deviation))) if deviation > 0 else 6
+    return f"{value:.{digits}f} +- {deviation:.{digits}f}"
+
+
+def _listed(files: Sequence[Path]) -> list[Path]:
+    paths: list[Path] = []
+    for path in files:
+        if path.is_dir():
+            inside = sorted(item for item in path.iterdir() if item.suffix.lower() in PICTURES)
+            if not inside:
+                raise ConfigError([f"{path}: no pictures in this folder ({', '.join(PICTURES)})"])
+            paths += inside
+        else:
+            paths.append(path)
+    if not paths:
+        raise ConfigError(["no photographs given; expected files or folders of them"])
+    places = [path.resolve() for path in paths]
+    twice = {str(path) for path, place in zip(paths, places, strict=True) if places.count(place) > 1}
+    if twice:
+        # The same view again would lower the stated deviations without making the camera any surer.
+        raise ConfigError([f"{path}: given twice" for path in sorted(twice)])
+    return paths

@@ -1,0 +1,289 @@
+"""What a tracking run tells at its end: counts by status, time per stage, stability, and a page of them."""
+
+import base64
+import io
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from holotorch.experiments.runs.markup import element, figure, plain, table
+from holotorch.experiments.runs.memory import peak_memory
+from holotorch.io.files import write_bytes, write_text
+from holotorch.io.images import encode_png
+from holotorch.io.video import Frame, Frames
+from holotorch.tracking import Pose, Status
+from holotorch.tracking.evaluation.protocols import counts, s_rms
+
+# Of poses.csv, a line per frame. Lengths in metres in the camera's frame (x right, y down, z forward), directions from
+# the tip to the rear, the covariance of the tip by its upper triangle, the tracker's own time. Floats are exact to the
+# bit; what a refusal does not have is empty, and ``stage`` is the one that refused.
+COLUMNS = (
+    *("frame", "time_s", "status", "stage", "reason"),
+    *("tip_x_m", "tip_y_m", "tip_z_m", "direction_x", "direction_y", "direction_z"),
+    *("cov_xx_m2", "cov_xy_m2", "cov_xz_m2", "cov_yy_m2", "cov_yz_m2", "cov_zz_m2"),
+    *("chi_square", "freedom", "milliseconds"),
+)
+_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+_STATED = "what the frames leave open; not what is unknown of the camera (its calibration) and of the catheter's edges"
+_MOVED = 3.0  # times the stated deviation that tips may spread about their mean and still be called at rest
+
+_SHOWN = 4  # statuses of which the page shows the first frame
+
+
+class Tracked(NamedTuple):
+    """One frame and what was found in it.
+
+    Attributes:
+        number: Of the frame, from 0.
+        frame: As it came.
+        pose: Or refusal; BAD_FRAME where the frame could not be read.
+        seconds: That the tracker took; 0 where it was not asked.
+        stages: Seconds of its stages, where it tells.
+    """
+
+    number: int
+    frame: Frame
+    pose: Pose
+    seconds: float
+    stages: dict[str, float]
+
+    @property
+    def status(self) -> Status:
+        """Of the pose, which is one and no batch."""
+        assert isinstance(self.pose.status, Status)
+        return self.pose.status
+
+
+def row(item: Tracked) -> list[str]:
+    """Cells of ``COLUMNS``, floats to the bit; what a refusal does not have is empty."""
+    pose = item.pose
+    told = [str(item.number), repr(item.frame.seconds), item.status.name]
+    told += ["" if pose.answered else item.status.stage, " ".join(pose.reason.split())]
+    taken = "" if item.frame.pixels is None else f"{1e3 * item.seconds:.3f}"
+    if not pose.answered:
+        return [*told, *[""] * (len(COLUMNS) - len(told) - 1), taken]
+    values = [*pose.tip.tolist(), *pose.direction.tolist(), *(float(pose.covariance[i, j]) for i, j in _UPPER)]
+    values += [float(pose.chi_square), float(pose.freedom)]
+    return [*told, *map(repr, values), taken]
+
+
+class Log:
+    """What a run remembers of its frames: numbers of all, and the first overlay of each status."""
+
+    def __init__(self, images: Path):
+        self.images = images
+        self.statuses: list[Status] = []
+        self.times: list[float] = []
+        self.tips: list[list[float]] = []
+        self.deviations: list[float] = []
+        self.seconds: list[float] = []
+        self.stages: dict[str, float] = {}
+        self.timed, self.warm = 0, False
+        self.pictures: dict[str, str] = {}
+
+    def wants(self, item: Tracked) -> bool:
+        """Whether the overlay of this frame will be shown."""
+        return item.status.name not in self.pictures and len(self.pictures) < _SHOWN
+
+    def take(self, item: Tracked, drawn: Tensor | None) -> None:
+        """Note a frame."""
+        pose = item.pose
+        if drawn is not None and self.wants(item):
+            write_bytes(self.images / f"{item.status.name}.png", encode_png(_smaller(drawn)))
+            said = f": {pose.reason}" if pose.reason else ""
+            self.pictures[item.status.name] = f"frame {item.number}, {item.status.name}{said}"
+        self.statuses.append(item.status)
+        self.times.append(item.frame.seconds)
+        self.tips.append(pose.tip.tolist() if pose.answered else [math.nan] * 3)
+        self.deviations.append(float(pose.tip_sd) if pose.answered else math.nan)
+        if item.frame.pixels is not None:
+            self.seconds.append(item.seconds)
+        if item.stages:
+            if self.timed == 1 and not self.warm:
+                self.warm = True  # the first call also builds its tables, and is left out where there are others
+                self.timed, self.stages = 0, {}
+            self.timed += 1
+            for name, value in item.stages.items():
+                self.stages[name] = self.stages.get(name, 0.0) + value
+
+
+def summarised(log: Log, frames: Frames, method: str, still: bool) -> dict[str, Any]:
+    """Plain JSON values of a run's summary; lengths in mm and times in ms, as their names say."""
+    answered = sum(status.answered for status in log.statuses)
+    summary: dict[str, Any] = {
+        "experiment": "track",
+        "status": "",
+        "source": frames.name,
+        "method": method,
+        "frames": len(log.statuses),
+        "answered": answered,
+        "statuses": counts(log.statuses),
+        "seconds": log.times[-1] - log.times[0],
+        "stated_rate_hz": frames.rate,
+    }
+    if answered:
+        stated = torch.tensor([value for value in log.deviations if math.isfinite(value)], dtype=torch.float64)
+        summary["tip_sd_mm"] = {"median": 1e3 * _at(stated, 0.5), "largest": 1e3 * _at(stated, 1.0)}
+        summary["tip_sd_holds"] = _STATED
+    if log.seconds:
+        taken = 1e3 * torch.tensor(log.seconds, dtype=torch.float64)
+        summary["milliseconds"] = {
+            "first": float(taken[0]),
+            "median": _at(taken, 0.5),
+            "p95": _at(taken, 0.95),
+            "largest": _at(taken, 1.0),
+        }
+    if log.timed:
+        whole = sum(log.stages.values())
+        summary["stages"] = [
+            {"stage": name, "milliseconds": 1e3 * value / log.timed, "percent": 100 * value / max(whole, 1e-12)}
+            for name, value in log.stages.items()
+        ]
+    notes = list(frames.notes)
+    if still:
+        try:
+            found = s_rms(torch.tensor(log.tips, dtype=torch.float64))
+            summary["stability"] = {
+                "s_rms_mm": 1e3 * found.s_rms,
+                "sd_mm": 1e3 * found.sd,
+                "differences": found.differences,
+                "answered": found.answered,
+            }
+            notes += _moved(log, found.sd)
+        except ValueError as error:
+            notes.append(f"no stability: {error}")
+    return summary | {"notes": notes, "peak_memory_bytes": peak_memory()}
+
+
+def _moved(log: Log, spread: float) -> list[str]:
+    """A doubt where the tips spread (m, root mean square about their mean) by far more than is stated of them."""
+    stated = torch.tensor([value for value in log.deviations if math.isfinite(value)], dtype=torch.float64)
+    allowed = float(stated.square().mean().sqrt()) if len(stated) else math.inf
+    if spread <= _MOVED * allowed:
+        return []
+    return [
+        f"was the catheter at rest? The tips spread by {1e3 * spread:.3f} mm about their mean, more than {_MOVED:g} "
+        f"times their stated deviation of {1e3 * allowed:.3f} mm (root mean squares); S_RMS of a moving catheter says "
+        "nothing of stability"
+    ]
+
+
+def known(value: Any) -> Any:
+    """JSON values with nothing (null) for NaN and infinity: one number must not cost a run its summary."""
+    if isinstance(value, dict):
+        return {key: known(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [known(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def verdict(summary: dict[str, Any]) -> str:
+    """The summary in one line."""
+    words = ", ".join(f"{name} {count}" for name, count in summary["statuses"].items())
+    text = f"Frames     {summary['answered']} of {summary['frames']} with a pose ({words})"
+    if "milliseconds" in summary:
+        text += f"; {summary['milliseconds']['median']:.1f} ms each, slowest {summary['milliseconds']['largest']:.1f}"
+    if "stability" in summary:
+        text += f"; S_RMS {summary['stability']['s_rms_mm']:.3f} mm unfiltered"
+    return text
+
+
+def write_page(folder: Path, summary: dict[str, Any], log: Log) -> None:
+    """Write ``report.html`` with everything inline, and the figure of the track."""
+    write_bytes(folder / "images" / "track.png", _png(drawn_track(log)))
+    body = element("h1", f"{folder.resolve().name}: {summary['source']}")
+    if summary["status"] != "complete":
+        body += f"<p>{element('b', summary['status'] + ' ' + summary.get('failure', ''))}</p>"
+    share = 100 * summary["answered"] / summary["frames"]
+    text = f"{summary['answered']} of {summary['frames']} frames have a pose ({share:.1f} %); every other says why "
+    text += "it has none. " + ("" if "truth" in summary else "Errors against the truth are not known here. ")
+    body += element("p", text + f"Deviations (sd) are the tracker's own estimate: {_STATED}, which adds to them.")
+    body += _truth(summary["truth"]) if "truth" in summary else ""
+    body += "".join(element("p", f"Note: {note}.") for note in summary["notes"])
+    rows = [[name, str(count)] for name, count in summary["statuses"].items()]
+    body += table(["status", "frames"], rows)
+    shown = [name for name in ("tip_sd_mm", "stability", "milliseconds") if name in summary]
+    body += table(["", ""], [[name.replace("_", " "), plain(summary[name])] for name in shown], head=False)
+    if "stages" in summary:
+        cells = [[each["stage"], f"{each['milliseconds']:.2f}", f"{each['percent']:.2f}"] for each in summary["stages"]]
+        total = sum(each["milliseconds"] for each in summary["stages"])
+        cells.append(["Total", f"{total:.2f}", "100.00"])
+        body += table(["stage", "mean time per frame (ms), without the first", "share (%)"], cells)
+    body += figure(_inline(folder, "track"), "Tip in the camera's frame; gaps are refusals", "wide")
+    body += "".join(figure(_inline(folder, name), caption, "wide") for name, caption in log.pictures.items())
+    style = "<style>img { max-width: 100% }</style>"
+    write_text(folder / "report.html", f"<!DOCTYPE html><meta charset='utf-8'><title>track</title>{style}{body}")
+
+
+def _truth(found: dict[str, float]) -> str:
+    """HTML of how far the tips lie from where a synthetic recording has them."""
+    text = f"The recording is synthetic, and where the tip truly is is known. Of {found['frames']} frames with a pose "
+    text = element("p", text + f"{found.get('wrong', 0)} are wrong by more than 5 mm.")
+    shares = [
+        (f"{name} (mm)", f"{found[f'{name}_mm']:.3f}") for name in ("median", "p95", "worst") if f"{name}_mm" in found
+    ]
+    if "coverage" in found:
+        shares.append(("truth within the stated 95 % ellipsoid", f"{100 * found['coverage']:.1f} % of the frames"))
+    return text + table(["tip's distance from the truth", ""], [list(pair) for pair in shares])
+
+
+def _smaller(drawn: Tensor) -> Tensor:
+    """Frame [3, H, W] from 0 to 1, of a size for a page."""
+    factor = max(1, min(drawn.shape[-2:]) // 400)
+    return torch.nn.functional.avg_pool2d(drawn.double() / 255, factor)
+
+
+def _inline(folder: Path, name: str) -> str:
+    return "data:image/png;base64," + base64.b64encode((folder / "images" / f"{name}.png").read_bytes()).decode()
+
+
+def _at(values: Tensor, share: float) -> float:
+    if not len(values):
+        return math.nan
+    return float(values.sort().values[round(share * (len(values) - 1))])
+
+
+def drawn_track(log: Log) -> Any:
+    """Figure of the tip and of its stated deviation against time; it says so where there is no pose."""
+    from matplotlib.figure import Figure
+
+    drawn = Figure(figsize=(9, 4.5), layout="constrained")
+    upper, lower = drawn.subplots(2, 1, sharex=True)
+    start = log.times[0]
+    seconds = [value - start for value in log.times]
+    poses = sum(map(math.isfinite, log.deviations))
+    size = 2 if poses > 1 else 6
+    if len(seconds) == 1:
+        upper.set_xticks([0])
+    if poses == 1:
+        upper.set_yticks([0])  # it is its own median
+    if not poses:
+        upper.set_xlim(0, seconds[-1] or None)
+        for axes in (upper, lower):
+            axes.text(0.5, 0.5, "no pose", transform=axes.transAxes, ha="center", va="center", color="0.4")
+            axes.set_yticks([])
+    for axis, name in enumerate("xyz"):
+        middle = torch.tensor(log.tips, dtype=torch.float64)[:, axis]
+        offset = 1e3 * (middle - middle.nanmedian())
+        upper.plot(seconds, offset.tolist(), ".-", linewidth=0.8, markersize=size, label=name)
+    upper.set_ylabel("tip from its median (mm)")
+    upper.legend(ncols=3)
+    upper.grid(alpha=0.3)
+    lower.plot(seconds, [1e3 * value for value in log.deviations], ".", markersize=size)
+    lower.set_ylabel("sd of the tip (mm)")
+    lower.set_xlabel("time (s)")
+    lower.grid(alpha=0.3)
+    return drawn
+
+
+def _png(drawn: Any) -> bytes:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    FigureCanvasAgg(drawn)
+    data = io.BytesIO()
+    drawn.savefig(data, format="png", dpi=100)
+    return data.getvalue()

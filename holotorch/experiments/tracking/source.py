@@ -1,0 +1,154 @@
+"""What a tracking run is made from: a source of frames, its camera, the catheter, and the tracker."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.tracking.config import (
+    CameraSettings,
+    build_camera,
+    build_catheter,
+    load_camera,
+    load_catheter,
+    misfit,
+)
+from holotorch.io.bundled import find_config
+from holotorch.io.recording import is_recording, open_recording
+from holotorch.io.video import Frames, is_camera, no_such_source, open_frames
+from holotorch.tracking import Camera, Catheter, Pose
+from holotorch.tracking.camera.calibration import SURE
+from holotorch.tracking.detection.channels import ChannelOrder, ambiguities, ambiguity_text
+
+METHODS = ("ours", "thesis")
+_OFF_CENTRE = 0.15  # of a side; two thirds of the resolution, as 720 to 1080 lines, shift the centre by a sixth
+Tracker = Callable[[Tensor, Sequence[Pose] | None], list[Pose]]
+
+
+class Given(NamedTuple):
+    """What a run is made from; ``paths`` of the two YAML files by the names that their copies get."""
+
+    frames: Frames
+    camera: Camera
+    catheter: Catheter
+    tracker: Tracker
+    paths: dict[str, Path]
+
+
+@contextmanager
+def opened(
+    source: str | Path, camera: Path | None, catheter: Path | None, method: str, rate: float | None
+) -> Iterator[Given]:
+    """Open a source with its files, and make a tracker for it.
+
+    Args:
+        source: A video, a folder of pictures, a folder of a recording, or the number of a camera.
+        camera: YAML file; that of the recording by default.
+        catheter: The same.
+        method: One of ``METHODS``.
+        rate: Frames per second where the source has no times.
+
+    Raises:
+        ConfigError: One of them cannot be used, or not with the others.
+    """
+    if method not in METHODS:
+        raise ConfigError([f"expected one of {', '.join(METHODS)} as the method, got {method!r}"])
+    replayed = _found(source)
+    files = {"camera.yaml": camera, "catheter.yaml": catheter}
+    for name in files:
+        if files[name] is None and replayed and (Path(source) / name).is_file():
+            files[name] = Path(source) / name
+    missing = [f"no {name}: say which with --{name[:-5]}" for name, path in files.items() if path is None]
+    if missing:
+        raise ConfigError(missing)
+    paths = {name: find_config(path) or path for name, path in files.items() if path is not None}
+    lens, tool = _loaded(paths)
+    seen = build_camera(lens)
+    try:
+        tracker = make_tracker(method, seen, tool)
+    except ValueError as error:
+        raise misfit(paths["catheter.yaml"], error) from None
+    try:
+        frames = open_recording(Path(source)) if replayed else open_frames(source, rate)
+    except ValueError as error:
+        raise ConfigError([str(error)]) from None
+    with frames:
+        _checked(lens, frames)
+        if doubt := ambiguity_text(ambiguities(seen, tool)):
+            frames.notes.append(doubt)
+        yield Given(frames, seen, tool, tracker, paths)
+
+
+def _found(source: str | Path) -> bool:
+    """Whether the source is a recording; ConfigError where there is none, or a part of one."""
+    path = Path(source)
+    if not (path.exists() or is_camera(source)):
+        raise ConfigError([no_such_source(source)])
+    if is_recording(path):
+        return True
+    parts = ("recording.json", "frames.rgb")
+    if any((path / name).is_file() for name in parts):
+        missing = [name for name in (parts[0], "times.csv") if not (path / name).is_file()]
+        raise ConfigError([f"{path}: a recording without its {' and '.join(missing)} cannot be replayed"])
+    return False
+
+
+def _loaded(paths: dict[str, Path]) -> tuple[CameraSettings, Catheter]:
+    """Camera and catheter of two files; ConfigError with the mistakes of both."""
+    mistakes: list[str] = []
+    found: list[Any] = []
+    for load, name in ((load_camera, "camera.yaml"), (load_catheter, "catheter.yaml")):
+        try:
+            found.append(load(paths[name]))
+        except ConfigError as error:
+            mistakes += error.mistakes
+    if mistakes:
+        raise ConfigError(mistakes)
+    return found[0], build_catheter(found[1])
+
+
+def make_tracker(method: str, camera: Camera, catheter: Catheter) -> Tracker:
+    """The tracker of a method; ValueError for a catheter that it cannot see."""
+    if method == "thesis":
+        from holotorch.tracking.thesis.tracker import ThesisTracker
+
+        return _Cold(ThesisTracker(camera, catheter))
+    from holotorch.tracking.detection.tracker import CatheterTracker
+
+    return CatheterTracker(camera, catheter, channels=ChannelOrder.RGB)  # as every source of frames gives them
+
+
+class _Cold:
+    """A tracker that makes no use of the pose before."""
+
+    def __init__(self, tracker: Callable[[Tensor], list[Pose]]):
+        self._tracker = tracker
+
+    def __call__(self, frames: Tensor, previous: Sequence[Pose] | None = None) -> list[Pose]:
+        return self._tracker(frames)
+
+    @property
+    def times(self) -> dict[str, float]:
+        return getattr(self._tracker, "times", {})
+
+
+def _checked(lens: CameraSettings, frames: Frames) -> None:
+    """ConfigError, or a doubt noted, for intrinsics that make poses wrong, and plausible: rough, or of another size."""
+    height, width = frames.shape
+    if lens.size is not None and tuple(lens.size) != frames.shape:
+        held = f"{lens.size[1]} x {lens.size[0]}"
+        raise ConfigError([f"the camera's file holds for frames of {held} px, and these have {width} x {height} px"])
+    if lens.size is None and max(abs(lens.cx / width - 0.5), abs(lens.cy / height - 0.5)) > _OFF_CENTRE:
+        frames.notes.append(
+            f"the principal point ({lens.cx:.0f}, {lens.cy:.0f}) is far from the middle of frames of {width} x "
+            f"{height} px: was the camera calibrated at another resolution?"
+        )
+    unsure = lens.calibration.deviations.get("fx", 0.0) / lens.fx if lens.calibration else 0.0
+    if unsure > SURE:
+        frames.notes.append(
+            f"the camera's calibration leaves its focal length open to {100 * unsure:.1f} %: tips are as far off along "
+            "the line of sight, in all frames alike, and no deviation below says so"
+        )

@@ -1,0 +1,188 @@
+"""A synthetic recording of a catheter that moves over a drape, with where it truly is: something to track at once."""
+
+import csv
+import io
+import math
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.runs.folder import claim
+from holotorch.experiments.tracking.config import (
+    build_camera,
+    build_catheter,
+    load_camera,
+    load_catheter,
+    save_camera,
+    save_catheter,
+)
+from holotorch.io.bundled import find_config
+from holotorch.io.files import write_text
+from holotorch.io.recording import Recorder, is_recording
+from holotorch.io.video import Frame
+from holotorch.tracking.evaluation.protocols import coverage
+from holotorch.tracking.pose.catheter import THESIS
+from holotorch.tracking.simulation.scenery import SKIN, drape, finger
+from holotorch.tracking.simulation.world import World, synthetic_camera
+
+RATE = 30.0  # frames per second
+_TIP = ("tip_x_m", "tip_y_m", "tip_z_m")
+_COVARIANCE = ("cov_xx_m2", "cov_xy_m2", "cov_xz_m2", "cov_yy_m2", "cov_yz_m2", "cov_zz_m2")
+_SHARES = {"median": 0.5, "p95": 0.95, "worst": 1.0}
+_WRONG = 5.0  # mm
+_COLUMNS = ("frame", "time_s", *_TIP, "direction_x", "direction_y", "direction_z")
+
+
+def write_synthetic(
+    out: Path | None,
+    frames: int = 45,
+    size: tuple[int, int] = (1080, 1920),
+    camera: Path | None = None,
+    catheter: Path | None = None,
+) -> Path:
+    """Render a recording, and ``truth.csv`` beside its frames; its folder, ``out`` or the next free runs/synthetic-001.
+
+    A catheter swings over a surgical drape and skin-coloured fingers pass over its bands. ``holotorch track`` takes
+    the folder as it is, with the camera and the catheter that were rendered. Whatever ends the rendering early leaves
+    no folder.
+
+    Args:
+        out: New or empty folder.
+        frames: To render.
+        size: (H, W) of a camera that states none.
+        camera: YAML file; :func:`synthetic_camera` by default.
+        catheter: The same; the thesis's.
+
+    Raises:
+        ConfigError: A file that cannot be used, a folder in use, or a catheter that is nowhere before the camera.
+    """
+    lens = None if camera is None else load_camera(find_config(camera) or camera)
+    tool = THESIS if catheter is None else build_catheter(load_catheter(find_config(catheter) or catheter))
+    size = (lens and lens.size) or size
+    seen = synthetic_camera(size) if lens is None else build_camera(lens)
+    folder = claim(out, "synthetic")
+    try:
+        _render(folder, frames, World(size=size, camera=seen, catheter=tool))
+    except ValueError as error:
+        shutil.rmtree(folder)
+        raise ConfigError([f"this catheter cannot be rendered with this camera: {error}"]) from None
+    except BaseException:
+        shutil.rmtree(folder)  # claimed empty a moment ago
+        raise
+    return folder
+
+
+def _render(folder: Path, frames: int, world: World) -> None:
+    if (folder / "images").is_dir():
+        (folder / "images").rmdir()
+    size, tool = world.size, world.catheter
+    cloth = drape(size, 0, (70, 120, 130))
+    scale = float(world.camera.matrix[0, 0]) / 1400  # of a finger in pixels
+    across = (tool.edges[0] + tool.edges[-1]) / 2
+    table = io.StringIO()
+    rows = csv.writer(table, lineterminator="\n")
+    rows.writerow(_COLUMNS)
+    own = folder.with_name(f".{folder.name}.parts")
+    own.mkdir(exist_ok=True)
+    try:
+        save_camera(own / "camera.yaml", world.camera, size)
+        save_catheter(own / "catheter.yaml", world.catheter)
+        copies = {name: own / name for name in ("camera.yaml", "catheter.yaml")}
+        with Recorder(folder, size, RATE, "synthetic", copies) as recorder:
+            for i in tqdm(range(frames), desc="rendering", unit="frame"):
+                turn = 2 * math.pi * i / 45
+                at = (0.05 * math.sin(turn), 0.03 * math.cos(turn))
+                tip, along = world.pose(0.5 + 0.03 * math.sin(turn), math.radians(15 + 8 * math.cos(turn)), 0.4, at)
+                middle = world.camera.project((tip + across * along)[None])[0]
+                # A finger passes over the middle of the bands for a while.
+                covers = 20 <= i % 45 < 30
+                start = (float(middle[0]), float(middle[1]) - 260 * scale)
+                end = (float(middle[0]), float(middle[1]) + 14 * scale)
+                fingers = finger(start, end, 16 * scale, SKIN) if covers else ()
+                case = world.case(f"synthetic {i}", (tip, along), lambda: cloth, occluders=tuple(fingers))
+                recorder.write(Frame(i / RATE, case.frame()))
+                rows.writerow([i, f"{i / RATE:.6f}", *(f"{value:.9f}" for value in torch.cat([tip, along]).tolist())])
+    finally:
+        for path in own.iterdir():
+            path.unlink()
+        own.rmdir()
+    write_text(folder / "truth.csv", table.getvalue())
+
+
+def read_truth(folder: Path) -> dict[str, list[float]]:
+    """True tips in metres by the number of their frame, of the truth.csv in a folder; empty where there is none.
+
+    Beside pictures a table of that name may be about something else and is left alone; in a recording it is the truth.
+
+    Raises:
+        ConfigError: A table that cannot be read as the truth, with the first line that is wrong.
+    """
+    path = folder / "truth.csv"
+    if not path.is_file():
+        return {}
+    wanted, found = ("frame", *_TIP), dict[str, list[float]]()
+    try:
+        with open(path, newline="", encoding="utf-8") as stream:
+            table = csv.DictReader(stream)
+            names = table.fieldnames or ()
+            if missing := [name for name in wanted if name not in names]:
+                if not is_recording(folder):
+                    return {}
+                raise ConfigError([f"{path}:1: columns {', '.join(missing)} are missing, got {', '.join(names)}"])
+            for row in table:
+                try:
+                    frame, place = str(int(row["frame"])), [float(row[name]) for name in _TIP]
+                    if not all(map(math.isfinite, place)) or frame in found:
+                        raise ValueError
+                except (TypeError, ValueError):
+                    got = ",".join(str(row[name]) for name in wanted)
+                    text = "the number of a frame, each once, and a finite tip in metres"
+                    raise ConfigError([f"{path}:{table.line_num}: expected {text}, got {got}"]) from None
+                found[frame] = place
+    except (UnicodeDecodeError, csv.Error):
+        raise ConfigError([f"{path}: not a table in UTF-8 text"]) from None
+    return found
+
+
+def errors(poses: Path, true: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    """How far the tips of a poses.csv lie from the truth, as plain JSON values in mm; nothing where none is known.
+
+    ``true``: as :func:`read_truth` gives it. ``coverage``: share of the answered frames whose truth lies in the 95 %
+    ellipsoid of the stated covariance. ``wrong``: frames off by more than 5 mm.
+    """
+    with open(poses, newline="") as stream:
+        known = [row for row in csv.DictReader(stream) if row["frame"] in true]
+    if not known:
+        return {}
+    rows = [row for row in known if row["tip_x_m"] not in ("", "nan")]
+    found: dict[str, float] = {"frames": len(rows), "refused": len(known) - len(rows)}
+    if not rows:
+        return found
+    tips, places = (
+        torch.tensor([[float(value) for value in values] for values in part], dtype=torch.float64)
+        for part in ([[row[name] for name in _TIP] for row in rows], [true[row["frame"]] for row in rows])
+    )
+    away = (1e3 * (tips - places).norm(dim=-1)).sort().values
+    last = len(away) - 1
+    found |= {f"{name}_mm": float(away[round(share * last)]) for name, share in _SHARES.items()}
+    found["wrong"] = int((away > _WRONG).sum())
+    if all(rows[0].get(name) for name in _COVARIANCE):
+        upper = torch.tensor([[float(row[name]) for name in _COVARIANCE] for row in rows], dtype=torch.float64)
+        with suppress(ValueError):  # a covariance that is none has no ellipsoid
+            found["coverage"] = coverage(tips, upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3), places)[0]
+    return found
+
+
+def compared(found: Mapping[str, float]) -> str:
+    """What :func:`errors` has found, in words."""
+    if not found["frames"]:
+        return f"Truth      no frame answered of {found['refused']} (synthetic)"
+    return (
+        f"Truth      the tip is {found['median_mm']:.2f} mm off (median), {found['worst_mm']:.2f} at most, "
+        f"in {found['frames']} frames; {found['refused']} refused (synthetic)"
+    )

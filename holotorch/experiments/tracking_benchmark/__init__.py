@@ -1,0 +1,1 @@
+"""Catheter trackers side by side on synthetic frames."""

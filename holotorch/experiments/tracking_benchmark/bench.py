@@ -1,0 +1,279 @@
+"""What catheter trackers are held to, on synthetic frames: each part streams over its frames and returns rows."""
+
+import math
+import statistics
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from itertools import pairwise, product
+from typing import Any
+
+import torch
+
+from holotorch.experiments.tracking_benchmark.bound import tip_bounds
+from holotorch.experiments.tracking_benchmark.methods import Answer, Method, answers, tips_of, truth_of
+from holotorch.tracking.evaluation import protocols
+from holotorch.tracking.pose.status import Status
+from holotorch.tracking.simulation.trials import conditions, negatives, occlusions
+from holotorch.tracking.simulation.world import World
+
+Row = dict[str, Any]
+
+# Distance in mm and tilt in degrees: what S_RMS may be in mm, or where efficiency is asked for.
+STILL: dict[tuple[int, int], float | None] = {
+    (450, 20): 0.05,
+    (520, 5): 0.12,
+    (700, 30): 1.1,
+    (350, 20): None,
+    (520, 0): None,
+    (520, 20): None,
+}
+# Which point lies at that distance, in metres from the tip; tilt brings the bands nearer to the camera than the tip. A
+# pose is told by its tip, so that is how the goals are read; the second moves S_RMS by a half at 450 and 700 mm.
+TIP, MIDDLE = "tip", "middle of the bands"
+POINTS: dict[str, float | None] = {TIP: 0.0, MIDDLE: None}
+_CODECS: dict[str, dict[str, Any]] = {
+    "none": {},
+    "video 4:2:0": {"video": True},
+    "JPEG 95, 4:2:0": {"jpeg_quality": 95},
+    "JPEG 75, 4:2:0": {"jpeg_quality": 75},
+}
+_LIGHTS: dict[str, dict[str, Any]] = {
+    "as everywhere here": {},
+    "even, without gloss": {"ambient": 1.0, "highlight": 0.0},
+    "a quarter more": {"gain": 1.25},
+    "half of it": {"gain": 0.5},
+    "a quarter of it": {"gain": 0.25},
+}
+_PLACES = 5  # less than a pixel apart
+# What a refusal may say of scenes that cannot be answered, by what their names begin with.
+_UNSEEN = frozenset({Status.NO_CATHETER, Status.BANDS_MISSING, Status.NO_AXIS})
+_SAYS: dict[str, frozenset[Status]] = {
+    "motion across": _UNSEEN | {Status.TOO_NARROW, Status.EDGES_UNCLEAR, Status.INCONSISTENT},
+    "tilt": frozenset({Status.UNCERTAIN, Status.EDGES_UNCLEAR, Status.TOO_NARROW}),
+    "1200 mm away": frozenset({Status.TOO_NARROW, Status.UNCERTAIN}),
+    "rear out": frozenset({Status.OUT_OF_FRAME, Status.BANDS_MISSING}),
+    "tip out": frozenset({Status.OUT_OF_FRAME, Status.BANDS_MISSING}),
+    "line of sight": _UNSEEN,
+    "over": frozenset({Status.BANDS_MISSING, Status.EDGES_UNCLEAR}),
+}
+
+
+def still(world: World, trackers: dict[str, Method], count: int) -> tuple[list[Row], list[Answer]]:
+    """Catheters at rest, ``count`` frames at each pose of ``STILL``: stability, bias, coverage, efficiency.
+
+    With the tip at that distance, and once more with the middle of the bands there, which is what the frame's middle
+    shows both times.
+
+    Each pose is measured at five places less than a pixel apart, and spreads are the root of their mean square: where
+    edges fall between pixels moves the spread at one place by a tenth and more.
+    """
+    rows, said = [], []
+    pixel = 1 / float(world.camera.matrix[0, 0])
+    offsets = (pixel * (torch.rand(_PLACES, 2, generator=torch.Generator().manual_seed(world.seed)) - 0.5)).tolist()
+    for (where, point), ((depth, tilt), goal) in product(POINTS.items(), STILL.items()):
+        place = (1e-3 * depth, math.radians(tilt))
+        pose = world.pose(*place, point=point)
+        bound, of_edges = (1e3 * math.sqrt(own.trace()) for own in tip_bounds(world, pose))
+        parts = [world.still(*place, max(2, count // _PLACES), at, point) for at in offsets]
+        found = [list(answers(part, trackers, f"still, {depth} mm, {tilt} deg")) for part in parts]
+        said += [answer for part in found for answer in part]
+        for name in trackers:
+            groups = [[answer for answer in part if answer.method == name] for part in found]
+            own = [answer for group in groups for answer in group]
+            row: Row = {"depth_mm": depth, "point": where, "tilt_deg": tilt, "method": name, "frames": len(own)}
+            row |= {
+                "answered": sum(answer.answered for answer in own),
+                "s_rms_mm": "",
+                "s_rms_error_mm": "",
+                "s_rms_goal_mm": goal or "",
+            }
+            row |= {"sd_mm": "", "bias_mm": "", "bound_mm": round(bound, 4), "edges_bound_mm": round(of_edges, 4)}
+            row |= {"efficiency": "", "coverage": ""}
+            known = [tips_of(g) for g in groups if any(a.answered and b.answered for a, b in pairwise(g))]
+            if known:
+                seen = [protocols.s_rms(tips) for tips in known]
+                sd, s_rms = (
+                    math.hypot(*values) / math.sqrt(len(seen))
+                    for values in ([each.sd for each in seen], [each.s_rms for each in seen])
+                )
+                bias = float((tips_of(own) - truth_of(own)).nanmean(0).norm())
+                row |= {"s_rms_mm": _mm(s_rms), "s_rms_error_mm": _mm(_error([each.s_rms for each in seen]))}
+                row |= {"sd_mm": _mm(sd), "bias_mm": _mm(bias)}
+                row |= {"efficiency": round((bound / (1e3 * sd)) ** 2, 3), "coverage": covered(own)}
+            rows.append(row)
+    return rows, said
+
+
+def grids(world: World, trackers: dict[str, Method], share: float = 1.0) -> tuple[list[Row], list[Answer]]:
+    """Tips over the sheet and the three faces of Sec. 3.5.2 and 3.5.3: absolute, after a rigid fit, and Acc."""
+    parts = {"2D": world.grid_2d()} | {f"3D {face}": cases for face, cases in world.grid_3d().items()}
+    every = max(1, round(1 / share))
+    said = {part: list(answers(cases[::every], trackers, f"grid {part}")) for part, cases in parts.items()}
+    rows = []
+    for name in trackers:
+        own = {part: [answer for answer in found if answer.method == name] for part, found in said.items()}
+        faces = [_grid_row(part, name, answers_) for part, answers_ in own.items()]
+        whole = _grid_row("3D", name, [answer for part, found in own.items() if part != "2D" for answer in found])
+        seen = [row["acc_mm"] for row in faces[1:] if row["acc_mm"] != ""]
+        whole["acc_mm"] = round(sum(seen) / len(seen), 4) if seen else ""  # the thesis's is the mean of its faces, too
+        rows += [*faces, whole]
+    return rows, [answer for found in said.values() for answer in found]
+
+
+def codecs(world: World, trackers: dict[str, Method], share: float = 1.0) -> tuple[list[Row], list[Answer]]:
+    """Every fourth tip of the sheet, with all colours and through codecs that keep fewer of them."""
+    every = max(1, round(4 / share))
+    rows, said = [], []
+    for codec, changes in _CODECS.items():
+        cases = replace(world, look=replace(world.look, **changes)).grid_2d()[::every]
+        found = list(answers(cases, trackers, codec))
+        for name in trackers:
+            row = _grid_row("2D", name, [answer for answer in found if answer.method == name])
+            kept = ("method", "points", "refused", "median_mm", "p95_mm", "worst_mm", "coverage")
+            rows.append({"codec": codec} | {key: row[key] for key in kept})
+        said += found
+    return rows, said
+
+
+def lights(world: World, tracker: Method, count: int, share: float = 1.0) -> list[Row]:
+    """What light is worth: S_RMS of a catheter at rest, ``count`` frames a pose, and every second tip of the sheet."""
+    rows = []
+    for light, changes in _LIGHTS.items():
+        lit = replace(world, look=replace(world.look, **changes))
+        row: Row = {"light": light}
+        for (depth, tilt), goal in STILL.items():
+            if goal is not None:
+                cases = lit.still(1e-3 * depth, math.radians(tilt), max(2, count), point=POINTS[TIP])
+                own = list(answers(cases, {light: tracker}, f"light, {light}"))
+                known = any(a.answered and b.answered for a, b in pairwise(own))
+                row[f"s_rms_mm_{depth}_{tilt}"] = _mm(protocols.s_rms(tips_of(own)).s_rms) if known else ""
+        found = answers(lit.grid_2d()[:: max(1, round(2 / share))], {light: tracker}, f"light, {light}")
+        grid = _grid_row("2D", light, list(found))
+        rows.append(row | {key: grid[key] for key in ("points", "refused", "median_mm", "p95_mm", "coverage")})
+    return rows
+
+
+def scenes(
+    world: World, trackers: dict[str, Method], count: int, kind: str, share: float = 1.0
+) -> tuple[list[Row], list[Answer]]:
+    """``kind`` "conditions" (from as many seeds) or "occlusions" (at as many poses), a row for each name and method.
+
+    Each seed has three of the world's photographs behind the catheter.
+    """
+    if kind == "conditions":
+        worlds = [_seeded(world, i) for i in range(count)]
+        cases = [replace(case, name=f"{case.name}, seed {one.seed}") for one in worlds for case in conditions(one)]
+    else:
+        cases = occlusions(world, count)
+    found = list(answers(cases[:: max(1, round(1 / share))], trackers, kind))
+    rows = []
+    for (name, method), own in _by(found, lambda answer: (_plain(answer.name), answer.method)).items():
+        errors = sorted(answer.error for answer in own if answer.answered)
+        refused = [answer for answer in own if not answer.answered]
+        fitting: Any = ""
+        if not own[0].answerable:
+            right = next(says for start, says in _SAYS.items() if name.startswith(start))
+            fitting = sum(answer.status in right for answer in refused)
+        rows.append(
+            {
+                "scene": name,
+                "method": method,
+                "answerable": own[0].answerable,
+                "frames": len(own),
+                "right": sum(answer.right for answer in own),
+                "wrong": sum(answer.wrong for answer in own),
+                "refused": len(refused),
+                "reason_fits": fitting,
+                "median_error_mm": _mm(errors[len(errors) // 2]) if errors else "",
+                "worst_error_mm": _mm(errors[-1]) if errors else "",
+                "statuses": told(answer.status for answer in own),
+                "reason": next((answer.reason for answer in refused), ""),
+            }
+        )
+    return rows, found
+
+
+def empty(world: World, trackers: dict[str, Method], count: int) -> tuple[list[Row], list[Answer]]:
+    """``count`` frames without the catheter, a row for each kind and method, with the names of those answered."""
+    found = list(answers(negatives(world, count), trackers, "negatives"))
+    rows = []
+    for (kind, method), own in _by(found, lambda answer: (_kind(answer.name), answer.method)).items():
+        false = [answer.name.split(",")[0].split()[-1] for answer in own if answer.answered]
+        row: Row = {"kind": kind, "method": method, "frames": len(own), "false": len(false)}
+        row["statuses"] = told(answer.status for answer in own)
+        rows.append(row | {"seed": world.seed, "numbers_of_false": " ".join(false)})
+    return rows, found
+
+
+def one(rows: list[Row], **wanted: Any) -> Row:
+    """The first row with these values."""
+    return next(row for row in rows if all(row[key] == value for key, value in wanted.items()))
+
+
+def covered(own: Sequence[Answer]) -> float | str:
+    """Share of answers whose 95 % ellipsoid holds the truth; "" without any."""
+    seen = [answer for answer in own if answer.answered and answer.truth is not None]
+    if not seen:
+        return ""
+    covariance = torch.tensor([answer.covariance for answer in seen], dtype=torch.float64)
+    return round(protocols.coverage(tips_of(seen), covariance, truth_of(seen))[0], 3)
+
+
+def told(statuses: Iterable[Status]) -> str:
+    """Statuses and how often, the most frequent first."""
+    return ", ".join(f"{status.name} {times}" for status, times in Counter(statuses).most_common())
+
+
+def _grid_row(part: str, name: str, own: list[Answer]) -> Row:
+    tips, truth = tips_of(own), truth_of(own)
+    row: Row = {"grid": part, "method": name, "points": len(own), "refused": int(tips.isnan().any(-1).sum())}
+    row |= dict.fromkeys(
+        ("median_mm", "p95_mm", "worst_mm", "acc_mm", "in_plane_mm", "rigid_median_mm", "rigid_p95_mm"), ""
+    )
+    row["coverage"] = covered(own)
+    known = tips.isfinite().all(-1).nonzero()[:, 0].tolist()
+    right, down, _ = torch.eye(3, dtype=torch.float64)
+    if len(known) >= 3:
+        # The point in the middle, or the nearest to it that was answered, is the one that all others refer to.
+        reference = min(known, key=lambda i: abs(i - len(own) // 2))
+        seen = protocols.grid_accuracy(tips, truth, reference, truth)
+        row |= dict(zip(("median_mm", "p95_mm", "worst_mm"), map(_mm, seen.absolute), strict=True))
+        if part == "2D":
+            row["in_plane_mm"] = _mm(protocols.planar_accuracy(tips, truth[:, :2], right, down, reference).in_plane)
+        row |= {"acc_mm": _mm(seen.acc), "rigid_median_mm": _mm(seen.rigid[0]), "rigid_p95_mm": _mm(seen.rigid[1])}
+    return row
+
+
+def _by(found: Iterable[Answer], key: Callable[[Answer], Any]) -> dict[Any, list[Answer]]:
+    groups: dict[Any, list[Answer]] = {}
+    for answer in found:
+        groups.setdefault(key(answer), []).append(answer)
+    return groups
+
+
+def _seeded(world: World, i: int) -> World:
+    """The same with another seed and the next three photographs."""
+    images = [world.photographs[(3 * i + k) % len(world.photographs)] for k in range(min(3, len(world.photographs)))]
+    return replace(world, photographs=tuple(images), seed=world.seed + i)
+
+
+def _plain(name: str) -> str:
+    """A scene's name without the number of its pose; of photographs, which are many, one name."""
+    return "photograph" if name.startswith("photograph") else name.split(",")[0]
+
+
+def _kind(name: str) -> str:
+    return name.split(", ")[1]
+
+
+def _error(values: list[float]) -> float:
+    """Standard error of the root mean square of a few values; NaN of one."""
+    squares = [value * value for value in values]
+    if len(values) < 2:
+        return math.nan
+    return statistics.stdev(squares) / math.sqrt(len(values)) / (2 * math.sqrt(statistics.fmean(squares)))
+
+
+def _mm(metres: float) -> float:
+    return round(1e3 * metres, 4)

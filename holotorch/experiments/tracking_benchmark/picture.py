@@ -1,0 +1,85 @@
+"""The picture of the chart of trackers."""
+
+import io
+import math
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from holotorch.experiments.tracking_benchmark.bench import STILL, TIP, Row, one
+from holotorch.experiments.tracking_benchmark.methods import BASE, COLD, FEWER, PRIOR
+
+_FALSE, _RIGHT, _REFUSED = "tab:red", "tab:green", "lightgray"
+_STYLE = {BASE: ("tab:gray", "s"), COLD: ("tab:blue", "o"), PRIOR: ("tab:green", "^"), FEWER: ("tab:orange", "v")}
+
+
+def draw(rows: list[Row], tables: dict[str, list[Row]]) -> bytes:
+    """PNG of the chart: error against time, spread at rest against its bounds, and what is refused."""
+    figure = Figure(figsize=(14, 4.6), layout="constrained")
+    first, second, third = (figure.add_subplot(1, 3, k + 1) for k in range(3))
+    _errors(first, rows)
+    _precision(second, tables["still"])
+    _outcomes(third, tables["reliability"])
+    buffer = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(buffer)
+    return buffer.getvalue()
+
+
+def _errors(axes: Axes, rows: list[Row]) -> None:
+    for row in rows:
+        if row["method"] not in _STYLE:
+            continue
+        colour, marker = _STYLE[row["method"]]
+        for grid, fill in (("2D", colour), ("3D", "white")):
+            if row[f"{grid}_median_mm"] != "":
+                ends = [row[f"{grid}_median_mm"], row[f"{grid}_p95_mm"]]
+                label = f"{row['method']}, {grid} grid"
+                axes.semilogy([row["milliseconds"]] * 2, ends, color=colour, linewidth=0.8)
+                axes.semilogy(row["milliseconds"], ends[0], marker, color=colour, markerfacecolor=fill, label=label)
+    axes.set_xlim(left=0)
+    axes.set_xlabel("milliseconds per frame, plain desk")
+    axes.set_ylabel("tip error: median, line up to p95 (mm)")
+    axes.set_title("synthetic frames")
+    axes.grid(alpha=0.3, which="both")
+    axes.legend(fontsize=7)
+
+
+def _precision(axes: Axes, rows: list[Row]) -> None:
+    places = list(STILL)
+    for name, (colour, marker) in _STYLE.items():
+        found = [one(rows, depth_mm=depth, tilt_deg=tilt, point=TIP, method=name) for depth, tilt in places]
+        values = [row["sd_mm"] if row["sd_mm"] != "" else math.nan for row in found]
+        axes.semilogy(range(len(places)), values, marker, color=colour, label=name)
+    own = [one(rows, depth_mm=depth, tilt_deg=tilt, point=TIP, method=BASE) for depth, tilt in places]
+    for of, colour, label in (("edges_bound_mm", "gray", ", of edges"), ("bound_mm", "black", ", of all pixels")):
+        bounds = [row[of] for row in own]
+        axes.semilogy(range(len(places)), bounds, "_", color=colour, markersize=20, label=f"Cramér-Rao bound{label}")
+    axes.set_xticks(range(len(places)), [f"{depth} mm\n{tilt}°" for depth, tilt in places])
+    axes.set_ylim(top=8 * axes.get_ylim()[1])  # room for the legend
+    axes.set_xlabel("distance of the tip and tilt")
+    axes.set_ylabel("sd of a resting tip, unfiltered (mm)")
+    axes.set_title("synthetic frames")
+    axes.grid(alpha=0.3, which="both")
+    axes.legend(fontsize=7)
+
+
+def _outcomes(axes: Axes, rows: list[Row]) -> None:
+    rows = [row for row in rows if row["frames_of"] in ("conditions", "occlusions", "negatives")]
+    kinds = (
+        ("right", _RIGHT, "within 5 mm"),
+        ("refused", _REFUSED, "refused, as negatives must be"),
+        ("wrong", _FALSE, "wrong or false"),
+    )
+    left = [0.0] * len(rows)
+    for key, colour, label in kinds:
+        shares = [100 * row[key] / row["frames"] for row in rows]
+        axes.barh(range(len(rows)), shares, left=left, color=colour, label=label)
+        left = [a + b for a, b in zip(left, shares, strict=True)]
+    for i, row in enumerate(rows):
+        box = {"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1}
+        axes.text(99, i, f"{row['wrong']} wrong of {row['frames']}", ha="right", va="center", fontsize=7, bbox=box)
+    axes.set_yticks(range(len(rows)), [f"{row['frames_of']}\n{row['method']}" for row in rows], fontsize=7)
+    axes.set_xlabel("% of synthetic frames")
+    axes.invert_yaxis()
+    axes.legend(fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)

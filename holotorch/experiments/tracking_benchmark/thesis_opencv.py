@@ -1,0 +1,205 @@
+"""The thesis's tracking pipeline (Sec. 3.4) in OpenCV on the CPU: what every time of the tracking charts is held to."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+from holotorch.tracking.camera.camera import Camera
+from holotorch.tracking.pose.catheter import Catheter
+from holotorch.tracking.pose.status import Pose, Refusal
+from holotorch.tracking.thesis import stages
+from holotorch.tracking.thesis.stages import Axis, Box, Endpoints, Stopwatch
+
+
+class ThesisOpenCV:
+    """The stages of ``holotorch.tracking.thesis.tracker.ThesisTracker``, with the same decisions, on 8-bit images.
+
+    Written to be a fair baseline: undistortion maps in fixed point, made once; 8-bit images throughout; filters within
+    the box of the bands only. Frames whose memory is [H, W, 3], as cameras deliver them, are not copied.
+
+    Args:
+        camera: Whose frames come.
+        catheter: Its bands.
+        literal: Undistort each frame by ``cv2.undistort``, the function of that name, which makes its maps anew.
+
+    Attributes:
+        times: Seconds of each stage of the last call, by the names of Table 3.1; all frames of the batch together.
+        endpoints: Of each frame of the last call, the bands' edges (x, y) in pixels of the undistorted frame, in the
+            catheter's order, None where not found; an empty list where the frame was refused before.
+
+    Raises:
+        ValueError: Colours that thresholds in hue cannot tell apart.
+
+    Source: Sec. 3.4 and Table 3.1 of the thesis, with its equations 3.5 to 3.12 corrected.
+    """
+
+    def __init__(self, camera: Camera, catheter: Catheter, *, literal: bool = False):
+        self.camera, self.catheter, self.literal = camera, catheter, literal
+        self.times: dict[str, float] = dict.fromkeys(stages.STAGES, 0.0)
+        self.endpoints: list[Endpoints] = []
+        windows = stages.windows(catheter)
+        hue = np.arange(256) * 2.0  # OpenCV's unit is 2 degrees
+        self._bands = np.zeros(256, dtype=np.uint8)
+        for number, middle in enumerate(windows.hues, 1):
+            self._bands[np.abs((hue - middle + 180) % 360 - 180) <= windows.reach] = number
+        self._low = np.ceil([0, 255 * windows.saturation, 255 * windows.value])
+        self._matrix = camera.matrix.detach().cpu().numpy()
+        self._distortion = camera.distortion.detach().cpu().numpy()
+        self._positions = np.array(catheter.edges)
+        self._maps: tuple[np.ndarray, np.ndarray] | None = None
+        self._size = (0, 0)
+
+    def __call__(self, frames: Tensor) -> list[Pose]:
+        """Pose in metres, or refusal, of each frame of uint8 [B, 3, H, W], RGB, in the CPU's memory.
+
+        Raises:
+            TypeError, ValueError: Not such a tensor.
+        """
+        stages.need_frames(frames)
+        if frames.device.type != "cpu":
+            raise ValueError(f"OpenCV works in the CPU's memory, got frames on {frames.device}; use frames.cpu()")
+        self._prepare((frames.shape[-1], frames.shape[-2]))
+        watch = Stopwatch()
+        poses, self.endpoints = [], []
+        for frame in frames.numpy():
+            self.endpoints.append([])
+            try:
+                poses.append(self._track(frame, watch))
+            except Refusal as refused:
+                watch.lap(stages.REFUSED_AT.get(refused.status, "Get axis"))
+                poses.append(Pose.refused(refused.status, refused.reason))
+        self.times = watch.stop()
+        return poses
+
+    def _prepare(self, size: tuple[int, int]) -> None:
+        """Maps of the undistortion for frames of this (width, height), black beyond the valid radius."""
+        if size == self._size and self._maps is not None:
+            return
+        x, y = cv2.initUndistortRectifyMap(self._matrix, self._distortion, np.eye(3), self._matrix, size, cv2.CV_32FC1)
+        across = (np.arange(size[0]) - self._matrix[0, 2]) / self._matrix[0, 0]
+        down = (np.arange(size[1]) - self._matrix[1, 2]) / self._matrix[1, 1]
+        outside = across[None, :] ** 2 + down[:, None] ** 2 > self.camera.valid_radius**2
+        x[outside] = y[outside] = -100
+        fixed, fraction = cv2.convertMaps(x.clip(-100, 32000), y.clip(-100, 32000), cv2.CV_16SC2)
+        self._maps, self._size = (fixed, fraction), size
+
+    def _track(self, frame: np.ndarray, watch: Stopwatch) -> Pose:
+        pixels = frame.transpose(1, 2, 0)
+        if not pixels.flags.c_contiguous:
+            pixels = cv2.merge(list(frame))
+        watch.lap("Other")
+        assert self._maps is not None
+        if self.literal:
+            image = cv2.undistort(pixels, self._matrix, self._distortion)
+        else:
+            image = cv2.remap(pixels, *self._maps, cv2.INTER_LINEAR)
+        watch.lap("Undistort")
+        hsv = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)
+        coloured = cv2.inRange(hsv, self._low, (180.0, 255.0, 255.0))  # type: ignore[call-overload]
+        bands = cv2.LUT(cv2.extractChannel(hsv, 0), self._bands)
+        cv2.bitwise_and(bands, coloured, bands)  # the band's number where the threshold is 255
+        watch.lap("Color segmentation")
+        solid = cv2.erode(bands, _SQUARE)
+        watch.lap("Erosion")
+        axis, box = self._axis(solid, bands)
+        watch.lap("Get axis")
+        left, top, right, bottom = box
+        crop = image[top:bottom, left:right]
+        change = cv2.convertScaleAbs(cv2.filter2D(crop, cv2.CV_16S, stages.oriented_sobel(*axis.direction)))
+        red, green, blue = cv2.split(change)
+        gradient = cv2.medianBlur(cv2.max(cv2.max(red, green), blue), stages.MEDIAN)
+        watch.lap("Gradient")
+        binary = cv2.threshold(gradient, stages.LEAST_GRADIENT - 1, 255, cv2.THRESH_BINARY)[1]
+        count, labels, _, _ = cv2.connectedComponentsWithStats(binary, connectivity=8)
+        watch.lap("Connected components")
+        centroids = _centroids(gradient, labels, count, left, top)
+        watch.lap("Weighted centroids")
+        self.endpoints[-1] = stages.endpoints(axis, centroids)
+        pose = self._pose(self.endpoints[-1])
+        watch.lap("Calculate catheter position")
+        return pose
+
+    def _axis(self, solid: np.ndarray, bands: np.ndarray) -> tuple[Axis, Box]:
+        """Line through the pixels that the erosion left, without those far from it, and the box around them."""
+        places = cv2.findNonZero(solid)
+        stages.need_pixels(0 if places is None else len(places))
+        points = np.asarray(places, dtype=np.int32).reshape(-1, 2)
+        near, kept = np.ones(len(points), dtype=bool), points
+        x, y, dx, dy = _line(points)
+        for _ in range(stages.AXIS_ROUNDS):
+            across = np.abs((points[:, 1] - y) * dx - (points[:, 0] - x) * dy)
+            closer = across <= max(stages.AXIS_REACH_PX, 2 * np.sqrt(np.square(across[near]).mean()))
+            settled = np.array_equal(closer, near)
+            near, kept = closer, points[closer]
+            if settled or len(kept) < stages.LEAST_PIXELS:
+                break
+            x, y, dx, dy = _line(kept)
+        rms = np.sqrt(np.square((kept[:, 1] - y) * dx - (kept[:, 0] - x) * dy).mean())
+        stages.need_line(len(points), len(kept), float(rms))
+        along = (kept[:, 0] - x) * dx + (kept[:, 1] - y) * dy
+        numbers = bands[kept[:, 1], kept[:, 0]]
+        extents: list[tuple[float, float] | None] = []
+        for number in range(1, len(self._positions)):
+            of_band = along[numbers == number]
+            seen = len(of_band) >= stages.LEAST_PIXELS // 5
+            extents.append((float(of_band.min()), float(of_band.max())) if seen else None)
+        axis = Axis((x, y), (dx, dy), tuple(extents))
+        stages.need_order(axis)
+        return axis, stages.box(kept.min(0).tolist(), kept.max(0).tolist(), (solid.shape[1], solid.shape[0]))
+
+    def _pose(self, found: Endpoints) -> Pose:
+        """Mean of the closed-form poses of each pair of neighbouring bands whose three endpoints were found."""
+        edges = stages.nudged(found)
+        rays = np.ones((*edges.shape[:2], 3))
+        rays[..., :2] = (edges - self._matrix[:2, 2]) / self._matrix.diagonal()[:2]
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        return stages.answer(found, *_closed_form(rays, self._positions, stages.triples(found)))
+
+
+_SQUARE = np.ones((3, 3), dtype=np.uint8)
+
+
+def _line(points: np.ndarray) -> tuple[float, float, float, float]:
+    """Point (x, y) and unit direction of the line with the least squares across it."""
+    dx, dy, x, y = cv2.fitLine(points, cv2.DIST_L2, 0, 0.01, 0.01).ravel().tolist()
+    return x, y, dx, dy
+
+
+def _centroids(gradient: np.ndarray, labels: np.ndarray, count: int, left: int, top: int) -> list[tuple[float, float]]:
+    """Centres (x, y) in the frame of the labelled components, weighted by the gradient."""
+    rows, columns = np.nonzero(labels)
+    weights = gradient[rows, columns].astype(np.float64)
+    kind = labels[rows, columns]
+    whole = np.bincount(kind, weights, count)[1:]
+    x = np.bincount(kind, weights * columns, count)[1:] / whole + left
+    y = np.bincount(kind, weights * rows, count)[1:] / whole + top
+    return list(zip(x.tolist(), y.tolist(), strict=True))
+
+
+def _closed_form(rays: np.ndarray, positions: np.ndarray, first: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean tip and direction [B, 3] over the triples of edges that begin at ``first``, from unit rays [B, N, 3].
+
+    The sine rule in the triangles of the camera and each band, Eqs. 3.5 to 3.12 as corrected; bands of any length.
+    That is :func:`holotorch.tracking.pose.pose.closed_form` once more, in numpy: other times are held to this one's.
+    """
+    tips, directions = [], []
+    for i in first:
+        a, b, c = rays[:, i], rays[:, i + 1], rays[:, i + 2]
+        front, back = positions[i + 1] - positions[i], positions[i + 2] - positions[i + 1]
+        p1, p2 = _angle(a, b), _angle(b, c)
+        both = p1 + p2
+        sine = np.sin(both)
+        delta = np.arctan2(front * np.sin(p2) * sine, back * np.sin(p1) - front * np.sin(p2) * np.cos(both))
+        scale = (front + back) / sine
+        near, far = (scale * np.sin(delta))[:, None] * a, (scale * np.sin(both + delta))[:, None] * c
+        direction = (far - near) / np.linalg.norm(far - near, axis=-1, keepdims=True)
+        tips.append(near - positions[i] * direction)
+        directions.append(direction)
+    direction = np.mean(directions, 0)
+    return np.mean(tips, 0), direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+
+
+def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1))

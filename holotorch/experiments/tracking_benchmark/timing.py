@@ -1,0 +1,147 @@
+"""How long trackers take on the same synthetic frames, turn by turn in one process, and where their time goes."""
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+from torch import Tensor
+from tqdm import tqdm
+
+from holotorch.experiments.timing import interleaved
+from holotorch.experiments.tracking_benchmark.bench import Row, told
+from holotorch.experiments.tracking_benchmark.methods import BASE, COLD, PRIOR, Method, as_camera, before, methods
+from holotorch.experiments.tracking_benchmark.thesis_opencv import ThesisOpenCV
+from holotorch.tracking.detection.channels import ChannelOrder
+from holotorch.tracking.detection.tracker import CatheterTracker
+from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.simulation.trials import conditions, negatives, occlusions
+from holotorch.tracking.simulation.world import Case, World
+from holotorch.tracking.thesis.tracker import ThesisTracker
+
+KORNIA = "thesis, kornia"
+# What is timed, by the names of the world's conditions; the last ones need a photograph or make do without.
+_FRAMES = {"plain desk": ("plain",), "clutter": ("heavy clutter",), "drape": ("cloth as band 3",)}
+_PHOTOGRAPH = ("photograph 0", "texture")
+_STREAM = 6  # different frames of each kind, of 6 MB each
+_REPEATS = 9  # so many, since the machine sometimes stalls for 50 ms
+
+
+def timing(world: World, rounds: int) -> list[Row]:
+    """Milliseconds of each method for a frame of each kind, medians over rounds, and their ratio to the baseline's.
+
+    In a round each method in turn takes a few different frames one after another, as it would those of a camera: they
+    do not fit into the processor's caches together, while what the method itself needs may stay there.
+    """
+    kornia = ThesisTracker(world.camera, world.catheter)
+    trackers: dict[str, Method] = methods(world) | {KORNIA: lambda frame, _: kornia(frame[None])[0]}
+    worlds = [replace(world, seed=world.seed + i) for i in range(_STREAM)]
+    known = [{case.name: case for case in conditions(one)} for one in worlds]
+    rows = []
+    for kind, names in tqdm((_FRAMES | {"photograph": _PHOTOGRAPH}).items(), desc="times", unit="frame"):
+        name = next(name for name in names if name in known[0])
+        frames = [(as_camera(cases[name].frame()), cases[name]) for cases in known]
+        seconds = interleaved({name: partial(_all, track, frames) for name, track in trackers.items()}, rounds)
+        rows += [
+            {
+                "frame": kind,
+                "method": name,
+                "milliseconds": round(1e3 * value / _STREAM, 2),
+                "ratio": round(value / seconds[BASE], 3),
+                "status": told(Status(pose.status) for pose in _all(trackers[name], frames)),
+            }
+            for name, value in seconds.items()
+        ]
+    return rows
+
+
+def _all(track: Method, frames: list[tuple[Tensor, Case]]) -> list[Pose]:
+    return [track(frame, case) for frame, case in frames]
+
+
+def stages(world: World, rounds: int) -> list[Row]:
+    """Mean time of each stage and its share of the whole, in the form of Table 3.1; a catheter on the plain desk."""
+    case = next(case for case in conditions(world) if case.name == "plain")
+    frames = as_camera(case.frame())[None]
+    expected = [before(case)]
+    ours = CatheterTracker(world.camera, world.catheter, channels=ChannelOrder.RGB)
+    thesis, kornia = ThesisOpenCV(world.camera, world.catheter), ThesisTracker(world.camera, world.catheter)
+    calls: dict[str, tuple[ThesisOpenCV | ThesisTracker | CatheterTracker, Callable[[], list[Pose]]]] = {
+        BASE: (thesis, lambda: thesis(frames)),
+        KORNIA: (kornia, lambda: kornia(frames)),
+        COLD: (ours, lambda: ours(frames)),
+        PRIOR: (ours, lambda: ours(frames, expected)),
+    }
+    rows = []
+    for name, (tracker, call) in calls.items():
+        call()
+        spent: dict[str, float] = {}
+        for _ in range(rounds):
+            started = time.perf_counter()
+            call()
+            whole = time.perf_counter() - started
+            own = dict(tracker.times)
+            own["Other"] = own.get("Other", 0.0) + whole - sum(own.values())
+            spent = {stage: spent.get(stage, 0.0) + value for stage, value in own.items()}
+        total = sum(spent.values())
+        spent["Total"] = total
+        rows += [
+            {
+                "method": name,
+                "stage": stage,
+                "milliseconds": round(1e3 * value / rounds, 3),
+                "percent": round(100 * value / total, 2),
+            }
+            for stage, value in spent.items()
+        ]
+    return rows
+
+
+def spread(world: World, seeds: int, share: float = 1.0) -> list[Row]:
+    """Slowest frame over the median one of each method: conditions, occlusions and one negative of each kind.
+
+    From as many seeds, each with two of the world's photographs. Each frame counts with the median of a few calls, each
+    of them over one for a plain frame right before it, so that what the machine does meanwhile is not the frame's.
+    """
+    cases, plain = [], next(case for case in conditions(world) if case.name == "plain")
+    usual = as_camera(plain.frame()), plain
+    for i in range(seeds):
+        some = replace(world, photographs=world.photographs[2 * i : 2 * i + 2], seed=world.seed + i)
+        found = [*conditions(some), *occlusions(some), *negatives(some, 10)][:: max(1, round(1 / share))]
+        cases += [replace(case, name=f"{case.name}, seed {some.seed}") for case in found]
+    trackers = methods(world, (BASE, COLD, PRIOR))
+    taken: dict[str, list[tuple[float, str]]] = {name: [] for name in trackers}
+    besides: dict[str, list[float]] = {name: [] for name in trackers}
+    for case in tqdm(cases, desc="slowest frames", unit="frame", dynamic_ncols=True):
+        frame = as_camera(case.frame())
+        for name, track in trackers.items():
+            if name == PRIOR and case.tip is None:
+                continue  # nothing was there before
+            track(frame, case)
+            pairs = [(_seconds(track, *usual), _seconds(track, frame, case)) for _ in range(_REPEATS)]
+            taken[name].append((statistics.median(own / beside for beside, own in pairs), case.name))
+            besides[name] += [beside for beside, _ in pairs]
+    rows = []
+    for name, values in taken.items():
+        if not values:
+            continue
+        middle, (slowest, which) = statistics.median(ratio for ratio, _ in values), max(values)
+        unit = 1e3 * statistics.median(besides[name])
+        rows.append(
+            {
+                "method": name,
+                "frames": len(values),
+                "median_ms": round(unit * middle, 2),
+                "slowest_ms": round(unit * slowest, 2),
+                "ratio": round(slowest / middle, 2),
+                "slowest": which,
+            }
+        )
+    return rows
+
+
+def _seconds(track: Method, frame: Tensor, case: Case) -> float:
+    started = time.perf_counter()
+    track(frame, case)
+    return time.perf_counter() - started

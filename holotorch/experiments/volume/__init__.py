@@ -1,0 +1,1 @@
+"""Holograms of volumes."""

@@ -1,0 +1,271 @@
+"""The volume experiment: a configuration made into a volume, its renderer and a hologram per colour."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from holotorch.core.grid import Grid
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.volume.config import TransferSettings, VolumeSettings, VolumeSource
+from holotorch.hologram import AxialHologram, ConvolutionHologram, HologramPlan, plan_hologram
+from holotorch.io.catalogue import PUBLISHED, fetch_volume
+from holotorch.io.volumes import load_volume
+from holotorch.scene import phantoms, transfer_presets
+from holotorch.scene.lighting import Lighting
+from holotorch.scene.phases import PointPhases, point_phases, random_phase, smooth_phase
+from holotorch.scene.sampler import DVRSampler
+from holotorch.scene.transfer import TransferFunction
+from holotorch.scene.volume import Volume
+
+_CATALOGUE = {"teapot": "boston_teapot"}  # the thesis's name: that of the catalogue
+_SMOOTH = 8  # rays over which smooth phases are alike
+
+
+@dataclass(frozen=True)
+class VolumeExperiment:
+    """A configuration made into what it means.
+
+    Attributes:
+        settings: The configuration.
+        volume: What is shown.
+        synthetic: Why it is a phantom, or an empty text for real data.
+        device: Where it runs.
+    """
+
+    settings: VolumeSettings
+    volume: Volume
+    synthetic: str
+    device: torch.device
+
+    @property
+    def grid(self) -> Grid:
+        """Pixels of the hologram."""
+        height, width = self.settings.hologram.shape
+        return Grid((height // self.settings.scale, width // self.settings.scale), self.settings.hologram.pitch)
+
+    @property
+    def distance(self) -> float:
+        """Of the volume's middle, in metres."""
+        return self.settings.hologram.distance / self.settings.scale
+
+    @property
+    def stride(self) -> int:
+        """Pixels between neighbouring rays."""
+        rays = self.settings.hologram.rays
+        return 1 if rays is None else self.settings.hologram.shape[0] // rays
+
+    @property
+    def rays(self) -> Grid:
+        """Grid of the rays, the same on all planes."""
+        (height, width), (py, px) = self.grid.shape, self.grid.pitch
+        return Grid((height // self.stride, width // self.stride), (py * self.stride, px * self.stride))
+
+    @property
+    def width(self) -> float:
+        """Of the volume's longest side, in metres."""
+        width = self.settings.view.width
+        return max(self.grid.extent) if width is None else width / self.settings.scale
+
+    @cached_property
+    def rotation(self) -> Tensor:
+        """Of the volume about its middle, over (z, y, x)."""
+        view = self.settings.view
+        a, e = math.radians(view.azimuth_deg), math.radians(view.elevation_deg)
+        about_y = torch.tensor([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
+        about_x = torch.tensor([[math.cos(e), -math.sin(e), 0], [math.sin(e), math.cos(e), 0], [0, 0, 1]])
+        return (about_x.double() @ about_y.double()).round(decimals=15)
+
+    @cached_property
+    def depths(self) -> tuple[float, ...]:
+        """Of the planes, in the order in which rays meet them."""
+        wanted, scale = self.settings.hologram.depths, self.settings.scale
+        if isinstance(wanted, int):
+            wanted, middle = max(1, wanted // scale), self.distance
+            extent = torch.tensor(self.volume.extent, dtype=torch.float64)
+            half = (self.rotation.abs()[0] @ (extent / extent.max() * self.width)).item() / 2
+            step = 2 * half / wanted  # the middle of each slab
+            wanted = tuple(scale * (middle - half + (j + 0.5) * step) for j in range(wanted))
+        return tuple(sorted((depth / scale for depth in wanted), reverse=self.settings.view.front == "far"))
+
+    @cached_property
+    def plans(self) -> list[HologramPlan]:
+        """One per colour."""
+        hologram = self.settings.hologram
+        try:
+            return [
+                plan_hologram(
+                    self.grid,
+                    wave,
+                    self.depths,
+                    self.rays.shape,
+                    stride=self.stride,
+                    tolerance=self.settings.tolerance,
+                    cone=hologram.cone,
+                )
+                for wave in self.settings.wavelengths
+            ]
+        except ValueError as error:
+            raise ConfigError([f"hologram: {error}"]) from error
+
+    @cached_property
+    def transfer(self) -> TransferFunction:
+        """Colour and opacity."""
+        return _transfer(self.settings.transfer).to(self.device)
+
+    def sampler(self, seed: int = 0) -> DVRSampler:
+        """The renderer with the phases of a realisation."""
+        generator = torch.Generator().manual_seed(self.settings.seed + seed)
+        phases: dict[str, Callable[[Grid], Tensor | PointPhases] | None] = {
+            "ray": lambda grid: random_phase(grid, generator=generator),
+            "point": lambda grid: point_phases(grid, generator=generator),
+            "smooth": lambda grid: smooth_phase(grid, _SMOOTH * grid.pitch[0], generator=generator),
+            "constant": None,
+        }
+        return DVRSampler(
+            self.transfer,
+            self.rays,
+            self.depths,
+            width=self.width,
+            distance=self.distance,
+            rotation=self.rotation,
+            lighting=Lighting() if self.settings.view.lighting else None,
+            phase=phases[self.settings.phase],
+        )
+
+    def hologram(
+        self, seed: int = 0, seen: Callable[[], object] = lambda: None, part: "Part | None" = None
+    ) -> tuple[Tensor, float]:
+        """Holograms [3, H, W] of one realisation, rendered plane by plane into all colours at once.
+
+        Args:
+            seed: Which realisation of the phases.
+            seen: Called after every plane.
+            part: Which planes of which colours to add up; all by default.
+
+        Returns:
+            The fields, and the seconds that rendering took of the whole.
+        """
+        layers = self.sampler(seed)(self.volume)
+        sums = []
+        for plan in self.plans:
+            assert isinstance(plan.operator, AxialHologram | ConvolutionHologram)
+            sums.append(plan.operator.accumulator(self.rays.shape, layers.phase))
+        rendering, started = 0.0, time.perf_counter()
+        with torch.no_grad():
+            for j, plane in enumerate(layers.amplitudes()):
+                rendering += time.perf_counter() - started
+                for colour, total in enumerate(sums):
+                    if part is None or part.takes(colour, j):
+                        total.add(j, plane[colour])
+                seen()
+                started = time.perf_counter()
+        fields = []
+        while sums:  # one after another: a spectrum's memory is free before the next is transformed
+            fields.append(sums.pop(0).finish().to(self.device))
+        return torch.stack(fields), rendering
+
+    @property
+    def refocus(self) -> list[float] | None:
+        """Depths of the report's pictures, if they are given."""
+        wanted = self.settings.report.refocus
+        return None if wanted is None else [depth / self.settings.scale for depth in wanted]
+
+
+@dataclass(frozen=True)
+class Part:
+    """What one of several processes adds up: colours first, then blocks of planes.
+
+    Attributes:
+        rank: Number of the process.
+        count: Of all processes.
+        planes: Of all planes.
+    """
+
+    rank: int
+    count: int
+    planes: int
+
+    def takes(self, colour: int, plane: int) -> bool:
+        """Whether this process adds ``plane`` of ``colour``."""
+        if self.count <= 3:
+            return colour % self.count == self.rank
+        blocks = (self.count - colour + 2) // 3  # processes whose number is this colour's, modulo 3
+        return self.rank % 3 == colour and plane * blocks // self.planes == self.rank // 3
+
+
+def build(settings: VolumeSettings) -> VolumeExperiment:
+    """Read the volume. ConfigError for what cannot be read, or has no voxel that can be seen."""
+    volume, synthetic = _volume(settings.volume)
+    try:
+        volume.check_finite()
+        experiment = VolumeExperiment(settings, volume, synthetic, _device(settings.device))
+        _ = experiment.transfer
+    except ValueError as error:
+        raise ConfigError([f"volume: {error}"]) from error
+    if min(experiment.depths) <= 0:
+        raise ConfigError(
+            [f"hologram.distance: the volume reaches beyond the hologram, to {min(experiment.depths):g} m"]
+        )
+    return experiment
+
+
+def _volume(source: VolumeSource) -> tuple[Volume, str]:
+    spacing = source.spacing[0] if source.spacing and len(source.spacing) == 1 else source.spacing
+    try:
+        if source.path:
+            asked = {"spacing": spacing, "shape": source.shape, "dtype": source.dtype, "unit": source.unit}
+            return load_volume(source.path, **asked), ""
+        why = "a phantom was asked for"
+        if source.scene:
+            name = _CATALOGUE.get(source.scene, source.scene)
+            if name in PUBLISHED:
+                try:
+                    return fetch_volume(name, source.directory), ""
+                except (OSError, ValueError) as error:
+                    cause = " ".join(str(error).split())
+                    why = f"{source.scene} could not be fetched ({cause}); give its file as volume.path=FILE"
+            else:
+                why = f"no checksum of {source.scene} is published; give its file as volume.path=FILE"
+            if not source.phantom:
+                raise ConfigError([f"volume.scene: {why}, or volume.phantom to stand in for it"])
+    except ValueError as error:
+        raise ConfigError([f"volume: {error}"]) from error
+    except OSError as error:
+        raise ConfigError([f"volume.path: {source.path}: {error.strerror or error}"]) from error
+    make = {
+        "shells": phantoms.shells,
+        "c60": phantoms.c60,
+        "marschner_lobb": phantoms.marschner_lobb,
+        "gaussian_ball": phantoms.gaussian_ball,
+    }
+    assert source.phantom is not None
+    return make[source.phantom](source.samples, dtype=torch.uint8), why
+
+
+def _transfer(settings: TransferSettings) -> TransferFunction:
+    if settings.preset:
+        assert settings.low is not None and settings.high is not None
+        make = {
+            "bone": transfer_presets.bone,
+            "soft_tissue": transfer_presets.soft_tissue,
+            "vessels": transfer_presets.vessels,
+            "industrial": transfer_presets.industrial,
+        }
+        return make[settings.preset](settings.low, settings.high)
+    if settings.file:
+        return transfer_presets.transfer_from_json(Path(settings.file).read_text(encoding="utf-8"))
+    assert settings.points is not None
+    table = torch.tensor(settings.points)
+    return TransferFunction(table[:, 0], table[:, 1:4], table[:, 4], unit_distance=settings.unit_distance)
+
+
+def _device(name: str) -> torch.device:
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError(["device: cuda was asked for, but torch finds no CUDA device; use device: auto or cpu"])
+    return torch.device("cuda" if name == "cuda" or (name == "auto" and torch.cuda.is_available()) else "cpu")

@@ -1,0 +1,54 @@
+"""The kind ``volume``: holograms of a volume, realisation after realisation."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from holotorch.experiments.config.source import Key
+from holotorch.experiments.kind import ExperimentKind
+from holotorch.experiments.runs.plan import RunPlan
+from holotorch.experiments.volume.config import VolumeSettings, contradictions
+
+if TYPE_CHECKING:
+    from holotorch.experiments.runs.folder import RunFolder
+    from holotorch.experiments.runs.record import RunRecord
+    from holotorch.experiments.volume.experiment import VolumeExperiment
+
+
+class VolumeKind(ExperimentKind[VolumeSettings, "VolumeExperiment"]):
+    """See :mod:`holotorch.experiments.kind`."""
+
+    settings = VolumeSettings
+    example = "configs/volume/tooth.yaml"
+    parallel = True
+
+    def contradictions(self, settings: VolumeSettings) -> list[tuple[Key, str]]:
+        return contradictions(settings)
+
+    def build(self, settings: VolumeSettings) -> VolumeExperiment:
+        from holotorch.experiments.volume.experiment import build
+
+        return build(settings)
+
+    def plan(self, experiment: VolumeExperiment) -> RunPlan:
+        from holotorch.experiments.runs.memory import shortage
+        from holotorch.experiments.volume.plan import plan_text, plan_values
+
+        values = plan_values(experiment)
+        return RunPlan(plan_text(experiment, values), values, shortage(values))
+
+    def run(self, experiment: VolumeExperiment, folder: RunFolder) -> bool:
+        from holotorch.experiments.volume.run import run_volume
+
+        return run_volume(experiment, folder)
+
+    def device(self, experiment: VolumeExperiment) -> str:
+        return str(experiment.device)
+
+    def section(self, record: RunRecord) -> list[str]:
+        from holotorch.experiments.volume.report import volume_section
+
+        return volume_section(record.title, record.summary, record.plan, record.picture)
+
+
+KIND = VolumeKind()

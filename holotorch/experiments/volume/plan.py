@@ -1,0 +1,141 @@
+"""What a volume's run will do, what it will cost and what its physics says, before it starts."""
+
+import math
+from typing import Any
+
+import torch
+
+from holotorch.core.grid import Grid
+from holotorch.experiments.volume.experiment import VolumeExperiment
+from holotorch.optics import diffraction_angle
+from holotorch.scene import DVRSampler
+
+# Seconds per flop of the plan's own measure, and per ray and plane of the renderer, on two CPU cores.
+_FLOP_SECONDS, _RAY_SECONDS = 4.2e-11, 1.5e-8
+_BASE_BYTES, _RAY_BYTES, _SLAB = 500e6, 120, 42
+_COARSE = 64  # rays along each side of a rendering that tells how much is cut off
+
+
+def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
+    """Choices with their reasons, cost and physics, as plain JSON values."""
+    settings, plans, depths = experiment.settings, experiment.plans, experiment.depths
+    rays = math.prod(experiment.rays.shape)
+    flops = sum(each.flops for each in plans)
+    seconds = settings.report.seeds * (_FLOP_SECONDS * flops + _RAY_SECONDS * rays * len(depths))
+    samples = [8 * math.prod(each.size) for each in plans]
+    # A sum and a step per colour while planes arrive; in the end a transform of one more. Planes that wait for nodes.
+    slab = 8 * rays * _SLAB * len(plans)
+    peak = _BASE_BYTES + 2 * sum(samples) + 1.5 * max(samples) + slab + _RAY_BYTES * rays
+    peak += experiment.volume.values.numel() * experiment.volume.values.element_size()
+    return {
+        "volume": {
+            "shape": list(experiment.volume.shape),
+            "unit": experiment.volume.unit,
+            "synthetic": experiment.synthetic,
+            "width_mm": experiment.width * 1e3,
+        },
+        "planes": len(depths),
+        "depths_mm": [min(depths) * 1e3, max(depths) * 1e3],
+        "rays": list(experiment.rays.shape),
+        "holograms": [
+            {
+                "wavelength_nm": wave * 1e9,
+                "method": each.method,
+                "cone": each.cone,
+                "near": each.near,
+                "transforms": each.transforms,
+                "samples": list(each.size),
+                "predicted_error": each.predicted_error,
+                "reason": each.reason,
+                "runner_up": each.runner_up,
+            }
+            for wave, each in zip(settings.wavelengths, plans, strict=True)
+        ],
+        "predicted_seconds": round(seconds, 2),
+        "predicted_peak_bytes": round(peak),
+        "device": str(experiment.device),
+        "physics": _physics(experiment),
+        "notes": _notes(experiment),
+    }
+
+
+def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
+    """The plan in words."""
+    settings, grid = experiment.settings, experiment.grid
+    volume, physics = values["volume"], values["physics"]
+    source = settings.volume.path or settings.volume.scene or settings.volume.phantom
+    if volume["synthetic"]:
+        source = f"{settings.volume.phantom} (synthetic: {volume['synthetic']})"
+    near, far = values["depths_mm"]
+    lines = [
+        f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, {volume['width_mm']:.4g} mm wide",
+        f"Rays       {values['rays'][0]} x {values['rays'][1]}, {settings.phase} phases; {values['planes']} planes "
+        f"from {near:.4g} to {far:.4g} mm, the {settings.view.front} end first",
+        f"Hologram   {grid.shape[0]} x {grid.shape[1]} px of {grid.pitch[1] * 1e6:.4g} um; field of view "
+        f"{', '.join(f'{angle:.2f}' for angle in physics['field_of_view_deg'])} deg",
+    ]
+    for each in values["holograms"]:
+        where = f", {each['cone']} cone" if each["near"] else ""
+        lines.append(
+            f"{each['wavelength_nm']:.0f} nm     {each['method']}{where}: {each['reason']}; {each['samples'][0]} "
+            f"samples, error {each['predicted_error']:.1e}; next: {each['runner_up']}"
+        )
+    lines.append(
+        f"Cost       about {values['predicted_seconds']:.2g} s on two idle cores for {settings.report.seeds} "
+        f"realisation(s), {values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak"
+    )
+    lines += [f"Note       {note}" for note in values["notes"]]
+    return "\n".join(lines)
+
+
+def _physics(experiment: VolumeExperiment) -> dict[str, Any]:
+    grid, waves = experiment.grid, experiment.settings.wavelengths
+    angles = [diffraction_angle(grid, wave)[1] for wave in waves]
+    middle = (min(experiment.depths) + max(experiment.depths)) / 2
+    return {
+        "field_of_view_deg": [2 * math.degrees(angle) for angle in angles],
+        "spot_um": [wave * middle / min(grid.extent) * 1e6 for wave in waves],
+        # Beyond, every pixel sees every source (region III); nearer, a source sees part of the hologram.
+        "whole_cone_from_mm": [
+            (experiment.width + min(grid.extent)) / 2 / math.tan(angle) * 1e3 if angle < math.pi / 2 else 0.0
+            for angle in angles
+        ],
+    }
+
+
+def _notes(experiment: VolumeExperiment) -> list[str]:
+    notes = list(dict.fromkeys(note for each in experiment.plans for note in each.notes))
+    lost = _beyond(experiment)
+    if lost > 0.005:
+        notes.append(f"{100 * lost:.1f} % of the volume's light lies beside the rays and is cut off")
+    return notes
+
+
+def _beyond(experiment: VolumeExperiment) -> float:
+    """Part of the volume's light that lies beside the rays, by a coarse rendering of the whole."""
+    extent = torch.tensor(experiment.volume.extent, dtype=torch.float64)
+    sides = (experiment.rotation.abs() @ extent / extent.max() * experiment.width).tolist()
+    inside = [min(1.0, size / side) for size, side in zip(experiment.rays.extent, sides[1:], strict=True)]
+    if min(inside) == 1:
+        return 0.0
+    middle, half, planes = experiment.distance, sides[0] / 2, 24
+    coarse = Grid(_COARSE, (sides[1] / _COARSE, sides[2] / _COARSE))
+    depths = [middle + half * ((j + 0.5) * 2 / planes - 1) for j in range(planes)]
+    sampler = DVRSampler(
+        experiment.transfer,
+        coarse,
+        depths[::-1] if experiment.settings.view.front == "far" else depths,
+        width=experiment.width,
+        distance=middle,
+        rotation=experiment.rotation,
+    )
+    with torch.no_grad():
+        light = sampler.render(experiment.volume)[0].sum(0)
+    total = light.sum().item()
+    if total == 0:
+        return 0.0
+    y, x = (
+        (place.abs() <= size / 2).to(light)
+        for place, size in zip(coarse.coordinates(light.device), experiment.rays.extent, strict=True)
+    )
+    return 1 - (light * y * x).sum().item() / total

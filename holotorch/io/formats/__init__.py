@@ -1,0 +1,1 @@
+"""Formats of volumes and pictures, and what a file may cost."""

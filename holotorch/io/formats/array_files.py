@@ -1,0 +1,80 @@
+"""Volumes in general array files: NumPy, HDF5 and Zarr, axes (z, y, x). None of them states a spacing."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from holotorch.io.formats.limits import affordable
+from holotorch.io.formats.scan import Scan, chosen, extra, readable, three_axes, uncompressed_from
+
+
+def read_npy(path: Path) -> Scan:
+    """NumPy array, mapped if large."""
+    with readable(path, ".npy array"):
+        stored = np.load(path, mmap_mode="r", allow_pickle=False)
+    if stored.flags.c_contiguous:
+        return Scan(three_axes(uncompressed_from(path, stored.shape, stored.dtype, stored.offset), path))
+    return Scan(three_axes(uncompressed_from(path, stored.shape[::-1], stored.dtype, stored.offset).T, path))
+
+
+def read_npz(path: Path, member: str | None = None) -> Scan:
+    """The only array of an .npz archive, or ``member``."""
+    with readable(path, ".npz archive"):
+        archive = np.load(path, allow_pickle=False)
+    with archive:
+        name = chosen(archive.files, member, path)
+        with readable(path, ".npz archive"):
+            _check_member(path, archive, name)
+            values = archive[name]
+    return Scan(three_axes(values, path))
+
+
+def _check_member(path: Path, archive: Any, name: str) -> None:
+    """Raise ValueError for an array that states more than it holds, before numpy allocates what it states."""
+    entry = next(item for item in archive.zip.infolist() if item.filename in (name, f"{name}.npy"))
+    with archive.zip.open(entry) as stream:
+        version = np.lib.format.read_magic(stream)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(stream)
+        stated, present = math.prod(shape) * dtype.itemsize, entry.file_size - stream.tell()
+    if stated != present:
+        raise ValueError(f"its array {name} states {stated} bytes and holds {present}")
+    affordable(path, stated, path.stat().st_size)
+
+
+def read_hdf5(path: Path, member: str | None = None) -> Scan:
+    """A dataset of an HDF5 file, ``path::dataset``; the name is needed where several have three axes."""
+    h5py = extra("h5py", "reading HDF5")
+    found: dict[str, int] = {}
+    with readable(path, "HDF5 file"):
+        file = h5py.File(path, "r")
+    with file:
+        with readable(path, "HDF5 file"):
+            file.visititems(lambda name, item: found.update({name: item.ndim}) if hasattr(item, "ndim") else None)
+        asked = member.strip("/") if member else None
+        name = chosen([name for name, axes in found.items() if axes == 3 or name == asked], asked, path)
+        with readable(path, "HDF5 file"):
+            affordable(path, file[name].size * file[name].dtype.itemsize, path.stat().st_size)
+            values = file[name][...]
+    return Scan(three_axes(values, path))
+
+
+def read_zarr(path: Path, member: str | None = None) -> Scan:
+    """An array of a Zarr folder, ``path::array``, or the folder itself where it is an array."""
+    zarr = extra("zarr", "reading Zarr")
+    with readable(path, "Zarr folder"):
+        node = zarr.open(str(path), mode="r")
+        single = hasattr(node, "ndim")
+        found = {} if single else {name: item for name, item in node.members(max_depth=None) if hasattr(item, "ndim")}
+    if single and member:
+        raise ValueError(f"{path} is a single array; load it without ::{member}")
+    if not single:
+        asked = member.strip("/") if member else None
+        node = found[chosen([name for name in found if found[name].ndim == 3 or name == asked], asked, path)]
+    with readable(path, "Zarr folder"):
+        stored = sum(item.stat().st_size for item in path.rglob("*") if item.is_file())
+        affordable(path, node.size * node.dtype.itemsize, stored)
+        values = np.asarray(node[...])
+    return Scan(three_axes(values, path))

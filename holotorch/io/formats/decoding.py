@@ -1,0 +1,141 @@
+"""Pictures decoded by OpenCV, once their own header has said what that takes."""
+
+import io
+import math
+import re
+import struct
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from holotorch.io.formats.limits import affordable
+
+PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG = b"\xff\xd8"
+_MOST_SCANS = 100  # of a progressive JPEG; a scan of a few bytes may stand for all of a picture
+_MARKER = re.compile(rb"\xff+([^\x00\xff])")
+_BARE = frozenset((0x01, *range(0xD0, 0xD9)))  # markers without a segment: restarts, the beginning
+_DECODED = 8  # bytes of a pixel, four channels of 16 bits
+
+
+def decode(path: Path, flags: int, *, data: bytes | None = None, memory: int = _DECODED) -> np.ndarray:
+    """Pixels [H, W] or [H, W, C] of a PNG, JPEG, BMP, TIFF or WebP file, as ``cv2.imdecode`` gives them.
+
+    Args:
+        path: Of the file.
+        flags: Of ``cv2.imdecode``.
+        data: Content of the file, where it has been read already.
+        memory: Bytes per pixel that decoding and what the caller does with the pixels take.
+
+    Raises:
+        ValueError: No picture, a damaged one, or one beyond the memory limit of :mod:`holotorch.io.formats.limits`.
+    """
+    import cv2
+
+    data = path.read_bytes() if data is None else data
+    height, width = picture_size(path, data)
+    if data.startswith(PNG):
+        data = data[: _png_end(data)]
+    if data.startswith(_JPEG) and (scans := _scans(data)) > _MOST_SCANS:
+        raise ValueError(
+            f"{path} is a JPEG of {scans} scans, each of which takes the time of a whole picture; ordinary ones have "
+            f"about ten and {_MOST_SCANS} are read: save it again"
+        )
+    affordable(path, height * width * memory, len(data))
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:  # in place of None, for some kinds of damage
+        pixels = None
+    if pixels is None:
+        raise ValueError(_unreadable(path))
+    return pixels
+
+
+def picture_size(path: Path, data: bytes) -> tuple[int, int]:
+    """(H, W) of an encoded picture by its header, without decoding it; ValueError where it has none."""
+    from PIL.BmpImagePlugin import BmpImageFile
+    from PIL.JpegImagePlugin import JpegImageFile
+    from PIL.TiffImagePlugin import TiffImageFile
+
+    readers = {_JPEG: JpegImageFile, b"BM": BmpImageFile, b"II": TiffImageFile, b"MM": TiffImageFile}
+    try:
+        if data.startswith(PNG):
+            return _png_size(data)
+        if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+            return _webp_size(data)
+        # The classes rather than Image.open, whose limit knows nothing of the file's size.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            picture = readers[data[:2]](io.BytesIO(data))
+        return picture.height, picture.width
+    except Exception:  # of a header that is cut short or damaged, many kinds
+        raise ValueError(_unreadable(path)) from None
+
+
+def check_exr(path: Path, *, memory: int) -> None:
+    """Raise ValueError for an EXR file that is damaged, or asks for more than the memory limit.
+
+    Args:
+        path: Of the file.
+        memory: Bytes per pixel that the caller takes beside 4 for each channel of the file.
+    """
+    import OpenEXR
+
+    try:
+        parts = OpenEXR.File(str(path), header_only=True).parts
+        needed = 0
+        for part in parts:
+            low, high = part.header["dataWindow"]
+            needed += math.prod(int(b) - int(a) + 1 for a, b in zip(low, high, strict=True)) * (
+                memory + 4 * len(part.header["channels"])
+            )
+    except Exception as error:  # the library raises bare RuntimeError and others
+        raise ValueError(f"{path} is not a readable EXR file: {error}") from None
+    affordable(path, needed, path.stat().st_size)
+
+
+def _scans(data: bytes) -> int:
+    """How many scans a JPEG has, those of a thumbnail in its metadata not counted."""
+    count, place = 0, 2
+    while (match := _MARKER.search(data, place)) and (kind := match[1][0]) != 0xD9:
+        count += kind == 0xDA
+        place = match.end()
+        if kind not in _BARE:  # two bytes of length, which count themselves
+            place += max(2, int.from_bytes(data[place : place + 2], "big"))
+    return count
+
+
+def _png_size(data: bytes) -> tuple[int, int]:
+    _png_end(data)
+    width, height = struct.unpack_from(">II", data, len(PNG) + 8)
+    return height, width
+
+
+def _png_end(data: bytes) -> int:
+    """Bytes up to the end of a PNG; an exception where a chunk is longer than the data.
+
+    Decoders allocate what a chunk states before they look for it, also in what follows the last one.
+    """
+    place, kind = len(PNG), b""
+    while kind != b"IEND":
+        length, kind = struct.unpack_from(">I4s", data, place)
+        place += 12 + length
+    if place > len(data):
+        raise ValueError("a chunk is longer than the file")
+    return place
+
+
+def _webp_size(data: bytes) -> tuple[int, int]:
+    kind = data[12:16]
+    if kind == b"VP8X":
+        return 1 + int.from_bytes(data[27:30], "little"), 1 + int.from_bytes(data[24:27], "little")
+    if kind == b"VP8L":
+        bits = struct.unpack_from("<I", data, 21)[0]
+        return 1 + (bits >> 14 & 0x3FFF), 1 + (bits & 0x3FFF)
+    width, height = struct.unpack_from("<HH", data, 26)
+    return height & 0x3FFF, width & 0x3FFF
+
+
+def _unreadable(path: Path) -> str:
+    return f"{path} is not a readable picture (PNG, JPEG, BMP, TIFF or WebP), or is truncated"

@@ -1,0 +1,218 @@
+"""Volumes whose voxels lie in a file as they are, or compressed: raw, MetaImage and NRRD."""
+
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from holotorch.io.formats.limits import unzipped
+from holotorch.io.formats.scan import (
+    Scan,
+    expect_bytes,
+    from_words,
+    metres,
+    named,
+    number_type,
+    placed,
+    readable,
+    stated_bytes,
+    uncompressed,
+    unpacked,
+)
+
+_HEADER = 1 << 20  # bytes, at most, of a header of unknown length within compressed data
+_META_TYPES = {
+    "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4",
+    "MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4", "MET_DOUBLE": "f8",
+}  # fmt: skip
+_NRRD_TYPES = {
+    "i1": ("signed char", "int8", "int8_t"),
+    "u1": ("uchar", "unsigned char", "uint8", "uint8_t"),
+    "i2": ("short", "short int", "signed short", "signed short int", "int16", "int16_t"),
+    "u2": ("ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"),
+    "i4": ("int", "signed int", "int32", "int32_t"),
+    "u4": ("uint", "unsigned int", "uint32", "uint32_t"),
+    "i8": ("longlong", "long long", "long long int", "signed long long", "int64", "int64_t"),
+    "u8": ("ulonglong", "unsigned long long", "unsigned long long int", "uint64", "uint64_t"),
+    "f4": ("float",),
+    "f8": ("double",),
+}
+
+
+def read_raw(path: Path, shape: Sequence[int] | None, dtype: DTypeLike | None) -> Scan:
+    """Voxels without a header, x fastest; what is not given comes from a name such as bonsai_256x256x256_uint8.raw.
+
+    That naming, of the Open SciVis Datasets, gives (x, y, z). ``path`` may end in .gz.
+    """
+    stated = re.search(r"_(\d+)x(\d+)x(\d+)_(u?int\d+|float\d+)\.", path.name)
+    if stated:
+        shape = shape or (int(stated[3]), int(stated[2]), int(stated[1]))
+        dtype = dtype or stated[4]
+    if shape is None or dtype is None:
+        headers = [path.with_suffix(suffix) for suffix in (".mhd", ".nhdr") if path.with_suffix(suffix).is_file()]
+        hint = f"load its header {headers[0]}" if headers else "name it name_XxYxZ_dtype.raw"
+        raise ValueError(
+            f"{path} has no header: pass shape=(D, H, W) and dtype=, such as 'uint8', or '>i2' if big-endian; or {hint}"
+        )
+    kind = number_type(dtype)
+    if path.suffix == ".gz":
+        return Scan(unpacked(path, unzipped(path, stated_bytes(path, shape, kind)), shape, kind))
+    return Scan(uncompressed(path, shape, kind))
+
+
+def read_metaimage(path: Path) -> Scan:
+    """MetaImage, .mhd with a data file or .mha in one; lengths are millimetres unless DistanceUnits says otherwise."""
+    fields, end = _metaimage_header(path)
+    if fields.get("NDims", "3") != "3" or fields.get("ElementNumberOfChannels", "1") != "1":
+        raise ValueError(
+            f"{path} has NDims = {fields.get('NDims')} and ElementNumberOfChannels = "
+            f"{fields.get('ElementNumberOfChannels', '1')}; expected one scalar on three axes"
+        )
+    if fields.get("BinaryData", "True").lower() != "true":
+        raise ValueError(f"{path} holds its voxels as text; write it with BinaryData = True")
+    name, kind = fields.get("ElementDataFile", ""), fields.get("ElementType")
+    if name.split()[:1] == ["LIST"] or "%" in name:
+        raise ValueError(f"{path} lists one file per slice; load the folder of the slices instead")
+    if kind not in _META_TYPES:
+        raise ValueError(f"{path} has ElementType = {kind}; known are {', '.join(_META_TYPES)}")
+    big = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", "False")).lower() == "true"
+    dtype = np.dtype((">" if big else "<") + _META_TYPES[kind])
+    shape = _whole(fields, "DimSize", 3, path, least=1)[::-1]
+    skip = _whole(fields, "HeaderSize", 1, path, least=-1)[0] if "HeaderSize" in fields else 0
+    data = path if name == "LOCAL" else named(path, name)
+    offset = end if name == "LOCAL" else skip
+    if fields.get("CompressedData", "False").lower() == "true":
+        values = unpacked(data, unzipped(data, stated_bytes(data, shape, dtype), offset), shape, dtype)
+    else:
+        values = uncompressed(data, shape, dtype, _at_end(data, shape, dtype) if skip == -1 else offset)
+    spacing = _numbers(fields, ("ElementSpacing", "ElementSize"), 3, path, default=[])
+    if not spacing:
+        return Scan(values)
+    identity = [1.0, 0, 0, 0, 1, 0, 0, 0, 1]
+    rows = _numbers(fields, ("TransformMatrix", "Orientation", "Rotation"), 9, path, default=identity)
+    origin = _numbers(fields, ("Offset", "Position", "Origin"), 3, path, default=[0.0, 0, 0])
+    axes = np.reshape(rows, (3, 3)) * np.reshape(spacing, (3, 1))
+    return placed(values, axes, origin, "m", metres(fields.get("DistanceUnits", "mm"), path))
+
+
+def read_nrrd(path: Path) -> Scan:
+    """NRRD, or NHDR with its data file; encodings raw, gzip, bzip2 and ascii. Without units the volume is relative."""
+    import nrrd
+
+    with open(path, "rb") as stream:
+        with readable(path, "NRRD header"):
+            header = nrrd.read_header(stream)
+        end = stream.tell()
+    missing = [field for field in ("type", "sizes", "encoding") if field not in header]
+    if missing:
+        raise ValueError(f"the NRRD header of {path} lacks {', '.join(missing)}")
+    sizes = [int(size) for size in header["sizes"]]
+    if len(sizes) != 3:
+        kinds = f" of kinds {' '.join(header['kinds'])}" if "kinds" in header else ""
+        raise ValueError(
+            f"{path} has {len(sizes)} axes{kinds}, sizes {sizes}; expected one scalar on three axes x, y, z"
+        )
+    return _nrrd_placed(_nrrd_values(path, header, sizes[::-1], end), header, path)
+
+
+def _nrrd_values(path: Path, header: dict[str, Any], shape: list[int], end: int) -> np.ndarray:
+    encoding, dtype = header["encoding"].lower(), _nrrd_type(path, header)
+    name = header.get("data file", header.get("datafile"))
+    if name and (name.startswith("LIST") or "%" in name):
+        raise ValueError(f"{path} lists one file per slice; load the folder of the slices instead")
+    data = named(path, name) if name else path
+    with open(data, "rb") as stream:
+        stream.seek(0 if name else end)
+        for _ in range(int(header.get("line skip", header.get("lineskip", 0)))):
+            if not stream.readline():
+                break
+        offset = stream.tell()
+    skip = int(header.get("byte skip", header.get("byteskip", 0)))
+    if skip < -1:
+        raise ValueError(f"{path} has byte skip {skip}; expected -1 or a number of bytes")
+    if encoding == "raw":
+        return uncompressed(data, shape, dtype, _at_end(data, shape, dtype) if skip == -1 else offset + skip)
+    if encoding in ("gzip", "gz", "bzip2", "bz2"):
+        size = stated_bytes(data, shape, dtype)
+        most = size + (_HEADER if skip == -1 else skip)
+        content = unzipped(data, most, offset, kind="gzip" if encoding[0] == "g" else "bzip2")
+        del content[: -size if skip == -1 else skip]
+        return unpacked(data, content, shape, dtype)
+    if encoding in ("ascii", "text", "txt"):
+        with readable(data, "text"), open(data, "rb") as stream:
+            stream.seek(offset)
+            values = from_words(stream.read().split(), dtype)
+        expect_bytes(data, values.nbytes, shape, dtype)
+        return values.reshape(shape)
+    raise ValueError(f"{path} is encoded as {encoding!r}; known are raw, gzip, bzip2 and ascii")
+
+
+def _nrrd_type(path: Path, header: dict[str, Any]) -> np.dtype:
+    kind = next((kind for kind, names in _NRRD_TYPES.items() if header["type"].lower() in names), None)
+    if kind is None:
+        raise ValueError(f"{path} has type {header['type']!r}, which is no real number")
+    endian = header.get("endian", "little" if kind[1] == "1" or header["encoding"].lower() == "ascii" else None)
+    if endian not in ("little", "big"):
+        raise ValueError(f"{path} must say 'endian: little' or 'endian: big' for type {header['type']}, got {endian!r}")
+    return np.dtype((">" if endian == "big" else "<") + kind)
+
+
+def _nrrd_placed(values: np.ndarray, header: dict[str, Any], path: Path) -> Scan:
+    in_space = header.get("space directions") is not None
+    if not in_space and "spacings" not in header:
+        return Scan(values)
+    axes = np.asarray(header["space directions"] if in_space else np.diag(header["spacings"]), dtype=np.float64)
+    if axes.shape != (3, 3):
+        raise ValueError(f"{path} has space directions {axes.tolist()}; expected three vectors of three components")
+    units = [unit for unit in header.get("space units" if in_space else "units", []) if unit.strip()]
+    if len(units) not in (0, 3):
+        raise ValueError(f"{path} gives units for {len(units)} of three axes; pass spacing= instead")
+    # One unit per axis; with directions, per component of every vector. Both are the columns.
+    scale = np.array([metres(unit, path) for unit in units] if units else [1.0, 1, 1])
+    origin = np.asarray(header.get("space origin", [0.0, 0, 0]), dtype=np.float64)
+    origin = np.where(np.isfinite(origin), origin, 0) * scale
+    return placed(values, axes * scale, origin, "m" if units else "relative")
+
+
+def _at_end(path: Path, shape: list[int], dtype: np.dtype) -> int:
+    # A header of unknown length is skipped by counting from the end; too short a file is reported by uncompressed.
+    return max(0, path.stat().st_size - math.prod(shape) * dtype.itemsize)
+
+
+def _metaimage_header(path: Path) -> tuple[dict[str, str], int]:
+    fields: dict[str, str] = {}
+    with open(path, "rb") as stream:
+        # The data may follow: stop at the field that ends every header.
+        while "ElementDataFile" not in fields and (line := stream.readline(1 << 16)):
+            name, equals, value = line.decode("latin-1").partition("=")
+            if equals:
+                fields[name.strip()] = value.strip()
+        if "ElementDataFile" not in fields:
+            raise ValueError(f"{path} is no MetaImage header: it has no field ElementDataFile")
+        return fields, stream.tell()
+
+
+def _whole(fields: dict[str, str], name: str, count: int, path: Path, *, least: int) -> list[int]:
+    numbers = _numbers(fields, (name,), count, path)
+    if not all(number.is_integer() and number >= least for number in numbers):
+        raise ValueError(f"{path} must give whole numbers from {least} on as {name}, got {fields[name]!r}")
+    return [int(number) for number in numbers]
+
+
+def _numbers(
+    fields: dict[str, str], names: Sequence[str], count: int, path: Path, default: list[float] | None = None
+) -> list[float]:
+    name = next((name for name in names if name in fields), None)
+    if name is None and default is not None:
+        return default
+    try:
+        numbers = [float(word) for word in fields[name or names[0]].split()]
+    except (KeyError, ValueError):
+        numbers = []
+    if len(numbers) != count:
+        raise ValueError(f"{path} must give {count} numbers as {names[0]}, got {fields.get(name or names[0])!r}")
+    return numbers

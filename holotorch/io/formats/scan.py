@@ -1,0 +1,243 @@
+"""What a file of voxels states, before it becomes a Volume, and the checks that all formats share."""
+
+import importlib
+import math
+import mmap
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from holotorch.io.formats.limits import affordable, readable_at_once
+from holotorch.scene.volume import IDENTITY, Triple
+
+_MAP_NORESERVE = 0x4000  # of Linux; Python has no name for it before 3.13
+_METRES = {
+    "m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 1e-2, "mm": 1e-3, "millimeter": 1e-3, "um": 1e-6, "µm": 1e-6,
+    "micron": 1e-6, "nm": 1e-9, "angstrom": 1e-10,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Voxels and the geometry that their file states.
+
+    Attributes:
+        values: [D, H, W] in the file's type, possibly mapped.
+        spacing: Along (z, y, x) in ``unit``, or None where the file does not say.
+        unit: "m" or "relative".
+        origin: Of voxel [0, 0, 0], (z, y, x) in ``unit``.
+        orientation: Unit rows for the axes z, y, x, with (z, y, x) components.
+    """
+
+    values: np.ndarray
+    spacing: Triple | None = None
+    unit: str = "relative"
+    origin: Triple = (0.0, 0.0, 0.0)
+    orientation: tuple[Triple, Triple, Triple] = IDENTITY
+
+
+def metres(unit: str, path: Path) -> float:
+    """Length in metres of a ``unit`` that the file at ``path`` names."""
+    name = unit.strip().lower()
+    if name not in _METRES:
+        name = name.removesuffix("s")
+    if name not in _METRES:
+        raise ValueError(f"{path} gives its spacing in {unit!r}; known are {', '.join(_METRES)}; pass spacing= instead")
+    return _METRES[name]
+
+
+def placed(values: np.ndarray, axes: Any, origin: Any, unit: str, scale: float = 1.0) -> Scan:
+    """Scan of ``values`` whose file lists geometry in the order (x, y, z), as medical formats do.
+
+    Args:
+        values: [D, H, W].
+        axes: [3, 3], the step from one voxel to the next along x, y and z as rows of (x, y, z) components.
+        origin: (x, y, z) of the first voxel.
+        unit: "m" or "relative".
+        scale: Length of the file's unit in ``unit``.
+    """
+    steps = np.asarray(axes, dtype=np.float64)[::-1, ::-1]
+    lengths = np.linalg.norm(steps, axis=1)
+    if not (np.isfinite(lengths).all() and (lengths > 0).all()):
+        return Scan(values)
+    rows = [triple(row) for row in steps / lengths[:, None]]
+    return Scan(
+        values,
+        triple(lengths * scale),
+        unit,
+        triple(np.asarray(origin, dtype=np.float64)[::-1] * scale),
+        (rows[0], rows[1], rows[2]),
+    )
+
+
+def triple(values: Sequence[float] | np.ndarray) -> Triple:
+    """Three numbers as floats."""
+    z, y, x = (float(value) for value in values)
+    return z, y, x
+
+
+def existing(path: Path) -> Path:
+    """``path``, or ValueError where it is missing or an empty file."""
+    return _not_empty(path, str(path))
+
+
+def named(header: Path, name: str) -> Path:
+    """The data file that a header names, in the header's folder or below it.
+
+    Raises:
+        ValueError: It is missing, empty or no file, or lies elsewhere: a header from someone else must not choose which
+            of the user's files are read.
+    """
+    path = header.parent / name
+    if not path.resolve().is_relative_to(header.parent.resolve()):
+        raise ValueError(
+            f"{header} names the data file {name!r}, which lies outside the header's folder; move it (no link) beside "
+            "the header, or load it without its header, with shape=, dtype= and spacing="
+        )
+    return _not_empty(path, f"the data file {path}, which {header} names,", file=True)
+
+
+def _not_empty(path: Path, where: str, *, file: bool = False) -> Path:
+    try:
+        path.stat()
+    except FileNotFoundError:
+        raise ValueError(f"{where} does not exist") from None
+    except OSError as error:  # a name that no file can have, a folder that may not be looked into
+        raise ValueError(f"{where} cannot be read: {error.strerror}") from None
+    if file and not path.is_file():
+        raise ValueError(f"{where} is no file")
+    if path.is_file() and not path.stat().st_size:
+        raise ValueError(f"{where} is empty (0 bytes)")
+    return path
+
+
+def number_type(dtype: DTypeLike) -> np.dtype:
+    """The type that ``dtype`` names; ValueError for what is no type of real numbers."""
+    try:
+        kind = np.dtype(dtype)
+        if kind.kind not in "buif":
+            raise TypeError("not a real number")
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"dtype must name a type of number, such as 'uint8' or '>i2', got {dtype!r}: {error}"
+        ) from None
+    return kind
+
+
+def expect_bytes(path: Path, found: int, shape: Sequence[int], dtype: np.dtype) -> int:
+    """Number of bytes of ``shape`` voxels; ValueError where ``found`` is another, or for no voxels."""
+    if any(size < 1 for size in shape):
+        raise ValueError(f"{path} states {' x '.join(map(str, shape))} voxels (D x H x W); every size must be above 0")
+    wanted = math.prod(shape) * dtype.itemsize
+    if found != wanted:
+        sizes = " x ".join(str(size) for size in shape)
+        raise ValueError(
+            f"{path}: expected {wanted} bytes = {sizes} (D x H x W) of {dtype.name}, found {found}; check shape and "
+            "dtype, or the file is truncated"
+        )
+    return wanted
+
+
+def uncompressed(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int = 0) -> np.ndarray:
+    """Voxels of a file that holds nothing else after ``offset`` bytes; see :func:`uncompressed_from`."""
+    expect_bytes(path, path.stat().st_size - offset, shape, dtype)
+    return uncompressed_from(path, shape, dtype, offset)
+
+
+def uncompressed_from(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int) -> np.ndarray:
+    """Voxels from ``offset`` bytes on: read, or mapped where they are over 1 GiB and more than half of the free memory.
+
+    A mapped voxel is read when it is touched, and the system ends the program where the file has been cut short since.
+    So only volumes that may be larger than memory are mapped. What is written to them never reaches the file.
+    """
+    size = math.prod(shape) * dtype.itemsize
+    if readable_at_once(size):
+        values = np.fromfile(path, dtype, math.prod(shape), offset=offset)
+        expect_bytes(path, values.nbytes, shape, dtype)
+        return values.reshape(tuple(shape))
+    if sys.platform != "linux":
+        return np.memmap(path, dtype, "c", offset, tuple(shape))
+    # numpy's mapping reserves memory for a copy of it all, so that volumes larger than memory would be refused.
+    with open(path, "rb") as stream:
+        access = {"flags": mmap.MAP_PRIVATE | _MAP_NORESERVE, "prot": mmap.PROT_READ | mmap.PROT_WRITE}
+        return np.ndarray(tuple(shape), dtype, mmap.mmap(stream.fileno(), 0, **access), offset)
+
+
+def stated_bytes(path: Path, shape: Sequence[int], dtype: np.dtype) -> int:
+    """Bytes of the ``shape`` voxels that a file states; ValueError for none, or more than its own size allows."""
+    size = expect_bytes(path, math.prod(shape) * dtype.itemsize, shape, dtype)
+    affordable(path, size, path.stat().st_size)
+    return size
+
+
+def unpacked(path: Path, data: bytes | bytearray, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
+    """Voxels of decompressed ``data``."""
+    expect_bytes(path, len(data), shape, dtype)
+    # A bytearray is writable, as torch wants it.
+    return np.frombuffer(data if isinstance(data, bytearray) else bytearray(data), dtype).reshape(tuple(shape))
+
+
+def from_words(words: Sequence[str] | Sequence[bytes], dtype: np.dtype) -> np.ndarray:
+    """Numbers written as text, of a type in the native byte order."""
+    # numpy's own conversion makes every word as wide as the longest.
+    number = float if dtype.kind == "f" else int
+    return np.array([number(word) for word in words], dtype.newbyteorder("="))
+
+
+def three_axes(values: np.ndarray, path: Path) -> np.ndarray:
+    """``values`` as [D, H, W] scalars; leading axes of length 1 are dropped, colours, vectors and series refused."""
+    if values.dtype.names or values.dtype.kind not in "buif":
+        raise ValueError(f"{path} holds {values.dtype} elements, not one real number per voxel; convert it to scalars")
+    while values.ndim > 3 and values.shape[0] == 1:
+        values = values[0]
+    if values.ndim != 3:
+        what = "one slice or fewer" if values.ndim < 3 else "colours, vectors or a series"
+        raise ValueError(
+            f"{path} must hold one scalar on three axes (z, y, x), got shape {values.shape}: {what}; select or convert "
+            "it to a single [D, H, W] array first"
+        )
+    return values
+
+
+@contextmanager
+def readable(path: Path, kind: str) -> Iterator[None]:
+    """Around a decoder: whatever it raises for a damaged file becomes a ValueError that names the file."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:  # libraries raise many kinds, bare RuntimeError and KeyError among them
+        raise ValueError(f"{path} is no readable {kind}, or is truncated: {error}") from None
+
+
+def extra(module: str, what: str) -> Any:
+    """Import an optional ``module``, or raise ImportError with the line that installs it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise ImportError(
+            f"{what} needs {module}, an extra of holotorch; install it with: pip install 'holotorch[volumes]'"
+        ) from None
+
+
+def split_member(path: str | Path) -> tuple[Path, str | None]:
+    """Path of the file and name of the array within it, written as ``file::name``."""
+    file, _, member = str(path).partition("::")
+    return Path(file), member or None
+
+
+def chosen(names: Sequence[str], member: str | None, path: Path) -> str:
+    """The array ``member`` of those in the file, or the only one."""
+    if member is None and len(names) == 1:
+        return names[0]
+    if member is None or member not in names:
+        listed = ", ".join(names) or "none"
+        asked = f"has no array {member!r}" if member else "does not hold exactly one volume"
+        raise ValueError(f"{path} {asked}; its arrays are: {listed}; choose one by writing {path}::name")
+    return member

@@ -1,0 +1,145 @@
+"""Volumes as pictures of their slices: TIFF stacks, folders of numbered pictures, and tiles in one picture."""
+
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from holotorch.io.formats.decoding import decode
+from holotorch.io.formats.limits import affordable
+from holotorch.io.formats.scan import Scan, readable
+
+_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES = 256, 257, 258, 277  # tags
+SLICE_SUFFIXES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg")
+
+
+def read_tiff(path: Path) -> Scan:
+    """Grey pages of a TIFF file, first page at z = 0. TIFF has no spacing between pages."""
+    import cv2
+
+    pages = _tiff_pages(path)
+    with readable(path, "TIFF file"):
+        fine, found = cv2.imdecodemulti(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    if not fine or len(found) != pages:
+        raise ValueError(
+            f"{path}: {len(found) if fine else 0} of {pages} pages could be decoded; it is truncated, or in a TIFF "
+            "variant that OpenCV does not read"
+        )
+    return _stacked(found, [f"page {index} of {path}" for index in range(pages)])
+
+
+def read_folder(folder: Path) -> Scan:
+    """Pictures of one folder, ordered by the last number in their names, which must count without a gap."""
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in SLICE_SUFFIXES]
+    if not paths:
+        raise ValueError(f"{folder} holds no slices: neither DICOM, Zarr nor pictures ({', '.join(SLICE_SUFFIXES)})")
+    numbered: dict[int, Path] = {}
+    for path in paths:
+        numbers = re.findall(r"\d+", path.stem)
+        if not numbers:
+            raise ValueError(f"{path} has no number in its name, so that its place is unknown; remove or rename it")
+        if (number := int(numbers[-1])) in numbered:
+            raise ValueError(f"{folder} holds slice {number} twice: {numbered[number].name} and {path.name}")
+        numbered[number] = path
+    first, last = min(numbered), max(numbered)
+    missing = [number for number in range(first, last + 1) if number not in numbered]
+    if missing:
+        raise ValueError(
+            f"{folder}: slices {first} to {last}, but {len(missing)} missing, the first being {missing[0]}"
+        )
+    ordered = [numbered[number] for number in range(first, last + 1)]
+    return _stacked((_picture(path) for path in ordered), [str(path) for path in ordered])
+
+
+def read_tiles(path: Path, shape: Sequence[int] | None) -> Scan:
+    """Slices side by side in one picture, row by row from the top left; ``shape`` = (D, H, W) says how they lie.
+
+    Tiles behind the last slice must be empty, as they are where a table of tiles was filled up.
+    """
+    if shape is None:
+        raise ValueError(f"{path} is one picture: pass shape=(D, H, W) if it is tiled with slices, or its folder")
+    picture = _picture(path)
+    depth, height, width = shape
+    rows, columns = picture.shape[0] // max(height, 1), picture.shape[1] // max(width, 1)
+    if picture.shape != (rows * height, columns * width) or rows * columns < depth:
+        raise ValueError(
+            f"{path} is {picture.shape[0]} x {picture.shape[1]} px and cannot be cut into {depth} tiles of {height} x "
+            f"{width} px; check shape=(D, H, W)"
+        )
+    tiles = picture.reshape(rows, height, columns, width).swapaxes(1, 2).reshape(-1, height, width)
+    if tiles[depth:].any():
+        used = int(np.flatnonzero(tiles.any((1, 2)))[-1]) + 1
+        raise ValueError(f"{path} has {used} tiles of {height} x {width} px with content, got shape {tuple(shape)}")
+    return Scan(tiles[:depth])
+
+
+def _picture(path: Path) -> np.ndarray:
+    import cv2
+
+    return _grey(decode(path, cv2.IMREAD_UNCHANGED), str(path))
+
+
+def _grey(pixels: np.ndarray, source: str) -> np.ndarray:
+    if pixels.ndim != 2:
+        raise ValueError(f"{source} has {pixels.shape[2]} colour channels, expected grey: one scalar per voxel")
+    return pixels
+
+
+def _stacked(slices: Iterable[np.ndarray], sources: Sequence[str]) -> Scan:
+    values = np.empty(0)
+    for index, (pixels, source) in enumerate(zip(slices, sources, strict=True)):
+        plane = _grey(pixels, source)
+        if not index:
+            values = np.empty((len(sources), *plane.shape), plane.dtype)
+        if plane.shape != values.shape[1:] or plane.dtype != values.dtype:
+            raise ValueError(
+                f"slices must be alike, but {source} is {plane.shape} of {plane.dtype} and the first is "
+                f"{values.shape[1:]} of {values.dtype}"
+            )
+        values[index] = plane
+    return Scan(values)
+
+
+def _tiff_pages(path: Path) -> int:
+    """Number of pages by the chain of directories: OpenCV leaves out silently what it cannot decode.
+
+    ValueError where their pixels need more than the memory limit.
+    """
+    data = np.memmap(path, np.uint8, "r")
+    order = "big" if data[:2].tobytes() == b"MM" else "little"
+    # Version 42 has offsets of 4 bytes; 43, BigTIFF, of 8.
+    version = int.from_bytes(data[2:4].tobytes(), order)
+    if data[:2].tobytes() not in (b"II", b"MM") or version not in (42, 43):
+        raise ValueError(f"{path} is not a TIFF file")
+    wide = version == 43
+    length, counter, entry = (8, 8, 20) if wide else (4, 2, 12)
+
+    def number(place: int, size: int) -> int:
+        if place + size > data.size:
+            raise ValueError(f"{path} is truncated: it ends at byte {data.size}, before its page directory")
+        return int.from_bytes(data[place : place + size].tobytes(), order)
+
+    def fact(directory: int, tag: int, default: int) -> int:
+        """The number in the entry ``tag``: one of 2, 4 or 8 bytes by its type, or the first of several elsewhere."""
+        for place in range(directory + counter, directory + counter + entry * number(directory, counter), entry):
+            if number(place, 2) == tag:
+                size = {3: 2, 4: 4, 16: 8}.get(number(place + 2, 2), 1)
+                count, value = number(place + 4, length), place + 4 + length
+                return number(value if count * size <= length else number(value, length), size)
+        return default
+
+    place, directories, entries, needed = number(8 if wide else 4, length), set[int](), 0, 0
+    while place:
+        if place in directories:
+            raise ValueError(f"{path} is damaged: its pages point at each other in a circle")
+        directories.add(place)
+        entries += number(place, counter)
+        if entries * entry > data.size:
+            raise ValueError(f"{path} is damaged: the directories of its pages overlap")
+        bits = max(8, fact(place, _TIFF_BITS, 1)) * fact(place, _TIFF_SAMPLES, 1)
+        needed += fact(place, _TIFF_WIDTH, 1) * fact(place, _TIFF_HEIGHT, 1) * bits // 8
+        place = number(place + counter + entry * number(place, counter), length)
+    # The pages, and the volume that they are copied to.
+    affordable(path, 2 * needed, data.size)
+    return len(directories)

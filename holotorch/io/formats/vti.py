@@ -1,0 +1,165 @@
+"""VTK image data (.vti): XML with the voxels as text, base64 or raw bytes, plain or compressed by zlib."""
+
+import base64
+import re
+import xml.etree.ElementTree as ElementTree
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from holotorch.io.formats.limits import inflated
+from holotorch.io.formats.scan import (
+    Scan,
+    chosen,
+    expect_bytes,
+    from_words,
+    placed,
+    readable,
+    stated_bytes,
+    three_axes,
+    uncompressed_from,
+    unpacked,
+)
+
+_TYPES = {
+    "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4", "Int64": "i8",
+    "UInt64": "u8", "Float32": "f4", "Float64": "f8",
+}  # fmt: skip
+# Bounded, since every part may match what the next one does: a file of nothing but such beginnings takes linear time.
+_APPENDED = re.compile(
+    rb"<AppendedData\s[^<>]{0,200}encoding\s{0,9}=\s{0,9}[\"'](\w{1,20})[\"'][^<>]{0,200}>\s{0,999}_"
+)
+
+
+def read_vti(path: Path, member: str | None = None) -> Scan:
+    """A scalar array of the only piece: the active one, the only one, or ``member``. VTK knows no units: relative.
+
+    Raw appended data without compression are mapped if large.
+    """
+    root, start, base64_coded = _document(path)
+    image = root.find("ImageData")
+    pieces = root.findall("ImageData/Piece")
+    if image is None or len(pieces) != 1:
+        raise ValueError(f"{path} must hold ImageData in one piece, got {root.get('type')} in {len(pieces)}")
+    array, cells = _array(pieces[0], member, path)
+    bounds = [int(word) for word in pieces[0].get("Extent", image.get("WholeExtent", "")).split()]
+    if len(bounds) != 6:
+        raise ValueError(f"{path} must give its Extent as six numbers, got {bounds}")
+    points = [last - first + 1 for first, last in zip(bounds[::2], bounds[1::2], strict=True)]
+    shape = [max(1, size - cells) for size in points[::-1]]
+    kind = array.get("type", "")
+    if kind not in _TYPES:
+        raise ValueError(f"{path} has an array of type {kind!r}; known are {', '.join(_TYPES)}")
+    components = int(array.get("NumberOfComponents", 1))
+    if components != 1:
+        raise ValueError(
+            f"{path}: array {array.get('Name')!r} has {components} components per voxel, expected a scalar"
+        )
+    dtype = np.dtype((">" if root.get("byte_order") == "BigEndian" else "<") + _TYPES[kind])
+    values = three_axes(_values(path, root, array, shape, dtype, start, base64_coded), path)
+    if "Spacing" not in image.attrib:
+        return Scan(values)
+    spacing = np.array([float(word) for word in image.attrib["Spacing"].split()])
+    # Columns of Direction are the axes.
+    direction = np.reshape([float(word) for word in image.get("Direction", "1 0 0 0 1 0 0 0 1").split()], (3, 3))
+    axes = direction.T * spacing[:, None]
+    corner = np.array([float(word) for word in image.get("Origin", "0 0 0").split()])
+    first = np.array(bounds[::2]) + (0.5 if cells else 0)
+    return placed(values, axes, corner + first @ axes, "relative")
+
+
+def _document(path: Path) -> tuple[ElementTree.Element, int, bool]:
+    """XML without appended data, where those start in the file, and whether they are base64."""
+    data = np.memmap(path, np.uint8, "r")
+    match = _APPENDED.search(data)  # type: ignore[arg-type]
+    text = bytes(data[: match.start()]) + b"</VTKFile>" if match else bytes(data)
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"{path} is no readable VTK XML file, or is truncated: {error}") from None
+    return root, match.end() if match else -1, bool(match) and match[1] == b"base64"
+
+
+def _array(piece: ElementTree.Element, member: str | None, path: Path) -> tuple[ElementTree.Element, int]:
+    """The wanted array, and 1 where it belongs to cells, of which there is one less per axis than of points."""
+    for name, cells in (("PointData", 0), ("CellData", 1)):
+        holder = piece.find(name)
+        arrays = {item.get("Name", ""): item for item in (holder if holder is not None else ())}
+        if holder is not None and arrays and (member is None or member in arrays or cells):
+            active = holder.get("Scalars")
+            wanted = member or (active if active in arrays else None)
+            return arrays[chosen(list(arrays), wanted, path)], cells
+    raise ValueError(f"{path} holds no array{f' {member!r}' if member else ''}")
+
+
+def _values(
+    path: Path,
+    root: ElementTree.Element,
+    array: ElementTree.Element,
+    shape: list[int],
+    dtype: np.dtype,
+    start: int,
+    base64_coded: bool,
+) -> np.ndarray:
+    form, compressor = array.get("format", "ascii"), root.get("compressor")
+    if form == "ascii":
+        with readable(path, "text of numbers"):
+            values = from_words((array.text or "").split(), dtype)
+        expect_bytes(path, values.nbytes, shape, dtype)
+        return values.reshape(shape)
+    header_type = root.get("header_type", "UInt32")
+    if header_type not in ("UInt32", "UInt64"):
+        raise ValueError(f"{path} has header_type {header_type!r}, expected UInt32 or UInt64")
+    if compressor not in (None, "vtkZLibDataCompressor"):
+        raise ValueError(f"{path} is compressed by {compressor}; write it with vtkZLibDataCompressor or without")
+    count = np.dtype((">" if root.get("byte_order") == "BigEndian" else "<") + _TYPES[header_type])
+    if form == "appended" and start < 0:
+        raise ValueError(f"{path} is truncated: its appended data are missing")
+    offset = start + int(array.get("offset", 0))
+    if form == "appended" and not base64_coded:
+        if compressor is None:
+            return _mapped(path, shape, dtype, offset, count)
+        data = path.read_bytes()[offset:]
+    else:
+        data = _decoded(array.text or "" if form == "binary" else path.read_bytes()[offset:].decode("latin-1"))
+    if compressor:
+        return unpacked(path, _inflated(path, data, count, stated_bytes(path, shape, dtype)), shape, dtype)
+    return unpacked(path, data[count.itemsize : count.itemsize + _length(data, count)], shape, dtype)
+
+
+def _mapped(path: Path, shape: list[int], dtype: np.dtype, offset: int, count: np.dtype) -> np.ndarray:
+    with open(path, "rb") as stream:
+        stream.seek(offset)
+        size = _length(stream.read(count.itemsize), count)
+    present = max(0, min(size, path.stat().st_size - offset - count.itemsize))
+    expect_bytes(path, present, shape, dtype)
+    return uncompressed_from(path, shape, dtype, offset + count.itemsize)
+
+
+def _length(data: bytes, count: np.dtype) -> int:
+    return int.from_bytes(data[: count.itemsize], "big" if count.byteorder == ">" else "little")
+
+
+def _decoded(text: str) -> bytes:
+    # The length in front is encoded on its own, so that "=" may stand in the middle; what follows "<" is no data.
+    parts = re.findall(r"[A-Za-z0-9+/]+=*", "".join(text.partition("<")[0].split()))
+    # A file cut short may end within a group of four.
+    return b"".join(base64.b64decode(part[: len(part) // 4 * 4]) for part in parts)
+
+
+def _inflated(path: Path, data: bytes, count: np.dtype, size: int) -> bytearray:
+    """Blocks of compressed data behind a table: their number, full size, the last one's size, compressed sizes.
+
+    ``size``: bytes of all content, beyond which nothing is unpacked.
+    """
+    try:
+        blocks = int(np.frombuffer(data, count, 1)[0])
+        sizes = np.frombuffer(data, count, blocks, 3 * count.itemsize)
+        content, place = bytearray(), (3 + blocks) * count.itemsize
+        for length in map(int, sizes):
+            content += inflated(data[place : place + length], size - len(content))
+            place += length
+        return content
+    except (ValueError, zlib.error) as error:
+        raise ValueError(f"{path} is truncated or damaged: {error}") from None

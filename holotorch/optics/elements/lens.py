@@ -1,0 +1,243 @@
+"""Thin elements: lenses and apertures, which multiply the field sample by sample."""
+
+import math
+import warnings
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from holotorch.core import checks
+from holotorch.core.checks import SamplingWarning
+from holotorch.core.grid import Grid
+from holotorch.core.quantities import APERTURE_RADIUS, FOCAL_LENGTH, PITCH, SOFTNESS, WAVELENGTH
+from holotorch.optics.free_space.kernels import turns_phasor
+
+
+def lens_phase(
+    grid: Grid, wavelength: Tensor | float, focal_length: Tensor | float, *, paraxial: bool = True
+) -> Tensor:
+    """Phase in radians that a thin lens adds, 0 on the axis; differentiable in wavelength and focal length.
+
+    Args:
+        grid: Sampling of the plane of the lens.
+        wavelength: In metres, shape [...]; broadcasts against ``focal_length``.
+        focal_length: In metres, positive converges, negative diverges, infinite is no lens; not 0.
+        paraxial: The parabola -k r^2 / (2 f) of Goodman, Eq. 5-10, and of the thesis (after Voelz). Otherwise the
+            spherical wave -k (sqrt(r^2 + f^2) - |f|) with the sign of f, which focuses a plane wave without spherical
+            aberration; the two differ by k r^4 / (8 f^3).
+
+    Returns:
+        float64, shape [..., H, W], not wrapped.
+
+    Raises:
+        ValueError: A length that cannot be meant.
+    """
+    checks.meant(WAVELENGTH, wavelength)
+    checks.meant(FOCAL_LENGTH, focal_length)
+    return 2 * math.pi * _turns(grid, wavelength, focal_length, paraxial)
+
+
+def pupil(grid: Grid, radius: Tensor | float, *, softness: float = 0.0) -> Tensor:
+    """Circular opening around the axis: 1 inside ``radius`` and 0 outside, float64 [..., H, W].
+
+    Args:
+        grid: Sampling of its plane.
+        radius: In metres, shape [...].
+        softness: Width in metres over which the amplitude falls, as 1 / (1 + exp((r - radius) / softness)). Only a soft
+            edge has a gradient in the radius; about a pitch is enough.
+
+    Raises:
+        ValueError: ``radius`` carries a gradient but the edge is hard, so that the gradient would be 0; or a length
+            that cannot be meant.
+    """
+    checks.meant(APERTURE_RADIUS, radius, "radius")
+    checks.quantity(SOFTNESS, softness)
+    radius = torch.as_tensor(radius, dtype=torch.float64)
+    y, x = grid.coordinates(radius.device)
+    return opening(y.square() + x.square(), radius[..., None, None], softness)
+
+
+def opening(square: Tensor, radius: Tensor, softness: float) -> Tensor:
+    """:func:`pupil` at given squared distances from the axis."""
+    if softness > 0:
+        # The root's gradient at the axis is infinite; nothing there depends on 1e-30.
+        return torch.sigmoid((radius - torch.sqrt(square + 1e-30)) / softness)
+    if radius.requires_grad:
+        raise ValueError("a hard edge has no gradient in its radius; give softness, for instance one pitch")
+    return (square <= radius.square()).to(torch.float64)
+
+
+def lens_limit(pitch: float, wavelength: float, focal_length: float, *, paraxial: bool = True) -> float:
+    """Distance in metres from the axis up to which samples ``pitch`` apart hold the phase of a lens.
+
+    There its slope reaches half a turn per sample: x = wavelength f / (2 pitch), or f tan(asin(wavelength / (2 pitch)))
+    for the spherical phase. Light that is tilted, or not flat, brings a slope of its own that adds to the lens's: a
+    band of sine s leaves (wavelength / (2 pitch) - s) f.
+    """
+    sine = checks.quantity(WAVELENGTH, wavelength) / (2 * checks.quantity(PITCH, pitch))
+    checks.quantity(FOCAL_LENGTH, focal_length)
+    if paraxial:
+        return abs(focal_length) * sine
+    return abs(focal_length) * sine / math.sqrt(1 - sine**2) if sine < 1 else math.inf
+
+
+class Transmission(nn.Module):
+    """A thin element: complex fields [..., C, H, W] times complex numbers, one per sample.
+
+    Args:
+        grid: Sampling of the field, also that of the result.
+        wavelengths: In metres, one per channel.
+        values: complex128, shape [C, H, W], or [1, H, W] for all channels.
+    """
+
+    values: Tensor
+
+    def __init__(self, grid: Grid, wavelengths: float | Sequence[float], values: Tensor):
+        super().__init__()
+        self.grid, self.out_grid, self.wavelengths = grid, grid, checks.wavelengths(wavelengths)
+        # A real pair: Module.to(dtype) would drop the imaginary part of a complex buffer.
+        self.register_buffer("values", torch.view_as_real(values).contiguous(), persistent=False)
+
+    def forward(self, field: Tensor) -> Tensor:
+        """Pass ``field`` through; TypeError if it is real, ValueError if its shape differs."""
+        return field * self._values_for(field)
+
+    def adjoint(self, field: Tensor) -> Tensor:
+        """Multiply by the conjugate numbers."""
+        return field * self._values_for(field).conj()
+
+    def _values_for(self, field: Tensor) -> Tensor:
+        checks.field("field", field, (len(self.wavelengths), *self.grid.shape))
+        return torch.view_as_complex(self.values.to(field.real.dtype))
+
+    def _apply(self, fn, recurse=True):
+        return super()._apply(lambda tensor: tensor.to(fn(tensor).device), recurse)
+
+    def extra_repr(self) -> str:
+        """Sampling and wavelengths, for ``print(module)``."""
+        return f"grid={self.grid}, wavelengths={self.wavelengths}"
+
+
+class Lens(Transmission):
+    """Thin lens with a circular rim: :func:`lens_phase` inside ``radius``, nothing outside.
+
+    Args:
+        grid: Sampling of the field.
+        wavelengths: In metres, one per channel.
+        focal_length: In metres, not 0; positive converges. One for all channels (a refractive or achromatic lens) or
+            one per channel (a holographic optical element, whose focal length goes as 1 / wavelength).
+        radius: Of the rim in metres; None lets the whole window through.
+        paraxial: Parabola, or the spherical wave.
+
+    Raises:
+        ValueError: A focal length of 0, or a length that cannot be meant, such as one in millimetres.
+        MemoryError: The grid has more samples than memory is available for.
+
+    Warns:
+        SamplingWarning: The grid is too coarse for the phase at the rim, or at the end of the window where there is
+            none; the message names the limit (:func:`lens_limit`) and the pitch that would do. Light that is not flat
+            asks for a finer one still.
+
+    Source: Goodman, Sec. 5.1; thesis Algorithm 6.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        wavelengths: float | Sequence[float],
+        focal_length: float | Sequence[float],
+        *,
+        radius: float | None = None,
+        paraxial: bool = True,
+    ):
+        waves = checks.wavelengths(wavelengths)
+        given = list(focal_length) if isinstance(focal_length, Sequence) else [focal_length] * len(waves)
+        if len(given) != len(waves):
+            raise ValueError(f"focal_length must be one number or one per wavelength ({len(waves)}), got {len(given)}")
+        lengths = [checks.quantity(FOCAL_LENGTH, each) for each in given]
+        rim = None if radius is None else checks.quantity(APERTURE_RADIUS, radius, "radius")
+        affordable("a lens", grid, len(waves))
+        values = turns_phasor(_turns(grid, _doubles(waves), _doubles(lengths), paraxial))
+        if rim is not None:
+            values = values * pupil(grid, rim)
+        super().__init__(grid, waves, values)
+        self.focal_length, self.radius, self.paraxial = tuple(lengths), rim, paraxial
+        warn_if_coarse(grid, waves, lengths, rim, paraxial=paraxial)
+
+    def extra_repr(self) -> str:
+        """Sampling, wavelengths and lens, for ``print(module)``."""
+        return f"{super().extra_repr()}, focal_length={self.focal_length}, radius={self.radius}"
+
+
+class Aperture(Transmission):
+    """Opening in an opaque screen.
+
+    Args:
+        grid: Sampling of the field.
+        wavelengths: In metres, one per channel.
+        shape: Radius in metres of a circle around the axis, or the amplitude that passes, real [H, W] within 0 .. 1.
+
+    Raises:
+        ValueError: A radius that cannot be meant, a mask of another shape or with values outside 0 .. 1.
+        MemoryError: The grid has more samples than memory is available for.
+    """
+
+    def __init__(self, grid: Grid, wavelengths: float | Sequence[float], shape: float | Tensor):
+        if isinstance(shape, Tensor) and shape.ndim:
+            mask = shape.to(torch.float64) if shape.dtype == torch.bool else shape
+            checks.field("aperture", mask, grid.shape, complex_valued=False)
+            if mask.ndim != 2 or not bool(((mask >= 0) & (mask <= 1)).all()):
+                raise ValueError(f"aperture must be [H, W] with values in 0 .. 1, got {tuple(mask.shape)}")
+        else:
+            radius = checks.quantity(APERTURE_RADIUS, float(shape))
+            affordable("an aperture", grid, 1)
+            mask = pupil(grid, radius)
+        super().__init__(grid, wavelengths, torch.complex(mask.double(), torch.zeros_like(mask.double()))[None])
+
+
+def affordable(what: str, grid: Grid, channels: int) -> None:
+    """MemoryError if memory for a thin element on ``grid``, 48 bytes per sample and channel (measured), is lacking."""
+    height, width = grid.shape
+    checks.affordable(
+        48 * channels * height * width,
+        f"{what} on {height} x {width} samples in {channels} channel(s)",
+        "use a smaller grid",
+    )
+
+
+def _turns(grid: Grid, wavelength: Tensor | float, focal_length: Tensor | float, paraxial: bool) -> Tensor:
+    waves, length = (torch.as_tensor(v, dtype=torch.float64)[..., None, None] for v in (wavelength, focal_length))
+    y, x = grid.coordinates(length.device)
+    square = y.square() + x.square()
+    if paraxial:
+        return -square / (2 * waves * length)
+    # sqrt(r^2 + f^2) - |f| without cancelling, and finite for an infinite f.
+    return -square / (waves * length * (1 + torch.sqrt(1 + square / length.square())))
+
+
+def _doubles(values: Sequence[float]) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def warn_if_coarse(
+    grid: Grid, wavelengths: Sequence[float], lengths: Sequence[float], radius: float | None, *, paraxial: bool = True
+) -> None:
+    """SamplingWarning if ``grid`` is too coarse for lenses of these focal lengths within ``radius``."""
+    for wavelength, length in zip(wavelengths, lengths, strict=True):
+        if math.isinf(length):
+            continue
+        for size, pitch in zip(grid.shape, grid.pitch, strict=True):
+            reach = min(size // 2 * pitch, radius or math.inf)
+            limit = lens_limit(pitch, wavelength, length, paraxial=paraxial)
+            if reach <= limit * (1 + 1e-9):
+                continue
+            slope = reach / (abs(length) if paraxial else math.hypot(reach, length))
+            warnings.warn(
+                f"Lens of focal length {length:g} m at {wavelength:g} m wavelength: samples {pitch:g} m apart hold its "
+                f"phase only up to {limit * 1e3:.3g} mm from the axis, but it reaches {reach * 1e3:.3g} mm; a pitch of "
+                f"{wavelength / 2 / slope:.3g} m or less would do for flat light, a smaller radius too",
+                SamplingWarning,
+                stacklevel=3,
+            )
+            return

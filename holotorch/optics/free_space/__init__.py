@@ -1,0 +1,1 @@
+"""Free space: transfer functions, impulse responses, and one class per way to propagate."""

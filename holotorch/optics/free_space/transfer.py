@@ -1,0 +1,133 @@
+"""Transfer functions in two factors: one exponential or set of taps per axis, and what lies beyond Fresnel."""
+
+import torch
+from torch import Tensor
+
+from holotorch.core.fourier import multiply_even
+from holotorch.core.grid import Grid
+from holotorch.optics.free_space.impulse_response import (
+    fresnel_taps,
+    levelling_shift,
+    remainder_kernel,
+    tap_indices,
+    tilted_turns,
+)
+from holotorch.optics.free_space.kernels import angular_spectrum_kernel, carrier, turns_phasor
+from holotorch.optics.free_space.passage import Passage, shifts
+
+
+def transfer_function(
+    path: Passage,
+    padded: Grid,
+    wavelength: Tensor,
+    distance: Tensor,
+    *,
+    sampled: tuple[bool, bool],
+    paraxial: bool,
+    tilt: Tensor | None = None,
+    dtype: torch.dtype = torch.complex128,
+) -> Tensor:
+    """Kernel of a linear convolution on the padded grid, carrier included, differentiable in all tensors.
+
+    Args:
+        path: From which samples to which; of equal pitch.
+        padded: Grid of the transforms. The first samples of the result are those of ``path.out``.
+        wavelength: In metres, float64, shape [...].
+        distance: In metres, float64, shape [...] that broadcasts; zeros give the identity.
+        sampled: Per axis (y, x), whether the paraxial factor is sampled in frequency, or its exact taps are cropped to
+            the transform's length and transformed.
+        paraxial: Leave out the factor beyond Fresnel.
+        tilt: Sines (y, x) of the carrier, float64 [2], for gradients; those of ``path`` by default.
+        dtype: Of the result. Phases are reduced in float64 and cast last.
+
+    Returns:
+        Shape [..., H, W], frequencies in FFT order.
+    """
+    wavelength, distance = torch.broadcast_tensors(wavelength, distance)
+    tilted = any(path.tilt)
+    if tilt is None:
+        tilt = torch.tensor(path.tilt, dtype=torch.float64, device=distance.device)
+    places = shifts(path, distance, tilt)
+    cosine2 = 1 - tilt.square().sum()
+    wave = carrier(wavelength, distance * torch.sqrt(cosine2)).to(dtype)
+    if tilted and all(sampled):
+        return _sampled_tilted(padded, wavelength, distance, tilt, places).to(dtype) * wave[..., None, None]
+    if tilted:
+        places = [place + _level(axis, padded, wavelength, distance, tilt) for axis, place in enumerate(places)]
+    factors = []
+    for axis in (0, 1):
+        bent = distance * (1 - tilt[1 - axis].square()) / cosine2**1.5
+        factors.append(_axis_factor(path, axis, padded, wavelength, bent, places[axis], sampled=sampled[axis]))
+        if path.straight and _alike(path.grid) and _alike(padded) and sampled[0] == sampled[1]:
+            factors *= 2  # one computation serves both axes
+            break
+    columns, rows = (factor.to(dtype) for factor in factors)
+    kernel = columns[..., :, None] * (rows * wave[..., None])[..., None, :]
+    if paraxial:
+        return kernel
+    wavelength, distance = wavelength[..., None, None], distance[..., None, None]
+    if tilted:
+        fy, fx = padded.frequencies(distance.device)
+        turns = tilted_turns(fy, fx, wavelength, distance, tilt, squares=False)
+        for axis, frequency in ((0, fy), (1, fx)):
+            level = _level(axis, padded, wavelength[..., 0, 0], distance[..., 0, 0], tilt)
+            turns = turns - frequency * padded.pitch[axis] * level[..., None, None]
+        return kernel * turns_phasor(turns).to(dtype)
+    # The factor beyond Fresnel is even in both frequencies: one quadrant is computed and mirrored.
+    (height, width), (py, px) = padded.shape, padded.pitch
+    fy = torch.arange(height // 2 + 1, dtype=torch.float64, device=distance.device)[:, None] / (height * py)
+    fx = torch.arange(width // 2 + 1, dtype=torch.float64, device=distance.device)[None, :] / (width * px)
+    quadrant = remainder_kernel(fy, fx, wavelength, distance).to(dtype)
+    if kernel.requires_grad or quadrant.requires_grad:
+        half = torch.cat([quadrant, quadrant[..., 1 : (width + 1) // 2].flip(-1)], -1)
+        return kernel * torch.cat([half, half[..., 1 : (height + 1) // 2, :].flip(-2)], -2)
+    return multiply_even(kernel, quadrant)
+
+
+def wide_transfer_function(
+    path: Passage, padded: Grid, wavelength: Tensor, distance: Tensor, *, dtype: torch.dtype
+) -> Tensor:
+    """Band-limited angular spectrum with its carrier, for pitches too fine for :func:`transfer_function`."""
+    kernel = angular_spectrum_kernel(padded, wavelength, distance)
+    kernel = kernel * carrier(wavelength, distance)[..., None, None]
+    straight = torch.zeros(2, dtype=torch.float64, device=distance.device)
+    for frequency, pitch, place in zip(
+        padded.frequencies(distance.device), padded.pitch, shifts(path, distance, straight), strict=True
+    ):
+        if bool((place != 0).any()):
+            kernel = kernel * turns_phasor(frequency * pitch * place[..., None, None])
+    return kernel.to(dtype)
+
+
+def _alike(grid: Grid) -> bool:
+    return grid.shape[0] == grid.shape[1] and grid.pitch[0] == grid.pitch[1]
+
+
+def _sampled_tilted(padded: Grid, wavelength: Tensor, distance: Tensor, tilt: Tensor, places: list[Tensor]) -> Tensor:
+    fy, fx = padded.frequencies(distance.device)
+    turns = tilted_turns(fy, fx, wavelength[..., None, None], distance[..., None, None], tilt)
+    for frequency, pitch, place in zip((fy, fx), padded.pitch, places, strict=True):
+        turns = turns + frequency * pitch * place[..., None, None]
+    return turns_phasor(turns)
+
+
+def _level(axis: int, padded: Grid, wavelength: Tensor, distance: Tensor, tilt: Tensor) -> Tensor:
+    """:func:`levelling_shift` in samples."""
+    top = 0.5 / padded.pitch[0], 0.5 / padded.pitch[1]
+    return levelling_shift(top, wavelength, distance, tilt, axis) / padded.pitch[axis]
+
+
+def _axis_factor(
+    path: Passage, axis: int, padded: Grid, wavelength: Tensor, distance: Tensor, place: Tensor, *, sampled: bool
+) -> Tensor:
+    """Paraxial factor of one axis in frequency, complex128 [..., size]; ``place`` as from :func:`shifts`."""
+    size, pitch = padded.shape[axis], padded.pitch[axis]
+    if sampled:
+        frequency = torch.fft.fftfreq(size, pitch, dtype=torch.float64, device=distance.device)
+        turns = -(wavelength * distance)[..., None] / 2 * frequency.square()
+        return turns_phasor(turns + frequency * pitch * place[..., None])
+    index = tap_indices(size, path.grid.shape[axis], path.out.shape[axis]).to(distance.device)
+    places = index + place[..., None]
+    here = (distance == 0)[..., None]
+    taps = fresnel_taps(places, pitch, wavelength, torch.where(distance == 0, pitch, distance))
+    return torch.fft.fft(torch.where(here, torch.sinc(places).to(taps.dtype), taps))

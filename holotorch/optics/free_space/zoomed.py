@@ -1,0 +1,131 @@
+"""ZoomedFilter: a spectral filter whose result is read at the points of another grid, by the chirp-z transform."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from holotorch.core import checks
+from holotorch.core.fourier import fft, fft2, good_length, ifft2, ifft_unscaled, multiplied
+from holotorch.core.grid import Grid
+from holotorch.optics.free_space.kernels import turns_phasor
+
+Chirp = tuple[Tensor, Tensor, Tensor]
+
+
+def chirp(size: int, step: float, start: float, count: int, device: torch.device | None = None) -> Chirp:
+    """Factors by which :func:`zoom` reads ``count`` points ``step`` samples apart, from ``start`` samples on.
+
+    k j = (k^2 + j^2 - (j - k)^2) / 2 makes the sum over frequencies a convolution with a chirp (Rabiner, Schafer and
+    Rader 1969; Bluestein 1970). complex128 of [size], [L >= size + count - 1] and [count].
+    """
+    index = torch.arange(size, dtype=torch.float64, device=device)
+    index = torch.where(index >= (size + 1) // 2, index - size, index)
+    reached = torch.arange(count, dtype=torch.float64, device=device)
+    length = good_length(size + count - 1)
+    between = torch.arange(length, dtype=torch.float64, device=device)
+    # From 0 to the largest j - k, which belongs to the most negative frequency, and then from the smallest.
+    between = torch.where(between >= count + size // 2, between - length, between)
+    rate = step / size
+    before = turns_phasor(rate / 2 * index.square() + index * (start / size))
+    after = turns_phasor(rate / 2 * reached.square()) / size
+    return before, torch.fft.fft(turns_phasor(-rate / 2 * between.square())) / length, after
+
+
+def zoom(spectrum: Tensor, factors: Chirp) -> Tensor:
+    """Inverse DFT over the last axis, [..., P] in FFT order, read at the points of :func:`chirp`: [..., count]."""
+    before, kernel, after = factors
+    size, half = len(before), (len(before) + 1) // 2
+    lines = spectrum * before
+    gap = lines.new_zeros(*lines.shape[:-1], len(kernel) - size)
+    lines = fft(torch.cat([lines[..., :half], gap, lines[..., half:]], -1))
+    return ifft_unscaled(multiplied(lines, kernel))[..., : len(after)] * after
+
+
+def zoom_adjoint(values: Tensor, factors: Chirp) -> Tensor:
+    """Conjugate transpose of :func:`zoom`."""
+    before, kernel, after = factors
+    size, half = len(before), (len(before) + 1) // 2
+    lines = fft(values * after.conj(), len(kernel))
+    lines = ifft_unscaled(multiplied(lines, kernel.conj()))
+    return torch.cat([lines[..., :half], lines[..., len(kernel) - size + half :]], -1) * before.conj()
+
+
+def chirps(
+    grid: Grid, padded: Grid, out: Grid, offset: Sequence[float], device: torch.device | None = None
+) -> list[Chirp]:
+    """Factors per axis (y, x) to read a field of ``grid``, padded, on ``out`` whose axis lies at ``offset`` metres."""
+    found = []
+    for axis in (0, 1):
+        pitch, step, count = grid.pitch[axis], out.pitch[axis], out.shape[axis]
+        start = (offset[axis] - count // 2 * step) / pitch + grid.shape[axis] // 2
+        found.append(chirp(padded.shape[axis], step / pitch, start, count, device))
+    return found
+
+
+def zoomed(field: Tensor, kernel: Tensor, factors: Sequence[Chirp]) -> Tensor:
+    """Multiply the spectrum of ``field`` [..., h, w] by ``kernel`` [..., P, Q], and read the result at other points."""
+    spectrum = multiplied(fft2(field, (kernel.shape[-2], kernel.shape[-1])), kernel)
+    columns, rows = ([part.to(spectrum.dtype) for part in chirp] for chirp in factors)
+    lines = zoom(spectrum, (rows[0], rows[1], rows[2])).transpose(-1, -2)
+    return zoom(lines, (columns[0], columns[1], columns[2])).transpose(-1, -2)
+
+
+class ZoomedFilter(nn.Module):
+    """A filter that is diagonal in frequency, read on a grid of any pitch: complex [..., C, H, W] to [..., C, H', W'].
+
+    The padded result is taken as what its samples are, a band-limited periodic field, and summed from its spectrum at
+    the asked points; exact as long as the kernel does not wrap light round into them. Twice to four times a
+    :class:`SpectralFilter`, where ``ResampledKernel`` grows with the cube of the size.
+
+    Args:
+        grid: Sampling of the field.
+        wavelengths: In metres, one per channel.
+        kernel: complex128, shape [C, P, Q], FFT order.
+        out_grid: Sampling of the result.
+        offset: Where (y, x) in metres the axis of the result lies beside that of the field.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        wavelengths: float | Sequence[float],
+        kernel: Tensor,
+        out_grid: Grid,
+        *,
+        offset: tuple[float, float] = (0.0, 0.0),
+    ):
+        super().__init__()
+        self.grid, self.out_grid, self.wavelengths = grid, out_grid, checks.wavelengths(wavelengths)
+        padded = Grid((kernel.shape[-2], kernel.shape[-1]), grid.pitch)
+        parts = [kernel, *(part for factors in chirps(grid, padded, out_grid, offset) for part in factors)]
+        for i, part in enumerate(parts):
+            self.register_buffer(f"part{i}", torch.view_as_real(part).contiguous(), persistent=False)
+
+    def forward(self, field: Tensor) -> Tensor:
+        """Filter ``field``, complex [..., C, H, W], and read it on the output grid, same dtype."""
+        checks.field("field", field, (len(self.wavelengths), *self.grid.shape))
+        kernel, columns, rows = self._parts_for(field)
+        return zoomed(field, kernel, (columns, rows))
+
+    def adjoint(self, field: Tensor) -> Tensor:
+        """Apply the conjugate transpose to ``field`` [..., C, H', W'] of the output grid."""
+        checks.field("field", field, (len(self.wavelengths), *self.out_grid.shape))
+        kernel, columns, rows = self._parts_for(field)
+        lines = zoom_adjoint(field.transpose(-1, -2), columns).transpose(-1, -2)
+        spectrum = multiplied(zoom_adjoint(lines, rows), kernel.conj())
+        # The adjoint of the unscaled transform: the inverse without its scale.
+        return ifft2(spectrum, self.grid.shape) * math.prod(kernel.shape[-2:])
+
+    def extra_repr(self) -> str:
+        """Samplings and wavelengths, for ``print(module)``."""
+        return f"grid={self.grid}, out_grid={self.out_grid}, wavelengths={self.wavelengths}"
+
+    def _parts_for(self, field: Tensor) -> tuple[Tensor, Chirp, Chirp]:
+        dtype = field.real.dtype
+        parts = [torch.view_as_complex(self.get_buffer(f"part{i}").to(dtype)) for i in range(7)]
+        return parts[0], (parts[1], parts[2], parts[3]), (parts[4], parts[5], parts[6])
+
+    def _apply(self, fn, recurse=True):
+        return super()._apply(lambda tensor: tensor.to(fn(tensor).device), recurse)

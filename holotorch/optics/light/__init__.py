@@ -1,0 +1,1 @@
+"""Light sources: spectra, coherence, and what of them is followed through the optics."""

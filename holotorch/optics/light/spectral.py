@@ -1,0 +1,185 @@
+"""Pictures under a spectrum: few wavelengths are followed through the optics, and their neighbours made from them.
+
+Derivation. Under light of wavelength lambda a fixed hologram H makes at distance z the field U with (Fresnel, without
+its carrier) FT[U](f) = exp(-i pi lambda z f^2) FT[H](f). Wavelength and distance enter by their product alone: another
+wavelength is another depth, and
+
+    FT[U'](f) = exp(-i pi (lambda' - lambda) z f^2) FT[U](f).
+
+The retina shows g, what the pupil passes of U exp(i pi A x^2 / (lambda B)), as
+:mod:`holotorch.optics.viewing.imaging` derives it.
+Taken off and put back, the parabola leaves U as seen through the pupil, and with it the neighbour's picture. Only
+the pupil itself stays that of the wavelength followed: as a stop of directions it would cut off 2 |lambda' - lambda| /
+lambda more, or less, of the light at its rim. That error, and not the speckle, decides how far a neighbour may be: a
+neighbour costs two transforms of the picture, whereas speckle changes every nanometre or so.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+from holotorch.core.complex import intensity
+from holotorch.core.fourier import centred_fft2, centred_ifft2
+from holotorch.core.grid import Grid
+from holotorch.optics.free_space.kernels import turns_phasor
+from holotorch.optics.light.incoherent import incoherent_sum
+from holotorch.optics.light.wavelength_sampling import flawless, followed, least_followed, unseparated
+from holotorch.optics.viewing.display import Display, number
+from holotorch.optics.viewing.elementwise import through_elements
+from holotorch.optics.viewing.eye import Eye
+from holotorch.optics.viewing.imaging import imaged
+
+
+def neighbours(
+    image: Tensor,
+    grid: Grid,
+    wavelength: float,
+    others: Sequence[float],
+    display: Display,
+    eye: Eye,
+    *,
+    elements: bool = False,
+) -> Iterator[Tensor]:
+    """Fields on the retina at wavelengths near the one that was followed there.
+
+    Args:
+        image: What :func:`imaged` or :func:`through_elements` gave for the plane in focus, complex [..., H, W].
+        grid: Its sampling.
+        wavelength: In metres, of ``image``.
+        others: In metres.
+        display: As it was for ``image``.
+        eye: Likewise. Its aberrations and its colour error are those of each wavelength.
+        elements: ``image`` comes from :func:`through_elements`, which keeps the retina's curvature.
+
+    Yields:
+        Complex [..., H, W] for each of ``others``, one in memory at a time. Near the edges light is missing that was
+        outside ``grid``, and at the opposite edges it enters: :func:`spectral_image` takes room for it.
+
+    Raises:
+        ValueError: An eye with aberrations or colour error whose pupil takes more than the band of ``grid``.
+    """
+    wave = checks.wavelengths(wavelength)[0]
+    if unseparated(grid, wave, display, eye):
+        raise ValueError(
+            "the errors of this eye cannot be set anew for another wavelength, since its pupil takes more than the "
+            "band of the grid; follow every wavelength, or use a smaller pupil or a finer grid"
+        )
+    plane = display.focus_plane(eye.accommodation)
+    first, second, _, _ = display.matrix(plane)
+    curvature = first / second + (eye.axial_length / second**2 if elements else 0.0)
+    y, x = grid.coordinates(image.device)
+    fy, fx = ((torch.arange(n, dtype=torch.float64, device=image.device) - n // 2) / (n * p)
+              for n, p in zip(grid.shape, grid.pitch, strict=True))  # fmt: skip
+    fy, fx = fy[:, None], fx[None, :]
+
+    def parabola(values: Tensor, rate, rows: Tensor, columns: Tensor) -> Tensor:
+        rate = torch.as_tensor(rate, dtype=torch.float64, device=values.device)
+        by_row, by_column = turns_phasor(rate * rows.square()), turns_phasor(rate * columns.square())
+        return values * by_row.to(values.dtype) * by_column.to(values.dtype)
+
+    def flawed(values: Tensor, length: float, sign: int) -> Tensor:
+        # On the pupil, where the eye's errors are; at -1 they are taken off again.
+        path = eye.path(fy * (length * second), fx * (length * second), length)
+        return centred_ifft2(centred_fft2(values) * turns_phasor(path * (sign / length)).to(values.dtype))
+
+    rate = first / second / 2
+    if flawless(eye):
+        spectrum = centred_fft2(parabola(image, -curvature / (2 * wave), y, x))
+    else:
+        lit = parabola(image, (rate - curvature / 2) / wave, y, x)
+        spectrum = centred_fft2(parabola(flawed(lit, wave, -1), -rate / wave, y, x))
+    for other in checks.wavelengths(list(others)):
+        field = centred_ifft2(parabola(spectrum, -plane * (other - wave) / 2, fy, fx))
+        yield field if flawless(eye) else flawed(parabola(field, rate / other, y, x), other, 1)
+
+
+def spectral_image(
+    field: Tensor,
+    grid: Grid,
+    places: Sequence[float] | Tensor,
+    weights: Sequence[float] | Tensor,
+    display: Display,
+    eye: Eye,
+    *,
+    count: int | None = None,
+    tolerance: float | None = None,
+    reach: float | None = None,
+    elements: bool = False,
+    paraxial: bool = False,
+    recompute: bool = False,
+) -> Tensor:
+    """Picture of one hologram on the retina under light of many wavelengths, few of which go through the optics.
+
+    Args:
+        field: Of the hologram, complex [..., H, W], the same for all wavelengths.
+        grid: Its sampling.
+        places: Wavelengths [K] in metres, increasing, as ``Spectrum.every`` or ``Spectrum.samples`` gives them.
+        weights: [K], at least 0; a tensor may carry gradients. [S, K] for S spectra at once.
+        display: Where everything stands.
+        eye: Pupil, retina, accommodation; the picture is of the plane in focus.
+        count: How many wavelengths to follow, with equal shares of the power; the others are :func:`neighbours`.
+        tolerance: In place of ``count``: error of the picture that may come of following few
+            (:func:`neighbour_error`), relative to the mean picture.
+        reach: Half width in metres of the scene, for ``tolerance``.
+        elements: Follow by :func:`through_elements` instead of :func:`imaged`.
+        paraxial: As there.
+        recompute: As in :func:`incoherent_sum`, per wavelength followed.
+
+    Returns:
+        Intensity [..., H, W] or [S, ..., H, W], real, referred back to the plane in focus, as ``retinal_image``'s.
+
+    Raises:
+        ValueError: Neither or both of count and tolerance, places that do not increase, impossible weights, or what
+            :func:`neighbours` and the way to the retina raise.
+    """
+    checks.field("field", field, grid.shape)
+    if (count is None) == (tolerance is None):
+        raise ValueError(f"give either count or tolerance, got {count!r} and {tolerance!r}")
+    given = checks.wavelengths(torch.as_tensor(places, dtype=torch.float64).tolist())
+    lengths = torch.tensor(given, dtype=torch.float64)
+    shares = torch.as_tensor(weights, dtype=torch.float64)
+    if shares.ndim not in (1, 2) or len(lengths) != shares.shape[-1] or bool((lengths.diff() <= 0).any()):
+        raise ValueError(
+            f"places must increase, with one weight each, got {len(lengths)} places, weights {tuple(shares.shape)}"
+        )
+    if not bool((shares >= 0).all()) or not 0 < shares.sum() < math.inf:
+        raise ValueError(f"weights must be at least 0, finite and not all 0, got {shares.tolist()}")
+    power = shares.detach().reshape(-1, len(lengths)).sum(0)
+    if tolerance is not None:
+        count = least_followed(lengths, power, tolerance, grid, display, eye, reach=reach)
+    nodes, owners = followed(lengths, power, count or 0)
+    way = through_elements if elements else imaged
+    room = _room(grid, lengths, nodes, owners, display, eye)
+    wide = Grid((grid.shape[0] + 2 * room[0], grid.shape[1] + 2 * room[1]), grid.pitch)
+    padded = torch.nn.functional.pad(field, (room[1], room[1], room[0], room[0]))
+
+    def weighed(image: Tensor, k: int) -> Tensor:
+        weight = shares[..., k].to(image.device, image.real.dtype)
+        return intensity(image) * weight.reshape(*weight.shape, *(1,) * image.ndim)
+
+    def around(node: int) -> Tensor:
+        wave = lengths[nodes[node]].item()
+        image = way(padded[..., None, :, :], wide, [wave], display, eye, paraxial=paraxial)[..., 0, :, :]
+        total = weighed(image, nodes[node])
+        others = [k for k, owner in enumerate(owners) if owner == node and k != nodes[node]]
+        if others:
+            made = neighbours(image, wide, wave, lengths[others].tolist(), display, eye, elements=elements)
+            for k, other in zip(others, made, strict=True):
+                total = total + weighed(other, k)
+        return total
+
+    total = incoherent_sum(around, list(range(len(nodes))), [1.0] * len(nodes), recompute=recompute)
+    return total[..., room[0] : room[0] + grid.shape[0], room[1] : room[1] + grid.shape[1]]
+
+
+def _room(
+    grid: Grid, places: Tensor, nodes: list[int], owners: list[int], display: Display, eye: Eye
+) -> tuple[int, int]:
+    """Samples (y, x) by which the steepest light of the farthest neighbour moves sideways."""
+    away = max(abs((places[k] - places[nodes[owner]]).item()) for k, owner in enumerate(owners))
+    plane = abs(number(display.focus_plane(eye.accommodation)))
+    rooms = [math.ceil(plane * away / (2 * p**2)) if n > 1 else 0 for n, p in zip(grid.shape, grid.pitch, strict=True)]
+    return rooms[0], rooms[1]

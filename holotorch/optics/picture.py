@@ -1,0 +1,88 @@
+"""From intensities at several wavelengths to a picture: linear sRGB, its gamut, equal power, the curve of Eq. 5.16."""
+
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+from holotorch.core.precision import at_least_single
+
+_LUMINANCE = (0.2126390058715103, 0.7151686787677559, 0.0721923153607337)  # of linear sRGB, IEC 61966-2-1
+GAMMA = 0.5  # of Eq. 5.16
+
+
+def linear_srgb(intensity: Tensor, matrix: Tensor) -> Tensor:
+    """One matrix product: linear sRGB [..., 3, H, W] of ``intensity`` [..., K, H, W], with ``matrix`` [3, K].
+
+    ``io.colour_tables.srgb_matrix`` makes the matrix from wavelengths. Differentiable. Pure colours lie outside sRGB
+    and come out with negative components, to be brought in by :func:`desaturated`; nothing is clipped here.
+
+    Raises:
+        ValueError: Shapes that do not match.
+    """
+    checks.real("intensity", intensity)
+    checks.real("matrix", matrix)
+    if intensity.ndim < 3 or tuple(matrix.shape) != (3, intensity.shape[-3]):
+        raise ValueError(
+            f"intensity [..., K, H, W] needs a matrix [3, K], got {tuple(intensity.shape)} and {tuple(matrix.shape)}"
+        )
+    return torch.einsum("ck,...khw->...chw", matrix.to(intensity), intensity)
+
+
+def desaturated(colour: Tensor) -> Tensor:
+    """Bring linear sRGB [..., 3, H, W] into its gamut: mixed with the grey of its own luminance until none is negative.
+
+    The gamut rule of the library. It keeps luminance, and the hue in the chromaticity diagram, where clipping changes
+    both: pure 455 nm would turn 3.2 times as bright. Values above 1 are left for the exposure. Black where the
+    luminance is not positive. Differentiable but on the gamut's border.
+    """
+    checks.real("colour", colour)
+    if colour.ndim < 3 or colour.shape[-3] != 3:
+        raise ValueError(f"colour must be linear red, green, blue, [..., 3, H, W], got {tuple(colour.shape)}")
+    share = colour.new_tensor(_LUMINANCE)[:, None, None]
+    grey = (colour * share).sum(-3, keepdim=True)
+    least = colour.amin(-3, keepdim=True)
+    outside = least < 0
+    mix = torch.where(outside, grey / torch.where(outside, grey - least, 1.0), 1.0)
+    return torch.where(grey > 0, (grey + (colour - grey) * mix).clamp_min(0), 0.0)
+
+
+def equal_power(intensity: Tensor, reference: Tensor) -> Tensor:
+    """Scale each channel of ``intensity`` [..., C, H, W] to the total of the same channel of ``reference``.
+
+    The text below Eq. 5.16: what may enter the eye limits the source, so pictures under different sources compare at
+    equal power. Black channels stay black. ``reference`` may have another H and W on an equal extent: then its mean
+    counts. ValueError for other leading axes.
+    """
+    for name, part in (("intensity", intensity), ("reference", reference)):
+        checks.real(name, part)
+        if part.ndim < 2:
+            raise ValueError(f"{name} must be [..., H, W], got {tuple(part.shape)}")
+    if intensity.shape[:-2] != reference.shape[:-2]:
+        raise ValueError(f"channels must match, got {tuple(intensity.shape)} and {tuple(reference.shape)}")
+    ours, wanted = (at_least_single(part).mean((-2, -1), keepdim=True) for part in (intensity, reference))
+    black = ours == 0
+    return intensity * torch.where(black, 0.0, wanted / torch.where(black, 1.0, ours)).to(intensity.dtype)
+
+
+def exposed(intensity: Tensor, *, peak: Tensor | None = None, gamma: float = GAMMA) -> Tensor:
+    """Picture (intensity / peak)^gamma in 0..1, Eq. 5.16; what exceeds the peak is cut to 1, an empty one is black.
+
+    Args:
+        intensity: [..., C, H, W], not negative; a tiny negative from rounding counts as 0.
+        peak: Intensity that becomes 1, which broadcasts against ``intensity``; to compare sources, that of one of them.
+            By default the largest value of each picture over C, H and W: Eq. 5.16 is printed for one channel, and a
+            peak of its own for each would change the colours.
+        gamma: Exponent, above 0.
+
+    Returns:
+        Same shape and dtype. Differentiable; the gradient where the intensity is 0 is 0, not the curve's infinity.
+    """
+    checks.real("intensity", intensity)
+    if intensity.ndim < 3:
+        raise ValueError(f"intensity must be [..., C, H, W], got {tuple(intensity.shape)}")
+    gamma = checks.positive("gamma", gamma)
+    if peak is None:
+        peak = intensity.amax((-3, -2, -1), keepdim=True)
+    lit = (intensity > 0) & (peak > 0)
+    part = torch.where(lit, intensity, 1.0) / torch.where(peak > 0, peak, 1.0)
+    return torch.where(lit, part.clamp(max=1).pow(gamma), 0.0)

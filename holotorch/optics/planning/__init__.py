@@ -1,0 +1,1 @@
+"""Which way to propagate: the content, the error of each way, and the plan."""

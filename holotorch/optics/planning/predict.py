@@ -1,0 +1,405 @@
+"""What a kernel on a transform of finite length gets wrong, computed on one axis before any field is propagated."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from holotorch.core.fourier import good_length
+from holotorch.optics.free_space.impulse_response import (
+    fresnel_taps,
+    levelling_shift,
+    remainder_kernel,
+    tap_indices,
+    tilted_turns,
+)
+from holotorch.optics.free_space.kernels import turns_phasor
+
+_TONES = 17
+_SLICES = 9  # frequencies of the other axis that stand for all, where its light changes this axis' kernel
+_QUANTILES = (0.02, 0.1, 0.25, 0.4, 0.6, 0.75, 0.9, 0.98)  # of a measured axis' energy, where there are more of them
+_LONGER = 4  # times source and window: a transform whose own wrapping is small beside that of the padding
+_LONGEST = 1 << 18  # samples of such a transform; light that is spread farther is taken as lost
+
+
+@dataclass(frozen=True)
+class AxisContent:
+    """Light of one axis: its band, and how the exact kernel and others treat tones of that band.
+
+    All errors are energies relative to what the exact kernel keeps in the window of the result. They are means over
+    tones exp(2 pi i f x) of the band, cut by the window of the source or faded out over its rim, which is the
+    expectation for noise that fills both; or over measured signals, where there are any.
+
+    Attributes:
+        size: Samples n of the source.
+        pitch: In metres.
+        band: Highest frequency present, in cycles per metre, at most 1 / (2 pitch).
+        wavelength: In metres.
+        distance: In metres, > 0.
+        margin: Width in metres of the rim over which the content fades to nothing at both ends; 0 for a hard edge.
+        out: Samples of the result; ``size`` if 0.
+        shift: Where sample 0 of the result lies beside sample 0 of the source, in samples, seen along the light.
+        tilt: Sines (this axis, the other) of the carrier's direction.
+        measured: Signals [K, size] to take instead of tones: random mixtures of the lines of a field.
+    """
+
+    size: int
+    pitch: float
+    band: float
+    wavelength: float
+    distance: float
+    margin: float = 0.0
+    out: int = 0
+    shift: float = 0.0
+    tilt: tuple[float, float] = (0.0, 0.0)
+    measured: Tensor | None = field(default=None, compare=False)
+    _exact: list[Tensor | None] = field(default_factory=list, init=False, repr=False, compare=False)
+
+    @property
+    def nyquist(self) -> float:
+        """Highest frequency of the grid, 1 / (2 pitch)."""
+        return 0.5 / self.pitch
+
+    @property
+    def window(self) -> int:
+        """Samples of the result."""
+        return self.out or self.size
+
+    @property
+    def bent(self) -> float:
+        """Distance over which untilted light of the same wavelength would get this axis' curvature of phase."""
+        own, other = self.tilt
+        return self.distance * (1 - other**2) / (1 - own**2 - other**2) ** 1.5
+
+    @cached_property
+    def captured(self) -> float:
+        """Share of the energy of the content that stays in the window."""
+        return max(self._energy(self._taps), 1e-300)
+
+    def moment(self, power: int, limit: float = math.inf) -> float:
+        """Mean of min(f, limit)^power over the content, f in cycles per metre.
+
+        Measured content has the window's edges in it, of a band without measurement only :meth:`standing` and
+        :meth:`paraxial` know them.
+        """
+        if self.measured is None:
+            top = min(self.band, limit)
+            return top**power / (power + 1)
+        frequency, weight = self._power
+        frequency = frequency.abs().clamp(max=limit)
+        return ((weight * frequency**power).sum() / weight.sum().clamp(min=1e-300)).item()
+
+    def standing(self) -> float:
+        """Error of leaving the field as it is, what its edges diffract included."""
+        still = (self._shifts == 0).to(torch.complex128)
+        return self._energy(still - self._taps) / self.captured
+
+    def wrapped(self, padded: int) -> float:
+        """Error of a transfer function sampled on ``padded`` points.
+
+        It repeats the kernel every ``padded`` samples; the repetitions among the window's displacements are the error.
+        Where the rays alone say that more than 5 % of the light wraps, that share is returned as it is.
+        """
+        if self.measured is None and not self.shift and self.window == self.size:
+            share = self._wrapped_rays(padded)
+            if share > 0.05:
+                return share
+        frequency = torch.fft.fftfreq(padded, self.pitch, dtype=torch.float64)
+        turns = -self.wavelength * self.bent / 2 * frequency.square() + frequency * self.shift * self.pitch
+        repeated = torch.fft.ifft(turns_phasor(turns))
+        return self._energy(repeated[self._shifts % padded] - self._taps) / self.captured
+
+    def wrapped_slices(self, padded: int, other: "AxisContent", *, limited: bool) -> float:
+        """:meth:`wrapped` with the exact kernel, for light steep enough that the other axis changes it.
+
+        Slices of the transfer function at frequencies of the ``other`` axis stand for all of it. ``limited`` drops the
+        frequencies that :func:`angular_spectrum_kernel` drops on ``padded`` points.
+        """
+        if any(self.tilt) and self._spread(other) > 2 * padded:
+            return 1.0  # as much light wraps as arrives
+        return self._from_exact(self._slices(padded, other, padded * self.pitch if limited else math.inf), other)
+
+    def tilted_taps(self, padded: int, other: "AxisContent", *, paraxial: bool) -> float:
+        """Error of cropped taps about a tilted carrier, which mixes the axes: by slices at frequencies of the other.
+
+        ``paraxial`` leaves out the factor beyond Fresnel.
+        """
+        if paraxial:
+            return self._from_exact(self._taps * self._across(other), other)
+        wavelength, distance, tilt = self._scene
+        shift = levelling_shift((self.nyquist, other.nyquist), wavelength, distance, tilt, 0)
+        return self._from_exact(self._levelled(padded, other, shift.expand(len(other.slices), 1)), other)
+
+    def _from_exact(self, given: Tensor, other: "AxisContent") -> float:
+        """Error of taps [K, n + m - 1] at the slices of the other axis."""
+        exact = self._exact_slices(other)
+        if exact is None:
+            return 1.0
+        weights = other.shares
+        lost, whole = (
+            sum(w * self._energy(each) for w, each in zip(weights, taps, strict=True))
+            for taps in (given - exact, exact)
+        )
+        return lost / max(whole, 1e-300)
+
+    def _exact_slices(self, other: "AxisContent") -> Tensor | None:
+        if not self._exact:
+            self._exact.append(self._long_slices(other))
+        return self._exact[0]
+
+    def _long_slices(self, other: "AxisContent") -> Tensor | None:
+        """Taps [K, n + m - 1] at the slices of the other axis, not wrapped; None where no transform holds them."""
+        padded = _LONGER * (self.size + self.window)
+        if not any(self.tilt):
+            return self._slices(4 * padded, other, math.inf)  # of which some are evanescent, with a singularity
+        padded = good_length(max(padded, 2 * self._spread(other)), odd=True)
+        if padded > _LONGEST:
+            return None
+        # Each slice is levelled exactly: nothing jumps where the band closes upon itself.
+        wavelength, distance, tilt = self._scene
+        ends = torch.tensor((self.nyquist, -self.nyquist), dtype=torch.float64)
+        turns = tilted_turns(ends, other.slices, wavelength, distance, tilt, squares=False)
+        return self._levelled(padded, other, (turns[:, :1] - turns[:, 1:]) / (2 * self.nyquist))
+
+    def _levelled(self, padded: int, other: "AxisContent", shift: Tensor) -> Tensor:
+        """Taps [K, n + m - 1]: Fresnel's, moved by ``shift`` [K, 1] metres, times what is beyond them less that."""
+        index = tap_indices(padded, self.size, self.window)
+        taps = torch.stack([self._fresnel(index + each / self.pitch) for each in shift[:, 0]])
+        factor = self._levelled_factor(padded, other, shift)
+        return torch.fft.ifft(torch.fft.fft(taps) * factor)[:, self._shifts % padded]
+
+    def _levelled_factor(self, padded: int, other: "AxisContent", shift: Tensor) -> Tensor:
+        """What is beyond Fresnel less a shift in metres, at the slices of the other axis: [K, padded]."""
+        wavelength, distance, tilt = self._scene
+        frequency = torch.fft.fftfreq(padded, self.pitch, dtype=torch.float64)
+        turns = tilted_turns(frequency, other.slices, wavelength, distance, tilt, squares=False)
+        return turns_phasor(turns - frequency * shift) * self._across(other)
+
+    def _across(self, other: "AxisContent") -> Tensor:
+        """What the other axis does to its own frequencies [K, 1], the same for all of this one."""
+        own, across = self.tilt
+        bent = self.distance * (1 - own**2) / (1 - own**2 - across**2) ** 1.5
+        return turns_phasor(-self.wavelength * bent / 2 * other.slices.square())
+
+    @property
+    def _scene(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Wavelength, distance, tilt."""
+        wavelength, distance, *tilt = torch.tensor((self.wavelength, self.distance, *self.tilt), dtype=torch.float64)
+        return wavelength, distance, torch.stack(tilt)
+
+    @cached_property
+    def slices(self) -> Tensor:
+        """Frequencies [K, 1] of this axis, in cycles per metre, that stand for its content where it changes the other.
+
+        From end to end of the band; if the content was measured, also where most of its energy is.
+        """
+        even = torch.linspace(-1, 1, _SLICES, dtype=torch.float64) * self.band
+        if self.measured is None:
+            return even[:, None]
+        frequency, energy = self._power
+        order = frequency.argsort()
+        shares = energy[order].cumsum(0) / energy.sum().clamp(min=1e-300)
+        strongest = torch.searchsorted(shares, torch.tensor(_QUANTILES, dtype=torch.float64)).clamp(max=len(order) - 1)
+        return torch.cat([even, frequency[order][strongest]]).unique()[:, None]
+
+    @property
+    def _power(self) -> tuple[Tensor, Tensor]:
+        """Frequencies of measured content and its energy at them.
+
+        Twice the window: on the window alone the field would repeat, and a uniform one would have no edges.
+        """
+        assert self.measured is not None
+        frequency = torch.fft.fftfreq(2 * self.size, self.pitch, dtype=torch.float64)
+        return frequency, torch.fft.fft(self.measured, 2 * self.size).abs().square().sum(0)
+
+    def _spread(self, other: "AxisContent") -> int:
+        """Samples over which a tilted axis spreads the light of one point, what the other axis does to it included."""
+        own, across = (
+            self.wavelength * torch.tensor((-axis.nyquist, 0.0, axis.nyquist), dtype=torch.float64) + sine
+            for axis, sine in zip((self, other), self.tilt, strict=True)
+        )
+        tangents = own[:, None] / torch.sqrt((1 - own[:, None].square() - across.square()).clamp(min=1e-3))
+        places = self.distance * tangents / self.pitch
+        return math.ceil((places.max() - places.min()).item()) + self.size + self.window
+
+    @cached_property
+    def shares(self) -> list[float]:
+        """Shares of the energy of the content that each of :attr:`slices` stands for."""
+        if self.measured is None:
+            parts = torch.ones(_SLICES, dtype=torch.float64)
+            parts[[0, -1]] = 0.5
+        else:
+            frequency, energy = self._power
+            nearest = (frequency[:, None] - self.slices[:, 0]).abs().argmin(1)
+            parts = torch.zeros(len(self.slices), dtype=torch.float64).index_add(0, nearest, energy)
+        return (parts / parts.sum().clamp(min=1e-300)).tolist()
+
+    def _slices(self, padded: int, other: "AxisContent", extent: float) -> Tensor:
+        """Taps [K, n + m - 1] of the exact kernel sampled at ``padded`` frequencies, for slices of the other axis."""
+        wavelength, distance, tilt = self._scene
+        frequency = torch.fft.fftfreq(padded, self.pitch, dtype=torch.float64)
+        moved = frequency * self.shift * self.pitch
+        if any(self.tilt):
+            kernel = turns_phasor(tilted_turns(frequency, other.slices, wavelength, distance, tilt) + moved)
+        else:
+            root = torch.sqrt(1 - (wavelength * frequency).square() - (wavelength * other.slices).square() + 0j)
+            kernel = turns_phasor(distance / wavelength * (root.real - 1) + moved)
+            kernel = kernel * torch.exp(-2 * math.pi * distance / wavelength * root.imag)
+            steep = 2 * distance * wavelength * frequency.abs() > extent * root.abs()
+            kernel = torch.where(steep, 0.0, kernel)
+        return torch.fft.ifft(kernel)[:, self._shifts % padded]
+
+    def _wrapped_rays(self, padded: int) -> float:
+        """Share of the light that travels sideways past the padding but not past the window behind it."""
+        steepest = self.wavelength * self.bent * self.band / self.pitch  # samples
+        room = padded - self.size
+        if steepest <= room:
+            return 0.0
+        farthest = min(steepest, room + self.size)
+        return (farthest - room) ** 2 / (2 * self.size * steepest) + max(0.0, steepest - farthest) / steepest
+
+    def cropped(self, padded: int, cross: float) -> float:
+        """Error of the factor beyond Fresnel on cropped taps, against the same on a much longer transform.
+
+        ``cross`` is the frequency on the other axis, in cycles per metre, which takes part in that factor.
+        """
+        if self._moved > padded / 4:
+            return self._rim()
+        far = self._beyond_fresnel(good_length(2 * (self.size + self.window)), cross)
+        return self._energy(self._beyond_fresnel(padded, cross) - far) / self.captured
+
+    def resampled(self, padded: int, cross: float) -> float:
+        """Error of the factor beyond Fresnel applied first, on ``padded`` samples around the window.
+
+        ``cross`` as in :meth:`cropped`.
+        """
+        if self._moved > padded / 4:
+            return self._rim()
+        given = self._filtered_first(self._remainder(padded, cross), self._fresnel)
+        far = self._beyond_fresnel(good_length(max(2 * (self.size + self.window), 4 * padded)), cross)
+        return ((given - self._arriving(far)).abs().square().sum() / self.size).item() / self.captured
+
+    def resampled_slices(self, padded: int, other: "AxisContent") -> float:
+        """:meth:`resampled` about a tilted carrier, as in :meth:`tilted_taps`."""
+        exact = self._exact_slices(other)
+        if exact is None:
+            return 1.0
+        wavelength, distance, tilt = self._scene
+        shift = levelling_shift((self.nyquist, other.nyquist), wavelength, distance, tilt, 0)
+        lost = whole = 0.0
+        for factor, taps, weight in zip(self._levelled_factor(padded, other, shift), exact, other.shares, strict=True):
+            given = self._filtered_first(factor, lambda index: self._fresnel(index + shift / self.pitch))
+            wanted = self._arriving(taps)
+            lost += weight * (given - wanted).abs().square().sum().item()
+            whole += weight * wanted.abs().square().sum().item()
+        return lost / max(whole, 1e-300)
+
+    def _filtered_first(self, factor: Tensor, taps: Callable[[Tensor], Tensor]) -> Tensor:
+        """The content times ``factor`` [P], its middle P samples convolved with the ``taps`` at given places."""
+        padded = len(factor)
+        rim = (padded - self.size) // 2
+        kept = self.size + 2 * rim
+        near = torch.fft.ifft(torch.fft.fft(self._signals, padded) * factor)
+        near = near[:, torch.arange(-rim, self.size + rim) % padded]
+        weights = taps(torch.arange(-(self.size + rim - 1), self.window + rim))
+        length = good_length(kept + len(weights) - 1)
+        given = torch.fft.ifft(torch.fft.fft(near, length) * torch.fft.fft(weights, length))
+        return given[:, kept - 1 : kept - 1 + self.window]
+
+    def paraxial(self) -> float:
+        """Error of leaving out the factor beyond Fresnel, for light that travels along this axis only."""
+        if self._moved > (self.size + self.window) / 4:
+            return self._rim()
+        exact = self._beyond_fresnel(good_length((3 * self.size + 3 * self.window) // 2), 0.0)
+        return self._energy(exact - self._taps) / self.captured
+
+    @property
+    def _moved(self) -> float:
+        """Samples by which the factor beyond Fresnel moves the steepest light of the grid: z s^3 / 2."""
+        return self.distance * (self.wavelength * self.nyquist) ** 3 / (2 * self.pitch)
+
+    def _rim(self) -> float:
+        """Energy of the kernel's part that comes from the ends of the band, where its phase is not to be trusted.
+
+        So far away the steepest light has long left the window; what remains of it are the two terms
+        f(u) ~ 1 / (pi u) of the taps beside the point source's 1 / sqrt(2), in random phase.
+        """
+        product = self.wavelength * self.bent
+        farthest = max(self.window - 1 + self.shift, self.size - 1 - self.shift, 0) * self.pitch
+        u = math.sqrt(2 * product) * (self.nyquist - farthest / product)
+        return min(1.0, 2 * 2 * 2 / (math.pi * u) ** 2) if u > 1 else 1.0
+
+    @cached_property
+    def _shifts(self) -> Tensor:
+        return torch.arange(-(self.size - 1), self.window)
+
+    @cached_property
+    def _taps(self) -> Tensor:
+        return self._fresnel(self._shifts)
+
+    def _fresnel(self, index: Tensor) -> Tensor:
+        wavelength, bent = (torch.tensor(value, dtype=torch.float64) for value in (self.wavelength, self.bent))
+        return fresnel_taps(index.to(torch.float64) + self.shift, self.pitch, wavelength, bent)
+
+    def _beyond_fresnel(self, padded: int, cross: float) -> Tensor:
+        taps = self._fresnel(tap_indices(padded, self.size, self.window))
+        return torch.fft.ifft(torch.fft.fft(taps) * self._remainder(padded, cross))[self._shifts % padded]
+
+    def _remainder(self, padded: int, cross: float) -> Tensor:
+        """Factor beyond Fresnel [padded] at the frequency ``cross`` of the other axis."""
+        frequency = torch.fft.fftfreq(padded, self.pitch, dtype=torch.float64)
+        wavelength, distance, other = (
+            torch.tensor(value, dtype=torch.float64) for value in (self.wavelength, self.distance, cross)
+        )
+        return remainder_kernel(other, frequency, wavelength, distance)
+
+    @cached_property
+    def _signals(self) -> Tensor:
+        """The content [K, size]."""
+        if self.measured is not None:
+            return self.measured
+        n = torch.arange(self.size, dtype=torch.float64)
+        frequencies = torch.linspace(-1, 1, _TONES, dtype=torch.float64) * self.band * self.pitch
+        tones = self._fade(n) * turns_phasor(frequencies[:, None] * n)
+        tones[[0, -1]] *= math.sqrt(0.5)  # trapezoidal rule over the band
+        return tones / math.sqrt(_TONES - 1)
+
+    @cached_property
+    def _tones(self) -> Tensor:
+        """Spectra of the content, long enough for the samples of the result to be free of wrapping."""
+        return torch.fft.fft(self._signals, good_length(self.size + self.window - 1))
+
+    def _fade(self, n: Tensor) -> Tensor:
+        """1 inside, infinitely smooth to 0 over the margin at both ends."""
+        if self.margin == 0:
+            return torch.ones_like(n)
+        place = (torch.minimum(n, self.size - 1 - n) + 0.5) * self.pitch / self.margin
+        t = place.clamp(2e-3, 1 - 2e-3)
+        return torch.where(place < 1, 1 / (1 + torch.exp(1 / t - 1 / (1 - t))), 1.0)
+
+    def _energy(self, taps: Tensor) -> float:
+        """Energy per sample of the source that a convolution with ``taps`` [n + m - 1] gives of the content."""
+        return (self._arriving(taps).abs().square().sum() / self.size).item()
+
+    def _arriving(self, taps: Tensor) -> Tensor:
+        """The content convolved with ``taps`` [n + m - 1], in the window of the result."""
+        spectrum = self._tones * torch.fft.fft(taps, self._tones.shape[-1])
+        return torch.fft.ifft(spectrum)[:, self.size - 1 : self.size - 1 + self.window]
+
+
+def rms_beyond_fresnel(axes: list[AxisContent]) -> float:
+    """Rms over the content of the phase that Fresnel leaves out, pi z s^4 / (4 lambda), for light that lands inside.
+
+    Both axes together, but without what hard edges put beyond the band; :meth:`AxisContent.paraxial` has that.
+    """
+    moments = []
+    for axis in axes:
+        reach = (abs(axis.shift) + (axis.size + axis.window) / 2) * axis.pitch
+        limit = reach / math.hypot(reach, axis.distance) / axis.wavelength
+        moments.append([axis.moment(power, limit) * axis.wavelength**power for power in (8, 6, 4, 2)])
+    (y8, y6, y4, y2), (x8, x6, x4, x2) = moments
+    mean_s8 = y8 + x8 + 4 * (y6 * x2 + y2 * x6) + 6 * y4 * x4
+    return min(math.pi * axes[0].distance / (4 * axes[0].wavelength) * math.sqrt(mean_s8), 2.0)

@@ -1,0 +1,301 @@
+"""propagate and Propagator: the planned way, which picks method and padding and says why."""
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from holotorch.core import checks
+from holotorch.core.checks import SamplingWarning
+from holotorch.core.fourier import fft2, ifft2, multiplied
+from holotorch.core.grid import Grid
+from holotorch.core.plan import Plan
+from holotorch.core.quantities import DISTANCE, WAVELENGTH
+from holotorch.optics.free_space.kernels import carrier
+from holotorch.optics.free_space.padding import FINEST
+from holotorch.optics.free_space.passage import Passage, passage
+from holotorch.optics.free_space.propagators import SpectralFilter
+from holotorch.optics.free_space.resampled import ResampledKernel, resample, resampling_factors
+from holotorch.optics.free_space.transfer import transfer_function, wide_transfer_function
+from holotorch.optics.free_space.zoomed import ZoomedFilter, chirps, zoomed
+from holotorch.optics.planning.candidates import Candidate
+from holotorch.optics.planning.plan import choose, find, plan_from
+
+_ZOOMED = "angular spectrum, zoomed"
+_UNUSABLE = 0.1  # expected error from which a result is refused
+_DIM = 1e-5  # share of the light below which both axes together decide what lands, which measured lines do not tell
+_DIMMER = 5.0  # times the tolerance: the error of what is left of the light from which a dim result is warned of
+
+
+def propagate(
+    field: Tensor,
+    grid: Grid,
+    wavelength: float | Tensor,
+    distance: float | Tensor,
+    *,
+    tolerance: float = 1e-3,
+    band: tuple[float, float] | None = None,
+    spread: tuple[float, float] | None = None,
+    margin: tuple[float, float] = (0.0, 0.0),
+    measure: bool = False,
+    out_grid: Grid | None = None,
+    offset: tuple[float, float] = (0.0, 0.0),
+    tilt: tuple[float, float] | Tensor = (0.0, 0.0),
+) -> Tensor:
+    """Propagate ``field`` over ``distance`` by the cheapest way that is accurate enough.
+
+    Args:
+        field: complex64 or complex128, shape [..., H, W].
+        grid: Its sampling.
+        wavelength: In metres: a number, or a tensor whose shape broadcasts against the leading axes of ``field``. In a
+            medium, the wavelength there: the one in vacuum divided by the refractive index.
+        distance: In metres, likewise; both may carry gradients. Many distances share one forward transform: give the
+            field an axis of size 1 where the distances have theirs.
+        tolerance: Largest relative L2 error, in expectation over noise that fills ``band`` and the window.
+        band: Highest frequencies (y, x) of the content, in cycles per metre; the grid's own by default.
+        spread: The same said as how far (y, x) in metres the content travels sideways over the distance.
+        margin: Widths (y, x) in metres over which the content fades smoothly to nothing at the ends of each axis.
+        measure: Plan for this very field instead of a description, at the cost of two thin matrix products.
+        out_grid: Sampling of the result, of any shape and pitch; that of the field by default.
+        offset: Where (y, x) in metres the axis of the result lies beside that of the field.
+        tilt: Sines (y, x) of the direction of a carrier that is taken out: the light is
+            ``field`` exp(2 pi i (y s_y + x s_x) / wavelength), and the result times the same carrier is the light that
+            arrives, with y and x counted from the axis of the source in both. May be a tensor [2] with gradients.
+
+    Returns:
+        Same dtype, shape [..., H', W'] broadcast with the leading axes. The carrier exp(ikz) is included; evanescent
+        waves decay for either sign of the distance.
+
+    Raises:
+        TypeError: A field that is not complex.
+        ValueError: Wrong shape, NaN or infinity anywhere, a wavelength that is not positive, or no way whose expected
+            error is below 0.1.
+
+    Warns:
+        SamplingWarning: No way meets the tolerance; the most accurate one is used and its expected error named. Or so
+            little of the light lands in the window of the result that the error is large beside it. The second is not
+            looked for while compiling, and :class:`Propagator`, which sees no result, does not warn of it.
+        PrecisionWarning: A wavelength or distance in float32, whose rounding turns the phase by 0.01 rad or more.
+
+    A gradient in the pitch, say a factor s on it and on the output's: nothing changes when all lengths are scaled, so
+    ``propagate(field, grid, wavelength / s, distance / s)`` is the field on a grid of s times the pitch.
+    """
+    checks.field("field", field, grid.shape)
+    sent = None if torch.compiler.is_compiling() else _finite_norms(field)
+    waves, distances = _float64("wavelength", wavelength, field), _float64("distance", distance, field)
+    checks.precise(wavelength, distance)
+    listed = [values.detach().reshape(-1).tolist() for values in (waves, distances)]
+    path = passage(grid, out_grid, offset, tilt, listed[0])
+    slanted = tilt.to(field.device, torch.float64) if isinstance(tilt, Tensor) else None
+    sample = field if measure else None
+    found = find(path, *listed, band=band, spread=spread, margin=margin, field=sample, dtype=field.dtype)
+    way = _best(found, checks.positive("tolerance", tolerance))
+    if way.method == "identity":
+        return field * carrier(waves, distances)[..., None, None].to(field.dtype)
+    if not path.same_pitch:
+        if bool((distances == 0).any()):
+            raise ValueError("distance must not be 0 for a propagation onto another grid")
+
+        def elsewhere(each: Tensor, wave: Tensor, far: Tensor) -> Tensor:
+            if way.method == _ZOOMED:
+                padded = Grid(way.padded, grid.pitch)
+                kernel = kernel_of(_read_along(path), way, wave, far, field.dtype, slanted)
+                return zoomed(each, kernel, chirps(grid, padded, path.out, path.offset, field.device))
+            room = None if way.paraxial else way.padded
+            factors = resampling_factors(path, wave, far, padded=room, tilt=slanted, dtype=field.dtype)
+            return resample(each, factors)
+
+        result = _one_by_one(field, waves, distances, path.out.shape, elsewhere)
+        _judge_light(way, tolerance, path, sent, result, measured=measure)
+        return result
+
+    def filtered(each: Tensor, wave: Tensor, far: Tensor) -> Tensor:
+        kernel = kernel_of(path, way, wave, far, field.dtype, slanted)
+        # The spectrum serves several distances; only when there is one may its memory be taken.
+        product = multiplied(each, kernel) if waves.numel() * distances.numel() == 1 else each * kernel
+        return ifft2(product, path.out.shape)
+
+    result = _one_by_one(fft2(field, way.padded), waves, distances, path.out.shape, filtered)
+    _judge_light(way, tolerance, path, sent, result, measured=measure)
+    return result
+
+
+def _one_by_one(
+    field: Tensor,
+    waves: Tensor,
+    distances: Tensor,
+    shape: tuple[int, int],
+    apply: Callable[[Tensor, Tensor, Tensor], Tensor],
+) -> Tensor:
+    """``apply`` for each wavelength and distance: all kernels together would not fit into the cache, nor memory."""
+    waves, distances = torch.broadcast_tensors(waves, distances)
+    batch = torch.broadcast_shapes(waves.shape, field.shape[:-2])
+    if waves.numel() == 1:
+        return apply(field, waves.reshape(()), distances.reshape(())).expand(*batch, *shape)
+    fields = field.expand(*batch, *field.shape[-2:])
+    fields = fields.flatten(fields.ndim - 2 - waves.ndim, -3)
+    pairs = zip(waves.reshape(-1), distances.reshape(-1), strict=True)
+    parts = [apply(fields[..., i, :, :], wave, far) for i, (wave, far) in enumerate(pairs)]
+    return torch.stack(parts, -3).reshape(*batch, *shape)
+
+
+class Propagator(nn.Module):
+    """The planned propagation as a module: plans once and keeps the one kernel that it needs.
+
+    Args:
+        grid: Sampling of the field.
+        wavelengths: In metres, one per channel.
+        distance: In metres, negative to travel back.
+        tolerance: Largest relative L2 error, in expectation over noise that fills ``band`` and the window.
+        band: Highest frequencies (y, x) of the content, in cycles per metre; the grid's own by default.
+        spread: The same said as how far (y, x) in metres the content travels sideways over the distance.
+        margin: Widths (y, x) in metres over which the content fades smoothly to nothing at the ends of each axis.
+        example: A field [..., H, W] like those to come, to measure instead of a description.
+        out_grid: Sampling of the result; that of the field by default.
+        offset: Where (y, x) in metres the axis of the result lies beside that of the field.
+        tilt: Sines (y, x) of the direction of a carrier that is taken out, as in :func:`propagate`.
+        memory_limit: Refuse a plan that needs more bytes than this per channel.
+
+    Attributes:
+        plan: What was chosen and why.
+
+    Raises and warns as ``propagate``.
+    """
+
+    plan: Plan
+
+    def __init__(
+        self,
+        grid: Grid,
+        wavelengths: float | Sequence[float],
+        distance: float,
+        *,
+        tolerance: float = 1e-3,
+        band: tuple[float, float] | None = None,
+        spread: tuple[float, float] | None = None,
+        margin: tuple[float, float] = (0.0, 0.0),
+        example: Tensor | None = None,
+        out_grid: Grid | None = None,
+        offset: tuple[float, float] = (0.0, 0.0),
+        tilt: tuple[float, float] = (0.0, 0.0),
+        memory_limit: int | None = None,
+    ):
+        super().__init__()
+        self.wavelengths = checks.wavelengths(wavelengths)
+        self.distance = checks.quantity(DISTANCE, distance)
+        path = passage(grid, out_grid, offset, tilt, self.wavelengths)
+        self.grid, self.out_grid, self.offset, self.tilt = grid, path.out, path.offset, path.tilt
+        content: dict[str, Any] = {"band": band, "spread": spread, "margin": margin, "field": example}
+        found = find(path, self.wavelengths, [self.distance], **content)
+        self.plan = plan_from(found, path, tolerance, memory_limit)
+        way = _best(found, tolerance)
+        if not path.same_pitch and way.method != _ZOOMED:
+            self.operator = ResampledKernel(
+                grid, self.wavelengths, self.distance, path.out,
+                offset=offset, tilt=tilt, paraxial=way.paraxial, padded=way.padded,
+            )  # fmt: skip
+            return
+        waves, far = (torch.tensor(value, dtype=torch.float64) for value in (self.wavelengths, self.distance))
+        if path.same_pitch:
+            kernel = kernel_of(path, way, waves, far, torch.complex128)
+            self.operator = SpectralFilter(grid, self.wavelengths, kernel, out_grid=path.out)
+        else:
+            kernel = kernel_of(_read_along(path), way, waves, far, torch.complex128)
+            self.operator = ZoomedFilter(grid, self.wavelengths, kernel, path.out, offset=path.offset)
+
+    def forward(self, field: Tensor) -> Tensor:
+        """Propagate ``field``, complex [..., C, H, W], to [..., C, H', W'], same dtype."""
+        return self.operator(field)
+
+    def adjoint(self, field: Tensor) -> Tensor:
+        """Apply the conjugate transpose to ``field`` [..., C, H', W'] of the output grid."""
+        return self.operator.adjoint(field)
+
+    def extra_repr(self) -> str:
+        """Distance and plan, for ``print(module)``."""
+        return f"distance={self.distance}, method={self.plan.method!r}, padded={self.plan.padded}"
+
+
+def _best(found: list[Candidate], tolerance: float) -> Candidate:
+    best, _ = choose(found, tolerance)
+    if best.error > tolerance:
+        text = (
+            f"no way reaches a tolerance of {tolerance:.1e} for noise that fills the described band and window; "
+            f"{best.method} on {best.padded[0]} x {best.padded[1]} samples comes to {best.error:.1e}. Describe the "
+            "content by band= and margin=, or ask for less"
+        )
+        if best.error > _UNUSABLE:
+            raise ValueError(text)
+        warnings.warn(text, SamplingWarning, stacklevel=3)
+    return best
+
+
+def _norms(field: Tensor) -> Tensor:
+    return torch.linalg.vector_norm(torch.view_as_real(field.detach().resolve_conj()), dim=(-3, -2, -1))
+
+
+def _finite_norms(field: Tensor) -> Tensor:
+    """L2 norms [...] of ``field``; ValueError for elements that are not finite."""
+    norms = _norms(field)
+    if not bool(torch.isfinite(norms).all()):  # or squares that overflow
+        checks.all_finite("field", torch.view_as_real(field.detach().resolve_conj()))
+    return norms
+
+
+def _judge_light(
+    way: Candidate, tolerance: float, path: Passage, sent: Tensor | None, result: Tensor, *, measured: bool
+) -> None:
+    """Warn where so much less light arrives than was expected that the error of the plan is large beside it."""
+    if sent is None or 0 in result.shape or way.error > tolerance:  # of which _best has warned
+        return
+    cells = math.prod(path.out.pitch) / math.prod(path.grid.pitch)
+    shares = torch.where(sent > 0, (_norms(result) / sent).square() * cells, 1.0)
+    dimmest = float(torch.where(torch.isfinite(shares), shares, 1.0).min())
+    allowed = _DIMMER * tolerance
+    # All light is the most that can be expected: most calls end here, without asking what is.
+    if way.error <= allowed * math.sqrt(dimmest):
+        return
+    expected = 1.0 if measured and dimmest < _DIM else way.captured()
+    left = way.error * math.sqrt(expected / max(dimmest, 1e-300))
+    if left > allowed:
+        warnings.warn(
+            f"only {dimmest:.2g} of the light lands in the window of the result, and the error of {way.method} may be "
+            f"{left:.1e} of what lands, more than the tolerance of {tolerance:.1e}. Move the window to the light, or "
+            f"ask for a tolerance below {tolerance * allowed / left:.1e}",
+            SamplingWarning,
+            stacklevel=3,
+        )
+
+
+def _read_along(path: Passage) -> Passage:
+    """The same light on the source's samples: where it is read elsewhere is left to the reading."""
+    return Passage(path.grid, path.grid, (0.0, 0.0), path.tilt)
+
+
+def kernel_of(
+    path: Passage, way: Candidate, waves: Tensor, distances: Tensor, dtype: torch.dtype, tilt: Tensor | None = None
+) -> Tensor:
+    """Transfer function of a chosen way, carrier included: [..., H, W] of its padded grid, in ``dtype``."""
+    grid = path.grid
+    padded = Grid(way.padded, grid.pitch)
+    sampled = way.method in ("angular spectrum", _ZOOMED)
+    if sampled and not any(path.tilt) and min(grid.pitch) < FINEST * waves.detach().max().item():
+        return wide_transfer_function(path, padded, waves, distances, dtype=dtype)
+    if way.method == "identity":
+        ones = torch.ones(*torch.broadcast_shapes(waves.shape, distances.shape), *grid.shape, dtype=dtype)
+        return ones * carrier(waves, distances)[..., None, None].to(dtype)
+    return transfer_function(
+        path, padded, waves, distances, sampled=way.sampled, paraxial=way.paraxial, tilt=tilt, dtype=dtype
+    )
+
+
+def _float64(name: str, value: float | Tensor, field: Tensor) -> Tensor:
+    kind = WAVELENGTH if name == "wavelength" else DISTANCE
+    if not isinstance(value, Tensor):
+        value = torch.tensor(checks.quantity(kind, value), dtype=torch.float64)
+    value = value.to(field.device, torch.float64)
+    checks.quantities(kind, value)
+    return value

@@ -1,0 +1,1 @@
+"""A display and the eye that looks through it, to the retina."""

@@ -1,0 +1,155 @@
+"""Eye: pupil, lens and retina, with the aberrations and the colour error that human eyes have."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+from holotorch.core.grid import Grid
+from holotorch.core.quantities import ACCOMMODATION, EYE_LENGTH, PUPIL_RADIUS, SOFTNESS, WAVEFRONT_ERROR
+from holotorch.optics.elements.lens import Transmission, affordable, lens_phase, opening, warn_if_coarse
+from holotorch.optics.free_space.kernels import turns_phasor
+from holotorch.optics.viewing.display import Length, inverse, number
+
+_HIGHEST = 27  # OSA index, sixth order
+
+
+@dataclass(frozen=True)
+class Eye:
+    """Reduced eye: one thin lens with the pupil in its plane, in air, and a retina (thesis Sec. 5.5.2).
+
+    Lengths in metres; pupil radius, axial length and accommodation may be tensors that carry a gradient.
+
+    Attributes:
+        pupil_radius: Of the iris; 1 to 4 mm, 1.5 mm in normal light.
+        axial_length: d_r from the lens to the retina; 24 mm in the thesis.
+        accommodation: Distance s in front of the lens that is in focus, above 0, infinite for the relaxed eye:
+            1 / f_eye = 1 / s + 1 / d_r.
+        aberrations: Wavefront error over the pupil: OSA/ANSI single index j of normalised Zernike polynomials to
+            coefficient in metres, positive where the light is delayed (longer path). Index 4 is defocus; a coefficient
+            c of it acts as a lens of power -4 sqrt(3) c / pupil_radius^2.
+        chromatic_reference: Wavelength in metres that is in focus at ``accommodation``, where others are off by
+            :func:`chromatic_refraction`; None for an eye without colour error.
+        softness: Width in metres of the pupil's edge, 0 for a hard one. A gradient in the radius needs a soft edge.
+
+    Raises:
+        ValueError: A length that cannot be meant, such as one in millimetres, or an unknown Zernike index.
+    """
+
+    pupil_radius: Length = 1.5e-3
+    axial_length: Length = 24e-3
+    accommodation: Length = math.inf
+    aberrations: Mapping[int, float] = field(default_factory=dict)
+    chromatic_reference: float | None = None
+    softness: float = 0.0
+
+    def __post_init__(self):
+        checks.quantity(PUPIL_RADIUS, number(self.pupil_radius))
+        checks.quantity(EYE_LENGTH, number(self.axial_length))
+        checks.quantity(ACCOMMODATION, number(self.accommodation))
+        for index, coefficient in self.aberrations.items():
+            if not 0 <= checks.whole("Zernike index", index, 0) <= _HIGHEST:
+                raise ValueError(f"Zernike index must be an OSA index of 0 .. {_HIGHEST}, got {index}")
+            checks.quantity(WAVEFRONT_ERROR, coefficient, f"Zernike coefficient {index}")
+        if self.chromatic_reference is not None:
+            chromatic_refraction(self.chromatic_reference)
+        checks.quantity(SOFTNESS, self.softness)
+
+    @property
+    def focal_length(self) -> Length:
+        """f_eye in metres at ``accommodation``, for the reference wavelength."""
+        return 1 / (inverse(self.accommodation) + inverse(self.axial_length))
+
+    def pupil_function(self, y: Tensor, x: Tensor, wavelength: Length) -> Tensor:
+        """What the pupil does beside the ideal lens: amplitude, aberrations and colour error.
+
+        Args:
+            y: Positions in metres on the pupil's plane, float64, broadcasting with ``x``.
+            x: Likewise.
+            wavelength: In metres.
+
+        Returns:
+            complex128 of the broadcast shape.
+        """
+        square = y.square() + x.square()
+        radius = torch.as_tensor(self.pupil_radius, dtype=torch.float64, device=square.device)
+        return opening(square, radius, self.softness) * turns_phasor(self.path(y, x, wavelength) / wavelength)
+
+    def path(self, y: Tensor, x: Tensor, wavelength: Length) -> Tensor:
+        """Path in metres by which aberrations and colour error lengthen the ideal lens, arguments as above, float64."""
+        square = y.square() + x.square()
+        radius = torch.as_tensor(self.pupil_radius, dtype=torch.float64, device=square.device)
+        path = torch.zeros_like(square)
+        for index, coefficient in self.aberrations.items():
+            path = path + coefficient * zernike(index, y / radius, x / radius)
+        if self.chromatic_reference is not None:
+            # A myopic refraction (below zero) is power in excess, and a path shorter towards the rim by P r^2 / 2.
+            excess = chromatic_refraction(self.chromatic_reference) - chromatic_refraction(wavelength)
+            path = path - excess * square / 2
+        return path
+
+
+class EyeLens(Transmission):
+    """Lens of an :class:`Eye` with its pupil and errors, as an element of an ``OpticalPath``.
+
+    Raises:
+        MemoryError: The grid has more samples than memory is available for.
+
+    Warns:
+        SamplingWarning: As :class:`Lens`, within the pupil.
+    """
+
+    def __init__(self, grid: Grid, wavelengths: float | Sequence[float], eye: Eye):
+        waves = checks.wavelengths(wavelengths)
+        affordable("the lens of an eye", grid, len(waves))
+        y, x = grid.coordinates()
+        length = number(eye.focal_length)
+        values = [
+            turns_phasor(lens_phase(grid, wave, length) / (2 * math.pi)) * eye.pupil_function(y, x, wave).detach()
+            for wave in waves
+        ]
+        super().__init__(grid, waves, torch.stack(values))
+        warn_if_coarse(grid, waves, [length] * len(waves), number(eye.pupil_radius))
+
+
+def chromatic_refraction(wavelength: Length) -> Length:
+    """Refractive error of the human eye in dioptres at a wavelength in metres, 0 near 590 nm and -1.7 at 400 nm.
+
+    1.68524 - 0.63346 / (wavelength in um - 0.21410): Thibos, Ye, Zhang and Bradley (1992), "The chromatic eye: a new
+    reduced-eye model of ocular chromatic aberration in humans", Appl. Opt. 31, 3594. Negative is myopic: the eye is
+    too strong for blue, and what is sharp in blue lies nearer.
+
+    Raises:
+        ValueError: Outside 380 .. 900 nm, beyond which the fit says nothing.
+    """
+    if not 380e-9 <= number(wavelength) <= 900e-9:
+        raise ValueError(f"the eye's colour error is known within 380 .. 900 nm, got {number(wavelength):g} m")
+    return 1.68524 - 0.63346 / (wavelength * 1e6 - 0.21410)
+
+
+def zernike(index: int, y: Tensor, x: Tensor) -> Tensor:
+    """Normalised Zernike polynomial of OSA/ANSI single index j at (y, x) in units of the pupil radius, any shape.
+
+    Mean square 1 over the disc, orthogonal; angle counted from +x towards +y. j = (n (n + 2) + m) / 2.
+    Raises TypeError for an index that is no whole number and ValueError for one below 0. Source: ANSI Z80.28.
+    """
+    checks.whole("Zernike index", index, 0)
+    order = math.ceil((-3 + math.sqrt(9 + 8 * index)) / 2)
+    signed = 2 * index - order * (order + 2)
+    m = abs(signed)
+    square = y.square() + x.square()
+    radial = torch.zeros_like(square)
+    for k in range((order - m) // 2 + 1):
+        ways = math.factorial(order - k) / math.factorial(k)
+        ways /= math.factorial((order + m) // 2 - k) * math.factorial((order - m) // 2 - k)
+        radial = radial + (-1) ** k * ways * square ** ((order - m) // 2 - k)
+    # r^m cos(m t) and r^m sin(m t), polynomials in y and x: no angle is needed at the centre.
+    real, imaginary = torch.ones_like(square), torch.zeros_like(square)
+    for _ in range(m):
+        real, imaginary = real * x - imaginary * y, real * y + imaginary * x
+    if m == 0:
+        return math.sqrt(order + 1) * radial
+    return math.sqrt(2 * (order + 1)) * radial * (imaginary if signed < 0 else real)

@@ -1,0 +1,1 @@
+"""The camera: model, calibration, tone curve."""

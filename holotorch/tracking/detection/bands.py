@@ -1,0 +1,229 @@
+"""Which stretch of a line shows which band: the line found among labels, the bands by the best order of stretches."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from holotorch.tracking.detection.colours import ColourTable
+
+_SIDE = 6  # pixels beside an edge whose colours must be right,
+_MIXED, _MOVED = 2, 11  # but for these next to it; and where the tube moved along itself meanwhile
+_RIGHT = 0.55  # share of them
+_VOTERS = 300  # of coloured pixels, that choose among lines; all of them say where the chosen one lies
+
+
+@dataclass(frozen=True, eq=False)
+class Stretches:
+    """Bands along a line.
+
+    Attributes:
+        edges: Where each edge lies along the line in pixels, [N]; NaN where it is not seen.
+        shown: For each band, pixels of its colour.
+        whole: For each band, its length on the line.
+        doubtful: For each edge, whether what lies beyond it may be something in front of the tube, by its colours.
+        flipped: Whether the tip lies towards larger t.
+    """
+
+    edges: np.ndarray
+    shown: tuple[float, ...]
+    whole: tuple[float, ...]
+    doubtful: tuple[bool, ...]
+    flipped: bool
+
+    @property
+    def known(self) -> int:
+        """Edges that are seen."""
+        return int(np.isfinite(self.edges).sum())
+
+
+def find_axis(labels: np.ndarray, t: np.ndarray, u: np.ndarray, reach: float) -> tuple[float, float] | None:
+    """Offset and slope (u = offset + slope t) of the coloured thin thing in labels [T, U], or None.
+
+    ``t`` [T] and ``u`` [U] are places along and across in pixels, evenly spaced, t about 0; slopes to ``reach`` per
+    pixel. The most coloured of a fan of lines, then weighted least squares among what lies on it.
+    """
+    along, across = np.divmod(np.flatnonzero(labels), labels.shape[1])
+    if len(along) and int(np.bincount(along).max()) >= 0.6 * len(u):  # rows of one colour are not thin
+        each = labels == np.arange(1, int(labels.max()) + 1)[:, None, None]
+        along, across = (each & (each.mean(-1, keepdims=True) < 0.6)).any(0).nonzero()
+    least = 20 / float((t[1] - t[0]) * (u[1] - u[0]))
+    if len(along) < least:
+        return None
+    place, offset, end = t[along], u[across], float(t[-1])
+    most = min(40, max(1, int(reach * 2 * end / 3)))
+    slopes = np.arange(-most, most + 1) * (reach / most)
+    low = float(u[0]) - reach * end - 4
+    bins = int(2 * (float(u[-1]) - low)) + 8
+    some = slice(None, None, -(-len(along) // _VOTERS))
+    at = (offset[some] + (0.5 - low) - slopes[:, None] * place[some]).astype(np.intp)
+    at += bins * np.arange(len(slopes))[:, None]
+    counts = np.bincount(at.ravel(), minlength=bins * len(slopes)).reshape(len(slopes), bins)
+    sums = counts.cumsum(-1)  # of five neighbours is the difference of two
+    best = int((sums[:, 5:] - sums[:, :-5]).argmax())
+    slope, value = float(slopes[best // (bins - 5)]), best % (bins - 5) + 3 + low
+    moments = np.empty((5, len(place)))
+    moments[0], moments[1], moments[2] = 1.0, place, offset
+    np.multiply(moments[1:3], place, out=moments[3:])
+    for width in (6.0, 4.0, 3.0, 3.0):
+        away = (offset - value - slope * place) / width
+        weight = np.maximum(1 - away * away, 0)
+        total, mt, mu, tt, tu = (moments @ (weight * weight)).tolist()
+        spread = tt - mt * mt / max(total, 1e-9)
+        if total < least / 4 or spread < 1:
+            return None
+        slope = (tu - mt * mu / total) / spread
+        value = (mu - slope * mt) / total
+    return (value, slope) if abs(slope) < 1.5 * reach else None
+
+
+def find_stretches(
+    labels: np.ndarray,
+    drape: np.ndarray,
+    through: np.ndarray,
+    table: ColourTable,
+    middle: float,
+    *,
+    onward: bool = False,
+) -> Stretches | None:
+    """Bands along labels [T, R] of a line's R central rows, or None where no order of them fits, or both ways do.
+
+    Where ``drape`` [T] is true the surroundings look the same, so that labels do not say what is a band; where
+    ``through`` [T] is, they shine through a tube that is none. ``middle`` is the index where t = 0. With ``onward`` the
+    tip is known to lie towards smaller t.
+
+    Of all ways to cut the line into "before, band 1, ..., band n, after", in both directions, that which is worth most
+    (:func:`_sweep`). Stretches that something hides count little, so that a finger within a band leaves it one band.
+    """
+    raw = _shares(labels, table)  # [C, T]
+    share = raw * ~drape
+    sums = _worth(share[None] if onward else np.stack([share, share[:, ::-1]]), table.bands)
+    value, cuts = _sweep(sums)
+    score = (value[:, -1] - sums[0, :, -1]).tolist()
+    flipped = score[-1] > score[0]
+    if score[int(flipped)] <= 0 or (not onward and abs(score[0] - score[1]) < _SIDE):
+        return None
+    at, edges = value.shape[-1] - 1, []
+    for total, reached in reversed(cuts):
+        # Where the best value so far was first reached; only one path is followed back.
+        at = int((total[int(flipped), : at + 1] >= reached[int(flipped), at]).argmax())
+        edges.append(at)
+    ways = (raw[:, ::-1], drape[::-1], through[::-1]) if flipped else (raw, drape, through)
+    return _judged(*ways, edges[::-1], table.bands, flipped, middle)
+
+
+def order_scores(labels: np.ndarray, table: ColourTable) -> np.ndarray:
+    """What lines of labels [K, T, R] are worth in the better direction, above no bands on them: [K], in pixels."""
+    sums = _worth(_shares(labels, table).swapaxes(0, 1), table.bands)
+    # The other way round, the same stretches are worth the same.
+    one, other = (_sweep(order)[0][:, -1] for order in (sums, [sums[0], *sums[-2:0:-1], sums[-1]]))
+    return np.maximum(one, other) - sums[0, :, -1]
+
+
+def _shares(labels: np.ndarray, table: ColourTable) -> np.ndarray:
+    """Share of the last axis that shows each colour, float32 [C, ...] of labels [..., R]."""
+    colours = len(table.colours)
+    each = np.eye(colours + 1, colours, k=-1, dtype=np.float32) / labels.shape[-1]
+    rows = [each.take(labels[..., i], axis=0) for i in range(labels.shape[-1])]
+    return np.moveaxis(np.add.reduce(rows), -1, 0)
+
+
+def _worth(share: np.ndarray, bands: tuple[int, ...]) -> np.ndarray:
+    """What pixels of lines [K, C, T] are worth before the bands, on each of them, and after: sums [n + 2, K, T + 1].
+
+    A pixel within a band is worth +1 where it shows the band's colour, -1 where it shows another band's and -0.6 where
+    it shows none, as fingers do; around the bands -0.25 where it shows one, and 0 where it shows none.
+    """
+    gains, least = _gains(bands, share.shape[1])
+    sums = np.zeros((len(least), len(share), share.shape[-1] + 1), dtype=np.float32)
+    np.cumsum((gains @ share).swapaxes(0, 1) + least, -1, out=sums[..., 1:])
+    return sums
+
+
+@lru_cache(maxsize=16)
+def _gains(bands: tuple[int, ...], colours: int) -> tuple[np.ndarray, np.ndarray]:
+    """What a pixel that shows a colour is worth more [n + 2, colours] than one that shows none [n + 2, 1, 1]."""
+    gains = np.full((len(bands) + 2, colours), -0.4, dtype=np.float32)
+    gains[[0, -1]] = -0.25
+    for i, band in enumerate(bands):
+        gains[i + 1, band] += 2
+    return gains, np.array([0.0] + [-0.6] * len(bands) + [0.0], dtype=np.float32)[:, None, None]
+
+
+def _sweep(order: Iterable[np.ndarray]) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
+    """Dynamic programming over the cuts between stretches worth [K, T + 1]: best value, what each cut chose from."""
+    value, *rest = order
+    cuts = []
+    for total in rest:
+        ahead = value - total
+        reached = np.maximum.accumulate(ahead, -1)
+        cuts.append((ahead, reached))
+        value = total + reached
+    return value, cuts
+
+
+def _judged(
+    share: np.ndarray,
+    drape: np.ndarray,
+    through: np.ndarray,
+    cuts: list[int],
+    bands: tuple[int, ...],
+    flipped: bool,
+    middle: float,
+) -> Stretches:
+    # In plain numbers: of so few edges, the calls into NumPy would cost several times as much.
+    count, last = share.shape[1], len(bands)
+    sums = _sums(share)
+    own = _sums(share * ~through) if through.any() else sums
+    drowned = _sums(drape[None])[0]
+
+    def mean(row: np.ndarray, low: int, high: int) -> float:
+        low, high = max(0, low), min(count, high)
+        return (row.item(high) - row.item(low)) / (high - low) if high > low else 0.0
+
+    def clear(i: int, cut: int, mixed: int, side: int, longest: int) -> bool:
+        """Whether the right colours lie to both sides of an edge, beyond what is mixed there."""
+        before, after = (cut - mixed - side, cut - mixed), (cut + mixed, cut + mixed + side)
+        if i > 0:
+            was = sums[bands[i - 1]]
+            if mean(was, *before) <= _RIGHT or mean(was, *after) >= (_RIGHT if i < last else 1 - _RIGHT):
+                return False
+        if i < last:
+            then = sums[bands[i]]
+            if mean(then, *after) <= _RIGHT or mean(then, *before) >= (_RIGHT if i else 1 - _RIGHT):
+                return False
+        # Beyond an outer edge lies tube, not the same colour and not a thing as thin in a band's colour.
+        if i == 0:
+            return all(mean(row, cut - longest // 2, before[1]) < _RIGHT for row in own)
+        return i < last or all(mean(row, after[0], cut + longest // 2) < _RIGHT for row in own)
+
+    edges, doubtful = [], []
+    for i, cut in enumerate(cuts):
+        length = [cuts[j + 1] - cuts[j] for j in (i - 1, i) if 0 <= j < last]
+        # A band that its surroundings drown has no length; the edge to it may be seen all the same.
+        shortest = min((value for value in length if value > _MIXED), default=0)
+        seen = False
+        if _SIDE // 2 < cut < count - _SIDE // 2:
+            seen = clear(i, cut, _MIXED, max(1, min(_SIDE, shortest - _MIXED)), max(length))
+            if not seen and shortest > 3 * _MOVED:
+                seen = clear(i, cut, _MOVED, _SIDE, max(length))
+        near = mean(drowned, cut - _MIXED - _SIDE, cut - _MIXED), mean(drowned, cut + _MIXED, cut + _MIXED + _SIDE)
+        doubtful.append(i in (0, last) or max(near) > 0.25)
+        at = cut - 0.5
+        edges.append((count - 1 - at if flipped else at) - middle if seen else np.nan)
+    spans = list(zip(bands, cuts, cuts[1:], strict=False))
+    return Stretches(
+        np.array(edges),
+        tuple(sums[band].item(high) - sums[band].item(low) for band, low, high in spans),
+        tuple(float(high - low) for _, low, high in spans),
+        tuple(doubtful),
+        flipped,
+    )
+
+
+def _sums(values: np.ndarray) -> np.ndarray:
+    """Of values [C, T], those before each place: [C, T + 1]."""
+    sums = np.zeros((len(values), values.shape[1] + 1), dtype=np.float32)
+    np.cumsum(values, 1, out=sums[:, 1:])
+    return sums

@@ -1,0 +1,186 @@
+"""Where on a frame a thin straight thing with the bands' colours in a row may lie: a few lines, for a bounded cost."""
+
+import itertools
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+from holotorch.tracking.detection.bands import order_scores
+from holotorch.tracking.detection.colours import ColourTable
+from holotorch.tracking.pose.status import Refusal, Status
+
+_STEP = 2  # every second pixel of every second row
+_TILE = 12  # of those, along the side of a tile
+_DENSE = 0.35  # share of a tile and those around it that thin things never fill
+_FEWEST = 6  # coloured pixels of a tile that count
+_TILES = 40  # for each colour
+_CANDIDATES = 16  # lines whose labels are read,
+_EVERY = 2  # coarse pixels along each,
+_LINES = 3  # and that are measured
+_ACROSS = 3.0  # coarse pixels beside a line that still count
+
+
+_Y, _X = np.divmod(np.arange(_TILE**2, dtype=np.float32), _TILE)
+_MOMENTS = np.stack([np.ones_like(_X), _X, _Y, _X * _X, _X * _Y, _Y * _Y], -1)  # of a tile's pixels
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A line on the frame: two points x + i y in pixels, where its coloured part begins and ends."""
+
+    start: complex
+    end: complex
+
+
+def find_segments(frame: Tensor, table: ColourTable) -> list[Segment]:
+    """The most promising lines on a frame uint8 [3, H, W], best first, of two bands or more.
+
+    A Refusal where nothing thin is coloured (NO_CATHETER), or what is shows no two bands in a row (BANDS_MISSING).
+    """
+    labels = _labels(frame, table)
+    tiles = _tiles(labels, len(table.colours))
+    if tiles is None:
+        raise Refusal(Status.NO_CATHETER, "nothing thin in the bands' colours")
+    lines = _lines(tiles, table)
+    found = _ranked(labels, *lines, table) if lines else []
+    if not found:
+        raise Refusal(Status.BANDS_MISSING, "what is thin and coloured shows no two bands in a row")
+    return found
+
+
+def _labels(frame: Tensor, table: ColourTable) -> np.ndarray:
+    """uint8 [h, w] of every second pixel of every second row; the one step in which a frame is read as a whole."""
+    rows, aside = frame.movedim(0, -1)[::_STEP], _STEP
+    if frame.device.type != "cpu" or rows.stride()[1:] != (3, 1):
+        rows, aside = rows[:, ::_STEP].contiguous().cpu(), 1
+    # As ColourTable.labels, but thinned out after the first step: to copy every second pixel takes longer.
+    packed = cv2.cvtColor(rows.numpy(), cv2.COLOR_RGB2BGR555).view(np.uint16)[:, ::aside, 0]
+    return cv2.LUT(np.ascontiguousarray(packed), table.table)
+
+
+@dataclass(frozen=True, eq=False)
+class _Tiles:
+    """Coloured parts of tiles [M]: label, pixels, centre [M] and unit direction [M], complex, in coarse pixels."""
+
+    label: np.ndarray
+    count: np.ndarray
+    centre: np.ndarray
+    along: np.ndarray
+
+
+def _tiles(labels: np.ndarray, colours: int) -> _Tiles | None:
+    height, width = labels.shape
+    down, aside = -height % _TILE, -width % (2 * _TILE)  # whole tiles, and whole words of eight pixels
+    if down or aside:
+        labels = cv2.copyMakeBorder(labels, 0, down, 0, aside, cv2.BORDER_CONSTANT, value=0)
+    blocks = labels.reshape(-1, _TILE, labels.shape[1])
+    # Eight pixels at a time: sums of so few ones do not overflow a byte.
+    lit = np.add.reduce((blocks != 0).view(np.uint64), 1).view(np.uint8)
+    lit = np.add.reduce(lit.reshape(len(lit), -1, _TILE), 2, dtype=np.float32)
+    row, column = (lit >= _FEWEST).nonzero()
+    tiles = blocks.reshape(len(blocks), _TILE, -1, _TILE)[row, :, column].reshape(-1, _TILE**2)
+    each = tiles == np.arange(1, colours + 1, dtype=np.uint8)[:, None, None]  # [colours, tiles, pixels]
+    own = np.add.reduce(each.view(np.uint64), 2, keepdims=True).view(np.uint8).sum(2, dtype=np.float32)
+    count = np.zeros((*lit.shape, colours), dtype=np.float32)
+    count[row, column] = own.T
+    around = cv2.blur(count, (3, 3), borderType=cv2.BORDER_CONSTANT).reshape(count.shape)[row, column].T
+    label, which = ((own >= _FEWEST) & (around < _DENSE * _TILE**2)).nonzero()
+    if not len(label):
+        return None
+    row, column = row[which], column[which]
+    n, sx, sy, xx, xy, yy = (each[label, which].astype(np.float32) @ _MOMENTS).T.astype(np.float64)
+    mx, my = sx / n, sy / n
+    vx, vy, c = xx / n - mx * mx, yy / n - my * my, xy / n - mx * my
+    root = np.sqrt((vx - vy) ** 2 / 4 + c * c)
+    long, short = (vx + vy) / 2 + root, (vx + vy) / 2 - root
+    worth = np.minimum(long / (short + 0.3), 20) * np.minimum(n, 2 * _TILE)
+    pick = np.concatenate([_most(np.where(label == colour, worth, -1.0), _TILES, 0.0) for colour in range(colours)])
+    centre = mx[pick] + column[pick] * _TILE + 1j * (my[pick] + row[pick] * _TILE)
+    return _Tiles(label[pick], n[pick].astype(np.float32), centre, np.exp(0.5j * np.arctan2(2 * c, vx - vy)[pick]))
+
+
+def _most(worth: np.ndarray, count: int, least: float) -> np.ndarray:
+    """Places of the ``count`` largest values above ``least``, largest first."""
+    if len(worth) > 4 * count:
+        some = np.argpartition(-worth, count)[:count]
+        some = some[np.argsort(-worth[some], kind="stable")]
+    else:
+        some = np.argsort(-worth, kind="stable")[:count]
+    return some[worth[some] > least]
+
+
+def _lines(tiles: _Tiles, table: ColourTable) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+    """Lines through two tiles of different bands: middle [K], direction [K], beginning and end [K] along it."""
+    pairs = []
+    for one, other in itertools.combinations(range(len(table.colours)), 2):
+        i, j = (tiles.label == one).nonzero()[0], (tiles.label == other).nonzero()[0]
+        pairs.append((np.repeat(i, len(j)), np.tile(j, len(i))))
+    i, j = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
+    gap = tiles.centre[j] - tiles.centre[i]
+    length = np.abs(gap)
+    along = gap / np.maximum(length, 1e-3)
+    back = along.conj()
+    agree = np.minimum(np.abs((back * tiles.along[i]).real), np.abs((back * tiles.along[j]).real))
+    good = _most(agree * (length > 2), 600, 0.85)
+    if not len(good):
+        return None
+    i, back = i[good], back[good]
+    offsets = back[:, None] * (tiles.centre - tiles.centre[i, None])  # t + i u of all tiles on each line
+    t = offsets.real
+    straight = np.abs((back[:, None] * tiles.along).real) > 0.8
+    used = (np.abs(offsets.imag) < _ACROSS) & straight
+    weight = np.where(used, tiles.count, 0)
+    colours = len(table.colours)
+    each = weight @ (tiles.label[:, None] == np.arange(colours)).astype(weight.dtype)
+    # Colours that are far from the others along the line are somebody else's.
+    whole = np.maximum(weight.sum(-1), 1e-6)
+    middle = (weight * t).sum(-1) / whole
+    spread = np.sqrt((weight * (t - middle[:, None]) ** 2).sum(-1) / whole)
+    filled = np.minimum(each.sum(-1) / (4 * spread + _TILE), 3.0)
+    runner_up = np.sort(each, -1)[:, -min(2, colours)]
+    score = (np.minimum(each, 300).sum(-1) + 3 * runner_up) * filled
+    best = _most(score, 120, -1.0)
+    used = used[best].astype(np.float32)
+    shared, size = used @ used.T, used.sum(-1)
+    alike = shared > 0.5 * np.minimum(size[:, None], size)
+    keep: list[int] = []
+    taken = np.zeros(len(best), dtype=bool)
+    for k, row in enumerate(alike):
+        if not taken[k]:
+            taken |= row
+            keep.append(k)
+            if len(keep) == _CANDIDATES:
+                break
+    chosen = weight[best[keep]]
+    mean = chosen @ tiles.centre / chosen.sum(-1)
+    offsets = tiles.centre - mean[:, None]
+    # The longest axis of points lies at half the angle of their squares' sum.
+    onward = np.exp(0.5j * np.angle((chosen * offsets * offsets).sum(-1)))
+    t = (offsets * onward.conj()[:, None]).real
+    low = np.where(chosen > 0, t, np.inf).min(-1) - _TILE / 2
+    high = np.where(chosen > 0, t, -np.inf).max(-1) + _TILE / 2
+    return mean, onward, low, high
+
+
+def _ranked(
+    labels: np.ndarray, mean: np.ndarray, along: np.ndarray, low: np.ndarray, high: np.ndarray, table: ColourTable
+) -> list[Segment]:
+    """The lines on which the bands' order explains most of the labels, best first."""
+    height, width = labels.shape
+    half = int(0.5 * max(height, width))
+    places = np.arange(-half, half + 1.0, _EVERY)[:, None] + 1j * np.array([-1.0, 0.0, 1.0, -7.0, 7.0])
+    points = mean[:, None, None] + along[:, None, None] * places  # [K, T, 5]
+    x, y = np.rint(points.real).astype(np.intp), np.rint(points.imag).astype(np.intp)
+    inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    found = labels.take(y * width + x, mode="clip") * inside
+    drape = (found[..., 3:4] == found[..., 1:2]) & (found[..., 4:5] == found[..., 1:2])
+    score = order_scores(found[..., :3] * ~drape, table)
+    order = np.argsort(-score, kind="stable")[:_LINES]
+    order = order[score[order] > 0]
+    starts, ends = mean + low * along, mean + high * along
+    return [
+        Segment(start, end)
+        for start, end in zip((_STEP * starts[order]).tolist(), (_STEP * ends[order]).tolist(), strict=True)
+    ]

@@ -1,0 +1,1 @@
+"""The tool and its pose."""

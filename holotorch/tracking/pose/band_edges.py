@@ -1,0 +1,244 @@
+"""Where a catheter's band edges really are, from many frames of it: poses and positions fitted together."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from holotorch.core import checks
+from holotorch.tracking.camera.camera import Camera
+from holotorch.tracking.pose.alignment import widest_angle
+from holotorch.tracking.pose.pose import edge_weights, solve_pose
+
+_FEWEST = 5  # frames
+_SAME_DIRECTION = math.radians(10)
+_WORST = 5e-4  # metres: a ruler measures better
+_STEPS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class BandEdges:
+    """Edges of the bands, as measured.
+
+    Attributes:
+        positions: float64 [N] in metres from the tip.
+        covariance: [N, N] in m^2, zero for what was given; enlarged by chi_square / freedom where that exceeds 1. Of
+            the edges' noise alone: what moves an edge alike in all frames, such as a highlight, is not in it.
+        chi_square: Squared residuals over their variances.
+        freedom: Its degrees of freedom.
+        pivot: [3], the resting tip in the camera's frame; None where the tip moved.
+    """
+
+    positions: Tensor
+    covariance: Tensor
+    chi_square: float
+    freedom: int
+    pivot: Tensor | None
+
+    @property
+    def deviations(self) -> Tensor:
+        """Standard deviation of each position in metres, [N]."""
+        return self.covariance.diagonal().clamp(min=0).sqrt()
+
+
+def fit_band_edges(
+    edges_px: Tensor,
+    positions_m: Tensor,
+    camera: Camera,
+    known: Sequence[int | tuple[int, int]],
+    *,
+    resting_tip: bool = False,
+    along_px: float = 0.1,
+    across_px: float = 0.1,
+    offset: float = 0.0,
+) -> BandEdges:
+    """Fit the positions of the edges together with the pose of every frame.
+
+    Views of a free straight tool determine its positions only up to a shift, a scale and one projective stretch
+    s -> s / (1 + e s): to every such change there are poses that give the same images. So three distances must be
+    given, whatever the number of frames, and four edges leave one to be found. When the tip rests in one place
+    (``resting_tip``, a pivot) and the catheter is tilted around it, shift and stretch are determined too, and one
+    given distance sets the scale.
+
+    Args:
+        edges_px: [F, N, 2] pixels (x, y) of the edges in F frames, all seen.
+        positions_m: [N] nominal distances from the tip in metres, rising.
+        camera: That took the frames.
+        known: Which nominal distances hold: an index i for edge i from the tip, a pair (i, j) for edge i to edge j.
+        resting_tip: Whether the tip was in the same place in all frames.
+        along_px: Standard deviation of an edge along the tool's image, in pixels.
+        across_px: The same across it.
+        offset: How far in front of the axis, toward the camera, the edges are seen, in metres; as in ``solve_pose``.
+
+    Raises:
+        TypeError, ValueError: Bad input; too few distances known; fewer than 5 frames, or all parallel; edges that stay
+            open by more than 0.5 mm; with what to do.
+
+    Source: joint least squares with the poses eliminated by their Schur complement, as in bundle adjustment (Triggs et
+    al. 2000).
+    """
+    pixels, start = _checked(edges_px, positions_m)
+    free = _constraints(known, start, resting_tip)
+    poses = solve_pose(pixels, start, camera, along_px=along_px, across_px=across_px, offset=offset)
+    lost = [i for i, tip in enumerate(poses.tip) if not bool(torch.isfinite(tip).all())]
+    if lost:
+        raise ValueError(f"no pose found in the frames {lost[:10]}: leave them out, or correct the nominal positions")
+    _check_directions(poses.direction)
+    plane = camera.undistort(pixels).detach()
+    seen = torch.ones_like(plane[..., 0], dtype=torch.bool)
+    deviations = plane.new_tensor([along_px, across_px]).expand_as(plane)
+    weights = edge_weights(pixels, plane, seen, deviations, camera).detach()
+    problem = _Problem(plane, weights, free, resting_tip, offset)
+    tip = poses.tip.mean(0).expand_as(poses.tip) if resting_tip else poses.tip
+    state, chi_square, information = problem.solve((tip.detach(), poses.direction.detach(), start))
+    freedom = 2 * plane.shape[0] * plane.shape[1] - problem.unknowns
+    size = information.diagonal().clamp(min=1e-300).rsqrt()
+    factor, failed = torch.linalg.cholesky_ex(size[:, None] * information * size)
+    shared = torch.cholesky_inverse(factor) * size[:, None] * size
+    covariance = free @ shared[: free.shape[1], : free.shape[1]] @ free.mT * max(1.0, chi_square / max(freedom, 1))
+    deviations = covariance.diagonal().clamp(min=0).sqrt()
+    if bool(failed) or not bool((deviations <= _WORST).all()):
+        worst = "" if bool(failed) else f" (edge {int(deviations.argmax())} to {1e3 * float(deviations.max()):.1f} mm)"
+        raise ValueError(
+            f"the frames leave the positions open{worst}: take more of them, nearer to the camera, tilted toward it "
+            "and away from it by 20 to 45 degrees"
+        )
+    tip, _, positions = state
+    return BandEdges(positions, covariance, chi_square, freedom, tip[0] if resting_tip else None)
+
+
+class _Problem:
+    """Frames [F], each with a direction (two turns) and a tip, unless it rests; shared: positions and a resting tip."""
+
+    def __init__(self, plane: Tensor, weights: Tensor, free: Tensor, resting: bool, offset: float):
+        self.plane, self.weights, self.free = plane, weights, free
+        self.resting, self.offset = resting, offset
+        self.own = 2 if resting else 5
+        self.shared = free.shape[1] + (3 if resting else 0)
+        self.unknowns = len(plane) * self.own + self.shared
+
+    def residuals(self, state: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+        """[F, 2 N], over their deviations."""
+        tip, along, positions = state
+        forward = (tip * along).sum(-1, keepdim=True)
+        toward = torch.nn.functional.normalize(forward * along - tip, dim=-1)  # from the axis to the camera
+        where = (tip + self.offset * toward)[:, None] + positions[..., None] * along[:, None]
+        missed = where[..., :2] / where[..., 2:] - self.plane
+        return (self.weights @ missed[..., None])[..., 0].flatten(1)
+
+    def moved(self, state: tuple[Tensor, Tensor, Tensor], own: Tensor, shared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The state after steps ``own`` [F, 2 or 5] and ``shared`` [..., m]."""
+        tip, along, positions = state
+        count = self.free.shape[1]
+        positions = positions + shared[..., :count] @ self.free.mT
+        tip = tip + (shared[..., count:] if self.resting else own[:, 2:])
+        helper = torch.nn.functional.one_hot(along.abs().argmin(-1), 3).to(along.dtype)
+        first = torch.nn.functional.normalize(torch.linalg.cross(along, helper), dim=-1)
+        turned = along + own[:, :1] * first + own[:, 1:2] * torch.linalg.cross(along, first)
+        return tip, torch.nn.functional.normalize(turned, dim=-1), positions
+
+    def slopes(self, state: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        """[F, 2 N, own] and [F, 2 N, shared]: each unknown moved in all frames at once, by forward derivatives."""
+        frames = len(self.plane)
+        zeros = self.plane.new_zeros(self.own + self.shared)
+
+        def stepped(step: Tensor) -> Tensor:
+            own, shared = step[: self.own].expand(frames, -1), step[self.own :].expand(frames, -1)
+            return self.residuals(self.moved(state, own, shared))
+
+        both = torch.func.jacfwd(stepped)(zeros)
+        return both[..., : self.own], both[..., self.own :]
+
+    def solve(self, state: tuple[Tensor, Tensor, Tensor]) -> tuple[tuple[Tensor, Tensor, Tensor], float, Tensor]:
+        """Levenberg-Marquardt: the state, its chi-square, and the information [m, m] on what is shared."""
+        damping, cost = 1e-6, float(self.residuals(state).square().sum())
+        own, shared = self.slopes(state)
+        for _ in range(_STEPS):
+            missed = self.residuals(state)[..., None]
+            within, across = own.mT @ own, own.mT @ shared
+            within = within + damping * torch.diag_embed(within.diagonal(dim1=-2, dim2=-1))
+            total = (shared.mT @ shared).sum(0)
+            total = total + damping * torch.diag(total.diagonal())
+            solved = torch.linalg.solve(within, torch.cat([across, own.mT @ missed], -1))
+            reduced = total - (across.mT @ solved[..., :-1]).sum(0)
+            goal = (shared.mT @ missed).sum(0) - (across.mT @ solved[..., -1:]).sum(0)
+            common = -torch.linalg.lstsq(reduced, goal, driver="gelsd").solution
+            each = -(solved[..., -1:] + solved[..., :-1] @ common)
+            trial = self.moved(state, each[..., 0], common[:, 0])
+            new = float(self.residuals(trial).square().sum())
+            if not new <= cost or bool((trial[0][:, 2] <= 0).any()):
+                damping = max(10 * damping, 1e-9)
+                if damping > 1e6:
+                    break
+                continue
+            state, damping = trial, damping / 10
+            own, shared = self.slopes(state)
+            settled = cost - new <= 1e-12 * (1 + new)
+            cost = new
+            if settled:
+                break
+        within, across = own.mT @ own, own.mT @ shared
+        information = (shared.mT @ shared - across.mT @ torch.linalg.solve(within, across)).sum(0)
+        return state, cost, information
+
+
+def _checked(edges_px: Tensor, positions_m: Tensor) -> tuple[Tensor, Tensor]:
+    if not isinstance(edges_px, Tensor) or not edges_px.is_floating_point():
+        raise TypeError(
+            f"edges_px must be a floating tensor, got {getattr(edges_px, 'dtype', type(edges_px).__name__)}"
+        )
+    if edges_px.ndim != 3 or edges_px.shape[2] != 2 or edges_px.shape[1] < 3:
+        raise ValueError(f"edges_px must be of shape [F, N, 2] with N >= 3 edges, got {list(edges_px.shape)}")
+    checks.all_finite("edges_px", edges_px)
+    positions = torch.as_tensor(positions_m).to(edges_px.device, torch.float64)
+    if positions.shape != edges_px.shape[1:2]:
+        raise ValueError(f"positions_m must be of shape [{edges_px.shape[1]}], got {list(positions.shape)}")
+    checks.all_finite("positions_m", positions)
+    if not bool((positions.diff() > 0).all()):
+        raise ValueError(f"positions_m must rise, got {positions.tolist()}")
+    if len(edges_px) < _FEWEST:
+        raise ValueError(f"at least {_FEWEST} frames are needed, in different poses, got {len(edges_px)}")
+    return edges_px.detach().to(torch.float64), positions.detach()
+
+
+def _constraints(known: Sequence[int | tuple[int, int]], positions: Tensor, resting: bool) -> Tensor:
+    """Basis [N, m] of the changes that leave the known distances as they are."""
+    count = len(positions)
+    rows = positions.new_zeros(len(known), count)
+    for row, entry in zip(rows, known, strict=True):
+        ends = entry if isinstance(entry, tuple) else (entry,)
+        fitting = len(ends) in (1, 2) and len(set(ends)) == len(ends)
+        if not fitting or not all(isinstance(i, int) and 0 <= i < count for i in ends):
+            raise ValueError(f"known must hold edges 0 to {count - 1} or pairs of different ones, got {entry!r}")
+        row[ends[-1]] = 1.0
+        if len(ends) == 2:
+            row[ends[0]] = -1.0
+    # What the images leave open: s -> s + c, c s, c s^2; of a resting tip the second only.
+    scaled = (2 * positions - positions[0] - positions[-1]) / (positions[-1] - positions[0])
+    moving = torch.stack([torch.ones_like(scaled), scaled, scaled.square()], -1)
+    open_ = positions[:, None] / positions[-1] if resting else moving
+    if len(known) == 0 or int(torch.linalg.matrix_rank(rows @ open_, rtol=0.02)) < open_.shape[1]:
+        raise ValueError(
+            f"one known distance is needed beside a resting tip, got known={list(known)}"
+            if resting
+            else "views of a moving tip determine the edges only up to shift, scale and projective stretch: three "
+            f"independent distances, one of them from the tip, must be known (a band in the middle of another distance "
+            f"adds nothing to it), got known={list(known)}; or let the tip rest in one place, tilt the catheter around "
+            "it and say resting_tip=True"
+        )
+    _, values, vectors = torch.linalg.svd(rows)
+    rank = int((values > 1e-9).sum())
+    if rank == count:
+        raise ValueError("all positions are given, nothing is left to be found; name fewer in known")
+    return vectors[rank:].mT
+
+
+def _check_directions(directions: Tensor) -> None:
+    spread = widest_angle(directions)
+    if spread < _SAME_DIRECTION:
+        raise ValueError(
+            f"the catheter is parallel to itself within {math.degrees(spread):.1f} degrees in all frames, so that "
+            "every frame has the same faults; tilt it toward the camera and away from it by 20 to 45 degrees"
+        )

@@ -1,0 +1,1 @@
+"""Poses over the network."""

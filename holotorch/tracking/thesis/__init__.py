@@ -1,0 +1,1 @@
+"""The tracking pipeline of the thesis."""

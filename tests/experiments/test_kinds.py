@@ -1,0 +1,104 @@
+"""A kind of experiment is one folder and one line of the registry; everything else follows."""
+
+import json
+import signal
+
+import pytest
+from toy.kind import ToyKind
+
+from holotorch.cli import main
+from holotorch.experiments import registry
+from holotorch.experiments.registry import KINDS, find_kind, load_config
+
+
+@pytest.fixture
+def config(monkeypatch, tmp_path):
+    monkeypatch.setitem(registry.KINDS, "toy", "toy")
+    path = tmp_path / "toy.yaml"
+    path.write_text("experiment: toy\nsteps: 4\n")
+    return str(path)
+
+
+def test_a_new_kind_is_checked_run_and_reported(config, tmp_path, capsys):
+    assert main(["check", config, "steps=5"]) == 0
+    assert capsys.readouterr().out == "Steps      5\n"
+    folder = tmp_path / "a"
+    assert main(["run", config, "--out", str(folder)]) == 0
+    assert capsys.readouterr().out == f"Steps      4\n{folder / 'report.html'}\n"
+    assert {path.name for path in folder.iterdir()} == {
+        *("config.yaml", "env.json", "images", "plan.json", "report.html", "summary.json")
+    }
+    assert json.loads((folder / "summary.json").read_text()) == {"experiment": "toy", "status": "complete", "total": 10}
+    assert "total 10" in (folder / "report.html").read_text()
+    assert main(["report", str(folder), str(folder), "--out", str(tmp_path / "both.html")]) == 0
+    assert (tmp_path / "both.html").read_text().count("total 10") == 2
+
+
+def test_a_new_kind_goes_on_where_it_was_interrupted(config, tmp_path, monkeypatch, capsys):
+    def pressed(_, number: int) -> int:
+        if number == 3:
+            signal.raise_signal(signal.SIGINT)
+        return number
+
+    folder = tmp_path / "a"
+    with monkeypatch.context() as patch:
+        patch.setattr(ToyKind, "step", pressed)
+        assert main(["run", config, "--out", str(folder)]) == 130
+    assert json.loads((folder / "interrupted.json").read_text())["total"] == 3
+    assert main(["run", config, "steps=6", "--out", str(folder)]) == 2
+    assert "steps was 4 and is 6" in capsys.readouterr().err
+    assert main(["resume", str(folder)]) == 0
+    assert json.loads((folder / "summary.json").read_text())["total"] == 10
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["steps=13"], "argument 'steps=13': steps: expected anything but 13"),
+        (["step=3"], "step: unknown setting; did you mean 'steps'?"),
+        (["gigabytes=10"], "needs too much"),
+    ],
+)
+def test_mistakes_of_a_new_kind_are_said_like_those_of_others(config, words, message, tmp_path, capsys):
+    for command in (["check", config, *words], ["run", config, *words, "--out", str(tmp_path / "a")]):
+        assert main(command) == 2
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_kind_has_an_example_that_it_takes_and_a_schema(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", name]) == 0
+    assert capsys.readouterr().out.startswith(f"{name}.yaml; look at what it will do with: holotorch check")
+    settings = load_config(f"{name}.yaml")
+    assert isinstance(settings, find_kind(name).settings)
+    assert main(["new", name]) == 2 and "is there already" in capsys.readouterr().err
+    assert main(["schema", name]) == 0
+    described = json.loads(capsys.readouterr().out)
+    assert described["properties"].keys() == type(settings).model_fields.keys()
+    assert described["additionalProperties"] is False
+
+
+def test_a_schema_takes_what_a_configuration_may_say(capsys):
+    assert main(["schema", "pec"]) == 0
+    parts = json.loads(capsys.readouterr().out)["$defs"]
+    grid, modulator = parts["GridSettings"]["properties"], parts["ModulatorSettings"]["properties"]
+    assert "string" in json.dumps(grid["pitch"])  # 8 um
+    assert {key: each for key, each in modulator["power_weight"].items() if "imum" in key} == {
+        "minimum": 0,
+        "maximum": 1000000.0,
+    }
+
+
+def test_unknown_kinds_and_places_are_refused(tmp_path, capsys):
+    for words in (["new", "volumes"], ["schema", "volumes"]):
+        assert main(words) == 2
+        assert "no kind 'volumes'; did you mean 'volume'?" in capsys.readouterr().err
+    assert main(["new", "pec", "--out", str(tmp_path / "no" / "a.yaml")]) == 2
+    assert "cannot write" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_kind_has_settings_of_its_own_name(name):
+    assert find_kind(name).settings.model_fields["experiment"].annotation.__args__ == (name,)
