@@ -1,7 +1,7 @@
 """Which stretch of a line shows which band: the line found among labels, the bands by the best order of stretches."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -24,6 +24,7 @@ class Stretches:
         whole: For each band, its length on the line.
         doubtful: For each edge, whether what lies beyond it may be something in front of the tube, by its colours.
         flipped: Whether the tip lies towards larger t.
+        turned: Whether few edges are seen where the tip is known to lie, and the other direction fits better.
     """
 
     edges: np.ndarray
@@ -31,6 +32,7 @@ class Stretches:
     whole: tuple[float, ...]
     doubtful: tuple[bool, ...]
     flipped: bool
+    turned: bool = False
 
     @property
     def known(self) -> int:
@@ -110,15 +112,23 @@ def find_stretches(
         at = int((total[int(flipped), : at + 1] >= reached[int(flipped), at]).argmax())
         edges.append(at)
     ways = (raw[:, ::-1], drape[::-1], through[::-1]) if flipped else (raw, drape, through)
-    return _judged(*ways, edges[::-1], table.bands, flipped, middle)
+    found = _judged(*ways, edges[::-1], table.bands, flipped, middle)
+    if onward and found.known < 3:
+        other, _ = _sweep(_reversed(sums))
+        found = replace(found, turned=float(other[0, -1] - sums[0, 0, -1]) > score[0])
+    return found
 
 
 def order_scores(labels: np.ndarray, table: ColourTable) -> np.ndarray:
     """What lines of labels [K, T, R] are worth in the better direction, above no bands on them: [K], in pixels."""
     sums = _worth(_shares(labels, table).swapaxes(0, 1), table.bands)
-    # The other way round, the same stretches are worth the same.
-    one, other = (_sweep(order)[0][:, -1] for order in (sums, [sums[0], *sums[-2:0:-1], sums[-1]]))
+    one, other = (_sweep(order)[0][:, -1] for order in (sums, _reversed(sums)))
     return np.maximum(one, other) - sums[0, :, -1]
+
+
+def _reversed(sums: np.ndarray) -> list[np.ndarray]:
+    """Sums for the bands in the other order; the other way round, the same stretches are worth the same."""
+    return [sums[0], *sums[-2:0:-1], sums[-1]]
 
 
 def _shares(labels: np.ndarray, table: ColourTable) -> np.ndarray:

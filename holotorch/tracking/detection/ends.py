@@ -6,7 +6,6 @@ import numpy as np
 
 from holotorch.tracking.camera.lens import Lens
 from holotorch.tracking.camera.strips import Sampler
-from holotorch.tracking.detection.footprint import axis_on_plane
 from holotorch.tracking.pose.catheter import Catheter
 from holotorch.tracking.pose.resection import Found
 
@@ -29,6 +28,9 @@ class EndCheck:
 
 _INSIDE = np.array([-0.3, -0.15, 0.0, 0.15, 0.3])  # widths from the axis
 _BESIDE = np.array([0.9, 1.2, 1.5, 1.8])
+_ACROSS = np.concatenate([-_BESIDE[::-1], _INSIDE, _BESIDE])
+_SIZES = len(_BESIDE), len(_INSIDE), len(_BESIDE)
+_MEANS = np.repeat(np.eye(3, dtype=np.float32) / (3 * np.array(_SIZES, dtype=np.float32)[:, None]), _SIZES, axis=1)
 
 
 def shows_reversed(
@@ -49,8 +51,11 @@ def shows_reversed(
         ahead, behind = (catheter.length, reach), (0.0, reach - catheter.length)
     if long - short < 4 * check.margin:
         return False
-    beyond, due = (_share(sampler, lens, found, catheter.radius, part, check) for part in (ahead, behind))
-    return beyond is not None and due is not None and beyond >= check.shown and due <= check.missing
+    beyond = _share(sampler, lens, found, catheter.radius, ahead, check)
+    if beyond is None or beyond < check.shown:  # as on most frames
+        return False
+    due = _share(sampler, lens, found, catheter.radius, behind, check)
+    return due is not None and due <= check.missing
 
 
 def _share(
@@ -62,21 +67,21 @@ def _share(
     """
     places = np.linspace(part[0] + check.margin, part[1] - check.margin, check.stations)
     depth = found.tip[2] + places * found.direction[2]
-    places, depth = places[depth > 10 * radius], depth[depth > 10 * radius]
+    if not depth.min() > 10 * radius:
+        places, depth = places[depth > 10 * radius], depth[depth > 10 * radius]
     if len(places) < check.fewest:
         return None
-    axis = np.array([axis_on_plane(found, place) for place in places.tolist()])
+    tip, direction = (complex(x, y) for x, y, _ in (found.tip.tolist(), found.direction.tolist()))
+    axis = (tip + places * direction) / depth
     along = axis[-1] - axis[0]
     if not abs(along) > 0:
         return None
-    across = np.concatenate([-_BESIDE[::-1], _INSIDE, _BESIDE])
     sideways = 1j * along / abs(along) * (2 * radius / depth)
-    pixels = lens.distort(axis[:, None] + sideways[:, None] * across)
-    levels = sampler.nearest(pixels).astype(np.float32).mean(-1)[sampler.inside(pixels).all(-1)]
-    if len(levels) < check.fewest:
+    pixels = lens.distort(axis[:, None] + sideways[:, None] * _ACROSS)
+    inside = sampler.inside(pixels).all(-1)
+    if (seen := int(inside.sum())) < check.fewest:
         return None
-    count = len(_BESIDE)
-    sides = np.stack([levels[:, :count].mean(-1), levels[:, -count:].mean(-1)])
-    tube = levels[:, count:-count].mean(-1)
-    brighter, darker = tube - sides.max(0), sides.min(0) - tube
-    return float(max((brighter > check.contrast).mean(), (darker > check.contrast).mean()))
+    # Means over one side, the tube and the other side, of all three colours.
+    one, tube, other = _MEANS @ sampler.nearest(pixels)[inside].sum(-1, dtype=np.float32).T
+    brighter, darker = tube - np.maximum(one, other), np.minimum(one, other) - tube
+    return max(int((brighter > check.contrast).sum()), int((darker > check.contrast).sum())) / seen

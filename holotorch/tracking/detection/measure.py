@@ -96,9 +96,8 @@ def find_bands(
     through = alike[:, 0] & alike[:, 1] & (pure[:, 0] < _PALE * np.minimum(pure[:, 1], pure[:, 2]))
     stretches = find_stretches(near[:, :3], drape, through, table, float(end), onward=onward)
     if stretches is None:
-        raise Refusal(
-            Status.BANDS_MISSING, "no stretch of line shows the bands in their order, or it shows them both ways"
-        )
+        why = "no stretch of line shows the bands in their order, or it shows them both ways"
+        raise Refusal(Status.BANDS_MISSING, why, turned=onward)
     if stretches.flipped:  # from here on t rises from the tip to the rear
         turned = Line(line.origin, -line.along, line.scale)
         return turned, dataclasses.replace(stretches, edges=-stretches.edges, flipped=False)

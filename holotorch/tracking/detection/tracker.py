@@ -147,6 +147,8 @@ class CatheterTracker:
         try:
             return self._shown(sampler, line, half, _MOVED, onward=True)
         except Refusal as refusal:
+            if not refusal.turned:
+                raise
             try:
                 turned = Line(line.origin, -line.along, line.scale)
                 self._shown(sampler, turned, half, _MOVED, onward=True)
@@ -171,7 +173,8 @@ class CatheterTracker:
             line, stretches = find_bands(sampler, self.lens, line, self.table, half, aside, reach, onward=onward)
         if stretches.known < 3:
             few = "a band hides, is drowned by its surroundings or leaves the frame"
-            raise Refusal(Status.BANDS_MISSING, f"{stretches.known} edges of bands are seen, 3 are needed: {few}")
+            text = f"{stretches.known} edges of bands are seen, 3 are needed: {few}"
+            raise Refusal(Status.BANDS_MISSING, text, turned=stretches.turned)
         return line, stretches
 
     def _along(self, sampler: Sampler, line: Line, stretches: Stretches, before: Found | None) -> Pose:

@@ -50,11 +50,15 @@ _STAGES = {
 
 
 class Refusal(Exception):
-    """A stage that could not go on."""
+    """A stage that could not go on.
 
-    def __init__(self, status: Status, reason: str):
+    Attributes:
+        turned: Whether the bands may lie there in the other direction.
+    """
+
+    def __init__(self, status: Status, reason: str, *, turned: bool = False):
         super().__init__(reason)
-        self.status, self.reason = status, reason
+        self.status, self.reason, self.turned = status, reason, turned
 
 
 @dataclass(frozen=True, eq=False)
