@@ -2,6 +2,7 @@
 
 import ast
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -109,8 +110,11 @@ def test_public_names():
         holotorch.Gird  # noqa: B018
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+GUIDE = sorted((ROOT / "scripts" / "docs").glob("*.md"))
+
+
+def blocks(language: str, page: Path = ROOT / "README.md") -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", page.read_text(), re.S)
 
 
 def test_readme_example_runs_and_is_short():
@@ -125,18 +129,30 @@ def test_readme_example_runs_and_is_short():
 
 
 def test_readme_example_of_tracking_runs():
-    done = subprocess.run([sys.executable, "-c", blocks("python")[1]], capture_output=True, text=True)
+    code = blocks("python", ROOT / "scripts" / "docs" / "tracking.md")[0]
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     status, off = re.findall(r"^(\w+) ([\d.]+) mm off", done.stdout)[0]
     assert status == "OK" and float(off) < 0.5, done.stderr
 
 
-def test_readme_names_files_that_exist_and_commands_that_parse():
-    text = (ROOT / "README.md").read_text()
-    for path in re.findall(r"(?:configs|scripts)/[\w/.-]+\.(?:yaml|sh|png)", text):
+@pytest.mark.parametrize("page", [ROOT / "README.md", *GUIDE], ids=lambda page: page.name)
+def test_pages_name_files_that_exist_and_commands_that_parse(page):
+    text = page.read_text()
+    for path in re.findall(
+        r"(?<![./\w])(?:configs|scripts|tests|holotorch)/[\w/.-]+\.(?:yaml|sh|png|py|txt|csv)", text
+    ):
         assert (ROOT / path).is_file(), path
+    for link in re.findall(r"\]\(([^):]+)\)", text):
+        assert (page.parent / link).is_file(), link
     from holotorch.cli import _parser
 
-    for line in "\n".join(blocks("bash")).splitlines():
-        words = line.split("#")[0].split()
+    for line in "\n".join(blocks("bash", page)).splitlines():
+        words = shlex.split(line.split("#")[0])
         if words[:1] == ["holotorch"]:
             _parser().parse_args(words[1:])
+
+
+def test_the_readme_is_short_and_leads_to_every_page_of_the_guide():
+    text = (ROOT / "README.md").read_text()
+    assert len(text.splitlines()) <= 220
+    assert GUIDE and all(f"(scripts/docs/{page.name})" in text for page in GUIDE)
