@@ -88,7 +88,7 @@ class PECProblem(nn.Module):
     def forward(self, phase: Tensor) -> Tensor:
         """Loss [..., C] for heater phases in rad, real [..., C, H, W], or [..., C, F, H, W] with ``frames``."""
         spread = self.crosstalk(phase)
-        loss = self.misfit(self._formed(spread))
+        loss = self.misfit(self._image(spread))
         behind = -3 if self.frames else -2
         if self.limit is not None and self.limit_weight:
             loss = loss + self.limit_weight * (spread - self.limit).clamp(min=0).square().flatten(behind).sum(-1)
@@ -98,7 +98,7 @@ class PECProblem(nn.Module):
 
     def intensity(self, phase: Tensor) -> Tensor:
         """U(X), real [..., C, *image]."""
-        return self._formed(self.crosstalk(phase))
+        return self._image(self.crosstalk(phase))
 
     def unknown(self, phase: Tensor) -> Tensor:
         """The unknown that :meth:`forward` takes, of heater phases: with ``frames`` of [..., F, C, H, W].
@@ -141,7 +141,7 @@ class PECProblem(nn.Module):
             formed = formed * scale.reshape(*scale.shape, *[1] * -behind)
         return (formed - target).square().flatten(behind).sum(-1)
 
-    def _formed(self, spread: Tensor) -> Tensor:
+    def _image(self, spread: Tensor) -> Tensor:
         if not self.frames:
             return intensity(self.propagator(phasor(spread)))
         if spread.ndim < 4:

@@ -130,7 +130,7 @@ class AxialHologram(LayerHologram):
         """A sum that planes are added to one by one; see :meth:`accumulate`."""
         return Accumulator(self, shape, phase)
 
-    def _formed(self, layers: Tensor) -> Tensor:
+    def _forward(self, layers: Tensor) -> Tensor:
         order = sorted(range(len(self.depths)), key=self.depths.__getitem__)
         fields = []
         for item in layers.reshape(-1, *layers.shape[-3:]):
@@ -140,7 +140,7 @@ class AxialHologram(LayerHologram):
             fields.append(total.finish())
         return torch.stack(fields).reshape(*layers.shape[:-3], *self.grid.shape).to(layers.dtype)
 
-    def _gathered(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
+    def _adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
         waves = self.waves(shape, field.dtype, field.device)
         nodes, raster = waves.design.nodes, waves.raster
         flat = field.reshape(-1, *field.shape[-2:])

@@ -13,7 +13,7 @@ from holotorch.hologram.band_limited import point_spectrum
 from holotorch.hologram.cone import Cone, cone_samples, is_plain, spherical_wave, taper, taper_margin
 from holotorch.hologram.layered import LayerHologram
 from holotorch.hologram.raster import Raster, lit, span, strided_length
-from holotorch.optics.free_space.passage import passage
+from holotorch.optics.free_space.plane_pair import plane_pair
 from holotorch.optics.free_space.transfer import transfer_function
 
 TAPER_ERROR = 2e-7  # part of the wave that wraps around, or by which the taper may differ from the plain wave
@@ -110,7 +110,7 @@ class ConvolutionHologram(LayerHologram):
 
     def _limited(self, depth: float, raster: Raster, apart: tuple[int, int]) -> Tensor:
         """The quadrant for ``band``: propagation of band-limited samples, times Weyl's i / w, per area of a sample."""
-        path = passage(
+        path = plane_pair(
             Grid((apart[0] + 1, apart[1] + 1), self.grid.pitch), None, (0.0, 0.0), (0.0, 0.0), [self.wavelength]
         )
         wave, far = (torch.tensor(value, dtype=torch.float64) for value in (self.wavelength, depth))
@@ -125,7 +125,7 @@ class ConvolutionHologram(LayerHologram):
         """A sum to which planes [h, w], real or complex, are added one by one; ``phase`` [h, w] is common to all."""
         return ConvolutionSum(self, shape, phase)
 
-    def _formed(self, layers: Tensor) -> Tensor:
+    def _forward(self, layers: Tensor) -> Tensor:
         fields = []
         for item in layers.reshape(-1, *layers.shape[-3:]):
             total = self.accumulator((item.shape[-2], item.shape[-1]))
@@ -134,7 +134,7 @@ class ConvolutionHologram(LayerHologram):
             fields.append(total.finish())
         return torch.stack(fields).reshape(*layers.shape[:-3], *self.grid.shape).to(layers.dtype)
 
-    def _gathered(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
+    def _adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
         raster = self._raster(shape)
         flat = field.reshape(-1, *field.shape[-2:])
         spectra = [raster.spectrum_of_pixels(item) for item in flat]

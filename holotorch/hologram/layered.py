@@ -12,7 +12,7 @@ from holotorch.hologram.cone import Cone, check_cone, check_layers, check_scene
 class LayerHologram(nn.Module):
     """A linear map from layers of sources to the field on a hologram, with its conjugate transpose.
 
-    A way is its two halves ``_formed`` and ``_gathered``; gradients of any order follow from them.
+    A way is its two halves ``_forward`` and ``_adjoint``; gradients of any order follow from them.
 
     Args:
         grid: Pixels of the hologram.
@@ -38,14 +38,14 @@ class LayerHologram(nn.Module):
         shape = (layers.shape[-2], layers.shape[-1])
         if 0 in layers.shape[:-3]:  # a batch of no scenes
             return (layers.sum((-3, -2, -1))[..., None, None]).expand(*layers.shape[:-3], *self.grid.shape)
-        return linear(layers, self._formed, lambda field: self._gathered(field, shape))
+        return linear(layers, self._forward, lambda field: self._adjoint(field, shape))
 
     def adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
         """Conjugate transpose: layers [..., D, h, w] of ``shape`` (h, w) from a field [..., H, W]."""
-        return linear(field, lambda given: self._gathered(given, shape), self._formed)
+        return linear(field, lambda given: self._adjoint(given, shape), self._forward)
 
-    def _formed(self, layers: Tensor) -> Tensor:
+    def _forward(self, layers: Tensor) -> Tensor:
         raise NotImplementedError
 
-    def _gathered(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
+    def _adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
         raise NotImplementedError

@@ -50,7 +50,7 @@ class DirectHologram(LayerHologram):
             total += int(((plane != 0) * (counts[0][:, None] * counts[1])).sum())
         return total
 
-    def _formed(self, layers: Tensor) -> Tensor:
+    def _forward(self, layers: Tensor) -> Tensor:
         flat = layers.reshape(-1, *layers.shape[-3:]).to(torch.complex128)
         out = flat.new_zeros(len(flat), *self.grid.shape)
         for item, field in zip(flat, out, strict=True):
@@ -68,7 +68,7 @@ class DirectHologram(LayerHologram):
                         field.index_add_(0, target, product[inside])
         return out.reshape(*layers.shape[:-3], *self.grid.shape).to(layers.dtype)
 
-    def _gathered(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
+    def _adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
         flat = field.reshape(-1, *field.shape[-2:]).to(torch.complex128)
         out = flat.new_zeros(len(flat), len(self.depths), *shape)
         places = self._places(torch.arange(shape[0], device=field.device), shape[0])

@@ -18,7 +18,7 @@ BRICK = 16
 
 
 @dataclass(frozen=True)
-class Found:
+class RaySamples:
     """What the rays meet on one plane: which ``rays`` [n] (flat index into the footprint), ``samples`` [c, n] there.
 
     ``length`` is that of their paths through the slab in metres, [n] or one number for all.
@@ -100,7 +100,7 @@ class SliceReader:
         self.place, self.rays, self.window, self.fields, self.support = place, rays, window, fields, support
         self.bands = [_band(layer.any(1)) for layer in occupied]
 
-    def read(self, low: float, high: float, alive: Tensor) -> Found | None:
+    def read(self, low: float, high: float, alive: Tensor) -> RaySamples | None:
         """Samples half-way between two depths from the centre, of the rays ``alive`` (bool, flat) in the window."""
         place, width = self.place, len(self.window.columns)
         depth = (low + high) / 2
@@ -131,7 +131,7 @@ class SliceReader:
         if len(lines) > 1:
             samples = torch.cat([samples, _between_rows(lines[1:], first, part, rays)])
         length = length.flatten().index_select(0, rays) if isinstance(length, Tensor) else length
-        return Found(rays + start * width, samples, length)
+        return RaySamples(rays + start * width, samples, length)
 
     def _slice(self, k: int, part: float) -> Tensor:
         here = self.fields(k)
@@ -159,7 +159,7 @@ class PointReader:
         self.place, self.rays, self.window, self.fields, self.support = place, rays, window, fields, support
         self.occupied = None if bool(occupied.all()) else occupied
 
-    def read(self, low: float, high: float, alive: Tensor) -> Found | None:
+    def read(self, low: float, high: float, alive: Tensor) -> RaySamples | None:
         """As :meth:`SliceReader.read`."""
         place, window = self.place, self.window
         length = window.length(low, high, slice(None))
@@ -185,7 +185,7 @@ class PointReader:
         kept = _visible(None, samples[0], self.support)
         if kept.numel() < rays.numel():
             rays, samples = rays[kept], samples.index_select(1, kept)
-        return Found(rays, samples, length.index_select(0, rays)) if rays.numel() else None
+        return RaySamples(rays, samples, length.index_select(0, rays)) if rays.numel() else None
 
     def _in_bricks(self, points: Tensor) -> Tensor:
         assert self.occupied is not None

@@ -12,7 +12,7 @@ from holotorch import Grid
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import phasor
 from holotorch.optics import CroppedKernel, Propagator, plan_propagation, propagate
-from holotorch.optics.free_space.passage import Passage
+from holotorch.optics.free_space.plane_pair import PlanePair
 from holotorch.optics.planning.plan import find
 from holotorch.optics.planning.propagate import kernel_of
 
@@ -132,7 +132,7 @@ def test_prediction_is_within_a_factor_of_ten_and_never_below_a_third_over_rando
         padded = torch.nn.functional.pad(field, (0, 3 * grid.shape[1], 0, 3 * grid.shape[0]))
         exact = CroppedKernel(wide, wavelength, distance)(padded[None])[0, : grid.shape[0], : grid.shape[1]]
         band = (share / (2 * pitch), share / (2 * pitch))
-        path = Passage(grid, grid)
+        path = PlanePair(grid, grid)
         found = find(path, [wavelength], [distance], band=band)
         truths = {}
         for way in found:

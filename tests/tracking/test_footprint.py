@@ -12,13 +12,13 @@ from holotorch.tracking.camera.lens import Lens
 from holotorch.tracking.camera.strips import Line
 from holotorch.tracking.detection.footprint import Front, bulge_px, width_px
 from holotorch.tracking.pose.catheter import THESIS
-from holotorch.tracking.pose.resection import Found
+from holotorch.tracking.pose.resection import LinePose
 
 LENS = Lens(Camera(torch.tensor([[1400.0, 0, 960], [0, 1400, 540], [0, 0, 1]]), torch.zeros(5)))
 
 
-def found_at(tip: np.ndarray, direction: np.ndarray) -> Found:
-    return Found(tip, direction, np.eye(6), 0.0)
+def found_at(tip: np.ndarray, direction: np.ndarray) -> LinePose:
+    return LinePose(tip, direction, np.eye(6), 0.0)
 
 
 def outline(tip, direction, radius):

@@ -18,14 +18,14 @@ from holotorch.tracking.detection.footprint import bulge_px
 from holotorch.tracking.detection.measure import Edges, _across, measure_edges
 from holotorch.tracking.detection.stations import Axis, look_across, measure_axis
 from holotorch.tracking.pose.catheter import THESIS
-from holotorch.tracking.pose.resection import Found
+from holotorch.tracking.pose.resection import LinePose
 from holotorch.tracking.pose.status import Refusal, Status
 from holotorch.tracking.simulation.render import Occluder
 
 LENS = Lens(WORLD.camera)
 POSITIONS = THESIS.positions.numpy()
 TIP, DIRECTION = (value.numpy() for value in at())
-FOUND = Found(TIP, DIRECTION, np.zeros((6, 6)), 0.0)
+FOUND = LinePose(TIP, DIRECTION, np.zeros((6, 6)), 0.0)
 OUTER = (True, False, False, True)
 
 

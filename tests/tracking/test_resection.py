@@ -11,7 +11,7 @@ from oracles.strips import on_plane
 from holotorch.tracking import THESIS, Camera, solve_pose
 from holotorch.tracking.camera.lens import Lens
 from holotorch.tracking.camera.strips import Line
-from holotorch.tracking.pose.resection import Found, pose_on_line
+from holotorch.tracking.pose.resection import LinePose, pose_on_line
 
 CAMERA = Camera(torch.tensor([[1400.0, 0, 959.5], [0, 1400, 539.5], [0, 0, 1]]), torch.zeros(5))
 LENS = Lens(CAMERA)
@@ -39,7 +39,7 @@ def solved(
     offset_sd=0.1,
     slope_sd=1e-4,
     shared_sd=0.0,
-) -> Found:
+) -> LinePose:
     found = pose_on_line(
         line, t.tolist(), positions.tolist(), (deviation * np.ones_like(t)).tolist(), offset_sd, slope_sd, shared_sd
     )

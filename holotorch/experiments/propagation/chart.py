@@ -21,7 +21,7 @@ from holotorch.core.fourier import fft2, filter_spectrum, ifft2
 from holotorch.core.grid import Grid
 from holotorch.experiments.timing import interleaved
 from holotorch.optics import AngularSpectrum, CroppedKernel, Fresnel, Propagator, unaliased_distance
-from holotorch.optics.free_space.passage import Passage
+from holotorch.optics.free_space.plane_pair import PlanePair
 from holotorch.optics.planning.plan import find
 from holotorch.optics.planning.propagate import kernel_of
 
@@ -145,7 +145,7 @@ def _predictions() -> list[dict[str, Any]]:
         wide = Grid((4 * grid.shape[0], 4 * grid.shape[1]), pitch)
         large = torch.nn.functional.pad(field, (0, 3 * grid.shape[1], 0, 3 * grid.shape[0]))
         exact = CroppedKernel(wide, wavelength, distance)(large[None])[0, : grid.shape[0], : grid.shape[1]]
-        path = Passage(grid, grid)
+        path = PlanePair(grid, grid)
         for way in find(path, [wavelength], [distance], band=(share / 2 / pitch, share / 2 / pitch)):
             wave, far = (torch.tensor(value, dtype=torch.float64) for value in (wavelength, distance))
             kernel = kernel_of(path, way, wave, far, torch.complex64)

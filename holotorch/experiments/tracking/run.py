@@ -20,7 +20,7 @@ from holotorch.experiments.runs.environment import environment
 from holotorch.experiments.runs.folder import claim
 from holotorch.experiments.runs.signals import deferred, interruptible
 from holotorch.experiments.tracking.report import COLUMNS, Log, Tracked, known, row, summarised, verdict, write_page
-from holotorch.experiments.tracking.source import Given, Tracker, opened
+from holotorch.experiments.tracking.source import Tracker, TrackingInputs, opened
 from holotorch.experiments.tracking.synthetic import compared, errors, read_truth
 from holotorch.io.files import append, replacing, write_bytes, write_json, write_text
 from holotorch.io.recording import Recorder, free_bytes, recording_bytes
@@ -119,7 +119,7 @@ def live(
     return _live(stack, stack.enter_context(opened(sources[0], camera, catheter, "ours", rate)))
 
 
-def _live(stack: ExitStack, given: Given) -> Iterator[tuple[float, Pose]]:
+def _live(stack: ExitStack, given: TrackingInputs) -> Iterator[tuple[float, Pose]]:
     with stack:
         frames, tracker = given.frames, given.tracker
         for note in frames.notes:
@@ -133,7 +133,9 @@ def _live(stack: ExitStack, given: Given) -> Iterator[tuple[float, Pose]]:
             print(note, flush=True)
 
 
-def _fill(folder: Path, given: Given, settings: dict[str, Any], truth: dict[str, list[float]]) -> tuple[Path, bool]:
+def _fill(
+    folder: Path, given: TrackingInputs, settings: dict[str, Any], truth: dict[str, list[float]]
+) -> tuple[Path, bool]:
     frames, log, failure, recorder = given.frames, Log(folder / "images"), None, None
     said = len(frames.notes)
     with interruptible() as pressed:
@@ -213,7 +215,7 @@ def _recorded(frames: Iterator[Frame], recorder: Recorder, pressed: list[int]) -
         yield frame
 
 
-def _drawn(item: Tracked, given: Given) -> Tensor:
+def _drawn(item: Tracked, given: TrackingInputs) -> Tensor:
     pixels = item.frame.pixels
     if pixels is None:
         pixels = torch.zeros(3, *given.frames.shape, dtype=torch.uint8)

@@ -28,7 +28,7 @@ _OFF_CENTRE = 0.15  # of a side; two thirds of the resolution, as 720 to 1080 li
 Tracker = Callable[[Tensor, Sequence[Pose] | None], list[Pose]]
 
 
-class Given(NamedTuple):
+class TrackingInputs(NamedTuple):
     """What a run is made from; ``paths`` of the two YAML files by the names that their copies get."""
 
     frames: Frames
@@ -41,7 +41,7 @@ class Given(NamedTuple):
 @contextmanager
 def opened(
     source: str | Path, camera: Path | None, catheter: Path | None, method: str, rate: float | None
-) -> Iterator[Given]:
+) -> Iterator[TrackingInputs]:
     """Open a source with its files, and make a tracker for it.
 
     Args:
@@ -79,7 +79,7 @@ def opened(
         _checked(lens, frames)
         if doubt := ambiguity_text(ambiguities(seen, tool)):
             frames.notes.append(doubt)
-        yield Given(frames, seen, tool, tracker, paths)
+        yield TrackingInputs(frames, seen, tool, tracker, paths)
 
 
 def _found(source: str | Path) -> bool:

@@ -9,7 +9,7 @@ from holotorch.core.fourier import good_length
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import DISTANCE
 from holotorch.optics.free_space.padding import FINEST, crop_length
-from holotorch.optics.free_space.passage import passage, shifts
+from holotorch.optics.free_space.plane_pair import plane_pair, shifts
 from holotorch.optics.free_space.propagators import SpectralFilter
 from holotorch.optics.free_space.transfer import transfer_function
 
@@ -50,19 +50,19 @@ class CroppedKernel(SpectralFilter):
         distance = checks.quantity(DISTANCE, distance)
         waves = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
         longest = waves.max().item()
-        path = passage(grid, None, offset, (0.0, 0.0), waves.tolist())
+        planes = plane_pair(grid, None, offset, (0.0, 0.0), waves.tolist())
         if min(grid.pitch) < FINEST * longest and not paraxial:
             raise ValueError(
                 f"CroppedKernel needs a pitch of at least {FINEST} wavelengths, got {min(grid.pitch):g} m at "
                 f"{longest:g} m; use AngularSpectrum"
             )
         far = torch.tensor(distance, dtype=torch.float64)
-        places = [place.item() for place in shifts(path, far, torch.zeros(2, dtype=torch.float64))]
+        places = [place.item() for place in shifts(planes, far, torch.zeros(2, dtype=torch.float64))]
         height, width = (
             good_length(2 * size - 1 if paraxial else crop_length(size, size, pitch, longest, abs(distance), place))
             for size, pitch, place in zip(grid.shape, grid.pitch, places, strict=True)
         )
         padded = Grid((height, width), grid.pitch)
-        kernel = transfer_function(path, padded, waves, far, sampled=(False, False), paraxial=paraxial)
+        kernel = transfer_function(planes, padded, waves, far, sampled=(False, False), paraxial=paraxial)
         super().__init__(grid, wavelengths, kernel)
-        self.distance, self.offset = distance, path.offset
+        self.distance, self.offset = distance, planes.offset

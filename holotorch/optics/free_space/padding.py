@@ -3,23 +3,23 @@
 import math
 
 from holotorch.core.fourier import good_length
-from holotorch.optics.free_space.passage import Passage
+from holotorch.optics.free_space.plane_pair import PlanePair
 
 FINEST = 0.9  # wavelengths of pitch below which the factor beyond Fresnel no longer separates
 CROP_PAD = 2.25  # of CroppedKernel
 
 
-def resampled_padding(path: Passage, wavelength: float, distance: float, tails: float = 0.125) -> tuple[int, int]:
+def resampled_padding(planes: PlanePair, wavelength: float, distance: float, tails: float = 0.125) -> tuple[int, int]:
     """Samples that hold the window, and on each side what the factor beyond Fresnel moves and its tails.
 
     ``tails``: their room, as a part of the window.
     """
-    steepest = wavelength * math.hypot(*(0.5 / step for step in path.grid.pitch))
+    steepest = wavelength * math.hypot(*(0.5 / step for step in planes.grid.pitch))
     sizes = []
-    for axis, size in enumerate(path.grid.shape):
-        reach = path.grid.extent[axis] + path.out.extent[axis] + 2 * abs(path.offset[axis])
+    for axis, size in enumerate(planes.grid.shape):
+        reach = planes.grid.extent[axis] + planes.out.extent[axis] + 2 * abs(planes.offset[axis])
         sine = min(steepest, 0.99, reach / math.hypot(reach, distance))
-        moved = distance * (sine / math.sqrt(1 - sine * sine) - sine) / path.grid.pitch[axis]
+        moved = distance * (sine / math.sqrt(1 - sine * sine) - sine) / planes.grid.pitch[axis]
         sizes.append(good_length(size + 2 * math.ceil(size * tails + moved)))
     return sizes[0], sizes[1]
 

@@ -12,13 +12,13 @@ from holotorch.core.quantities import DISTANCE
 from holotorch.optics.free_space.impulse_response import fresnel_taps, levelling_shift, remainder_kernel, tilted_turns
 from holotorch.optics.free_space.kernels import carrier, turns_phasor
 from holotorch.optics.free_space.padding import FINEST, resampled_padding
-from holotorch.optics.free_space.passage import Passage, passage
+from holotorch.optics.free_space.plane_pair import PlanePair, plane_pair
 
 Factors = tuple[Tensor, Tensor, Tensor | None]
 
 
 def resampling_factors(
-    path: Passage,
+    planes: PlanePair,
     wavelength: Tensor,
     distance: Tensor,
     *,
@@ -34,19 +34,19 @@ def resampling_factors(
     """
     wavelength, distance = torch.broadcast_tensors(wavelength, distance)
     if tilt is None:
-        tilt = torch.tensor(path.tilt, dtype=torch.float64, device=distance.device)
+        tilt = torch.tensor(planes.tilt, dtype=torch.float64, device=distance.device)
     cosine2 = 1 - tilt.square().sum()
-    rims = [(room - size) // 2 for room, size in zip(padded or path.grid.shape, path.grid.shape, strict=True)]
+    rims = [(room - size) // 2 for room, size in zip(padded or planes.grid.shape, planes.grid.shape, strict=True)]
     # What the taps take over from the factor beyond Fresnel.
-    top = 0.5 / path.grid.pitch[0], 0.5 / path.grid.pitch[1]
+    top = 0.5 / planes.grid.pitch[0], 0.5 / planes.grid.pitch[1]
     levels = [torch.zeros_like(distance)] * 2
-    if padded is not None and any(path.tilt):
+    if padded is not None and any(planes.tilt):
         levels = [levelling_shift(top, wavelength, distance, tilt, axis) for axis in (0, 1)]
     matrices = []
     for axis, rim in enumerate(rims):
-        pitch, size = path.grid.pitch[axis], path.grid.shape[axis]
+        pitch, size = planes.grid.pitch[axis], planes.grid.shape[axis]
         source = torch.arange(-rim, size + rim, dtype=torch.float64, device=distance.device) - size // 2
-        reached = path.out.coordinates(distance.device)[axis].reshape(-1) + path.offset[axis]
+        reached = planes.out.coordinates(distance.device)[axis].reshape(-1) + planes.offset[axis]
         aside = distance * tilt[axis] / torch.sqrt(cosine2) - levels[axis]
         place = (reached[:, None] - aside[..., None, None]) / pitch - source
         bent = distance * (1 - tilt[1 - axis].square()) / cosine2**1.5
@@ -55,9 +55,9 @@ def resampling_factors(
     columns = matrices[0] * carrier(wavelength, distance * torch.sqrt(cosine2))[..., None, None]
     beyond = None
     if padded is not None:
-        fy, fx = Grid(padded, path.grid.pitch).frequencies(distance.device)
+        fy, fx = Grid(padded, planes.grid.pitch).frequencies(distance.device)
         wave, far = wavelength[..., None, None], distance[..., None, None]
-        if any(path.tilt):
+        if any(planes.tilt):
             turns = tilted_turns(fy, fx, wave, far, tilt, squares=False)
             turns = turns - fy * levels[0][..., None, None] - fx * levels[1][..., None, None]
             beyond = turns_phasor(turns).to(dtype)
@@ -124,8 +124,8 @@ class ResampledKernel(nn.Module):
         super().__init__()
         self.grid, self.out_grid, self.wavelengths = grid, out_grid, checks.wavelengths(wavelengths)
         self.distance = checks.quantity(DISTANCE, distance)
-        path = passage(grid, out_grid, offset, tilt, self.wavelengths)
-        self.offset = path.offset
+        planes = plane_pair(grid, out_grid, offset, tilt, self.wavelengths)
+        self.offset = planes.offset
         if self.distance == 0:
             raise ValueError("distance must not be 0 for a propagation onto another grid")
         longest = max(self.wavelengths)
@@ -134,8 +134,8 @@ class ResampledKernel(nn.Module):
         waves = torch.tensor(self.wavelengths, dtype=torch.float64)
         far = torch.tensor(self.distance, dtype=torch.float64)
         if padded is None and not paraxial:
-            padded = resampled_padding(path, longest, abs(self.distance))
-        factors = resampling_factors(path, waves, far, padded=None if paraxial else padded)
+            padded = resampled_padding(planes, longest, abs(self.distance))
+        factors = resampling_factors(planes, waves, far, padded=None if paraxial else padded)
         for name, values in zip(("columns", "rows", "beyond"), factors, strict=True):
             pair = None if values is None else torch.view_as_real(values).contiguous()
             self.register_buffer(name, pair, persistent=False)

@@ -13,11 +13,11 @@ from holotorch.optics.free_space.impulse_response import (
     tilted_turns,
 )
 from holotorch.optics.free_space.kernels import angular_spectrum_kernel, carrier, turns_phasor
-from holotorch.optics.free_space.passage import Passage, shifts
+from holotorch.optics.free_space.plane_pair import PlanePair, shifts
 
 
 def transfer_function(
-    path: Passage,
+    planes: PlanePair,
     padded: Grid,
     wavelength: Tensor,
     distance: Tensor,
@@ -30,24 +30,24 @@ def transfer_function(
     """Kernel of a linear convolution on the padded grid, carrier included, differentiable in all tensors.
 
     Args:
-        path: From which samples to which; of equal pitch.
-        padded: Grid of the transforms. The first samples of the result are those of ``path.out``.
+        planes: From which samples to which; of equal pitch.
+        padded: Grid of the transforms. The first samples of the result are those of ``planes.out``.
         wavelength: In metres, float64, shape [...].
         distance: In metres, float64, shape [...] that broadcasts; zeros give the identity.
         sampled: Per axis (y, x), whether the paraxial factor is sampled in frequency, or its exact taps are cropped to
             the transform's length and transformed.
         paraxial: Leave out the factor beyond Fresnel.
-        tilt: Sines (y, x) of the carrier, float64 [2], for gradients; those of ``path`` by default.
+        tilt: Sines (y, x) of the carrier, float64 [2], for gradients; those of ``planes`` by default.
         dtype: Of the result. Phases are reduced in float64 and cast last.
 
     Returns:
         Shape [..., H, W], frequencies in FFT order.
     """
     wavelength, distance = torch.broadcast_tensors(wavelength, distance)
-    tilted = any(path.tilt)
+    tilted = any(planes.tilt)
     if tilt is None:
-        tilt = torch.tensor(path.tilt, dtype=torch.float64, device=distance.device)
-    places = shifts(path, distance, tilt)
+        tilt = torch.tensor(planes.tilt, dtype=torch.float64, device=distance.device)
+    places = shifts(planes, distance, tilt)
     cosine2 = 1 - tilt.square().sum()
     wave = carrier(wavelength, distance * torch.sqrt(cosine2)).to(dtype)
     if tilted and all(sampled):
@@ -57,8 +57,8 @@ def transfer_function(
     factors = []
     for axis in (0, 1):
         bent = distance * (1 - tilt[1 - axis].square()) / cosine2**1.5
-        factors.append(_axis_factor(path, axis, padded, wavelength, bent, places[axis], sampled=sampled[axis]))
-        if path.straight and _alike(path.grid) and _alike(padded) and sampled[0] == sampled[1]:
+        factors.append(_axis_factor(planes, axis, padded, wavelength, bent, places[axis], sampled=sampled[axis]))
+        if planes.straight and _alike(planes.grid) and _alike(padded) and sampled[0] == sampled[1]:
             factors *= 2  # one computation serves both axes
             break
     columns, rows = (factor.to(dtype) for factor in factors)
@@ -85,14 +85,14 @@ def transfer_function(
 
 
 def wide_transfer_function(
-    path: Passage, padded: Grid, wavelength: Tensor, distance: Tensor, *, dtype: torch.dtype
+    planes: PlanePair, padded: Grid, wavelength: Tensor, distance: Tensor, *, dtype: torch.dtype
 ) -> Tensor:
     """Band-limited angular spectrum with its carrier, for pitches too fine for :func:`transfer_function`."""
     kernel = angular_spectrum_kernel(padded, wavelength, distance)
     kernel = kernel * carrier(wavelength, distance)[..., None, None]
     straight = torch.zeros(2, dtype=torch.float64, device=distance.device)
     for frequency, pitch, place in zip(
-        padded.frequencies(distance.device), padded.pitch, shifts(path, distance, straight), strict=True
+        padded.frequencies(distance.device), padded.pitch, shifts(planes, distance, straight), strict=True
     ):
         if bool((place != 0).any()):
             kernel = kernel * turns_phasor(frequency * pitch * place[..., None, None])
@@ -118,7 +118,7 @@ def _level(axis: int, padded: Grid, wavelength: Tensor, distance: Tensor, tilt: 
 
 
 def _axis_factor(
-    path: Passage, axis: int, padded: Grid, wavelength: Tensor, distance: Tensor, place: Tensor, *, sampled: bool
+    planes: PlanePair, axis: int, padded: Grid, wavelength: Tensor, distance: Tensor, place: Tensor, *, sampled: bool
 ) -> Tensor:
     """Paraxial factor of one axis in frequency, complex128 [..., size]; ``place`` as from :func:`shifts`."""
     size, pitch = padded.shape[axis], padded.pitch[axis]
@@ -126,7 +126,7 @@ def _axis_factor(
         frequency = torch.fft.fftfreq(size, pitch, dtype=torch.float64, device=distance.device)
         turns = -(wavelength * distance)[..., None] / 2 * frequency.square()
         return turns_phasor(turns + frequency * pitch * place[..., None])
-    index = tap_indices(size, path.grid.shape[axis], path.out.shape[axis]).to(distance.device)
+    index = tap_indices(size, planes.grid.shape[axis], planes.out.shape[axis]).to(distance.device)
     places = index + place[..., None]
     here = (distance == 0)[..., None]
     taps = fresnel_taps(places, pitch, wavelength, torch.where(distance == 0, pitch, distance))

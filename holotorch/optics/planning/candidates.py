@@ -11,8 +11,8 @@ import torch
 from holotorch.core.fourier import good_length
 from holotorch.core.grid import Grid
 from holotorch.optics.free_space.padding import CROP_PAD, FINEST, crop_length, resampled_padding
-from holotorch.optics.free_space.passage import Passage, shifts
-from holotorch.optics.planning.content import Content
+from holotorch.optics.free_space.plane_pair import PlanePair, shifts
+from holotorch.optics.planning.content import FieldContent
 from holotorch.optics.planning.predict import AxisContent, rms_beyond_fresnel
 
 _PADS = (1.0, 1.03125, 1.0625, 1.125, 1.25, 1.5)
@@ -59,67 +59,69 @@ Axes = tuple[AxisContent, AxisContent]
 
 
 def candidates(
-    path: Passage, waves: Sequence[float], distances: Sequence[float], content: Content, dtype: torch.dtype
+    planes: PlanePair, waves: Sequence[float], distances: Sequence[float], content: FieldContent, dtype: torch.dtype
 ) -> list[Candidate]:
-    """Every way for ``path``; for several wavelengths and distances with the worst of their errors."""
+    """Every way for ``planes``; for several wavelengths and distances with the worst of their errors."""
     if dtype not in (torch.complex64, torch.complex128):
         raise TypeError(f"dtype must be complex64 or complex128, got {dtype}")
     longest, far = max(waves), max(distances, key=abs)
-    scenes = [_axes(path, longest, distance, content) for distance in _extremes(path, distances)]
-    ways = [_identity(scenes)] if path.straight else []
-    if far == 0 and path.straight:
+    scenes = [_axes(planes, longest, distance, content) for distance in _extremes(planes, distances)]
+    ways = [_identity(scenes)] if planes.straight else []
+    if far == 0 and planes.straight:
         return ways
-    wide = min(path.grid.pitch) < FINEST * longest
-    if not path.same_pitch:
-        dense = [] if wide else [_resampled(path, scenes, dtype, tails) for tails in (None, *_TAILS)]
+    wide = min(planes.grid.pitch) < FINEST * longest
+    if not planes.same_pitch:
+        dense = [] if wide else [_resampled(planes, scenes, dtype, tails) for tails in (None, *_TAILS)]
         pairs = zip(*(_lengths(axis, _PADS + _WIDE_PADS) for axis in scenes[0]), strict=False)
-        return dense + [_zoomed(path, scenes, pair, dtype) for pair in pairs]
+        return dense + [_zoomed(planes, scenes, pair, dtype) for pair in pairs]
     alike = scenes[0][0] is scenes[0][1]
-    tilted = any(path.tilt)
-    pads = _PADS + (_WIDE_PADS if wide or tilted or path.out != path.grid else ())
+    tilted = any(planes.tilt)
+    pads = _PADS + (_WIDE_PADS if wide or tilted or planes.out != planes.grid else ())
     lengths = [_lengths(axis, pads) for axis in scenes[0]]
     pairs = zip(*lengths, strict=False) if alike or wide or tilted else itertools.product(*lengths)
     ways += [_sampled(scenes, pair, dtype) for pair in pairs]
     if wide:
         return ways
     masks = (
-        [(False, False)] if alike or tilted or path.out != path.grid else [(False, False), (True, False), (False, True)]
+        [(False, False)]
+        if alike or tilted or planes.out != planes.grid
+        else [(False, False), (True, False), (False, True)]
     )
     rooms = [*_CROP_PADS, 3.0, 4.0] if tilted else [None, *_CROP_PADS]
     return ways + [_cropped(scenes, mask, room, dtype) for mask in masks for room in rooms]
 
 
-def _extremes(path: Passage, distances: Sequence[float]) -> list[float]:
+def _extremes(planes: PlanePair, distances: Sequence[float]) -> list[float]:
     """Distances that stand for all: the farthest, and where the result is aside both ends of their range."""
-    if path.straight:
+    if planes.straight:
         return [max(map(abs, distances)) or 1e-12]
     return list(dict.fromkeys(z or 1e-12 for z in (min(distances), max(distances))))
 
 
-def _axes(path: Passage, wavelength: float, distance: float, content: Content) -> Axes:
-    asked = path
-    if not path.same_pitch:
+def _axes(planes: PlanePair, wavelength: float, distance: float, content: FieldContent) -> Axes:
+    asked = planes
+    if not planes.same_pitch:
         # The window of the result in samples of the source, a sample more on each side, and between them: the tails of
         # the content vanish on samples, and the ends of its band half-way cancel.
         height, width = (
-            math.ceil(extent / pitch) + 2 for extent, pitch in zip(path.out.extent, path.grid.pitch, strict=True)
+            math.ceil(extent / pitch) + 2 for extent, pitch in zip(planes.out.extent, planes.grid.pitch, strict=True)
         )
-        path = Passage(path.grid, Grid((height, width), path.grid.pitch), path.offset, path.tilt)
-    places = shifts(path, torch.tensor(distance, dtype=torch.float64), torch.tensor(path.tilt, dtype=torch.float64))
+        planes = PlanePair(planes.grid, Grid((height, width), planes.grid.pitch), planes.offset, planes.tilt)
+    places = shifts(planes, torch.tensor(distance, dtype=torch.float64), torch.tensor(planes.tilt, dtype=torch.float64))
     # Light that travels back is the conjugate of light that travels on in the mirrored direction.
     back = distance < 0
     signals = [each.conj() if back else each for each in content.signals or ()]
-    sines = [-sine if back else sine for sine in path.tilt]
+    sines = [-sine if back else sine for sine in planes.tilt]
     y, x = (
         AxisContent(
-            path.grid.shape[axis],
-            path.grid.pitch[axis],
+            planes.grid.shape[axis],
+            planes.grid.pitch[axis],
             content.band[axis],
             wavelength,
             abs(distance),
             content.margin[axis],
-            path.out.shape[axis],
-            places[axis].item() if path == asked else round(places[axis].item()) + 0.25,
+            planes.out.shape[axis],
+            places[axis].item() if planes == asked else round(places[axis].item()) + 0.25,
             (sines[axis], sines[1 - axis]),
             signals[axis] if signals else None,
         )
@@ -209,16 +211,16 @@ def _cropped(scenes: list[Axes], mask: tuple[bool, bool], room: float | None, dt
     return _way(method, mask, lengths, room is None, scenes, predict, dtype)
 
 
-def _resampled(path: Passage, scenes: list[Axes], dtype: torch.dtype, tails: float | None) -> Candidate:
+def _resampled(planes: PlanePair, scenes: list[Axes], dtype: torch.dtype, tails: float | None) -> Candidate:
     """Dense taps between any two grids; the factor beyond Fresnel applied first, with room for its ``tails``.
 
     None leaves that factor out.
     """
-    height, width = path.grid.shape
+    height, width = planes.grid.shape
     wavelength, far = scenes[0][0].wavelength, max(axes[0].distance for axes in scenes)
-    padded = path.grid.shape if tails is None else resampled_padding(path, wavelength, far, tails)
+    padded = planes.grid.shape if tails is None else resampled_padding(planes, wavelength, far, tails)
     rims = (padded[0] - height) // 2, (padded[1] - width) // 2
-    paraxial, tilted = tails is None, any(path.tilt)
+    paraxial, tilted = tails is None, any(planes.tilt)
 
     def predict(axes: Axes) -> float:
         error = _rounding(axes, (False, False), dtype) ** 2
@@ -234,13 +236,13 @@ def _resampled(path: Passage, scenes: list[Axes], dtype: torch.dtype, tails: flo
         return math.sqrt(error)
 
     tall, broad = height + 2 * rims[0], width + 2 * rims[1]
-    products = 8.0 * path.out.shape[0] * broad * (tall + path.out.shape[1])
+    products = 8.0 * planes.out.shape[0] * broad * (tall + planes.out.shape[1])
     transforms = 0.0 if paraxial else _transforms(math.prod(padded))
     memory = dtype.itemsize * (
-        path.out.shape[0] * (tall + broad)
-        + path.out.shape[1] * broad
+        planes.out.shape[0] * (tall + broad)
+        + planes.out.shape[1] * broad
         + 3 * math.prod(padded)
-        + math.prod(path.out.shape)
+        + math.prod(planes.out.shape)
     )
     method = "resampled Fresnel" if paraxial else "resampled kernel"
     return Candidate(
@@ -256,15 +258,15 @@ def _resampled(path: Passage, scenes: list[Axes], dtype: torch.dtype, tails: flo
     )
 
 
-def _zoomed(path: Passage, scenes: list[Axes], padded: tuple[int, ...], dtype: torch.dtype) -> Candidate:
+def _zoomed(planes: PlanePair, scenes: list[Axes], padded: tuple[int, ...], dtype: torch.dtype) -> Candidate:
     """The sampled transfer function, and the result summed from its spectrum at the points of the other grid."""
     way = _sampled(scenes, padded, dtype)
     lines = 0.0
-    for size, count, number in zip(padded, path.out.shape, (path.out.shape[1], padded[0]), strict=True):
+    for size, count, number in zip(padded, planes.out.shape, (planes.out.shape[1], padded[0]), strict=True):
         length = good_length(size + count - 1)
         lines += 10 * number * length * math.log2(length)
     flops = way.flops / 2 + lines
-    memory = way.memory + 2 * dtype.itemsize * max(padded[0], path.out.shape[0]) * (padded[1] + path.out.shape[1])
+    memory = way.memory + 2 * dtype.itemsize * max(padded[0], planes.out.shape[0]) * (padded[1] + planes.out.shape[1])
     return replace(way, method="angular spectrum, zoomed", flops=flops, cost=flops, memory=memory)
 
 

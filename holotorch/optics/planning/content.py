@@ -14,7 +14,7 @@ _MIXTURES = 24
 
 
 @dataclass(frozen=True)
-class Content:
+class FieldContent:
     """Band and rim of the light on a grid, and signals that stand for it if they were measured.
 
     Attributes:
@@ -36,7 +36,7 @@ def described(
     band: tuple[float, float] | None = None,
     spread: tuple[float, float] | None = None,
     margin: tuple[float, float] = (0.0, 0.0),
-) -> Content:
+) -> FieldContent:
     """Content by its ``band``, or by its ``spread``: how far (y, x) in metres it travels sideways over the distance."""
     for rim in margin:
         if checks.quantity(OFFSET, rim, "margin") < 0:
@@ -52,10 +52,10 @@ def described(
         if distance:
             limits = [reach / math.hypot(reach, distance) / wavelength for reach in reaches]
     y, x = (min(limit, top) for limit, top in zip(limits, nyquist, strict=True))
-    return Content((y, x), margin)
+    return FieldContent((y, x), margin)
 
 
-def measured(field: Tensor, grid: Grid) -> Content:
+def measured(field: Tensor, grid: Grid) -> FieldContent:
     """Content of ``field``, complex [..., H, W]: each axis by random mixtures of the field's lines along it.
 
     The energy that any filter of one axis lets through is, in expectation, the same for the mixtures as for the field,
@@ -71,4 +71,4 @@ def measured(field: Tensor, grid: Grid) -> Content:
         mixed.append(mixture.to("cpu", torch.complex128))
     scale = max(signals.abs().max().item() for signals in mixed) or 1.0
     nyquist = 0.5 / grid.pitch[0], 0.5 / grid.pitch[1]
-    return Content(nyquist, (0.0, 0.0), (mixed[0] / scale, mixed[1] / scale))
+    return FieldContent(nyquist, (0.0, 0.0), (mixed[0] / scale, mixed[1] / scale))

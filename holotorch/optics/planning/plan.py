@@ -9,7 +9,7 @@ from holotorch.core import checks
 from holotorch.core.grid import Grid
 from holotorch.core.plan import Plan
 from holotorch.core.quantities import DISTANCE
-from holotorch.optics.free_space.passage import Passage, passage
+from holotorch.optics.free_space.plane_pair import PlanePair, plane_pair
 from holotorch.optics.planning.candidates import Candidate, candidates
 from holotorch.optics.planning.content import described, measured
 
@@ -53,9 +53,9 @@ def plan_propagation(
         ValueError: Impossible numbers, or more memory than ``memory_limit``; the message says how to tile.
     """
     waves = checks.wavelengths(wavelength)
-    path = passage(grid, out_grid, offset, tilt, waves)
+    planes = plane_pair(grid, out_grid, offset, tilt, waves)
     found = find(
-        path,
+        planes,
         waves,
         [checks.quantity(DISTANCE, z) for z in _listed(distance)],
         band=band,
@@ -64,11 +64,11 @@ def plan_propagation(
         field=field,
         dtype=dtype,
     )
-    return plan_from(found, path, tolerance, memory_limit, dtype)
+    return plan_from(found, planes, tolerance, memory_limit, dtype)
 
 
 def find(
-    path: Passage,
+    planes: PlanePair,
     waves: Sequence[float],
     distances: Sequence[float],
     *,
@@ -79,16 +79,16 @@ def find(
     dtype: torch.dtype = torch.complex64,
 ) -> list[Candidate]:
     """Every way for the described or measured content; arguments as of :func:`plan_propagation`."""
-    content = described(path.grid, max(waves), max(map(abs, distances)), band=band, spread=spread, margin=margin)
+    content = described(planes.grid, max(waves), max(map(abs, distances)), band=band, spread=spread, margin=margin)
     if field is not None:
-        checks.field("field", field, path.grid.shape)
-        content = measured(field, path.grid)
-    return candidates(path, waves, distances, content, dtype)
+        checks.field("field", field, planes.grid.shape)
+        content = measured(field, planes.grid)
+    return candidates(planes, waves, distances, content, dtype)
 
 
 def plan_from(
     found: list[Candidate],
-    path: Passage,
+    planes: PlanePair,
     tolerance: float,
     memory_limit: int | None = None,
     dtype: torch.dtype = torch.complex64,
@@ -108,8 +108,8 @@ def plan_from(
         f"{best.method} on {size} is {verdict} of {len(found)} ways: predicted error {best.error:.1e} for a tolerance "
         f"of {tolerance:.1e}"
     )
-    pad = best.padded[0] / path.grid.shape[0], best.padded[1] / path.grid.shape[1]
-    precision, window = str(dtype).removeprefix("torch."), (path.out.shape, path.out.pitch, path.offset)
+    pad = best.padded[0] / planes.grid.shape[0], best.padded[1] / planes.grid.shape[1]
+    precision, window = str(dtype).removeprefix("torch."), (planes.out.shape, planes.out.pitch, planes.offset)
     return Plan(
         best.method,
         pad,

@@ -16,7 +16,7 @@ from holotorch.core.plan import Plan
 from holotorch.core.quantities import DISTANCE, WAVELENGTH
 from holotorch.optics.free_space.kernels import carrier
 from holotorch.optics.free_space.padding import FINEST
-from holotorch.optics.free_space.passage import Passage, passage
+from holotorch.optics.free_space.plane_pair import PlanePair, plane_pair
 from holotorch.optics.free_space.propagators import SpectralFilter
 from holotorch.optics.free_space.resampled import ResampledKernel, resample, resampling_factors
 from holotorch.optics.free_space.transfer import transfer_function, wide_transfer_function
@@ -88,38 +88,38 @@ def propagate(
     waves, distances = _float64("wavelength", wavelength, field), _float64("distance", distance, field)
     checks.precise(wavelength, distance)
     listed = [values.detach().reshape(-1).tolist() for values in (waves, distances)]
-    path = passage(grid, out_grid, offset, tilt, listed[0])
+    planes = plane_pair(grid, out_grid, offset, tilt, listed[0])
     slanted = tilt.to(field.device, torch.float64) if isinstance(tilt, Tensor) else None
     sample = field if measure else None
-    found = find(path, *listed, band=band, spread=spread, margin=margin, field=sample, dtype=field.dtype)
+    found = find(planes, *listed, band=band, spread=spread, margin=margin, field=sample, dtype=field.dtype)
     way = _best(found, checks.positive("tolerance", tolerance))
     if way.method == "identity":
         return field * carrier(waves, distances)[..., None, None].to(field.dtype)
-    if not path.same_pitch:
+    if not planes.same_pitch:
         if bool((distances == 0).any()):
             raise ValueError("distance must not be 0 for a propagation onto another grid")
 
         def elsewhere(each: Tensor, wave: Tensor, far: Tensor) -> Tensor:
             if way.method == _ZOOMED:
                 padded = Grid(way.padded, grid.pitch)
-                kernel = kernel_of(_read_along(path), way, wave, far, field.dtype, slanted)
-                return zoomed(each, kernel, chirps(grid, padded, path.out, path.offset, field.device))
+                kernel = kernel_of(_read_along(planes), way, wave, far, field.dtype, slanted)
+                return zoomed(each, kernel, chirps(grid, padded, planes.out, planes.offset, field.device))
             room = None if way.paraxial else way.padded
-            factors = resampling_factors(path, wave, far, padded=room, tilt=slanted, dtype=field.dtype)
+            factors = resampling_factors(planes, wave, far, padded=room, tilt=slanted, dtype=field.dtype)
             return resample(each, factors)
 
-        result = _one_by_one(field, waves, distances, path.out.shape, elsewhere)
-        _judge_light(way, tolerance, path, sent, result, measured=measure)
+        result = _one_by_one(field, waves, distances, planes.out.shape, elsewhere)
+        _judge_light(way, tolerance, planes, sent, result, measured=measure)
         return result
 
     def filtered(each: Tensor, wave: Tensor, far: Tensor) -> Tensor:
-        kernel = kernel_of(path, way, wave, far, field.dtype, slanted)
+        kernel = kernel_of(planes, way, wave, far, field.dtype, slanted)
         # The spectrum serves several distances; only when there is one may its memory be taken.
         product = multiplied(each, kernel) if waves.numel() * distances.numel() == 1 else each * kernel
-        return ifft2(product, path.out.shape)
+        return ifft2(product, planes.out.shape)
 
-    result = _one_by_one(fft2(field, way.padded), waves, distances, path.out.shape, filtered)
-    _judge_light(way, tolerance, path, sent, result, measured=measure)
+    result = _one_by_one(fft2(field, way.padded), waves, distances, planes.out.shape, filtered)
+    _judge_light(way, tolerance, planes, sent, result, measured=measure)
     return result
 
 
@@ -186,25 +186,25 @@ class Propagator(nn.Module):
         super().__init__()
         self.wavelengths = checks.wavelengths(wavelengths)
         self.distance = checks.quantity(DISTANCE, distance)
-        path = passage(grid, out_grid, offset, tilt, self.wavelengths)
-        self.grid, self.out_grid, self.offset, self.tilt = grid, path.out, path.offset, path.tilt
+        planes = plane_pair(grid, out_grid, offset, tilt, self.wavelengths)
+        self.grid, self.out_grid, self.offset, self.tilt = grid, planes.out, planes.offset, planes.tilt
         content: dict[str, Any] = {"band": band, "spread": spread, "margin": margin, "field": example}
-        found = find(path, self.wavelengths, [self.distance], **content)
-        self.plan = plan_from(found, path, tolerance, memory_limit)
+        found = find(planes, self.wavelengths, [self.distance], **content)
+        self.plan = plan_from(found, planes, tolerance, memory_limit)
         way = _best(found, tolerance)
-        if not path.same_pitch and way.method != _ZOOMED:
+        if not planes.same_pitch and way.method != _ZOOMED:
             self.operator = ResampledKernel(
-                grid, self.wavelengths, self.distance, path.out,
+                grid, self.wavelengths, self.distance, planes.out,
                 offset=offset, tilt=tilt, paraxial=way.paraxial, padded=way.padded,
             )  # fmt: skip
             return
         waves, far = (torch.tensor(value, dtype=torch.float64) for value in (self.wavelengths, self.distance))
-        if path.same_pitch:
-            kernel = kernel_of(path, way, waves, far, torch.complex128)
-            self.operator = SpectralFilter(grid, self.wavelengths, kernel, out_grid=path.out)
+        if planes.same_pitch:
+            kernel = kernel_of(planes, way, waves, far, torch.complex128)
+            self.operator = SpectralFilter(grid, self.wavelengths, kernel, out_grid=planes.out)
         else:
-            kernel = kernel_of(_read_along(path), way, waves, far, torch.complex128)
-            self.operator = ZoomedFilter(grid, self.wavelengths, kernel, path.out, offset=path.offset)
+            kernel = kernel_of(_read_along(planes), way, waves, far, torch.complex128)
+            self.operator = ZoomedFilter(grid, self.wavelengths, kernel, planes.out, offset=planes.offset)
 
     def forward(self, field: Tensor) -> Tensor:
         """Propagate ``field``, complex [..., C, H, W], to [..., C, H', W'], same dtype."""
@@ -246,12 +246,12 @@ def _finite_norms(field: Tensor) -> Tensor:
 
 
 def _judge_light(
-    way: Candidate, tolerance: float, path: Passage, sent: Tensor | None, result: Tensor, *, measured: bool
+    way: Candidate, tolerance: float, planes: PlanePair, sent: Tensor | None, result: Tensor, *, measured: bool
 ) -> None:
     """Warn where so much less light arrives than was expected that the error of the plan is large beside it."""
     if sent is None or 0 in result.shape or way.error > tolerance:  # of which _best has warned
         return
-    cells = math.prod(path.out.pitch) / math.prod(path.grid.pitch)
+    cells = math.prod(planes.out.pitch) / math.prod(planes.grid.pitch)
     shares = torch.where(sent > 0, (_norms(result) / sent).square() * cells, 1.0)
     dimmest = float(torch.where(torch.isfinite(shares), shares, 1.0).min())
     allowed = _DIMMER * tolerance
@@ -270,25 +270,25 @@ def _judge_light(
         )
 
 
-def _read_along(path: Passage) -> Passage:
+def _read_along(planes: PlanePair) -> PlanePair:
     """The same light on the source's samples: where it is read elsewhere is left to the reading."""
-    return Passage(path.grid, path.grid, (0.0, 0.0), path.tilt)
+    return PlanePair(planes.grid, planes.grid, (0.0, 0.0), planes.tilt)
 
 
 def kernel_of(
-    path: Passage, way: Candidate, waves: Tensor, distances: Tensor, dtype: torch.dtype, tilt: Tensor | None = None
+    planes: PlanePair, way: Candidate, waves: Tensor, distances: Tensor, dtype: torch.dtype, tilt: Tensor | None = None
 ) -> Tensor:
     """Transfer function of a chosen way, carrier included: [..., H, W] of its padded grid, in ``dtype``."""
-    grid = path.grid
+    grid = planes.grid
     padded = Grid(way.padded, grid.pitch)
     sampled = way.method in ("angular spectrum", _ZOOMED)
-    if sampled and not any(path.tilt) and min(grid.pitch) < FINEST * waves.detach().max().item():
-        return wide_transfer_function(path, padded, waves, distances, dtype=dtype)
+    if sampled and not any(planes.tilt) and min(grid.pitch) < FINEST * waves.detach().max().item():
+        return wide_transfer_function(planes, padded, waves, distances, dtype=dtype)
     if way.method == "identity":
         ones = torch.ones(*torch.broadcast_shapes(waves.shape, distances.shape), *grid.shape, dtype=dtype)
         return ones * carrier(waves, distances)[..., None, None].to(dtype)
     return transfer_function(
-        path, padded, waves, distances, sampled=way.sampled, paraxial=way.paraxial, tilt=tilt, dtype=dtype
+        planes, padded, waves, distances, sampled=way.sampled, paraxial=way.paraxial, tilt=tilt, dtype=dtype
     )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from holotorch.tracking.camera.lens import Lens
 from holotorch.tracking.camera.strips import Sampler
 from holotorch.tracking.pose.catheter import Catheter
-from holotorch.tracking.pose.resection import Found
+from holotorch.tracking.pose.resection import LinePose
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ _MEANS = np.repeat(np.eye(3, dtype=np.float32) / (3 * np.array(_SIZES, dtype=np.
 
 
 def shows_reversed(
-    sampler: Sampler, lens: Lens, found: Found, catheter: Catheter, check: EndCheck | None = None
+    sampler: Sampler, lens: Lens, found: LinePose, catheter: Catheter, check: EndCheck | None = None
 ) -> bool:
     """Whether the tube goes on beyond the tip, or the rear, of a pose and is missing where the pose says that it is.
 
@@ -59,7 +59,7 @@ def shows_reversed(
 
 
 def _share(
-    sampler: Sampler, lens: Lens, found: Found, radius: float, part: tuple[float, float], check: EndCheck
+    sampler: Sampler, lens: Lens, found: LinePose, radius: float, part: tuple[float, float], check: EndCheck
 ) -> float | None:
     """Share of the stations along ``part``, metres from the tip, at which something shows that is as wide as the tube.
 

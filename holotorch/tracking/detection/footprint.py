@@ -8,7 +8,7 @@ import numpy as np
 
 from holotorch.tracking.camera.strips import Line
 from holotorch.tracking.detection.fits import SHARPEST
-from holotorch.tracking.pose.resection import Found
+from holotorch.tracking.pose.resection import LinePose
 
 _INTERPOLATED = 1 / 6  # pixels^2 that bilinear samples add to a blur, whatever their direction
 _NODES = (np.arange(16) + 0.5) / 8 - 1  # across a tube, from one side to the other
@@ -18,7 +18,7 @@ _BOTH = np.concatenate([_LIT, _LIT * _ROUND[:, None]], -1)
 _RIDGE = 1e-4 * np.eye(_LIT.shape[1])
 
 
-def width_px(found: Found, positions: Sequence[float], radius: float, line: Line) -> tuple[float, float]:
+def width_px(found: LinePose, positions: Sequence[float], radius: float, line: Line) -> tuple[float, float]:
     """Of the tube's image at t = 0 in pixels across the line, and its change per pixel.
 
     2 r / (z sqrt(1 - n_z^2)) on the plane z = 1, n the unit normal of the plane through axis and camera: what is
@@ -34,7 +34,7 @@ def width_px(found: Found, positions: Sequence[float], radius: float, line: Line
     return near - taper * t0, taper
 
 
-def bulge_px(found: Found, positions: Sequence[float], radius: float, line: Line) -> np.ndarray:
+def bulge_px(found: LinePose, positions: Sequence[float], radius: float, line: Line) -> np.ndarray:
     """How far along the line [N], in pixels, the front of each ring's image lies from that of its centre."""
     (x, y, z), (a, b, c) = found.tip.tolist(), found.direction.tolist()
     onward = x * a + y * b + z * c
@@ -47,7 +47,7 @@ def bulge_px(found: Found, positions: Sequence[float], radius: float, line: Line
     return np.array(bulges)
 
 
-def axis_on_plane(found: Found, position: float) -> complex:
+def axis_on_plane(found: LinePose, position: float) -> complex:
     """The tool's point ``position`` metres from its tip, seen on the plane z = 1; NaN in the camera's own plane."""
     (x, y, z), (a, b, c) = found.tip.tolist(), found.direction.tolist()
     return complex(x + position * a, y + position * b) / (z + position * c or math.nan)

@@ -26,7 +26,7 @@ from holotorch.tracking.detection.footprint import axis_on_plane, bulge_px, widt
 from holotorch.tracking.detection.measure import BLURRED, Edges, find_bands, halfway, measure_edges
 from holotorch.tracking.detection.stations import THIRD, Axis, look_across, measure_axis, measure_width, narrowed
 from holotorch.tracking.pose.catheter import Catheter
-from holotorch.tracking.pose.resection import Found, on_host, pose_on_line
+from holotorch.tracking.pose.resection import LinePose, on_host, pose_on_line
 from holotorch.tracking.pose.status import Pose, Refusal, Status
 
 _FLOOR = 0.004  # pixels: what model and pixels leave in an edge, however little noise;
@@ -141,7 +141,7 @@ class CatheterTracker:
                 return self._along(sampler, *shown, None)
         raise Refusal(*furthest)
 
-    def _near(self, sampler: Sampler, found: Found) -> tuple[Line, Stretches]:
+    def _near(self, sampler: Sampler, found: LinePose) -> tuple[Line, Stretches]:
         """The line near a previous pose, and which bands it shows; a Refusal says so where they lie the other way."""
         line, half = self._expected(found)
         try:
@@ -158,7 +158,7 @@ class CatheterTracker:
                 refusal.status, f"the bands lie along the previous line, in the other direction: {_EXCHANGED}"
             ) from None
 
-    def _expected(self, found: Found) -> tuple[Line, float]:
+    def _expected(self, found: LinePose) -> tuple[Line, float]:
         """Where the bands of a pose lie, and half their length with room to move."""
         start, end = (axis_on_plane(found, self._positions[n]) for n in (0, -1))
         return Line.between(self.lens, start, end), abs(end - start) * self.lens.scale / 2 + 1.5 * _MOVED
@@ -177,7 +177,7 @@ class CatheterTracker:
             raise Refusal(Status.BANDS_MISSING, text, turned=stretches.turned)
         return line, stretches
 
-    def _along(self, sampler: Sampler, line: Line, stretches: Stretches, before: Found | None) -> Pose:
+    def _along(self, sampler: Sampler, line: Line, stretches: Stretches, before: LinePose | None) -> Pose:
         """The pose on a line that shows the bands, or a Refusal."""
         lens = self.lens
         with self._timed("axis"):
@@ -222,7 +222,7 @@ class CatheterTracker:
                 raise Refusal(Status.INCONSISTENT, f"the tube goes on beyond its end on one side only: {_EXCHANGED}")
             return pose
 
-    def _rough(self, line: Line, places: np.ndarray) -> Found | None:
+    def _rough(self, line: Line, places: np.ndarray) -> LinePose | None:
         """A first pose, from where the colours change; None where one of these places may be no edge."""
         seen = [(t, s) for t, s in zip(places.tolist(), self._positions, strict=True) if math.isfinite(t)]
         if (count := len(seen)) < 4:
@@ -239,17 +239,17 @@ class CatheterTracker:
         (near, a), (far, b) = seen[0], seen[-1]
         return min(max(2 * self.catheter.radius * 1.15 * (b - a) / (far - near), 2.0), _WIDEST), 0.0
 
-    def _bulge(self, found: Found, line: Line) -> np.ndarray:
+    def _bulge(self, found: LinePose, line: Line) -> np.ndarray:
         return bulge_px(found, self._positions, self.catheter.radius, line)
 
-    def _wide(self, found: Found, line: Line) -> tuple[float, float]:
+    def _wide(self, found: LinePose, line: Line) -> tuple[float, float]:
         """Of the tube's image in pixels and its taper, as the pose gives them; a Refusal where no camera sees such."""
         width, taper = width_px(found, self._positions, self.catheter.radius, line)
         if not 1.0 < width < _WIDEST or not abs(taper) < 1:
             raise Refusal(Status.INCONSISTENT, "no pose in front of the camera explains the edges")
         return width, taper
 
-    def _solved(self, axis: Axis, edges: Edges, *, rough: bool = False) -> Found:
+    def _solved(self, axis: Axis, edges: Edges, *, rough: bool = False) -> LinePose:
         known, last = np.isfinite(edges.t).nonzero()[0].tolist(), len(edges.t) - 1
         t: list[float] = edges.t[known].tolist()
         if len(t) < 3:
@@ -277,7 +277,7 @@ class CatheterTracker:
             raise Refusal(Status.INCONSISTENT, "no pose in front of the camera explains the edges")
         return found
 
-    def _judged(self, found: Found, axis: Axis, edges: Edges, *, cold: bool) -> Pose:
+    def _judged(self, found: LinePose, axis: Axis, edges: Edges, *, cold: bool) -> Pose:
         """The pose, if nothing speaks against it; ``axis`` is that with a width of its own where the frame is cold."""
         seen = edges.t[np.isfinite(edges.t)]
         count = len(seen)

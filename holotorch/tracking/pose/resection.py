@@ -16,7 +16,7 @@ _Three = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class LinePose:
     """A pose as :class:`holotorch.tracking.pose.status.Pose` has it, in NumPy.
 
     Attributes:
@@ -47,7 +47,7 @@ def pose_on_line(
     shared_sd: float = 0.0,
     *,
     rough: bool = False,
-) -> Found | None:
+) -> LinePose | None:
     """Pose of a tool whose image is ``line``; the part of :func:`solve_pose` that is left where the line is known.
 
     Tool and camera span a plane, whose image is the line. On it a point s from the tool's middle is seen at
@@ -99,7 +99,7 @@ def pose_on_line(
     if rough:
         tip, direction = np.array([[p, q, 0.0], [along, deep, 0.0]]) @ axes
         size = math.sqrt(float(direction @ direction))
-        return Found(tip / size, direction / size, np.zeros((6, 6)), chi_square) if size > 0 else None
+        return LinePose(tip / size, direction / size, np.zeros((6, 6)), chi_square) if size > 0 else None
     # Tip and direction, how they move with h, and with the line's offset and slope.
     tip = [[p, q, 0.0], [1.0, 0.0, 0.0], [start, 0.0, 0.0], [0.0, start, 0.0], [0.0, 0.0, q], [0.0, 0.0, p * wide]]
     direction = [
@@ -121,7 +121,7 @@ def pose_on_line(
     own += np.diag([0.0, 0.0, 0.0, offset_sd**2, slope_sd**2]) + alike * alike[:, None]
     lever = moved.swapaxes(1, 2).reshape(6, 5)
     covariance = lever @ own @ lever.T
-    return Found(pose[0], pose[1], covariance, chi_square) if np.isfinite(covariance).all() else None
+    return LinePose(pose[0], pose[1], covariance, chi_square) if np.isfinite(covariance).all() else None
 
 
 def _terms(points: list[tuple[float, float, float]], h: _Three) -> tuple[list[float], _Three, float, float]:
@@ -162,8 +162,8 @@ def _solved(normal: list[float], right: _Three) -> _Three:
     return (df * x + ce * y + be * z) / whole, (ce * x + af * y + bc * z) / whole, (be * x + bc * y + ad * z) / whole
 
 
-def on_host(pose: Pose) -> Found | None:
+def on_host(pose: Pose) -> LinePose | None:
     """Its tip and direction in NumPy, whatever device it is on; None where they are not finite."""
     place, onward = (value.numpy(force=True).astype(np.float64) for value in (pose.tip, pose.direction))
     known = all(map(math.isfinite, (*place.tolist(), *onward.tolist())))
-    return Found(place, onward, np.zeros((6, 6)), 0.0) if known else None
+    return LinePose(place, onward, np.zeros((6, 6)), 0.0) if known else None

@@ -1,4 +1,4 @@
-"""Passage: from which samples to which, and along which direction, light is propagated."""
+"""PlanePair: from which samples to which, and along which direction, light is propagated."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from holotorch.core.quantities import OFFSET
 
 
 @dataclass(frozen=True)
-class Passage:
+class PlanePair:
     """Source grid, grid of the result, and the carrier that is taken out of both fields.
 
     Attributes:
@@ -39,14 +39,14 @@ class Passage:
         return self.out.pitch == self.grid.pitch
 
 
-def passage(
+def plane_pair(
     grid: Grid,
     out: Grid | None,
     offset: Sequence[float],
     tilt: Sequence[float] | Tensor,
     wavelengths: Sequence[float],
-) -> Passage:
-    """A checked passage.
+) -> PlanePair:
+    """A checked pair of planes.
 
     TypeError for arguments of another kind; ValueError for a tilt at which part of the grid's band would not travel.
     """
@@ -62,10 +62,10 @@ def passage(
                 f"tilt of sines ({sy:g}, {sx:g}) brings part of the grid's band to a sine of {steepest:.3g}, beyond "
                 "0.98, where light hardly travels forward; use a coarser pitch or a smaller tilt"
             )
-    return Passage(grid, out or grid, (y, x), (sy, sx))
+    return PlanePair(grid, out or grid, (y, x), (sy, sx))
 
 
-def shifts(path: Passage, distance: Tensor, tilt: Tensor) -> list[Tensor]:
+def shifts(planes: PlanePair, distance: Tensor, tilt: Tensor) -> list[Tensor]:
     """Per axis: where sample 0 of the result lies beside sample 0 of the source, in samples, seen along the light.
 
     float64 of the distance's shape; differentiable in distance and tilt.
@@ -74,6 +74,6 @@ def shifts(path: Passage, distance: Tensor, tilt: Tensor) -> list[Tensor]:
     return [
         source // 2 - result // 2 + (aside - distance * tangent) / pitch
         for source, result, aside, tangent, pitch in zip(
-            path.grid.shape, path.out.shape, path.offset, tangents, path.grid.pitch, strict=True
+            planes.grid.shape, planes.out.shape, planes.offset, tangents, planes.grid.pitch, strict=True
         )
     ]

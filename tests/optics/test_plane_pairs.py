@@ -13,7 +13,7 @@ from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import phasor
 from holotorch.core.fourier import fft2, filter_spectrum, ifft2
 from holotorch.optics import CroppedKernel, Propagator, plan_propagation, propagate
-from holotorch.optics.free_space.passage import Passage, passage
+from holotorch.optics.free_space.plane_pair import PlanePair, plane_pair
 from holotorch.optics.free_space.resampled import resample, resampling_factors
 from holotorch.optics.free_space.zoomed import chirps, zoomed
 from holotorch.optics.planning.plan import find
@@ -76,7 +76,7 @@ def test_white_phases_arrive_right_in_any_window(window, crossovers):
 def test_every_way_into_a_window_errs_as_predicted(window, crossovers):
     (out, offset), distance, field = WINDOWS[window], crossovers * CROSS_OVER, white()
     wanted = exact(field, out, offset, distance)
-    path = passage(GRID, out, offset, (0.0, 0.0), [WAVE])
+    path = plane_pair(GRID, out, offset, (0.0, 0.0), [WAVE])
     waves, far = (torch.tensor(value, dtype=torch.float64) for value in (WAVE, distance))
     checked = 0
     for way in find(path, [WAVE], [distance], dtype=torch.complex128):
@@ -85,7 +85,7 @@ def test_every_way_into_a_window_errs_as_predicted(window, crossovers):
         if path.same_pitch:
             got = filter_spectrum(field, kernel_of(path, way, waves, far, torch.complex128), out.shape)
         elif way.method == "angular spectrum, zoomed":
-            kernel = kernel_of(Passage(GRID, GRID), way, waves, far, torch.complex128)
+            kernel = kernel_of(PlanePair(GRID, GRID), way, waves, far, torch.complex128)
             got = zoomed(field, kernel, chirps(GRID, Grid(way.padded, GRID.pitch), out, offset))
         else:
             got = resample(field, resampling_factors(path, waves, far, padded=None if way.paraxial else way.padded))
@@ -101,7 +101,7 @@ def test_tilted_light_arrives_as_predicted(tilt, crossovers):
     sines, distance, field = TILTS[tilt], crossovers * CROSS_OVER, white()
     offset = follow(sines, distance)
     wanted = exact(field, GRID, offset, distance, sines)
-    path = passage(GRID, None, offset, sines, [WAVE])
+    path = plane_pair(GRID, None, offset, sines, [WAVE])
     waves, far = (torch.tensor(value, dtype=torch.float64) for value in (WAVE, distance))
     ways = [way for way in find(path, [WAVE], [distance], dtype=torch.complex128) if way.error < 0.1]
     assert ways
@@ -185,10 +185,10 @@ def test_measured_content_predicts_the_error_of_the_very_field(kind):
         large = torch.nn.functional.pad(field, (0, 3 * shape[1], 0, 3 * shape[0]))
         wanted = CroppedKernel(wide, WAVE, distance)(large[None])[0, : shape[0], : shape[1]]
         waves, far = (torch.tensor(value, dtype=torch.float64) for value in (WAVE, distance))
-        for way in find(Passage(grid, grid), [WAVE], [distance], field=field, dtype=torch.complex128):
+        for way in find(PlanePair(grid, grid), [WAVE], [distance], field=field, dtype=torch.complex128):
             if not 1e-5 < way.error < 0.05:
                 continue
-            out = filter_spectrum(field, kernel_of(Passage(grid, grid), way, waves, far, torch.complex128))
+            out = filter_spectrum(field, kernel_of(PlanePair(grid, grid), way, waves, far, torch.complex128))
             checked += 1
             assert way.error / 10 <= error(out, wanted) <= 3 * way.error, way
     assert checked >= (1 if kind == "beam" else 5)
