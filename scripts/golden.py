@@ -137,8 +137,18 @@ def call(words: list[str]) -> tuple[int, str, str]:
 
 def plain(text: str, folder: str) -> list[str]:
     """Lines without what is of this moment and machine."""
-    lines = text.replace(folder, "FOLDER").replace(str(ROOT), "ROOT").splitlines()
+    lines = without_seconds(text.replace(folder, "FOLDER").replace(str(ROOT), "ROOT").splitlines())
     return [re.sub(r"\d+(\.\d+)?(e[-+]\d+)? (s|GB|min)\b", r"# \3", line) for line in lines]
+
+
+def without_seconds(lines: list[str]) -> list[str]:
+    """Lines of a table without its column of seconds."""
+    head = next((number for number, line in enumerate(lines) if re.search(r"  seconds\b", line)), None)
+    if head is None:
+        return lines
+    begin = lines[head].index("  seconds") + 2
+    end = begin + len(re.match(r"seconds *", lines[head][begin:])[0])  # type: ignore[index]
+    return lines[:head] + [line[:begin] + line[end:] for line in lines[head:]]
 
 
 def contents(folder: Path) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from typing import Any
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.config.source import read_source
 from holotorch.experiments.registry import find_kind, load_config
-from holotorch.experiments.report import has_section, write_report
+from holotorch.experiments.report import write_report
 from holotorch.experiments.runs.folder import RunFolder, open_run, tidied
 from holotorch.experiments.runs.plan import RunPlan
 from holotorch.experiments.runs.processes import joined_processes
@@ -48,7 +48,7 @@ def execute(settings: Any, out: Path | None, name: str = "run") -> tuple[Path, b
             write_report([path.parent], path)
 
         with open_run(out, name, settings, plan, kind.device(experiment)) as folder:
-            folder.write_page = write_page if has_section(settings.experiment) else None
+            folder.write_page = write_page
             if plan.values:
                 write_json(folder.path / "plan.json", plan.values)
             return folder.path, kind.run(experiment, folder)
@@ -78,7 +78,7 @@ def resume(folder: Path) -> tuple[Path, bool]:
         raise ConfigError([f"{folder} holds no run to resume: config.yaml and env.json are not both there"])
     if (folder / "summary.json").is_file():
         print("this run is complete; nothing is left to do")
-        if tidied(folder) and has_section(held.get("experiment")):
+        if tidied(folder):
             write_report([folder], folder / "report.html")
         return folder, True
     return execute(load_config(config), folder, folder.resolve().name)

@@ -59,12 +59,9 @@ class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
         """Where the run computes."""
         return "cpu"
 
-    def section(self, record: RunRecord) -> list[str] | None:
-        """The run's part of a report page, as HTML, from the files of its folder alone.
-
-        None for kinds whose runs write a page of their own.
-        """
-        return None
+    @abstractmethod
+    def section(self, record: RunRecord) -> list[str]:
+        """The run's part of a report page, as HTML, from the files of its folder alone."""
 
     def comparison(self, records: Sequence[RunRecord]) -> list[str]:
         """What a page of several runs of this kind begins with."""

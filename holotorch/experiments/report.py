@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from holotorch.experiments.config.errors import ConfigError
-from holotorch.experiments.kind import ExperimentKind
 from holotorch.experiments.registry import KINDS, find_kind
 from holotorch.experiments.runs.markup import element, plain, table
 from holotorch.experiments.runs.page import page
@@ -30,19 +29,14 @@ def write_report(folders: Sequence[Path], path: Path, more: Mapping[str, str] | 
     write_text(path, page(title, "\n".join(body)))
 
 
-def has_section(kind: object) -> bool:
-    """Whether runs of a kind can be shown together on a page."""
-    return isinstance(kind, str) and kind in KINDS and type(find_kind(kind)).section is not ExperimentKind.section
-
-
 def _read(folder: Path) -> tuple[RunRecord, str]:
     """What a run folder says of itself, and its part of the page."""
     try:
         run = RunRecord(folder)
-        if not has_section(run.kind):
+        if run.kind not in KINDS:
             raise ConfigError([_other(folder, run.kind)])
         run.load()
-        section = find_kind(run.kind).section(run) or []
+        section = find_kind(run.kind).section(run)
         return run, "\n".join(section + _repeat(run))
     except ConfigError:
         raise
@@ -53,8 +47,7 @@ def _read(folder: Path) -> tuple[RunRecord, str]:
 def _other(folder: Path, kind: str) -> str:
     page = folder / "report.html"
     own = f"; its own page is {page}" if page.is_file() else ""
-    shown = ", ".join(name for name in KINDS if has_section(name))
-    return f"{folder} holds a run of kind {kind}, and only those of {shown} can be shown together{own}"
+    return f"{folder} holds a run of kind {kind}, and only those of {', '.join(KINDS)} can be shown together{own}"
 
 
 def _repeat(run: RunRecord) -> list[str]:

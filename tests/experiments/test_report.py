@@ -5,11 +5,12 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from tiny_runs import command
 
 from holotorch.cli import main
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.execute import execute
-from holotorch.experiments.registry import load_config
+from holotorch.experiments.registry import KINDS, load_config
 from holotorch.experiments.report import write_report
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -76,20 +77,25 @@ def test_refuses_a_folder_without_a_run(folders, tmp_path):
             write_report([tmp_path / "a"], tmp_path / "report.html")
 
 
-def test_runs_with_pages_of_their_own_are_refused_in_one_line(tmp_path, capsys):
-    few = ["simulation.participants=6", "resamples=100", "power=null", "targets=[{seconds: 0.45}]"]
-    main(["run", str(CONFIGS / "perception" / "analysis.yaml"), *few, "--out", str(tmp_path / "a")])
-    (tmp_path / "t").mkdir()
-    (tmp_path / "t" / "summary.json").write_text('{"experiment": "track", "status": "complete"}')
-    own = (tmp_path / "a" / "report.html").read_text()
-    capsys.readouterr()
-    for name, kind, page in (
-        ("a", "perception_analysis", f"; its own page is {tmp_path}/a/report.html"),
-        ("t", "track", ""),
-    ):
-        assert main(["report", str(tmp_path / name)]) == 2
-        words = (
-            f"{tmp_path}/{name} holds a run of kind {kind}, and only those of pec, volume, eye can be shown together"
-        )
+def test_runs_of_all_kinds_share_a_page(folders, tmp_path, capsys, tiny):
+    names = ("study", "layout", "analysis")
+    for name in names:
+        assert main(command(name, tmp_path / name)) == 0
+    own = (tmp_path / "layout" / "report.html").read_text()
+    for words in ("<h2>Sizes</h2>", "<h2>How to repeat</h2>", "notional theme park", "Displays of thesis Table 2.1"):
+        assert words in own
+    every = [*map(str, folders), *(str(tmp_path / name) for name in names)]
+    assert main(["report", *every, "--out", str(tmp_path / "all.html")]) == 0
+    page = (tmp_path / "all.html").read_text()
+    assert all(words in page for words in ("<h1>Runs</h1>", "study: lowpass", "<h1>layout</h1>", "<h1>analysis</h1>"))
+    assert page.count("<style>") == page.count("<!DOCTYPE html>") == 1
+
+
+def test_runs_of_no_kind_are_refused_in_one_line(tmp_path, capsys):
+    (tmp_path / "summary.json").write_text('{"experiment": "track", "status": "complete"}')
+    for page in ("", f"; its own page is {tmp_path}/report.html"):
+        assert main(["report", str(tmp_path)]) == 2
+        words = f"{tmp_path} holds a run of kind track, and only those of {', '.join(KINDS)} can be shown together"
         assert capsys.readouterr().err == f"{words}{page}\n"
-    assert (tmp_path / "a" / "report.html").read_text() == own
+        (tmp_path / "report.html").write_text("its own")
+    assert (tmp_path / "report.html").read_text() == "its own"

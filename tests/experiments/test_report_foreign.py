@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from foreign import ATTACK, foreign
+from tiny_runs import command
 
 from holotorch.cli import main
 from holotorch.experiments.config.errors import ConfigError
@@ -34,7 +35,9 @@ def runs(tmp_path_factory, tiny) -> dict[str, Path]:
     volume = [SCENE, "volume.samples=8", "report.seeds=1"]
     execute(load_config(CONFIGS / "demo_volume.yaml", volume), base / "volume", "volume")
     execute(load_config(CONFIGS / "eye" / "teapot.yaml", EYE), base / "eye", "eye")
-    return {kind: base / kind for kind in ("pec", "volume", "eye")}
+    for kind in ("study", "layout", "analysis"):
+        assert main(command(kind, base / kind)) == 0
+    return {kind: base / kind for kind in ("pec", "volume", "eye", "study", "layout", "analysis")}
 
 
 def spoiled(value: Any) -> Iterator[Any]:
@@ -50,12 +53,14 @@ def spoiled(value: Any) -> Iterator[Any]:
     yield [ATTACK]
 
 
-@pytest.mark.parametrize("kind", ["pec", "volume", "eye"])
+@pytest.mark.parametrize("kind", ["pec", "volume", "eye", "study", "layout", "analysis"])
 def test_no_file_of_a_run_writes_into_its_page(runs, tmp_path, kind):
     folder, page = tmp_path / "run", tmp_path / "report.html"
     shutil.copytree(runs[kind], folder, ignore=shutil.ignore_patterns("*.png", "*.npy"))
     shown = 0
     for name in ("summary.json", "plan.json", "env.json"):
+        if not (folder / name).is_file():
+            continue
         text = (folder / name).read_text()
         for value in spoiled(json.loads(text)):
             (folder / name).write_text(json.dumps(value))

@@ -11,6 +11,7 @@ from holotorch.experiments.runs.plan import RunPlan
 if TYPE_CHECKING:
     from holotorch.experiments.pec_study.run import Study
     from holotorch.experiments.runs.folder import RunFolder
+    from holotorch.experiments.runs.record import RunRecord
 
 
 class StudyKind(ExperimentKind[StudySettings, "Study"]):
@@ -36,6 +37,11 @@ class StudyKind(ExperimentKind[StudySettings, "Study"]):
         from holotorch.experiments.pec_study.run import run_study
 
         return run_study(experiment, folder)
+
+    def section(self, record: RunRecord) -> list[str]:
+        from holotorch.experiments.pec_study.report import study_section
+
+        return study_section(record)
 
 
 KIND = StudyKind()

@@ -11,7 +11,6 @@ from holotorch.experiments.pec_study.config import StudySettings
 from holotorch.experiments.pec_study.studies import STUDIES
 from holotorch.experiments.runs.fingerprint import fingerprint
 from holotorch.experiments.runs.folder import RunFolder, conclude
-from holotorch.experiments.runs.markup import element
 from holotorch.experiments.runs.memory import peak_memory
 from holotorch.experiments.runs.pictures import curves
 from holotorch.experiments.runs.saving import Checkpoint, Results
@@ -51,8 +50,6 @@ def run_study(study: Study, opened: RunFolder) -> bool:
     files.write(write_text, folder / "table.txt", text)
     picture = curves(rows, f"{settings.study}: mean of {', '.join(settings.images)} at {settings.size} px")
     files.write(write_bytes, folder / "images" / "table.png", picture)
-    page = element("title", settings.study) + element("h1", settings.study)
-    page += "<img src='images/table.png'>" + element("pre", text)
     verdicts = [row["verdict"].split(":")[0] for row in rows if row["verdict"]]
     summary = {
         "experiment": settings.experiment,
@@ -63,8 +60,6 @@ def run_study(study: Study, opened: RunFolder) -> bool:
         "seconds": round(cases.seconds, 1),
         "peak_memory_bytes": peak_memory(),
     }
-    page = f"<!DOCTYPE html><meta charset='utf-8'>{page}"
-    files.write(write_text, folder / "report.html", page)
     complete = conclude(opened, summary, files, done=True)
     print(text)
     return complete

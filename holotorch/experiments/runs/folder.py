@@ -65,7 +65,7 @@ class RunFolder:
         name: Of the run.
         plan: What the run is to do.
         pressed: Signals that have come.
-        write_page: Writes the page of the folder to a path, from what is in the folder; None where the run does.
+        write_page: Writes the page of the folder to a path, from what is in the folder; None where there is none yet.
     """
 
     path: Path

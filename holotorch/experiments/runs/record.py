@@ -1,6 +1,8 @@
 """RunRecord: what the folder of a run says of it."""
 
 import base64
+import csv
+import io
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +33,20 @@ class RunRecord:
         self.kind = str(self.summary["experiment"])
 
     def load(self) -> None:
-        """Read what a section of a page is made of: ``plan``, ``env`` and ``config``."""
-        self.plan: dict[str, Any] = read_json(self.folder / "plan.json")
+        """Read what a section of a page is made of: ``plan``, where there is one, ``env`` and ``config``."""
+        plan = self.folder / "plan.json"
+        self.plan: dict[str, Any] = read_json(plan) if plan.is_file() else {}
         self.env: dict[str, Any] = read_json(self.folder / "env.json")
         self.config = (self.folder / "config.yaml").read_text(encoding="utf-8")
+
+    def text(self, name: str) -> str:
+        """A text file of the folder, or nothing where there is none."""
+        path = self.folder / name
+        return path.read_text(encoding="utf-8") if path.is_file() else ""
+
+    def rows(self, name: str) -> list[dict[str, str]]:
+        """Rows of a table of the folder, none where there is none."""
+        return list(csv.DictReader(io.StringIO(self.text(name))))
 
     def picture(self, name: str) -> str:
         """A picture of the folder as a data URL, or nothing where there is none."""

@@ -10,6 +10,7 @@ from holotorch.experiments.runs.plan import RunPlan
 
 if TYPE_CHECKING:
     from holotorch.experiments.runs.folder import RunFolder
+    from holotorch.experiments.runs.record import RunRecord
 
 
 class AnalysisKind(ExperimentKind[AnalysisSettings, AnalysisSettings]):
@@ -36,6 +37,11 @@ class AnalysisKind(ExperimentKind[AnalysisSettings, AnalysisSettings]):
         from holotorch.experiments.perception.analysis.run import run_analysis
 
         return run_analysis(experiment, folder)
+
+    def section(self, record: RunRecord) -> list[str]:
+        from holotorch.experiments.perception.analysis.report import analysis_section
+
+        return analysis_section(record)
 
 
 KIND = AnalysisKind()

@@ -35,23 +35,14 @@ from holotorch.experiments.perception.analysis.statistics import (
 )
 from holotorch.experiments.perception.study.frames import quantisation
 from holotorch.experiments.runs.folder import RunFolder, conclude
-from holotorch.experiments.runs.markup import element, figure, table
 from holotorch.experiments.runs.saving import Results
 from holotorch.experiments.runs.tables import write_table
-from holotorch.io.files import save_array, write_bytes, write_json, write_text
+from holotorch.io.files import save_array, write_bytes, write_json
 
 LEFT_OUT = (
     "repeated measures and the mixed model, which need statsmodels: pip install 'holotorch[stats]' and run it again; "
     "the one-way ANOVA takes the answers of one participant as independent"
 )
-_CAPTIONS = {
-    "time_surface": "Fig. 2.3: quartiles of the perception time",
-    "time_map": "Fig. 2.4: median perception time of all conditions",
-    "participant": "Fig. 2.5: times of one participant",
-    "time_slices": "Fig. 2.6: perception time over eccentricity",
-    "scale_lines": "Fig. 2.7: equal-efficiency scales",
-    "power": "Power of the study",
-}
 
 
 def find(settings: AnalysisSettings, times: Times, curves: Curves) -> list[Finding]:
@@ -164,9 +155,6 @@ def run_analysis(settings: AnalysisSettings, opened: RunFolder) -> bool:
         print("\n".join(said), flush=True)
     for key, data in images.items():
         files.write(write_bytes, folder / "images" / f"{key}.png", data)
-    body = "<h1>Perception in the far periphery</h1>" + element("pre", text) + _table(rows)
-    body += "".join(figure(f"images/{key}.png", _CAPTIONS[key], "wide") for key in images)
-    body += _table(power) if power else ""
     summary = {
         "experiment": "perception_analysis",
         "status": "",
@@ -177,10 +165,9 @@ def run_analysis(settings: AnalysisSettings, opened: RunFolder) -> bool:
         "quantisation": asdict(frames) | {"on_frames": in_json(whole)},
         "rows": rows,
         "power": power,
+        "lines": text.splitlines(),
         "seconds": round(time.perf_counter() - started, 2),
     }
-    page = f"<!DOCTYPE html><meta charset='utf-8'><title>perception</title>{body}"
-    files.write(write_text, opened.path / "report.html", page)
     return conclude(opened, summary, files, done=True)
 
 
@@ -214,10 +201,3 @@ def _curves(times: Times, curves: Curves) -> list[dict[str, Any]]:
         for p in range(len(times.participants))
         for k in range(len(curves.eccentricities))
     ]
-
-
-def _table(rows: list[dict[str, Any]]) -> str:
-    def cell(value: Any) -> str:
-        return "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
-
-    return table([key.replace("_", " ") for key in rows[0]], [[cell(value) for value in row.values()] for row in rows])

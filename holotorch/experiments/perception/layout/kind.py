@@ -11,6 +11,7 @@ from holotorch.experiments.runs.plan import RunPlan
 if TYPE_CHECKING:
     from holotorch.experiments.perception.layout.run import Layouts
     from holotorch.experiments.runs.folder import RunFolder
+    from holotorch.experiments.runs.record import RunRecord
 
 
 class LayoutKind(ExperimentKind[LayoutSettings, "Layouts"]):
@@ -34,6 +35,11 @@ class LayoutKind(ExperimentKind[LayoutSettings, "Layouts"]):
         from holotorch.experiments.perception.layout.run import run_layout
 
         return run_layout(experiment, folder)
+
+    def section(self, record: RunRecord) -> list[str]:
+        from holotorch.experiments.perception.layout.report import layout_section
+
+        return layout_section(record)
 
 
 KIND = LayoutKind()

@@ -1,10 +1,8 @@
 """A layout over a wide field, scaled for equal perception time: picture, tables and report (thesis Fig. 2.8)."""
 
-import base64
 import io
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -20,11 +18,9 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.perception.layout.config import ItemSettings, LayoutSettings
 from holotorch.experiments.perception.layout.icons import draw_ground, draw_icon
 from holotorch.experiments.runs.folder import RunFolder, conclude
-from holotorch.experiments.runs.markup import element, figure, table
-from holotorch.experiments.runs.page import page
 from holotorch.experiments.runs.saving import Results
 from holotorch.experiments.runs.tables import write_table
-from holotorch.io.files import write_bytes, write_text
+from holotorch.io.files import write_bytes
 from holotorch.perception import (
     FITTED_DEG,
     TABLE_2_1,
@@ -91,7 +87,7 @@ def build_layouts(settings: LayoutSettings) -> Layouts:
 
 def run_layout(layouts: Layouts, opened: RunFolder) -> bool:
     """Draw the layouts and fill the folder; whether the run is complete."""
-    settings, name = layouts.settings, opened.name
+    settings = layouts.settings
     folder, files, text = opened.path, Results(), layout_text(settings)
     rows = [row for title, layout in layouts.scaled for row in _rows(settings, title, layout)]
     files.write(write_table, folder / "layout.csv", rows)
@@ -99,7 +95,6 @@ def run_layout(layouts: Layouts, opened: RunFolder) -> bool:
     files.write(write_bytes, folder / "images" / "layout.png", picture)
     displays = _displays(settings)
     files.write(write_table, folder / "displays.csv", displays)
-    page = _report(name, text, picture, rows, displays, folder)
     flags = {
         title: {
             "fitted": int(layout.fitted.sum()),
@@ -110,8 +105,13 @@ def run_layout(layouts: Layouts, opened: RunFolder) -> bool:
         }
         for title, layout in layouts.scaled
     }
-    summary = {"experiment": settings.experiment, "status": "", "targets": flags, "items": rows}
-    files.write(write_text, folder / "report.html", page)
+    summary = {
+        "experiment": settings.experiment,
+        "status": "",
+        "targets": flags,
+        "items": rows,
+        "lines": text.splitlines(),
+    }
     complete = conclude(opened, summary, files, done=True)
     print(text)
     return complete
@@ -242,21 +242,3 @@ def _box(axes: Axes, centre: tuple[float, float], size: tuple[float, float], col
         corner, size[1], size[0], fill=False, edgecolor=colour, linestyle=style, linewidth=1.5, zorder=300
     )
     axes.add_patch(shape)
-
-
-def _report(
-    name: str, text: str, picture: bytes, rows: list[dict[str, Any]], displays: list[dict[str, Any]], folder: Path
-) -> str:
-    source = "data:image/png;base64," + base64.b64encode(picture).decode()
-    caption = "Icons of a notional theme park with their sizes. Those framed in grey are not scaled"
-    caption += "; * extrapolated." if any(row["note"].startswith("extrapolated") for row in rows) else "."
-    body = [element("h1", name), figure(source, caption, "wide"), element("pre", text)]
-    for heading, lines in (
-        ("Sizes", rows),
-        ("Displays of thesis Table 2.1: how far out they show what is asked", displays),
-    ):
-        names = [key.replace("_", " ") for key in lines[0]]
-        cells = [[str(value) for value in line.values()] for line in lines]
-        body.append(element("h2", heading) + table(names, cells))
-    body.append("<h2>How to repeat</h2>" + element("code", f"holotorch run {folder / 'config.yaml'}"))
-    return page(f"holotorch: {name}", "\n".join(body))

@@ -1,0 +1,27 @@
+"""The part of a report page that shows a layout over a wide field."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from holotorch.experiments.runs.markup import element, figure, heading, table
+from holotorch.experiments.runs.record import RunRecord
+
+
+def layout_section(record: RunRecord) -> list[str]:
+    """HTML of a layout: its picture, what it asks for in words, its sizes and the displays that show it."""
+    rows = record.summary["items"]
+    parts = [heading(record.title, record.summary["status"])]
+    caption = "Icons of a notional theme park with their sizes. Those framed in grey are not scaled"
+    caption += "; * extrapolated." if any(row["note"].startswith("extrapolated") for row in rows) else "."
+    if source := record.picture("layout"):
+        parts.append(figure(source, caption, "wide"))
+    parts.append(element("pre", "\n".join(record.summary["lines"])))
+    displays = "Displays of thesis Table 2.1: how far out they show what is asked"
+    for title, lines in (("Sizes", rows), (displays, record.rows("displays.csv"))):
+        parts += [element("h2", title), *_table(lines)]
+    return parts
+
+
+def _table(rows: Sequence[dict[str, Any]]) -> list[str]:
+    names = [key.replace("_", " ") for key in rows[0]] if rows else []
+    return [table(names, [[str(value) for value in row.values()] for row in rows])] if rows else []
