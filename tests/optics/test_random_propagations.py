@@ -9,8 +9,7 @@ from oracles.propagation import random_case
 
 from holotorch import Grid
 from holotorch.core.checks import SamplingWarning
-from holotorch.optics import propagate
-from holotorch.optics.planning.plan import plan_propagation
+from holotorch.optics import plan_propagation, propagate
 
 # Of ten thousand, those whose error was beyond ten tolerances without a word while a plan's prediction was relative to
 # the light that noise would leave in the window, tilts were predicted without what one axis does to the other, and a

@@ -30,7 +30,9 @@ _INSIDE = np.array([-0.3, -0.15, 0.0, 0.15, 0.3])  # widths from the axis
 _BESIDE = np.array([0.9, 1.2, 1.5, 1.8])
 _ACROSS = np.concatenate([-_BESIDE[::-1], _INSIDE, _BESIDE])
 _SIZES = len(_BESIDE), len(_INSIDE), len(_BESIDE)
-_MEANS = np.repeat(np.eye(3, dtype=np.float32) / (3 * np.array(_SIZES, dtype=np.float32)[:, None]), _SIZES, axis=1)
+_MEANS = np.repeat(
+    np.eye(3, dtype=np.float32) / (3 * np.array(_SIZES, dtype=np.float32)[:, None]), 3 * np.array(_SIZES), axis=1
+)
 
 
 def shows_reversed(
@@ -65,7 +67,8 @@ def _share(
 
     None where fewer than ``check.fewest`` lie on the frame.
     """
-    places = np.linspace(part[0] + check.margin, part[1] - check.margin, check.stations)
+    begin, end = part[0] + check.margin, part[1] - check.margin
+    places = begin + (end - begin) / (check.stations - 1) * np.arange(check.stations)
     depth = found.tip[2] + places * found.direction[2]
     if not depth.min() > 10 * radius:
         places, depth = places[depth > 10 * radius], depth[depth > 10 * radius]
@@ -78,10 +81,11 @@ def _share(
         return None
     sideways = 1j * along / abs(along) * (2 * radius / depth)
     pixels = lens.distort(axis[:, None] + sideways[:, None] * _ACROSS)
-    inside = sampler.inside(pixels).all(-1)
+    inside = sampler.inside(pixels[:, [0, -1]]).all(-1)
     if (seen := int(inside.sum())) < check.fewest:
         return None
     # Means over one side, the tube and the other side, of all three colours.
-    one, tube, other = _MEANS @ sampler.nearest(pixels)[inside].sum(-1, dtype=np.float32).T
+    levels = sampler.nearest(pixels if seen == len(pixels) else pixels[inside])
+    one, tube, other = _MEANS @ levels.reshape(seen, -1).astype(np.float32).T
     brighter, darker = tube - np.maximum(one, other), np.minimum(one, other) - tube
     return max(int((brighter > check.contrast).sum()), int((darker > check.contrast).sum())) / seen
