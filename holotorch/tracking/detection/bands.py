@@ -48,8 +48,9 @@ def find_axis(labels: np.ndarray, t: np.ndarray, u: np.ndarray, reach: float) ->
     """
     along, across = np.divmod(np.flatnonzero(labels), labels.shape[1])
     if len(along) and int(np.bincount(along).max()) >= 0.6 * len(u):  # rows of one colour are not thin
-        each = labels == np.arange(1, int(labels.max()) + 1)[:, None, None]
-        along, across = (each & (each.mean(-1, keepdims=True) < 0.6)).any(0).nonzero()
+        each = labels == np.arange(1, int(labels.max()) + 1, dtype=np.uint8)[:, None, None]
+        thin = np.add.reduce(each.view(np.uint8), -1, dtype=np.uint16, keepdims=True) < 0.6 * len(u)
+        along, across = np.divmod(np.flatnonzero((each & thin).any(0)), labels.shape[1])
     least = 20 / float((t[1] - t[0]) * (u[1] - u[0]))
     if len(along) < least:
         return None

@@ -56,8 +56,11 @@ def _labels(frame: Tensor, table: ColourTable) -> np.ndarray:
     if frame.device.type != "cpu" or rows.stride()[1:] != (3, 1):
         rows, aside = rows[:, ::_STEP].contiguous().cpu(), 1
     # As ColourTable.labels, but thinned out after the first step: to copy every second pixel takes longer.
-    packed = cv2.cvtColor(rows.numpy(), cv2.COLOR_RGB2BGR555).view(np.uint16)[:, ::aside, 0]
-    return cv2.LUT(np.ascontiguousarray(packed), table.table)
+    packed = cv2.cvtColor(rows.numpy(), cv2.COLOR_RGB2BGR555).view(np.uint16)[..., 0]
+    if aside == 2 and packed.shape[1] % 2 == 0:
+        # The lower half of each pair of pixels is the first of them; a cast is four times as fast as a strided copy.
+        return cv2.LUT(packed.view("<u4").astype(np.uint16), table.table)
+    return cv2.LUT(np.ascontiguousarray(packed[:, ::aside]), table.table)
 
 
 @dataclass(frozen=True, eq=False)
