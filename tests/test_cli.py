@@ -11,10 +11,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from paths import CONFIGS
 
 from holotorch.cli import main
 
-CONFIG = str(Path(__file__).parents[1] / "configs" / "pec" / "fourier.yaml")
+CONFIG = str(CONFIGS / "pec" / "fourier.yaml")
 TINY = ["grid.shape=[16,16]", "solver.max_steps=2"]
 
 

@@ -8,8 +8,8 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+from paths import ROOT
 
-ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "holotorch"
 FILES = sorted(PACKAGE.rglob("*.py"))
 # Rooms of a package: each may use those after it; names on one level do not import each other.

@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from paths import ROOT
 
-ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "holotorch"
 # Each level may use those after it and itself; names on one level do not import each other.
 LEVELS = [

@@ -6,8 +6,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from paths import ROOT
 
-ROOT = Path(__file__).parents[1]
 NEEDED = ("bash", "cat", "cksum", "dirname", "mktemp", "rm", "tail", "grep", "mkdir", "chmod")
 
 

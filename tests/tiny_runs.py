@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from paths import CONFIGS
 
-CONFIGS = Path(__file__).parents[1] / "configs"
 VOLUME = [
     "volume={phantom: shells, samples: 8}",
     "transfer={points: [[20, 1, 0.2, 0, 0], [255, 0.2, 0.9, 1, 0.9]], unit_distance: 0.05}",

@@ -2,9 +2,9 @@ import base64
 import re
 import shutil
 from html.parser import HTMLParser
-from pathlib import Path
 
 import pytest
+from paths import CONFIGS
 from tiny_runs import command
 
 from holotorch.cli import main
@@ -13,7 +13,6 @@ from holotorch.experiments.execute import execute
 from holotorch.experiments.registry import KINDS, load_config
 from holotorch.experiments.report import write_report
 
-CONFIGS = Path(__file__).parents[2] / "configs"
 VOID = {"meta", "img", "br"}
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from foreign import ATTACK, foreign
+from paths import CONFIGS
 from tiny_runs import command
 
 from holotorch.cli import main
@@ -17,7 +18,6 @@ from holotorch.experiments.registry import load_config
 from holotorch.experiments.report import write_report
 from holotorch.experiments.tracking.report import write_page
 
-CONFIGS = Path(__file__).parents[2] / "configs"
 SCENE = "hologram={shape: [32, 32], pitch: 3.74 um, distance: 5 mm, depths: 4}"
 EYE = [
     "scene={config: configs/volume/c60.yaml, change: ['volume={phantom: c60, samples: 16}', "

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from oracles import dense
+from paths import CONFIGS
 from skimage.metrics import structural_similarity
 
 from holotorch.correction import Solution
@@ -28,7 +29,6 @@ from holotorch.experiments.runs.folder import claim
 from holotorch.experiments.runs.saving import Checkpoint
 from holotorch.io.images import load_image
 
-CONFIGS = Path(__file__).parents[2] / "configs"
 FILES = ["arrays", "config.yaml", "env.json", "images", "metrics.csv", "plan.json", "report.html", "summary.json"]
 SMALL = ["grid.shape=[32,24]", "solver.max_steps=12", "target.image=coffee"]
 

@@ -10,7 +10,6 @@ from fuzz.engine import Input, Refused
 
 from holotorch.cli import main
 
-CONFIGS = Path(__file__).parents[2] / "configs"
 _LONG = 200_000  # characters of a message
 
 

@@ -8,10 +8,11 @@ from typing import Any
 
 import torch
 import yaml
-from fuzz.commands import CONFIGS, command
+from fuzz.commands import command
 from fuzz.engine import Input, Refused, Target
 from fuzz.mutate import NUMBERS, mutated
 from fuzz.mutate_tree import LENGTHS, table_mutated, yaml_mutated
+from paths import CONFIGS
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.panel.config import build_panel, load_panel

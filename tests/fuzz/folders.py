@@ -13,11 +13,12 @@ from unittest.mock import patch
 import numpy as np
 import torch
 from foreign import ATTACK, foreign
-from fuzz.commands import CONFIGS, command, files, without_figures
+from fuzz.commands import command, files, without_figures
 from fuzz.engine import Input, Refused, Target
 from fuzz.mutate import mutated
 from fuzz.mutate_headers import png_mutated
 from fuzz.mutate_tree import json_mutated, table_mutated, yaml_mutated
+from paths import CONFIGS
 
 from holotorch.cli import main
 from holotorch.experiments.pec.progress import Log

@@ -11,10 +11,11 @@ from pathlib import Path
 from random import Random
 
 import torch
-from fuzz.commands import CONFIGS, command
+from fuzz.commands import command
 from fuzz.engine import Input, Refused, Target
 from fuzz.mutate import mutated
 from fuzz.mutate_tree import json_mutated, table_mutated
+from paths import CONFIGS
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.perception.study.log import TrialLog, read_log

@@ -3,16 +3,14 @@ import http.server
 import json
 import re
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
+from paths import SHARED
 
 from holotorch.io import catalogue
 from holotorch.io.catalogue import PUBLISHED, Published, fetch_volume
 from holotorch.io.volumes import load_volume
-
-SHARED = Path(__file__).parents[3] / "shared" / "data"
 
 
 @pytest.fixture

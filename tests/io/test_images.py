@@ -3,6 +3,7 @@ import numpy as np
 import OpenEXR
 import pytest
 import torch
+from paths import SHARED
 
 from holotorch.io.bundled import BUNDLED_IMAGES
 from holotorch.io.images import encode_png, fit_image, load_image, with_channels
@@ -160,9 +161,8 @@ def test_png_round_trip(tmp_path):
 
 
 def test_shared_photographs_load():
-    from pathlib import Path
 
-    folder = Path(__file__).parents[3] / "shared" / "data" / "images"
+    folder = SHARED / "images"
     if not folder.is_dir():
         pytest.skip("the shared photographs are not beside this checkout; bundled ones cover the same path")
     for path in folder.iterdir():

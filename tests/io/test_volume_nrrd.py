@@ -9,10 +9,10 @@ from typing import Any
 import nrrd
 import numpy as np
 import pytest
+from paths import SHARED
 
 from holotorch.io.volumes import load_volume
 
-SHARED = Path(__file__).parents[3] / "shared" / "data"
 SHAPE = (4, 5, 6)
 CUBES = {"spacing": 1, "unit": "relative"}
 

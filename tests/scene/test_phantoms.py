@@ -1,8 +1,8 @@
 import math
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import paths
 import pytest
 import torch
 
@@ -16,7 +16,7 @@ from holotorch.scene import (
     shells,
 )
 
-SHARED = Path(__file__).parents[3] / "shared" / "data" / "volumes"
+SHARED = paths.SHARED / "volumes"
 SHAPE = (6, 11, 16)
 PHANTOMS = [marschner_lobb, gaussian_ball, homogeneous_slab, exponential_medium, c60, shells]
 

@@ -1,0 +1,307 @@
+"""track, calibrate and stream as a user types them: exit statuses and messages, and what is loaded when."""
+
+import csv
+import json
+import shutil
+import socket
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import paths
+import pytest
+
+from holotorch.cli import main
+from holotorch.experiments.streaming import check as stream_check
+from holotorch.experiments.streaming import stream
+from holotorch.experiments.tracking import run as track
+from holotorch.experiments.tracking import synthetic
+from holotorch.experiments.tracking.synthetic import write_synthetic
+from holotorch.tracking.pose.status import Status
+from holotorch.tracking.streaming.packet import PosePacket, decode
+
+CONFIGS = paths.CONFIGS / "tracking"
+FILES = ["--camera", str(CONFIGS / "camera.yaml"), "--catheter", str(CONFIGS / "catheter.yaml")]
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def said(capsys, *arguments: str, status: int = 2) -> str:
+    """What a command says on stderr, ending with ``status`` and without a trace."""
+    assert main(list(arguments)) == status
+    out, err = capsys.readouterr()
+    assert "Traceback" not in out + err
+    return err
+
+
+def wrong(capsys, *arguments: str) -> str:
+    """What argparse says of arguments that it refuses."""
+    with pytest.raises(SystemExit) as stop:
+        main(list(arguments))
+    assert stop.value.code == 2
+    return capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    return write_synthetic(tmp_path_factory.mktemp("made") / "recording", 2, (540, 960))
+
+
+def test_track_a_recording_with_its_own_files(recording, capsys):
+    assert main(["track", str(recording), "--out", "here", "--no-video"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == "here/report.html" and Path("here/report.html").is_file()
+    assert lines[-2].startswith("Truth      the tip is") and "in 2 frames; 0 refused (synthetic)" in lines[-2]
+    with open("here/poses.csv", newline="") as stream:
+        assert [row["status"] for row in csv.DictReader(stream)] == ["OK", "OK"]
+    assert not Path("here/overlay.mp4").exists()
+    assert json.loads(Path("here/summary.json").read_text())["status"] == "complete"
+
+
+def test_track_the_synthetic_source_renders_it_first(monkeypatch, capsys):
+    monkeypatch.setattr(synthetic, "write_synthetic", lambda out, **given: write_synthetic(out, 1, (540, 960), **given))
+    assert main(["track", "synthetic", "--no-video"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "runs/synthetic-001" and lines[-1] == "runs/track-001/report.html"
+    assert "in 1 frames; 0 refused" in lines[-2]
+    Path("c.yaml").write_text("fx: 620\nfy: 620\ncx: 480\ncy: 270\nsize: [540, 960]\n")
+    assert main(["track", "synthetic", "--no-video", "--camera", "c.yaml", *FILES[2:]]) == 0
+    assert "fx: 620" in Path("runs/synthetic-002/camera.yaml").read_text()
+    with open("runs/track-002/poses.csv", newline="") as stream:
+        (row,) = csv.DictReader(stream)
+    with open("runs/synthetic-002/truth.csv", newline="") as stream:
+        (true,) = csv.DictReader(stream)
+    assert abs(float(row["tip_z_m"]) - float(true["tip_z_m"])) < 1.5e-3
+
+
+def test_track_says_an_interruption_by_its_status(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(track, "run_tracking", lambda *_, **__: (tmp_path, False))
+    assert main(["track", "video.mp4", *FILES]) == 130
+    assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path)
+    (tmp_path / "report.html").touch()
+    assert main(["track", "video.mp4", *FILES]) == 130
+    assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "report.html")
+
+
+def test_track_hands_its_arguments_on(monkeypatch):
+    taken = {}
+
+    def stand_in(*arguments, **options):
+        taken.update(options, arguments=arguments)
+        return Path("here"), True
+
+    monkeypatch.setattr(track, "run_tracking", stand_in)
+    words = ["--out", "o", "--method", "thesis", "--record", "--still", "--rate", "25"]
+    assert main(["track", "0", "--camera", "c.yaml", "--catheter", "t.yaml", *words]) == 0
+    assert taken.pop("arguments") == ("0", Path("c.yaml"), Path("t.yaml"), Path("o"))
+    assert taken == {"method": "thesis", "record": True, "video": True, "still": True, "rate": 25.0}
+
+
+def test_track_without_a_camera_or_a_catheter_asks_for_them(capsys):
+    cv2.imwrite("0.png", np.zeros((48, 64, 3), np.uint8))
+    error = said(capsys, "track", ".")
+    assert "no camera.yaml: say which with --camera" in error and "no catheter.yaml: say which with --catheter" in error
+    error = said(capsys, "track", ".", *FILES[2:])
+    assert "--camera" in error and "--catheter" not in error
+    assert not Path("runs").exists()
+
+
+def test_track_with_files_that_are_missing_or_wrong(capsys):
+    cv2.imwrite("0.png", np.zeros((1080, 1920, 3), np.uint8))
+    assert "nowhere.mp4" in said(capsys, "track", "nowhere.mp4", *FILES)
+    assert "none.yaml" in said(capsys, "track", ".", "--camera", "none.yaml", *FILES[2:])
+    assert "none.yaml" in said(capsys, "track", ".", *FILES[:2], "--catheter", "none.yaml")
+    Path("bad.yaml").write_text("fx: -3\nfy: 1400\ncx: 960\ncy: 540\n")
+    assert "bad.yaml:1:1: fx: expected greater than 0, got -3" in said(
+        capsys, "track", ".", "--camera", "bad.yaml", *FILES[2:]
+    )
+    Path("text.mp4").write_text("no video")
+    assert "text.mp4" in said(capsys, "track", "text.mp4", *FILES)
+    Path("empty").mkdir()
+    assert "empty" in said(capsys, "track", "empty", *FILES)
+    assert not Path("runs").exists()
+
+
+def test_track_with_wrong_arguments(capsys):
+    assert "expected one of ours, thesis as the method, got 'best'" in said(
+        capsys, "track", ".", *FILES, "--method", "best"
+    )
+    assert "SOURCE" in wrong(capsys, "track")
+    assert "invalid float value: 'fast'" in wrong(capsys, "track", ".", "--rate", "fast")
+    assert "unrecognized arguments: --colour" in wrong(capsys, "track", ".", "--colour", "red")
+
+
+def test_track_looks_for_the_source_first(recording, capsys):
+    assert said(capsys, "track", "nowhere").splitlines() == [
+        "no such video, folder or camera: nowhere; a camera is given by its number, such as 0"
+    ]
+    for name, lost in (("a", "times.csv"), ("b", "recording.json")):
+        shutil.copytree(recording, name)
+        Path(name, lost).unlink()
+        assert said(capsys, "track", name) == f"{name}: a recording without its {lost} cannot be replayed\n"
+
+
+def test_track_with_two_wrong_files_names_both(capsys):
+    cv2.imwrite("0.png", np.zeros((1080, 1920, 3), np.uint8))
+    error = said(capsys, "track", ".", "--camera", "no1.yaml", "--catheter", "no2.yaml")
+    assert [line.split(":")[0] for line in error.splitlines()] == ["no1.yaml", "no2.yaml"]
+    Path("no1.yaml").write_text("")
+    Path("no2.yaml").write_text("[1, 2]\n")
+    error = said(capsys, "track", ".", "--camera", "no1.yaml", "--catheter", "no2.yaml")
+    assert error.splitlines() == [
+        "no1.yaml:1:1: the file is empty; expected the settings of a camera: fx, fy, cx, cy",
+        "no2.yaml:1:1: expected the settings of a catheter: edges, colours, radius, length, got [1, 2]",
+    ]
+
+
+def test_track_for_frames_of_another_size(capsys):
+    cv2.imwrite("0.png", np.zeros((48, 64, 3), np.uint8))
+    Path("camera.yaml").write_text("fx: 60\nfy: 60\ncx: 320\ncy: 240\nsize: [480, 640]\n")
+    error = said(capsys, "track", ".", "--camera", "camera.yaml", *FILES[2:])
+    assert "holds for frames of 640 x 480 px, and these have 64 x 48 px" in error
+
+
+def test_calibrate_with_files_that_are_missing_or_wrong(capsys):
+    assert "FILE" in wrong(capsys, "calibrate")
+    assert said(capsys, "calibrate", "none.png", "camera") == (
+        "none.png: no such file or folder\ncamera: no such file or folder\n"
+    )
+    Path("empty").mkdir()
+    assert "empty" in said(capsys, "calibrate", "empty")
+    for i in range(4):
+        cv2.imwrite(f"{i}.png", np.full((120, 160, 3), 90, np.uint8))
+    error = said(capsys, "calibrate", *(f"{i}.png" for i in range(4)))
+    assert "0.png: " in error and "3.png: " in error  # no board on any, each named
+    cv2.imwrite("4.png", np.full((60, 80, 3), 90, np.uint8))
+    assert "photographs of one size" in said(capsys, "calibrate", *(f"{i}.png" for i in range(5)))
+    assert not Path("camera.yaml").exists()
+
+
+def test_calibrate_with_a_board_that_is_none(capsys):
+    cv2.imwrite("0.png", np.full((120, 160, 3), 90, np.uint8))
+    error = said(capsys, "calibrate", "0.png", "--board", "chessboard", "9x6", "-25mm")
+    assert error == "--board: square must be above zero in metres, got -0.025\n"
+    for words in (["circles", "9x6", "25mm"], ["chessboard", "9x6"], ["chessboard", "nine", "25mm"], ["charuco"]):
+        assert "--board: expected chessboard 9x6 25mm" in said(capsys, "calibrate", "0.png", "--board", *words)
+
+
+def test_calibrate_does_not_write_over_a_file(capsys):
+    Path("camera.yaml").write_text("mine")
+    cv2.imwrite("0.png", np.full((120, 160, 3), 90, np.uint8))
+    assert "camera.yaml exists already" in said(capsys, "calibrate", "0.png")
+    assert Path("camera.yaml").read_text() == "mine"
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+def test_stream_check_on_a_free_port_and_on_one_in_use(monkeypatch, capsys):
+    """Where others use the computer a packet may be slow; the status says so, and the counts are right all the same."""
+    monkeypatch.setattr(stream_check, "check", partial(stream_check.check, packets=150))
+    status = main(["stream", "--check", "--port", str(free_port())])
+    lines = capsys.readouterr().out.splitlines()
+    assert status == (1 if any(line.startswith("FAIL") for line in lines) else 0)
+    assert lines[0].startswith("OK    port")
+    assert sum(line.startswith("OK    receiver") and "150 of 150 packets" in line for line in lines) == 2
+    assert sum(line.startswith("OK    lossy way") for line in lines) == 1
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("", 0))
+        assert main(["stream", "--check", "--port", str(one.getsockname()[1])]) == 1
+    assert capsys.readouterr().out.startswith("FAIL  port")
+
+
+def test_stream_check_says_by_its_status_what_failed(monkeypatch, capsys):
+    for sound, status in ((True, 0), (False, 1)):
+        monkeypatch.setattr(stream_check, "check", lambda port, sound=sound: sound and port == 4711 or False)
+        assert main(["stream", "--check", "--port", "4711"]) == status
+
+
+def test_stream_with_nobody_and_nothing_to_send(capsys):
+    assert "say to whom: --to HOST:PORT" in said(capsys, "stream", "poses.csv")
+    to = ["--to", "127.0.0.1:1"]
+    assert "expected one poses.csv or videos to track, got nothing" in said(capsys, "stream", *to)
+    assert "poses.csv" in said(capsys, "stream", "poses.csv", *to)  # there is none
+    Path("other.csv").write_text("a,b\n1,2\n")
+    assert "other.csv: not a table of poses" in said(capsys, "stream", "other.csv", *to)
+    assert "rate must be above 0 Hz, got -5" in said(capsys, "stream", "poses.csv", *to, "--rate", "-5")
+    error = said(capsys, "stream", "poses.csv", "--to", "127.0.0.1:99999")
+    assert "expected a port from 1 to 65535, got 99999 in '127.0.0.1:99999'" in error
+
+
+def test_ports_that_are_none(capsys):
+    for words in (["--view", "--port", "65536"], ["--check", "--port", "-1"], ["poses.csv", "--igtl", "99999"]):
+        error = wrong(capsys, "stream", *words)
+        assert f"expected a port from 0 (any that is free) to 65535, got '{words[-1]}'" in error
+
+
+def test_stream_of_a_video_takes_a_camera_and_a_catheter(capsys):
+    cv2.imwrite("0.png", np.zeros((1080, 1920, 3), np.uint8))
+    to = ["--to", "127.0.0.1:1"]
+    assert "no camera.yaml: say which with --camera" in said(capsys, "stream", ".", *to)
+    assert "no catheter.yaml: say which with --catheter" in said(capsys, "stream", ".", *FILES[:2], *to)
+    assert "expected one source to track and stream, got 2" in said(capsys, "stream", "a.mp4", "b.mp4", *FILES, *to)
+    assert "nowhere.mp4" in said(capsys, "stream", "nowhere.mp4", *FILES, *to)
+    assert "none.yaml" in said(capsys, "stream", ".", "--camera", "none.yaml", *FILES[2:], *to)
+
+
+def test_stream_looks_at_its_files_before_it_says_that_it_sends(capsys):
+    cv2.imwrite("0.png", np.zeros((1080, 1920, 3), np.uint8))
+    assert main(["stream", ".", "--to", "127.0.0.1:1"]) == 2
+    assert capsys.readouterr().out == ""
+
+
+def test_what_sends_nothing_of_the_users_takes_no_source(capsys):
+    error = said(capsys, "stream", "poses.csv", "--to", "127.0.0.1:1", "--view")
+    assert error.splitlines() == ["--view only listens; send from another terminal: it takes no SOURCE, --to"]
+    error = said(capsys, "stream", "poses.csv", "--check")
+    assert error.splitlines() == ["--check sends to this computer itself: it takes no SOURCE"]
+    error = said(capsys, "stream", "--check", "--view", "--smooth", "--igtl", "0")
+    assert "takes no --igtl, --smooth, --view" in error
+
+
+def test_stream_says_by_its_status_what_became_of_it(monkeypatch, capsys):
+    for ended, source, status in (
+        ((4, True, True), "rec", 0),
+        ((4, False, True), "rec", 130),
+        ((4, False, True), "0", 0),  # a camera never ends
+        ((4, True, False), "rec", 1),
+    ):
+        monkeypatch.setattr(stream, "stream", lambda *_, ended=ended, **__: stream.Streamed(*ended))
+        assert main(["stream", source, "--to", "127.0.0.1:1"]) == status
+    assert "nothing could be delivered" in capsys.readouterr().err
+
+
+def test_stream_tracks_a_recording(recording, capsys):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(5)
+        assert main(["stream", str(recording), "--to", f"127.0.0.1:{receiver.getsockname()[1]}"]) == 0
+        packets = [decode(receiver.recv(4096)) for _ in range(2)]
+    poses = [packet for packet in packets if isinstance(packet, PosePacket)]
+    assert [packet.pose.status for packet in poses] == [Status.OK, Status.OK]
+    assert 0 < poses[1].sequence - poses[0].sequence <= 2
+
+
+LOADED = """
+import contextlib, io, sys
+from holotorch.cli import main
+for words in (["--help"], ["track", "--help"], ["calibrate", "--help"], ["stream", "--help"]):
+    with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit):
+        main(words)
+    slow = {"torch", "kornia", "cv2", "numpy", "yaml", "pydantic"}
+    print(len(text.getvalue()) > 100, sorted(slow & set(sys.modules)))
+"""
+
+
+def test_help_loads_nothing():
+    found = subprocess.run([sys.executable, "-c", LOADED], capture_output=True, text=True, check=True)
+    assert found.stdout.splitlines() == ["True []"] * 4
