@@ -9,8 +9,9 @@ from pathlib import Path
 
 from holotorch import __version__
 from holotorch.experiments.runs.signals import interruptible
+from holotorch.experiments.streaming.commands import add_stream
 from holotorch.experiments.study_commands import add_study
-from holotorch.experiments.tracking_commands import add_tracking
+from holotorch.experiments.tracking.commands import add_tracking
 
 OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -200,6 +201,7 @@ def _parser() -> argparse.ArgumentParser:
     export.set_defaults(action=_export_slm)
 
     add_tracking(commands)
+    add_stream(commands)
     add_study(commands)
     doctor = commands.add_parser("doctor", help="check the installation and print what repairs it")
     doctor.set_defaults(action=_doctor)

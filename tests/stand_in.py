@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import torch
 
-from holotorch.experiments.tracking.run import run_tracking
+from holotorch.experiments.execute import execute
+from holotorch.experiments.tracking.config import TrackSettings
 from holotorch.tracking import Camera, Pose, Status
 
 SIZE = (48, 64)
@@ -52,9 +53,14 @@ def pictures(folder: Path, levels: list[int | None]) -> Path:
     return folder
 
 
+def track(out: Path, source, **options) -> tuple[Path, bool]:
+    """As ``holotorch run`` does it; ``options`` are settings."""
+    return execute(TrackSettings(experiment="track", source=str(source), **options), out, "track")
+
+
 def tracked(tmp_path: Path, source, name: str = "out", **options) -> tuple[Path, bool]:
-    files = tmp_path / "camera.yaml", tmp_path / "catheter.yaml"
-    return run_tracking(source, *files, tmp_path / name, **options)
+    files = {name: str(tmp_path / f"{name}.yaml") for name in ("camera", "catheter")}
+    return track(tmp_path / name, source, **(files | options))
 
 
 def read(folder: Path) -> list[dict[str, str]]:

@@ -72,7 +72,7 @@ def test_demo_runs_on_bundled_data(capsys):
     assert capsys.readouterr().out.splitlines()[-1] == "here/report.html"
     page = Path("here/report.html").read_text()
     assert "Corrected" in page and "Direct volume rendering" in page and "Synthetic volume" in page
-    parts = {"correction", "volume", "recording", "tracking", "layout"}
+    parts = {"correction", "volume", "tracking", "layout"}
     assert {path.name for path in Path("here").iterdir()} == {*parts, "report.html"}
     for part in ("tracking", "layout"):
         assert f'href="{part}/report.html"' in Path("here/report.html").read_text()

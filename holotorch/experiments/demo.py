@@ -6,16 +6,14 @@ from holotorch.experiments.execute import execute
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.report import write_report
 from holotorch.experiments.runs.folder import claim
-from holotorch.experiments.tracking.run import run_tracking
-from holotorch.experiments.tracking.synthetic import write_synthetic
 from holotorch.io.bundled import find_config
 
 
 def demo(out: Path | None) -> tuple[Path, bool]:
     """Carry the runs out and write one page of all; returns the folder and whether all are complete."""
-    names = ("demo", "demo_volume", "perception/layout")
-    paths = [find_config(f"configs/{name}.yaml") for name in names]
-    image, scene, layout = (load_config(path) for path in paths if path is not None)
+    changes = {"demo": [], "demo_volume": [], "tracking/track": ["frames=10"], "perception/layout": []}
+    paths = [(find_config(f"configs/{name}.yaml"), overrides) for name, overrides in changes.items()]
+    image, scene, tracking, layout = (load_config(path, words) for path, words in paths if path is not None)
     folder = claim(out, "demo")
     if (folder / "images").is_dir():
         (folder / "images").rmdir()  # the claim's; each run has a folder of its own
@@ -26,8 +24,7 @@ def demo(out: Path | None) -> tuple[Path, bool]:
             parts.append(part)
     more = {}
     if complete:
-        recording = write_synthetic(folder / "recording", 10)
-        _, complete = run_tracking(recording, out=folder / "tracking")
+        _, complete = execute(tracking, folder / "tracking", "tracking")
         execute(layout, folder / "layout", "layout")
         more["Catheter tracking, in a synthetic recording"] = "tracking/report.html"
         more["Icons over a wide field, as large as they must be"] = "layout/report.html"

@@ -5,7 +5,7 @@ from typing import Any
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.config.source import read_source
-from holotorch.experiments.registry import find_kind, load_config
+from holotorch.experiments.registry import KINDS, find_kind, load_config
 from holotorch.experiments.report import write_report
 from holotorch.experiments.runs.folder import RunFolder, open_run, tidied
 from holotorch.experiments.runs.plan import RunPlan
@@ -47,7 +47,8 @@ def execute(settings: Any, out: Path | None, name: str = "run") -> tuple[Path, b
         def write_page(path: Path) -> None:
             write_report([path.parent], path)
 
-        with open_run(out, name, settings, plan, kind.device(experiment)) as folder:
+        restart = kind.restart(out or Path(), settings.model_dump())
+        with open_run(out, name, settings, plan, kind.device(experiment), resumes=restart is None) as folder:
             folder.write_page = write_page
             if plan.values:
                 write_json(folder.path / "plan.json", plan.values)
@@ -68,12 +69,6 @@ def resume(folder: Path) -> tuple[Path, bool]:
             of its checkpoint.
     """
     config = folder / "config.yaml"
-    held = read_source(config, []).data if config.is_file() else {}
-    if held.get("experiment") == "track":
-        again = f"its poses are kept, and all is tracked anew by: holotorch track {held.get('source', 'SOURCE')}"
-        frames = f", the frames that it kept by: holotorch track {folder / 'recording'}"
-        frames = frames if (folder / "recording").is_dir() else ""
-        raise ConfigError([f"{folder} holds a tracking run, which is not resumed: {again}{frames}"])
     if not config.is_file() or not (folder / "env.json").is_file():
         raise ConfigError([f"{folder} holds no run to resume: config.yaml and env.json are not both there"])
     if (folder / "summary.json").is_file():
@@ -81,4 +76,8 @@ def resume(folder: Path) -> tuple[Path, bool]:
         if tidied(folder):
             write_report([folder], folder / "report.html")
         return folder, True
+    held = read_source(config, []).data
+    name = held.get("experiment")
+    if isinstance(name, str) and name in KINDS and (instead := find_kind(name).restart(folder, held)):
+        raise ConfigError([f"{folder} holds an interrupted run of kind {name}, which cannot be continued: {instead}"])
     return execute(load_config(config), folder, folder.resolve().name)

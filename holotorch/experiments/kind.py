@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 from holotorch.experiments.config.settings import Settings
 from holotorch.experiments.config.source import Key
@@ -54,6 +55,15 @@ class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
     @abstractmethod
     def run(self, experiment: Experiment, folder: RunFolder) -> bool:
         """Compute, fill the folder and conclude it; whether the run is complete."""
+
+    def restart(self, folder: Path, config: Mapping[str, Any]) -> str | None:
+        """What to do instead of continuing an interrupted run; None for the kinds whose runs can be continued.
+
+        Args:
+            folder: Of the run.
+            config: Its configuration, as it stands in the folder.
+        """
+        return None
 
     def device(self, experiment: Experiment) -> str:
         """Where the run computes."""

@@ -4,7 +4,7 @@ from stand_in import CAMERA, SIZE, StandIn
 
 from holotorch.experiments.runs import pictures
 from holotorch.experiments.tracking import source as track_source
-from holotorch.experiments.tracking.config import save_camera, save_catheter
+from holotorch.experiments.tracking.devices import save_camera, save_catheter
 from holotorch.tracking import THESIS
 
 

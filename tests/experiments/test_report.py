@@ -91,10 +91,10 @@ def test_runs_of_all_kinds_share_a_page(folders, tmp_path, capsys, tiny):
 
 
 def test_runs_of_no_kind_are_refused_in_one_line(tmp_path, capsys):
-    (tmp_path / "summary.json").write_text('{"experiment": "track", "status": "complete"}')
+    (tmp_path / "summary.json").write_text('{"experiment": "dream", "status": "complete"}')
     for page in ("", f"; its own page is {tmp_path}/report.html"):
         assert main(["report", str(tmp_path)]) == 2
-        words = f"{tmp_path} holds a run of kind track, and only those of {', '.join(KINDS)} can be shown together"
+        words = f"{tmp_path} holds a run of kind dream, and only those of {', '.join(KINDS)} can be shown together"
         assert capsys.readouterr().err == f"{words}{page}\n"
         (tmp_path / "report.html").write_text("its own")
     assert (tmp_path / "report.html").read_text() == "its own"

@@ -16,7 +16,6 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.execute import execute
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.report import write_report
-from holotorch.experiments.tracking.report import write_page
 
 SCENE = "hologram={shape: [32, 32], pitch: 3.74 um, distance: 5 mm, depths: 4}"
 EYE = [
@@ -97,11 +96,10 @@ def test_numbers_beyond_all_are_damage(runs, tmp_path, value):
         write_report([folder], tmp_path / "report.html")
 
 
-def test_no_source_of_a_track_writes_into_its_page(tmp_path, monkeypatch):
-    monkeypatch.setattr("holotorch.experiments.tracking.report.drawn_track", lambda _: None)
-    monkeypatch.setattr("holotorch.experiments.tracking.report._png", lambda _: b"")
+def test_no_source_of_a_track_writes_into_its_page(tmp_path):
     (tmp_path / "images").mkdir()
     summary = {
+        "experiment": "track",
         "source": ATTACK,
         "status": ATTACK,
         "failure": ATTACK,
@@ -114,10 +112,9 @@ def test_no_source_of_a_track_writes_into_its_page(tmp_path, monkeypatch):
         "truth": {"frames": ATTACK, "wrong": ATTACK},
     }
     (tmp_path / "images" / "one.png").write_bytes(b"")
-
-    class Log:
-        pictures = {"one": ATTACK}
-
-    write_page(tmp_path, summary, Log())  # type: ignore[arg-type]
+    (tmp_path / "summary.json").write_text(json.dumps(summary | {"pictures": {"one": ATTACK}}))
+    (tmp_path / "env.json").write_text(json.dumps({ATTACK: ATTACK}))
+    (tmp_path / "config.yaml").write_text(f"source: {ATTACK}")
+    write_report([tmp_path], tmp_path / "report.html")
     found = (tmp_path / "report.html").read_text()
     assert foreign(found) == 0 and found.count("&lt;script&gt;") > 8

@@ -17,7 +17,7 @@ from paths import CONFIGS
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.panel.config import build_panel, load_panel
 from holotorch.experiments.perception.study.config import load_study
-from holotorch.experiments.tracking.config import load_camera, load_catheter, load_headset
+from holotorch.experiments.tracking.devices import load_camera, load_catheter, load_headset
 
 _GRID: dict[str, Any] = {"grid": {"shape": [32, 24], "pitch": "9 um"}}
 _HOLOGRAM = {"shape": [64, 64], "pitch": "3.74 um", "distance": "5 mm", "depths": 4, "rays": 32}

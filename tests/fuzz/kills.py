@@ -34,7 +34,7 @@ from holotorch.experiments.eye import run as eye_run
 from holotorch.experiments.pec import progress
 from holotorch.experiments.runs import pictures
 from holotorch.experiments.tracking import source as track_source
-from holotorch.experiments.tracking.config import save_camera, save_catheter
+from holotorch.experiments.tracking.devices import save_camera, save_catheter
 from holotorch.io.images import encode_png
 from holotorch.io.recording import open_recording
 from holotorch.tracking import THESIS

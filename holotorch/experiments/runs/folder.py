@@ -65,6 +65,7 @@ class RunFolder:
         name: Of the run.
         plan: What the run is to do.
         pressed: Signals that have come.
+        resumes: Whether the run can be continued after an interruption.
         write_page: Writes the page of the folder to a path, from what is in the folder; None where there is none yet.
     """
 
@@ -72,12 +73,17 @@ class RunFolder:
     name: str
     plan: RunPlan
     pressed: Pressed
+    resumes: bool = True
     write_page: Callable[[Path], Any] | None = None
 
 
 @contextmanager
-def open_run(out: Path | None, name: str, settings: BaseModel, plan: RunPlan, device: str) -> Iterator[RunFolder]:
+def open_run(
+    out: Path | None, name: str, settings: BaseModel, plan: RunPlan, device: str, *, resumes: bool = True
+) -> Iterator[RunFolder]:
     """Fill a folder within this block: a new one, or ``out`` where that holds an unfinished run of the same settings.
+
+    A run that cannot be continued (not ``resumes``) always takes a new folder.
 
     The folder is this run's alone, on systems that can lock one, and gets config.yaml and env.json at once. Within the
     block the first signal raises KeyboardInterrupt. Where the block fails, the folder keeps what was computed; a new
@@ -92,16 +98,16 @@ def open_run(out: Path | None, name: str, settings: BaseModel, plan: RunPlan, de
                 out.mkdir(parents=True, exist_ok=True)
             if out.is_dir():
                 stack.enter_context(_locked(out))
-        new = out is None or not _unfinished(out, settings)
+        new = out is None or not (resumes and _unfinished(out, settings))
         folder = claim(out, name) if new or out is None else out
         if out is None:
             stack.enter_context(_locked(folder))
-        with _kept(folder, new):
+        with _kept(folder, new, resumes):
             (folder / "images").mkdir(exist_ok=True)
             write_json(folder / "env.json", environment(getattr(settings, "seed", 0), torch.device(device)))
             if new:
                 write_text(folder / "config.yaml", yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
-            yield RunFolder(folder, name, plan, pressed)
+            yield RunFolder(folder, name, plan, pressed, resumes)
 
 
 def _unfinished(folder: Path, settings: BaseModel) -> bool:
@@ -167,34 +173,37 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _kept(folder: Path, new: bool) -> Iterator[None]:
+def _kept(folder: Path, new: bool, resumes: bool) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        print(f"interrupted; start it again with: holotorch resume {folder}", file=sys.stderr)
+        if resumes:
+            print(f"interrupted; start it again with: holotorch resume {folder}", file=sys.stderr)
+        elif new:
+            _remove_setup(folder)
         raise
     except BaseException as error:
-        files = [path for path in folder.rglob("*") if not path.is_dir()]
-        if new and {path.name for path in files} <= _SETUP:
-            _remove(folder, files)
-        elif not isinstance(error, ConfigError):
-            done = (folder / "summary.json").is_file()
-            cure = (
-                "make its page with: holotorch report"
-                if done
-                else "when the cause is mended, go on with: holotorch resume"
-            )
-            print(f"failed; what was computed until then is in {folder}; {cure} {folder}", file=sys.stderr)
+        removed = new and _remove_setup(folder)
+        if not removed and not isinstance(error, ConfigError):
+            cure = f"; when the cause is mended, go on with: holotorch resume {folder}" if resumes else ""
+            if (folder / "summary.json").is_file():
+                cure = f"; make its page with: holotorch report {folder}"
+            print(f"failed; what was computed until then is in {folder}{cure}", file=sys.stderr)
         raise
 
 
-def _remove(folder: Path, files: list[Path]) -> None:
+def _remove_setup(folder: Path) -> bool:
+    """Remove a folder that holds nothing but what is written before the work begins; whether that was so."""
+    files = [path for path in folder.rglob("*") if not path.is_dir()]
+    if not {path.name for path in files} <= _SETUP:
+        return False
     with suppress(OSError):  # what cannot be removed does no harm
         for path in files:
             path.unlink()
         for path in (folder / "arrays", folder / "images", folder):
             if path.is_dir():
                 path.rmdir()
+    return True
 
 
 def conclude(
@@ -238,5 +247,6 @@ def conclude(
         if results.failure is not None:
             raise results.failure
     if not complete:
-        print(f"interrupted; what was computed is saved; go on with: holotorch resume {run.path}", file=sys.stderr)
+        cure = f"go on with: holotorch resume {run.path}" if run.resumes else f"it is in {run.path}"
+        print(f"interrupted; what was computed is saved; {cure}", file=sys.stderr)
     return complete

@@ -10,7 +10,7 @@ from pydantic_core import PydanticCustomError
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.config.settings import metres
-from holotorch.experiments.tracking.config import save_camera
+from holotorch.experiments.tracking.devices import save_camera
 from holotorch.io.images import load_image, with_channels
 from holotorch.io.video import PICTURES
 from holotorch.tracking.camera.boards import Charuco, Chessboard, View, describe_board, find_board

@@ -1,6 +1,5 @@
-"""What a tracking run tells at its end: counts by status, time per stage, stability, and a page of them."""
+"""What a tracking run reports: counts by status, time per stage, stability, and its section of a page."""
 
-import base64
 import io
 import math
 from pathlib import Path
@@ -9,9 +8,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from holotorch.experiments.runs.markup import element, figure, plain, table
+from holotorch.experiments.runs.markup import element, figure, heading, plain, table
 from holotorch.experiments.runs.memory import peak_memory
-from holotorch.io.files import write_bytes, write_text
+from holotorch.experiments.runs.record import RunRecord
+from holotorch.io.files import write_bytes
 from holotorch.io.images import encode_png
 from holotorch.io.video import Frame, Frames
 from holotorch.tracking import Pose, Status
@@ -111,7 +111,7 @@ class Log:
                 self.stages[name] = self.stages.get(name, 0.0) + value
 
 
-def summarised(log: Log, frames: Frames, method: str, still: bool) -> dict[str, Any]:
+def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, Any]:
     """Plain JSON values of a run's summary; lengths in mm and times in ms, as their names say."""
     answered = sum(status.answered for status in log.statuses)
     summary: dict[str, Any] = {
@@ -156,7 +156,7 @@ def summarised(log: Log, frames: Frames, method: str, still: bool) -> dict[str, 
             notes += _moved(log, found.sd)
         except ValueError as error:
             notes.append(f"no stability: {error}")
-    return summary | {"notes": notes, "peak_memory_bytes": peak_memory()}
+    return summary | {"notes": notes, "pictures": log.pictures, "peak_memory_bytes": peak_memory()}
 
 
 def _moved(log: Log, spread: float) -> list[str]:
@@ -172,15 +172,6 @@ def _moved(log: Log, spread: float) -> list[str]:
     ]
 
 
-def known(value: Any) -> Any:
-    """JSON values with nothing (null) for NaN and infinity: one number must not cost a run its summary."""
-    if isinstance(value, dict):
-        return {key: known(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [known(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def verdict(summary: dict[str, Any]) -> str:
     """The summary in one line."""
     words = ", ".join(f"{name} {count}" for name, count in summary["statuses"].items())
@@ -192,31 +183,34 @@ def verdict(summary: dict[str, Any]) -> str:
     return text
 
 
-def write_page(folder: Path, summary: dict[str, Any], log: Log) -> None:
-    """Write ``report.html`` with everything inline, and the figure of the track."""
+def save_figure(folder: Path, log: Log) -> None:
+    """Draw the tip over time to ``images/track.png``."""
     write_bytes(folder / "images" / "track.png", _png(drawn_track(log)))
-    body = element("h1", f"{folder.resolve().name}: {summary['source']}")
-    if summary["status"] != "complete":
-        body += f"<p>{element('b', summary['status'] + ' ' + summary.get('failure', ''))}</p>"
+
+
+def track_section(record: RunRecord) -> list[str]:
+    """HTML of a tracking run: how many frames have a pose, how well, how fast, and a frame of each status."""
+    summary = record.summary
+    parts = [heading(f"{record.title}: {summary['source']}", summary["status"])]
+    if "failure" in summary:
+        parts.append(element("p", summary["failure"], "warn"))
     share = 100 * summary["answered"] / summary["frames"]
     text = f"{summary['answered']} of {summary['frames']} frames have a pose ({share:.1f} %); every other says why "
     text += "it has none. " + ("" if "truth" in summary else "Errors against the truth are not known here. ")
-    body += element("p", text + f"Deviations (sd) are the tracker's own estimate: {_STATED}, which adds to them.")
-    body += _truth(summary["truth"]) if "truth" in summary else ""
-    body += "".join(element("p", f"Note: {note}.") for note in summary["notes"])
-    rows = [[name, str(count)] for name, count in summary["statuses"].items()]
-    body += table(["status", "frames"], rows)
-    shown = [name for name in ("tip_sd_mm", "stability", "milliseconds") if name in summary]
-    body += table(["", ""], [[name.replace("_", " "), plain(summary[name])] for name in shown], head=False)
+    parts.append(element("p", text + f"Deviations (sd) are the tracker's own estimate: {_STATED}, which adds to them."))
+    parts += [_truth(summary["truth"])] if "truth" in summary else []
+    parts += [element("p", f"Note: {note}.") for note in summary["notes"]]
+    parts.append(table(["status", "frames"], [[name, str(count)] for name, count in summary["statuses"].items()]))
+    names = [name for name in ("tip_sd_mm", "stability", "milliseconds") if name in summary]
+    parts.append(table(["", ""], [[name.replace("_", " "), plain(summary[name])] for name in names], head=False))
     if "stages" in summary:
         cells = [[each["stage"], f"{each['milliseconds']:.2f}", f"{each['percent']:.2f}"] for each in summary["stages"]]
         total = sum(each["milliseconds"] for each in summary["stages"])
         cells.append(["Total", f"{total:.2f}", "100.00"])
-        body += table(["stage", "mean time per frame (ms), without the first", "share (%)"], cells)
-    body += figure(_inline(folder, "track"), "Tip in the camera's frame; gaps are refusals", "wide")
-    body += "".join(figure(_inline(folder, name), caption, "wide") for name, caption in log.pictures.items())
-    style = "<style>img { max-width: 100% }</style>"
-    write_text(folder / "report.html", f"<!DOCTYPE html><meta charset='utf-8'><title>track</title>{style}{body}")
+        parts.append(table(["stage", "mean time per frame (ms), without the first", "share (%)"], cells))
+    pictures = {"track": "Tip in the camera's frame; gaps are refusals", **summary.get("pictures", {})}
+    parts += [figure(source, pictures[name], "wide") for name in pictures if (source := record.picture(name))]
+    return parts
 
 
 def _truth(found: dict[str, float]) -> str:
@@ -224,7 +218,9 @@ def _truth(found: dict[str, float]) -> str:
     text = f"The recording is synthetic, and where the tip truly is is known. Of {found['frames']} frames with a pose "
     text = element("p", text + f"{found.get('wrong', 0)} are wrong by more than 5 mm.")
     shares = [
-        (f"{name} (mm)", f"{found[f'{name}_mm']:.3f}") for name in ("median", "p95", "worst") if f"{name}_mm" in found
+        (f"{name} (mm)", f"{value:.3f}")
+        for name in ("median", "p95", "worst")
+        if (value := found.get(f"{name}_mm")) is not None
     ]
     if "coverage" in found:
         shares.append(("truth within the stated 95 % ellipsoid", f"{100 * found['coverage']:.1f} % of the frames"))
@@ -235,10 +231,6 @@ def _smaller(drawn: Tensor) -> Tensor:
     """Frame [3, H, W] from 0 to 1, of a size for a page."""
     factor = max(1, min(drawn.shape[-2:]) // 400)
     return torch.nn.functional.avg_pool2d(drawn.double() / 255, factor)
-
-
-def _inline(folder: Path, name: str) -> str:
-    return "data:image/png;base64," + base64.b64encode((folder / "images" / f"{name}.png").read_bytes()).decode()
 
 
 def _at(values: Tensor, share: float) -> float:

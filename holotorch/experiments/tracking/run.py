@@ -2,27 +2,30 @@
 
 import csv
 import io
+import math
 import shutil
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
 import torch
-import yaml
 from torch import Tensor
 from tqdm import tqdm
 
 from holotorch.experiments.config.errors import ConfigError
-from holotorch.experiments.runs.environment import environment
-from holotorch.experiments.runs.folder import claim
-from holotorch.experiments.runs.signals import deferred, interruptible
-from holotorch.experiments.tracking.report import COLUMNS, Log, Tracked, known, row, summarised, verdict, write_page
-from holotorch.experiments.tracking.source import Tracker, TrackingInputs, opened
-from holotorch.experiments.tracking.synthetic import compared, errors, read_truth
-from holotorch.io.files import append, replacing, write_bytes, write_json, write_text
+from holotorch.experiments.runs.folder import RunFolder, conclude
+from holotorch.experiments.runs.plan import RunPlan
+from holotorch.experiments.runs.saving import Results
+from holotorch.experiments.runs.signals import deferred
+from holotorch.experiments.tracking.config import SYNTHETIC, TrackSettings
+from holotorch.experiments.tracking.report import COLUMNS, Log, Tracked, row, save_figure, summarise, verdict
+from holotorch.experiments.tracking.source import Tracker, TrackingInputs, open_inputs
+from holotorch.experiments.tracking.synthetic import compared, errors, frame_size, read_truth, write_synthetic
+from holotorch.io.files import append, replacing, write_bytes
 from holotorch.io.recording import Recorder, free_bytes, recording_bytes
 from holotorch.io.video import Frame, Frames, replacing_video
 from holotorch.tracking import Pose, Status
@@ -51,154 +54,192 @@ def follow(frames: Iterable[Frame], tracker: Tracker) -> Iterator[Tracked]:
         yield Tracked(number, frame, pose, seconds, dict(getattr(tracker, "times", {})))
 
 
-def run_tracking(
-    source: str | Path,
-    camera: Path | None = None,
-    catheter: Path | None = None,
-    out: Path | None = None,
-    *,
-    method: str = "ours",
-    record: bool = False,
-    video: bool = True,
-    still: bool = False,
-    rate: float | None = None,
-) -> tuple[Path, bool]:
-    """Track a source and fill a folder: ``out``, or the next free ``runs/track-001``.
-
-    The folder gets ``poses.csv`` (a line per frame, ``COLUMNS``), ``overlay.mp4``, ``report.html``, copies of the two
-    YAML files, ``recording`` if asked for, and ``summary.json`` last. Ctrl-C, as SIGTERM and a closed terminal, saves
-    what there is, and is the ordinary end of a camera. A killed process (``kill -9``) leaves what it had written
-    under hidden names: ``.poses.csv.PID.partial``, whole but for its last line, and an overlay that no player may open;
-    its recording can be tracked.
-
-    Args:
-        source: A video, a folder of pictures, a folder of a recording, or the number of a camera.
-        camera: YAML file; that of the recording by default.
-        catheter: The same.
-        out: New or empty folder.
-        method: ours or thesis.
-        record: Keep every frame, losslessly.
-        video: Write the overlay.
-        still: The catheter is held still; measure its stability, Eq. 3.13.
-        rate: Frames per second where the source has no times.
-
-    Returns:
-        The folder, and whether the source was tracked to its end.
-
-    Raises:
-        ConfigError: A source, file or method that cannot be used, a truth.csv of a recording that cannot be read, a
-            folder in use, or no room for the recording.
-    """
-    with opened(source, camera, catheter, method, rate) as given:
-        truth = read_truth(Path(source))
-        for line in [*_announced(given.frames, out, record), *given.frames.notes]:
-            print(line, flush=True)
-        settings = {
-            "experiment": "track",
-            "source": str(source),
-            "method": method,
-            "record": record,
-            "video": video,
-            "still": still,
-            "rate_hz": rate,
-        }
-        return _fill(claim(out, "track"), given, settings, truth)
-
-
 def live(
     sources: Sequence[str], camera: Path | None, catheter: Path | None, rate: float | None = None
 ) -> Iterator[tuple[float, Pose]]:
-    """Times on the packets' clock and poses of one source, as its frames come; see :func:`run_tracking`.
+    """Times on the packets' clock and poses of one source, as its frames come.
 
     Frames of a file come at the pace of its times: those of their poses are when each is due, and may be still to come.
     The source and its files are opened, and refused, when this is called; frames are read as poses are asked for.
     """
     if len(sources) != 1:
         raise ConfigError([f"expected one source to track and stream, got {len(sources)}"])
-    stack = ExitStack()
-    return _live(stack, stack.enter_context(opened(sources[0], camera, catheter, "ours", rate)))
+    return _live(open_inputs(sources[0], camera, catheter, "ours", rate))
 
 
-def _live(stack: ExitStack, given: TrackingInputs) -> Iterator[tuple[float, Pose]]:
-    with stack:
-        frames, tracker = given.frames, given.tracker
+def _live(inputs: TrackingInputs) -> Iterator[tuple[float, Pose]]:
+    with inputs.frames as frames:
         for note in frames.notes:
             print(note, flush=True)
-        said, began = len(frames.notes), None
-        for item in follow(frames, tracker):
-            began = now() - item.frame.seconds if began is None else began
+        printed, start = len(frames.notes), None
+        for item in follow(frames, inputs.tracker):
+            start = now() - item.frame.seconds if start is None else start
             # The camera took the frame before the tracker's time.
-            yield (now() - item.seconds if frames.live else began + item.frame.seconds), item.pose
-        for note in frames.notes[said:]:
+            yield (now() - item.seconds if frames.live else start + item.frame.seconds), item.pose
+        for note in frames.notes[printed:]:
             print(note, flush=True)
 
 
-def _fill(
-    folder: Path, given: TrackingInputs, settings: dict[str, Any], truth: dict[str, list[float]]
-) -> tuple[Path, bool]:
-    frames, log, failure, recorder = given.frames, Log(folder / "images"), None, None
-    said = len(frames.notes)
-    with interruptible() as pressed:
-        parts: list[ExitStack] = []  # each to be closed, whatever happens to the others
-        try:
-            for name, path in given.paths.items():
-                write_bytes(folder / name, path.read_bytes())
-            write_text(folder / "config.yaml", yaml.safe_dump(settings, sort_keys=False))
-            write_json(folder / "env.json", environment(0, torch.device("cpu")))
-            (folder / "images").mkdir(exist_ok=True)
-            table = _entered(parts, replacing(folder / "poses.csv", buffering=0))
-            _append(table, COLUMNS)
-            movie, came = None, iter(frames)
-            if settings["video"]:
-                movie = _entered(parts, replacing_video(folder / "overlay.mp4", frames.shape, frames.rate))
-            if settings["record"]:
-                recorder = Recorder(folder / "recording", frames.shape, frames.rate, frames.name, given.paths)
-                came = _recorded(came, _entered(parts, recorder), pressed)
-            bar = _entered(parts, tqdm(total=frames.total, unit="frame", desc="tracking", dynamic_ncols=True))
-            for item in follow(came, given.tracker):
-                with deferred(pressed):
-                    _append(table, row(item))
-                    drawn = _drawn(item, given) if movie or log.wants(item) else None
-                    if movie and drawn is not None:
-                        movie.write(drawn)
-                    log.take(item, drawn)
-                    bar.set_postfix_str(f"{item.status.name}, {1e3 * item.seconds:.1f} ms", refresh=False)
-                    bar.update()
-                if pressed:
-                    break
-        except KeyboardInterrupt:
-            pass
-        except Exception as error:  # what was found until now is kept
-            failure = error
-        with deferred(pressed):
-            for part in reversed(parts):
-                try:
-                    part.close()
-                except OSError as error:
-                    failure = failure or error
-            if not log.statuses:
-                if (recorder is None or not recorder.frames) and not _poses(folder):
-                    shutil.rmtree(folder)  # claimed empty a moment ago, and without a frame or a pose
-                    raise failure or KeyboardInterrupt
-                print(f"no frame was tracked to its end; what there is of the first is in {folder}", file=sys.stderr)
-                if failure is not None:
-                    raise failure
-                return folder, False
-            complete = failure is None and (not pressed or frames.live)
-            summary = summarised(log, frames, settings["method"], settings["still"])
-            if found := errors(folder / "poses.csv", truth):
-                summary["truth"] = found
-            summary["status"] = "complete" if complete else "interrupted"
+@dataclass(frozen=True, eq=False)
+class TrackingExperiment:
+    """A configuration with its source.
+
+    Attributes:
+        settings: The configuration.
+        inputs: Source, camera, catheter and tracker; None for a synthetic source, which the run renders first.
+        truth: True tips in metres by the number of their frame; empty where nobody knows them.
+    """
+
+    settings: TrackSettings
+    inputs: TrackingInputs | None
+    truth: dict[str, list[float]]
+
+
+def build_tracking(settings: TrackSettings) -> TrackingExperiment:
+    """Open the source of a configuration and the files that it needs.
+
+    Raises:
+        ConfigError: A source or file that cannot be used, or a truth.csv of a recording that cannot be read.
+    """
+    if settings.source == SYNTHETIC:
+        return TrackingExperiment(settings, None, {})
+    truth = read_truth(Path(settings.source))
+    return TrackingExperiment(settings, _opened(settings, settings.source), truth)
+
+
+def _opened(settings: TrackSettings, source: str | Path) -> TrackingInputs:
+    camera, catheter = _path(settings.camera), _path(settings.catheter)
+    return open_inputs(source, camera, catheter, settings.method, settings.rate_hz)
+
+
+def plan_tracking(experiment: TrackingExperiment) -> RunPlan:
+    """What will be tracked, and the room that a recording of it takes."""
+    settings = experiment.settings
+    if experiment.inputs is None:
+        height, width = frame_size(_path(settings.camera))
+        gigabytes = recording_bytes((height, width), settings.frames) / 1e9
+        size = f"{width} x {height} px, {gigabytes:.2f} GB"
+        return RunPlan(f"Source     synthetic: {settings.frames} frames are rendered first, {size}")
+    frames = experiment.inputs.frames
+    height, width = frames.shape
+    count = "an unknown number of frames" if frames.total is None else f"{frames.total} frames"
+    count = "without end; Ctrl-C ends it" if frames.live else count
+    lines = [f"Source     {frames.name}: {width} x {height} px, {frames.rate:g} per second, {count}"]
+    if settings.record and frames.total is None:
+        lines.append(f"Recording  {recording_bytes(frames.shape, 1) * frames.rate / 1e6:.1f} MB per second")
+    elif settings.record:
+        lines.append(f"Recording  {recording_bytes(frames.shape, frames.total or 0) / 1e9:.3f} GB")
+    return RunPlan("\n".join([*lines, *frames.notes]))
+
+
+def _path(name: str | None) -> Path | None:
+    return Path(name) if name else None
+
+
+def run_tracking(experiment: TrackingExperiment, folder: RunFolder) -> bool:
+    """Track a source and fill its folder; whether the source was tracked to its end.
+
+    The folder gets ``poses.csv`` (a line per frame, ``COLUMNS``), ``overlay.mp4``, copies of the two YAML files,
+    ``recording`` if asked for, and ``summary.json`` and the page last. Ctrl-C, as SIGTERM and a closed terminal, saves
+    what there is, and is the ordinary end of a camera. A killed process (``kill -9``) leaves what it had written
+    under hidden names: ``.poses.csv.PID.partial``, whole but for its last line, and an overlay that no player may open;
+    its recording can be tracked.
+
+    Raises:
+        ConfigError: No room for the recording.
+        Exception: Whatever the tracker or the disk raised, once all poses before it are saved.
+    """
+    if experiment.inputs is not None:
+        return _tracked(experiment, experiment.inputs, folder)
+    settings = experiment.settings
+    camera, catheter = _path(settings.camera), _path(settings.catheter)
+    recording = write_synthetic(folder.path / SYNTHETIC, settings.frames, camera=camera, catheter=catheter)
+    inputs = _opened(settings, recording)
+    return _tracked(TrackingExperiment(settings, inputs, read_truth(recording)), inputs, folder)
+
+
+def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFolder) -> bool:
+    folder, settings, frames = run.path, experiment.settings, inputs.frames
+    log, results, failure = Log(folder / "images"), Results(), None
+    printed = len(frames.notes)
+    if settings.record:
+        _check_room(folder, frames)
+    parts: list[ExitStack] = []  # each to be closed, whatever happens to the others
+    parts.append(ExitStack())
+    parts[0].enter_context(frames)
+    try:
+        _track_all(inputs, settings, run, log, parts)
+    except KeyboardInterrupt:
+        pass
+    except Exception as error:  # the poses before it are kept
+        failure = error
+    with deferred(run.pressed):
+        for part in reversed(parts):
+            try:
+                part.close()
+            except OSError as error:
+                failure = failure or error
+        if not log.statuses:
+            if not _holds_frames(folder):
+                shutil.rmtree(folder)  # of this run alone, and without a frame or a pose
+                raise failure or KeyboardInterrupt
+            print(f"no frame was tracked to its end; what there is of the first is in {folder}", file=sys.stderr)
             if failure is not None:
-                summary["failure"] = f"{type(failure).__name__}: {failure}"
-            write_page(folder, summary, log)
-            write_json(folder / ("summary.json" if complete else "interrupted.json"), known(summary))
-    lines = [verdict(summary), *summary["notes"][said:]]
-    print("\n".join(lines + ([compared(summary["truth"])] if "truth" in summary else [])), flush=True)
+                raise failure
+            return False
+        summary = summarise(log, frames, settings.method, settings.still)
+        if comparison := errors(folder / "poses.csv", experiment.truth):
+            summary["truth"] = comparison
+        if failure is not None:
+            summary["failure"] = f"{type(failure).__name__}: {failure}"
+        lines = [verdict(summary), *summary["notes"][printed:], *([compared(comparison)] if comparison else [])]
+        print("\n".join(lines), flush=True)
+        if failure is None:
+            save_figure(folder, log)
+        else:
+            results.write(save_figure, folder, log)
+            results.failure = None  # the first failure is the one to tell
+        done = failure is None and (not run.pressed or frames.live)
+        complete = conclude(run, _without_nan(summary), results, done=done)
     if failure is not None:
-        print(f"failed; what was found until then is in {folder}", file=sys.stderr)
         raise failure
-    return folder, complete
+    return complete
+
+
+def _track_all(
+    inputs: TrackingInputs, settings: TrackSettings, run: RunFolder, log: Log, parts: list[ExitStack]
+) -> None:
+    """Track every frame and write what it gives, until a signal comes; ``parts`` close the files."""
+    folder, frames = run.path, inputs.frames
+    for name, path in inputs.paths.items():
+        write_bytes(folder / name, path.read_bytes())
+    table = _entered(parts, replacing(folder / "poses.csv", buffering=0))
+    _append(table, COLUMNS)
+    movie, source = None, iter(frames)
+    if settings.video:
+        movie = _entered(parts, replacing_video(folder / "overlay.mp4", frames.shape, frames.rate))
+    if settings.record:
+        recorder = Recorder(folder / "recording", frames.shape, frames.rate, frames.name, inputs.paths)
+        source = _recorded(source, _entered(parts, recorder), run.pressed)
+    bar = _entered(parts, tqdm(total=frames.total, unit="frame", desc="tracking", dynamic_ncols=True))
+    for item in follow(source, inputs.tracker):
+        with deferred(run.pressed):
+            _append(table, row(item))
+            drawn = _drawn(item, inputs) if movie or log.wants(item) else None
+            if movie and drawn is not None:
+                movie.write(drawn)
+            log.take(item, drawn)
+            bar.set_postfix_str(f"{item.status.name}, {1e3 * item.seconds:.1f} ms", refresh=False)
+            bar.update()
+        if run.pressed:
+            break
+
+
+def _check_room(folder: Path, frames: Frames) -> None:
+    """ConfigError where the disk cannot hold a recording of all frames."""
+    size, free = recording_bytes(frames.shape, frames.total or 0), free_bytes(folder)
+    if size > free:
+        raise ConfigError([f"the recording takes {size / 1e9:.2f} GB and {free / 1e9:.2f} GB are free; choose --out"])
 
 
 def _entered(parts: list[ExitStack], context: AbstractContextManager[Entered]) -> Entered:
@@ -215,11 +256,11 @@ def _recorded(frames: Iterator[Frame], recorder: Recorder, pressed: list[int]) -
         yield frame
 
 
-def _drawn(item: Tracked, given: TrackingInputs) -> Tensor:
+def _drawn(item: Tracked, inputs: TrackingInputs) -> Tensor:
     pixels = item.frame.pixels
     if pixels is None:
-        pixels = torch.zeros(3, *given.frames.shape, dtype=torch.uint8)
-    return overlay(pixels, item.pose, given.camera, given.catheter)
+        pixels = torch.zeros(3, *inputs.frames.shape, dtype=torch.uint8)
+    return overlay(pixels, item.pose, inputs.camera, inputs.catheter)
 
 
 def _append(table: IO[bytes], cells: Sequence[str]) -> None:
@@ -228,25 +269,16 @@ def _append(table: IO[bytes], cells: Sequence[str]) -> None:
     append(table, text.getvalue().encode("utf-8", "replace"))
 
 
-def _poses(folder: Path) -> bool:
-    """Whether there is a pose, or the refusal of one, in the table."""
-    path = folder / "poses.csv"
-    return path.is_file() and path.read_bytes().count(b"\n") > 1
+def _holds_frames(folder: Path) -> bool:
+    """Whether a pose, the refusal of one, or a recorded frame is in the folder."""
+    tables = (folder / "poses.csv", folder / "recording" / "times.csv")
+    return any(path.is_file() and path.read_bytes().count(b"\n") > 1 for path in tables)
 
 
-def _announced(frames: Frames, out: Path | None, record: bool) -> list[str]:
-    """What will be done, in words; ConfigError where there is no room for it."""
-    height, width = frames.shape
-    count = "an unknown number of frames" if frames.total is None else f"{frames.total} frames"
-    count = "without end; Ctrl-C ends it" if frames.live else count
-    lines = [f"Source     {frames.name}: {width} x {height} px, {frames.rate:g} per second, {count}"]
-    if not record:
-        return lines
-    free = free_bytes(out or Path())
-    if frames.total is None:
-        size = recording_bytes(frames.shape, 1) * frames.rate
-        return [*lines, f"Recording  {size / 1e6:.1f} MB per second; {free / 1e9:.1f} GB free, {free / size:.0f} s"]
-    size = recording_bytes(frames.shape, frames.total)
-    if size > free:
-        raise ConfigError([f"the recording takes {size / 1e9:.2f} GB and {free / 1e9:.2f} GB are free; choose --out"])
-    return [*lines, f"Recording  {size / 1e9:.3f} GB; {free / 1e9:.1f} GB free"]
+def _without_nan(value: Any) -> Any:
+    """JSON values with null for NaN and infinity: one number must not cost a run its summary."""
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

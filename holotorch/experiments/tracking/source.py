@@ -1,14 +1,13 @@
 """What a tracking run is made from: a source of frames, its camera, the catheter, and the tracker."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from torch import Tensor
 
 from holotorch.experiments.config.errors import ConfigError
-from holotorch.experiments.tracking.config import (
+from holotorch.experiments.tracking.devices import (
     CameraSettings,
     build_camera,
     build_catheter,
@@ -23,13 +22,15 @@ from holotorch.tracking import Camera, Catheter, Pose
 from holotorch.tracking.camera.calibration import SURE
 from holotorch.tracking.detection.channels import ChannelOrder, ambiguities, ambiguity_text
 
-METHODS = ("ours", "thesis")
 _OFF_CENTRE = 0.15  # of a side; two thirds of the resolution, as 720 to 1080 lines, shift the centre by a sixth
 Tracker = Callable[[Tensor, Sequence[Pose] | None], list[Pose]]
 
 
 class TrackingInputs(NamedTuple):
-    """What a run is made from; ``paths`` of the two YAML files by the names that their copies get."""
+    """What a run is made from; ``frames`` are to be closed by whoever opened them.
+
+    ``paths``: of the two YAML files, by the names that their copies in the run folder get.
+    """
 
     frames: Frames
     camera: Camera
@@ -38,25 +39,22 @@ class TrackingInputs(NamedTuple):
     paths: dict[str, Path]
 
 
-@contextmanager
-def opened(
+def open_inputs(
     source: str | Path, camera: Path | None, catheter: Path | None, method: str, rate: float | None
-) -> Iterator[TrackingInputs]:
+) -> TrackingInputs:
     """Open a source with its files, and make a tracker for it.
 
     Args:
         source: A video, a folder of pictures, a folder of a recording, or the number of a camera.
         camera: YAML file; that of the recording by default.
         catheter: The same.
-        method: One of ``METHODS``.
+        method: ours or thesis.
         rate: Frames per second where the source has no times.
 
     Raises:
         ConfigError: One of them cannot be used, or not with the others.
     """
-    if method not in METHODS:
-        raise ConfigError([f"expected one of {', '.join(METHODS)} as the method, got {method!r}"])
-    replayed = _found(source)
+    replayed = _is_replay(source)
     files = {"camera.yaml": camera, "catheter.yaml": catheter}
     for name in files:
         if files[name] is None and replayed and (Path(source) / name).is_file():
@@ -66,23 +64,26 @@ def opened(
         raise ConfigError(missing)
     paths = {name: find_config(path) or path for name, path in files.items() if path is not None}
     lens, tool = _loaded(paths)
-    seen = build_camera(lens)
+    model = build_camera(lens)
     try:
-        tracker = make_tracker(method, seen, tool)
+        tracker = make_tracker(method, model, tool)
     except ValueError as error:
         raise misfit(paths["catheter.yaml"], error) from None
     try:
         frames = open_recording(Path(source)) if replayed else open_frames(source, rate)
     except ValueError as error:
         raise ConfigError([str(error)]) from None
-    with frames:
-        _checked(lens, frames)
-        if doubt := ambiguity_text(ambiguities(seen, tool)):
-            frames.notes.append(doubt)
-        yield TrackingInputs(frames, seen, tool, tracker, paths)
+    try:
+        _check_intrinsics(lens, frames)
+    except ConfigError:
+        frames.__exit__()
+        raise
+    if doubt := ambiguity_text(ambiguities(model, tool)):
+        frames.notes.append(doubt)
+    return TrackingInputs(frames, model, tool, tracker, paths)
 
 
-def _found(source: str | Path) -> bool:
+def _is_replay(source: str | Path) -> bool:
     """Whether the source is a recording; ConfigError where there is none, or a part of one."""
     path = Path(source)
     if not (path.exists() or is_camera(source)):
@@ -135,7 +136,7 @@ class _Cold:
         return getattr(self._tracker, "times", {})
 
 
-def _checked(lens: CameraSettings, frames: Frames) -> None:
+def _check_intrinsics(lens: CameraSettings, frames: Frames) -> None:
     """ConfigError, or a doubt noted, for intrinsics that make poses wrong, and plausible: rough, or of another size."""
     height, width = frames.shape
     if lens.size is not None and tuple(lens.size) != frames.shape:

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.runs.folder import claim
-from holotorch.experiments.tracking.config import (
+from holotorch.experiments.tracking.devices import (
     build_camera,
     build_catheter,
     load_camera,
@@ -31,6 +31,7 @@ from holotorch.tracking.simulation.scenery import SKIN, drape, finger
 from holotorch.tracking.simulation.world import World, synthetic_camera
 
 RATE = 30.0  # frames per second
+_SIZE = (1080, 1920)  # (H, W) of a camera that states none
 _TIP = ("tip_x_m", "tip_y_m", "tip_z_m")
 _COVARIANCE = ("cov_xx_m2", "cov_xy_m2", "cov_xz_m2", "cov_yy_m2", "cov_yz_m2", "cov_zz_m2")
 _SHARES = {"median": 0.5, "p95": 0.95, "worst": 1.0}
@@ -39,13 +40,13 @@ _COLUMNS = ("frame", "time_s", *_TIP, "direction_x", "direction_y", "direction_z
 
 
 def write_synthetic(
-    out: Path | None,
-    frames: int = 45,
-    size: tuple[int, int] = (1080, 1920),
+    out: Path,
+    frames: int,
+    size: tuple[int, int] = _SIZE,
     camera: Path | None = None,
     catheter: Path | None = None,
 ) -> Path:
-    """Render a recording, and ``truth.csv`` beside its frames; its folder, ``out`` or the next free runs/synthetic-001.
+    """Render a recording, and ``truth.csv`` beside its frames; the folder ``out``.
 
     A catheter swings over a surgical drape and skin-coloured fingers pass over its bands. ``holotorch track`` takes
     the folder as it is, with the camera and the catheter that were rendered. Whatever ends the rendering early leaves
@@ -75,6 +76,11 @@ def write_synthetic(
         shutil.rmtree(folder)  # claimed empty a moment ago
         raise
     return folder
+
+
+def frame_size(camera: Path | None) -> tuple[int, int]:
+    """(H, W) of the frames that :func:`write_synthetic` renders for a camera. ConfigError for a file that is none."""
+    return (None if camera is None else load_camera(find_config(camera) or camera).size) or _SIZE
 
 
 def _render(folder: Path, frames: int, world: World) -> None:

@@ -10,7 +10,7 @@ from oracles import boards as oracle
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.tracking.calibrate import calibrate_photographs, calibration_text, parse_board
-from holotorch.experiments.tracking.config import (
+from holotorch.experiments.tracking.devices import (
     build_camera,
     build_catheter,
     build_headset,

@@ -15,10 +15,10 @@ import paths
 import pytest
 
 from holotorch.cli import main
+from holotorch.experiments import execute
 from holotorch.experiments.streaming import check as stream_check
 from holotorch.experiments.streaming import stream
-from holotorch.experiments.tracking import run as track
-from holotorch.experiments.tracking import synthetic
+from holotorch.experiments.tracking import run
 from holotorch.experiments.tracking.synthetic import write_synthetic
 from holotorch.tracking.pose.status import Status
 from holotorch.tracking.streaming.packet import PosePacket, decode
@@ -65,23 +65,23 @@ def test_track_a_recording_with_its_own_files(recording, capsys):
 
 
 def test_track_the_synthetic_source_renders_it_first(monkeypatch, capsys):
-    monkeypatch.setattr(synthetic, "write_synthetic", lambda out, **given: write_synthetic(out, 1, (540, 960), **given))
+    monkeypatch.setattr(run, "write_synthetic", lambda out, _, **given: write_synthetic(out, 1, (540, 960), **given))
     assert main(["track", "synthetic", "--no-video"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "runs/synthetic-001" and lines[-1] == "runs/track-001/report.html"
+    assert lines[0].startswith("Source     synthetic: 45 frames") and lines[-1] == "runs/track-001/report.html"
     assert "in 1 frames; 0 refused" in lines[-2]
     Path("c.yaml").write_text("fx: 620\nfy: 620\ncx: 480\ncy: 270\nsize: [540, 960]\n")
     assert main(["track", "synthetic", "--no-video", "--camera", "c.yaml", *FILES[2:]]) == 0
-    assert "fx: 620" in Path("runs/synthetic-002/camera.yaml").read_text()
+    assert "fx: 620" in Path("runs/track-002/synthetic/camera.yaml").read_text()
     with open("runs/track-002/poses.csv", newline="") as stream:
         (row,) = csv.DictReader(stream)
-    with open("runs/synthetic-002/truth.csv", newline="") as stream:
+    with open("runs/track-002/synthetic/truth.csv", newline="") as stream:
         (true,) = csv.DictReader(stream)
     assert abs(float(row["tip_z_m"]) - float(true["tip_z_m"])) < 1.5e-3
 
 
 def test_track_says_an_interruption_by_its_status(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(track, "run_tracking", lambda *_, **__: (tmp_path, False))
+    monkeypatch.setattr(execute, "execute", lambda *_: (tmp_path, False))
     assert main(["track", "video.mp4", *FILES]) == 130
     assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path)
     (tmp_path / "report.html").touch()
@@ -90,17 +90,19 @@ def test_track_says_an_interruption_by_its_status(tmp_path, monkeypatch, capsys)
 
 
 def test_track_hands_its_arguments_on(monkeypatch):
-    taken = {}
+    taken = []
 
-    def stand_in(*arguments, **options):
-        taken.update(options, arguments=arguments)
+    def stand_in(settings, *others):
+        taken.extend((settings.model_dump(), *others))
         return Path("here"), True
 
-    monkeypatch.setattr(track, "run_tracking", stand_in)
+    monkeypatch.setattr(execute, "execute", stand_in)
     words = ["--out", "o", "--method", "thesis", "--record", "--still", "--rate", "25"]
     assert main(["track", "0", "--camera", "c.yaml", "--catheter", "t.yaml", *words]) == 0
-    assert taken.pop("arguments") == ("0", Path("c.yaml"), Path("t.yaml"), Path("o"))
-    assert taken == {"method": "thesis", "record": True, "video": True, "still": True, "rate": 25.0}
+    assert taken[1:] == [Path("o"), "track"]
+    flags = {"method": "thesis", "record": True, "video": True, "still": True, "rate_hz": 25.0}
+    values = {"experiment": "track", "source": "0", "camera": "c.yaml", "catheter": "t.yaml", "frames": 45}
+    assert taken[0] == values | flags
 
 
 def test_track_without_a_camera_or_a_catheter_asks_for_them(capsys):
@@ -129,9 +131,9 @@ def test_track_with_files_that_are_missing_or_wrong(capsys):
 
 
 def test_track_with_wrong_arguments(capsys):
-    assert "expected one of ours, thesis as the method, got 'best'" in said(
-        capsys, "track", ".", *FILES, "--method", "best"
-    )
+    words = said(capsys, "track", ".", *FILES, "--method", "best")
+    assert words == "argument --method: method: expected 'ours' or 'thesis', got 'best'\n"
+    assert "argument --rate: rate_hz: expected a finite number" in said(capsys, "track", ".", "--rate", "nan")
     assert "SOURCE" in wrong(capsys, "track")
     assert "invalid float value: 'fast'" in wrong(capsys, "track", ".", "--rate", "fast")
     assert "unrecognized arguments: --colour" in wrong(capsys, "track", ".", "--colour", "red")
@@ -305,3 +307,16 @@ for words in (["--help"], ["track", "--help"], ["calibrate", "--help"], ["stream
 def test_help_loads_nothing():
     found = subprocess.run([sys.executable, "-c", LOADED], capture_output=True, text=True, check=True)
     assert found.stdout.splitlines() == ["True []"] * 4
+
+
+def test_a_configuration_tracks_as_the_short_form_does(recording, capsys):
+    config = str(CONFIGS / "track.yaml")
+    words = [config, f"source={recording}", "video=false"]
+    assert main(["check", *words]) == 0
+    assert capsys.readouterr().out.startswith("Source     recording: 960 x 540 px, 30 per second, 2 frames\n")
+    assert main(["run", *words, "--out", "a"]) == main(["track", str(recording), "--no-video", "--out", "b"]) == 0
+    texts = [Path(name, "poses.csv").read_text().splitlines() for name in ("a", "b")]
+    one, other = ([row | {"milliseconds": ""} for row in csv.DictReader(text)] for text in texts)
+    assert one == other and len(one) == 2
+    assert main(["report", "a", "b", "--out", "both.html"]) == 0
+    assert Path("both.html").read_text().count("2 of 2 frames have a pose") == 2

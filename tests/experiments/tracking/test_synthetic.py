@@ -9,12 +9,12 @@ import signal
 import numpy as np
 import pytest
 import torch
+from stand_in import track
 
 from holotorch.experiments.config.errors import ConfigError
-from holotorch.experiments.tracking import run as track
+from holotorch.experiments.tracking import run as tracking_run
 from holotorch.experiments.tracking import synthetic
-from holotorch.experiments.tracking.config import build_camera, build_catheter, load_camera, load_catheter
-from holotorch.experiments.tracking.run import run_tracking
+from holotorch.experiments.tracking.devices import build_camera, build_catheter, load_camera, load_catheter
 from holotorch.experiments.tracking.synthetic import RATE, compared, errors, read_truth, write_synthetic
 from holotorch.io.recording import is_recording, open_recording
 from holotorch.tracking.detection.tracker import CatheterTracker
@@ -75,13 +75,6 @@ def test_it_is_the_same_each_time_and_takes_no_folder_in_use(folder, tmp_path):
         write_synthetic(again, 1, SIZE)
 
 
-def test_without_a_folder_it_takes_the_next_free_one(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    first, second = (write_synthetic(None, 1, (64, 96)) for _ in range(2))
-    assert (str(first), str(second)) == ("runs/synthetic-001", "runs/synthetic-002")
-    assert len(truths(second)) == 1
-
-
 def write(path, rows):
     names = ("frame", "tip_x_m", "tip_y_m", "tip_z_m")
     path.write_text("\n".join([",".join(names), *(",".join(row) for row in rows)]) + "\n")
@@ -104,7 +97,7 @@ def test_poses_are_compared_with_the_truth_in_words(tmp_path):
 
 
 def test_a_run_of_a_synthetic_recording_holds_its_errors(folder, tmp_path):
-    out, _ = run_tracking(str(folder), out=tmp_path / "run", video=False)
+    out, _ = track(tmp_path / "run", folder, video=False)
     found = json.loads((out / "summary.json").read_text())["truth"]
     with open(out / "poses.csv", newline="") as stream:
         poses = list(csv.DictReader(stream))
@@ -149,13 +142,15 @@ def test_a_truth_that_is_none_is_refused_before_tracking_begins(folder, tmp_path
     source = shutil.copytree(folder, tmp_path / "source")
     (source / "truth.csv").write_text(text, errors="surrogateescape")
     with pytest.raises(ConfigError, match=f"truth.csv:{message}"):
-        run_tracking(source, out=tmp_path / "run", video=False)
+        track(tmp_path / "run", source, video=False)
     assert not (tmp_path / "run").exists()
 
 
 def test_a_number_that_is_none_costs_no_summary(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(track, "errors", lambda *_: {"frames": 3, "refused": 0, "median_mm": 1.0, "worst_mm": math.nan})
-    run, complete = run_tracking(folder, out=tmp_path / "run", video=False)
+    monkeypatch.setattr(
+        tracking_run, "errors", lambda *_: {"frames": 3, "refused": 0, "median_mm": 1.0, "worst_mm": math.nan}
+    )
+    run, complete = track(tmp_path / "run", folder, video=False)
     assert complete and json.loads((run / "summary.json").read_text())["truth"]["worst_mm"] is None
 
 
@@ -173,10 +168,10 @@ def test_it_is_rendered_with_the_camera_and_the_catheter_that_were_given(tmp_pat
     (tmp_path / "t.yaml").write_text(bands + "radius: 1.5 mm\nlength: 300 mm\n")
     files = tmp_path / "c.yaml", tmp_path / "t.yaml"
     made = write_synthetic(tmp_path / "made", 2, camera=files[0], catheter=files[1])
-    out, _ = run_tracking(made, *files, tmp_path / "run", video=False)
+    out, _ = track(tmp_path / "run", made, camera=str(files[0]), catheter=str(files[1]), video=False)
     found = json.loads((out / "summary.json").read_text())
     assert found["answered"] == 2 and found["truth"]["worst_mm"] < 1.5
-    own, _ = run_tracking(made, out=tmp_path / "own", video=False)  # with the files that it holds
+    own, _ = track(tmp_path / "own", made, video=False)  # with the files that it holds
     assert json.loads((own / "summary.json").read_text())["truth"] == pytest.approx(found["truth"], rel=1e-6)
     with pytest.raises(ConfigError, match="c.yaml"):
         write_synthetic(tmp_path / "more", 1, camera=tmp_path / "none" / "c.yaml")

@@ -211,15 +211,15 @@ def test_resume_says_what_to_do_with_a_tracking_run(tmp_path, tracker, monkeypat
 
     monkeypatch.setattr(track_source, "make_tracker", lambda *_: pressed)
     source = pictures(tmp_path / "in", [9, 12])
-    for name, kept in (("a", f", the frames that it kept by: holotorch track {tmp_path}/a/recording"), ("b", "")):
+    for name, kept in (("a", f", the recorded ones by: holotorch track {tmp_path}/a/recording"), ("b", "")):
         folder, complete = tracked(tmp_path, source, name, record=name == "a", video=False)
         assert not complete
-        with pytest.raises(ConfigError, match=f"which is not resumed: its poses .* holotorch track {source}{kept}$"):
+        with pytest.raises(ConfigError, match=f"cannot be continued: the poses .* holotorch track {source}{kept}$"):
             resume(folder)
 
 
 def test_ctrl_c_before_the_first_frame_leaves_nothing(tmp_path, tracker, monkeypatch):
-    monkeypatch.setattr(track, "environment", lambda *_: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr("holotorch.experiments.runs.folder.environment", lambda *_: signal.raise_signal(signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
         tracked(tmp_path, pictures(tmp_path / "in", [9]), record=True)
     assert not (tmp_path / "out").exists()

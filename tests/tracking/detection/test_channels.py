@@ -11,7 +11,7 @@ import torch
 from paths import CONFIGS
 from tracked import TRACKER, WORLD, at, refused, right, scenes, truth
 
-from holotorch.experiments.tracking.config import build_catheter, load_catheter
+from holotorch.experiments.tracking.devices import build_catheter, load_catheter
 from holotorch.tracking import THESIS, CatheterTracker, ChannelOrder, Pose, Status, ThesisTracker, ambiguities
 from holotorch.tracking.detection.channels import ChannelOrderWarning, ambiguity_text
 

@@ -1,0 +1,73 @@
+"""The commands track and calibrate: their arguments, and what they call. Nothing loads before it is used."""
+
+import argparse
+import re
+from pathlib import Path
+
+OK, INTERRUPTED = 0, 130
+# Options for the two files that track and stream need.
+FILES = {
+    "--camera": "its intrinsics: a YAML file, as calibrate writes it",
+    "--catheter": "YAML file, such as configs/tracking/catheter.yaml",
+}
+
+
+def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add both commands to the parser of ``holotorch``."""
+    track = commands.add_parser("track", help="a catheter's tip on every frame of a video, a folder or a camera")
+    what = "video, folder of pictures or of a recording, number of a camera, or: synthetic"
+    track.add_argument("source", metavar="SOURCE", help=what)
+    track.add_argument("--out", type=Path, help="folder of the run (default: runs/track-001, ...)")
+    track.add_argument("--method", default="ours", help="ours (default) or thesis")
+    track.add_argument("--record", action="store_true", help="keep every frame, losslessly, to be tracked again")
+    track.add_argument("--no-video", action="store_true", help="write no overlay video")
+    track.add_argument("--still", action="store_true", help="the catheter is at rest: measure its stability")
+    track.add_argument("--rate", type=float, metavar="HZ", help="frames per second of a source without times")
+    track.set_defaults(action=_track)
+
+    calibrate = commands.add_parser("calibrate", help="a camera's intrinsics from photographs of a board")
+    calibrate.add_argument("files", nargs="+", type=Path, metavar="FILE", help="photographs, or folders of them")
+    board = "chessboard 9x6 25mm (default; inner corners, square) or charuco 5x7 40mm 20mm DICT_6X6_250"
+    calibrate.add_argument("--board", nargs="+", metavar="WORD", help=board)
+    # A size of -25mm is a wrong size, and no unknown option; argparse knows this of whole numbers only.
+    calibrate._negative_number_matcher = re.compile(r"-\.?\d")
+    calibrate.add_argument("--out", type=Path, default=Path("camera.yaml"), help="file (default: camera.yaml)")
+    calibrate.set_defaults(action=_calibrate)
+
+    for name, words in FILES.items():
+        track.add_argument(name, type=Path, help=words)
+
+
+def _track(options: argparse.Namespace) -> int:
+    from holotorch.experiments.config.messages import validated
+    from holotorch.experiments.config.source import Key, Source
+    from holotorch.experiments.tracking.config import TrackSettings
+
+    given = {
+        "source": options.source,
+        "camera": options.camera and str(options.camera),
+        "catheter": options.catheter and str(options.catheter),
+        "method": options.method,
+        "record": options.record,
+        "video": not options.no_video,
+        "still": options.still,
+        "rate_hz": options.rate,
+    }
+    places: dict[Key, str] = {("method",): "argument --method", ("rate_hz",): "argument --rate"}
+    settings = validated(Source(Path("track"), {"experiment": "track", **given}, places), TrackSettings)
+    from holotorch.experiments.execute import execute
+
+    folder, complete = execute(settings, options.out, "track")
+    page = folder / "report.html"
+    print(page if page.is_file() else folder)
+    return OK if complete else INTERRUPTED
+
+
+def _calibrate(options: argparse.Namespace) -> int:
+    from holotorch.experiments.tracking.calibrate import BOARD, calibrate_photographs, calibration_text
+
+    board = options.board or BOARD
+    found, missing = calibrate_photographs(options.files, options.out, board)
+    print(calibration_text(found, missing, board))
+    print(options.out)
+    return OK

@@ -1,0 +1,223 @@
+"""Files of what tracking needs to know: a camera, a catheter, and where the camera sits on a headset."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import torch
+import yaml
+from pydantic import BeforeValidator, Field
+from pydantic_core import PydanticCustomError
+
+from holotorch.core.quantities import TOOL_LENGTH, TOOL_POSITION, TOOL_RADIUS
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.config.messages import validated
+from holotorch.experiments.config.settings import Count, Length, Number, Settings, Side, number, plausible
+from holotorch.experiments.config.source import Source, read_source
+from holotorch.io.files import write_text
+from holotorch.tracking.camera.calibration import PARAMETERS, Calibration
+from holotorch.tracking.camera.camera import Camera
+from holotorch.tracking.pose.alignment import Alignment
+from holotorch.tracking.pose.catheter import Catheter
+
+
+def _tone(value: Any) -> Any:
+    if value in ("srgb", "linear") or (
+        isinstance(value, list | tuple)
+        and len(value) == 256
+        and all(isinstance(item, float | int) and 0 <= item <= 1 for item in value)
+        and all(b > a for a, b in zip(value, value[1:], strict=False))
+    ):
+        return value
+    raise PydanticCustomError("tone", "expected srgb, linear, or the light of the 256 levels, rising from 0 to 1")
+
+
+Positive = Annotated[Number, Field(gt=0)]
+Level = Annotated[int, BeforeValidator(number), Field(ge=0, le=255)]
+Five = Annotated[tuple[Number, ...], Field(min_length=5, max_length=5)]
+Row = tuple[Number, Number, Number, Number]
+
+
+class EvidenceSettings(Settings):
+    """What a calibration says of itself; for the reader, and for a doubt that tracking notes. Angles in radians.
+
+    ``deviations``: of each parameter. ``views`` and ``left_out``: rms in pixels by photograph. ``cells``, ``radius``,
+    ``tilts``, ``between``: see ``Coverage``.
+    """
+
+    deviations: dict[str, Number]
+    rms_px: Number
+    views: dict[str, Number]
+    left_out: dict[str, Number] = {}
+    cells: Number
+    radius: Number
+    tilts: tuple[Number, Number]
+    between: Number
+    warnings: tuple[str, ...] = ()
+
+
+class CameraSettings(Settings):
+    """A camera; see ``Camera``.
+
+    ``distortion``: k1, k2, p1, p2, k3 in OpenCV's order. ``size``: rows and columns of the frames that it holds for.
+    ``tone``: srgb, linear, or the light of each of the 256 levels.
+    """
+
+    fx: Positive
+    fy: Positive
+    cx: Number
+    cy: Number
+    distortion: Five = (0.0, 0.0, 0.0, 0.0, 0.0)
+    size: tuple[Side, Side] | None = None
+    tone: Annotated[str | tuple[Number, ...], BeforeValidator(_tone)] = "srgb"
+    calibration: EvidenceSettings | None = None
+
+
+class CatheterSettings(Settings):
+    """A catheter; see ``Catheter``. ``edges``: distances of the band edges from the tip; ``colours``: sRGB triples."""
+
+    edges: Annotated[tuple[Annotated[Length, plausible(TOOL_POSITION)], ...], Field(min_length=4)]
+    colours: tuple[tuple[Level, Level, Level], ...]
+    radius: Annotated[Length, plausible(TOOL_RADIUS)]
+    length: Annotated[Length, plausible(TOOL_LENGTH)]
+
+
+class HeadsetSettings(Settings):
+    """Where a camera sits on a headset: rows of the 4 x 4 matrix from camera to headset, in metres.
+
+    ``residuals`` and ``leave_one_out``: of the alignments that it was found from, in metres; see ``Alignment``. Nothing
+    (null) where an alignment could not be left out.
+    """
+
+    headset_from_camera: tuple[Row, Row, Row, Row]
+    residuals: tuple[Number, ...] = ()
+    leave_one_out: tuple[Number | None, ...] = ()
+    alignments: Count | None = None
+
+
+AnySettings = TypeVar("AnySettings", bound=Settings)
+
+
+def load_camera(path: Path | str, overrides: Sequence[str] = ()) -> CameraSettings:
+    """Read, override and check a camera; ConfigError names each mistake with its file, line and column."""
+    source, settings = _read(CameraSettings, path, overrides)
+    _tried(source, build_camera, settings)
+    return settings
+
+
+def build_camera(settings: CameraSettings) -> Camera:
+    """The camera that was described."""
+    matrix = [[settings.fx, 0.0, settings.cx], [0.0, settings.fy, settings.cy], [0.0, 0.0, 1.0]]
+    tone = settings.tone if isinstance(settings.tone, str) else torch.tensor(settings.tone, dtype=torch.float64)
+    distortion = torch.tensor(settings.distortion, dtype=torch.float64)
+    return Camera(torch.tensor(matrix, dtype=torch.float64), distortion, tone, settings.size)
+
+
+def save_camera(path: Path, camera: Camera | Calibration, size: tuple[int, int] | None = None) -> None:
+    """Write a camera, or a calibration with its evidence; ``size`` (H, W) of the frames that a bare camera is for."""
+    values: dict[str, Any] = {}
+    if isinstance(camera, Calibration):
+        calibration, camera, size = camera, camera.camera, camera.size
+        seen = calibration.coverage
+        values["calibration"] = EvidenceSettings(
+            deviations=calibration.deviations,
+            rms_px=calibration.rms_px,
+            views=calibration.views,
+            left_out=calibration.left_out,
+            cells=seen.cells,
+            radius=seen.radius,
+            tilts=seen.tilts,
+            between=seen.between,
+            warnings=calibration.warnings,
+        )
+    matrix = camera.matrix.detach()
+    found = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
+    tone = camera.tone if isinstance(camera.tone, str) else tuple(camera.tone.tolist())
+    settings = CameraSettings(
+        **dict(zip(PARAMETERS, map(float, found), strict=False)),
+        distortion=tuple(camera.distortion.detach().tolist()),
+        size=size,
+        tone=tone,
+        **values,
+    )
+    _write(path, "A camera: pixels; distortion k1, k2, p1, p2, k3; size in rows and columns.", settings)
+
+
+def load_catheter(path: Path | str, overrides: Sequence[str] = ()) -> CatheterSettings:
+    """Read, override and check a catheter; ConfigError names each mistake with its file, line and column."""
+    source, settings = _read(CatheterSettings, path, overrides)
+    _tried(source, build_catheter, settings)
+    return settings
+
+
+def build_catheter(settings: CatheterSettings) -> Catheter:
+    """The catheter that was described."""
+    return Catheter(settings.edges, settings.colours, settings.radius, settings.length)
+
+
+def misfit(path: Path, error: ValueError) -> ConfigError:
+    """What a tracker says of a catheter that it cannot see, where the colours stand, which it is always about."""
+    return ConfigError([read_source(path, []).mistake(("colours",), str(error))])
+
+
+def save_catheter(path: Path, catheter: Catheter) -> None:
+    """Write a catheter, for instance one with edges that were measured."""
+    settings = CatheterSettings(
+        edges=catheter.edges, colours=catheter.colours, radius=catheter.radius, length=catheter.length
+    )
+    _write(path, "A catheter: lengths in metres, edges of its bands from the tip, colours as 8-bit sRGB.", settings)
+
+
+def load_headset(path: Path | str, overrides: Sequence[str] = ()) -> HeadsetSettings:
+    """Read, override and check where a camera sits; ConfigError names each mistake with its file, line and column."""
+    source, settings = _read(HeadsetSettings, path, overrides)
+    _tried(source, build_headset, settings)
+    return settings
+
+
+def build_headset(settings: HeadsetSettings) -> torch.Tensor:
+    """[4, 4] float64, headset_from_camera; ValueError unless it is rigid."""
+    matrix = torch.tensor(settings.headset_from_camera, dtype=torch.float64)
+    turn, last = matrix[:3, :3], torch.tensor([0.0, 0, 0, 1], dtype=torch.float64)
+    missed = (turn @ turn.mT - torch.eye(3, dtype=torch.float64)).abs().max()
+    if missed > 1e-6 or turn.det() < 0 or not torch.equal(matrix[3], last) or matrix[:3, 3].abs().max() > 10:
+        raise ValueError(
+            "headset_from_camera must be a rotation without mirroring, a shift in metres, and the last row 0, 0, 0, 1"
+        )
+    return matrix
+
+
+def save_headset(path: Path, alignment: Alignment) -> None:
+    """Write an alignment of camera and headset with its residuals."""
+    alone = [value if value != float("inf") else None for value in alignment.leave_one_out.tolist()]
+    rows = [(a, b, c, d) for a, b, c, d in alignment.headset_from_camera.detach().tolist()]
+    settings = HeadsetSettings(
+        headset_from_camera=(rows[0], rows[1], rows[2], rows[3]),
+        residuals=tuple(alignment.residuals.tolist()),
+        leave_one_out=tuple(alone),
+        alignments=len(alone),
+    )
+    _write(path, "From the camera's frame to the headset's: metres, points as columns.", settings)
+
+
+def _read(model: type[AnySettings], path: Path | str, overrides: Sequence[str]) -> tuple[Source, AnySettings]:
+    needed = ", ".join(name for name, field in model.model_fields.items() if field.is_required())
+    kind = model.__name__.removesuffix("Settings").lower()
+    source = read_source(Path(path), list(overrides), f"the settings of a {kind}: {needed}")
+    return source, validated(source, model)
+
+
+def _tried(source: Source, build: Any, settings: Settings) -> None:
+    """Build what is described; what is wrong with it as a whole is said where its first word stands."""
+    try:
+        build(settings)
+    except ValueError as error:
+        word = str(error).split()[0]
+        key = (word,) if word in type(settings).model_fields else ()
+        raise ConfigError([source.mistake(key, str(error).removeprefix(f"{word} ") if key else str(error))]) from None
+
+
+def _write(path: Path, words: str, settings: Settings) -> None:
+    data = settings.model_dump(mode="json", exclude_none=True)
+    text = yaml.safe_dump(data, sort_keys=False, width=110, allow_unicode=True, default_flow_style=None)
+    write_text(path, f"# {words}\n{text}")
