@@ -74,10 +74,17 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
 
+def read_bytes(path: Path) -> bytes:
+    """Contents of a file. OSError where it cannot be read, or is a device such as /dev/zero, which never ends."""
+    if path.is_char_device() or path.is_block_device():
+        raise OSError(errno.EINVAL, "a device, not a file", str(path))
+    return path.read_bytes()
+
+
 def read_json(path: Path) -> Any:
     """What a JSON file holds; ValueError for damage of any kind, a nesting without end among it."""
     try:
-        return json.loads(path.read_bytes().decode("utf-8"))
+        return json.loads(read_bytes(path).decode("utf-8"))
     except RecursionError:
         raise ValueError("nested too deeply to be read") from None
 

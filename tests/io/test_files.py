@@ -1,10 +1,11 @@
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from holotorch.io.files import append, replacing, save_array, write_json, write_text
+from holotorch.io.files import append, read_bytes, read_json, replacing, save_array, write_json, write_text
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path):
@@ -51,3 +52,10 @@ def test_json_refuses_what_json_lacks(tmp_path):
     assert not list(tmp_path.iterdir())
     write_json(tmp_path / "a.json", {"unit": "µm"})
     assert json.loads((tmp_path / "a.json").read_text()) == {"unit": "µm"}
+
+
+@pytest.mark.skipif(not Path("/dev/zero").is_char_device(), reason="this system has no devices among its files")
+def test_a_device_that_never_ends_is_no_file():
+    for read in (read_bytes, read_json):
+        with pytest.raises(OSError, match="a device, not a file"):
+            read(Path("/dev/zero"))

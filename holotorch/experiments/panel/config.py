@@ -13,6 +13,7 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.config.messages import validated
 from holotorch.experiments.config.settings import Count, GridSettings, Number, Settings, Wavelength
 from holotorch.experiments.config.source import Key, read_source
+from holotorch.io.files import read_bytes
 from holotorch.modulator.dispersion import Birefringence, BirefringenceTable, Cauchy, phase_scale
 from holotorch.modulator.panel import PhaseModulator, checked_lut, even_lut
 
@@ -158,7 +159,7 @@ def _table(row: CalibrationSettings, bits: int) -> torch.Tensor:
 
 def _read_points(path: Path) -> tuple[tuple[float, float], ...]:
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_bytes(path).decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a UTF-8 text file"
         raise ValueError(f"cannot read {path}: {reason}") from None

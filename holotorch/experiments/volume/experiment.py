@@ -15,6 +15,7 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.volume.config import TransferSettings, VolumeSettings, VolumeSource
 from holotorch.hologram import AxialHologram, ConvolutionHologram, HologramPlan, plan_hologram
 from holotorch.io.catalogue import PUBLISHED, fetch_volume
+from holotorch.io.files import read_bytes
 from holotorch.io.volumes import load_volume
 from holotorch.scene import phantoms, transfer_presets
 from holotorch.scene.lighting import Lighting
@@ -208,6 +209,8 @@ def build(settings: VolumeSettings) -> VolumeExperiment:
         _ = experiment.transfer
     except ValueError as error:
         raise ConfigError([f"volume: {error}"]) from error
+    except OSError as error:
+        raise ConfigError([f"transfer.file: {error.filename}: {error.strerror}"]) from error
     if min(experiment.depths) <= 0:
         raise ConfigError(
             [f"hologram.distance: the volume reaches beyond the hologram, to {min(experiment.depths):g} m"]
@@ -259,7 +262,7 @@ def _transfer(settings: TransferSettings) -> TransferFunction:
         }
         return make[settings.preset](settings.low, settings.high)
     if settings.file:
-        return transfer_presets.transfer_from_json(Path(settings.file).read_text(encoding="utf-8"))
+        return transfer_presets.transfer_from_json(read_bytes(Path(settings.file)).decode("utf-8"))
     assert settings.points is not None
     table = torch.tensor(settings.points)
     return TransferFunction(table[:, 0], table[:, 1:4], table[:, 4], unit_distance=settings.unit_distance)

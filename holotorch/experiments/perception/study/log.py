@@ -15,6 +15,7 @@ from typing import Any, TypeGuard
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.config.messages import position
+from holotorch.io.files import read_bytes
 
 FORMAT, VERSION = "holotorch-trials", 1
 _NUMBERS = ("eccentricity_deg", "size_deg", "onset_s", "frame_s")
@@ -50,7 +51,7 @@ def read_log(path: Path) -> Trials:
             each, as ``file:line:column``.
     """
     try:
-        data = path.read_bytes()
+        data = read_bytes(path)
     except OSError as error:
         raise ConfigError([f"{path}: cannot read the log: {error.strerror}"]) from None
     whole, _, rest = data.rpartition(b"\n")
