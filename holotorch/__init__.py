@@ -4,21 +4,56 @@ Units: metres, radians, seconds, kelvin differences. A field is a complex tensor
 per wavelength; axes are (y, x); the optical axis lies on sample ``n // 2``; frequencies stay in FFT order.
 ``exp(+ikz)`` travels towards +z, a converging lens is ``exp(-i k r^2 / 2f)``, the far field is the unitary DFT.
 
-Importing this package opens no file and sets no global; ``torch`` itself is imported when a name is first used.
+The names that most scripts begin with are here; each loads its module, and ``torch``, when it is first used. Importing
+the package opens no file and sets no global.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from holotorch.core.grid import Grid
+    from holotorch.correction import APG, PECProblem
+    from holotorch.hologram import AxialHologram
+    from holotorch.modulator import PhasedArray, ThermalCrosstalk
+    from holotorch.optics import Eye, Lens, Propagator, propagate
+    from holotorch.scene import DVRSampler, Volume
+    from holotorch.tracking import CatheterTracker
 
 __version__ = "0.1.0"
-__all__ = ["Grid", "__version__"]
+__all__ = [
+    "APG",
+    "AxialHologram",
+    "CatheterTracker",
+    "DVRSampler",
+    "Eye",
+    "Grid",
+    "Lens",
+    "PECProblem",
+    "PhasedArray",
+    "Propagator",
+    "ThermalCrosstalk",
+    "Volume",
+    "__version__",
+    "propagate",
+]
+_PACKAGES = {
+    "core.grid": ("Grid",),
+    "correction": ("APG", "PECProblem"),
+    "hologram": ("AxialHologram",),
+    "modulator": ("PhasedArray", "ThermalCrosstalk"),
+    "optics": ("Eye", "Lens", "Propagator", "propagate"),
+    "scene": ("DVRSampler", "Volume"),
+    "tracking": ("CatheterTracker",),
+}
 
 
 def __getattr__(name: str) -> object:
-    if name == "Grid":
-        from holotorch.core.grid import Grid
-
-        return Grid
+    for package, names in _PACKAGES.items():
+        if name in names:
+            return getattr(import_module(f"holotorch.{package}"), name)
     raise AttributeError(f"module 'holotorch' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

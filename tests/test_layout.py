@@ -110,6 +110,16 @@ def test_public_names():
         holotorch.Gird  # noqa: B018
 
 
+def test_the_names_that_most_scripts_begin_with_are_at_the_top():
+    import holotorch
+    from holotorch.optics import propagate
+    from holotorch.tracking import CatheterTracker
+
+    assert holotorch.propagate is propagate and holotorch.CatheterTracker is CatheterTracker
+    assert all(getattr(holotorch, name) for name in holotorch.__all__)
+    assert set(holotorch.__all__) <= set(dir(holotorch))
+
+
 GUIDE = sorted((ROOT / "scripts" / "docs").glob("*.md"))
 
 
