@@ -26,10 +26,18 @@ def linear(x: Tensor, apply: Callable[[Tensor], Tensor], adjoint: Callable[[Tens
 
 class _Linear(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, x: Tensor, apply: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor]) -> Tensor:
-        ctx.maps = adjoint, apply
+    def forward(x: Tensor, apply: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor]) -> Tensor:
         return apply(x)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.maps = inputs[2], inputs[1]
 
     @staticmethod
     def backward(ctx, *grad_outputs):
         return _Linear.apply(*grad_outputs, *ctx.maps), None, None
+
+    @staticmethod
+    def vmap(info, in_dims, *args):
+        x, apply, adjoint = args
+        return _Linear.apply(x.movedim(in_dims[0], 0), apply, adjoint), 0

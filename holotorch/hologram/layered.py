@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
+from holotorch.core import checks
 from holotorch.core.grid import Grid
 from holotorch.core.operator import linear
 from holotorch.hologram.cone import Cone, check_cone, check_layers, check_scene
@@ -40,8 +41,15 @@ class LayerHologram(nn.Module):
             return (layers.sum((-3, -2, -1))[..., None, None]).expand(*layers.shape[:-3], *self.grid.shape)
         return linear(layers, self._forward, lambda field: self._adjoint(field, shape))
 
-    def adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
-        """Conjugate transpose: layers [..., D, h, w] of ``shape`` (h, w) from a field [..., H, W]."""
+    def adjoint(self, field: Tensor, shape: tuple[int, int] | None = None) -> Tensor:
+        """Conjugate transpose: layers [..., D, h, w] from a field, complex [..., H, W].
+
+        ``shape`` (h, w) is that of the layers; by default they cover the hologram, H / stride x W / stride rounded up.
+        """
+        checks.field("field", field, self.grid.shape)
+        if shape is None:
+            height, width = (-(-size // self.stride) for size in self.grid.shape)
+            shape = height, width
         return linear(field, lambda given: self._adjoint(given, shape), self._forward)
 
     def _forward(self, layers: Tensor) -> Tensor:
