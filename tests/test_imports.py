@@ -134,3 +134,10 @@ def test_declared_dependencies_are_imported(group):
         name = re.split(r"[<>=~!;\[ ]", requirement)[0].lower()
         optional = f'"{name}"' in text  # by its name, where it is installed
         assert IMPORTED_AS.get(name, name) in everything or optional, requirement
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_a_function_fits_on_a_screen(path: Path):
+    functions = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)]
+    long = [node.name for node in functions if (node.end_lineno or 0) - node.lineno >= 80]
+    assert not long, f"more than 80 lines: {', '.join(long)}"

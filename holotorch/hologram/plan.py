@@ -102,7 +102,7 @@ def plan_hologram(
     if not adequate:
         best = min(found, key=lambda way: way["predicted_error"])
         raise ValueError(
-            f"no way reaches a tolerance of {tolerance:.1e} for cone={asked!r}: {best['method']} comes to "
+            f"no method reaches a tolerance of {tolerance:.1e} for cone={asked!r}: {best['method']} comes to "
             f"{best['predicted_error']:.1e}; use cone='taper' or a larger tolerance"
         )
     ordered = sorted(adequate, key=lambda way: way["flops"])

@@ -47,7 +47,7 @@ def test_memory_is_foreseen_and_kept():
 def test_what_no_way_reaches_is_refused():
     sharp = plan_hologram(Grid(64, PITCH), WAVE, [1e-3], (64, 64), cone="band", tolerance=2e-3)
     assert sharp.method == "convolution" and sharp.predicted_error < 2e-3
-    with pytest.raises(ValueError, match="no way reaches a tolerance of 1.0e-06 for cone='band'"):
+    with pytest.raises(ValueError, match="no method reaches a tolerance of 1.0e-06 for cone='band'"):
         plan_hologram(Grid(64, PITCH), WAVE, [1e-3], (64, 64), cone="band", tolerance=1e-6)
     with pytest.raises(TypeError, match="complex64 or torch.complex128, got torch.float32"):
         plan_hologram(Grid(64, PITCH), WAVE, [1e-3], (64, 64), dtype=torch.float32)

@@ -1,4 +1,4 @@
-"""propagate and Propagator: the planned way, which picks method and padding and says why."""
+"""propagate and Propagator: the planned propagation, which picks method and padding and says why."""
 
 import math
 import warnings
@@ -45,7 +45,7 @@ def propagate(
     offset: tuple[float, float] = (0.0, 0.0),
     tilt: tuple[float, float] | Tensor = (0.0, 0.0),
 ) -> Tensor:
-    """Propagate ``field`` over ``distance`` by the cheapest way that is accurate enough.
+    """Propagate ``field`` over ``distance`` by the cheapest method that is accurate enough.
 
     Args:
         field: complex64 or complex128, shape [..., H, W].
@@ -71,13 +71,13 @@ def propagate(
 
     Raises:
         TypeError: A field that is not complex.
-        ValueError: Wrong shape, NaN or infinity anywhere, a wavelength that is not positive, or no way whose expected
-            error is below 0.1.
+        ValueError: Wrong shape, NaN or infinity anywhere, a wavelength that is not positive, or no method whose
+            expected error is below 0.1.
 
     Warns:
-        SamplingWarning: No way meets the tolerance; the most accurate one is used and its expected error named. Or so
-            little of the light lands in the window of the result that the error is large beside it. The second is not
-            looked for while compiling, and :class:`Propagator`, which sees no result, does not warn of it.
+        SamplingWarning: No method meets the tolerance; the most accurate one is used and its expected error named. Or
+            so little of the light lands in the window of the result that the error is large compared with it. The
+            second is not checked while compiling, nor by :class:`Propagator`, which plans before there is a result.
         PrecisionWarning: A wavelength or distance in float32, whose rounding turns the phase by 0.01 rad or more.
 
     A gradient in the pitch, say a factor s on it and on the output's: nothing changes when all lengths are scaled, so
@@ -85,60 +85,72 @@ def propagate(
     """
     checks.field("field", field, grid.shape)
     sent = None if torch.compiler.is_compiling() else _finite_norms(field)
-    waves, distances = _float64("wavelength", wavelength, field), _float64("distance", distance, field)
+    wavelengths, distances = _float64("wavelength", wavelength, field), _float64("distance", distance, field)
     checks.precise(wavelength, distance)
-    listed = [values.detach().reshape(-1).tolist() for values in (waves, distances)]
-    planes = plane_pair(grid, out_grid, offset, tilt, listed[0])
-    slanted = tilt.to(field.device, torch.float64) if isinstance(tilt, Tensor) else None
+    numbers = [values.detach().reshape(-1).tolist() for values in (wavelengths, distances)]
+    planes = plane_pair(grid, out_grid, offset, tilt, numbers[0])
+    sines = tilt.to(field.device, torch.float64) if isinstance(tilt, Tensor) else None
     sample = field if measure else None
-    found = find(planes, *listed, band=band, spread=spread, margin=margin, field=sample, dtype=field.dtype)
-    way = _best(found, checks.positive("tolerance", tolerance))
-    if way.method == "identity":
-        return field * carrier(waves, distances)[..., None, None].to(field.dtype)
-    if not planes.same_pitch:
-        if bool((distances == 0).any()):
-            raise ValueError("distance must not be 0 for a propagation onto another grid")
+    candidates = find(planes, *numbers, band=band, spread=spread, margin=margin, field=sample, dtype=field.dtype)
+    best = _best(candidates, checks.positive("tolerance", tolerance))
+    if best.method == "identity":
+        return field * carrier(wavelengths, distances)[..., None, None].to(field.dtype)
+    carry_out = _filtered if planes.same_pitch else _resampled
+    result = carry_out(field, planes, best, wavelengths, distances, sines)
+    _check_light(best, tolerance, planes, sent, result, measured=measure)
+    return result
 
-        def elsewhere(each: Tensor, wave: Tensor, far: Tensor) -> Tensor:
-            if way.method == _ZOOMED:
-                padded = Grid(way.padded, grid.pitch)
-                kernel = kernel_of(_read_along(planes), way, wave, far, field.dtype, slanted)
-                return zoomed(each, kernel, chirps(grid, padded, planes.out, planes.offset, field.device))
-            room = None if way.paraxial else way.padded
-            factors = resampling_factors(planes, wave, far, padded=room, tilt=slanted, dtype=field.dtype)
-            return resample(each, factors)
 
-        result = _one_by_one(field, waves, distances, planes.out.shape, elsewhere)
-        _judge_light(way, tolerance, planes, sent, result, measured=measure)
-        return result
+def _filtered(
+    field: Tensor, planes: PlanePair, best: Candidate, wavelengths: Tensor, distances: Tensor, tilt: Tensor | None
+) -> Tensor:
+    """Propagate onto samples of the same pitch: one filter in frequency per wavelength and distance."""
 
-    def filtered(each: Tensor, wave: Tensor, far: Tensor) -> Tensor:
-        kernel = kernel_of(planes, way, wave, far, field.dtype, slanted)
+    def apply(spectrum: Tensor, wavelength: Tensor, distance: Tensor) -> Tensor:
+        kernel = kernel_of(planes, best, wavelength, distance, field.dtype, tilt)
         # The spectrum serves several distances; only when there is one may its memory be taken.
-        product = multiplied(each, kernel) if waves.numel() * distances.numel() == 1 else each * kernel
+        product = multiplied(spectrum, kernel) if wavelengths.numel() * distances.numel() == 1 else spectrum * kernel
         return ifft2(product, planes.out.shape)
 
-    result = _one_by_one(fft2(field, way.padded), waves, distances, planes.out.shape, filtered)
-    _judge_light(way, tolerance, planes, sent, result, measured=measure)
-    return result
+    return _one_by_one(fft2(field, best.padded), wavelengths, distances, planes.out.shape, apply)
+
+
+def _resampled(
+    field: Tensor, planes: PlanePair, best: Candidate, wavelengths: Tensor, distances: Tensor, tilt: Tensor | None
+) -> Tensor:
+    """Propagate onto a grid of another pitch. ValueError for a distance of 0."""
+    if bool((distances == 0).any()):
+        raise ValueError("distance must not be 0 for a propagation onto another grid")
+
+    def apply(each: Tensor, wavelength: Tensor, distance: Tensor) -> Tensor:
+        if best.method == _ZOOMED:
+            padded = Grid(best.padded, planes.grid.pitch)
+            kernel = kernel_of(_on_source_samples(planes), best, wavelength, distance, field.dtype, tilt)
+            return zoomed(each, kernel, chirps(planes.grid, padded, planes.out, planes.offset, field.device))
+        room = None if best.paraxial else best.padded
+        return resample(
+            each, resampling_factors(planes, wavelength, distance, padded=room, tilt=tilt, dtype=field.dtype)
+        )
+
+    return _one_by_one(field, wavelengths, distances, planes.out.shape, apply)
 
 
 def _one_by_one(
     field: Tensor,
-    waves: Tensor,
+    wavelengths: Tensor,
     distances: Tensor,
     shape: tuple[int, int],
     apply: Callable[[Tensor, Tensor, Tensor], Tensor],
 ) -> Tensor:
     """``apply`` for each wavelength and distance: all kernels together would not fit into the cache, nor memory."""
-    waves, distances = torch.broadcast_tensors(waves, distances)
-    batch = torch.broadcast_shapes(waves.shape, field.shape[:-2])
-    if waves.numel() == 1:
-        return apply(field, waves.reshape(()), distances.reshape(())).expand(*batch, *shape)
+    wavelengths, distances = torch.broadcast_tensors(wavelengths, distances)
+    batch = torch.broadcast_shapes(wavelengths.shape, field.shape[:-2])
+    if wavelengths.numel() == 1:
+        return apply(field, wavelengths.reshape(()), distances.reshape(())).expand(*batch, *shape)
     fields = field.expand(*batch, *field.shape[-2:])
-    fields = fields.flatten(fields.ndim - 2 - waves.ndim, -3)
-    pairs = zip(waves.reshape(-1), distances.reshape(-1), strict=True)
-    parts = [apply(fields[..., i, :, :], wave, far) for i, (wave, far) in enumerate(pairs)]
+    fields = fields.flatten(fields.ndim - 2 - wavelengths.ndim, -3)
+    pairs = zip(wavelengths.reshape(-1), distances.reshape(-1), strict=True)
+    parts = [apply(fields[..., i, :, :], *pair) for i, pair in enumerate(pairs)]
     return torch.stack(parts, -3).reshape(*batch, *shape)
 
 
@@ -189,21 +201,24 @@ class Propagator(nn.Module):
         planes = plane_pair(grid, out_grid, offset, tilt, self.wavelengths)
         self.grid, self.out_grid, self.offset, self.tilt = grid, planes.out, planes.offset, planes.tilt
         content: dict[str, Any] = {"band": band, "spread": spread, "margin": margin, "field": example}
-        found = find(planes, self.wavelengths, [self.distance], **content)
-        self.plan = plan_from(found, planes, tolerance, memory_limit)
-        way = _best(found, tolerance)
-        if not planes.same_pitch and way.method != _ZOOMED:
+        candidates = find(planes, self.wavelengths, [self.distance], **content)
+        self.plan = plan_from(candidates, planes, tolerance, memory_limit)
+        best = _best(candidates, tolerance)
+        if not planes.same_pitch and best.method != _ZOOMED:
             self.operator = ResampledKernel(
                 grid, self.wavelengths, self.distance, planes.out,
-                offset=offset, tilt=tilt, paraxial=way.paraxial, padded=way.padded,
+                offset=offset, tilt=tilt, paraxial=best.paraxial, padded=best.padded,
             )  # fmt: skip
             return
-        waves, far = (torch.tensor(value, dtype=torch.float64) for value in (self.wavelengths, self.distance))
+        lengths = (
+            torch.tensor(self.wavelengths, dtype=torch.float64),
+            torch.tensor(self.distance, dtype=torch.float64),
+        )
         if planes.same_pitch:
-            kernel = kernel_of(planes, way, waves, far, torch.complex128)
+            kernel = kernel_of(planes, best, *lengths, torch.complex128)
             self.operator = SpectralFilter(grid, self.wavelengths, kernel, out_grid=planes.out)
         else:
-            kernel = kernel_of(_read_along(planes), way, waves, far, torch.complex128)
+            kernel = kernel_of(_on_source_samples(planes), best, *lengths, torch.complex128)
             self.operator = ZoomedFilter(grid, self.wavelengths, kernel, planes.out, offset=planes.offset)
 
     def forward(self, field: Tensor) -> Tensor:
@@ -219,11 +234,11 @@ class Propagator(nn.Module):
         return f"distance={self.distance}, method={self.plan.method!r}, padded={self.plan.padded}"
 
 
-def _best(found: list[Candidate], tolerance: float) -> Candidate:
-    best, _ = choose(found, tolerance)
+def _best(candidates: list[Candidate], tolerance: float) -> Candidate:
+    best, _ = choose(candidates, tolerance)
     if best.error > tolerance:
         text = (
-            f"no way reaches a tolerance of {tolerance:.1e} for noise that fills the described band and window; "
+            f"no method reaches a tolerance of {tolerance:.1e} for noise that fills the described band and window; "
             f"{best.method} on {best.padded[0]} x {best.padded[1]} samples comes to {best.error:.1e}. Describe the "
             "content by band= and margin=, or ask for less"
         )
@@ -245,24 +260,24 @@ def _finite_norms(field: Tensor) -> Tensor:
     return norms
 
 
-def _judge_light(
-    way: Candidate, tolerance: float, planes: PlanePair, sent: Tensor | None, result: Tensor, *, measured: bool
+def _check_light(
+    best: Candidate, tolerance: float, planes: PlanePair, sent: Tensor | None, result: Tensor, *, measured: bool
 ) -> None:
     """Warn where so much less light arrives than was expected that the error of the plan is large beside it."""
-    if sent is None or 0 in result.shape or way.error > tolerance:  # of which _best has warned
+    if sent is None or 0 in result.shape or best.error > tolerance:  # of which _best has warned
         return
     cells = math.prod(planes.out.pitch) / math.prod(planes.grid.pitch)
     shares = torch.where(sent > 0, (_norms(result) / sent).square() * cells, 1.0)
     dimmest = float(torch.where(torch.isfinite(shares), shares, 1.0).min())
     allowed = _DIMMER * tolerance
     # All light is the most that can be expected: most calls end here, without asking what is.
-    if way.error <= allowed * math.sqrt(dimmest):
+    if best.error <= allowed * math.sqrt(dimmest):
         return
-    expected = 1.0 if measured and dimmest < _DIM else way.captured()
-    left = way.error * math.sqrt(expected / max(dimmest, 1e-300))
+    expected = 1.0 if measured and dimmest < _DIM else best.captured()
+    left = best.error * math.sqrt(expected / max(dimmest, 1e-300))
     if left > allowed:
         warnings.warn(
-            f"only {dimmest:.2g} of the light lands in the window of the result, and the error of {way.method} may be "
+            f"only {dimmest:.2g} of the light lands in the window of the result, and the error of {best.method} may be "
             f"{left:.1e} of what lands, more than the tolerance of {tolerance:.1e}. Move the window to the light, or "
             f"ask for a tolerance below {tolerance * allowed / left:.1e}",
             SamplingWarning,
@@ -270,25 +285,30 @@ def _judge_light(
         )
 
 
-def _read_along(planes: PlanePair) -> PlanePair:
-    """The same light on the source's samples: where it is read elsewhere is left to the reading."""
+def _on_source_samples(planes: PlanePair) -> PlanePair:
+    """The same propagation with the result on the source's samples, to be read at other points afterwards."""
     return PlanePair(planes.grid, planes.grid, (0.0, 0.0), planes.tilt)
 
 
 def kernel_of(
-    planes: PlanePair, way: Candidate, waves: Tensor, distances: Tensor, dtype: torch.dtype, tilt: Tensor | None = None
+    planes: PlanePair,
+    best: Candidate,
+    wavelengths: Tensor,
+    distances: Tensor,
+    dtype: torch.dtype,
+    tilt: Tensor | None = None,
 ) -> Tensor:
-    """Transfer function of a chosen way, carrier included: [..., H, W] of its padded grid, in ``dtype``."""
+    """Transfer function of the chosen method, carrier included: [..., H, W] of its padded grid, in ``dtype``."""
     grid = planes.grid
-    padded = Grid(way.padded, grid.pitch)
-    sampled = way.method in ("angular spectrum", _ZOOMED)
-    if sampled and not any(planes.tilt) and min(grid.pitch) < FINEST * waves.detach().max().item():
-        return wide_transfer_function(planes, padded, waves, distances, dtype=dtype)
-    if way.method == "identity":
-        ones = torch.ones(*torch.broadcast_shapes(waves.shape, distances.shape), *grid.shape, dtype=dtype)
-        return ones * carrier(waves, distances)[..., None, None].to(dtype)
+    padded = Grid(best.padded, grid.pitch)
+    sampled = best.method in ("angular spectrum", _ZOOMED)
+    if sampled and not any(planes.tilt) and min(grid.pitch) < FINEST * wavelengths.detach().max().item():
+        return wide_transfer_function(planes, padded, wavelengths, distances, dtype=dtype)
+    if best.method == "identity":
+        ones = torch.ones(*torch.broadcast_shapes(wavelengths.shape, distances.shape), *grid.shape, dtype=dtype)
+        return ones * carrier(wavelengths, distances)[..., None, None].to(dtype)
     return transfer_function(
-        planes, padded, waves, distances, sampled=way.sampled, paraxial=way.paraxial, tilt=tilt, dtype=dtype
+        planes, padded, wavelengths, distances, sampled=best.sampled, paraxial=best.paraxial, tilt=tilt, dtype=dtype
     )
 
 

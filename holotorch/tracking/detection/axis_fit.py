@@ -95,7 +95,7 @@ def fit_axis(
         t: [S] places along, in samples.
         band: [S] which band a station is on, from 0.
         level: [bands] light of each band, as ``light``.
-        bright: [bands] the same, had channels of a mix not cancelled each other; gloss and shadow need not.
+        bright: [bands] the same without the cancelling of channels in a mix, which gloss and shadow need not follow.
         width: Of the tube at t = 0 in samples, and its taper per sample, to begin with.
         blur: Standard deviation to begin with, in samples.
         known: Share of the width to which it and the taper are known beforehand. Shading and width are hard to tell
@@ -104,24 +104,13 @@ def fit_axis(
     """
     light, weight = light.astype(np.float64), weight.astype(np.float64)[..., None]
     stations, count, bands, kinds = *light.shape, len(level), len(_SHADINGS)
-    u = np.arange(count) - (count - 1) / 2
-    reach = max(1.0, float(np.abs(t).max()))
-    # Unknown are middle and width (each at t = 0 and what t = reach adds), blur, and the shadings of each band. A
-    # station sees 3 + kinds numbers of them: ``parts`` [S, 4 + kinds, 6 + bands kinds], with what is left of the light.
-    parts = np.zeros((stations, 4 + kinds, 6 + bands * kinds))
-    parts[:, 0, 0] = parts[:, 1, 2] = parts[:, 2, 4] = parts[:, -1, -1] = 1
-    parts[:, 0, 1] = parts[:, 1, 3] = t / reach
+    u, reach = np.arange(count) - (count - 1) / 2, max(1.0, float(np.abs(t).max()))
     member = (band[:, None] == np.arange(bands)).astype(np.float64)
-    for kind in range(kinds):
-        parts[:, 3 + kind, 5 + kind : -1 : kinds] = member
+    parts = _parts(t / reach, member)
     flat = parts[:, :-1, :-1].reshape(stations * (3 + kinds), -1)
     expected = np.zeros(flat.shape[1])
     expected[2:5] = width[0], width[1] * reach, blur
-    unknown = expected.copy()
-    if start is None:
-        unknown[5::kinds] = level
-    else:
-        unknown[:2], unknown[4:] = start[:2], start[4:]
+    unknown = _first(expected, level, start)
     shares = np.maximum(bright, 1e-9)[:, None] * np.array(_SHARES)
     prior = np.concatenate([[0.0, 0.0, *2 * [(known * width[0]) ** -2], 0.0], shares.ravel() ** -2.0])
     moving, station, noise, normal, beside = 0.0, np.ones(stations), 1.0, prior, prior
@@ -142,10 +131,7 @@ def fit_axis(
         both = weighted @ design
         gram = (design * weight).swapaxes(1, 2) @ design - both.swapaxes(1, 2) @ (inverse @ both)
         if k:
-            chi = gram[:, -1, -1] / count
-            typical = max(median(chi), 1e-12)
-            noise = math.sqrt(typical * count / max(1, count - 3))
-            station = np.maximum(chi / (4 * typical), 1.0) ** -2
+            noise, station = _weighed(gram[:, -1, -1] / count, count)
             gram = gram * station[:, None, None]
         both = flat.T @ (gram[:, :-1] @ parts).reshape(len(flat), -1)
         normal, slope = both[:, :-1], both[:, -1]
@@ -162,9 +148,47 @@ def fit_axis(
         if k and max(moving, abs(soft)) < _SETTLED and max(abs(wide), abs(taper)) < _WIDENED:
             break
     tube = member @ (unknown[5:].reshape(bands, kinds) @ np.array(_MEANS))
-    one, other = median(np.abs(tube - beside[:, 0])), median(np.abs(tube - beside[:, 1]))
+    one, other = (median(np.abs(tube - side)) for side in beside.T)
     most = max(one, other, 1e-300)
     return AxisFit(unknown, normal / max(noise, 0.5) ** 2, reach, (one / most, other / most), station, moving)
+
+
+def _weighed(chi: np.ndarray, count: int) -> tuple[float, np.ndarray]:
+    """Noise over what was assumed, and the weight [S] of each station: less than 1 where something else is seen.
+
+    ``chi`` [S]: mean weighted square of what is left of a station's ``count`` samples.
+    """
+    typical = max(median(chi), 1e-12)
+    return math.sqrt(typical * count / max(1, count - 3)), np.maximum(chi / (4 * typical), 1.0) ** -2
+
+
+def _first(expected: np.ndarray, level: np.ndarray, start: np.ndarray | None) -> np.ndarray:
+    """Unknowns to begin with: what is expected, with the light of each band [bands] or the rest of an earlier fit."""
+    unknown = expected.copy()
+    if start is None:
+        unknown[5 :: len(_SHADINGS)] = level
+    else:
+        unknown[:2], unknown[4:] = start[:2], start[4:]
+    return unknown
+
+
+def _parts(t: np.ndarray, member: np.ndarray) -> np.ndarray:
+    """What each station sees of the unknowns, [S, 4 + K, 6 + bands K], K the number of shadings.
+
+    The unknowns are middle and width (each at t = 0 and what t = 1 adds), blur, and the shadings of each band. A
+    station sees middle, width, blur and the K shadings of its band; the last row is for what is left of the light.
+
+    Args:
+        t: [S] positions of the stations over the farthest one.
+        member: [S, bands] 1 where a station is on a band, else 0.
+    """
+    (stations, bands), kinds = member.shape, len(_SHADINGS)
+    parts = np.zeros((stations, 4 + kinds, 6 + bands * kinds))
+    parts[:, 0, 0] = parts[:, 1, 2] = parts[:, 2, 4] = parts[:, -1, -1] = 1
+    parts[:, 0, 1] = parts[:, 1, 3] = t
+    for kind in range(kinds):
+        parts[:, 3 + kind, 5 + kind : -1 : kinds] = member
+    return parts
 
 
 def _solved(normal: np.ndarray, right: np.ndarray) -> np.ndarray:

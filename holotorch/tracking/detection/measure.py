@@ -139,15 +139,11 @@ def measure_edges(
     t, deviation = np.full(len(guess), np.nan), np.full(len(guess), np.inf)
     if not len(chosen):
         return Edges(t, deviation, blur, blur, 0.0, False, (), ())
-    near = guess[chosen]
-    gap = min((abs(b - a) for a, b in itertools.pairwise(near.tolist())), default=math.inf)
-    window = int(min(_WINDOW + 2 * blur, max(4.0, 0.45 * gap)))
-    along = np.arange(-window, window + 1.0)
-    along = along[(np.abs(along) <= _CLOSE + 2 * blur) | (along % 2 == window % 2)]
+    near, bulge = guess[chosen], curve[chosen]
+    window, along = _along(near, blur)
     widths = axis.width_at(near)
     half = math.ceil(float(widths.max()) / 2 + _ASIDE) - 1
     u = np.arange(-half, half + 1.0)
-    bulge = curve[chosen]
     front = Front.of(u, widths, axis.blur)
     # Rows on the tube, and three to either side of it, which tell whether something lies across.
     rows = np.empty((len(near), len(u) + 6))
@@ -156,13 +152,7 @@ def measure_edges(
     farther[:, : len(u)] = bulge[:, None] * front.mean
     # A row that is mostly surroundings tells little of the edge, and what it tells may be of something else.
     row = np.minimum(np.maximum(widths[:, None] / 2 + _ASIDE - np.abs(u), 0), 1)
-    # Beyond the bands a table's grain shines through the tube: light that drifts draws an edge to where it grows.
-    outside = _OUTSIDE + 2 * blur
-    kept = np.ones((len(near), len(along)), dtype=np.float32)
-    if chosen[0] == 0:
-        kept[0] *= along >= -outside
-    if chosen[-1] == len(guess) - 1:
-        kept[-1] *= along <= outside
+    kept = _between(along, len(near), chosen[0] == 0, chosen[-1] == len(guess) - 1, blur)
     looks = 2
     while True:
         place = near[:, None, None] + along[:, None] + farther[:, None]
@@ -181,9 +171,8 @@ def measure_edges(
             # It moved along itself, farther than what was looked at.
             t[chosen] = near + fit.place
             return measure_edges(sampler, lens, axis, t, doubtful, median(fit.blur[known]), curve)
-        coarse = bool(np.any(coarse_colours(sampler, pixels[[0, -1], len(along) // 2, half])))
         shading, looks = fit, looks - 1
-        if coarse:
+        if coarse := bool(np.any(coarse_colours(sampler, pixels[[0, -1], len(along) // 2, half]))):
             fit, shading = fit_luma(fit, light, shown, sampler.light, along)
         elif bool((fit.deviation > _UNSURE).any()) and not _astray(fit, looks):
             # Surroundings that are not even leak into the outer rows; those in the middle may tell all the same.
@@ -199,31 +188,40 @@ def measure_edges(
     covered, beyond = _across(beside.reshape(*every.shape[:2], 6, 3), along - fit.place[:, None], fit)
     if beyond and len(near) > 2 and soft < blur + BLURRED:
         raise Refusal(Status.INCONSISTENT, "all bands go on beside the tube: this is thicker, seen in one part of it")
-    reach = _MARGIN + 2 * soft
-    far = np.abs(fit.place)
-    if inside.all() and window >= reach + far.max():
-        within = [True] * len(near)
-    else:
-        within = np.all(sampler.inside(lens.distort(line.plane(near[:, None] + reach * np.array([-1, 1])))), -1)
-    clear = (fit.deviation < 0.6) & (far < window / 2) & (fit.blur < 0.55 * window)
-    hidden, outside = [], []
-    for j, index in enumerate(chosen.tolist()):
-        if not within[j]:
-            outside.append(index)
-        elif doubtful[index] and covered[j]:
-            hidden.append(index)  # an edge between two bands shows by its colours what it is; an outer one does not
-        elif clear[j]:
-            t[index], deviation[index] = near[j], fit.deviation[j]
-    return Edges(
-        t,
-        deviation,
-        median(blurs) if len(blurs) else blur,
-        blur,
-        float(np.abs(bulge).max()),
-        coarse,
-        tuple(hidden),
-        tuple(outside),
-    )
+    margin, moved = _MARGIN + 2 * soft, np.abs(fit.place)
+    within = np.ones(len(near), dtype=bool)
+    if not inside.all() or window < margin + moved.max():
+        within = np.all(sampler.inside(lens.distort(line.plane(near[:, None] + margin * np.array([-1, 1])))), -1)
+    clear = (fit.deviation < 0.6) & (moved < window / 2) & (fit.blur < 0.55 * window)
+    # An edge between two bands shows by its colours what it is; an outer one does not.
+    hides = covered & np.array(doubtful)[chosen]
+    outside, hidden = chosen[~within].tolist(), chosen[within & hides].tolist()
+    measured = within & ~hides & clear
+    t[chosen[measured]], deviation[chosen[measured]] = near[measured], fit.deviation[measured]
+    soft, most = median(blurs) if len(blurs) else blur, float(np.abs(bulge).max())
+    return Edges(t, deviation, soft, blur, most, coarse, tuple(hidden), tuple(outside))
+
+
+def _along(near: np.ndarray, blur: float) -> tuple[int, np.ndarray]:
+    """Half the length of the windows around edges at ``near`` [E], in pixels, and the samples along a window [T]."""
+    gap = min((abs(b - a) for a, b in itertools.pairwise(near.tolist())), default=math.inf)
+    window = int(min(_WINDOW + 2 * blur, max(4.0, 0.45 * gap)))
+    along = np.arange(-window, window + 1.0)
+    return window, along[(np.abs(along) <= _CLOSE + 2 * blur) | (along % 2 == window % 2)]
+
+
+def _between(along: np.ndarray, edges: int, first: bool, last: bool, blur: float) -> np.ndarray:
+    """[E, T] 1 for samples that count, 0 far beyond the ``first`` and the ``last`` edge, where these are outermost.
+
+    There a table's grain shines through the tube, and light that drifts draws an edge to where it grows.
+    """
+    outside = _OUTSIDE + 2 * blur
+    kept = np.ones((edges, len(along)), dtype=np.float32)
+    if first:
+        kept[0] *= along >= -outside
+    if last:
+        kept[-1] *= along <= outside
+    return kept
 
 
 def _astray(fit: EdgeFit, looks: int) -> bool:

@@ -46,14 +46,9 @@ def solve_pose(
     Source: Sec. 3.4.2 of the thesis asks for this; :func:`closed_form` is what its Eqs. 3.8 to 3.11 become.
     """
     pixels, positions = _checked(edges_px, positions_m)
-    batch, count = pixels.shape[:2]
+    batch = len(pixels)
     plane = camera.undistort(pixels)
-    given = torch.isfinite(pixels.detach()).all(-1)
-    if seen is not None:
-        seen = torch.as_tensor(seen, device=given.device)
-        if seen.shape != given.shape or seen.dtype != torch.bool:
-            raise ValueError(f"seen must be bool of shape [{batch}, {count}], got {seen.dtype}, {list(seen.shape)}")
-        given = given & seen
+    given = _visible(pixels, seen)
     known = given & torch.isfinite(plane.detach()).all(-1)
     shift = _expanded("offset", TOOL_OFFSET, offset, pixels, 1)
     deviations = [
@@ -81,7 +76,7 @@ def solve_pose(
     tip = point - middle[:, None] * along
     normal = slopes.mT @ slopes
     inverse, singular = torch.linalg.inv_ex(normal)
-    lever = torch.zeros(batch, 6, 5, dtype=tip.dtype, device=tip.device)
+    lever = torch.zeros(batch, 6, 5, dtype=tip.dtype, device=tip.device)  # of tip and direction to the unknowns
     lever[:, :3, :3] = torch.eye(3, dtype=tip.dtype)
     lever[:, :3, 3:] = -middle[:, None, None] * basis
     lever[:, 3:, 3:] = basis
@@ -96,6 +91,17 @@ def solve_pose(
         (2 * known.sum(-1) - 5).clamp(min=0).to(tip.dtype),
         codes,
     )
+
+
+def _visible(pixels: Tensor, seen: Tensor | None) -> Tensor:
+    """Which edges [B, N] are finite, and among those ``seen`` where that is given."""
+    finite = torch.isfinite(pixels.detach()).all(-1)
+    if seen is None:
+        return finite
+    seen = torch.as_tensor(seen, device=finite.device)
+    if seen.shape != finite.shape or seen.dtype != torch.bool:
+        raise ValueError(f"seen must be bool of shape {list(finite.shape)}, got {seen.dtype}, {list(seen.shape)}")
+    return finite & seen
 
 
 def closed_form(edges_px: Tensor, positions_m: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:

@@ -83,18 +83,8 @@ def pose_on_line(
     normal, _, chi_square, least = _terms(points, h)
     if not (least > 0 and math.isfinite(chi_square)):
         return None
-    # Points of space are p e1 + q e2, up to one scale: tip and direction. A line that is not quite where it was found
-    # moves them to the side.
-    (h0, h1, h2), onward = h, line.along / line.scale
-    place = line.origin + middle * onward
-    unit, start = 1 / length, -mean / length
-    axes = np.array(
-        [
-            [wide * onward.real, wide * onward.imag, 0.0],
-            [place.real, place.imag, 1.0],
-            [-onward.imag, onward.real, 0.0],
-        ]
-    )
+    (h0, h1, h2), unit, start = h, 1 / length, -mean / length
+    axes = _axes(line, middle, wide)
     (p, q), (along, deep) = (h0 + h1 * start, 1 + h2 * start), (h1 * unit, h2 * unit)
     if rough:
         tip, direction = np.array([[p, q, 0.0], [along, deep, 0.0]]) @ axes
@@ -114,14 +104,30 @@ def pose_on_line(
     raw /= np.sqrt(raw[1, 0] @ raw[1, 0])
     pose, moved = raw[:, 0], raw[:, 1:]
     moved = moved - (moved[1] @ pose[1])[:, None] * pose[:, None]
-    own = np.zeros((5, 5))
+    own = np.zeros((5, 5))  # covariance of h, and of the line's offset and slope
     for column, right in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))):
         own[:3, column] = _solved(normal, right)
-    alike = shared_sd / wide * np.array([1.0, h2, 0.0, 0.0, 0.0])
-    own += np.diag([0.0, 0.0, 0.0, offset_sd**2, slope_sd**2]) + alike * alike[:, None]
+    shared = shared_sd / wide * np.array([1.0, h2, 0.0, 0.0, 0.0])
+    own += np.diag([0.0, 0.0, 0.0, offset_sd**2, slope_sd**2]) + shared * shared[:, None]
     lever = moved.swapaxes(1, 2).reshape(6, 5)
     covariance = lever @ own @ lever.T
     return LinePose(pose[0], pose[1], covariance, chi_square) if np.isfinite(covariance).all() else None
+
+
+def _axes(line: Line, middle: float, wide: float) -> np.ndarray:
+    """Axes e1, e2, e3 (rows) in which points of space are p e1 + q e2 up to one scale; e3 is across the line.
+
+    A line that is not quite where it was measured moves points along e3.
+    """
+    onward = line.along / line.scale
+    place = line.origin + middle * onward
+    return np.array(
+        [
+            [wide * onward.real, wide * onward.imag, 0.0],
+            [place.real, place.imag, 1.0],
+            [-onward.imag, onward.real, 0.0],
+        ]
+    )
 
 
 def _terms(points: list[tuple[float, float, float]], h: _Three) -> tuple[list[float], _Three, float, float]:

@@ -19,7 +19,7 @@ from holotorch.optics.free_space.zoomed import chirps, zoomed
 from holotorch.optics.planning.plan import find
 from holotorch.optics.planning.propagate import kernel_of
 
-pytestmark = pytest.mark.filterwarnings("ignore:no way reaches:holotorch.core.checks.SamplingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore:no method reaches:holotorch.core.checks.SamplingWarning")
 GRID, WAVE = Grid((24, 20), (8e-6, 7e-6)), 530e-9
 CROSS_OVER = 2 * 24 * 8e-6**2 / WAVE
 WINDOWS = {
@@ -262,5 +262,5 @@ def test_bad_input_is_named(change, kind, message):
 
 def test_beyond_what_a_tilt_allows_the_error_is_said():
     sines = (0.2, 0.2)
-    with pytest.warns(SamplingWarning, match="no way reaches a tolerance"):
+    with pytest.warns(SamplingWarning, match="no method reaches a tolerance"):
         propagate(white(), GRID, WAVE, CROSS_OVER / 2, tolerance=1e-6, tilt=sines, offset=follow(sines, CROSS_OVER / 2))

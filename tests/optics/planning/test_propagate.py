@@ -17,7 +17,7 @@ from holotorch.optics.planning.plan import find
 from holotorch.optics.planning.propagate import kernel_of
 
 pytestmark = [
-    pytest.mark.filterwarnings("ignore:no way reaches:holotorch.core.checks.SamplingWarning"),
+    pytest.mark.filterwarnings("ignore:no method reaches:holotorch.core.checks.SamplingWarning"),
     # Of noise in the far field one mode lands, which is dim by chance.
     pytest.mark.filterwarnings("ignore:only .* of the light lands:holotorch.core.checks.SamplingWarning"),
 ]
@@ -218,7 +218,7 @@ def test_pitches_below_half_a_wavelength_decay_and_warn_of_what_is_lost(distance
     try:
         out = propagate(field, grid, wavelength, distance, tolerance=0.5)
     except ValueError as refusal:
-        assert "no way reaches a tolerance of 5.0e-01" in str(refusal)
+        assert "no method reaches a tolerance of 5.0e-01" in str(refusal)
         return
     assert torch.isfinite(torch.view_as_real(out)).all()
     assert out.norm() <= field.norm() * 1.001  # evanescent waves decay for either sign
@@ -235,7 +235,7 @@ def test_says_when_the_tolerance_cannot_be_met():
     grid = Grid(96, 8e-6)
     field = beam(grid, 90e-6)
     with pytest.warns(
-        SamplingWarning, match=r"no way reaches a tolerance of 1\.0e-07 .*; .* comes to .*margin="
+        SamplingWarning, match=r"no method reaches a tolerance of 1\.0e-07 .*; .* comes to .*margin="
     ) as caught:
         propagate(field, grid, 530e-9, 5e-3, tolerance=1e-7)
     assert caught[0].filename == __file__

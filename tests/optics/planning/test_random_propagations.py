@@ -99,7 +99,7 @@ def test_no_error_beyond_ten_tolerances_is_silent(seed, measure):
         except ValueError as refused:
             said = str(refused)
     if got is None:
-        assert "no way reaches a tolerance" in said
+        assert "no method reaches a tolerance" in said
         return
     if caught:
         assert {each.category for each in caught} == {SamplingWarning}
@@ -127,7 +127,7 @@ def test_a_tilted_pitch_below_a_wavelength_keeps_its_tilt():
     grid, wavelength, tilt = Grid((20, 24), 0.55e-6), 640e-9, (0.06, -0.1)
     case = random_case(1)
     field = torch.from_numpy(np.random.default_rng(1).normal(size=(20, 24)) + 0j)
-    with pytest.warns(SamplingWarning, match="no way reaches"):
+    with pytest.warns(SamplingWarning, match="no method reaches"):
         got = propagate(field, grid, wavelength, 3e-6, tolerance=1e-4, tilt=tilt)
     wanted = type(case)(
         "", field.numpy(), grid.pitch, wavelength, 3e-6, 1e-4, grid.shape, grid.pitch, (0.0, 0.0), tilt, None
