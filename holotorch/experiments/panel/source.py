@@ -86,7 +86,7 @@ def _from_pec(folder: Path, settings: PECSettings) -> Wanted:
     def picture(fields: Tensor) -> Tensor:
         device = experiment.device
         formed = [intensity(experiment.propagator(each.to(device))) for each in fields]
-        return experiment.seen(torch.stack(formed).mean(0)).cpu()
+        return experiment.picture_in(torch.stack(formed).mean(0)).cpu()
 
     return Wanted(phase, experiment.wavelengths, experiment.grid, "phase", picture)
 
