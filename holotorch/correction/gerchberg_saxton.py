@@ -100,15 +100,8 @@ def iterative_pec(
 
     With a Fresnel propagator it is the thesis's iterative Fresnel PEC (IFPEC).
 
-    Args:
-        propagator: Operator on fields [..., C, H, W] with ``adjoint``.
-        crosstalk: P. The deconvolution takes ``inner_steps`` of :func:`deconvolve`, beginning at the wanted phase.
-        target: Wanted intensity, real [C, H, W], mean 1 per channel.
-        start: Random far-field phase phi_0 in rad, real [..., C, H, W].
-        max_steps: Passes; each costs ``inner_steps`` applications of P and of its transpose.
-        inner_steps: Iterations of each deconvolution.
-        mask: Signal region, as in :func:`gerchberg_saxton`.
-        callback: Called with the solution so far after every pass.
+    Arguments and result are those of :func:`gerchberg_saxton`. The deconvolution takes ``inner_steps`` of
+    :func:`deconvolve`, beginning at the wanted phase; each costs one application of P and one of its transpose.
     """
     return gerchberg_saxton(
         propagator,

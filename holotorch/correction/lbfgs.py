@@ -58,8 +58,7 @@ class LBFGS:
         resume: State | None = None,
     ) -> Solution:
         """Minimise ``objective`` within the box ``project``, from ``start``; otherwise as :meth:`APG.__call__`."""
-        rule = {"max_steps": self.max_steps, "tolerance": self.tolerance, "patience": self.patience}
-        run = Run(objective, start, project, **rule, resume=resume)
+        run = Run(objective, start, project, self.max_steps, self.tolerance, self.patience, resume)
         gradient = run.extra.get("gradient", run.gradient)
         memory = _Memory(self.memory, run)
         flat = (*memory.s.shape[:1], -1)

@@ -83,11 +83,10 @@ class Run:
         objective: Objective,
         start: Tensor,
         project: Projection,
-        *,
         max_steps: int,
         tolerance: float,
         patience: int,
-        resume: State | None = None,
+        resume: State | None,
     ):
         checks.real("start", start)
         checks.all_finite("start", start)

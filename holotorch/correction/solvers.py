@@ -65,8 +65,7 @@ class APG:
             callback: Called with the solution so far after every step.
             resume: The ``state`` of an earlier solution of the same work.
         """
-        rule = {"max_steps": self.max_steps, "tolerance": self.tolerance, "patience": self.patience}
-        run = Run(objective, start, project, **rule, resume=resume)
+        run = Run(objective, start, project, self.max_steps, self.tolerance, self.patience, resume)
         previous = run.extra.get("previous", run.x)
         step = run.extra.get("step_length", torch.full_like(run.loss, self.step))
         count = run.extra.get("count", torch.zeros_like(run.loss))
@@ -142,8 +141,7 @@ class ProjectedAdam:
         resume: State | None = None,
     ) -> Solution:
         """Minimise ``objective`` as :meth:`APG.__call__` does."""
-        rule = {"max_steps": self.max_steps, "tolerance": self.tolerance, "patience": self.patience}
-        run = Run(objective, start, project, **rule, resume=resume)
+        run = Run(objective, start, project, self.max_steps, self.tolerance, self.patience, resume)
         gradient = run.extra.get("gradient", run.gradient)
         mean = run.extra.get("mean", torch.zeros_like(run.x))
         square = run.extra.get("square", torch.zeros_like(run.x))

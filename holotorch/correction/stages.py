@@ -146,29 +146,16 @@ def _joined(before: Solution | None, now: Solution, k: int) -> Solution:
     state = {f"inner_{name}": values for name, values in now.state.items()} | {"stage": torch.tensor(k)}
     if before is None:
         return replace(now, state=state)
-    state |= {
-        "before_x": before.x,
-        "before_losses": before.losses,
-        "before_steps": before.steps,
-        "before_evaluations": torch.tensor(before.evaluations),
-    }
-    losses = torch.cat([before.losses, now.losses[1:]])
-    return Solution(
-        now.x,
-        losses,
-        before.steps + now.steps,
-        now.converged,
-        now.stalled,
-        before.evaluations + now.evaluations,
-        state,
-    )
+    state |= {"before_x": before.x, "before_losses": before.losses, "before_steps": before.steps}
+    state["before_evaluations"] = torch.tensor(before.evaluations)
+    losses, steps = torch.cat([before.losses, now.losses[1:]]), before.steps + now.steps
+    return replace(now, losses=losses, steps=steps, evaluations=before.evaluations + now.evaluations, state=state)
 
 
 def _from_state(state: State) -> Solution | None:
     """Solution of all stages before the interrupted one; None in the first stage."""
     if "before_x" not in state:
         return None
-    steps = state["before_steps"]
+    x, losses, steps = (state[f"before_{name}"] for name in ("x", "losses", "steps"))
     never = torch.zeros_like(steps, dtype=torch.bool)
-    evaluations = int(state["before_evaluations"])
-    return Solution(state["before_x"], state["before_losses"], steps, never, never, evaluations)
+    return Solution(x, losses, steps, never, never, int(state["before_evaluations"]))

@@ -74,12 +74,12 @@ def load_panel(path: Path | str, overrides: Sequence[str] = ()) -> PanelSettings
     """
     source = read_source(Path(path), list(overrides))
     settings = validated(source, PanelSettings)
-    found: list[tuple[Key, str]] = []
+    mistakes: list[tuple[Key, str]] = []
     tables: list[CalibrationSettings] = []
     for i, row in enumerate(settings.calibration):
         key = ("calibration", i)
         if sum(item is not None for item in (row.full_turn, row.lut, row.lut_file)) > 1:
-            found.append((key, "expected one of full_turn, lut or lut_file"))
+            mistakes.append((key, "expected one of full_turn, lut or lut_file"))
             continue
         try:
             points = _read_points(Path(path).parent / row.lut_file) if row.lut_file else row.lut
@@ -87,15 +87,15 @@ def load_panel(path: Path | str, overrides: Sequence[str] = ()) -> PanelSettings
             _table(row, settings.bits)
             tables.append(row)
         except ValueError as error:
-            found.append(((*key, "lut_file" if row.lut_file else "lut"), str(error)))
+            mistakes.append(((*key, "lut_file" if row.lut_file else "lut"), str(error)))
     if settings.dispersion is not None:
         try:
             law = _law(settings.dispersion)
             law(torch.tensor([row.wavelength for row in settings.calibration], dtype=torch.float64))
         except ValueError as error:
-            found.append((("dispersion",), str(error)))
-    if found:
-        raise ConfigError([source.mistake(key, message) for key, message in found])
+            mistakes.append((("dispersion",), str(error)))
+    if mistakes:
+        raise ConfigError([source.mistake(key, message) for key, message in mistakes])
     return settings.model_copy(update={"calibration": tuple(tables)})
 
 
@@ -114,14 +114,11 @@ def build_panel(settings: PanelSettings, wavelengths: Sequence[float]) -> PhaseM
         nearest = min(settings.calibration, key=lambda row, to=wavelength: abs(row.wavelength - to))
         table = _table(nearest, settings.bits)
         if abs(nearest.wavelength / wavelength - 1) > _SAME:
-            known = ", ".join(f"{row.wavelength * 1e9:g} nm" for row in settings.calibration)
+            calibrated = ", ".join(f"{row.wavelength * 1e9:g} nm" for row in settings.calibration)
             if law is None:
-                raise ConfigError(
-                    [
-                        f"the panel {settings.name} is not calibrated at {wavelength * 1e9:g} nm but at {known}; add a "
-                        "calibration, or the crystal's dispersion: {a: 0.18, b: 8.5e-15}"
-                    ]
-                )
+                at = f"not calibrated at {wavelength * 1e9:g} nm but at {calibrated}"
+                cure = "add a calibration, or the crystal's dispersion: {a: 0.18, b: 8.5e-15}"
+                raise ConfigError([f"the panel {settings.name} is {at}; {cure}"])
             try:
                 table = table * phase_scale(wavelength, nearest.wavelength, law).item()
             except ValueError as error:

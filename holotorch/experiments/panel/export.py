@@ -62,24 +62,24 @@ def export_slm(
     if form not in FORMATS:
         raise ConfigError([f"expected one of {', '.join(FORMATS)} as the format, got {form!r}"])
     settings = load_panel(description, overrides)
-    wanted = load_panel_phases(folder, encoding)
-    panel = build_panel(settings, wanted.wavelengths)
+    source = load_panel_phases(folder, encoding)
+    panel = build_panel(settings, source.wavelengths)
     if form == "bmp" and panel.bits > 8:
         raise ConfigError([f"a BMP holds 8 bits and the panel {settings.name} has {panel.bits}; use png"])
-    window = _window(wanted.grid, panel.grid, settings.name)
+    window = _window(source.grid, panel.grid, settings.name)
     place = folder / "slm" if out is None else out
     _claim(place)
     try:
-        names = _write(place, wanted, panel, window, form, folder, settings.name)
+        names = _write(place, source, panel, window, form, folder, settings.name)
         report = {
             "source": str(folder),
             "panel": described(settings),
-            "encoding": wanted.encoding,
-            **({"content": _AFTER_SPREADING} if wanted.encoding == "phase" else {}),
+            "encoding": source.encoding,
+            **({"content": _AFTER_SPREADING} if source.encoding == "phase" else {}),
             "format": form,
             "files": [name for row in names for name in row],
-            "padded": wanted.grid.shape != panel.grid.shape,
-            **resimulate(place, names, wanted, panel, window, form),
+            "padded": source.grid.shape != panel.grid.shape,
+            **resimulate(place, names, source, panel, window, form),
         }
         write_json(place / "export.json", report)
     except BaseException:
@@ -89,7 +89,7 @@ def export_slm(
 
 
 def resimulate(
-    place: Path, names: list[list[str]], wanted: PanelPhases, panel: PhaseModulator, window: tuple, form: str
+    place: Path, names: list[list[str]], source: PanelPhases, panel: PhaseModulator, window: tuple, form: str
 ) -> dict[str, Any]:
     """Errors of the written files, computed from the files and the panel alone, one value per colour.
 
@@ -97,9 +97,9 @@ def resimulate(
     change and the correlation of the picture at its best scale, due to the levels alone, and due to the whole panel
     with fringing fields and gaps.
     """
-    square = torch.zeros(len(wanted.wavelengths), dtype=torch.float64)
+    square = torch.zeros(len(source.wavelengths), dtype=torch.float64)
     fields: dict[str, list[Tensor]] = {"levels": [], "panel": []}
-    for frame, row in zip(wanted.phase, names, strict=True):
+    for frame, row in zip(source.phase, names, strict=True):
         files = [(read_phases if form == "exr" else read_levels)(place / name) for name in row]
         for c, (name, (_, facts)) in enumerate(zip(row, files, strict=True)):
             if facts.get("lut_sha256") != panel.lut_hash(c):
@@ -110,18 +110,18 @@ def resimulate(
         square += error.square().mean((-2, -1)) / len(names)
         fields["levels"].append(phasor(whole[window].float()))
         fields["panel"].append(panel.emitted(whole.float())[window])
-    before = wanted.picture(phasor(wanted.phase))
+    before = source.picture(phasor(source.phase))
     numbers: dict[str, Any] = {
         "rms_phase_error_rad": square.sqrt().tolist(),
         "expected_rms_phase_error_rad": [0.0] * len(square) if form == "exr" else list(panel.expected_rms),
     }
     for name, frames in fields.items():
-        after = wanted.picture(torch.stack(frames))
+        after = source.picture(torch.stack(frames))
         pairs = [_compared(a, b) for a, b in zip(after, before, strict=True)]
         numbers[f"picture_change_by_{name}"] = [change for change, _ in pairs]
         numbers[f"picture_correlation_{name}"] = [correlation for _, correlation in pairs]
-    if wanted.losses:
-        numbers["encoding_loss"] = wanted.losses
+    if source.losses:
+        numbers["encoding_loss"] = source.losses
     return numbers
 
 
@@ -177,14 +177,14 @@ def _claim(place: Path) -> None:
 
 
 def _write(
-    place: Path, wanted: PanelPhases, panel: PhaseModulator, window: tuple, form: str, folder: Path, name: str
+    place: Path, source: PanelPhases, panel: PhaseModulator, window: tuple, form: str, folder: Path, name: str
 ) -> list[list[str]]:
     """Write all files; returns their names, a list of colours for each frame."""
     common = {
         "program": f"holotorch {__version__}",
         "panel": name,
         "pitch_m": list(panel.grid.pitch),
-        "encoding": wanted.encoding,
+        "encoding": source.encoding,
         "bits": panel.bits,
         "source": str(folder),
         "config_sha256": hashlib.sha256((folder / "config.yaml").read_bytes()).hexdigest(),
@@ -193,12 +193,12 @@ def _write(
         "content": "phase in rad" if form == "exr" else "grey levels",
     }
     names = []
-    for f, phase in enumerate(wanted.phase):
+    for f, phase in enumerate(source.phase):
         whole = phase.new_zeros(len(phase), *panel.grid.shape)
         whole[window] = phase
         frames = whole.flip(panel.flips) if form == "exr" else panel.levels(whole)
         names.append([])
-        for c, wavelength in enumerate(wanted.wavelengths):
+        for c, wavelength in enumerate(source.wavelengths):
             facts = {"wavelength_m": wavelength, "lut_sha256": panel.lut_hash(c), "frame": f, "colour": c}
             file = f"frame-{f:03d}_{wavelength * 1e9:.6g}nm.{form}"
             write = write_phases if form == "exr" else write_levels

@@ -102,7 +102,7 @@ class Log:
 
     def table(self) -> str:
         """The rows as CSV."""
-        colours = [f"loss_{wave * 1e9:.0f}nm" for wave in self.experiment.wavelengths]
+        colours = [f"loss_{wavelength * 1e9:.0f}nm" for wavelength in self.experiment.wavelengths]
         header = ["step", "evaluations", "seconds", f"{self.metric}_mean", *colours]
         return "\n".join(",".join(row) for row in [header, *self.rows]) + "\n"
 

@@ -53,9 +53,9 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
                 if not pressed:
                     started = time.perf_counter()
                     all_frames = name == "unweighted"
-                    found = experiment.unweighted.solve() if all_frames else baseline(experiment, name)
+                    other = experiment.unweighted.solve() if all_frames else baseline(experiment, name)
                     seconds = time.perf_counter() - started
-                    results[name] = _result(experiment, found, seconds, single=not all_frames)
+                    results[name] = _result(experiment, other, seconds, single=not all_frames)
             except KeyboardInterrupt:
                 pressed.append(signal.SIGINT)
             except ValueError as error:

@@ -50,7 +50,7 @@ def run_study(study: Study, opened: RunFolder) -> bool:
     files.write(write_text, folder / "table.txt", text)
     picture = curves(rows, f"{settings.study}: mean of {', '.join(settings.images)} at {settings.size} px")
     files.write(write_bytes, folder / "images" / "table.png", picture)
-    verdicts = [row["verdict"].split(":")[0] for row in rows if row["verdict"]]
+    verdicts = [row["verdict"] for row in rows if row["verdict"]]
     summary = {
         "experiment": settings.experiment,
         "study": settings.study,

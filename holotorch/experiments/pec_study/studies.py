@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from holotorch.correction import Solution
 from holotorch.experiments.pec_study.bench import Bench, Track
 from holotorch.experiments.pec_study.cases import Cases
 from holotorch.experiments.pec_study.volume import SLICES, focal_sweep
@@ -47,9 +48,7 @@ def lowpass(bench: Bench, cutoffs: Sequence[float], steps: int, store: Cases) ->
     """Fig. 4.12: targets of which a low-pass filter has removed the fine detail."""
     rows = store.rows
     for cutoff in store.each(cutoffs, desc="low-pass targets", unit="cut-off"):
-        setup = replace(bench, lowpass=cutoff)
-        for name, phase, seconds in _methods(setup, steps, ("basic IPEC", "IPEC", "PPEC", "ours")):
-            rows.append(_row(setup, name, setup.scores(phase), seconds) | {"setting": f"cut-off {cutoff:g} cycles/px"})
+        rows += _corrected(replace(bench, lowpass=cutoff), steps, f"cut-off {cutoff:g} cycles/px")
     return rows
 
 
@@ -71,9 +70,8 @@ def multiplexing(bench: Bench, sigmas: Sequence[float], steps: int, store: Cases
             ("2 joint frames", setup, partial(setup.lbfgs, setup.start("hot", 2), steps=steps)),
             ("4 joint frames", setup, partial(setup.lbfgs, setup.start("hot", 4), steps=steps)),
         ):
-            started = time.perf_counter()
-            phase = work().x
-            rows.append(_row(where, name, where.scores(phase), time.perf_counter() - started))
+            phase, seconds = _timed(work)
+            rows.append(_row(where, name, where.scores(phase), seconds))
     return rows
 
 
@@ -99,9 +97,7 @@ def scaling(bench: Bench, sigmas: Sequence[float], steps: int, store: Cases) -> 
     rows = store.rows
     cases = [(bench.size, sigma) for sigma in sigmas] + [(size, bench.sigma_px) for size in SIZES]
     for size, sigma in store.each(cases, desc="time", unit="case"):
-        setup = replace(bench, size=size, sigma_px=sigma)
-        for name, phase, seconds in _methods(setup, steps, ("basic IPEC", "IPEC", "PPEC", "ours")):
-            rows.append(_row(setup, name, setup.scores(phase), seconds) | {"setting": f"{size} px"})
+        rows += _corrected(replace(bench, size=size, sigma_px=sigma), steps, f"{size} px")
     return rows
 
 
@@ -117,9 +113,8 @@ def focus(bench: Bench, sigmas: Sequence[float], steps: int, store: Cases) -> li
         scores = setup.scores(stack[0], formed * (setup.wanted.mean() / formed.mean()))
         rows.append(_row(setup, "stack of 3 slices", scores, time.perf_counter() - started))
         for name, frames in (("one hologram", 1), ("4 joint frames", 4)):
-            started = time.perf_counter()
-            phase = setup.lbfgs(setup.start("cool", frames), steps=steps).x
-            rows.append(_row(setup, name, setup.scores(phase), time.perf_counter() - started))
+            phase, seconds = _timed(setup.lbfgs, setup.start("cool", frames), steps=steps)
+            rows.append(_row(setup, name, setup.scores(phase), seconds))
             for plane in (0.07, 0.08, 0.09, 0.10, 0.11, 0.12, 0.13):
                 image = replace(setup, distances=(plane,)).formed(phase)
                 for band, depth in enumerate(depths):
@@ -140,9 +135,8 @@ def limits(bench: Bench, sigmas: Sequence[float], steps: int, store: Cases) -> l
         setup = replace(bench, sigma_px=sigma)
         for multiple in (1, 2, 4, 8):
             for frames in (1, 4):
-                started = time.perf_counter()
-                phase = setup.lbfgs(setup.start("hot", frames), steps=steps, limit=multiple * PI).x
-                row = _row(setup, f"{frames} frame(s)", setup.scores(phase), time.perf_counter() - started)
+                phase, seconds = _timed(setup.lbfgs, setup.start("hot", frames), steps=steps, limit=multiple * PI)
+                row = _row(setup, f"{frames} frame(s)", setup.scores(phase), seconds)
                 rows.append(row | {"setting": f"P <= {multiple} pi ({multiple * 175} degC at 630 nm)"})
         phase = setup.lbfgs(setup.start("hot"), steps=steps).x
         for error in (-0.05, -0.02, -0.01, 0.0, 0.01, 0.02, 0.05):
@@ -209,18 +203,28 @@ _ALL = ("none", "basic IPEC", "IPEC", "PPEC", "ours")
 
 def _methods(bench: Bench, steps: int, names: Sequence[str]) -> Iterator[tuple[str, Tensor, float]]:
     """Heater phases and seconds of each method; the solvers begin at the thesis's hot start if not said otherwise."""
-    work: dict[str, Callable[[], Tensor]] = {
-        "none": lambda: bench.retrieved("none").x,
-        "basic IPEC": lambda: bench.retrieved("basic").x,
-        "IPEC": lambda: bench.retrieved("ipec", passes=30).x,
-        "PPEC": lambda: bench.algorithm2(bench.start("hot"), steps=steps).x,
-        "PPEC, cool start": lambda: bench.algorithm2(bench.start("cool"), steps=steps).x,
-        "ours": lambda: bench.lbfgs(bench.start("hot"), steps=steps).x,
+    work: dict[str, Callable[[], Solution]] = {
+        "none": lambda: bench.retrieved("none"),
+        "basic IPEC": lambda: bench.retrieved("basic"),
+        "IPEC": lambda: bench.retrieved("ipec", passes=30),
+        "PPEC": lambda: bench.algorithm2(bench.start("hot"), steps=steps),
+        "PPEC, cool start": lambda: bench.algorithm2(bench.start("cool"), steps=steps),
+        "ours": lambda: bench.lbfgs(bench.start("hot"), steps=steps),
     }
     for name in names:
-        started = time.perf_counter()
-        phase = work[name]()
-        yield name, phase, time.perf_counter() - started
+        yield name, *_timed(work[name])
+
+
+def _timed(work: Callable[..., Solution], *arguments: Any, **options: Any) -> tuple[Tensor, float]:
+    """Heater phases that ``work`` returns for the arguments, and the seconds that it takes."""
+    started = time.perf_counter()
+    return work(*arguments, **options).x, time.perf_counter() - started
+
+
+def _corrected(bench: Bench, steps: int, setting: str) -> list[Row]:
+    """Rows of the methods with a correction at one setting."""
+    methods = _methods(bench, steps, _ALL[1:])
+    return [_row(bench, name, bench.scores(phase), seconds) | {"setting": setting} for name, phase, seconds in methods]
 
 
 def _slices(bench: Bench, steps: int) -> tuple[Tensor, Tensor]:
