@@ -56,6 +56,11 @@ def test_check_says_how_hot_and_how_many_frames(path, capsys):
     out = capsys.readouterr().out.splitlines()
     assert (FOUR_PI if capped else NO_LIMIT) + "; heaters with 64 steps" in out
     assert FRAMES.format("one by one") in out
+    (crosstalk,) = (line for line in out if line.startswith("Crosstalk"))
+    assert (
+        "warms one d px away by exp(-d^2/sigma^2) of its own rise; sigma is the usual Gaussian sigma times" in crosstalk
+    )
+    assert any("random heater phases" in line for line in out if line.startswith("Solver"))  # what a start is
 
 
 def test_report_of_several_runs(capsys):

@@ -1,4 +1,7 @@
-"""Finding the heater phases whose image survives the proximity effect."""
+"""Proximity effect correction: heater phases whose image is right although heat spreads between the pixels."""
+
+import warnings
+from typing import Any
 
 from holotorch.correction.deconvolution import deconvolve, deconvolve_admm, inverse
 from holotorch.correction.gerchberg_saxton import gerchberg_saxton, iterative_pec
@@ -6,7 +9,7 @@ from holotorch.correction.lbfgs import LBFGS, spread_preconditioner
 from holotorch.correction.problem import PECProblem
 from holotorch.correction.run import Box, Solution, nonnegative
 from holotorch.correction.solvers import APG, ProjectedAdam
-from holotorch.correction.stages import Stage, below, limited, proximal_pec, run_stages
+from holotorch.correction.stages import Stage, limit_peak_phase, penalty_schedule, proximal_pec, run_stages
 
 __all__ = [
     "APG",
@@ -16,15 +19,26 @@ __all__ = [
     "ProjectedAdam",
     "Solution",
     "Stage",
-    "below",
     "deconvolve",
     "deconvolve_admm",
     "gerchberg_saxton",
     "inverse",
     "iterative_pec",
-    "limited",
+    "limit_peak_phase",
     "nonnegative",
+    "penalty_schedule",
     "proximal_pec",
     "run_stages",
     "spread_preconditioner",
 ]
+
+_RENAMED = {"limited": penalty_schedule, "below": limit_peak_phase}
+
+
+def __getattr__(name: str) -> Any:
+    """The function that had this name in version 0.1, with a warning."""
+    if name not in _RENAMED:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    new = _RENAMED[name]
+    warnings.warn(f"holotorch.correction.{name} is now {new.__name__}", DeprecationWarning, stacklevel=2)
+    return new

@@ -1,4 +1,4 @@
-"""Deconvolution of phases: heater phases whose spread comes close to wanted ones (thesis Eqs. 4.5, 4.6, 4.32-4.35)."""
+"""Deconvolution of phases: heater phases that give a wanted phase after spreading (thesis Eqs. 4.5, 4.6, 4.32-4.35)."""
 
 from typing import Protocol
 
@@ -9,7 +9,7 @@ from holotorch.core import checks
 
 
 class Crosstalk(Protocol):
-    """A convolution of phases [..., H, W] with a known kernel, zero outside, such as ``ThermalCrosstalk``."""
+    """A convolution of phases [..., H, W] with a kernel and zero padding, such as ``ThermalCrosstalk``."""
 
     @property
     def kernel(self) -> Tensor:
@@ -26,31 +26,35 @@ class Crosstalk(Protocol):
 
 
 def inverse(crosstalk: Crosstalk, phase: Tensor) -> Tensor:
-    """The exact solution of P(X) = ``phase``, real [..., H, W], which may be negative or huge; float64 inside.
+    """The exact solution X of P(X) = ``phase``, real [..., H, W], computed in float64.
 
-    Chopping is ``.clamp(min=0)`` of it, shifting adds the absolute of its least entry (Marrian et al. 1987). Raises
-    ValueError for a kernel whose matrix is singular to rounding (near sigma 1.67 px with 7 taps) or not separable.
+    X may be negative or very large. The method "chopping" sets its negative entries to 0; "shifting" adds the magnitude
+    of its smallest entry (Marrian et al. 1987).
+
+    Raises:
+        ValueError: A kernel that is not separable and symmetric, or whose matrix is singular to rounding, as it is near
+            sigma 1.67 px with 7 taps.
     """
     columns, rows = _axis_matrices(crosstalk, phase)
     for matrix in (columns, rows):
-        size = torch.linalg.svdvals(matrix)
-        if size[-1] <= 1e-12 * size[0]:
+        singular = torch.linalg.svdvals(matrix)
+        if singular[-1] <= 1e-12 * singular[0]:
             raise ValueError(f"{crosstalk} has no inverse on {tuple(phase.shape[-2:])} px: it erases some patterns")
     solved = torch.linalg.solve(columns, phase.to(torch.float64))
     return torch.linalg.solve(rows, solved.transpose(-1, -2)).transpose(-1, -2).to(phase.dtype)
 
 
 def deconvolve(crosstalk: Crosstalk, phase: Tensor, *, max_steps: int = 30, start: Tensor | None = None) -> Tensor:
-    """The X >= 0 with the least || P(X) - phase ||, by accelerated proximal gradient with its known step.
+    """The X >= 0 that minimises || P(X) - phase ||, by accelerated proximal gradient with a fixed step.
 
     Args:
         crosstalk: P.
-        phase: Wanted phase after spreading in rad, real [..., H, W], wrapped to [0, 2 pi): of phases around 0, half
-            would be out of reach.
+        phase: Wanted phase after spreading in rad, real [..., H, W], wrapped to [0, 2 pi). Negative phases cannot be
+            reached, since X and the kernel are non-negative.
         max_steps: Iterations.
-        start: Where to begin, such as the last result in a loop; ``phase`` itself by default.
+        start: X of the first iteration, such as the last result in a loop; ``phase`` by default.
 
-    Source: thesis Eqs. 4.32-4.35, with M^T phi in the gradient; the step 1 / L needs no search, as L <= (sum K)^2.
+    Source: thesis Eqs. 4.32-4.35, with M^T phi in the gradient. The step 1 / L needs no search, as L <= (sum K)^2.
     """
     checks.real("phase", phase)
     checks.all_finite("phase", phase)
@@ -64,7 +68,7 @@ def deconvolve(crosstalk: Crosstalk, phase: Tensor, *, max_steps: int = 30, star
 
 
 def deconvolve_admm(crosstalk: Crosstalk, phase: Tensor, *, max_steps: int = 30, weight: float = 1.0) -> Tensor:
-    """The same by ADMM; the linear system of each step is solved exactly in the eigenvectors of both axes.
+    """The result of :func:`deconvolve` by ADMM, whose linear system is solved exactly in the eigenvectors of each axis.
 
     ``weight`` is the penalty rho, relative to the mean square of the kernel's eigenvalues. Raises ValueError for a
     kernel that is not separable and symmetric. Source: Parikh and Boyd (2014), Sec. 4.4 and 5.
@@ -72,15 +76,15 @@ def deconvolve_admm(crosstalk: Crosstalk, phase: Tensor, *, max_steps: int = 30,
     checks.all_finite("phase", phase)
     checks.whole("max_steps", max_steps, 1)
     checks.positive("weight", weight)
-    bases, sizes = zip(*(torch.linalg.eigh(matrix)[::-1] for matrix in _axis_matrices(crosstalk, phase)), strict=True)
-    eigenvalues = sizes[0][:, None] * sizes[1]
+    (down, basis_y), (across, basis_x) = (torch.linalg.eigh(matrix) for matrix in _axis_matrices(crosstalk, phase))
+    eigenvalues = down[:, None] * across
     penalty = weight * eigenvalues.square().mean()
-    wanted = bases[0].T @ phase.to(torch.float64) @ bases[1] * eigenvalues
+    wanted = basis_y.T @ phase.to(torch.float64) @ basis_x * eigenvalues
     z = phase.to(torch.float64).clamp(min=0)
     dual = torch.zeros_like(z)
     for _ in range(max_steps):
-        pulled = bases[0].T @ (z - dual) @ bases[1]
-        x = bases[0] @ ((wanted + penalty * pulled) / (eigenvalues.square() + penalty)) @ bases[1].T
+        coefficients = basis_y.T @ (z - dual) @ basis_x
+        x = basis_y @ ((wanted + penalty * coefficients) / (eigenvalues.square() + penalty)) @ basis_x.T
         z = (x + dual).clamp(min=0)
         dual = dual + x - z
     return z.to(phase.dtype)
@@ -100,6 +104,7 @@ def _axis_matrices(crosstalk: Crosstalk, phase: Tensor) -> tuple[Tensor, Tensor]
 
 
 def _toeplitz(taps: Tensor, size: int, device: torch.device) -> Tensor:
+    """Matrix [size, size] of the convolution of ``size`` samples with ``taps`` and zero padding."""
     offsets = torch.arange(size)[:, None] - torch.arange(size) + len(taps) // 2
     inside = (offsets >= 0) & (offsets < len(taps))
     return torch.where(inside, taps[offsets.clamp(0, len(taps) - 1)], 0.0).to(device)

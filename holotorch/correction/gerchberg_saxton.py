@@ -1,4 +1,7 @@
-"""Gerchberg-Saxton phase retrieval: plain, with the crosstalk in its loop, and with its deconvolution (IPEC)."""
+"""Gerchberg-Saxton phase retrieval: plain, with the crosstalk in its loop, and with a deconvolution of the phase.
+
+The last one is iterative proximity effect correction (IPEC).
+"""
 
 from collections.abc import Callable
 
@@ -27,26 +30,26 @@ def gerchberg_saxton(
 ) -> Solution:
     """Phases whose propagated intensity resembles ``target``, by alternating the two amplitude constraints.
 
-    Without ``crosstalk`` this is the classical algorithm, and showing its result on a coupled array is the case "no
-    correction". With it, each pass spreads the phase before it propagates: the basic iterative PEC of Persson et al.
-    and Gemayel et al., which has no deconvolution (thesis Sec. 4.4.3.3, B = S exp(i P(phs(A)))). With both it is the
-    thesis's Algorithm 1, see :func:`iterative_pec`.
+    Without ``crosstalk`` this is the classical algorithm; its result on an array with crosstalk is the case "no
+    correction". With ``crosstalk``, each pass spreads the phase before it propagates the field. This is the basic
+    iterative PEC of Persson et al. and Gemayel et al., which has no deconvolution (thesis Sec. 4.4.3.3,
+    B = S exp(i P(phs(A)))). With a ``deconvolution`` as well it is the thesis's Algorithm 1, :func:`iterative_pec`.
 
     Args:
         propagator: Operator on fields [..., C, H, W] with ``adjoint``.
-        target: Wanted intensity, real [C, H, W], mean 1 per channel; its root is the amplitude constraint.
+        target: Wanted intensity, real [C, H, W], mean 1 per channel; its square root is the amplitude constraint.
         start: Random far-field phase phi_0 in rad, real [..., C, H, W] (Algorithm 1).
         max_steps: Passes through the loop.
         crosstalk: Operator on phases, or None.
-        deconvolution: From the phase wanted after spreading, in [0, 2 pi), and the heater phases of the last pass (None
-            in the first) to the new ones; None leaves them as they are.
-        mask: 1 in the signal region, 0 in the background, where the light stays as it comes (Eqs. 4.7, 4.8).
-        callback: Sees the state after every pass.
+        deconvolution: Function of the phase wanted after spreading, in [0, 2 pi), and of the heater phases of the last
+            pass (None in the first pass), that returns the new heater phases. None takes the wanted phase itself.
+        mask: 1 in the signal region, 0 in the background, where the field is not constrained (Eqs. 4.7, 4.8).
+        callback: Called with the solution so far after every pass.
 
     Returns:
-        Solution whose ``x`` are heater phases in [0, 2 pi), or what ``deconvolution`` gave, and whose losses are
-        || T - |C| ||^2 of each pass, T the target amplitude, within the mask; ``converged`` is False throughout, as no
-        stop rule is used.
+        Solution whose ``x`` are heater phases, in [0, 2 pi) without a ``deconvolution``. Its losses are
+        || T - |C| ||^2 of each pass within the mask, where T is the target amplitude and C the propagated field.
+        ``converged`` is always False, as there is no stop rule.
     """
     checks.real("target", target)
     checks.all_finite("target", target)
@@ -58,7 +61,7 @@ def gerchberg_saxton(
     if mask is not None:
         checks.weights("mask", mask, tuple(target.shape))
     amplitude = target.to(start.dtype).sqrt()
-    far = amplitude * phasor(start)
+    image = amplitude * phasor(start)  # field in the image plane
     phase, losses = start, []
     weight = torch.ones_like(amplitude) if mask is None else mask.to(amplitude.dtype).expand_as(amplitude)
 
@@ -69,14 +72,14 @@ def gerchberg_saxton(
 
     with torch.no_grad():
         for step in range(max_steps + 1):
-            wanted = wrapped(torch.angle(propagator.adjoint(far)))
+            wanted = wrapped(torch.angle(propagator.adjoint(image)))
             phase = wanted if deconvolution is None else deconvolution(wanted, phase if step else None)
             spread = phase if crosstalk is None else crosstalk(phase)
             formed = propagator(phasor(spread))
             magnitude = intensity(formed).sqrt()
             losses.append((weight * (amplitude - magnitude)).square().sum((-2, -1)))
-            aimed = amplitude * torch.where(magnitude > 0, formed / torch.where(magnitude > 0, magnitude, 1), 1)
-            far = weight * aimed + (1 - weight) * formed
+            constrained = amplitude * torch.where(magnitude > 0, formed / torch.where(magnitude > 0, magnitude, 1), 1)
+            image = weight * constrained + (1 - weight) * formed
             if callback and step:
                 callback(state())
     return state()
@@ -93,19 +96,12 @@ def iterative_pec(
     mask: Tensor | None = None,
     callback: Callback | None = None,
 ) -> Solution:
-    """Iterative PEC, thesis Algorithm 1: Gerchberg-Saxton that deconvolves the phase in every pass.
+    """Iterative PEC (IPEC), thesis Algorithm 1: Gerchberg-Saxton that deconvolves the phase in every pass.
 
-    With a Fresnel propagator it is the thesis's IFPEC.
+    With a Fresnel propagator it is the thesis's iterative Fresnel PEC (IFPEC).
 
-    Args:
-        propagator: Operator on fields [..., C, H, W] with ``adjoint``.
-        crosstalk: P; the deconvolution is non-negative, by ``inner_steps`` of :func:`deconvolve` from the wanted phase.
-        target: Wanted intensity, real [C, H, W], mean 1 per channel.
-        start: Random far-field phase phi_0 in rad, real [..., C, H, W].
-        max_steps: Passes; each costs ``inner_steps`` applications of P and of its transpose.
-        inner_steps: Iterations of each deconvolution.
-        mask: Signal region, as in :func:`gerchberg_saxton`.
-        callback: Sees the state after every pass.
+    Arguments and result are those of :func:`gerchberg_saxton`. The deconvolution takes ``inner_steps`` of
+    :func:`deconvolve`, beginning at the wanted phase; each costs one application of P and one of its transpose.
     """
     return gerchberg_saxton(
         propagator,

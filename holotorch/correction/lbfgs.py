@@ -10,22 +10,23 @@ from holotorch.core import checks
 from holotorch.core.fourier import fft2, filter_real
 from holotorch.correction.run import Box, Callback, Objective, Run, Solution, State, check_stop_rule, nonnegative
 
-_ENOUGH = 1e-4  # of the decrease that the slope promises (Armijo)
-_SHRINK, _SHORTEST = 0.5, 2.0**-12
+# Line search: the least share of the decrease predicted by the slope that a step must give (Armijo's condition, Nocedal
+# and Wright, Eq. 3.4), the factor on the length of a refused step, and the shortest length, relative to the first.
+_ARMIJO, _SHRINK, _SHORTEST = 1e-4, 0.5, 2.0**-12
 
 
 @dataclass(frozen=True)
 class LBFGS:
-    """L-BFGS within a box, each item of a batch with a memory, a step length and a stop of its own.
+    """L-BFGS within a box; each item of a batch has a separate memory, step length and stop.
 
-    Elements that lie on a bound and want to leave the box are held; the others take the quasi-Newton step and are
-    projected, the step being halved until the loss falls enough (Bertsekas 1982). The first guess of the inverse
-    Hessian is ``precondition``, scaled; products with the memory are taken by inner products of whole histories, so
-    that a step costs a few passes over them whatever the number of items.
+    Elements on a bound whose descent direction leaves the box are held. The others take the quasi-Newton step and are
+    projected; the step is halved until the loss falls enough (Bertsekas 1982). The initial inverse Hessian is
+    ``precondition``, scaled. Products with the memory are computed for all items at once from inner products of the
+    stored vectors, so that a step costs a few passes over them, whatever the number of items.
 
     Attributes:
-        memory: Pairs of steps and changes of gradient that are kept. Holograms gain nothing from more than 3, and at
-            strong crosstalk they lose (``holotorch chart pec``).
+        memory: Number of stored pairs of a step and its change of gradient. For holograms more than 3 do not help, and
+            at strong crosstalk they converge more slowly (``holotorch chart pec``).
         precondition: Symmetric positive linear operator on x, such as :func:`spread_preconditioner`; identity if None.
         first: Largest change of an element in the first step, in the unit of x.
         max_steps: Most iterations.
@@ -56,9 +57,8 @@ class LBFGS:
         callback: Callback | None = None,
         resume: State | None = None,
     ) -> Solution:
-        """Minimise ``objective`` within the box ``project``, from ``start`` [..., *unknown]; else as ``APG``."""
-        rule = {"max_steps": self.max_steps, "tolerance": self.tolerance, "patience": self.patience}
-        run = Run(objective, start, project, **rule, resume=resume)
+        """Minimise ``objective`` within the box ``project``, from ``start``; otherwise as :meth:`APG.__call__`."""
+        run = Run(objective, start, project, self.max_steps, self.tolerance, self.patience, resume)
         gradient = run.extra.get("gradient", run.gradient)
         memory = _Memory(self.memory, run)
         flat = (*memory.s.shape[:1], -1)
@@ -66,22 +66,24 @@ class LBFGS:
             free = self._free(run.x, gradient, project)
             steepest = free * gradient
             guess = self._preconditioned(steepest)
-            direction = free * memory.direction(steepest.reshape(flat), guess.reshape(flat)).reshape(run.x.shape)
-            lost = ~(run.total(direction * gradient) < 0)
-            if lost.any():
-                # The memory no longer fits, as where the set of held elements has changed: forget it.
-                memory.forget(lost.reshape(-1))
-                direction = torch.where(run.each(lost), -free * guess, direction)
-            largest = direction.abs().flatten(run.items).amax(-1)
-            reach = self.first / largest.clamp(min=torch.finfo(largest.dtype).tiny)
-            length = torch.where(memory.empty.reshape(run.loss.shape), reach, 1.0)
+            rows = memory.direction(*(run.rows(part).reshape(flat) for part in (steepest, guess)))
+            direction = free * run.from_rows(rows)
+            ascending = ~(run.total(direction * gradient) < 0)
+            if ascending.any():
+                # The memory no longer describes the loss, for example after a change of the held elements: forget it.
+                memory.forget(ascending.reshape(-1))
+                direction = torch.where(run.each(ascending), -free * guess, direction)
+            largest = run.rows(direction.abs()).amax(-1)
+            first_length = self.first / largest.clamp(min=torch.finfo(largest.dtype).tiny)
+            length = torch.where(memory.empty.reshape(run.loss.shape), first_length, 1.0)
             x, loss, after, failed = self._search(run, project, direction, gradient, length)
-            # A step that fails with a memory may succeed without; one that fails without never will.
+            # A step that fails with a memory may succeed without it; a step that fails without a memory has stalled.
             stalled = failed & memory.empty.reshape(run.loss.shape)
             change = after - gradient
             if failed.any():
                 memory.forget(failed.reshape(-1))
-            memory.add(*(part.reshape(flat) for part in (x - run.x, change, self._preconditioned(change))))
+            pair = x - run.x, change, self._preconditioned(change)
+            memory.add(*(run.rows(part).reshape(flat) for part in pair))
             run.advance(x, loss, stalled)
             gradient = after if run.active.all() else torch.where(run.each(run.active), after, gradient)
             if callback:
@@ -93,13 +95,16 @@ class LBFGS:
 
     @staticmethod
     def _free(x: Tensor, gradient: Tensor, box: Box) -> Tensor:
-        """1 where an element may move, 0 where it lies on a bound that the descent would cross."""
+        """1 where an element may move, 0 where it lies on a bound that a step downhill would cross."""
         lower, upper = (torch.as_tensor(bound, dtype=x.dtype, device=x.device) for bound in (box.lower, box.upper))
         held = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
         return (~held).to(x.dtype)
 
     def _search(self, run: Run, project: Box, direction: Tensor, gradient: Tensor, length: Tensor):
-        """Halve the step of each item until its loss falls enough; a gradient comes with every trial."""
+        """Halve the step of each item until its loss falls enough.
+
+        Every trial computes the gradient too, as most first trials are accepted.
+        """
         slack = 8 * torch.finfo(run.x.dtype).eps * run.loss
         accepted, failed = ~run.active, torch.zeros_like(run.active)
         shortest = length * _SHORTEST
@@ -107,9 +112,9 @@ class LBFGS:
         while True:
             x = project(run.x + run.each(length) * direction)
             loss, after = run.value_and_gradient(x)
-            promised = _ENOUGH * run.total(gradient * (x - run.x))
-            enough = ~accepted & (loss <= run.loss + promised + slack)
-            if enough.all():  # all at the first trial, as is most common
+            wanted = _ARMIJO * run.total(gradient * (x - run.x))
+            enough = ~accepted & (loss <= run.loss + wanted + slack)
+            if enough.all():  # the most common case: all items accept the first trial
                 return x, loss, after, failed
             taken = run.each(enough)
             best, best_gradient = torch.where(taken, x, best), torch.where(taken, after, best_gradient)
@@ -122,9 +127,9 @@ class LBFGS:
 
 
 class _Memory:
-    """The last m steps s, changes of gradient y, and z = H0 y, of every item, oldest first; never changed in place.
+    """The last m steps s, changes of gradient y, and z = H0 y of every item, oldest first; never changed in place.
 
-    A place whose pair shows no positive curvature along s is left zero for that item, and takes no part.
+    A pair without positive curvature along s is stored as zeros for that item, and has no effect.
     """
 
     def __init__(self, size: int, run: Run):
@@ -143,7 +148,7 @@ class _Memory:
 
     @property
     def empty(self) -> Tensor:
-        """Which items remember nothing, [items]."""
+        """Whether an item has no pair, [items]."""
         return (self.sy.diagonal(dim1=-2, dim2=-1) == 0).all(-1)
 
     def forget(self, which: Tensor) -> None:
@@ -155,17 +160,17 @@ class _Memory:
     def add(self, step: Tensor, change: Tensor, preconditioned: Tensor) -> None:
         """Keep one more pair, all [items, length], and drop the oldest."""
         curvature = (step * change).sum(-1)
-        good = curvature > 1e-8 * (step.square().sum(-1) * change.square().sum(-1)).sqrt()
-        bad = ~good[:, None, None]
-        new = [part[:, None].masked_fill(bad, 0) for part in (step, change, preconditioned)]
+        # Below 1e-8 of the product of their lengths, float32 rounding decides the sign of the inner product.
+        convex = curvature > 1e-8 * (step.square().sum(-1) * change.square().sum(-1)).sqrt()
+        new = [part[:, None].masked_fill(~convex[:, None, None], 0) for part in (step, change, preconditioned)]
         self.s, self.y, self.z = (
             torch.cat([old[:, 1:], part], 1) for old, part in zip((self.s, self.y, self.z), new, strict=True)
         )
         column, row = (self.s @ new[1].mT).double(), (new[0] @ self.y.mT).double()
         self.sy = _bordered(self.sy, column, row)
-        bent = (self.y @ new[2].mT).double()
-        self.yz = _bordered(self.yz, bent, bent.mT)
-        newest = bent[:, -1, 0]
+        column = (self.y @ new[2].mT).double()
+        self.yz = _bordered(self.yz, column, column.mT)
+        newest = column[:, -1, 0]
         self.scale = torch.where(newest > 0, curvature.double() / newest.clamp(min=1e-300), self.scale)
 
     def direction(self, gradient: Tensor, preconditioned: Tensor) -> Tensor:
@@ -178,15 +183,15 @@ class _Memory:
         u = torch.linalg.solve_triangular(upper, a, upper=True)
         middle = torch.diag_embed(curvature) + scale * self.yz
         v = torch.linalg.solve_triangular(upper.mT, middle @ u - b, upper=False)
-        back, forth, scale = (part.to(gradient.dtype) for part in (v.mT, (scale * u).mT, scale[:, 0]))
-        return (forth @ self.z - back @ self.s)[:, 0] - scale * preconditioned
+        of_s, of_z, scale = (part.to(gradient.dtype) for part in (v.mT, (scale * u).mT, scale[:, 0]))
+        return (of_z @ self.z - of_s @ self.s)[:, 0] - scale * preconditioned
 
 
 _MEMORY = ("s", "y", "z", "sy", "yz", "scale")
 
 
 def _bordered(square: Tensor, column: Tensor, row: Tensor) -> Tensor:
-    """Matrices [items, m, m] without their first row and column, and with a new last column and row, [m] each."""
+    """Matrices [items, m, m] that lose their first row and column and gain a last column and row, [m] each."""
     inner = torch.cat([square[:, 1:, 1:], column[:, :-1]], -1)
     return torch.cat([inner, row], -2)
 
@@ -194,8 +199,8 @@ def _bordered(square: Tensor, column: Tensor, row: Tensor) -> Tensor:
 def spread_preconditioner(kernel: Tensor, floor: float = 0.1) -> Callable[[Tensor], Tensor]:
     """Approximate inverse Hessian for unknowns that a ``kernel`` spreads: 1 / (|K|^2 / max |K|^2 + floor) in frequency.
 
-    Where heat is smoothed away the gradient is small and the step should not be. The convolution is taken as periodic,
-    which a first guess may be.
+    The kernel attenuates high frequencies of the unknown, and with them the gradient; this operator restores the step
+    there. The convolution is taken as periodic, which is accurate enough for an initial inverse Hessian.
 
     Args:
         kernel: Real, [h, w], such as ``ThermalCrosstalk.kernel``.
@@ -208,7 +213,7 @@ def spread_preconditioner(kernel: Tensor, floor: float = 0.1) -> Callable[[Tenso
         height, width = x.shape[-2:]
         key = (height, width, x.dtype, x.device)
         if key not in factors:
-            # As large as the kernel at least: a small array sees it wrapped.
+            # Taps beyond the edge of a small array wrap around.
             taps = torch.zeros(height, width, dtype=torch.float64)
             for i, row in enumerate(kernel.tolist()):
                 for j, tap in enumerate(row):

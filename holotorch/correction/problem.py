@@ -1,4 +1,4 @@
-"""PECProblem: how far the image of a thermally coupled array is from the wanted one."""
+"""PECProblem: the distance between the image of a thermally coupled array and the wanted image."""
 
 from collections.abc import Callable
 
@@ -12,29 +12,31 @@ from holotorch.core.complex import intensity, phasor
 class PECProblem(nn.Module):
     """g(X) = || U(X) - I ||^2 with U(X) = | F(exp(i P(X))) |^2, one value per hologram and colour.
 
+    The unknown X are heater phases in rad, [..., C, H, W]. With ``frames`` they are [..., F, C, H, W], the layout of
+    heater phases everywhere, and the F frames of a colour share one loss. Solvers read from :attr:`unknown_axes` which
+    axes of X belong to one loss; a function that is wrapped around such a problem needs the same attribute.
+
     Args:
         crosstalk: Real linear operator P on heater phases [..., H, W], such as ``ThermalCrosstalk``.
         propagator: Complex linear operator F on fields [..., C, H, W], to [..., C, *image].
-        target: Wanted intensity I, real [C, *image], >= 0 and scaled to mean 1 per channel where F keeps the light, as
-            a unitary one does (Parseval), so that no scale between U and I is left open. The image is [H, W], or
-            [D, H, W] for a propagator to several depths, such as ``DepthStack``.
-        mask: Weights >= 0 that broadcast to the target, 0 where anything may be: beside a signal region, or out of
-            focus at a depth. They multiply U - I, so that the root of a weight map weighs the squared error.
-        scale_free: Compare s U with I instead, s = <U, I> / <U, U> the best scale of each hologram and colour. For
-            light that may leave the window or the mask; report the efficiency beside the result.
+        target: Wanted intensity I, real [C, *image], >= 0. Where F is unitary it must be scaled to mean 1 per channel,
+            the mean of U by Parseval's theorem. The image is [H, W], or [D, H, W] for a propagator to several depths,
+            such as ``DepthStack``.
+        mask: Weights >= 0 that broadcast to the target, 0 where the image is free: beside a signal region, or out of
+            focus at a depth. They multiply U - I, so a weight of the squared error enters as its square root.
+        scale_free: Compare s U with I instead, where s = <U, I> / <U, U> is the best scale of each hologram and colour.
+            For light that may leave the window or the mask; report the efficiency beside the result.
         amplitude: Compare sqrt(U) with sqrt(I) instead, whose gradient does not vanish where U is dark.
-        frames: The unknown is [..., C, F, H, W], F frames shown in turn, and U the mean of their intensities. Heater
-            phases elsewhere, such as a run's ``phase.npy``, are [F, C, H, W]; where F = C no shape can tell the two
-            orders apart, so go from one to the other by :meth:`unknown` and :meth:`heater_phase` only.
-        limit: In rad, a number or [C]: from here on P(X), the temperature that the chip really reaches, is penalised. A
-            penalty alone does not keep it: ``limited`` with ``below`` does.
+        frames: X has an axis of F frames that are shown one after another; U is the mean of their intensities.
+        limit: In rad, a number or [C]. The part of P(X) above it, the phase that the warm chip really has, is
+            penalised. A penalty alone does not keep the limit; ``penalty_schedule`` with ``limit_peak_phase`` does.
         limit_weight: Weight >= 0 of the penalty || max(P(X) - limit, 0) ||^2 that is added.
-        power_weight: Weight >= 0 of the sum of X, the heating power, that is added.
+        power_weight: Weight >= 0 of the sum of X, which is proportional to the heating power, that is added.
 
     Raises:
         TypeError: ``target`` is not a real tensor.
         ValueError: ``target`` is not [C, *image], not finite, negative somewhere, or black in a channel; a mask that is
-            negative or leaves nothing of a channel; a negative weight; in a call: a phase of another shape.
+            negative or zero in all of a channel; a negative weight; in a call: a phase of another shape.
 
     Source: thesis Eqs. 4.9, 4.10 (Fourier) and 4.50, 4.51 (Fresnel; there H stands inside the transform by mistake).
     """
@@ -76,8 +78,7 @@ class PECProblem(nn.Module):
         self.register_buffer("target", target, persistent=False)
         self.register_buffer("mask", mask, persistent=False)
         if limit is not None:
-            # One value per channel, against [C, H, W] or [C, F, H, W].
-            limit = torch.as_tensor(limit, dtype=target.dtype).reshape(-1, *[1] * (3 if frames else 2))
+            limit = torch.as_tensor(limit, dtype=target.dtype).reshape(-1, 1, 1)
             if not (limit > 0).all():
                 raise ValueError("limit must be above zero in rad")
             checks.all_finite("limit", limit)
@@ -85,42 +86,24 @@ class PECProblem(nn.Module):
                 raise ValueError(f"limit must be a number or one per channel, {len(target)}, got {len(limit)}")
         self.register_buffer("limit", limit, persistent=False)
 
+    @property
+    def unknown_axes(self) -> tuple[int, ...]:
+        """Axes of the unknown that belong to one loss, counted from the end."""
+        return (-4, -2, -1) if self.frames else (-2, -1)
+
     def forward(self, phase: Tensor) -> Tensor:
-        """Loss [..., C] for heater phases in rad, real [..., C, H, W], or [..., C, F, H, W] with ``frames``."""
+        """Loss [..., C] of heater phases in rad, real [..., C, H, W], or [..., F, C, H, W] with ``frames``."""
         spread = self.crosstalk(phase)
         loss = self.misfit(self._image(spread))
-        behind = -3 if self.frames else -2
         if self.limit is not None and self.limit_weight:
-            loss = loss + self.limit_weight * (spread - self.limit).clamp(min=0).square().flatten(behind).sum(-1)
+            loss = loss + self.limit_weight * self._total((spread - self.limit).clamp(min=0).square())
         if self.power_weight:
-            loss = loss + self.power_weight * phase.flatten(behind).sum(-1)
+            loss = loss + self.power_weight * self._total(phase)
         return loss
 
     def intensity(self, phase: Tensor) -> Tensor:
         """U(X), real [..., C, *image]."""
         return self._image(self.crosstalk(phase))
-
-    def unknown(self, phase: Tensor) -> Tensor:
-        """The unknown that :meth:`forward` takes, of heater phases: with ``frames`` of [..., F, C, H, W].
-
-        Raises:
-            ValueError: With ``frames``, C is not that of the target.
-        """
-        if not self.frames:
-            return phase
-        if phase.ndim < 4 or phase.shape[-3] != len(self.target):
-            wanted = f"(F, C, H, W) with C = {len(self.target)}"
-            raise ValueError(f"heater phases must end in {wanted}, got {tuple(phase.shape)}")
-        return phase.movedim(-3, -4)
-
-    def heater_phase(self, unknown: Tensor) -> Tensor:
-        """Heater phases, with ``frames`` [..., F, C, H, W], of the unknown; inverse of :meth:`unknown`."""
-        if not self.frames:
-            return unknown
-        if unknown.ndim < 4 or unknown.shape[-4] != len(self.target):
-            wanted = f"(C, F, H, W) with C = {len(self.target)}"
-            raise ValueError(f"the unknown must end in {wanted}, got {tuple(unknown.shape)}")
-        return unknown.movedim(-3, -4)
 
     def misfit(self, formed: Tensor) -> Tensor:
         """Distance [..., C] of an intensity [..., C, *image] from the target."""
@@ -134,25 +117,26 @@ class PECProblem(nn.Module):
         if self.mask is not None:
             mask = self.mask.to(formed.dtype)
             formed, target = formed * mask, target * mask
-        behind = 1 - self.target.ndim
+        first = 1 - self.target.ndim  # axis of the image
         if self.scale_free:
-            # s minimises the loss, so its own derivative is zero and need not be followed.
-            scale = best_scale(formed.detach(), target, behind)
-            formed = formed * scale.reshape(*scale.shape, *[1] * -behind)
-        return (formed - target).square().flatten(behind).sum(-1)
+            # s minimises the loss, so the derivative of the loss by s is zero: s may be taken as a constant.
+            scale = best_scale(formed.detach(), target, first)
+            formed = formed * scale.reshape(*scale.shape, *[1] * -first)
+        return (formed - target).square().flatten(first).sum(-1)
+
+    def _total(self, values: Tensor) -> Tensor:
+        """Sum [..., C] of values shaped as the unknown over the elements of one loss."""
+        return values.movedim(-4, -3).flatten(-3).sum(-1) if self.frames else values.flatten(-2).sum(-1)
 
     def _image(self, spread: Tensor) -> Tensor:
-        if not self.frames:
-            return intensity(self.propagator(phasor(spread)))
-        if spread.ndim < 4:
-            raise ValueError(f"phase must end in (C, F, H, W), as frames=True has it, got {tuple(spread.shape)}")
-        # Fields keep their channel before the picture: frames go in front of it, and are averaged there.
-        formed = intensity(self.propagator(phasor(self.heater_phase(spread))))
-        return formed.mean(-1 - self.target.ndim)
+        if self.frames and spread.ndim < 4:
+            raise ValueError(f"phase must end in (F, C, H, W), as frames=True has it, got {tuple(spread.shape)}")
+        image = intensity(self.propagator(phasor(spread)))
+        return image.mean(-1 - self.target.ndim) if self.frames else image
 
 
-def best_scale(formed: Tensor, target: Tensor, behind: int = -2) -> Tensor:
-    """The scale s of ``formed`` with the least || s formed - target || over the axes from ``behind`` on; 1 if black."""
-    power = formed.square().flatten(behind).sum(-1)
+def best_scale(formed: Tensor, target: Tensor, first: int = -2) -> Tensor:
+    """The scale s that minimises || s formed - target || over the axes from ``first`` on; 1 where formed is black."""
+    power = formed.square().flatten(first).sum(-1)
     lit = power > 0
-    return torch.where(lit, (formed * target).flatten(behind).sum(-1) / torch.where(lit, power, 1), 1)
+    return torch.where(lit, (formed * target).flatten(first).sum(-1) / torch.where(lit, power, 1), 1)

@@ -1,9 +1,13 @@
-"""What solvers share: the result they return, the set they project onto, and the bookkeeping of a run.
+"""What the solvers share: the result they return, the set they project onto, and the bookkeeping of a run.
 
-An objective maps x to one loss per item: losses of shape [...] for x of shape [..., *unknown]. The unknown of an item
-is everything behind the losses' axes, such as [H, W] for one hologram or [F, H, W] for frames that share an image. A
-loss is never negative and 0 for a perfect fit, as sums of squares are. The items are independent: each has its own step
-length and its own stop, so a batch gives what its items give alone.
+An objective maps the unknown x to one loss per item. The items are independent: each has its own step length and its
+own stop, so a batch gives the same results as its items alone. A loss is never negative, and 0 for a perfect fit, as
+sums of squares are.
+
+An objective may have an attribute ``unknown_axes``: the axes of x, counted from its end, that hold the elements of one
+item. They are (-2, -1) where each hologram [H, W] has a loss, and (-4, -2, -1) for frames [F, C, H, W] of which each
+colour has one loss. The losses have the other axes of x. Without that attribute the axes of the losses are the first
+ones of x: losses [...] for x [..., *unknown].
 """
 
 from collections.abc import Callable
@@ -49,17 +53,17 @@ nonnegative = Box()
 
 @dataclass(frozen=True)
 class Solution:
-    """What a solver found, or has so far.
+    """Result of a solver, final or so far.
 
     Attributes:
-        x: The unknown, [..., *unknown].
-        losses: Loss at the start and after each step, [steps + 1, ...]; an item that has stopped repeats its last.
+        x: The unknown, shaped as the start.
+        losses: Loss at the start and after each step, [steps + 1, ...]. An item that has stopped repeats its last loss.
         steps: Steps that each item took, integer [...].
         converged: Whether each item met the stop rule, [...]; False where it ran out of steps or stalled.
         stalled: Whether each item stopped because no step, however short, was accepted, [...].
         evaluations: How often the objective was evaluated, with or without its gradient.
-        state: Tensors by name; ``resume=`` of the same solver goes on from them as if it had never stopped, to the bit
-            on a CPU.
+        state: Tensors by name. The same solver continues from them when they are passed as ``resume``, on a CPU with
+            the same bits as an uninterrupted run.
     """
 
     x: Tensor
@@ -72,34 +76,31 @@ class Solution:
 
 
 class Run:
-    """Bookkeeping of a solver: evaluations, history, which items still move, and what it takes to go on later."""
+    """Bookkeeping of a solver: evaluations, losses, which items are still active, and the state to resume from."""
 
     def __init__(
         self,
         objective: Objective,
         start: Tensor,
         project: Projection,
-        *,
         max_steps: int,
         tolerance: float,
         patience: int,
-        resume: State | None = None,
+        resume: State | None,
     ):
         checks.real("start", start)
         checks.all_finite("start", start)
         self.objective, self.tolerance, self.patience = objective, tolerance, patience
         self.x, self.evaluations = project(start.detach()), 0
         loss, self.gradient = self.value_and_gradient(self.x)
-        if loss.shape != self.x.shape[: loss.ndim] or loss.ndim == self.x.ndim:
-            raise ValueError(
-                f"the objective must return one loss per item, the first axes of {tuple(self.x.shape)}, got "
-                f"{tuple(loss.shape)}"
-            )
+        items, unknown = _split_axes(objective, self.x, loss)
+        # The axes of x with those of the items first, and the shape of a value per item that broadcasts against x.
+        self.items, self.axes = loss.ndim, items + unknown
+        self.broadcast = [size if axis in items else 1 for axis, size in enumerate(self.x.shape)]
         checks.all_finite("loss at the start", loss)
         if loss.numel() and loss.min() < 0:
             raise ValueError(f"the objective must not be negative, got {loss.min().item():g} at the start")
         # To first order, moving every element by one unit (a radian) would change the loss by less than its rounding.
-        self.items = loss.ndim
         rounding = 1e3 * torch.finfo(loss.dtype).eps * loss
         stuck = (self.total(self.gradient.abs()) <= rounding) & (loss > 0)
         if stuck.any():
@@ -123,13 +124,22 @@ class Run:
         """Of the point ``x``, [...]."""
         return self.losses[self.step]
 
+    def rows(self, values: Tensor) -> Tensor:
+        """Values shaped as x, as one row of elements for each item, [..., N]."""
+        return values.permute(self.axes).flatten(self.items)
+
+    def from_rows(self, rows: Tensor) -> Tensor:
+        """Inverse of :meth:`rows`; all axes of the items may be one."""
+        shape = [self.x.shape[axis] for axis in self.axes]
+        return rows.reshape(shape).permute([self.axes.index(axis) for axis in range(len(shape))])
+
     def total(self, values: Tensor) -> Tensor:
-        """Sum over the unknown of each item, [...]."""
-        return values.flatten(self.items).sum(-1)
+        """Sum of values shaped as x over the elements of each item, [...]."""
+        return self.rows(values).sum(-1)
 
     def each(self, values: Tensor) -> Tensor:
-        """Values of items, [...], with axes of 1 for the unknown."""
-        return values.reshape(*values.shape, *[1] * (self.x.ndim - self.items))
+        """One value per item, [...], in a shape that broadcasts against x."""
+        return values.reshape(self.broadcast)
 
     def value(self, x: Tensor) -> Tensor:
         """Losses at ``x``."""
@@ -147,7 +157,7 @@ class Run:
         return losses.detach(), gradient
 
     def advance(self, x: Tensor, loss: Tensor, stalled: Tensor) -> None:
-        """Take ``x`` for the items that still move, and stop those that have settled (Eq. 4.36) or stalled."""
+        """Take ``x`` for the active items, and stop those that have converged (Eq. 4.36) or stalled."""
         last = self.loss
         self.stalled = self.stalled | (self.active & stalled)
         self.active = self.active & ~stalled
@@ -161,11 +171,18 @@ class Run:
         self.active = self.active & (self.calm < self.patience) & (loss > 0)
 
     def solution(self, **extra: Tensor) -> Solution:
-        """What has been found so far; ``extra`` is what the solver itself needs to go on."""
-        counts = torch.tensor([self.step, self.evaluations])
-        own = {"x": self.x, "active": self.active, "steps": self.steps, "calm": self.calm, "stalled": self.stalled}
+        """The result so far; ``extra`` holds the tensors that the solver itself needs to resume."""
         losses = self.losses[: self.step + 1]
-        state = {**extra, **own, "losses": losses, "counts": counts}
+        state = {
+            **extra,
+            "x": self.x,
+            "active": self.active,
+            "steps": self.steps,
+            "calm": self.calm,
+            "stalled": self.stalled,
+            "losses": losses,
+            "counts": torch.tensor([self.step, self.evaluations]),
+        }
         return Solution(self.x, losses, self.steps, ~self.active & ~self.stalled, self.stalled, self.evaluations, state)
 
     def _restore(self, state: State) -> None:
@@ -182,6 +199,20 @@ class Run:
         self.x, self.active, self.steps = state["x"], state["active"], state["steps"]
         self.calm, self.stalled = state["calm"], state["stalled"]
         self.extra = state
+
+
+def _split_axes(objective: Objective, x: Tensor, loss: Tensor) -> tuple[list[int], list[int]]:
+    """Axes of ``x`` that the losses have, and those of the elements of one item; ValueError if the losses differ."""
+    size = x.ndim
+    named = getattr(objective, "unknown_axes", None)
+    unknown = [axis % size for axis in (range(loss.ndim - size, 0) if named is None else named)]
+    items = [axis for axis in range(size) if axis not in unknown]
+    if not unknown or loss.shape != tuple(x.shape[axis] for axis in items):
+        which = "the first axes" if named is None else f"axes {items}"
+        raise ValueError(
+            f"the objective must return one loss per item, {which} of {tuple(x.shape)}, got {tuple(loss.shape)}"
+        )
+    return items, unknown
 
 
 def check_stop_rule(max_steps: int, tolerance: float, patience: int) -> None:

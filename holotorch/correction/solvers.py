@@ -13,14 +13,15 @@ from holotorch.correction.run import Callback, Objective, Projection, Run, Solut
 class APG:
     """Accelerated proximal gradient with a backtracking step: thesis Algorithm 2 and Eq. 4.14.
 
-    The printed test g(Z) < g' gets a rounding slack, without which it can never hold near convergence and the step
-    collapses. As printed, the step only shrinks and the momentum only grows; ``grow`` and ``restart`` change that.
+    Departure from the thesis: the printed test g(Z) < g' is relaxed by the rounding of g. Without that it fails near
+    convergence for any step length, and the step collapses to zero. As printed, the step only shrinks and the momentum
+    only grows; ``grow`` and ``restart`` change that.
 
     Attributes:
         step: First step length tau.
         shrink: Factor beta in (0, 1) on a refused step.
-        grow: Factor >= 1 that an accepted step is tried with next.
-        restart: Drop the momentum of an item whose loss has risen (O'Donoghue and Candes 2015).
+        grow: Factor >= 1 on the step length after each accepted step.
+        restart: Reset the momentum of an item whose loss has risen (O'Donoghue and Candes 2015).
         max_steps: Most iterations.
         tolerance: Stop an item once its relative change of loss (Eq. 4.36) stays below this ...
         patience: ... for so many iterations in a row.
@@ -55,12 +56,16 @@ class APG:
         callback: Callback | None = None,
         resume: State | None = None,
     ) -> Solution:
-        """Minimise ``objective`` over the set that ``project`` projects onto, from ``start`` [..., *unknown].
+        """Minimise ``objective`` over the set that ``project`` projects onto, beginning at ``start``.
 
-        ``callback`` sees the state after every step; ``resume`` is the ``state`` of an earlier solution.
+        Args:
+            objective: From the unknown to one loss per item, see ``holotorch.correction.run``.
+            start: The unknown at the start, real and finite.
+            project: To the nearest point of the allowed set.
+            callback: Called with the solution so far after every step.
+            resume: The ``state`` of an earlier solution of the same work.
         """
-        rule = {"max_steps": self.max_steps, "tolerance": self.tolerance, "patience": self.patience}
-        run = Run(objective, start, project, **rule, resume=resume)
+        run = Run(objective, start, project, self.max_steps, self.tolerance, self.patience, resume)
         previous = run.extra.get("previous", run.x)
         step = run.extra.get("step_length", torch.full_like(run.loss, self.step))
         count = run.extra.get("count", torch.zeros_like(run.loss))
@@ -91,7 +96,8 @@ class APG:
             refused = run.active & ~(loss <= bound + slack)
             stalled = refused & (step <= least)
             if not (refused & ~stalled).any():
-                # Shortened until nothing moves is no progress either; unmoved at once is a minimum on the border.
+                # An item whose step was shortened until z = y has stalled as well. One that does not move at its first
+                # trial is at a minimum on the boundary of the set.
                 stalled = stalled | (shortened & (run.total(moved != 0) == 0))
                 return z, loss, step, stalled
             step = torch.where(refused, step * self.shrink, step)
@@ -104,12 +110,12 @@ class ProjectedAdam:
 
     Attributes:
         learning_rate: In the unit of the unknown.
-        betas: Decay of its two running means.
+        betas: Decay rates of the running means of the gradient and of its square.
         max_steps: Most iterations, one evaluation each.
         tolerance: Stop rule as for :class:`APG`.
         patience: Stop rule as for :class:`APG`.
 
-    Raises as :class:`APG`. The loss need not fall at every step; the best point seen is not kept.
+    Raises as :class:`APG`. The loss may rise in a step, and the result is the last point, not the best one.
     Source: Kingma and Ba (2015).
     """
 
@@ -135,17 +141,16 @@ class ProjectedAdam:
         resume: State | None = None,
     ) -> Solution:
         """Minimise ``objective`` as :meth:`APG.__call__` does."""
-        rule = {"max_steps": self.max_steps, "tolerance": self.tolerance, "patience": self.patience}
-        run = Run(objective, start, project, **rule, resume=resume)
+        run = Run(objective, start, project, self.max_steps, self.tolerance, self.patience, resume)
         gradient = run.extra.get("gradient", run.gradient)
         mean = run.extra.get("mean", torch.zeros_like(run.x))
         square = run.extra.get("square", torch.zeros_like(run.x))
         while run.step < self.max_steps and run.active.any():
             mean = mean + (1 - self.betas[0]) * (gradient - mean)
             square = square + (1 - self.betas[1]) * (gradient.square() - square)
-            turn = run.step + 1
-            scale = torch.sqrt(square / (1 - self.betas[1] ** turn)) + 1e-8
-            x = project(run.x - self.learning_rate / (1 - self.betas[0] ** turn) * mean / scale)
+            step = run.step + 1
+            scale = torch.sqrt(square / (1 - self.betas[1] ** step)) + 1e-8
+            x = project(run.x - self.learning_rate / (1 - self.betas[0] ** step) * mean / scale)
             x = torch.where(run.each(run.active), x, run.x)
             loss, gradient = run.value_and_gradient(x)
             run.advance(x, loss, ~torch.isfinite(loss))

@@ -1,4 +1,4 @@
-"""Stages: one solver run after another, each from where the last one ended, as one solution."""
+"""Stages: several solver runs in a row, each starting from the result of the one before, as one solution."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ from holotorch.correction.solvers import APG
 
 
 class Solver(Protocol):
-    """What ``APG``, ``ProjectedAdam`` and ``LBFGS`` are."""
+    """Interface of ``APG``, ``ProjectedAdam`` and ``LBFGS``."""
 
     def __call__(
         self,
@@ -32,7 +32,7 @@ class Solver(Protocol):
 
 @dataclass(frozen=True)
 class Stage:
-    """One run: what is minimised, by what, and within which box."""
+    """One run: the objective, the solver that minimises it, and the box that bounds the unknown."""
 
     objective: Objective
     solver: Solver
@@ -44,21 +44,21 @@ def run_stages(
 ) -> Solution:
     """Run ``stages`` one after another from ``start``; ``callback`` and ``resume`` as for a single solver.
 
-    The solution's losses are those of all stages in a row, each in the measure of its own objective; ``converged`` and
-    ``stalled`` are those of the last.
+    The losses of all stages are in a row, each computed by the objective of its stage; ``converged`` and ``stalled``
+    are those of the last stage.
     """
     first, before, inner = 0, None, None
     if resume:
-        first, before = int(resume["stage"]), _unpacked(resume)
-        inner = {name[6:]: values for name, values in resume.items() if name.startswith("inner_")}
+        first, before = int(resume["stage"]), _from_state(resume)
+        inner = {name.removeprefix("inner_"): resume[name] for name in resume if name.startswith("inner_")}
         start = before.x if before else start
     for k, stage in enumerate(stages[first:], first):
 
-        def seen(solution: Solution, k: int = k, before: Solution | None = before) -> None:
+        def report(solution: Solution, k: int = k, before: Solution | None = before) -> None:
             if callback:
                 callback(_joined(before, solution, k))
 
-        solution = stage.solver(stage.objective, start, stage.box, callback=seen, resume=inner)
+        solution = stage.solver(stage.objective, start, stage.box, callback=report, resume=inner)
         inner = None
         before = _joined(before, solution, k)
         start = before.x
@@ -66,37 +66,37 @@ def run_stages(
     return before
 
 
-def limited(
+def penalty_schedule(
     make: Callable[..., PECProblem], solver: LBFGS, spread: float, limit: float | None, *, amplitude: bool = True
 ) -> list[Stage]:
-    """Stages by which L-BFGS finds good holograms, within a limit on the phase after spreading if there is one.
+    """Stages in which L-BFGS computes a hologram, under a limit on the phase after spreading if one is given.
 
-    The amplitude's loss comes first, as its gradient does not vanish in dark pixels. With a limit it is minimised in
-    the box that certainly keeps it, X <= limit / sum K; then the box is opened and the limit becomes a penalty of
-    growing weight, 1.5 % below the limit so that what is left over it can be taken off by scaling.
+    The first stage minimises the loss of the amplitude, whose gradient does not vanish in dark pixels. Without a limit,
+    the second and last stage minimises the loss of the intensity. With a limit, the first stage stays in the box
+    X <= limit / sum K, in which no P(X) exceeds the limit; the stages after it have no such box, but a penalty with
+    growing weight on P(X) above 98.5 % of the limit. The margin of 1.5 % leaves little for ``limit_peak_phase`` to
+    scale down.
 
     Args:
         make: Builds the problem from ``amplitude``, ``limit`` and ``limit_weight``, as keywords of ``PECProblem``.
         solver: Its ``max_steps`` is the sum over all stages.
         spread: Sum of the kernel.
         limit: On P(X), in rad.
-        amplitude: Whether to begin with the amplitude's loss.
+        amplitude: Whether the first stage minimises the loss of the amplitude.
     """
-    whole = solver.max_steps
+    total = solver.max_steps
     spread = checks.positive("spread", spread)
-    if limit is not None:
-        limit = checks.positive("limit", limit, "rad")
     if limit is None:
-        begin = whole // 6 if amplitude else 0
-        parts: list[tuple[dict[str, Any], Box, int]] = [({"amplitude": True}, nonnegative, begin)]
-        parts.append(({}, nonnegative, whole - begin))
+        first = total // 6 if amplitude else 0
+        parts: list[tuple[dict[str, Any], Box, int]] = [({"amplitude": True}, nonnegative, first)]
+        parts.append(({}, nonnegative, total - first))
     else:
-        box, soft = Box(0.0, limit / spread), {"limit": 0.985 * limit}
-        begin = whole // 3
-        parts = [({"amplitude": amplitude}, box, begin)]
-        ends = [begin + round((whole - begin) * share) for share in (0.0, 0.3, 0.6, 0.85, 1.0)]
-        shares = zip((1.0, 10.0, 100.0, 1000.0), ends, ends[1:], strict=False)
-        parts += [({**soft, "limit_weight": w}, nonnegative, end - before) for w, before, end in shares]
+        limit = checks.positive("limit", limit, "rad")
+        first = total // 3
+        parts = [({"amplitude": amplitude}, Box(0.0, limit / spread), first)]
+        ends = [first + round((total - first) * share) for share in (0.0, 0.3, 0.6, 0.85, 1.0)]
+        for weight, begin, end in zip((1.0, 10.0, 100.0, 1000.0), ends, ends[1:], strict=False):
+            parts.append(({"limit": 0.985 * limit, "limit_weight": weight}, nonnegative, end - begin))
     return [
         Stage(make(**keywords), replace(solver, max_steps=steps), box) for keywords, box, steps in parts if steps > 0
     ]
@@ -112,60 +112,50 @@ def proximal_pec(
     callback: Callback | None = None,
     **options: Any,
 ) -> Solution:
-    """Proximal PEC, thesis Algorithm 2: minimise ``PECProblem`` from ``start``; with a Fresnel propagator it is FPEC.
+    """Proximal PEC (PPEC), thesis Algorithm 2: minimise ``PECProblem`` from ``start``.
+
+    With a Fresnel propagator it is the thesis's Fresnel PEC (FPEC).
 
     Args:
         crosstalk: P.
         propagator: F, as for ``PECProblem``.
         target: Wanted intensity.
-        start: Heater phases in rad, real [..., C, H, W]; with ``frames=True`` the unknown [..., C, F, H, W] that
-            ``PECProblem.unknown`` makes of heater phases [..., F, C, H, W].
+        start: Heater phases in rad, real [..., C, H, W], or [..., F, C, H, W] with ``frames=True``.
         solver: ``APG()`` by default.
-        callback: Sees the state after every step.
+        callback: Called with the solution so far after every step.
         options: Further keywords of ``PECProblem``.
     """
     return (solver or APG())(PECProblem(crosstalk, propagator, target, **options), start, callback=callback)
 
 
-def below(limit: float, phase: Tensor, crosstalk: Callable[[Tensor], Tensor]) -> Tensor:
-    """``phase`` [..., H, W] scaled down where its spread passes ``limit`` in rad, hologram by hologram.
+def limit_peak_phase(limit: float, phase: Tensor, crosstalk: Callable[[Tensor], Tensor]) -> Tensor:
+    """Scale down each hologram of ``phase`` [..., H, W] whose phase after spreading exceeds ``limit`` in rad.
 
     Raises:
-        ValueError: A limit that is not finite and above zero, or a phase that is not finite: neither holds anything.
+        ValueError: A limit that is not finite and above zero, or a phase that is not finite.
     """
     limit = checks.positive("limit", limit, "rad")
     checks.all_finite("phase", phase)
     peak = crosstalk(phase).amax((-2, -1), keepdim=True)
-    held = limit * (1 - 1e-6)  # what float32 rounds may not pass the limit in float64
-    return torch.where(peak > held, phase * (held / peak.clamp(min=held)), phase)
+    allowed = limit * (1 - 1e-6)  # the margin is the rounding of float32: in float64 the limit must hold too
+    return torch.where(peak > allowed, phase * (allowed / peak.clamp(min=allowed)), phase)
 
 
 def _joined(before: Solution | None, now: Solution, k: int) -> Solution:
+    """Solution ``now`` of stage k behind that of all stages before it, with the state to resume from."""
     state = {f"inner_{name}": values for name, values in now.state.items()} | {"stage": torch.tensor(k)}
     if before is None:
         return replace(now, state=state)
-    state |= {
-        "before_x": before.x,
-        "before_losses": before.losses,
-        "before_steps": before.steps,
-        "before_evaluations": torch.tensor(before.evaluations),
-    }
-    losses = torch.cat([before.losses, now.losses[1:]])
-    return Solution(
-        now.x,
-        losses,
-        before.steps + now.steps,
-        now.converged,
-        now.stalled,
-        before.evaluations + now.evaluations,
-        state,
-    )
+    state |= {"before_x": before.x, "before_losses": before.losses, "before_steps": before.steps}
+    state["before_evaluations"] = torch.tensor(before.evaluations)
+    losses, steps = torch.cat([before.losses, now.losses[1:]]), before.steps + now.steps
+    return replace(now, losses=losses, steps=steps, evaluations=before.evaluations + now.evaluations, state=state)
 
 
-def _unpacked(state: State) -> Solution | None:
+def _from_state(state: State) -> Solution | None:
+    """Solution of all stages before the interrupted one; None in the first stage."""
     if "before_x" not in state:
         return None
-    steps = state["before_steps"]
+    x, losses, steps = (state[f"before_{name}"] for name in ("x", "losses", "steps"))
     never = torch.zeros_like(steps, dtype=torch.bool)
-    evaluations = int(state["before_evaluations"])
-    return Solution(state["before_x"], state["before_losses"], steps, never, never, evaluations)
+    return Solution(x, losses, steps, never, never, int(state["before_evaluations"]))

@@ -1,4 +1,4 @@
-"""Devices that put a phase on light."""
+"""Devices that modulate the phase of light: thermally driven phased arrays and liquid-crystal panels."""
 
 from holotorch.modulator.crosstalk import ThermalCrosstalk
 from holotorch.modulator.dispersion import BirefringenceTable, Cauchy, fit_cauchy, phase_scale

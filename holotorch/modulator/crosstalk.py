@@ -1,4 +1,4 @@
-"""ThermalCrosstalk: heat that spreads between the pixels of a phased array."""
+"""ThermalCrosstalk: the spreading of heat between the pixels of a phased array."""
 
 import math
 
@@ -9,24 +9,28 @@ from torch.nn import functional
 from holotorch.core import checks
 from holotorch.core.quantities import SIGMA_PX
 
-_SMALLEST_TAP = 1e-12  # of the centre tap; smaller ones would only make denormal numbers, which are slow
-_DROPPED_TAP = 1e-6  # of the centre tap; with no size given, the kernel ends where the taps fall below this
+# Taps below 1e-12 of the centre tap are set to 0: their products would be denormal numbers, which are slow.
+_SMALLEST_TAP = 1e-12
+# With no size given, the kernel ends where the taps fall below 1e-6 of the centre tap.
+_DROPPED_TAP = 1e-6
 
 
 class ThermalCrosstalk(nn.Module):
-    """Convolution of heater phases (or temperatures) with the heat kernel exp(-d^2 / sigma^2), zero outside the chip.
+    """Convolution of heater phases (or temperatures) [..., H, W] with the heat kernel exp(-d^2 / sigma^2).
 
-    The centre tap is 1 and the kernel is not normalised: a heated pixel warms its neighbours on top of itself. Heat
-    that would land outside the array leaves it. Linear, real, dtype and device follow the input [..., H, W].
+    A pixel heated alone warms one at a distance of d pixels by exp(-d^2 / sigma^2) of its own rise, so sigma is the
+    usual Gaussian sigma times sqrt 2. The centre tap is 1 and the kernel is not normalised: heat in the neighbours adds
+    to that in the pixel. Outside the array there is no pixel that warms or is warmed. Linear and real; dtype and device
+    follow the input.
 
     Args:
-        sigma_px: Width in pixels, 0 to 100; 0 means no crosstalk. The thesis's chip has 0.66.
-        size: Odd number of taps per axis. By default as many as have a tap above 1e-6 of the centre; the thesis always
-            takes 7, which loses 2.3 % of the heat at sigma 2.0 (see :attr:`lost_heat`).
+        sigma_px: Sigma in pixels, 0 to 100; 0 means no crosstalk. The thesis's chip has 0.66.
+        size: Odd number of taps per axis. By default all taps above 1e-6 of the centre tap; the thesis always takes 7,
+            which loses 2.3 % of the heat at sigma 2.0 (see :attr:`lost_heat`).
 
     Raises:
-        ValueError: ``sigma_px`` outside its range, ``size`` even or below 1; in a call: an array smaller than the
-            ``size`` that was asked for.
+        ValueError: ``sigma_px`` outside its range, ``size`` even or below 1; in a call: an array smaller than the given
+            ``size``.
 
     Source: thesis Eqs. 4.2-4.4.
     """
@@ -45,8 +49,8 @@ class ThermalCrosstalk(nn.Module):
     def from_patch(cls, patch: Tensor) -> "ThermalCrosstalk":
         """Build from a measured response: the temperature rises [h, w], odd sizes, around one heated centre pixel.
 
-        The patch is divided by its centre, so any unit will do; it need not be symmetric. Raises ValueError for even
-        sizes, NaN, negative rises or a centre that is not the warmest.
+        The patch is divided by its centre, so its unit does not matter; it need not be symmetric. Raises ValueError for
+        even sizes, NaN, negative rises or a centre that is not the warmest.
         """
         checks.real("patch", patch)
         checks.all_finite("patch", patch)
@@ -65,11 +69,11 @@ class ThermalCrosstalk(nn.Module):
 
     @classmethod
     def fitted(cls, patch: Tensor, size: int | None = None) -> "ThermalCrosstalk":
-        """Build from the Gaussian exp(-d^2 / sigma^2) that fits a measured response [h, w] best, as thesis Sec. 4.3.2.
+        """Build from the Gaussian exp(-d^2 / sigma^2) that fits a measured response [h, w] best, as in Sec. 4.3.2.
 
-        The patch is as for :meth:`from_patch`, and larger than one pixel; ``size`` is that of the constructor. Least
-        squares in the rises themselves, so that the noise of the cold rim counts as what it is. Raises ValueError as
-        ``from_patch``, and for a patch that does not fall off.
+        The patch is as for :meth:`from_patch`, and larger than one pixel; ``size`` is that of the constructor. The fit
+        is by least squares in the rises, not in their logarithms, which would amplify the noise of cold pixels. Raises
+        ValueError as ``from_patch``, and for a patch that does not fall off.
         """
         measured = cls.from_patch(patch).kernel
         y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in measured.shape)
@@ -77,10 +81,10 @@ class ThermalCrosstalk(nn.Module):
         if not (measured[square > 0] < 1).any():
             raise ValueError("patch must fall off from its centre to be fitted")
         low, high = 1e-2, SIGMA_PX.high**2
-        for _ in range(60):  # of the error's slope in 1 / sigma^2, bisected: it changes sign once
+        for _ in range(60):  # bisection: the derivative of the squared error by sigma^2 changes sign once
             middle = math.sqrt(low * high)
             model = torch.exp(-square / middle)
-            # d/ds of sum (exp(-d^2 / s) - k)^2, up to a positive factor
+            # d/ds of sum (exp(-d^2 / s) - k)^2 with s = sigma^2, up to a positive factor
             if ((model - measured) * model * square).sum() > 0:
                 high = middle
             else:
@@ -102,11 +106,11 @@ class ThermalCrosstalk(nn.Module):
 
     @property
     def lost_heat(self) -> float:
-        """Share of the Gaussian's heat that falls outside the taps kept; NaN for a measured patch."""
+        """Share of the Gaussian's heat that falls outside the taps; NaN for a measured patch."""
         if math.isnan(self.sigma_px):
             return math.nan
-        reach = _needed_radius(self.sigma_px) + 4
-        whole = sum(_tap(offset, self.sigma_px) for offset in range(-reach, reach + 1)) ** 2
+        radius = _needed_radius(self.sigma_px) + 4
+        whole = sum(_tap(offset, self.sigma_px) for offset in range(-radius, radius + 1)) ** 2
         return max(0.0, 1 - self.total / whole)
 
     def forward(self, phase: Tensor) -> Tensor:
@@ -114,7 +118,7 @@ class ThermalCrosstalk(nn.Module):
         return self._apply_factors(phase, self._factors)
 
     def adjoint(self, phase: Tensor) -> Tensor:
-        """Apply the transpose: correlation with the kernel, zero outside; equals forward for a symmetric kernel."""
+        """Apply the transpose, the correlation with the kernel; it equals :meth:`forward` for a symmetric kernel."""
         flipped = tuple(tuple(row[::-1] for row in factor[::-1]) for factor in reversed(self._factors))
         return self._apply_factors(phase, flipped)
 
@@ -123,7 +127,7 @@ class ThermalCrosstalk(nn.Module):
         return f"sigma_px={self.sigma_px:g}, taps={tuple(self.kernel.shape)}"
 
     def _set_factors(self, *factors: Tensor) -> None:
-        # Taps as numbers, not buffers: they follow the input's dtype and device by themselves, at full precision.
+        # Taps are Python floats, not buffers, so that they have full precision for any dtype and device of the input.
         self._factors = tuple(tuple(map(tuple, factor.tolist())) for factor in factors)
 
     def _apply_factors(self, phase: Tensor, factors: tuple) -> Tensor:
@@ -142,11 +146,10 @@ class ThermalCrosstalk(nn.Module):
 
 
 class _ShiftAndAdd(torch.autograd.Function):
-    """Convolution by summing shifted copies, one per tap.
+    """Convolution as a sum of shifted copies of the image, one per tap.
 
-    With one channel, conv2d's backward pass on a CPU takes about ten times as long (``scripts/bench.py crosstalk``);
-    conv2d is the twin that judges this in the tests. There is no forward mode: torch.compile refuses a function that
-    defines one.
+    On a CPU and with one channel, the backward pass of conv2d takes about ten times as long (``scripts/bench.py
+    crosstalk``). Forward-mode derivatives are not defined, since torch.compile refuses a function that has them.
     """
 
     generate_vmap_rule = True
@@ -175,6 +178,7 @@ class _ShiftAndAdd(torch.autograd.Function):
 
 
 def _tap(offset: int, sigma: float) -> float:
+    """One-dimensional kernel at a whole number of pixels from its centre."""
     if offset == 0:
         return 1.0
     ratio = offset / sigma if sigma > 0 else math.inf
@@ -183,4 +187,5 @@ def _tap(offset: int, sigma: float) -> float:
 
 
 def _needed_radius(sigma: float) -> int:
+    """Largest offset whose tap is not below ``_DROPPED_TAP``."""
     return max(0, math.ceil(sigma * math.sqrt(-math.log(_DROPPED_TAP))) - 1)

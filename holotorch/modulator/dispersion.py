@@ -1,4 +1,4 @@
-"""Liquid crystal at other wavelengths than the one a panel was calibrated with."""
+"""Phase of a liquid-crystal panel at wavelengths other than that of its calibration."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -30,7 +30,7 @@ class Cauchy:
 
     def __call__(self, wavelength: Tensor) -> Tensor:
         """Birefringence at ``wavelength``."""
-        value = self.a + self.b / _waves(wavelength).square()
+        value = self.a + self.b / _checked(wavelength).square()
         if bool((value.detach() <= 0).any()):
             raise ValueError(
                 f"birefringence must be positive, got {value.detach().min().item():g} from a = {self.a:g}, "
@@ -41,9 +41,9 @@ class Cauchy:
 
 @dataclass(frozen=True)
 class BirefringenceTable:
-    """Measured birefringence, linear in 1 / lambda^2 between its rows; that is exact where Cauchy's law is.
+    """Measured birefringence, interpolated linearly in 1 / lambda^2, which is exact for Cauchy's law.
 
-    Only ratios count for :func:`phase_scale`, so the values may be in any unit, such as phase times wavelength.
+    :func:`phase_scale` needs only ratios, so the values may have any unit, such as phase times wavelength.
 
     Args:
         wavelengths: In metres, at least two, each once, in any order.
@@ -58,63 +58,64 @@ class BirefringenceTable:
     values: tuple[float, ...]
 
     def __init__(self, wavelengths: Sequence[float], values: Sequence[float]):
-        waves = checks.wavelengths(wavelengths)
-        if len(waves) != len(values) or len(waves) < 2 or len(set(waves)) < len(waves):
+        lengths = checks.wavelengths(wavelengths)
+        if len(lengths) != len(values) or len(lengths) < 2 or len(set(lengths)) < len(lengths):
             raise ValueError(
                 f"a birefringence table needs at least two different wavelengths with one value each, got "
-                f"{len(waves)} wavelengths ({len(set(waves))} different) and {len(values)} values"
+                f"{len(lengths)} wavelengths ({len(set(lengths))} different) and {len(values)} values"
             )
-        rows = sorted(zip(waves, (checks.positive("birefringence", value) for value in values), strict=True))
+        rows = sorted(zip(lengths, (checks.positive("birefringence", value) for value in values), strict=True))
         object.__setattr__(self, "wavelengths", tuple(row[0] for row in rows))
         object.__setattr__(self, "values", tuple(row[1] for row in rows))
 
     def __call__(self, wavelength: Tensor) -> Tensor:
         """Birefringence at ``wavelength``."""
-        waves = _waves(wavelength)
-        low, high = self.wavelengths[0], self.wavelengths[-1]  # to 1e-6: float32 rounds the ends themselves
-        if bool(((waves.detach() < low * (1 - 1e-6)) | (waves.detach() > high * (1 + 1e-6))).any()):
+        lengths = _checked(wavelength)
+        low, high = self.wavelengths[0], self.wavelengths[-1]
+        # With a margin of 1e-6, as float32 rounds the end points.
+        if bool(((lengths.detach() < low * (1 - 1e-6)) | (lengths.detach() > high * (1 + 1e-6))).any()):
             raise ValueError(
-                f"wavelengths {waves.min().item() * 1e9:.6g} to {waves.max().item() * 1e9:.6g} nm lie outside the "
+                f"wavelengths {lengths.min().item() * 1e9:.6g} to {lengths.max().item() * 1e9:.6g} nm lie outside the "
                 f"birefringence table, {low * 1e9:.6g} to {high * 1e9:.6g} nm; measure there, or fit it by fit_cauchy"
             )
-        at = torch.tensor(self.wavelengths, dtype=torch.float64, device=waves.device).square().reciprocal()
-        values = torch.tensor(self.values, dtype=torch.float64, device=waves.device)
-        place = waves.square().reciprocal()  # falls along the table
-        row = torch.bucketize(-place.detach(), -at).clamp(1, len(at) - 1)
-        part = (place - at[row - 1]) / (at[row] - at[row - 1])
+        nodes = torch.tensor(self.wavelengths, dtype=torch.float64, device=lengths.device).square().reciprocal()
+        values = torch.tensor(self.values, dtype=torch.float64, device=lengths.device)
+        x = lengths.square().reciprocal()
+        row = torch.bucketize(-x.detach(), -nodes).clamp(1, len(nodes) - 1)  # nodes fall with the wavelength
+        part = (x - nodes[row - 1]) / (nodes[row] - nodes[row - 1])
         return values[row - 1] + part * (values[row] - values[row - 1])
 
 
 def phase_scale(light: float | Tensor, design: float | Tensor, birefringence: Birefringence | None = None) -> Tensor:
-    """Factor on the phase of a panel calibrated at ``design`` when it is lit at ``light``: (l0 / l) dn(l) / dn(l0).
+    """Phase at the wavelength l = ``light`` divided by that at l0 = ``design``: (l0 / l) dn(l) / dn(l0).
 
     Args:
-        light: Wavelengths in metres; broadcasts against ``design``.
+        light: Wavelengths in metres of the light; broadcasts against ``design``.
         design: Wavelengths in metres of the calibration.
         birefringence: :class:`Cauchy` with its defaults if not given, or a :class:`BirefringenceTable`.
 
     Returns:
-        float64, differentiable in both wavelengths. The voltage's part of the retardation is taken to be the same at
-        both wavelengths: the director does not see the light.
+        float64, differentiable in both wavelengths. The orientation of the crystal depends on the voltage, not on the
+        light, and is taken to be the same at both wavelengths.
 
     Source: thesis Sec. 6.4.1, which asks for it; phi = 2 pi d dn / lambda for a cell of thickness d.
     """
     law = Cauchy() if birefringence is None else birefringence
-    lit, at = _waves(light), _waves(design)
-    return at / lit * (law(lit) / law(at))
+    lit, calibrated = _checked(light), _checked(design)
+    return calibrated / lit * (law(lit) / law(calibrated))
 
 
 def kinoform_efficiency(scale: Tensor) -> Tensor:
-    """Part of the light that a kinoform of phases on [0, 2 pi) keeps in its picture when they are scaled.
+    """Share of the light in the picture of a kinoform whose phases on [0, 2 pi) are multiplied by ``scale``.
 
-    sinc^2(1 - scale) for phases that are uniformly distributed, as those of a blaze or of a diffuse picture are.
+    It is sinc^2(1 - scale) for uniformly distributed phases, such as those of a blazed grating or a diffuse picture.
     Source: Goodman, Sec. 4.4; Dammann (1970), blazed gratings of the wrong depth.
     """
     return torch.sinc(1 - scale).square()
 
 
 def zero_order(scale: Tensor) -> Tensor:
-    """Part of the light that stays undiffracted from phases uniform on [0, 2 pi) scaled by ``scale``: sinc^2."""
+    """Share of undiffracted light for phases uniform on [0, 2 pi) that are multiplied by ``scale``: sinc^2(scale)."""
     return torch.sinc(scale).square()
 
 
@@ -123,10 +124,10 @@ class CauchyFit:
     """Result of :func:`fit_cauchy`.
 
     Attributes:
-        law: The birefringence; with no path length given, times a length in metres, which ratios do not see.
-        residuals: Measured minus fitted phase in rad, in the table's order.
-        rms: Their root mean square.
-        errors: Standard errors of (a, b) from the residuals; NaN where the table has but two rows.
+        law: The birefringence; without a path length it is multiplied by an unknown length, which cancels in ratios.
+        residuals: Measured minus fitted phase in rad, in the order of the table.
+        rms: Root mean square of the residuals.
+        errors: Standard errors of (a, b) from the residuals; NaN for a table of two rows.
     """
 
     law: Cauchy
@@ -136,38 +137,39 @@ class CauchyFit:
 
 
 def fit_cauchy(wavelengths: Sequence[float], phases: Sequence[float], *, path: float = 1.0) -> CauchyFit:
-    """Fit a and b to an interferometric table: the phase between no and full drive at several wavelengths.
+    """Fit a and b of Cauchy's law to measured phase differences between no and full drive at several wavelengths.
 
-    Least squares in the phase, which is linear in both: phi = 2 pi path (a / lambda + b / lambda^3).
+    Least squares in the phase, which is linear in a and b: phi = 2 pi path (a / lambda + b / lambda^3).
 
     Args:
-        wavelengths: In metres, at least two different ones; three give residuals a meaning.
-        phases: In rad, not wrapped: their true numbers of turns.
-        path: Way of the light through the crystal in metres, twice the cell's thickness in reflection. Without it only
-            b / a is found, which is all that :func:`phase_scale` needs.
+        wavelengths: In metres, at least two different ones; residuals need a third.
+        phases: In rad, not wrapped.
+        path: Length of the light's path through the crystal in metres, twice the cell's thickness in reflection.
+            Without it only the ratio b / a is determined, which is all that :func:`phase_scale` needs.
 
     Raises:
         ValueError: Fewer than two wavelengths, unequal lengths, phases that are not positive, or phases that no
-            positive birefringence gives: most likely they are wrapped.
+            positive birefringence gives, most likely because they are wrapped.
     """
-    waves = checks.wavelengths(wavelengths)
+    lengths = checks.wavelengths(wavelengths)
     wanted = torch.tensor([checks.positive("phase", phase, "rad") for phase in phases], dtype=torch.float64)
-    if len(waves) != len(wanted) or len(set(waves)) < 2:
+    if len(lengths) != len(wanted) or len(set(lengths)) < 2:
         raise ValueError(
-            f"a Cauchy fit needs at least two different wavelengths with one phase each, got {len(waves)} wavelengths "
-            f"({len(set(waves))} different) and {len(wanted)} phases"
+            f"a Cauchy fit needs at least two different wavelengths with one phase each, got "
+            f"{len(lengths)} wavelengths ({len(set(lengths))} different) and {len(wanted)} phases"
         )
     length = checks.positive("path", path, "metres")
-    at, unit = torch.tensor(waves, dtype=torch.float64), 1e-6  # columns of like size: micrometres
-    matrix = 2 * math.pi * torch.stack([unit / at, (unit / at) ** 3], 1)
+    unit = 1e-6  # metres: in micrometres the two columns are of similar size
+    inverse = unit / torch.tensor(lengths, dtype=torch.float64)
+    matrix = 2 * math.pi * torch.stack([inverse, inverse**3], 1)
     solution = torch.linalg.lstsq(matrix, wanted[:, None]).solution[:, 0]
     residuals = wanted - matrix @ solution
     a, b = solution[0].item() * unit / length, solution[1].item() * unit**3 / length
-    if min(a + b / wave**2 for wave in waves) <= 0:
+    if min(a + b / each**2 for each in lengths) <= 0:
         raise ValueError(
             "no positive birefringence gives these phases; expected unwrapped ones, falling with wavelength"
         )
-    spare = len(waves) - 2
+    spare = len(lengths) - 2
     errors = (math.nan, math.nan)
     if spare:
         covariance = torch.linalg.inv(matrix.T @ matrix) * residuals.square().sum() / spare
@@ -176,7 +178,8 @@ def fit_cauchy(wavelengths: Sequence[float], phases: Sequence[float], *, path: f
     return CauchyFit(Cauchy(a, b), tuple(residuals.tolist()), residuals.square().mean().sqrt().item(), errors)
 
 
-def _waves(wavelength: float | Tensor) -> Tensor:
-    waves = torch.as_tensor(wavelength, dtype=torch.float64)
-    checks.quantities(WAVELENGTH, waves)
-    return waves
+def _checked(wavelength: float | Tensor) -> Tensor:
+    """Wavelengths as float64; ValueError outside the range of light."""
+    lengths = torch.as_tensor(wavelength, dtype=torch.float64)
+    checks.quantities(WAVELENGTH, lengths)
+    return lengths

@@ -1,4 +1,4 @@
-"""PhaseModulator: a liquid-crystal panel with grey levels, from the wanted phase to the light it really emits."""
+"""PhaseModulator: the field that a liquid-crystal panel with discrete grey levels emits for a wanted phase."""
 
 import hashlib
 import math
@@ -14,84 +14,88 @@ from holotorch.core.quantities import WAVELENGTH
 from holotorch.modulator.crosstalk import ThermalCrosstalk
 from holotorch.modulator.dispersion import Birefringence, phase_scale
 
-_TURN = 2 * math.pi
+_CYCLE = 2 * math.pi
 
 
 def even_lut(bits: int, full_turn: float | None = None) -> Tensor:
-    """Phases of levels that are evenly spaced, float64 [2^bits] in rad, 0 at level 0.
+    """Phases of evenly spaced levels, float64 [2^bits] in rad, 0 at level 0.
 
-    ``full_turn`` is the level, not necessarily whole or one the panel has, at which the phase is 2 pi: 2^bits by
-    default, which spreads the levels evenly over the circle; more for a panel that does not reach a full turn.
+    ``full_turn`` is the level at which the phase is 2 pi. It need not be a whole number. The default 2^bits spreads the
+    levels evenly over the circle; it is larger for a panel whose phases do not reach 2 pi.
     """
     count = 2 ** _checked_bits(bits)
-    turn = checks.positive("full_turn", count if full_turn is None else full_turn, "levels")
-    return torch.arange(count, dtype=torch.float64) * (_TURN / turn)
+    levels_per_cycle = checks.positive("full_turn", count if full_turn is None else full_turn, "levels")
+    return torch.arange(count, dtype=torch.float64) * (_CYCLE / levels_per_cycle)
 
 
 def nearest_levels(phase: Tensor, lut: Tensor) -> Tensor:
-    """Grey level whose phase is nearest to the wanted one on the circle, int64 of the shape of ``phase``.
+    """Grey level whose phase modulo 2 pi is nearest to the wanted phase, int64 of the shape of ``phase``.
 
-    Phases in rad of any size; ``lut`` float64 [L] in rad, of any stroke: wanted phases that a short stroke leaves out
-    go to the nearer of its two ends, and of levels that show the same phase modulo 2 pi one is taken.
+    Args:
+        phase: In rad, of any size.
+        lut: Phases of the levels, float64 [L] in rad, of any stroke. Wanted phases beyond a stroke of less than 2 pi go
+            to the nearer of its two ends; of levels with the same phase modulo 2 pi one is taken.
     """
-    circle, order = torch.sort(torch.remainder(lut, _TURN))
-    circle = torch.cat([circle[-1:] - _TURN, circle, circle[:1] + _TURN])
+    circle, order = torch.sort(torch.remainder(lut, _CYCLE))
+    circle = torch.cat([circle[-1:] - _CYCLE, circle, circle[:1] + _CYCLE])
     order = torch.cat([order[-1:], order, order[:1]])
     borders = ((circle[1:] + circle[:-1]) / 2).to(phase.device)
-    wanted = torch.remainder(phase.detach().double(), _TURN).contiguous()
+    wanted = torch.remainder(phase.detach().double(), _CYCLE).contiguous()
     return order.to(phase.device)[torch.bucketize(wanted, borders)]
 
 
 def snapped(phase: Tensor, lut: Tensor) -> Tensor:
-    """The phase of the nearest level, dtype of ``phase``, in the range of ``lut`` [L]; gradient of the identity.
+    """Phase of the nearest level, in the dtype of ``phase`` and the range of ``lut`` [L].
 
-    The straight-through estimator, as in :func:`holotorch.modulator.quantised`, whose levels depend on the hologram
-    and do not wrap; these are the panel's and do.
+    The gradient is that of the identity (straight-through estimator), as in :func:`holotorch.modulator.quantised`. Here
+    the levels are those of the panel, and phases are compared modulo 2 pi.
     """
     shown = lut.to(phase.device)[nearest_levels(phase, lut)].to(phase.dtype)
-    return shown + (phase - phase.detach())  # the second term is zero: the level's phase stays exact
+    return shown + (phase - phase.detach())  # the second term is exactly zero and carries the gradient
 
 
 def quantisation_rms(lut: Tensor) -> float:
     """Expected rms phase error in rad of the nearest level for phases uniform on the circle.
 
-    sqrt(sum g^3 / 24 pi) over the gaps g between neighbouring levels on the circle: 2 pi / L / sqrt(12) where L levels
-    are evenly spread, 0.0071 rad for 8 bits.
+    It is sqrt(sum g^3 / 24 pi) over the gaps g between neighbouring levels on the circle. For L evenly spread levels
+    this is 2 pi / L / sqrt(12), 0.0071 rad for 8 bits.
     """
-    circle = torch.remainder(lut.double(), _TURN).sort().values
-    gaps = torch.diff(circle, append=circle[:1] + _TURN)
-    return math.sqrt((gaps**3).sum().item() / (12 * _TURN))
+    circle = torch.remainder(lut.double(), _CYCLE).sort().values
+    gaps = torch.diff(circle, append=circle[:1] + _CYCLE)
+    return math.sqrt((gaps**3).sum().item() / (12 * _CYCLE))
 
 
 class PhaseModulator(nn.Module):
-    """Wanted phase, real [..., C, H, W] in rad, to the emitted field, complex [..., C, H, W], of one panel.
+    """Emitted field of one panel, complex [..., C, H, W], for a wanted phase, real [..., C, H, W] in rad.
 
-    In this order: the nearest of the panel's grey levels on the circle, with the gradient of the identity; its phase by
-    the look-up table; fringing fields between pixels; dispersion, where the light has another wavelength than the
-    calibration; the gaps between the pixels. Colours are shown in turn, each with its own table.
+    The model has these steps: the grey level nearest to the wanted phase modulo 2 pi, with the gradient of the
+    identity; the phase of that level by the look-up table; fringing fields between pixels; dispersion, if the light has
+    another wavelength than the calibration; the gaps between the pixels. Colours are shown one after another, each with
+    a separate table.
 
-    Fringing is a convolution of the phases (not of the phasors: the crystal's director is what cannot follow) with a
-    kernel of sum 1, normalised at the panel's border. Detail within a pixel is not modelled. The amplitude is that of
-    the central diffraction order for unit illumination: ``fill_factor`` of a pixel's own and what the gaps send back
-    unmodulated, a zero order. The fall of a pixel's light towards higher orders is that of
-    ``holotorch.optics.PixelShape``, which may follow with a ``fill`` of the root of the area's share; with a ``gap`` of
-    0 only, as light from the gaps falls differently.
+    Fringing is a convolution of the phases with a kernel of sum 1, normalised at the border of the panel. Phases and
+    not phasors are convolved, since the orientation of the crystal is smoothed. Detail within a pixel is not modelled.
+    The amplitude is that of the central diffraction order for unit illumination: the modulated light, weighted by
+    ``fill_factor``, plus the unmodulated light of the gaps, a zero order. ``holotorch.optics.PixelShape`` models the
+    decrease towards higher orders and may follow, with a ``fill`` of the square root of ``fill_factor`` and only with a
+    ``gap`` of 0, as the light of the gaps decreases in another way.
 
     Args:
         grid: Pixels of the panel.
-        wavelengths: Of the calibration, in metres, one per channel.
-        bits: 1 to 16.
-        full_turn: See :func:`even_lut`.
-        lut: Instead of it: phase in rad of every level, real [2^bits] or [C, 2^bits], strictly rising or falling.
+        wavelengths: Wavelengths of the calibration in metres, one per channel.
+        bits: Bits of a grey level, 1 to 16.
+        full_turn: Level at which the phase is 2 pi, see :func:`even_lut`.
+        lut: Phase in rad of every level, real [2^bits] or [C, 2^bits], strictly rising or falling; excludes
+            ``full_turn``.
         fill_factor: Share of the area that is modulated, above 0 and at most 1.
         gap: Amplitude reflected by the rest, 0 (dark) to 1, with phase 0.
-        flip_rows: Whether the panel shows its last row first; concerns :meth:`levels` and :meth:`phase` alone. A frame
-            is turned about its middle, which for an even size moves the axis by one pixel.
+        flip_rows: Whether the panel shows its last row first; affects only :meth:`levels` and :meth:`phase`. A frame is
+            flipped about its middle, which for an even size moves the optical axis by one pixel.
         flip_columns: The same for columns.
         crosstalk: Standard deviation in pixels of a Gaussian fringing field, or its measured kernel, odd sizes, centre
             largest.
-        birefringence: Law of the crystal, see :func:`holotorch.modulator.dispersion.phase_scale`; with None the phase
-            is the same for every wavelength, as in the thesis's simulation.
+        birefringence: Birefringence of the crystal, see :func:`holotorch.modulator.dispersion.phase_scale`. With None
+            the phase is the same for every wavelength, as in the thesis's simulation.
 
     Raises:
         TypeError: A wrong kind of number or tensor.
@@ -125,7 +129,7 @@ class PhaseModulator(nn.Module):
             raise ValueError(f"lut must have one row for each of {len(self.wavelengths)} wavelengths, got {len(table)}")
         self.register_buffer("lut", table.expand(len(self.wavelengths), -1).contiguous(), persistent=False)
         self.fill_factor, self.gap = _share("fill_factor", fill_factor), _share("gap", gap, least=True)
-        self.flips = tuple(axis for axis, turned in ((-2, flip_rows), (-1, flip_columns)) if turned)
+        self.flips = tuple(axis for axis, flipped in ((-2, flip_rows), (-1, flip_columns)) if flipped)
         self.crosstalk = _fringing(crosstalk)
         self.birefringence = birefringence
 
@@ -135,21 +139,21 @@ class PhaseModulator(nn.Module):
         return tuple(quantisation_rms(row) for row in self.lut)
 
     def forward(self, phase: Tensor, light: float | Sequence[float] | Tensor | None = None) -> Tensor:
-        """Emitted field [..., C, H, W] of a wanted phase [..., C, H, W].
+        """Emitted field [..., C, H, W] for a wanted phase [..., C, H, W].
 
-        ``light``: wavelengths in metres that really fall on the panel, broadcasting against [..., C]; those of the
-        calibration if not given.
+        ``light``: wavelengths of the illumination in metres, broadcast against [..., C]; by default those of the
+        calibration.
         """
         return self.emitted(self.shown(phase), light)
 
     def shown(self, phase: Tensor) -> Tensor:
-        """Phase [..., C, H, W] of the levels nearest to the wanted one, in the range of the table."""
+        """Phase [..., C, H, W] of the levels nearest to a wanted phase, in the range of the table."""
         self._check(phase)
         rows = [snapped(phase[..., c, :, :], row) for c, row in enumerate(self.lut)]
         return torch.stack(rows, -3)
 
     def emitted(self, shown: Tensor, light: float | Sequence[float] | Tensor | None = None) -> Tensor:
-        """Field of phases [..., C, H, W] that the levels stand for, such as :meth:`phase` gives them."""
+        """Emitted field for the phases [..., C, H, W] of grey levels, such as :meth:`phase` returns."""
         self._check(shown)
         if self.crosstalk is not None:
             weight = self.crosstalk(torch.ones(self.grid.shape, dtype=shown.dtype, device=shown.device))
@@ -165,14 +169,14 @@ class PhaseModulator(nn.Module):
         return field if self.fill_factor == 1 else self.fill_factor * field + (1 - self.fill_factor) * self.gap
 
     def levels(self, phase: Tensor) -> Tensor:
-        """Frames for the panel, uint8 or (above 8 bits) uint16 [..., C, H, W], turned as it is mounted."""
+        """Frames for the panel, uint8 or (above 8 bits) uint16 [..., C, H, W], flipped as the panel is mounted."""
         self._check(phase)
         checks.all_finite("phase", phase.detach())
         rows = [nearest_levels(phase[..., c, :, :], row) for c, row in enumerate(self.lut)]
         return torch.stack(rows, -3).flip(self.flips).to(torch.uint8 if self.bits <= 8 else torch.uint16)
 
     def phase(self, levels: Tensor) -> Tensor:
-        """Phase in rad, float64 [..., C, H, W], of frames as :meth:`levels` gives them, turned back."""
+        """Phase in rad, float64 [..., C, H, W], of frames as :meth:`levels` returns them, with the flips undone."""
         if levels.is_floating_point() or levels.is_complex():
             raise TypeError(f"levels must be whole numbers, got {levels.dtype}")
         index = levels.to(torch.int64)
@@ -200,7 +204,7 @@ class PhaseModulator(nn.Module):
         checks.field("phase", phase, (len(self.wavelengths), *self.grid.shape), complex_valued=False)
 
     def _apply(self, fn, recurse=True):
-        # Tables stay float64: 16 bits of 2 pi are finer than half precision, and module casts would round them.
+        # The tables stay float64 when a module is cast: 16 bits are finer than half precision.
         return super()._apply(lambda tensor: tensor.to(fn(tensor).device), recurse)
 
 
@@ -224,10 +228,10 @@ def checked_lut(lut: Tensor, bits: int) -> Tensor:
 
 
 def level_of(phase: Tensor, lut: Tensor) -> Tensor:
-    """Inverse of a table as a continuous level, float64: where between two levels a phase in its range lies.
+    """Inverse of a look-up table: the continuous level of a phase, float64, by linear interpolation.
 
-    Linear between levels; ``phase`` in rad and not wrapped, ``lut`` [L] monotone. Differentiable in both. Raises
-    ValueError for phases outside the table.
+    ``phase`` is in rad and not wrapped, ``lut`` [L] is monotone; differentiable in both. Raises ValueError for phases
+    outside the table.
     """
     table = lut.double() if lut[-1] >= lut[0] else -lut.double()
     wanted = phase.double() if lut[-1] >= lut[0] else -phase.double()
@@ -258,5 +262,5 @@ def _fringing(crosstalk: float | Tensor) -> ThermalCrosstalk | None:
     if isinstance(crosstalk, Tensor) and crosstalk.ndim > 0:
         return ThermalCrosstalk.from_patch(crosstalk)
     width = checks.finite("crosstalk", float(crosstalk), "pixels")
-    # exp(-d^2 / (2 s^2)) of a standard deviation s is exp(-d^2 / sigma^2) with sigma = sqrt(2) s.
+    # A Gaussian of standard deviation s, exp(-d^2 / (2 s^2)), is exp(-d^2 / sigma^2) with sigma = sqrt(2) s.
     return None if width == 0 else ThermalCrosstalk(math.sqrt(2) * width)

@@ -1,4 +1,4 @@
-"""Frames of grey levels that calibrate a panel, and the look-up table from what they give."""
+"""Frames of grey levels for the calibration of a panel, and the fit of its look-up table to measured intensities."""
 
 import math
 from collections.abc import Sequence
@@ -9,9 +9,21 @@ from torch import Tensor
 
 from holotorch.core import checks
 
-_STROKES = 96  # first guesses of the fit: full strokes between a quarter and eight turns of half a circle,
-_BENDS = 13  # each with phases rising as powers of the level between 0.4 and 2.5
-_KNOTS = 17
+
+@dataclass(frozen=True)
+class _Fit:
+    """Parameters of the fit. The first guess is the best stroke * level^power of a grid of strokes and powers.
+
+    The weight of the smoothness holds the knots where sin^2 is flat, and the intensity does not determine them.
+    """
+
+    strokes: int = 96  # full strokes tried, from pi / 2 to 8 pi rad
+    powers: int = 13  # powers tried, from 0.4 to 2.5
+    knots: int = 17  # of the smooth curve that is fitted then
+    smoothness: float = 1e-4  # weight of squared differences between the logarithms of neighbouring increments
+
+
+_FIT = _Fit()
 
 
 def uniform(shape: tuple[int, int], level: int, *, bits: int = 8) -> Tensor:
@@ -20,7 +32,7 @@ def uniform(shape: tuple[int, int], level: int, *, bits: int = 8) -> Tensor:
 
 
 def grey_sweep(shape: tuple[int, int], levels: Sequence[int], *, bits: int = 8) -> Tensor:
-    """Uniform frames, one for each level, uint8 or uint16 [L, H, W]; a view that needs the memory of L pixels."""
+    """Uniform frames, one for each level, uint8 or uint16 [L, H, W]; a view that takes the memory of L pixels."""
     shades = torch.tensor([_level("level", level, bits) for level in levels], dtype=torch.int32)
     return _frame(shades, bits)[:, None, None].expand(-1, *_shape(shape))
 
@@ -32,22 +44,21 @@ def grating(
 
     Args:
         shape: (H, W) of the panel.
-        period: In pixels, at least 2; even ones make equal halves along the axes, and the even orders vanish.
+        period: In pixels, at least 2. Along an axis an even period has equal halves, and no even diffraction orders.
         level: Grey level of the second half.
-        reference: Of the first half, which begins at pixel (0, 0).
-        angle: Direction in rad in which the stripes follow each other, from +x (right) towards +y (down).
-        bits: Of the panel.
+        reference: Grey level of the first half, which begins at pixel (0, 0).
+        angle: Direction of the grating vector in rad, from +x (right) towards +y (down).
+        bits: Bits of a grey level.
 
     Returns:
         uint8 or uint16 [H, W]. Its first order has (2 / pi)^2 sin^2(phase difference / 2) of the light.
     """
     if not checks.finite("period", period, "pixels") >= 2:
         raise ValueError(f"period must be at least 2 pixels, got {period!r}")
-    turn = checks.finite("angle", angle, "rad")
+    angle = checks.finite("angle", angle, "rad")
     y, x = _coordinates(shape)
-    # Rounded, so that cos(pi / 2) = 6e-17 does not push the borders of stripes to and fro.
-    along = (x * math.cos(turn) + y * math.sin(turn)) * (2 / period)
-    second = (along + 1e-9).floor().long() % 2 == 1
+    half_periods = (x * math.cos(angle) + y * math.sin(angle)) * (2 / period)
+    second = (half_periods + 1e-9).floor().long() % 2 == 1  # 1e-9 is above the rounding of cos(pi / 2) = 6e-17
     return _two(second, reference, level, bits)
 
 
@@ -60,23 +71,23 @@ def grating_sweep(
     angle: float = 0.0,
     bits: int = 8,
 ) -> Tensor:
-    """Gratings between ``reference`` and each of ``levels``, [L, H, W]: their first orders are :func:`fit_lut`'s."""
+    """Gratings between ``reference`` and each of ``levels``, [L, H, W]; :func:`fit_lut` takes their first orders."""
     frames = [grating(shape, period, level, reference=reference, angle=angle, bits=bits) for level in levels]
     return torch.stack(frames) if frames else torch.empty(0, *_shape(shape), dtype=torch.uint8)
 
 
 def checkerboard(shape: tuple[int, int], side: int, level: int, *, reference: int = 0, bits: int = 8) -> Tensor:
-    """Squares of ``side`` pixels that show ``reference`` (the first) and ``level`` in turn, [H, W]."""
+    """Squares of ``side`` pixels that alternate between ``reference``, at pixel (0, 0), and ``level``, [H, W]."""
     checks.whole("side", side, 1)
     y, x = _coordinates(shape)
     return _two((y.long() // side + x.long() // side) % 2 == 1, reference, level, bits)
 
 
 def orientation_chart(shape: tuple[int, int], *, bits: int = 8) -> Tensor:
-    """Four quadrants of four greys and a letter F, [H, W]: no flip, turn or transposition leaves it as it is.
+    """Four quadrants of different grey and a letter F, [H, W], which every flip, rotation or transposition changes.
 
-    Rising from 1/4 of the top level over upper left, upper right, lower left to the top itself at the lower right; the
-    F of level 0 stands upright in the middle and takes a third of the height. At least 16 x 16 pixels.
+    The quadrants have 1/4 (upper left), 1/2 (upper right), 3/4 (lower left) and 1/1 (lower right) of the top level. The
+    F of level 0 is in the middle and takes a third of the shorter side. The frame has at least 16 x 16 pixels.
     """
     height, width = _shape(shape)
     if min(height, width) < 16:
@@ -92,14 +103,14 @@ def orientation_chart(shape: tuple[int, int], *, bits: int = 8) -> Tensor:
 
 
 def circles(shape: tuple[int, int], radii: Sequence[float], level: int, *, width: float = 2.0, bits: int = 8) -> Tensor:
-    """Rings about the optical axis (pixel n // 2) and a cross of a pixel's width through it, [H, W], else level 0.
+    """Rings about the optical axis (pixel n // 2) and a cross of one pixel's width through it, on level 0, [H, W].
 
     Args:
         shape: (H, W) of the panel.
-        radii: Of the middle of each ring, in pixels.
-        level: Of the rings and the cross.
-        width: Of the rings, in pixels.
-        bits: Of the panel.
+        radii: Radius of the centre line of each ring, in pixels.
+        level: Grey level of the rings and the cross.
+        width: Width of the rings in pixels.
+        bits: Bits of a grey level.
     """
     y, x = _coordinates(shape)
     y, x = y - shape[0] // 2, x - shape[1] // 2
@@ -116,10 +127,10 @@ class LUTFit:
     """Result of :func:`fit_lut`.
 
     Attributes:
-        lut: Phase in rad of every level against level 0, float64 [2^bits], strictly rising.
-        peak: Intensity at a phase of pi, in the measurement's unit, without the background.
-        background: Intensity at no phase.
-        rms: Of measured minus fitted intensity, relative to ``peak``.
+        lut: Phase in rad of every level relative to level 0, float64 [2^bits], strictly rising.
+        peak: Intensity at a phase of pi minus the background, in the unit of the measurement.
+        background: Intensity at a phase of 0.
+        rms: Root mean square of measured minus fitted intensity, relative to ``peak``.
     """
 
     lut: Tensor
@@ -131,73 +142,72 @@ class LUTFit:
 def fit_lut(levels: Sequence[int], first_order_intensity: Sequence[float] | Tensor, *, bits: int = 8) -> LUTFit:
     """Phase of every level from the first-order intensity of gratings between level 0 and each of ``levels``.
 
-    The model is background + peak sin^2(phase / 2) with a phase that rises from 0, as a smooth curve through 17 knots,
-    least squares. First guesses cover strokes from half a turn to four turns.
+    The model is background + peak sin^2(phase / 2), where the phase rises from 0 as a smooth curve through 17 knots. It
+    is fitted by least squares, from first guesses with strokes from pi / 2 to 8 pi.
+
+    The intensity does not determine the sign of the phase; it is taken to rise. Near multiples of pi sin^2 is flat and
+    a single value determines the phase badly, which is why a smooth curve is fitted instead of inverting each value.
 
     Args:
-        levels: Grey levels of the sweep, rising, from 0 to the top one; at least 24 of them.
-        first_order_intensity: One value each, any unit.
-        bits: Of the panel.
+        levels: Grey levels of the sweep, rising, from 0 to the top level; at least 24 of them.
+        first_order_intensity: One value per level, in any unit.
+        bits: Bits of a grey level.
 
     Raises:
-        ValueError: Too few levels, not from 0 to the top, NaN, or no maximum within the sweep: the peak is not known
-            for a stroke below half a turn.
-
-    Intensity does not say the sign of a phase: it is taken to rise. Near a phase of 0, pi, 2 pi, ... sin^2 is flat and
-    a single value says little: that is why a smooth curve is fitted instead of inverting value by value.
+        ValueError: Too few levels, not from 0 to the top level, NaN, or no maximum within the sweep: for a stroke below
+            pi the peak is unknown.
     """
     top = 2 ** checks.whole("bits", bits, 1) - 1
-    at = [_level("level", level, bits) for level in levels]
+    swept = [_level("level", level, bits) for level in levels]
     measured = torch.as_tensor(first_order_intensity).detach().to("cpu", torch.float64)
     checks.all_finite("first_order_intensity", measured)
-    if measured.shape != (len(at),) or len(at) < 24 or at[0] != 0 or at[-1] != top or sorted(set(at)) != at:
+    ends = (swept[0], swept[-1]) if swept else ("none", "none")
+    if measured.shape != (len(swept),) or len(swept) < 24 or ends != (0, top) or sorted(set(swept)) != swept:
         raise ValueError(
-            f"a sweep needs at least 24 rising levels from 0 to {top} with one intensity each, got {len(at)} levels "
-            f"from {at[0] if at else 'none'} to {at[-1] if at else 'none'} and intensities {tuple(measured.shape)}"
+            f"a sweep needs at least 24 rising levels from 0 to {top} with one intensity each, got {len(swept)} levels "
+            f"from {ends[0]} to {ends[1]} and intensities {tuple(measured.shape)}"
         )
     spread = (measured.max() - measured.min()).item()
     if spread <= 0:
         raise ValueError("the first order does not change with the level: no phase can be found in it")
     unit = (measured - measured.min()) / spread
-    place = torch.tensor(at, dtype=torch.float64) / top
-    knots = _refined(place, unit, _first_guess(place, unit))
-    phase = _curve(knots, place)
+    x = torch.tensor(swept, dtype=torch.float64) / top
+    knots = _refined(x, unit, _first_guess(x, unit))
+    phase = _curve(knots, x)
     if knots.sum() < 1.05 * math.pi:
         raise ValueError(
             f"the stroke comes out as {knots.sum().item():.3g} rad: the first order has no clear maximum within the "
             "sweep, so its peak, and with it the phase, is unknown; raise the voltage, or take a shorter wavelength"
         )
     background, peak, error = _linear_part(phase, unit)
-    everywhere = torch.arange(top + 1, dtype=torch.float64) / top
     return LUTFit(
-        _curve(knots, everywhere),
+        _curve(knots, torch.arange(top + 1, dtype=torch.float64) / top),
         peak.item() * spread,
         background.item() * spread + measured.min().item(),
-        math.sqrt(error.item() / len(at)) / abs(peak.item()),
+        math.sqrt(error.item() / len(swept)) / abs(peak.item()),
     )
 
 
-def _first_guess(place: Tensor, unit: Tensor) -> Tensor:
-    """Increments between the knots of the best power law."""
-    strokes = torch.linspace(math.pi / 2, 8 * math.pi, _STROKES, dtype=torch.float64)
-    bends = torch.logspace(math.log10(0.4), math.log10(2.5), _BENDS, dtype=torch.float64)
-    phases = strokes[:, None, None] * place ** bends[:, None]
-    error = _linear_part(phases, unit)[2]
+def _first_guess(x: Tensor, unit: Tensor) -> Tensor:
+    """Phase increments between the knots of the best power law; ``x`` are levels in [0, 1], ``unit`` intensities."""
+    strokes = torch.linspace(math.pi / 2, 8 * math.pi, _FIT.strokes, dtype=torch.float64)
+    powers = torch.logspace(math.log10(0.4), math.log10(2.5), _FIT.powers, dtype=torch.float64)
+    error = _linear_part(strokes[:, None, None] * x ** powers[:, None], unit)[2]
     best = int(error.argmin())
-    stroke, bend = strokes[best // _BENDS], bends[best % _BENDS]
-    at = torch.linspace(0, 1, _KNOTS, dtype=torch.float64)
-    return torch.diff(stroke * at**bend).clamp(min=1e-3 * stroke)
+    stroke, power = strokes[best // _FIT.powers], powers[best % _FIT.powers]
+    knots = torch.linspace(0, 1, _FIT.knots, dtype=torch.float64)
+    return torch.diff(stroke * knots**power).clamp(min=1e-3 * stroke)
 
 
-def _refined(place: Tensor, unit: Tensor, increments: Tensor) -> Tensor:
-    """Least squares over the logarithms of the increments, which keeps them above zero."""
+def _refined(x: Tensor, unit: Tensor, increments: Tensor) -> Tensor:
+    """Increments by least squares over their logarithms, which keeps them above zero."""
     logs = increments.log().requires_grad_()
     solver = torch.optim.LBFGS([logs], max_iter=300, tolerance_grad=1e-10, line_search_fn="strong_wolfe")
 
     def loss() -> Tensor:
         solver.zero_grad()
-        # A weak pull towards equal neighbours: flat parts of sin^2 leave the knots there free otherwise.
-        value = _linear_part(_curve(logs.exp(), place), unit)[2] / len(unit) + 1e-4 * torch.diff(logs).square().mean()
+        error = _linear_part(_curve(logs.exp(), x), unit)[2] / len(unit)
+        value = error + _FIT.smoothness * torch.diff(logs).square().mean()
         value.backward()
         return value
 
@@ -205,12 +215,12 @@ def _refined(place: Tensor, unit: Tensor, increments: Tensor) -> Tensor:
     return logs.detach().exp()
 
 
-def _curve(increments: Tensor, place: Tensor) -> Tensor:
-    """Phase at ``place`` in [0, 1]: a cubic through the knots whose slopes keep it rising (harmonic means)."""
+def _curve(increments: Tensor, x: Tensor) -> Tensor:
+    """Phase at ``x`` in [0, 1]: cubics through the knots, monotone as the slopes are harmonic means of differences."""
     values = torch.cat([increments.new_zeros(1), increments.cumsum(0)])
     inner = 2 / (1 / increments[1:] + 1 / increments[:-1])
     slopes = torch.cat([increments[:1], inner, increments[-1:]])
-    scaled = place * len(increments)
+    scaled = x * len(increments)
     row = scaled.floor().long().clamp(0, len(increments) - 1)
     t = scaled - row
     return (
@@ -222,14 +232,14 @@ def _curve(increments: Tensor, place: Tensor) -> Tensor:
 
 
 def _linear_part(phase: Tensor, unit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Best background and peak [...] for phases [..., L], and the sum of squares that remains."""
-    shape = torch.sin(phase / 2).square()
-    mean, wanted = shape.mean(-1, keepdim=True), unit.mean()
-    deviation = shape - mean
-    peak = (deviation * (unit - wanted)).sum(-1) / deviation.square().sum(-1).clamp(min=1e-12)
+    """Least-squares background and peak [...] for phases [..., L], and the sum of squared residuals."""
+    model = torch.sin(phase / 2).square()
+    mean, measured = model.mean(-1, keepdim=True), unit.mean()
+    deviation = model - mean
+    peak = (deviation * (unit - measured)).sum(-1) / deviation.square().sum(-1).clamp(min=1e-12)
     peak = peak.clamp(min=0)
-    background = wanted - peak * mean[..., 0]
-    return background, peak, (unit - background[..., None] - peak[..., None] * shape).square().sum(-1)
+    background = measured - peak * mean[..., 0]
+    return background, peak, (unit - background[..., None] - peak[..., None] * model).square().sum(-1)
 
 
 def _coordinates(shape: tuple[int, int]) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""PhasedArray: heater phases to the field that a nanophotonic phased array emits."""
+"""PhasedArray: the field that a nanophotonic phased array emits for given heater phases."""
 
 import math
 from collections.abc import Sequence
@@ -10,9 +10,8 @@ from holotorch.core import checks
 from holotorch.core.complex import phasor
 from holotorch.modulator.crosstalk import ThermalCrosstalk
 
-# The thesis's phase shifter turns red light of 630 nm by pi when it is 175 K above ambient.
-REFERENCE_WAVELENGTH = 630e-9
-REFERENCE_RESPONSE = math.pi / 175
+# The thesis's phase shifter shifts light of 630 nm by pi at 175 K above ambient: metres, and rad/K at that wavelength.
+REFERENCE_WAVELENGTH, REFERENCE_RESPONSE = 630e-9, math.pi / 175
 
 
 class PhasedArray(nn.Module):
@@ -20,11 +19,11 @@ class PhasedArray(nn.Module):
 
     Args:
         wavelengths: In metres, one per channel.
-        crosstalk: Spreads heater phases [..., C, H, W].
+        crosstalk: Spreading of the heat, an operator on heater phases [..., C, H, W].
 
-    A phase is a temperature rise above ambient times ``response`` (rad/K), which falls with the wavelength:
-    (pi/175 rad/K)(630 nm / wavelength). The thesis's text says "proportional" under Eq. 4.1; its three printed values
-    are inversely proportional.
+    A phase is a temperature rise above ambient times ``response`` in rad/K, which is inversely proportional to the
+    wavelength: (pi/175 rad/K)(630 nm / wavelength). Departure from the thesis: its text says "proportional" under
+    Eq. 4.1, but its three printed values are inversely proportional.
     """
 
     crosstalk: ThermalCrosstalk
@@ -39,19 +38,16 @@ class PhasedArray(nn.Module):
         return tuple(REFERENCE_RESPONSE * REFERENCE_WAVELENGTH / wavelength for wavelength in self.wavelengths)
 
     def forward(self, phase: Tensor) -> Tensor:
-        """Emitted field, complex [..., C, H, W], for heater phases in rad, real [..., C, H, W].
-
-        Frames are [F, C, H, W]: phases [C, F, H, W] are refused, but where F = C no shape tells them apart.
-        """
+        """Emitted field, complex [..., C, H, W], for heater phases in rad, real [..., C, H, W]; frames [F, C, H, W]."""
         self._check(phase)
         return phasor(self.crosstalk(phase))
 
     def temperature(self, phase: Tensor) -> Tensor:
-        """Temperature rise in kelvin that gives ``phase`` [..., C, H, W]; of the chip for a phase after spreading."""
+        """Temperature rise in kelvin for ``phase`` [..., C, H, W]; that of the chip for a phase after spreading."""
         return phase / self._response_like(phase)
 
     def phase(self, temperature: Tensor) -> Tensor:
-        """Phase in rad that a temperature rise in kelvin, [..., C, H, W], gives; inverse of :meth:`temperature`."""
+        """Phase in rad for a temperature rise in kelvin, [..., C, H, W]; inverse of :meth:`temperature`."""
         return temperature * self._response_like(temperature)
 
     def _check(self, value: Tensor) -> None:

@@ -1,4 +1,4 @@
-"""Heaters with a limited number of steps."""
+"""Heaters with a limited number of levels."""
 
 import torch
 from torch import Tensor
@@ -7,9 +7,9 @@ from holotorch.core import checks
 
 
 def quantised(phase: Tensor, bits: int) -> Tensor:
-    """``phase`` [..., H, W] >= 0 on the 2^bits levels between 0 and the largest phase of each hologram.
+    """Round ``phase`` [..., H, W] >= 0 to the 2^bits even levels between 0 and the largest phase of each hologram.
 
-    The gradient is that of the identity, so that a quantised array can be optimised (straight-through estimator).
+    The gradient is that of the identity (straight-through estimator), so that a quantised array can be optimised.
     Raises ValueError for fewer than 1 or more than 24 bits, or a negative phase.
     """
     checks.real("phase", phase)

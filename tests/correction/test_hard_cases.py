@@ -12,7 +12,7 @@ from holotorch.correction import (
     PECProblem,
     ProjectedAdam,
     Stage,
-    limited,
+    penalty_schedule,
     proximal_pec,
     run_stages,
     spread_preconditioner,
@@ -49,7 +49,9 @@ def test_a_uniform_start_of_a_fourier_hologram_is_refused(name, value):
     with pytest.raises(ValueError, match="gradient vanishes at the start"):
         run_stages([Stage(problem, SOLVERS[name]())], start)
     with pytest.raises(ValueError, match="gradient vanishes at the start"):
-        run_stages(limited(lambda **options: make(problem.target, crosstalk, **options), LBFGS(), 1.44, None), start)
+        run_stages(
+            penalty_schedule(lambda **options: make(problem.target, crosstalk, **options), LBFGS(), 1.44, None), start
+        )
     with pytest.raises(ValueError, match="gradient vanishes at the start"):
         proximal_pec(problem.crosstalk, problem.propagator, problem.target, start, solver=SOLVERS[name]())
 
@@ -126,7 +128,7 @@ def test_small_and_odd_arrays(shape, limit):
     target = torch.rand(1, *shape) + 0.1
     target = target / target.mean()
     start = hot(shape)
-    stages = limited(
+    stages = penalty_schedule(
         lambda **options: make(target, crosstalk, **options), solvers(crosstalk, 24)[1], crosstalk.total, limit
     )
     runs = [lambda: run_stages(stages, start)]

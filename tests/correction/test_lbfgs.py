@@ -136,7 +136,7 @@ def test_every_step_descends(box):
 
 def test_frames_that_share_an_image_are_one_unknown():
     problem = pec_problem(2, frames=True)
-    start = torch.rand(3, 2, 4, 16, 16, dtype=torch.float64) * 6
+    start = torch.rand(3, 4, 2, 16, 16, dtype=torch.float64) * 6
     solver = LBFGS(3, spread_preconditioner(ThermalCrosstalk(0.8).kernel), max_steps=12, tolerance=0)
     together = solver(problem, start)
     assert together.losses.shape == (13, 3, 2) and together.steps.shape == (3, 2)

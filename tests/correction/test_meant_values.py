@@ -8,7 +8,7 @@ import torch
 from holotorch.core.grid import Grid
 from holotorch.correction import APG, LBFGS, PECProblem, ProjectedAdam, gerchberg_saxton
 from holotorch.correction.run import Box
-from holotorch.correction.stages import below, limited
+from holotorch.correction.stages import limit_peak_phase, penalty_schedule
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import Fraunhofer
 
@@ -52,16 +52,18 @@ def test_phase_retrieval_refuses_a_mask_that_leaves_nothing():
 @pytest.mark.parametrize("limit", [math.nan, math.inf, 0.0, -1.0])
 def test_a_limit_that_holds_nothing_is_refused(limit):
     with pytest.raises(ValueError, match="limit must be (finite|above zero) in rad"):
-        below(limit, torch.rand(2, 6, 7), CROSSTALK)
+        limit_peak_phase(limit, torch.rand(2, 6, 7), CROSSTALK)
     with pytest.raises(ValueError, match="limit must be (finite|above zero) in rad"):
-        limited(lambda **options: PECProblem(CROSSTALK, FAR, TARGET, **options), LBFGS(), CROSSTALK.total, limit)
+        penalty_schedule(
+            lambda **options: PECProblem(CROSSTALK, FAR, TARGET, **options), LBFGS(), CROSSTALK.total, limit
+        )
 
 
 def test_phases_that_hold_no_limit_are_refused():
     phase = torch.rand(2, 6, 7)
     phase[1, 2, 3] = math.nan
     with pytest.raises(ValueError, match=r"phase must be finite, but element \(1, 2, 3\) is nan"):
-        below(1.0, phase, CROSSTALK)
+        limit_peak_phase(1.0, phase, CROSSTALK)
 
 
 def test_boxes_and_solvers_refuse_nan():
@@ -74,18 +76,3 @@ def test_boxes_and_solvers_refuse_nan():
     for betas in ((1.0, 0.9), (0.9, math.nan), (-0.1, 0.9)):
         with pytest.raises(ValueError, match="betas must be at least 0 and below 1"):
             ProjectedAdam(betas=betas)
-
-
-def test_frames_and_colours_change_places_by_name():
-    problem = PECProblem(CROSSTALK, FAR, TARGET, frames=True)
-    phase = torch.rand(5, 2, 2, 6, 7, dtype=torch.float64)  # two frames of two colours: the shape tells nothing
-    unknown = problem.unknown(phase)
-    assert torch.equal(unknown[:, 1, 0], phase[:, 0, 1]) and torch.equal(problem.heater_phase(unknown), phase)
-    one_by_one = torch.stack([PECProblem(CROSSTALK, FAR, TARGET).intensity(phase[:, f]) for f in range(2)])
-    torch.testing.assert_close(problem.intensity(unknown), one_by_one.mean(0), rtol=1e-13, atol=0)
-    assert not torch.allclose(problem.intensity(phase), one_by_one.mean(0))  # why the order must be said
-    for call, shape in ((problem.unknown, (2, 3, 6, 7)), (problem.heater_phase, (3, 2, 6, 7)), (problem, (3, 2, 6, 7))):
-        with pytest.raises(ValueError, match=r"must end in \([CF], [CF], H, W\) with C = 2, got"):
-            call(torch.rand(shape))
-    plain = PECProblem(CROSSTALK, FAR, TARGET)
-    assert plain.unknown(phase) is phase and plain.heater_phase(phase) is phase

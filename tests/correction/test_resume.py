@@ -14,7 +14,7 @@ from holotorch.correction import (
     ProjectedAdam,
     Solution,
     Stage,
-    limited,
+    penalty_schedule,
     run_stages,
     spread_preconditioner,
 )
@@ -103,7 +103,7 @@ def test_a_finished_run_does_not_go_on(solver):
 @pytest.mark.parametrize("limit", [None, 12.0])
 @pytest.mark.parametrize("after", [1, 4, 5, 8, 9, 13, 20, 23])
 def test_stages_resume_within_and_between_each_other(limit, after):
-    stages, start = limited(make_problem, STEPS, CROSSTALK.total, limit), beginning()
+    stages, start = penalty_schedule(make_problem, STEPS, CROSSTALK.total, limit), beginning()
     whole = run_stages(stages, start)
     state = interrupted(lambda callback: run_stages(stages, start, callback=callback), after)
     assert_same(run_stages(stages, start, resume=state), whole)
@@ -135,7 +135,7 @@ def test_states_do_not_change_later(solver):
 
 
 def test_states_of_stages_do_not_change_later():
-    stages = limited(make_problem, STEPS, CROSSTALK.total, 12.0)
+    stages = penalty_schedule(make_problem, STEPS, CROSSTALK.total, 12.0)
     assert_states_stay(lambda callback: run_stages(stages, beginning(), callback=callback))
 
 
@@ -164,7 +164,7 @@ def test_refuses_a_state_of_another_run(solver):
 
 @pytest.mark.parametrize("limit", [None, 12.0])
 @pytest.mark.parametrize("steps", [1, 2, 3, 7, 8, 24, 50])
-def test_limited_shares_all_steps_among_its_stages(limit, steps):
-    stages = limited(make_problem, replace(STEPS, max_steps=steps), CROSSTALK.total, limit)
+def test_a_penalty_schedule_shares_all_steps_among_its_stages(limit, steps):
+    stages = penalty_schedule(make_problem, replace(STEPS, max_steps=steps), CROSSTALK.total, limit)
     assert sum(stage.solver.max_steps for stage in stages if isinstance(stage.solver, LBFGS)) == steps
     assert len(run_stages(stages, beginning()).losses) == steps + 1

@@ -1,4 +1,4 @@
-"""What the description of a phase panel may say, and the panel that it means."""
+"""Settings of the description of a phase panel, and the panel that is built from them."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +17,8 @@ from holotorch.io.files import read_bytes
 from holotorch.modulator.dispersion import Birefringence, BirefringenceTable, Cauchy, phase_scale
 from holotorch.modulator.panel import PhaseModulator, checked_lut, even_lut
 
-_SAME = 1e-3  # relative; a laser's wavelength is not the printed one to the picometre
+# Relative difference up to which a wavelength is that of a calibration: lasers differ from their nominal wavelength.
+_SAME = 1e-3
 
 
 def _rising(points: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
@@ -31,11 +32,11 @@ Points = Annotated[tuple[tuple[Number, Number], ...], Field(min_length=2), After
 
 
 class CalibrationSettings(Settings):
-    """One wavelength and the phase of the levels there: evenly spaced, or a table of [level, phase in rad].
+    """Phases of the grey levels at one wavelength: evenly spaced, or a table of [level, phase in rad].
 
-    ``full_turn``: the level, whole or not, at which the phase is 2 pi; 2^bits by default. ``lut``: rows from level 0 to
-    the top one, linear between them. ``lut_file``: the same as a text file of ``level, phase`` lines, its path relative
-    to the description.
+    ``full_turn``: level at which the phase is 2 pi, not necessarily whole; 2^bits by default. ``lut``: rows from level
+    0 to the top level, interpolated linearly. ``lut_file``: the same table as a text file of ``level, phase`` lines,
+    with its path relative to the description.
     """
 
     wavelength: Wavelength
@@ -53,7 +54,7 @@ class DispersionSettings(Settings):
 
 
 class PanelSettings(GridSettings):
-    """A phase panel: its pixels, levels, calibration and how it is mounted; see ``PhaseModulator``."""
+    """A phase panel: its pixels, grey levels, calibration and orientation; see ``PhaseModulator``."""
 
     name: str = "panel"
     bits: Annotated[Count, Field(le=16)] = 8
@@ -67,19 +68,19 @@ class PanelSettings(GridSettings):
 
 
 def load_panel(path: Path | str, overrides: Sequence[str] = ()) -> PanelSettings:
-    """Read, override and check the description of a panel.
+    """Read the description of a panel, apply ``overrides``, and check it.
 
     Raises:
-        ConfigError: Everything that is wrong with it, one line per mistake with its file, line and column.
+        ConfigError: All mistakes, one line each with file, line and column.
     """
     source = read_source(Path(path), list(overrides))
     settings = validated(source, PanelSettings)
-    found: list[tuple[Key, str]] = []
+    mistakes: list[tuple[Key, str]] = []
     tables: list[CalibrationSettings] = []
     for i, row in enumerate(settings.calibration):
         key = ("calibration", i)
         if sum(item is not None for item in (row.full_turn, row.lut, row.lut_file)) > 1:
-            found.append((key, "expected one of full_turn, lut or lut_file"))
+            mistakes.append((key, "expected one of full_turn, lut or lut_file"))
             continue
         try:
             points = _read_points(Path(path).parent / row.lut_file) if row.lut_file else row.lut
@@ -87,43 +88,40 @@ def load_panel(path: Path | str, overrides: Sequence[str] = ()) -> PanelSettings
             _table(row, settings.bits)
             tables.append(row)
         except ValueError as error:
-            found.append(((*key, "lut_file" if row.lut_file else "lut"), str(error)))
+            mistakes.append(((*key, "lut_file" if row.lut_file else "lut"), str(error)))
     if settings.dispersion is not None:
         try:
             law = _law(settings.dispersion)
             law(torch.tensor([row.wavelength for row in settings.calibration], dtype=torch.float64))
         except ValueError as error:
-            found.append((("dispersion",), str(error)))
-    if found:
-        raise ConfigError([source.mistake(key, message) for key, message in found])
+            mistakes.append((("dispersion",), str(error)))
+    if mistakes:
+        raise ConfigError([source.mistake(key, message) for key, message in mistakes])
     return settings.model_copy(update={"calibration": tuple(tables)})
 
 
 def build_panel(settings: PanelSettings, wavelengths: Sequence[float]) -> PhaseModulator:
-    """The panel as it is when lit at ``wavelengths`` in metres, one per channel.
+    """The panel under light of ``wavelengths`` in metres, one per channel.
 
-    Levels are chosen for the phase that they really have there: by the table of that wavelength (to 0.1 %), or by the
-    nearest one times the crystal's dispersion.
+    The table of each channel is that of the calibration at its wavelength (to 0.1 %), or that of the nearest
+    calibration, scaled by the dispersion of the crystal.
 
     Raises:
         ConfigError: A wavelength without a table in a panel without dispersion, or outside the dispersion's table.
     """
     law = _law(settings.dispersion) if settings.dispersion is not None else None
     rows = []
-    for wave in wavelengths:
-        nearest = min(settings.calibration, key=lambda row, wave=wave: abs(row.wavelength - wave))
+    for wavelength in wavelengths:
+        nearest = min(settings.calibration, key=lambda row, to=wavelength: abs(row.wavelength - to))
         table = _table(nearest, settings.bits)
-        if abs(nearest.wavelength / wave - 1) > _SAME:
-            known = ", ".join(f"{row.wavelength * 1e9:g} nm" for row in settings.calibration)
+        if abs(nearest.wavelength / wavelength - 1) > _SAME:
+            calibrated = ", ".join(f"{row.wavelength * 1e9:g} nm" for row in settings.calibration)
             if law is None:
-                raise ConfigError(
-                    [
-                        f"the panel {settings.name} is not calibrated at {wave * 1e9:g} nm but at {known}; add a "
-                        "calibration, or the crystal's dispersion: {a: 0.18, b: 8.5e-15}"
-                    ]
-                )
+                at = f"not calibrated at {wavelength * 1e9:g} nm but at {calibrated}"
+                cure = "add a calibration, or the crystal's dispersion: {a: 0.18, b: 8.5e-15}"
+                raise ConfigError([f"the panel {settings.name} is {at}; {cure}"])
             try:
-                table = table * phase_scale(wave, nearest.wavelength, law).item()
+                table = table * phase_scale(wavelength, nearest.wavelength, law).item()
             except ValueError as error:
                 raise ConfigError([f"the panel {settings.name}: {error}"]) from error
         rows.append(table)
@@ -142,6 +140,7 @@ def build_panel(settings: PanelSettings, wavelengths: Sequence[float]) -> PhaseM
 
 
 def _table(row: CalibrationSettings, bits: int) -> torch.Tensor:
+    """Phase in rad of every level, float64 [2^bits]."""
     if row.lut is None:
         return even_lut(bits, row.full_turn)
     top = 2**bits - 1
@@ -151,10 +150,10 @@ def _table(row: CalibrationSettings, bits: int) -> torch.Tensor:
             f"{row.lut[-1][0]:g}"
         )
     points = torch.tensor(row.lut, dtype=torch.float64)
-    at = torch.arange(top + 1, dtype=torch.float64)
-    upper = torch.bucketize(at, points[:, 0].contiguous()).clamp(min=1)
+    levels = torch.arange(top + 1, dtype=torch.float64)
+    upper = torch.bucketize(levels, points[:, 0].contiguous()).clamp(min=1)
     (x0, y0), (x1, y1) = points[upper - 1].T, points[upper].T
-    return checked_lut(y0 + (at - x0) / (x1 - x0) * (y1 - y0), bits)
+    return checked_lut(y0 + (levels - x0) / (x1 - x0) * (y1 - y0), bits)
 
 
 def _read_points(path: Path) -> tuple[tuple[float, float], ...]:
@@ -166,7 +165,7 @@ def _read_points(path: Path) -> tuple[tuple[float, float], ...]:
     points = []
     for number, line in enumerate(lines, 1):
         words = line.split("#")[0].replace(",", " ").split()
-        if not words or (number == 1 and words[0].isalpha()):  # a comment, or the names of the columns
+        if not words or (number == 1 and words[0].isalpha()):  # a comment, or a header of column names
             continue
         try:
             level, phase = map(float, words)
@@ -182,13 +181,12 @@ def _law(settings: DispersionSettings) -> Birefringence:
     if settings.table is not None:
         if settings.a is not None or settings.b is not None:
             raise ValueError("expected a and b, or a table, not both")
-        waves, values = zip(*settings.table, strict=True)
-        return BirefringenceTable(waves, values)
+        return BirefringenceTable(*zip(*settings.table, strict=True))
     if settings.a is None or settings.b is None:
         raise ValueError("expected both a and b, such as {a: 0.18, b: 8.5e-15}, or a table")
     return Cauchy(settings.a, settings.b)
 
 
 def described(settings: PanelSettings) -> dict[str, Any]:
-    """The description as plain data, for the report of an export."""
+    """The description as plain data for ``export.json``."""
     return settings.model_dump(mode="json", exclude_none=True)

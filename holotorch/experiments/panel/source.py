@@ -1,4 +1,4 @@
-"""What a finished run wants a panel to show: phases, and the way to the picture that they form."""
+"""Phases that a panel shows for a finished run, and the propagation to the picture that they form."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -30,17 +30,18 @@ ENCODINGS: dict[str, Callable[[Tensor], Tensor]] = {
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What a run wants a panel to show.
+class PanelPhases:
+    """Phases for a panel, and the picture that they form.
 
     Attributes:
         phase: float32 [F, C, H, W] in rad, not wrapped.
-        wavelengths: Of the C colours, in metres.
+        wavelengths: Wavelengths of the C colours in metres.
         grid: Pixels of the hologram.
-        encoding: How the phases came from a field; "phase" where the run holds phases.
-        picture: Intensity [C, ...] that fields [F, C, H, W], one after another in time, form where it is looked at.
-        losses: Relative squared error of the picture by the encoding, one per colour, with no aperture, and by the
-            kinoform; empty for phases.
+        encoding: Encoding of the field as phases; "phase" for a run whose result is phases.
+        picture: Function from fields [F, C, H, W] to the intensity [C, ...] that they form in the plane of the picture,
+            the mean over the F frames.
+        losses: Relative squared error of the picture due to the encoding and to a kinoform, without an aperture, one
+            value per colour; empty for a run whose result is phases.
     """
 
     phase: Tensor
@@ -51,8 +52,8 @@ class Wanted:
     losses: dict[str, list[float]] = field(default_factory=dict)
 
 
-def load_wanted(folder: Path, encoding: str | None = None) -> Wanted:
-    """Phases and propagation of a run folder of kind ``pec`` or ``volume``. ConfigError where it cannot be used."""
+def load_panel_phases(folder: Path, encoding: str | None = None) -> PanelPhases:
+    """Phases and propagation of a run folder of kind ``pec`` or ``volume``; ConfigError for any other folder."""
     if not (folder / "config.yaml").is_file():
         raise ConfigError([f"{folder} holds no run: config.yaml is not there"])
     if encoding is not None and encoding not in ENCODINGS:
@@ -72,7 +73,7 @@ def load_wanted(folder: Path, encoding: str | None = None) -> Wanted:
     raise ConfigError([f"{folder} holds a {settings.experiment}; only runs of kind pec and volume have a hologram"])
 
 
-def _from_pec(folder: Path, settings: PECSettings) -> Wanted:
+def _from_pec(folder: Path, settings: PECSettings) -> PanelPhases:
     from holotorch.experiments.pec.experiment import build
 
     experiment = build(settings)
@@ -86,38 +87,38 @@ def _from_pec(folder: Path, settings: PECSettings) -> Wanted:
     def picture(fields: Tensor) -> Tensor:
         device = experiment.device
         formed = [intensity(experiment.propagator(each.to(device))) for each in fields]
-        return experiment.seen(torch.stack(formed).mean(0)).cpu()
+        return experiment.picture_in(torch.stack(formed).mean(0)).cpu()
 
-    return Wanted(phase, experiment.wavelengths, experiment.grid, "phase", picture)
+    return PanelPhases(phase, experiment.wavelengths, experiment.grid, "phase", picture)
 
 
-def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> Wanted:
+def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> PanelPhases:
     height, width = (size // settings.scale for size in settings.hologram.shape)
     grid = Grid((height, width), settings.hologram.pitch)
     shape = (len(settings.wavelengths), height, width)
     hologram = _array(folder / "arrays" / "hologram.npy", shape, "(C, H, W)", "complex64")
     checks.all_finite("hologram", torch.view_as_real(hologram))
-    # Near 1, by a power of two that changes no digit: losses are of fourth power, which float32 may not hold.
+    # Scaled to about 1 by an exact power of two, as the losses contain fourth powers that may overflow float32.
     hologram = hologram * 2.0 ** -torch.frexp(hologram.abs().amax()).exponent.double().item()
     depth = _depth(folder, settings)
 
-    def views(colour: int) -> Callable[[Tensor], Tensor]:
+    def propagator(colour: int) -> Callable[[Tensor], Tensor]:
         return lambda light: refocused(light, grid, settings.wavelengths[colour], depth, tolerance=3e-3)
 
     def picture(fields: Tensor) -> Tensor:
-        return torch.stack([intensity(views(c)(fields[:, c])).mean(0) for c in range(fields.shape[1])])
+        return torch.stack([intensity(propagator(c)(fields[:, c])).mean(0) for c in range(fields.shape[1])])
 
     phase = torch.stack([ENCODINGS[encoding](each) for each in hologram])
     losses = {}
     for name, phases in ((encoding, phase), ("kinoform", kinoform(hologram))):
-        losses[name] = [encoding_loss(hologram[c], phases[c], views(c)).item() for c in range(len(hologram))]
-    return Wanted(phase[None], settings.wavelengths, grid, encoding, picture, losses)
+        losses[name] = [encoding_loss(hologram[c], phases[c], propagator(c)).item() for c in range(len(hologram))]
+    return PanelPhases(phase[None], settings.wavelengths, grid, encoding, picture, losses)
 
 
 def _check_axes(folder: Path, experiment: "PECExperiment", heaters: Tensor) -> None:
-    """ValueError if the axes of heater phases [F, C, H, W] have changed places, which no shape tells where F = C.
+    """ValueError for a phase.npy whose first two axes a user has exchanged, also where F = C.
 
-    The heating power of each colour tells it, which the run's summary holds.
+    The heating power of each colour in the run's summary identifies the order [F, C, H, W].
     """
     try:
         numbers = _summary(folder).get("methods", {}).get("corrected", {}).get("heating_power_K_per_pixel")
@@ -140,16 +141,16 @@ def _check_axes(folder: Path, experiment: "PECExperiment", heaters: Tensor) -> N
 
 
 def _depth(folder: Path, settings: VolumeSettings) -> float:
-    """The middle one of the depths at which the run's report looks."""
+    """The middle one of the depths in the report of the run."""
     try:
         depths = _summary(folder).get("refocused_m") or [settings.hologram.distance / settings.scale]
         return checks.finite("refocused_m", depths[len(depths) // 2], "metres")
     except (ValueError, AttributeError, TypeError, LookupError):
-        raise ValueError("summary.json is damaged: it does not say at which depths the run has looked") from None
+        raise ValueError("summary.json is damaged: it does not say at which depths the run was refocused") from None
 
 
 def _summary(folder: Path) -> dict[str, Any]:
-    """What the run says of itself; empty before it has ended."""
+    """Summary of a complete or interrupted run; empty for a run without either."""
     for name in ("summary.json", "interrupted.json"):
         if (folder / name).is_file():
             return read_json(folder / name)
@@ -157,14 +158,15 @@ def _summary(folder: Path) -> dict[str, Any]:
 
 
 def _array(path: Path, shape: tuple[int, ...], axes: str, dtype: str) -> Tensor:
+    """An array of the run; ValueError if it is missing, damaged or of another shape or dtype."""
     if not path.is_file():
-        raise ValueError(f"{path.name} is not in its arrays; the run has not come so far: holotorch resume")
+        raise ValueError(f"{path.name} is not in its arrays; finish the run first: holotorch resume")
     try:
-        found = np.load(path, mmap_mode="r", allow_pickle=False)  # which compares sizes before it takes memory
-        stated = found.shape, str(found.dtype)
-    except Exception as error:  # what damaged bytes raise is anyone's guess
+        values = np.load(path, mmap_mode="r", allow_pickle=False)  # a memory map checks the size before it allocates
+        stated = values.shape, str(values.dtype)
+    except Exception as error:  # damaged bytes may raise any exception
         raise ValueError(f"{path.name} cannot be read: {error}") from None
     if stated != (shape, dtype):
         wanted = f"the shape {axes} = {shape} of its configuration in {dtype}"
         raise ValueError(f"{path.name} must have {wanted}, got {stated[0]} in {stated[1]}")
-    return torch.from_numpy(found.copy())
+    return torch.from_numpy(values.copy())

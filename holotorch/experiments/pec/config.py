@@ -1,4 +1,4 @@
-"""What the configuration of a proximity effect correction may say."""
+"""Settings of a configuration of kind ``pec``, proximity effect correction."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -36,16 +36,19 @@ def _is_picture(value: str) -> bool:
 
 
 Picture = Annotated[str, existing(_is_picture, no_such_picture)]
-# "hot": phases uniform on [0, 2 pi); "cool": their spread is; "flat": on [0, 1); "quadratic": a lens, after spreading;
-# "retrieved": phases of Gerchberg-Saxton, deconvolved.
+# The heater phases at which the solver starts; plan.py describes each of them.
 Start = Literal["hot", "cool", "flat", "quadratic", "retrieved"]
+SIGMA_MEANING = (
+    "a pixel heated alone warms one d px away by exp(-d^2/sigma^2) of its own rise; sigma is the usual Gaussian sigma "
+    "times sqrt 2"
+)
 
 
 class PeripheralWeightSettings(Settings):
-    """Squared errors weighed by what the eye can use of them: (1 + E / e2_deg)^-2 at the eccentricity E.
+    """Weight of the squared error that falls with the eccentricity E as visual acuity does: (1 + E / e2_deg)^-2.
 
-    ``field_deg``: what the picture spans from left to right, at equal angles per pixel; ``gaze_deg``: elevation and
-    azimuth of the point that is looked at; ``least``: lower limit, relative to the weight at that point.
+    ``field_deg``: angle that the picture spans from left to right, at equal angles per pixel; ``gaze_deg``: elevation
+    and azimuth of the gaze; ``least``: lower limit of the weight, relative to that at the gaze.
     """
 
     kind: Literal["peripheral"]
@@ -56,12 +59,12 @@ class PeripheralWeightSettings(Settings):
 
 
 class TargetSettings(Settings):
-    """A bundled photograph or a picture file, and how it is brought to the grid's aspect, or to that of a region of it.
+    """A bundled photograph or a picture file, cropped or padded to the aspect ratio of the grid or of a region of it.
 
-    ``region``: size in pixels of the middle of the image in which the picture is wanted; the rest is free (thesis
-    Eqs. 4.7, 4.8). ``depths``: with several distances, ``bands`` puts as many vertical bands of the picture in focus,
-    one at each, and leaves them free elsewhere; ``full`` wants the whole picture at every distance. ``weight``: how
-    much an error counts where.
+    ``region``: size in pixels of the middle part of the image that shows the picture; the rest of the image is free
+    (thesis Eqs. 4.7, 4.8). ``depths``: with several distances, ``bands`` divides the picture into as many vertical
+    bands, each of which is wanted at one distance only; ``full`` wants the whole picture at every distance.
+    ``weight``: weight of the squared error over the picture.
     """
 
     image: Picture
@@ -72,14 +75,15 @@ class TargetSettings(Settings):
 
 
 class ModulatorSettings(Settings):
-    """The phased array: width of the heat kernel in pixels, number of taps (chosen from the width if not given).
+    """The phased array and the heat that spreads between its pixels.
 
-    ``max_phase``: limit in rad on the phase after spreading, which the hottest pixel never passes (4 pi is 700 degC at
-    630 nm); no limit is the thesis's model. ``bits``: resolution of the heaters, between 0 and their largest phase.
-    ``power_weight``: of the sum of the heater phases in the loss, whose other part is a squared error of the image.
+    ``sigma_px``: width of the heat kernel. ``kernel_size``: its number of taps, by default as many as the width needs.
+    ``max_phase``: limit in rad on the phase after spreading, also of the hottest pixel (4 pi is 700 degC at 630 nm);
+    the thesis has no limit. ``bits``: resolution of the heaters, whose levels are even between 0 and the largest phase.
+    ``power_weight``: weight of the sum of the heater phases, which is added to the squared error of the image.
     """
 
-    sigma_px: Annotated[Number, plausible(SIGMA_PX)]
+    sigma_px: Annotated[Number, plausible(SIGMA_PX), Field(description=SIGMA_MEANING)]
     kernel_size: Annotated[Count, Field(le=401)] | None = None
     max_phase: Annotated[Number, Field(ge=0.1, le=1000)] | None = None
     bits: Annotated[Count, Field(le=16)] | None = None
@@ -87,13 +91,13 @@ class ModulatorSettings(Settings):
 
 
 class FraunhoferSettings(Settings):
-    """Image in the far field."""
+    """An image in the far field."""
 
     kind: Literal["fraunhofer"]
 
 
 class NearFieldSettings(Settings):
-    """Image at one distance or more. ``isolated``: the array stands alone; ``periodic``: it repeats (the thesis)."""
+    """An image at one or more distances, of a single array (``isolated``) or of its periodic repetition (thesis)."""
 
     kind: Literal["fresnel", "angular_spectrum"]
     distance: Annotated[
@@ -128,7 +132,7 @@ class AdamSettings(Settings):
 
 
 class LBFGSSettings(Settings):
-    """Preconditioned L-BFGS, in stages: the amplitude's loss first, and a limit on the heat by penalties."""
+    """Preconditioned L-BFGS in stages: first the loss of the amplitude, then that of the intensity and of a limit."""
 
     kind: Literal["lbfgs"]
     memory: Annotated[Count, Field(le=100)] = 3
@@ -138,12 +142,12 @@ class LBFGSSettings(Settings):
     start: Start | None = None
 
 
-# "unweighted": the run's own solver without target.weight.
+# Methods to compare with; "unweighted" is the solver of the run without target.weight.
 Baseline = Literal["none", "basic_ipec", "ipec", "chopping", "shifting", "nonnegative", "unweighted"]
 
 
 class ReportSettings(Settings):
-    """What is measured and compared in the report."""
+    """Metrics of the report, and the methods that the corrected hologram is compared with."""
 
     metrics: Annotated[tuple[Literal["ssim", "psnr"], ...], BeforeValidator(several), Field(min_length=1)] = (
         "ssim",
@@ -170,43 +174,49 @@ class PECSettings(Settings):
 
 
 def contradictions(settings: PECSettings) -> list[tuple[Key, str]]:
-    """Settings that are fine one by one and not together."""
-    found: list[tuple[Key, str]] = []
+    """Settings that are valid one by one but contradict each other: the key and the message for each."""
+    mistakes: list[tuple[Key, str]] = []
     smallest = min(settings.grid.shape)
     if len(settings.wavelengths) not in (1, 3):
-        found.append((("wavelengths",), f"expected 1 (grey) or 3 (red, green, blue), got {len(settings.wavelengths)}"))
+        mistakes.append(
+            (("wavelengths",), f"expected 1 (grey) or 3 (red, green, blue), got {len(settings.wavelengths)}")
+        )
     if "ssim" in settings.report.metrics and smallest < 11:
         hint = "use a larger grid, or report.metrics: [psnr]"
-        found.append((("grid", "shape"), f"expected at least 11 x 11 px for ssim, got {settings.grid.shape}; {hint}"))
+        mistakes.append(
+            (("grid", "shape"), f"expected at least 11 x 11 px for ssim, got {settings.grid.shape}; {hint}")
+        )
     size = settings.modulator.kernel_size
     if size is not None and size % 2 == 0:
-        found.append((("modulator", "kernel_size"), f"expected an odd number of taps, got {size}; use {size + 1}"))
+        mistakes.append((("modulator", "kernel_size"), f"expected an odd number of taps, got {size}; use {size + 1}"))
     elif size is not None and size > smallest:
         key = ("modulator", "kernel_size")
-        found.append((key, f"expected at most {smallest}, the smaller side of the grid, got {size}"))
+        mistakes.append((key, f"expected at most {smallest}, the smaller side of the grid, got {size}"))
     light, finest, longest = settings.propagator, min(settings.grid.pitch), max(settings.wavelengths, default=0.0)
     if isinstance(light, NearFieldSettings) and finest < 0.9 * longest:
         least = f"at least 0.9 of the longest wavelength, {0.9 * longest:.3g} m, for an image at a distance"
-        found.append((("grid", "pitch"), f"expected {least}, got {finest:g} m"))
+        mistakes.append((("grid", "pitch"), f"expected {least}, got {finest:g} m"))
     smaller = settings.target.region
     if smaller and (smaller[0] > settings.grid.shape[0] or smaller[1] > settings.grid.shape[1]):
-        found.append((("target", "region"), f"expected at most the grid, {settings.grid.shape}, got {smaller}"))
+        mistakes.append((("target", "region"), f"expected at most the grid, {settings.grid.shape}, got {smaller}"))
     if smaller and "ssim" in settings.report.metrics and min(smaller) < 11:
-        found.append((("target", "region"), f"expected at least 11 x 11 px for ssim, got {smaller}"))
+        mistakes.append((("target", "region"), f"expected at least 11 x 11 px for ssim, got {smaller}"))
     limit = settings.modulator.max_phase
     if limit is not None and settings.solver.kind != "lbfgs":
         hint = "'solver={kind: lbfgs}'"
-        found.append((("modulator", "max_phase"), f"only the solver lbfgs keeps a limit; use {hint}, or leave it out"))
+        mistakes.append(
+            (("modulator", "max_phase"), f"only the solver lbfgs keeps a limit; use {hint}, or leave it out")
+        )
     several = isinstance(light, NearFieldSettings) and len(light.distance) > 1
     if several and smaller:
-        found.append((("target", "region"), "expected one distance beside a region"))
+        mistakes.append((("target", "region"), "expected one distance beside a region"))
     if settings.target.weight and (several or smaller):
-        found.append((("target", "weight"), "expected one distance and no region beside a weight"))
+        mistakes.append((("target", "weight"), "expected one distance and no region beside a weight"))
     if settings.target.weight:
         rows, columns = settings.grid.shape
         if (high := settings.target.weight.field_deg * rows / columns) > 360:
             field = f"expected a picture of at most 360 deg in height as well, got {high:g}"
-            found.append((("target", "weight", "field_deg"), field))
+            mistakes.append((("target", "weight", "field_deg"), field))
     if "unweighted" in settings.report.baselines and not settings.target.weight:
-        found.append((("report", "baselines"), "unweighted asks for a target.weight that can be left out"))
-    return found
+        mistakes.append((("report", "baselines"), "unweighted asks for a target.weight that can be left out"))
+    return mistakes

@@ -1,4 +1,4 @@
-"""The proximity-effect experiment: a configuration made into operators, and its solution."""
+"""PECExperiment: the operators, the target and the solver that a configuration of kind ``pec`` describes."""
 
 import math
 import warnings
@@ -20,10 +20,10 @@ from holotorch.correction import (
     ProjectedAdam,
     Solution,
     Stage,
-    below,
     deconvolve,
     gerchberg_saxton,
-    limited,
+    limit_peak_phase,
+    penalty_schedule,
     run_stages,
     spread_preconditioner,
 )
@@ -41,15 +41,18 @@ Progress = Callable[[Solution], None]
 
 @dataclass(frozen=True)
 class PECExperiment:
-    """A configuration made into operators. Colours in which the picture is black are left dark and not solved for.
+    """The operators, the target and the solver of a configuration.
+
+    Colours in which the picture is black are not lit and not solved for; C below counts the lit ones if not said
+    otherwise.
 
     Attributes:
         settings: The configuration.
         source: The picture as loaded, float64 [C', h, w].
-        lit: Which colours are not black, [C].
+        lit: Which of all colours are not black.
         array: The phased array, over the lit colours.
-        start: Where the solver starts.
-        device: Where it runs.
+        start: Kind of the phases at the start, as in ``solver.start``.
+        device: Device of the solver.
     """
 
     settings: PECSettings
@@ -66,65 +69,65 @@ class PECExperiment:
 
     @property
     def wavelengths(self) -> tuple[float, ...]:
-        """Of the colours that are lit, in metres."""
+        """Wavelengths of the lit colours in metres."""
         return self.array.wavelengths
 
     @property
     def distances(self) -> tuple[float, ...]:
-        """Of the image, in metres; none in the far field."""
+        """Distances of the image in metres; none in the far field."""
         light = self.settings.propagator
         return light.distance if isinstance(light, NearFieldSettings) else ()
 
     @property
     def isolated(self) -> bool:
-        """Whether the array stands alone at a distance, and light may leave the window."""
+        """Whether the model is a single chip with an image at a distance, where light may leave the window."""
         light = self.settings.propagator
         return isinstance(light, NearFieldSettings) and light.boundary == "isolated"
 
     @property
     def scale_free(self) -> bool:
-        """Whether light may leave the picture, so that only the best scale can be compared."""
+        """Whether light may leave the picture, so that the image is compared at its best scale."""
         return self.isolated or self.settings.target.region is not None
 
     @property
     def joint(self) -> bool:
-        """Whether several frames share one image and are solved for together."""
+        """Whether several frames share one image and one loss."""
         return self.settings.frames > 1 and self.settings.multiplexing == "joint"
 
     @cached_property
     def image(self) -> Tensor:
-        """The picture on its samples, float64 [C, H, W]; resampled when first used, so that a plan needs no memory."""
+        """The picture resampled to its pixels, float64 [all colours, H, W]; computed on first use, not for a plan."""
         settings = self.settings
         fitted = fit_image(self.source, settings.target.region or settings.grid.shape, settings.target.fit)
         return with_channels(fitted, len(settings.wavelengths)).contiguous()
 
     @property
     def wanted(self) -> Tensor:
-        """The intensity of the lit colours in the picture, mean 1 each, float64 [C, H, W]."""
+        """Intensity of the lit colours of the picture, scaled to mean 1 each, float64 [C, H, W]."""
         image = self.image[self.lit]
         return image / image.mean((-2, -1), keepdim=True)
 
     @property
     def target(self) -> Tensor:
-        """The same where the propagator puts it: in the middle of the grid, or at each distance, [C, *image]."""
+        """Wanted intensity [C, *image]: the picture in the middle of the grid, or at each of several distances."""
         wanted = self.wanted
         if region := self.settings.target.region:
             whole = wanted.new_zeros(len(wanted), *self.grid.shape)
             whole[self.window] = wanted
-            # Half of the light in the region is what such holograms reach; the scale is free.
+            # A region holds about half of the light of such holograms. The scale of the image is free.
             return whole * (math.prod(self.grid.shape) / math.prod(region) / 2)
         return wanted[:, None].repeat(1, len(self.distances), 1, 1) if len(self.distances) > 1 else wanted
 
     @property
     def window(self) -> tuple[Any, ...]:
-        """Where the picture lies in [..., H, W]."""
+        """Index of the picture in a tensor [..., H, W] on the grid."""
         size = self.settings.target.region or self.grid.shape
         begin = [whole // 2 - part // 2 for whole, part in zip(self.grid.shape, size, strict=True)]
         return (..., slice(begin[0], begin[0] + size[0]), slice(begin[1], begin[1] + size[1]))
 
     @property
     def mask(self) -> Tensor | None:
-        """1 where the target is to be met, float64, broadcasting to it; None for everywhere."""
+        """1 where the image is compared with the target, else 0, float64, broadcasts to the target; None for all 1."""
         depths, width = len(self.distances), self.grid.shape[1]
         if self.settings.target.region:
             mask = torch.zeros(1, *self.grid.shape, dtype=torch.float64)
@@ -139,19 +142,19 @@ class PECExperiment:
 
     @property
     def weights(self) -> Tensor | None:
-        """What multiplies the error: the mask, and the root of the weight of its square. None for 1 everywhere."""
+        """Factor on the error: the mask, or the square root of ``target.weight``. None for 1 everywhere."""
         if self.settings.target.weight is None:
             return self.mask
         return weight_map(self.settings.target.weight, self.grid.shape).sqrt()[None]
 
     @property
     def unweighted(self) -> "PECExperiment":
-        """The same work with all errors alike."""
+        """This experiment without ``target.weight``."""
         target = self.settings.target.model_copy(update={"weight": None})
         return replace(self, settings=self.settings.model_copy(update={"target": target}))
 
-    def seen(self, formed: Tensor) -> Tensor:
-        """The picture in an intensity [..., C, *image]: its region, or what is in focus, [..., C, h, w]."""
+    def picture_in(self, formed: Tensor) -> Tensor:
+        """The picture [..., C, h, w] in an intensity [..., C, *image]: its region, or the bands that are in focus."""
         if len(self.distances) < 2:
             return formed[self.window]
         mask = self.mask
@@ -159,7 +162,7 @@ class PECExperiment:
 
     @cached_property
     def propagator(self) -> SpectralFilter | Fraunhofer | DepthStack:
-        """From the array to the image. Built when first used: its kernel is the first large allocation."""
+        """Propagator from the array to the image; built on first use, as its kernel is the first large allocation."""
         if not self.distances:
             return Fraunhofer(self.grid, self.wavelengths).to(self.device)
         filters = [self._to_distance(distance).to(self.device) for distance in self.distances]
@@ -169,7 +172,7 @@ class PECExperiment:
         paraxial = self.settings.propagator.kind == "fresnel"
         if self.isolated:
             return CroppedKernel(self.grid, self.wavelengths, distance, paraxial=paraxial)
-        with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the plan says the same
+        with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the plan's notes contain it
             if paraxial:
                 return Fresnel(self.grid, self.wavelengths, distance, pad=1)
             return AngularSpectrum(self.grid, self.wavelengths, distance, pad=1, band_limit=False)
@@ -189,57 +192,53 @@ class PECExperiment:
             **options,
         )
 
-    def formed(self, phase: Tensor) -> Tensor:
-        """Mean intensity of frames of heater phases [F, C, H, W] of the lit colours, [C, *image]."""
-        # One frame at a time: a stack of float64 fields at several depths is large.
+    def intensity(self, phase: Tensor) -> Tensor:
+        """Mean intensity [C, *image] of the frames of heater phases [F, C, H, W]."""
+        # One frame at a time, since float64 fields at several depths take much memory.
         return torch.stack([intensity(self.propagator(self.array(each))) for each in phase]).mean(0)
 
     def start_phase(self) -> Tensor:
-        """The unknown at the start, float32 over the lit colours, the same numbers on every device.
+        """Heater phases at the start, float32 [C, H, W], or [F, C, H, W] for several frames; the same on every device.
 
-        [C, H, W]; [C, F, H, W] for joint frames, [F, C, H, W] for independent ones.
+        The random numbers of joint frames are drawn colour by colour, those of independent frames frame by frame.
         """
         generator = torch.Generator().manual_seed(self.settings.seed)
-        shape, frames = [len(self.wavelengths), *self.grid.shape], self.settings.frames
-        if frames > 1:
-            shape.insert(1 if self.joint else 0, frames)
-        uniform = torch.rand(shape, generator=generator).to(self.device)
+        colours, frames, side = len(self.wavelengths), self.settings.frames, self.grid.shape
+        if self.joint:
+            uniform = torch.rand(colours, frames, *side, generator=generator).movedim(1, 0).contiguous()
+        else:
+            uniform = torch.rand(*[frames] * (frames > 1), colours, *side, generator=generator)
+        uniform = uniform.to(self.device)
         spread = self.array.crosstalk.total
         if self.start == "quadratic":
             (y, x), (height, width) = self.grid.coordinates(self.device), self.grid.shape
             y, x = y / self.grid.pitch[0], x / self.grid.pitch[1]
-            lens = math.pi * (y.square() / height + x.square() / width)  # its slope at the edge is pi per pixel
+            lens = math.pi * (y.square() / height + x.square() / width)  # with a slope of pi per pixel at the edge
             return (lens / spread + 0.01 * uniform).to(uniform.dtype)
         if self.start == "retrieved":
             return self._retrieved(2 * math.pi * uniform)
         return uniform * {"hot": 2 * math.pi, "cool": 2 * math.pi / spread, "flat": 1.0}[self.start]
 
     def _retrieved(self, begin: Tensor) -> Tensor:
-        """Phases of 30 passes of Gerchberg-Saxton from random image phases, deconvolved, shaped as ``begin``."""
+        """Phases of 30 passes of Gerchberg-Saxton from the image phases ``begin``, deconvolved."""
         propagator = self.propagator
         if isinstance(propagator, DepthStack):
             raise ValueError("a retrieved start needs one distance; use another solver.start")
-        frames = begin.movedim(1, 0) if self.joint else begin
         mask = None if self.mask is None else self.mask.to(begin)
-        found = gerchberg_saxton(propagator, self.target.to(begin), frames, max_steps=30, mask=mask)
-        phase = deconvolve(self.array.crosstalk, found.x, max_steps=100)
-        return phase.movedim(0, 1).contiguous() if self.joint else phase
+        retrieved = gerchberg_saxton(propagator, self.target.to(begin), begin, max_steps=30, mask=mask).x
+        return deconvolve(self.array.crosstalk, retrieved, max_steps=100)
 
-    def frames_of(self, unknown: Tensor) -> Tensor:
-        """Heater phases [F, C, H, W] of the solver's unknown, within the limit and in the heaters' steps."""
-        phase = unknown.detach()
-        if self.joint:
-            phase = phase.movedim(-3, 0)
-        elif self.settings.frames == 1:
-            phase = phase[None]
+    def heater_phases(self, solution: Tensor) -> Tensor:
+        """Phases [F, C, H, W] for the heaters: the solver's result on their levels and scaled to keep the limit."""
+        phase = solution.detach() if self.settings.frames > 1 else solution.detach()[None]
         limit, bits = self.settings.modulator.max_phase, self.settings.modulator.bits
         if bits is not None:
             phase = quantised(phase, bits)
-        # Last: rounding to the heaters' steps may pass the limit, scaling them all keeps their number.
-        return phase if limit is None else below(limit, phase, self.array.crosstalk)
+        # After the rounding to levels, which may exceed the limit. A common scale keeps the number of levels.
+        return phase if limit is None else limit_peak_phase(limit, phase, self.array.crosstalk)
 
     def stages(self) -> list[Stage]:
-        """What the configured solver does, one run after another."""
+        """The runs of the configured solver, one after another."""
         solver = self.settings.solver
         rule = {"max_steps": solver.max_steps, "tolerance": solver.tolerance, "patience": solver.patience}
         if isinstance(solver, APGSettings):
@@ -248,10 +247,10 @@ class PECExperiment:
             return [Stage(self.problem(), ProjectedAdam(solver.learning_rate, **rule))]
         crosstalk = self.array.crosstalk
         method = LBFGS(solver.memory, spread_preconditioner(crosstalk.kernel), **rule)
-        return limited(self.problem, method, crosstalk.total, self.settings.modulator.max_phase)
+        return penalty_schedule(self.problem, method, crosstalk.total, self.settings.modulator.max_phase)
 
     def solve(self, progress: Progress | None = None, resume: State | None = None) -> Solution:
-        """Run the configured solver on the lit colours. ConfigError where it cannot start."""
+        """Run the configured solver on the lit colours. ConfigError if it cannot start."""
         try:
             return run_stages(self.stages(), self.start_phase(), callback=progress, resume=resume)
         except ValueError as error:
@@ -259,7 +258,7 @@ class PECExperiment:
 
 
 def build(settings: PECSettings) -> PECExperiment:
-    """Load the picture and choose what the configuration leaves open. ConfigError for what cannot be shown."""
+    """Load the picture, and choose the settings that the configuration leaves open. ConfigError for a bad picture."""
     shape = settings.target.region or settings.grid.shape
     try:
         source = load_image(settings.target.image)
@@ -269,15 +268,15 @@ def build(settings: PECSettings) -> PECExperiment:
         raise ConfigError([f"target.image: {error}"]) from error
     if not lit.any():
         raise ConfigError([f"target.image: {settings.target.image} is black inside its crop; use target.fit: pad"])
-    waves = [wave for wave, on in zip(settings.wavelengths, lit.tolist(), strict=True) if on]
-    array = PhasedArray(waves, ThermalCrosstalk(settings.modulator.sigma_px, settings.modulator.kernel_size))
+    wavelengths = [length for length, on in zip(settings.wavelengths, lit.tolist(), strict=True) if on]
+    array = PhasedArray(wavelengths, ThermalCrosstalk(settings.modulator.sigma_px, settings.modulator.kernel_size))
     start = settings.solver.start or _start_for(settings)
     return PECExperiment(settings, source, lit, array, start, _device(settings.device))
 
 
 def _start_for(settings: PECSettings) -> str:
-    # From hot phases the isolated chip sends most of the light past the window: at 128 px and sigma 0.66 it ends at 4
-    # to 25 % of the light and SSIM 0.5 to 0.75, from nearly flat ones at half of it and 0.9.
+    # From a hot start most of the light of an isolated chip misses the window: at 128 px and sigma 0.66 the result has
+    # 4 to 25 % of the light and an SSIM of 0.5 to 0.75. From a flat start it has half of the light and an SSIM of 0.9.
     light = settings.propagator
     return "flat" if isinstance(light, NearFieldSettings) and light.boundary == "isolated" else "hot"
 

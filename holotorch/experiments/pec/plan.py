@@ -1,25 +1,33 @@
-"""What a run will do, what it will cost and what its physics says, before it starts."""
+"""Plan of a run: its choices with their reasons, its cost, and the physics of its setup."""
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from holotorch.core.grid import Grid
 from holotorch.experiments.pec.baselines import PASSES
-from holotorch.experiments.pec.config import NearFieldSettings
+from holotorch.experiments.pec.config import SIGMA_MEANING, NearFieldSettings
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.optics import diffraction_angle, plan_propagation, unaliased_distance
 
-# Seconds of one evaluation per pixel, and per padded sample times log2 of their number, on two CPU cores. Measured at
-# 128 to 1024 px and within a factor of 2 there on an idle machine; the printed time is a guide.
-_PIXEL_SECONDS, _FFT_SECONDS = 8e-9, 0.8e-9
-# Measured on the same runs, within 30 %: the interpreter with its libraries; per pixel; per padded sample of the
-# solver; per sample of the judge's grid of one colour.
-_BASE_BYTES, _PIXEL_BYTES, _SOLVER_BYTES, _JUDGE_BYTES = 450e6, 240, 60, 112
+
+@dataclass(frozen=True)
+class _Cost:
+    """Seconds of one evaluation on two CPU cores, and bytes, measured in runs of 128 to 1024 px.
+
+    The predicted seconds are right within a factor of 2 on an idle machine, the predicted bytes within 30 %.
+    """
+
+    pixel_s: float = 8e-9  # per pixel, colour and frame
+    fft_s: float = 0.8e-9  # per padded sample, times log2 of their number
+    base_bytes: float = 450e6  # the interpreter with its libraries
+    pixel_bytes: int = 240  # per pixel, colour and frame
+    solver_bytes: int = 60  # per padded sample of the solver
+    evaluation_bytes: int = 112  # per sample of the grid of one colour in the float64 evaluation
 
 
 def plan_values(experiment: PECExperiment) -> dict[str, Any]:
-    """Choices with their reasons, cost and physics, as plain JSON values."""
+    """Choices with their reasons, cost and physics, as values of plan.json."""
     settings, light, grid = experiment.settings, experiment.settings.propagator, experiment.grid
     padded = grid.padded(2 if experiment.isolated else 1)
     pixels = len(experiment.wavelengths) * math.prod(grid.shape) * settings.frames
@@ -27,8 +35,10 @@ def plan_values(experiment: PECExperiment) -> dict[str, Any]:
     samples *= max(1, (1 + len(experiment.distances)) // 2)
     evaluations = (2 if settings.solver.kind == "apg" else 1) * settings.solver.max_steps
     work = evaluations + PASSES / settings.frames * len(settings.report.baselines)
-    seconds = work * (_PIXEL_SECONDS * pixels + _FFT_SECONDS * samples * math.log2(max(2, samples)))
-    judge = 16 * samples + _JUDGE_BYTES * 5 * math.prod(grid.shape) if isinstance(light, NearFieldSettings) else 0
+    cost, final = _Cost(), 0
+    seconds = work * (cost.pixel_s * pixels + cost.fft_s * samples * math.log2(max(2, samples)))
+    if isinstance(light, NearFieldSettings):  # bytes of the evaluation after the solver
+        final = 16 * samples + cost.evaluation_bytes * 5 * math.prod(grid.shape)
     single = {}
     if experiment.isolated and isinstance(light, NearFieldSettings):
         single = {"single_propagation": asdict(plan_propagation(grid, experiment.wavelengths, list(light.distance)))}
@@ -38,33 +48,42 @@ def plan_values(experiment: PECExperiment) -> dict[str, Any]:
         "propagator": light.kind,
         "padding": {"samples": list(padded.shape), "reason": _padding_reason(experiment)},
         **single,
-        "crosstalk": {"taps": crosstalk.kernel.shape[0], "lost_heat": crosstalk.lost_heat, "reason": size_rule},
+        "crosstalk": {
+            "sigma_px": settings.modulator.sigma_px,
+            "meaning": SIGMA_MEANING,
+            "taps": crosstalk.kernel.shape[0],
+            "lost_heat": crosstalk.lost_heat,
+            "reason": size_rule,
+        },
         "heat": _heat(experiment),
         "frames": settings.frames,
         "start": {"kind": experiment.start, "reason": _START_REASONS[experiment.start]},
         "loss": "intensity"
         + (" at its best scale, since light may leave the picture" if experiment.scale_free else ""),
         "device": str(experiment.device),
-        "precision": "complex64 in the solver, complex128 in the judge",
+        "precision": "complex64 in the solver, complex128 in the evaluation",
         "predicted_evaluations": evaluations,
         "predicted_seconds": round(seconds, 2),
-        "predicted_peak_bytes": round(_BASE_BYTES + _PIXEL_BYTES * pixels + max(_SOLVER_BYTES * samples, judge)),
+        "predicted_peak_bytes": round(
+            cost.base_bytes + cost.pixel_bytes * pixels + max(cost.solver_bytes * samples, final)
+        ),
         "physics": _physics(experiment, grid),
         "notes": _notes(experiment, grid),
     }
 
 
 def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
-    """The plan in words for a display engineer."""
+    """The plan as text for ``holotorch check`` and ``holotorch run``."""
     settings, physics, crosstalk = experiment.settings, values["physics"], values["crosstalk"]
     height, width = settings.grid.shape
     colours = "colour" if len(experiment.lit) == 3 else "grey"
-    waves = ", ".join(f"{wave * 1e9:.4g} nm" for wave in experiment.wavelengths)
+    wavelengths = ", ".join(f"{wavelength * 1e9:.4g} nm" for wavelength in experiment.wavelengths)
     lines = [
         f"Picture    {settings.target.image}, {colours}, on {height} x {width} px",
-        f"Array      {physics['width_mm']:.4g} x {physics['height_mm']:.4g} mm (width x height); heat spreads with "
-        f"sigma {settings.modulator.sigma_px:g} px over {crosstalk['taps']} taps ({crosstalk['reason']})",
-        f"Light      {waves}; field of view {_listed(physics['field_of_view_deg'], '.2f')} deg across",
+        f"Array      {physics['width_mm']:.4g} x {physics['height_mm']:.4g} mm (width x height)",
+        f"Crosstalk  heat spreads with sigma {settings.modulator.sigma_px:g} px over {crosstalk['taps']} taps "
+        f"({crosstalk['reason']}): {SIGMA_MEANING}",
+        f"Light      {wavelengths}; field of view {_listed(physics['field_of_view_deg'], '.2f')} deg across",
         f"Propagator {values['propagator']}, {values['padding']['reason']}",
     ]
     if "distance_mm" in physics:
@@ -98,11 +117,11 @@ def plan_text(experiment: PECExperiment, values: dict[str, Any]) -> str:
 
 
 _START_REASONS = {
-    "hot": "phases uniform on [0, 2 pi): light everywhere",
-    "flat": "phases uniform on [0, 1): a nearly plane wave keeps its light in the window",
-    "cool": "spread phases uniform on [0, 2 pi): the least heat",
-    "retrieved": "phases of Gerchberg-Saxton, deconvolved",
-    "quadratic": "a lens after spreading, slope pi per pixel at the edge: much heat, few vortices",
+    "hot": "random heater phases, uniform on [0, 2 pi): the light covers the whole image",
+    "flat": "random heater phases, uniform on [0, 1): a nearly plane wave, whose light stays in the window",
+    "cool": "random heater phases, so small that no phase after spreading exceeds 2 pi: little heat",
+    "retrieved": "phases of Gerchberg-Saxton phase retrieval, deconvolved",
+    "quadratic": "the phase of a lens after spreading, slope pi per pixel at the edge: much heat, few phase vortices",
 }
 
 
@@ -111,7 +130,7 @@ def _listed(values: list[float], form: str = ".3g") -> str:
 
 
 def _heat(experiment: PECExperiment) -> str:
-    """The limit on the temperature, or that there is none, in words."""
+    """Text about the limit on the temperature and the resolution of the heaters."""
     limit, bits = experiment.settings.modulator.max_phase, experiment.settings.modulator.bits
     steps = "" if bits is None else f"; heaters with {2**bits} steps"
     if limit is None:
@@ -122,68 +141,69 @@ def _heat(experiment: PECExperiment) -> str:
 
 def _padding_reason(experiment: PECExperiment) -> str:
     if experiment.isolated:
-        return "a chip that stands alone: its exact kernel on twice the window, nothing wraps around"
+        return "a chip that stands alone: its exact kernel on twice the window, so that no light wraps around"
     if isinstance(experiment.settings.propagator, NearFieldSettings):
         return "unpadded: the periodic model of the thesis"
     return "unpadded: the far field of the array, sampled once per pixel"
 
 
 def _notes(experiment: PECExperiment, grid: Grid) -> list[str]:
-    """Where the model stops being valid, in words."""
-    found = []
+    """Warnings about the limits of the model."""
+    notes = []
     light, longest = experiment.settings.propagator, max(experiment.wavelengths)
     if isinstance(light, NearFieldSettings):
         limit, farthest = unaliased_distance(grid, longest, 1), max(map(abs, light.distance))
         if min(light.distance) < 0:
-            found.append("a distance is negative: that image is virtual, behind the array as seen from the observer")
+            notes.append("a distance is negative: that image is virtual, behind the array as seen from the observer")
         if not experiment.isolated:
-            found.append(
+            notes.append(
                 "periodic boundary: the array repeats without end, as in the thesis; a single chip forms another "
                 "picture, shown and scored beside it as 'isolated'"
             )
             if farthest > limit:
-                found.append(
+                notes.append(
                     f"the periodic kernel is undersampled beyond {limit * 1e3:.3g} mm at {longest * 1e9:.0f} nm; at "
                     f"{farthest * 1e3:.4g} mm this model aliases"
                 )
         spot = longest * farthest / min(grid.extent)
         if spot > 1.5 * max(grid.pitch):
-            found.append(
+            notes.append(
                 f"the array resolves {spot * 1e6:.3g} um at this distance, {spot / max(grid.pitch):.1f} samples: finer "
                 "detail of the picture cannot be formed"
             )
     elif len(experiment.wavelengths) > 1:
-        found.append(
+        notes.append(
             "each colour has its own field of view and is shown here sample by sample; on a display the shorter "
             "wavelengths' pictures are smaller and the targets must be scaled to overlap"
         )
     lost = experiment.array.crosstalk.lost_heat
     if lost > 0.01:
-        found.append(f"{100 * lost:.1f} % of the heat falls outside the kernel's taps; leave modulator.kernel_size out")
+        notes.append(f"{100 * lost:.1f} % of the heat falls outside the kernel's taps; leave modulator.kernel_size out")
     dark = [i for i, on in enumerate(experiment.lit.tolist()) if not on]
     if dark:
-        found.append(f"colour {', '.join(map(str, dark))} of the picture is black: its light source stays off")
+        notes.append(f"colour {', '.join(map(str, dark))} of the picture is black: its light source stays off")
     if experiment.source.mean() < 0.02:
-        found.append(
+        notes.append(
             "the picture is very dark: SSIM and PSNR, which compare with full white, are near their best anyway"
         )
-    return found
+    return notes
 
 
 def _physics(experiment: PECExperiment, grid: Grid) -> dict[str, Any]:
-    light, waves = experiment.settings.propagator, experiment.wavelengths
+    """Sizes, angles and distances of the setup, as values of plan.json."""
+    light, wavelengths = experiment.settings.propagator, experiment.wavelengths
     values: dict[str, Any] = {
         "height_mm": grid.extent[0] * 1e3,
         "width_mm": grid.extent[1] * 1e3,
         "pitch_um": [step * 1e6 for step in grid.pitch],
-        "field_of_view_deg": [2 * math.degrees(diffraction_angle(grid, wave)[1]) for wave in waves],
+        "field_of_view_deg": [2 * math.degrees(diffraction_angle(grid, each)[1]) for each in wavelengths],
         "phase_response_rad_per_K": list(experiment.array.response),
         "kernel_sum": experiment.array.crosstalk.total,
     }
     if isinstance(light, NearFieldSettings):
         values |= {
             "distance_mm": [distance * 1e3 for distance in light.distance],
-            "spot_um": [wave * max(map(abs, light.distance)) / min(grid.extent) * 1e6 for wave in waves],
-            "alias_free_mm": [unaliased_distance(grid, wave, 1) * 1e3 for wave in waves],
+            "spot_um": [each * max(map(abs, light.distance)) / min(grid.extent) * 1e6 for each in wavelengths],
+            "alias_free_mm": [unaliased_distance(grid, each, 1) * 1e3 for each in wavelengths],
         }
     return values

@@ -1,4 +1,4 @@
-"""What is seen and kept of a solver at work: progress bar, metrics.csv, checkpoints."""
+"""Log of a running solver: progress bar, metrics.csv, checkpoints."""
 
 import time
 from collections.abc import Iterator
@@ -9,17 +9,20 @@ import torch
 from tqdm import tqdm
 
 from holotorch.correction import Solution
+from holotorch.experiments.pec.evaluation import quality
 from holotorch.experiments.pec.experiment import PECExperiment
-from holotorch.experiments.pec.judge import quality
 from holotorch.experiments.runs.memory import peak_memory
 from holotorch.experiments.runs.saving import Checkpoint
 
-_CHECK_EVERY = 10  # steps between two measurements of quality, which cost about as much as a step
+_CHECK_STEPS = 10  # steps between two measurements of the quality, each of which takes about as long as a step
 _SAVE_EVERY = 30.0  # seconds between two checkpoints
 
 
 class Log:
-    """Callback of the solver: progress bar, rows of metrics.csv, the last state, and a checkpoint now and then."""
+    """Callback of the solver that draws the progress bar and keeps the rows of metrics.csv and the last solution.
+
+    It writes a checkpoint every 30 seconds.
+    """
 
     def __init__(self, experiment: PECExperiment, checkpoint: Checkpoint):
         self.experiment, self.checkpoint, self.last = experiment, checkpoint, None
@@ -40,22 +43,22 @@ class Log:
 
     @property
     def metric(self) -> str:
-        """Name of what is measured on the way."""
+        """Name of the metric that is measured during the run."""
         return self.experiment.settings.report.metrics[0]
 
     @property
     def seconds(self) -> float:
-        """Spent by the solver so far, an earlier run of it included and this log's own work left out."""
+        """Time that the solver has taken, including the runs before an interruption and excluding this log."""
         return self.before + time.perf_counter() - self.started - self.seconds_spent
 
     def __call__(self, solution: Solution) -> None:
-        """Take note of a step."""
+        """Log one step."""
         entered = time.perf_counter()
         elapsed = self.before + entered - self.started - self.seconds_spent
         step = len(solution.losses) - 1
         shown, score = {}, ""
-        if step % _CHECK_EVERY == 0:
-            self.checked.append((step, quality(self.experiment, self.experiment.frames_of(solution.x))))
+        if step % _CHECK_STEPS == 0:
+            self.checked.append((step, quality(self.experiment, self.experiment.heater_phases(solution.x))))
             score = f"{self.checked[-1][1]:.6f}"
         losses = solution.losses[-1].reshape(-1, len(self.experiment.wavelengths)).mean(0).tolist()
         self.rows.append([str(step), str(solution.evaluations), f"{elapsed:.4f}", score, *map(repr, losses)])
@@ -71,21 +74,21 @@ class Log:
         self.seconds_spent += time.perf_counter() - entered
 
     def save(self) -> bool:
-        """Write what it takes to go on from the last step; False where that is not possible."""
+        """Write a checkpoint of the last step; False if that is not possible."""
         if self.last is None:
             return True
         content: dict[str, Any] = {
             "state": self.last.state,
-            "rows": self.rows[: len(self.last.losses) - 1],  # an interruption may come between a row and its state
+            "rows": self.rows[: len(self.last.losses) - 1],  # a signal may arrive between a row and its solution
             "checked": self.checked,
             "seconds": self.seconds,
         }
-        self.saved = time.perf_counter()  # the next try is not at once, either way
+        self.saved = time.perf_counter()  # also if it fails, so that the next attempt is 30 seconds later
         return self.checkpoint.save(content)
 
     @contextmanager
     def saved_on_failure(self) -> Iterator[None]:
-        """Save the last step also where the block fails, so that going on computes nothing again."""
+        """Save the last step if the block raises an exception, so that ``resume`` repeats no steps."""
         try:
             yield
         except Exception:
@@ -99,7 +102,7 @@ class Log:
 
     def table(self) -> str:
         """The rows as CSV."""
-        colours = [f"loss_{wave * 1e9:.0f}nm" for wave in self.experiment.wavelengths]
+        colours = [f"loss_{wavelength * 1e9:.0f}nm" for wavelength in self.experiment.wavelengths]
         header = ["step", "evaluations", "seconds", f"{self.metric}_mean", *colours]
         return "\n".join(",".join(row) for row in [header, *self.rows]) + "\n"
 

@@ -1,40 +1,32 @@
-"""The part of a report page that shows a correction, and the table of several."""
+"""Section of the report page for a run of kind ``pec``, and the table that compares several runs."""
 
 from collections.abc import Sequence
 from typing import Any
 
-from holotorch.experiments.pec.zones import zone_rows
 from holotorch.experiments.runs.markup import element, figure, heading, plain, table
 from holotorch.experiments.runs.record import RunRecord
 
-_PICTURES = {
-    "target": "Target",
+METHOD_NAMES = {
     "none": "No correction",
-    "chopping": "Matrix inverse, negative entries chopped",
+    "chopping": "Matrix inverse, negative entries set to zero",
     "shifting": "Matrix inverse, shifted",
     "nonnegative": "Non-negative deconvolution",
-    "basic_ipec": "Basic iterative correction",
-    "ipec": "Iterative correction",
-    "unweighted": "Corrected, all errors alike",
+    "basic_ipec": "Basic iterative correction (basic IPEC: no deconvolution)",
+    "ipec": "Iterative proximity effect correction (IPEC)",
+    "unweighted": "Corrected, errors weighted equally",
     "corrected": "Corrected",
-    "isolated": "Corrected, on a chip that stands alone",
 }
+_PICTURES = {"target": "Target", **METHOD_NAMES, "isolated": "Corrected, on a chip that stands alone"}
 _FIGURES = {
-    "phase": "Heater phases, before the heat spreads",
-    "temperature": "Temperature of the chip above ambient, after the heat has spread",
+    "phase": "Heater phases, before the heat spreads{frame}",
+    "temperature": "Temperature of the chip above ambient, after the heat has spread{frame}",
     "convergence": "Convergence of the solver",
     "weight": "Weight of the squared error, mean 1",
-}
-_METHOD_NAMES = {
-    "none": "no correction",
-    "basic_ipec": "basic IPEC",
-    "ipec": "IPEC",
-    "unweighted": "corrected, all errors alike",
 }
 
 
 def comparison(runs: Sequence[RunRecord]) -> list[str]:
-    """HTML of a table of the corrections of several runs."""
+    """HTML of a table that compares the corrected holograms of several runs."""
     rows = [[run.title, *_numbers(run.summary["methods"]["corrected"])] for run in runs]
     return ["<h1>Runs</h1>" + table(["run", *_COLUMNS], rows)]
 
@@ -43,9 +35,9 @@ def pec_section(run: RunRecord) -> list[str]:
     """HTML of a run: scores by method, pictures side by side, figures and plan."""
     methods: dict[str, Any] = run.summary["methods"]
     parts = [heading(run.title, run.summary["status"])]
-    parts.append(table(["method", *_COLUMNS], [[_METHOD_NAMES.get(n, n), *_numbers(m)] for n, m in methods.items()]))
+    parts.append(table(["method", *_COLUMNS], [[METHOD_NAMES.get(n, n), *_numbers(m)] for n, m in methods.items()]))
     parts.append(element("p", _verdict(run)))
-    head, rows = zone_rows(methods)
+    head, rows = _zone_rows(methods)
     if rows:
         parts.append("<h2>By eccentricity</h2>" + table(head, rows))
     parts.append('<div class="row">')
@@ -53,9 +45,11 @@ def pec_section(run: RunRecord) -> list[str]:
         if source := run.picture(name):
             parts.append(figure(source, f"{caption}{_score(run, name)}", "picture"))
     parts.append("</div>")
+    frames = methods["corrected"]["frames"]
+    which = f"; frame 1 of {frames}, arrays/phase.npy holds all" if frames > 1 else ""
     for name, caption in _FIGURES.items():
         if source := run.picture(name):
-            parts.append(figure(source, caption, "wide"))
+            parts.append(figure(source, caption.format(frame=which), "wide"))
     parts.append("<h2>Plan</h2>" + table(["", ""], _plan_rows(run.plan), head=False))
     return parts + [element("p", note, "warn") for note in run.plan["notes"]]
 
@@ -64,7 +58,7 @@ _COLUMNS = (
     "frames",
     "SSIM",
     "PSNR (dB)",
-    "SSIM between samples",
+    "SSIM half a sample off",
     "SSIM, chip alone (exact)",
     "light in window",
     "hottest pixel (degC above ambient)",
@@ -96,18 +90,36 @@ def _verdict(run: RunRecord) -> str:
     stop = "met its stop rule" if done else "ran out of steps"
     if any(corrected["stalled"]):
         stop = "stopped where no step lowered the loss any more, at float precision or in a corner of the limit"
-    between = " (see 'between samples')"
-    if "isolated" not in corrected:
-        between = f"; half a sample off, a Fourier hologram is speckled{between}"
+    speckle = ", where a Fourier hologram is speckled" if "isolated" not in corrected else ""
     fewer = any(method["frames"] < corrected["frames"] for method in run.summary["methods"].values())
-    alone = " Methods that are compared with show a single frame." if fewer else ""
+    single = " The methods that it is compared with show a single frame." if fewer else ""
     return (
         f"The hottest pixel of the corrected hologram is {hottest:.0f} degC above ambient. The solver took {steps} "
         f"steps and {stop}. Peak memory {run.summary['peak_memory_bytes'] / 1e9:.2f} GB. Heating power is the mean "
         "temperature rise that the heaters alone would cause, before the heat spreads; times the number of pixels and "
         "the chip's watts per kelvin it is the power in watts. Scores are of a float64 simulation of the phases. They "
-        f"are taken at the samples of the image, where the solver controls the light{between}.{alone}"
+        "are taken at the samples of the image, one per pixel, where the solver controls the light. 'SSIM half a "
+        f"sample off' is the score midway between four samples{speckle}.{single}"
     )
+
+
+def _zone_rows(methods: dict[str, dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
+    """Head and cells of a table of scores by zone, one row per method; empty if the run has no zones."""
+    scored = {name: numbers["zones"] for name, numbers in methods.items() if "zones" in numbers}
+    if not scored:
+        return [], []
+    zones: Sequence[dict[str, Any]] = next(iter(scored.values()))
+    limits = [f"{zone['from_deg']} to {zone['to_deg']} deg" for zone in zones[:-1]] + [
+        f"from {zones[-1]['from_deg']} deg"
+    ]
+    head = ["method"] + [f"{z['zone']}, {words}" for z, words in zip(zones, limits, strict=True)]
+    return head, [[METHOD_NAMES.get(name, name), *map(_cell, row)] for name, row in scored.items()]
+
+
+def _cell(zone: dict[str, Any]) -> str:
+    parts = [] if zone["ssim"] is None else [f"SSIM {zone['ssim']:.3f}"]
+    parts += [] if zone["psnr"] is None else [f"{zone['psnr']:.1f} dB"]
+    return ", ".join([*parts, f"{100 * zone['error']:.0f} % of the error"])
 
 
 def _plan_rows(plan: dict[str, Any]) -> list[list[str]]:

@@ -1,4 +1,4 @@
-"""The weight of errors over a wide picture, and scores by zones of the visual field."""
+"""Weight of the error over a wide picture, and scores by zones of the visual field."""
 
 import math
 from typing import TYPE_CHECKING, Any
@@ -12,13 +12,13 @@ from holotorch.perception import Headset, LinearMagnification, peripheral_weight
 if TYPE_CHECKING:
     from holotorch.experiments.pec.config import PeripheralWeightSettings
 
-# Thesis Sec. 2.1: central vision, near, middle and far periphery.
+# Limits in degrees of central vision and of the near, middle and far periphery: thesis Sec. 2.1.
 ZONES = ((0, 8), (8, 30), (30, 60), (60, 180))
 _NAMES = ("central", "near", "middle", "far")
 
 
 def eccentricities(settings: "PeripheralWeightSettings", shape: tuple[int, int]) -> Tensor:
-    """Of the pixels of a picture (H, W) from the point that is looked at, in degrees, float64 [H, W]."""
+    """Angle in degrees between each pixel of a picture (H, W) and the gaze, float64 [H, W]."""
     display = Headset(shape, shape[1] / settings.field_deg)
     y, x = (torch.arange(side, dtype=torch.float64) for side in shape)
     return separation(*display.angles(y[:, None], x), *settings.gaze_deg)
@@ -33,16 +33,17 @@ def weight_map(settings: "PeripheralWeightSettings", shape: tuple[int, int]) -> 
 def zone_scores(
     settings: "PeripheralWeightSettings", picture: Tensor, image: Tensor, lit: Tensor
 ) -> list[dict[str, Any]]:
-    """PSNR and SSIM of pictures [C, H, W] in 0 .. 1 in each zone of the visual field that they reach, nearest first.
+    """PSNR and SSIM of a picture [C, H, W] in 0 .. 1, one row for each zone of the visual field, central zone first.
 
-    A zone's PSNR is that of its pixels, over all colours that are lit; its SSIM is the mean of the windows centred in
-    it, None where there is none. ``error`` is the zone's part of the whole squared error.
+    The PSNR of a zone is that of its pixels, over all lit colours. Its SSIM is the mean over the windows centred in it,
+    None if there is no such window. ``error`` is its share of the whole squared error. Zones without pixels are left
+    out.
     """
     picture, image = picture[lit].clamp(0, 1), image[lit]
     where = eccentricities(settings, (image.shape[-2], image.shape[-1]))
     square = (picture - image).double().square().mean(0)
     edge = SSIM_WINDOW // 2
-    middles = where[edge:-edge, edge:-edge]
+    centres = where[edge:-edge, edge:-edge]  # of the windows
     windows = square[:0]
     if min(where.shape) >= SSIM_WINDOW:
         windows = ssim_map(picture, image, data_range=1.0).mean(0)
@@ -52,7 +53,7 @@ def zone_scores(
         if not inside.any():
             continue
         error = square[inside].mean().item()
-        similar = windows[(middles >= low) & (middles < high)] if len(windows) else windows
+        similar = windows[(centres >= low) & (centres < high)] if len(windows) else windows
         rows.append(
             {
                 "zone": name,

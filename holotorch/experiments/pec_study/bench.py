@@ -1,10 +1,10 @@
-"""Grey photographs on one array, as a batch: what charts and studies of PEC compare methods on."""
+"""Bench: grey photographs as a batch on one array, the common work of the charts and studies of PEC."""
 
 import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
@@ -19,10 +19,10 @@ from holotorch.correction import (
     LBFGS,
     PECProblem,
     Solution,
-    below,
     gerchberg_saxton,
     iterative_pec,
-    limited,
+    limit_peak_phase,
+    penalty_schedule,
     run_stages,
     spread_preconditioner,
 )
@@ -34,7 +34,8 @@ from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import CroppedKernel, DepthStack, Fraunhofer, Fresnel
 
 PHOTOGRAPHS = ("camera", "astronaut", "coffee", "page")
-WAVELENGTH, EXTENT, DISTANCE = 530e-9, 2e-3, 0.1  # the thesis's chip of 2 mm and its image at 100 mm
+WAVELENGTH, EXTENT, DISTANCE = 530e-9, 2e-3, 0.1  # metres: the thesis's chip of 2 mm and its image at 100 mm
+# Weights of linear red, green and blue in the luminance: ITU-R BT.709.
 LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)[:, None, None]
 
 
@@ -46,17 +47,18 @@ def grey(name: str, size: tuple[int, int]) -> Tensor:
 
 @dataclass(frozen=True)
 class Bench:
-    """One array, one kind of propagation, and photographs as its channels.
+    """One array, one kind of propagation, and C photographs as its channels.
 
     Attributes:
-        images: Names.
+        images: Names of the photographs.
         size: Pixels of the array along each axis.
-        sigma_px: Width of the heat.
+        sigma_px: Width of the heat kernel, exp(-d^2 / sigma^2).
         kind: "fourier", "fresnel" (the thesis's periodic model) or "isolated".
-        region: Pixels of a signal region, or 0 for the whole window.
-        distances: Of the image, for the two kinds that have any; several make a scene of as many bands.
+        region: Pixels along each axis of a signal region, or 0 for the whole window.
+        distances: Distances of the image in metres for "fresnel" and "isolated"; several divide it into as many bands.
         lowpass: Cut-off of a Butterworth filter on the targets in cycles per pixel, or 0 for none.
-        perceptual: Scores the pictures too, where it can be had.
+        perceptual: Learned similarity that scores the pictures too, if it is installed.
+        pictures: Luminances [C, h, w] instead of those of the photographs.
     """
 
     images: Sequence[str] = PHOTOGRAPHS
@@ -67,17 +69,20 @@ class Bench:
     distances: tuple[float, ...] = (DISTANCE,)
     lowpass: float = 0.0
     perceptual: PerceptualSimilarity | None = None
+    pictures: Tensor | None = field(default=None, compare=False, repr=False)
 
     @cached_property
     def image(self) -> Tensor:
         """Luminances, float64 [C, h, w]."""
+        if self.pictures is not None:
+            return self.pictures
         size = self.region or self.size
         pictures = torch.cat([grey(name, (size, size)) for name in self.images])
         return butterworth(pictures, self.lowpass) if self.lowpass else pictures
 
     @cached_property
     def wanted(self) -> Tensor:
-        """With mean 1."""
+        """Luminances scaled to mean 1."""
         return self.image / self.image.mean((-2, -1), keepdim=True)
 
     @property
@@ -87,24 +92,24 @@ class Bench:
 
     @cached_property
     def crosstalk(self) -> ThermalCrosstalk:
-        """Seven taps, as in the thesis, or one for no heat at all."""
+        """Crosstalk with seven taps, as in the thesis, or with one tap where no heat spreads."""
         return ThermalCrosstalk(self.sigma_px, 7 if self.sigma_px else 1)
 
     @cached_property
     def propagator(self) -> Fraunhofer | DepthStack | Fresnel | CroppedKernel:
-        """Of all channels."""
-        waves = [WAVELENGTH] * len(self.images)
+        """Propagator of all channels to the image."""
+        wavelengths = [WAVELENGTH] * len(self.images)
         if self.kind == "fourier":
-            return Fraunhofer(self.grid, waves)
+            return Fraunhofer(self.grid, wavelengths)
         if self.kind == "isolated":
-            return CroppedKernel(self.grid, waves, self.distances[0], paraxial=True)
-        with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # it is the thesis's model
-            filters = [Fresnel(self.grid, waves, z, pad=1) for z in self.distances]
+            return CroppedKernel(self.grid, wavelengths, self.distances[0], paraxial=True)
+        with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the thesis's model is periodic
+            filters = [Fresnel(self.grid, wavelengths, z, pad=1) for z in self.distances]
         return filters[0] if len(filters) == 1 else DepthStack(filters)
 
     @property
     def mask(self) -> Tensor | None:
-        """Where the target is to be met: the region, or the band in focus at each distance."""
+        """1 where the image is compared with the target: in the region, or in the band in focus at each distance."""
         if self.region:
             begin = (self.size - self.region) // 2
             mask = torch.zeros(1, self.size, self.size)
@@ -120,7 +125,7 @@ class Bench:
 
     @property
     def target(self) -> Tensor:
-        """float32 [C, *image]."""
+        """Wanted intensity, float32 [C, *image]."""
         if self.region:
             begin, part = (self.size - self.region) // 2, self.size**2 / self.region**2 / 2
             around = (begin, self.size - self.region - begin)
@@ -140,10 +145,10 @@ class Bench:
         return PECProblem(self.crosstalk, self.propagator, self.target, **options)
 
     def start(self, kind: str, frames: int = 1, seed: int = 7) -> Tensor:
-        """The unknown at the start, [C, H, W] or [C, F, H, W], as in ``experiments.pec``."""
+        """Heater phases at the start, [C, H, W] or [F, C, H, W], of a kind as in the configurations ``pec``."""
         generator = torch.Generator().manual_seed(seed)
-        frame = (frames,) if frames > 1 else ()
-        uniform = torch.rand(len(self.images), *frame, self.size, self.size, generator=generator)
+        uniform = torch.rand(len(self.images), frames, self.size, self.size, generator=generator)
+        uniform = uniform.movedim(1, 0).contiguous() if frames > 1 else uniform[:, 0]
         if kind == "quadratic":
             n = torch.arange(self.size) - self.size // 2
             lens = math.pi * n.square() / self.size
@@ -160,22 +165,23 @@ class Bench:
         power_weight: float = 0.0,
         callback: Callback | None = None,
     ) -> Solution:
-        """Our staged solver, joint where the start has frames."""
+        """L-BFGS in stages; frames [F, C, H, W] share the image."""
         frames = start.ndim == 4
         solver = LBFGS(precondition=spread_preconditioner(self.crosstalk.kernel), max_steps=steps, tolerance=tolerance)
 
         def make(**options) -> PECProblem:
             return self.problem(frames=frames, power_weight=power_weight, **options)
 
-        found = run_stages(limited(make, solver, self.crosstalk.total, limit), start, callback=callback)
-        return found if limit is None else replace(found, x=below(limit, found.x, self.crosstalk))
+        stages = penalty_schedule(make, solver, self.crosstalk.total, limit)
+        solution = run_stages(stages, start, callback=callback)
+        return solution if limit is None else replace(solution, x=limit_peak_phase(limit, solution.x, self.crosstalk))
 
     def algorithm2(self, start: Tensor, *, steps: int = 400, callback: Callback | None = None) -> Solution:
-        """The thesis's solver."""
+        """The thesis's solver, proximal proximity effect correction (PPEC)."""
         return APG(max_steps=steps)(self.problem(), start, callback=callback)
 
     def retrieved(self, kind: str, *, passes: int = 100, inner: int = 30, seed: int = 7) -> Solution:
-        """Gerchberg-Saxton: "none" (plain), "basic" (crosstalk in its loop) or "ipec" (deconvolution too)."""
+        """Gerchberg-Saxton: "none" (plain), "basic" (with the crosstalk in the loop) or "ipec" (deconvolution too)."""
         generator = torch.Generator().manual_seed(seed)
         begin = 2 * math.pi * torch.rand(self.target.shape, generator=generator)
         assert not isinstance(self.propagator, DepthStack)
@@ -188,7 +194,7 @@ class Bench:
 
     @property
     def exact(self) -> CroppedKernel:
-        """What judges a chip that stands alone: nothing paraxial, nothing periodic."""
+        """Exact propagator of a single chip, neither paraxial nor periodic, for its scores."""
         return CroppedKernel(self.grid, [WAVELENGTH] * len(self.images), self.distances[0])
 
     def formed(
@@ -197,18 +203,17 @@ class Bench:
         crosstalk: Callable[[Tensor], Tensor] | None = None,
         propagator: Callable[[Tensor], Tensor] | None = None,
     ) -> Tensor:
-        """Mean intensity of the frames of ``phase`` [C, H, W] or [C, F, H, W] in float64, of the picture [C, h, w]."""
-        frames = phase.double()[:, None] if phase.ndim == 3 else phase.double()
-        spread = crosstalk or self.crosstalk
-        total = 0
-        for frame in frames.unbind(1):
-            total = total + intensity((propagator or self.propagator)(phasor(spread(frame))))
-        formed = total / frames.shape[1]
+        """Picture [C, h, w] in the mean intensity of the frames of ``phase`` [C, H, W] or [F, C, H, W], float64."""
+        frames = phase.double().reshape(-1, *phase.shape[-3:])
+        spread, propagate = crosstalk or self.crosstalk, propagator or self.propagator
+        formed = intensity(propagate(phasor(spread(frames[0]))))
+        for frame in frames[1:]:
+            formed = formed + intensity(propagate(phasor(spread(frame))))
+        formed = formed / len(frames)
         if len(self.distances) > 1:
             mask = self.mask
-            assert mask is not None and isinstance(formed, Tensor)
+            assert mask is not None
             return (formed * mask).sum(-3)
-        assert isinstance(formed, Tensor)
         begin, size = (self.size - (self.region or self.size)) // 2, self.region or self.size
         return formed[:, begin : begin + size, begin : begin + size]
 
@@ -232,7 +237,7 @@ class Bench:
 
 
 class Track:
-    """Callback that scores the way of a solver; the scoring is left out of its seconds."""
+    """Callback that scores a solver on its way; the time of the scoring is subtracted."""
 
     def __init__(self, bench: Bench, every: int = 5):
         self.bench, self.every = bench, every
@@ -249,7 +254,7 @@ class Track:
         self.spent += time.perf_counter() - entered
 
     def reached(self, quality: float) -> tuple[float, int, float, float] | None:
-        """The row in which a quality was reached first."""
+        """The first row whose SSIM is at least ``quality``; None if there is none."""
         return next((row for row in self.rows if row[2] >= quality), None)
 
 

@@ -1,4 +1,4 @@
-"""Cases of a study: those that are complete are on the disk, and are not computed again."""
+"""Cases of a study with a checkpoint, so that a resumed study computes only the cases that are missing."""
 
 import time
 from collections.abc import Iterable, Iterator
@@ -12,12 +12,12 @@ Case = TypeVar("Case")
 
 
 class Cases:
-    """Cases one after another, and the rows that they have given.
+    """Iterator over the cases of a study, and the rows of its table so far.
 
     Attributes:
-        rows: Of all cases so far; a study appends to it.
-        saved: Cases whose rows are in the checkpoint.
-        checkpoint: Where they are kept.
+        rows: Rows of all cases so far; a study appends to this list.
+        saved: Number of cases whose rows are in the checkpoint.
+        checkpoint: File that keeps the rows.
     """
 
     def __init__(self, checkpoint: Checkpoint):
@@ -32,11 +32,11 @@ class Cases:
 
     @property
     def seconds(self) -> float:
-        """Spent so far, also before an interruption."""
+        """Time so far, including the runs before an interruption."""
         return self._before + time.perf_counter() - self._started
 
     def each(self, cases: Iterable[Case], desc: str, unit: str) -> Iterator[Case]:
-        """Those of the cases that are still to be computed; one is complete when the next one is asked for."""
+        """The cases that are not in the checkpoint; requesting the next case marks the one before as complete."""
         for case in tqdm(cases, desc=desc, unit=unit):
             self._count += 1
             if self._count <= self.saved:

@@ -1,4 +1,4 @@
-"""What the thesis says of proximity effect correction in words, held against the numbers of a study."""
+"""Statements of the thesis about proximity effect correction, compared with the numbers of a study."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -7,18 +7,15 @@ Row = dict[str, Any]
 
 
 def with_claims(study: str, rows: list[Row]) -> list[Row]:
-    """``rows`` and behind them one row for each claim: what it says, what was found, and whether they agree."""
+    """``rows``, followed by one row for each statement: its text, the measured value, and whether they agree."""
+    claims = _CLAIMS[study](rows) if study in _CLAIMS else ()
     return rows + [
-        dict.fromkeys(rows[0], "") | {"setting": found, "method": "claim", "thesis": claim, "verdict": verdict}
-        for claim, found, verdict in _CLAIMS.get(study, _none)(rows)
+        dict.fromkeys(rows[0], "") | {"setting": measured, "method": "claim", "thesis": claim, "verdict": verdict}
+        for claim, measured, verdict in claims
     ]
 
 
 Claims = Iterable[tuple[str, str, str]]
-
-
-def _none(_: list[Row]) -> Claims:
-    return ()
 
 
 def _reproduction(rows: list[Row]) -> Claims:
@@ -27,12 +24,14 @@ def _reproduction(rows: list[Row]) -> Claims:
         ("IPEC", "IFPEC degrades from sigma 0.4 on (Fig. 4.17)"),
         ("none", "without correction quality falls from sigma 0.3 on (Fig. 4.17)"),
     ):
-        kept = _ssim(rows, name, kind="fresnel")
-        below, above = ([kept[s] for s in kept if low <= s <= high] for low, high in ((0, 0.5), (0.6, 1.0)))
-        if below and above:
-            drop = max(below) - min(above)
+        chosen = [row for row in rows if row["method"] == name and row["kind"] == "fresnel" and row["ssim"] != ""]
+        weak, strong = (
+            [row["ssim"] for row in chosen if low <= row["sigma_px"] <= high] for low, high in ((0, 0.5), (0.6, 1.0))
+        )
+        if weak and strong:
+            drop = max(weak) - min(strong)
             agrees = drop < 0.1 if name == "PPEC" else drop > 0.1
-            yield words, f"SSIM falls by {drop:.3f} between sigma <= 0.5 and 1.0", _said(agrees)
+            yield words, f"SSIM falls by {drop:.3f} between sigma <= 0.5 and 1.0", _verdict(agrees)
 
 
 def _lowpass(rows: list[Row]) -> Claims:
@@ -40,26 +39,24 @@ def _lowpass(rows: list[Row]) -> Claims:
         values = [row["ssim"] for row in rows if row["method"] == name]
         change = max(values) - min(values)
         words = "no significant change with the picture's spatial frequency (Fig. 4.12)"
-        why = "" if change < 0.05 else ": SSIM is lower for smooth pictures, in which speckle stands out"
-        yield f"{name}: {words}", f"SSIM {min(values):.3f} to {max(values):.3f}", _said(change < 0.05) + why
+        yield f"{name}: {words}", f"SSIM {min(values):.3f} to {max(values):.3f}", _verdict(change < 0.05)
 
 
 def _multiplexing(rows: list[Row]) -> Claims:
-    found = {row["method"]: row["ssim"] for row in rows if row["sigma_px"] < 0.7}
+    ssim = {row["method"]: row["ssim"] for row in rows if row["sigma_px"] < 0.7}
     for name in ("IPEC, 10 runs", "IPEC, signal region"):
-        if name in found and "PPEC" in found:
-            behind = found["PPEC"] - found[name]
+        if name in ssim and "PPEC" in ssim:
+            behind = ssim["PPEC"] - ssim[name]
             words = f"{name}: comparable with PPEC below sigma 0.7 (Fig. 4.14)"
-            why = "" if behind < 0.1 else ": PPEC runs to its end here and is better than the thesis's"
-            yield words, f"SSIM {found[name]:.3f}, PPEC {found['PPEC']:.3f}", _said(behind < 0.1) + why
+            yield words, f"SSIM {ssim[name]:.3f}, PPEC {ssim['PPEC']:.3f}", _verdict(behind < 0.1)
 
 
 def _iterations(rows: list[Row]) -> Claims:
-    own = [row["ssim"] for row in rows if row["sigma_px"] == 0.66 and row["method"] == "PPEC"]
-    if own:
-        gain = own[-1] - own[len(own) // 2]
+    ssim = [row["ssim"] for row in rows if row["sigma_px"] == 0.66 and row["method"] == "PPEC"]
+    if ssim:
+        gain = ssim[-1] - ssim[len(ssim) // 2]
         words = "PPEC, sigma 0.66: quality changes very little towards the end (Fig. 4.15)"
-        yield words, f"SSIM gains {gain:.3f} in the second half of the steps", _said(abs(gain) < 0.02)
+        yield words, f"SSIM gains {gain:.3f} in the second half of the steps", _verdict(abs(gain) < 0.02)
 
 
 def _time(rows: list[Row]) -> Claims:
@@ -68,27 +65,26 @@ def _time(rows: list[Row]) -> Claims:
 
     middle = {"setting": rows[0]["setting"], "sigma_px": 0.66}
     basic, iterative, proximal = (min(seconds(name, **middle), default=0) for name in ("basic IPEC", "IPEC", "PPEC"))
-    found = f"basic {basic:.2f} s, IPEC {iterative:.2f} s, PPEC {proximal:.2f} s"
-    yield "basic IPEC is the fastest (Fig. 4.10)", found, _said(basic <= min(iterative, proximal))
-    why = "" if iterative >= proximal else ": 30 x 30 steps here; the thesis does not give its counts"
-    yield "IPEC is slower than PPEC (Fig. 4.10)", found, _said(iterative >= proximal) + why
+    measured = f"basic {basic:.2f} s, IPEC {iterative:.2f} s, PPEC {proximal:.2f} s"
+    yield "basic IPEC is the fastest (Fig. 4.10)", measured, _verdict(basic <= min(iterative, proximal))
+    yield "IPEC is slower than PPEC (Fig. 4.10)", measured, _verdict(iterative >= proximal)
     for name in ("IPEC", "PPEC"):
-        grows = seconds(name, sigma_px=0.66)[-4:]
+        times = seconds(name, sigma_px=0.66)[-4:]
         words = f"{name}: time grows with resolution (Fig. 4.11)"
-        yield words, ", ".join(f"{value:.2f}" for value in grows) + " s", _said(grows == sorted(grows))
+        yield words, ", ".join(f"{value:.2f}" for value in times) + " s", _verdict(times == sorted(times))
 
 
 def _focus(rows: list[Row]) -> Claims:
     for name in dict.fromkeys(row["method"] for row in rows if row["error"] != ""):
         sharp = total = 0
         for sigma in dict.fromkeys(row["sigma_px"] for row in rows):
-            own = [r for r in rows if r["method"] == name and r["sigma_px"] == sigma and r["error"] != ""]
-            for band in dict.fromkeys(row["setting"].split(", ")[1] for row in own):
-                errors = {r["setting"].split(", ")[0]: r["error"] for r in own if r["setting"].endswith(band)}
+            chosen = [r for r in rows if r["method"] == name and r["sigma_px"] == sigma and r["error"] != ""]
+            for band in dict.fromkeys(row["setting"].split(", ")[1] for row in chosen):
+                errors = {r["setting"].split(", ")[0]: r["error"] for r in chosen if r["setting"].endswith(band)}
                 sharp += band.split()[2] == min(errors, key=errors.__getitem__).split()[1]
                 total += 1
         words = f"{name}: moving the focus brings one part of the scene after another into focus (Fig. 4.18)"
-        yield words, f"{sharp} of {total} bands are sharpest at their own depth", _said(sharp == total)
+        yield words, f"{sharp} of {total} bands are sharpest at their own depth", _verdict(sharp == total)
 
 
 _CLAIMS: dict[str, Callable[[list[Row]], Claims]] = {
@@ -101,10 +97,5 @@ _CLAIMS: dict[str, Callable[[list[Row]], Claims]] = {
 }
 
 
-def _ssim(rows: list[Row], method: str, kind: str) -> dict[float, float]:
-    chosen = [row for row in rows if row["method"] == method and row["kind"] == kind and row["ssim"] != ""]
-    return {row["sigma_px"]: row["ssim"] for row in chosen}
-
-
-def _said(agrees: bool) -> str:
+def _verdict(agrees: bool) -> str:
     return "reproduced" if agrees else "not reproduced"

@@ -1,4 +1,4 @@
-"""What the configuration of a study of proximity effect correction may say."""
+"""Settings of a configuration of kind ``pec_study``."""
 
 from typing import Annotated, Literal
 
@@ -7,9 +7,18 @@ from pydantic import BeforeValidator, Field
 from holotorch.experiments.config.settings import Count, Number, Settings, number, several
 from holotorch.experiments.pec.config import Picture
 
+METHODS = (
+    "IPEC: iterative proximity effect correction (thesis Algorithm 1; in the near field IFPEC), basic IPEC: the same "
+    "without deconvolution; PPEC: proximal proximity effect correction (Algorithm 2; in the near field FPEC); ours: "
+    "L-BFGS in stages (solver.kind lbfgs)"
+)
+
 
 class StudySettings(Settings):
-    """A comparison of methods over several photographs; ``sweep`` are sigmas in pixels, or cut-offs for lowpass."""
+    """A comparison of methods over several photographs.
+
+    ``sweep``: sigmas in pixels, or for the study ``lowpass`` cut-offs in cycles per pixel; ``targets`` has its sigmas.
+    """
 
     experiment: Literal["pec_study"]
     study: Literal["reproduction", "lowpass", "multiplexing", "iterations", "time", "focus", "limits", "targets"]

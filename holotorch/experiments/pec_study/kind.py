@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holotorch.experiments.kind import ExperimentKind
-from holotorch.experiments.pec_study.config import StudySettings
+from holotorch.experiments.pec.config import SIGMA_MEANING
+from holotorch.experiments.pec_study.config import METHODS, StudySettings
 from holotorch.experiments.runs.plan import RunPlan
 
 if TYPE_CHECKING:
@@ -28,9 +29,11 @@ class StudyKind(ExperimentKind[StudySettings, "Study"]):
 
     def plan(self, experiment: Study) -> RunPlan:
         settings = experiment.settings
+        swept = "cut-off in cycles/px" if settings.study == "lowpass" else "sigma in px"
         return RunPlan(
             f"Study      {settings.study} of {', '.join(settings.images)} on {settings.size} x {settings.size} px\n"
-            f"Sweep      {', '.join(f'{value:g}' for value in settings.sweep)}; {settings.max_steps} steps at most"
+            f"Sweep      {swept}: {', '.join(f'{value:g}' for value in settings.sweep)}; {settings.max_steps} steps at "
+            f"most\nCrosstalk  {SIGMA_MEANING}\nMethods    {METHODS}"
         )
 
     def run(self, experiment: Study, folder: RunFolder) -> bool:

@@ -1,15 +1,18 @@
-"""The part of a report page that shows a study."""
+"""Section of the report page for a study of proximity effect correction."""
 
+from holotorch.experiments.pec.config import SIGMA_MEANING
+from holotorch.experiments.pec_study.config import METHODS
 from holotorch.experiments.runs.markup import element, figure, heading
 from holotorch.experiments.runs.record import RunRecord
 
 
 def study_section(record: RunRecord) -> list[str]:
-    """HTML of a study: its curves and its table; of an interrupted one, how many cases are complete."""
+    """HTML of a study: its curves and its table, or the number of complete cases if it was interrupted."""
     summary = record.summary
     parts = [heading(f"{record.title}: {summary['study']}", summary["status"])]
     if source := record.picture("table"):
         parts.append(figure(source, "Each line is a method, each point the mean over the photographs", "wide"))
+        parts.append(element("p", f"{METHODS}. Sigma: {SIGMA_MEANING}."))
     if text := record.text("table.txt"):
         parts.append(element("pre", text))
     if "cases" in summary:

@@ -1,4 +1,4 @@
-"""A study as a run: a folder with its table, a picture, and what it says in words."""
+"""Run of kind ``pec_study``: its table as CSV and text, and a picture."""
 
 import sys
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from holotorch.metrics import PerceptualSimilarity
 
 @dataclass(frozen=True)
 class Study:
-    """A study and the photographs that it is made on."""
+    """A study and its photographs."""
 
     settings: StudySettings
     bench: Bench
@@ -33,7 +33,7 @@ def build_study(settings: StudySettings) -> Study:
 
 
 def run_study(study: Study, opened: RunFolder) -> bool:
-    """Carry a study out and fill the folder; whether it is complete. It goes on after the last case that is."""
+    """Run a study and fill the folder; true if it is complete. A resumed study begins after its last complete case."""
     settings, bench = study.settings, study.bench
     folder, files = opened.path, Results()
     inputs = {"images": (bench.image,), "perceptual": ("none" if bench.perceptual is None else "LPIPS",)}
@@ -50,7 +50,7 @@ def run_study(study: Study, opened: RunFolder) -> bool:
     files.write(write_text, folder / "table.txt", text)
     picture = curves(rows, f"{settings.study}: mean of {', '.join(settings.images)} at {settings.size} px")
     files.write(write_bytes, folder / "images" / "table.png", picture)
-    verdicts = [row["verdict"].split(":")[0] for row in rows if row["verdict"]]
+    verdicts = [row["verdict"] for row in rows if row["verdict"]]
     summary = {
         "experiment": settings.experiment,
         "study": settings.study,
@@ -66,7 +66,7 @@ def run_study(study: Study, opened: RunFolder) -> bool:
 
 
 def _perceptual() -> PerceptualSimilarity | None:
-    """The learned similarity, if its extra is installed and its weights are at hand."""
+    """The learned similarity, or None if its extra is not installed or its weights cannot be read."""
     try:
         return PerceptualSimilarity()
     except ImportError:
@@ -77,7 +77,7 @@ def _perceptual() -> PerceptualSimilarity | None:
 
 
 def table_text(rows: list[dict[str, Any]]) -> str:
-    """Rows as a table of fixed columns, without those that are empty throughout."""
+    """Rows as a table of aligned columns, without the columns that are empty."""
     names = [name for name in rows[0] if any(row[name] != "" for row in rows)]
     cells = [names, *([str(row[name]) for name in names] for row in rows)]
     widths = [max(len(line[i]) for line in cells) for i in range(len(names))]

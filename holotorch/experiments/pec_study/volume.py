@@ -14,15 +14,15 @@ from holotorch.experiments.pec_study.bench import WAVELENGTH, Bench
 from holotorch.optics import Fresnel
 from holotorch.scene import DVRSampler, TransferFunction, Volume, phantoms
 
-NEAR, FAR, SLICES = 0.08, 0.12, 24
-_SEEN = 0.05
+NEAR, FAR, SLICES = 0.08, 0.12, 24  # distances of the volume's faces in metres, and slices between them
+_LIT = 0.05  # intensity above which a pixel counts in the error, relative to the brightest
 
 
 def slices_of_a_volume(size: int, pitch: float) -> tuple[list[float], Tensor, Tensor]:
-    """Depths, light of each slice [D, h, w], and the depth of what each ray sees [h, w], of a synthetic C60 molecule.
+    """Depths and light of the slices [D, h, w] of a synthetic C60 molecule, and its depth map [h, w].
 
-    The phantom is as wide as the chip and stretched along the axis, as scenes for such chips are: 2 mm would lie within
-    the depth of focus.
+    The phantom is as wide as the chip and stretched along the optical axis: a depth of 2 mm would lie within the depth
+    of focus.
     """
     values = phantoms.c60(64).values
     width = size * pitch
@@ -41,32 +41,31 @@ def slices_of_a_volume(size: int, pitch: float) -> tuple[list[float], Tensor, Te
 
 def focal_sweep(bench: Bench, steps: int) -> list[tuple[float, float, float]]:
     """(focus, depth of a part of the scene, its relative error) for three foci and three parts, by Algorithm 2."""
-    depths, light, seen = slices_of_a_volume(bench.size, bench.grid.pitch[0])
+    depths, light, depth_map = slices_of_a_volume(bench.size, bench.grid.pitch[0])
     foci = [NEAR + (FAR - NEAR) * part for part in (1 / 6, 1 / 2, 5 / 6)]
     shown = torch.zeros(len(foci), *light.shape[1:], dtype=torch.float64)
     for depth, image in zip(depths, light, strict=True):
         if image.max() <= 0:
             continue
         mean = image.mean()
-        single = replace(bench, kind="fresnel", distances=(depth,), images=("slice",))
-        single.__dict__["wanted"] = (image / mean)[None]
+        single = replace(bench, kind="fresnel", distances=(depth,), images=("slice",), pictures=image[None])
         phase = APG(max_steps=steps)(single.problem(), single.start("cool")).x.double()
         field = phasor(bench.crosstalk(phase))
         for k, focus in enumerate(foci):
             shown[k] += mean * intensity(_fresnel(bench, focus)(field))[0]
     wanted = light.sum(0).double()
-    part = (seen - torch.tensor(foci)[:, None, None]).abs().argmin(0)
-    lit = wanted > _SEEN * wanted.max()
-    found = []
+    part = (depth_map - torch.tensor(foci)[:, None, None]).abs().argmin(0)
+    lit = wanted > _LIT * wanted.max()
+    errors = []
     for k, focus in enumerate(foci):
         for j, depth in enumerate(foci):
             inside = (part == j) & lit
             if inside.any():
                 error = (shown[k] - wanted)[inside].square().sum() / wanted[inside].square().sum()
-                found.append((focus, depth, math.sqrt(error.item())))
-    return found
+                errors.append((focus, depth, math.sqrt(error.item())))
+    return errors
 
 
 def _fresnel(bench: Bench, distance: float) -> Fresnel:
-    with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # it is the thesis's model
+    with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the thesis's model is periodic
         return Fresnel(bench.grid, [WAVELENGTH], distance, pad=1)

@@ -17,7 +17,7 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.execute import execute
 from holotorch.experiments.panel.config import build_panel, load_panel
 from holotorch.experiments.panel.export import export_slm, resimulate
-from holotorch.experiments.panel.source import load_wanted
+from holotorch.experiments.panel.source import load_panel_phases
 from holotorch.experiments.registry import load_config
 from holotorch.io.panel_files import read_levels, read_phases
 
@@ -59,7 +59,7 @@ def volume(tiny, tmp_path_factory):
 def test_files_hold_the_phases_to_the_predicted_error(pec, tmp_path, bits, form):
     words = [*SMALL, f"bits={bits}", "flip_columns=true"]
     out, report = export_slm(pec, PANEL, tmp_path / "slm", form=form, overrides=words)
-    wanted = load_wanted(pec).phase.double().numpy()
+    wanted = load_panel_phases(pec).phase.double().numpy()
     step = 2 * math.pi / 2**bits
     names = [f"frame-{f:03d}_{wave}nm.{form}" for f in range(2) for wave in (630, 530, 445)]
     assert report["files"] == names and report["padded"]
@@ -93,14 +93,14 @@ def test_facts_survive_in_every_format(pec, tmp_path):
 
 def test_exr_is_exact(pec, tmp_path):
     out, report = export_slm(pec, PANEL, tmp_path / "a", form="exr", overrides=[*SMALL, "flip_rows=true"])
-    wanted = load_wanted(pec).phase
+    wanted = load_panel_phases(pec).phase
     for i, name in enumerate(report["files"]):
         assert torch.equal(read_phases(out / name)[0].flip(0)[4:36, 6:30], wanted[i // 3, i % 3])
     assert report["rms_phase_error_rad"] == [0, 0, 0] and max(report["picture_change_by_levels"]) < 1e-6
 
 
 def test_the_picture_is_that_of_the_run(pec):
-    wanted = load_wanted(pec)
+    wanted = load_panel_phases(pec)
     formed = wanted.picture(torch.polar(torch.ones_like(wanted.phase), wanted.phase)).double()
     saved = torch.from_numpy(np.load(pec / "arrays" / "intensity.npy"))
     ratio = formed / saved
@@ -221,14 +221,14 @@ def test_colours_before_frames_are_refused_where_no_shape_tells(pec, tmp_path):
     told["heating_power_K_per_pixel"] = (power * three.mean((0, 2, 3)) / two.mean((0, 2, 3))).tolist()
     summary.write_text(json.dumps(numbers))
     np.save(copy / "arrays" / "phase.npy", three)
-    assert load_wanted(copy).phase.shape == (3, 3, 32, 24)
+    assert load_panel_phases(copy).phase.shape == (3, 3, 32, 24)
     np.save(copy / "arrays" / "phase.npy", three.swapaxes(0, 1))
     with pytest.raises(
         ConfigError, match=r"phase.npy holds \[C, F, H, W\], .* and \[F, C, H, W\] is wanted; as F = C = 3"
     ):
-        load_wanted(copy)
+        load_panel_phases(copy)
     np.save(copy / "arrays" / "phase.npy", three * 2)  # another solution of neither order is taken at its word
-    assert load_wanted(copy).phase.shape == (3, 3, 32, 24)
+    assert load_panel_phases(copy).phase.shape == (3, 3, 32, 24)
 
 
 def test_damaged_runs_are_refused(pec, tmp_path):
@@ -269,15 +269,15 @@ def test_a_volume_of_someone_else_is_refused_by_its_files(volume, tmp_path, chan
         summary = json.loads((folder / "summary.json").read_text())
         (folder / "summary.json").write_text(json.dumps(summary | {"refocused_m": made}))
     with pytest.raises(ConfigError, match=message):
-        load_wanted(folder)
+        load_panel_phases(folder)
 
 
 def test_a_field_of_any_strength_is_exported_alike(volume, tmp_path):
     folder = shutil.copytree(volume, tmp_path / "run")
     values = np.load(folder / "arrays" / "hologram.npy")
-    before = load_wanted(folder)
+    before = load_panel_phases(folder)
     np.save(folder / "arrays" / "hologram.npy", values * np.float32(2.0**60))  # its fourth power is beyond float32
-    after = load_wanted(folder)
+    after = load_panel_phases(folder)
     assert torch.equal(after.phase, before.phase) and after.losses == before.losses
 
 
@@ -297,6 +297,10 @@ def test_command(pec, tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "Files      6 png for LCOS 2048, phase" and lines[-1] == str(tmp_path / "a")
     assert "0.0071 / 0.0071 / 0.0071 rad expected" in lines[2]
+    # The files are of no use to a thermal chip, and the text says so.
+    assert lines[-2].startswith("Content    phase after the heat has spread, modulo 2 pi, for a liquid-crystal panel")
+    assert "arrays/phase.npy" in lines[-2]
+    assert json.loads((tmp_path / "a" / "export.json").read_text())["content"] == lines[-2].removeprefix("Content    ")
     assert main(words) == 2
     assert "holds files already; choose another --out" in capsys.readouterr().err
     for extra, message in (
@@ -313,7 +317,7 @@ def test_command(pec, tmp_path, capsys):
 
 def test_files_of_another_panel_are_not_taken_for_ones_own(pec, tmp_path):
     out, report = export_slm(pec, PANEL, tmp_path / "a", overrides=SMALL)
-    wanted = load_wanted(pec)
+    wanted = load_panel_phases(pec)
     other = build_panel(
         load_panel(PANEL, [*SMALL[:2], EVEN.replace("530 nm", "530 nm, full_turn: 260")]), wanted.wavelengths
     )

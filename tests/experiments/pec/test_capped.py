@@ -1,6 +1,7 @@
 """A limit on the heat is kept by the phases that are saved, whatever else is asked for."""
 
 import json
+import re
 import signal
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from paths import CONFIGS
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.execute import execute
 from holotorch.experiments.pec import run as run_module
+from holotorch.experiments.pec.experiment import build
 from holotorch.experiments.pec.progress import Log
 from holotorch.experiments.registry import load_config
 
@@ -149,5 +151,28 @@ def test_a_report_says_which_methods_show_fewer_frames(tmp_path):
     execute(load_config(CONFIG, [*SMALL, "frames=2", "report.baselines=[none]"]), tmp_path / "two")
     page = (tmp_path / "two" / "report.html").read_text()
     assert "<th>frames</th>" in page and "compared with show a single frame" in page
+    for caption in (
+        "Heater phases, before the heat spreads",
+        "Temperature of the chip above ambient, after the heat has",
+    ):
+        assert re.search(f"{caption}[^<]*; frame 1 of 2, arrays/phase.npy holds all", page)
+    assert "SSIM half a sample off" in page and "midway between four samples" in page
     execute(load_config(CONFIG, [*SMALL, "report.baselines=[none]"]), tmp_path / "one")
-    assert "single frame" not in (tmp_path / "one" / "report.html").read_text()
+    page = (tmp_path / "one" / "report.html").read_text()
+    assert "single frame" not in page and "frame 1" not in page
+
+
+@pytest.mark.parametrize("frames", [1, 3])
+def test_maps_name_the_frame_that_they_show(tmp_path, monkeypatch, frames):
+    titles = []
+    monkeypatch.setattr(run_module.pictures, "channel_maps", lambda values, names, *_: titles.append(names) or b"")
+    execute(load_config(CONFIG, [*SMALL, f"frames={frames}"]), tmp_path / "a")
+    wavelengths = ["630 nm", "530 nm", "445 nm"]
+    assert titles == 2 * [wavelengths if frames == 1 else [f"{each}, frame 1 of 3" for each in wavelengths]]
+
+
+def test_a_checkpoint_with_other_axes_is_refused(tmp_path):
+    """Joint frames were [C, F, H, W] in checkpoints of version 0.1.0, and with F = C only the fingerprint tells."""
+    joint, alone = (build(load_config(CONFIG, [*SMALL, f"frames={frames}"])) for frames in (3, 1))
+    assert run_module._fingerprint(joint)["axes of joint frames"] == "F, C, H, W"
+    assert "axes of joint frames" not in run_module._fingerprint(alone)

@@ -36,20 +36,26 @@ def test_every_study_fills_its_folder(study, tmp_path, capsys, monkeypatch):
     claims = [row for row in rows if row["method"] == "claim"]
     assert all(row["thesis"] and row["verdict"] and row["setting"] for row in claims)
     assert bool(claims) == (study not in ("limits", "targets", "reproduction"))  # one sigma alone shows no decline
+    assert not any("goal" in str(row) for row in rows)
     assert "method" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("study", STUDIES)
 def test_check_says_what_a_study_does(study, capsys):
     assert main(["check", f"configs/pec/studies/{study}.yaml"]) == 0
-    assert f"Study      {study} of camera" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert f"Study      {study} of camera" in out
+    assert "PPEC: proximal proximity effect correction" in out and "exp(-d^2/sigma^2)" in out
 
 
 def test_a_small_chart_of_pec_is_complete(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(chart_pec, "SIGMAS", (0.66,))
     monkeypatch.setattr(chart_pec, "SIZE", 32)
     monkeypatch.setattr(chart_pec, "STEPS", 24)
-    monkeypatch.setattr(chart_pec, "GOALS", {0.66: (0.3, 0.6)})
+    monkeypatch.setattr(chart_pec, "LEVELS", {0.66: (0.3, 0.6)})
+    goals = tmp_path / "goals.yaml"
+    monkeypatch.setattr(chart_pec, "GOALS", goals)
+    goals.write_text("solver: {0.66: {evaluations: 0.01, seconds: 0.0001}}\ntargets: []\n")
     assert main(["chart", "pec", "--out", str(tmp_path / "c")]) == 0
     assert {path.name for path in (tmp_path / "c").iterdir()} == {
         "chart.csv",
@@ -57,7 +63,26 @@ def test_a_small_chart_of_pec_is_complete(tmp_path, monkeypatch, capsys):
         "comparison.csv",
         "verdict.txt",
     }
-    assert "fourier, sigma 0.66: " in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "fourier, sigma 0.66: " in out and "exp(-d^2/sigma^2)" in out
+    assert out.count("(goal 0.01/0.0001: met by APG, growing step, restart; ") == 2
+
+
+def test_goals_are_read_from_the_file_beside_the_charts(tmp_path, monkeypatch):
+    """Only the chart command compares them; a study has none. The committed ones fit the committed table."""
+    row = {"kind": "fresnel", "sigma_px": 1.0, "solver": "L-BFGS", "evaluations_ratio": 3.0, "seconds_ratio": 1.5}
+    lines = chart_pec._verdict([row])
+    assert next(line for line in lines if line.startswith("fresnel, sigma 1:")).endswith("(goal 4/1.8: not met)")
+    assert lines[-1] == "targets: the SSIM of 32 of 32 cases meets its goal"
+    monkeypatch.setattr(chart_pec, "GOALS", tmp_path / "goals.yaml")
+    assert not any("goal" in line for line in chart_pec._verdict([row]))  # as in an installed package
+    (tmp_path / "targets").mkdir()
+    (tmp_path / "targets" / "table.csv").write_text("method,kind,sigma_px,ssim\none,fourier,1.0,0.5\n")
+    (tmp_path / "goals.yaml").write_text(
+        "solver: {}\ntargets: [{method: one, kind: fourier, ssim: {1.0: 0.5, 2.0: 0.1}}]\n"
+    )
+    words = "targets: the SSIM of 1 of 2 cases meets its goal; not met: one, fourier, sigma 2"
+    assert chart_pec._verdict([row])[-1] == words
 
 
 def test_bench_scores_what_the_solver_is_not_asked(tmp_path):

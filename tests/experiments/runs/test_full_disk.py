@@ -161,7 +161,7 @@ def test_a_failure_after_the_solver_loses_no_step(whole, tmp_path, monkeypatch):
         raise RuntimeError("CUDA out of memory")
 
     with monkeypatch.context() as patch:
-        patch.setattr(run_module, "judge", fails)
+        patch.setattr(run_module, "evaluate", fails)
         assert main(command("pec", tmp_path / "a")) == 1
     monkeypatch.setattr(Log, "__call__", lambda *_: pytest.fail("a step was taken again"))
     assert main(["resume", str(tmp_path / "a")]) == 0

@@ -7,7 +7,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from paths import CONFIGS
 
 from holotorch import Grid
-from holotorch.correction import LBFGS, PECProblem, limited, run_stages
+from holotorch.correction import LBFGS, PECProblem, penalty_schedule, run_stages
 from holotorch.experiments.pec.weight import eccentricities, weight_map
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.runs import pictures
@@ -55,7 +55,7 @@ def test_a_second_stage_is_named_and_the_legend_covers_no_curve(drawn):
     crosstalk, propagator = ThermalCrosstalk(sigma_px=0.66), Fraunhofer(Grid((24, 24), 9e-6), (630e-9, 530e-9, 445e-9))
     make = lambda **more: PECProblem(crosstalk, propagator, target, **more)  # noqa: E731
     solver = LBFGS(max_steps=60, tolerance=0.0)
-    found = run_stages(limited(make, solver, crosstalk.total, None), 6 * torch.rand(3, 24, 24))
+    found = run_stages(penalty_schedule(make, solver, crosstalk.total, None), 6 * torch.rand(3, 24, 24))
     pictures.convergence(found.losses, ["a", "b", "c"], [(10, 0.3), (60, 0.5)], "ssim")
     plain = LBFGS(max_steps=20, tolerance=0.0)(make(), 6 * torch.rand(3, 24, 24))
     pictures.convergence(plain.losses, ["a", "b", "c"], [], "ssim")

@@ -1,4 +1,4 @@
-"""Scores of heater phases by simulations of their own, in float64, independent of what the solver computed."""
+"""Scores of heater phases, from a simulation in float64 that does not use results of the solver."""
 
 import math
 from dataclasses import dataclass
@@ -23,9 +23,9 @@ class Result:
 
     Attributes:
         phase: Heater phases in rad, [F, C, H, W].
-        picture: Intensity on the picture's own scale, float64 [C, h, w].
-        isolated: The same for a chip that stands alone; None in the far field.
-        numbers: What summary.json says of the method.
+        picture: Intensity, scaled so that it can be compared with the target picture, float64 [C, h, w].
+        isolated: The same for a single chip without periodic repetition; None in the far field.
+        numbers: Entry of summary.json for the method.
     """
 
     phase: Tensor
@@ -35,76 +35,79 @@ class Result:
 
 
 def quality(experiment: PECExperiment, phase: Tensor) -> float:
-    """Mean of the first metric over the lit colours for phases [F, C, H, W] of these; cheap, for progress bars."""
+    """Mean of the first metric over the lit colours, for phases [F, C, H, W] of them; cheap, for progress bars."""
     name = experiment.settings.report.metrics[0]
-    seen = experiment.seen(experiment.formed(phase.double())).cpu()
-    picture = _as_picture(experiment, seen, at_best_scale=experiment.scale_free)
+    formed = experiment.picture_in(experiment.intensity(phase.double())).cpu()
+    picture = _as_picture(experiment, formed, at_best_scale=experiment.scale_free)
     return _scores(experiment, picture, experiment.image)[f"{name}_mean"]
 
 
-def judge(experiment: PECExperiment, phase: Tensor) -> Result:
-    """Score heater phases of the lit colours, [F, C, H, W]: in the model of the run, between its samples, and alone."""
+def evaluate(experiment: PECExperiment, phase: Tensor) -> Result:
+    """Score heater phases [F, C, H, W] of the lit colours.
+
+    The image is scored at its samples in the model of the run, half a sample off them, and for a single chip.
+    """
     phase = phase.detach().double()
-    seen = experiment.seen(experiment.formed(phase)).cpu()
-    picture = _as_picture(experiment, seen, at_best_scale=experiment.scale_free)
+    formed = experiment.picture_in(experiment.intensity(phase)).cpu()
+    picture = _as_picture(experiment, formed, at_best_scale=experiment.scale_free)
     warm = experiment.array.temperature(experiment.array.crosstalk(phase))
     driven = experiment.array.temperature(phase)
     numbers = _scores(experiment, picture, experiment.image) | {
         "frames": len(phase),
-        "efficiency": _per_colour(experiment, _share(experiment, seen)),
+        "efficiency": _per_colour(experiment, _efficiency(experiment, formed)),
         "peak_phase_rad": experiment.array.crosstalk(phase).max().item(),
         "peak_temperature_rise_K": _per_colour(experiment, warm.amax((0, -2, -1))),
         "mean_temperature_rise_K": _per_colour(experiment, warm.mean((0, -2, -1))),
         "heating_power_K_per_pixel": _per_colour(experiment, driven.mean((0, -2, -1))),
     }
-    alone = None
+    isolated = None
     if experiment.distances:
-        alone, numbers["isolated"], between = _alone(experiment, phase)
+        isolated, numbers["isolated"], between = _isolated(experiment, phase)
     else:
         (y, x), (height, width) = experiment.grid.coordinates(phase.device), experiment.grid.extent
         half_a_sample = torch.exp(-1j * math.pi * (y / height + x / width))
         shifted = [intensity(experiment.propagator(experiment.array(each) * half_a_sample)) for each in phase]
-        between = experiment.seen(torch.stack(shifted).mean(0)).cpu()
+        between = experiment.picture_in(torch.stack(shifted).mean(0)).cpu()
         if experiment.scale_free:
-            between = between * best_scale(seen, experiment.wanted)[:, None, None]
+            between = between * best_scale(formed, experiment.wanted)[:, None, None]
     numbers["between_samples"] = _between_scores(experiment, between)
     if weight := experiment.settings.target.weight:
         numbers["zones"] = zone_scores(weight, picture, experiment.image, experiment.lit)
-    return Result(_all_colours(experiment, phase.cpu()), picture, alone, numbers)
+    return Result(_all_colours(experiment, phase.cpu()), picture, isolated, numbers)
 
 
-def _share(experiment: PECExperiment, seen: Tensor) -> Tensor:
-    """Share of the array's light that the picture gets, [C]."""
-    return seen.sum((-2, -1)) / math.prod(experiment.grid.shape)
+def _efficiency(experiment: PECExperiment, formed: Tensor) -> Tensor:
+    """Share of the array's light that falls in the picture, [C]."""
+    return formed.sum((-2, -1)) / math.prod(experiment.grid.shape)
 
 
-def _alone(experiment: PECExperiment, phase: Tensor) -> tuple[Tensor, dict[str, Any], Tensor]:
-    """What a single chip forms by the exact kernel: the picture, its scores, and the intensity between the samples."""
+def _isolated(experiment: PECExperiment, phase: Tensor) -> tuple[Tensor, dict[str, Any], Tensor]:
+    """Picture of a single chip by the exact kernel, its scores, and the intensity half a sample off the samples."""
     shape = (len(experiment.wavelengths), len(experiment.distances), *experiment.grid.shape)
     formed, between = (torch.zeros(shape, dtype=torch.float64) for _ in range(2))
     half = experiment.grid.pitch[0] / 2, experiment.grid.pitch[1] / 2
-    for i, wave in enumerate(experiment.wavelengths):  # one colour and one depth at a time: float64 kernels are large
+    for i, wavelength in enumerate(experiment.wavelengths):  # one kernel at a time: in float64 they are large
         for j, distance in enumerate(experiment.distances):
             for offset, total in (((0.0, 0.0), formed), (half, between)):
-                exact = CroppedKernel(experiment.grid, wave, distance, offset=offset).to(experiment.device)
+                exact = CroppedKernel(experiment.grid, wavelength, distance, offset=offset).to(experiment.device)
                 for each in phase:
                     total[i, j] += intensity(exact(experiment.array(each)[i : i + 1]))[0].cpu() / len(phase)
     if len(experiment.distances) == 1:
         formed, between = formed[:, 0], between[:, 0]
-    formed, between = experiment.seen(formed), experiment.seen(between)
+    formed, between = experiment.picture_in(formed), experiment.picture_in(between)
     picture = _as_picture(experiment, formed, at_best_scale=True)
     numbers = _scores(experiment, picture, experiment.image)
-    numbers["efficiency"] = _per_colour(experiment, _share(experiment, formed))
+    numbers["efficiency"] = _per_colour(experiment, _efficiency(experiment, formed))
     scale = best_scale(formed, experiment.wanted)[:, None, None]
     return picture, numbers, between * scale
 
 
 def _between_scores(experiment: PECExperiment, between: Tensor) -> dict[str, Any]:
-    """Scores half a sample off the image's samples, against the mean of the picture's four neighbours there."""
+    """Scores half a sample off the image's samples, against the mean of the four nearest pixels of the picture."""
     picture = _as_picture(experiment, between, at_best_scale=False)[..., :-1, :-1]
     image = experiment.image
-    middle = (image[..., 1:, 1:] + image[..., 1:, :-1] + image[..., :-1, 1:] + image[..., :-1, :-1]) / 4
-    return _scores(experiment, picture, middle) if min(middle.shape[-2:]) >= SSIM_WINDOW else {}
+    wanted = (image[..., 1:, 1:] + image[..., 1:, :-1] + image[..., :-1, 1:] + image[..., :-1, :-1]) / 4
+    return _scores(experiment, picture, wanted) if min(wanted.shape[-2:]) >= SSIM_WINDOW else {}
 
 
 def _scores(experiment: PECExperiment, picture: Tensor, image: Tensor) -> dict[str, Any]:
@@ -117,7 +120,7 @@ def _scores(experiment: PECExperiment, picture: Tensor, image: Tensor) -> dict[s
 
 
 def _as_picture(experiment: PECExperiment, formed: Tensor, *, at_best_scale: bool) -> Tensor:
-    """Relative intensity of the lit colours [C, h, w] to the picture's own scale, dark colours black."""
+    """Relative intensity of the lit colours [C, h, w] on the scale of the picture, with the dark colours as zeros."""
     if at_best_scale:
         formed = formed * best_scale(formed, experiment.wanted)[:, None, None]
     mean = experiment.image[experiment.lit].mean((-2, -1), keepdim=True)
@@ -125,7 +128,7 @@ def _as_picture(experiment: PECExperiment, formed: Tensor, *, at_best_scale: boo
 
 
 def _all_colours(experiment: PECExperiment, lit: Tensor) -> Tensor:
-    """[..., C, h, w] or [C] of the lit colours to all, zero in the dark ones."""
+    """Values [..., C, h, w] or [C] of the lit colours, extended to all colours by zeros."""
     axis = 0 if lit.ndim == 1 else lit.ndim - 3
     shape = list(lit.shape)
     shape[axis] = len(experiment.lit)
