@@ -217,7 +217,7 @@ import holotorch, holotorch.optics, holotorch.modulator, holotorch.correction, h
 holotorch.Grid
 assert before == state()
 assert not opened, opened
-assert not {"cv2", "colour", "kornia", "matplotlib", "pydantic"} & set(sys.modules)
+assert not {"cv2", "colour", "kornia", "matplotlib", "pydantic", "jinja2"} & set(sys.modules)
 """
     subprocess.run([sys.executable, "-c", code], check=True)
     assert not list(tmp_path.iterdir())

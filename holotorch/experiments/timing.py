@@ -1,26 +1,34 @@
-"""How long calls take beside each other: turn by turn in one process, so that all of them meet the same machine."""
+"""How long calls take: one call, or several in alternation, so that all of them meet the same state of the machine."""
 
 import statistics
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
+Result = TypeVar("Result")
 ROUNDS = 5
 
 
+def timed(call: Callable[[], Result]) -> tuple[Result, float]:
+    """The result of a call and its duration in seconds, including work that a GPU finishes after the call returns."""
+    _synchronize()
+    started = time.perf_counter()
+    result = call()
+    _synchronize()
+    return result, time.perf_counter() - started
+
+
 def interleaved(calls: dict[str, Callable[[], Any]], rounds: int = ROUNDS) -> dict[str, float]:
-    """Median seconds of each call over rounds in which all of them take one turn; one round before warms up."""
+    """Median seconds of each call over ``rounds``; each round makes every call once, after one round of warming up."""
     times: dict[str, list[float]] = {name: [] for name in calls}
-    for turn in range(rounds + 1):
+    for _ in range(rounds + 1):
         for name, call in calls.items():
-            if torch.cuda.is_available():
-                torch.cuda.synchronize()
-            started = time.perf_counter()
-            call()
-            if torch.cuda.is_available():
-                torch.cuda.synchronize()
-            if turn:
-                times[name].append(time.perf_counter() - started)
-    return {name: statistics.median(values) for name, values in times.items()}
+            times[name].append(timed(call)[1])
+    return {name: statistics.median(seconds[1:]) for name, seconds in times.items()}
+
+
+def _synchronize() -> None:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()

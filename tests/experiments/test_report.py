@@ -46,6 +46,7 @@ def test_one_static_page_with_pictures_inside(folders):
     parser.feed(page)
     assert parser.open == []
     assert "<script" not in page and "http" not in page
+    assert "width=device-width" in page and "prefers-color-scheme: dark" in page  # telephones, dark mode
     pictures = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
     assert len(pictures) == page.count("<img") == 7
     assert all(base64.b64decode(picture).startswith(b"\x89PNG") for picture in pictures)

@@ -1,15 +1,12 @@
-"""The way to the retina: error against time, wavelengths against error, and speckle against sharpness."""
+"""Chart of an observer's view: error against time, wavelengths against error, and speckle against sharpness."""
 
-import io
 import math
-import time
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -20,6 +17,8 @@ from holotorch.experiments.eye.config import ObserverSettings
 from holotorch.experiments.eye.experiment import PRESETS, Observer, observer
 from holotorch.experiments.eye.tradeoff import WIDTHS, Case, fitted_prefactor, in_words, tradeoff
 from holotorch.experiments.registry import load_config
+from holotorch.experiments.runs.pictures import figure_png
+from holotorch.experiments.timing import timed
 from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.io.bundled import find_config
 from holotorch.optics.light.spectral import spectral_image
@@ -28,165 +27,164 @@ from holotorch.optics.viewing.elementwise import ElementSampling, least_oversamp
 from holotorch.optics.viewing.imaging import imaged
 from holotorch.optics.viewing.retina import plan_retina
 
-SIDE, DISTANCES = 512, (10e-3, 20e-3, 30e-3)
+SIDE, DISTANCES = 512, (10e-3, 20e-3, 30e-3)  # pixels of the hologram; distances of the scene in metres
+FOCUS = 30e-3  # metres from the hologram
 SCENE = "hologram={{shape: [{0}, {0}], pitch: 3.74 um, distance: 30 mm, depths: 58, rays: {1}}}"
-FACTORS = (1.0, 2.0, 4.0)
+FACTORS = (1.0, 2.0, 4.0)  # oversampling of the element-by-element propagation
 
 
 def eye() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
-    """Rows of ways and of sources, rows of the trade-off, pictures by name, and the verdict."""
-    looking, shown = find_config("configs/eye/teapot.yaml"), find_config("configs/volume/c60.yaml")
-    assert looking is not None and shown is not None
-    settings, scene = load_config(looking), load_config(shown, [_scene()])
-    assert isinstance(settings, ObserverSettings) and isinstance(scene, VolumeSettings)
-    found = observer(settings.model_copy(update={"focus": (30e-3,)}), scene)
-    ways = _ways(_quarter(settings, scene))
-    counts = _counts(found)
+    """Rows of methods and sources, rows of the trade-off, pictures by name, and the verdict."""
+    settings, scene = _settings()
+    methods = _methods(_quarter_size(settings, scene))
+    counts = _counts(observer(settings.model_copy(update={"focus": (FOCUS,)}), scene))
     cases = tradeoff(settings, scene, DISTANCES)
     rows = [case.row(fitted_prefactor(cases)) for case in cases]
-    return ways + counts, rows, {"chart": _draw(ways, counts, cases)}, _verdict(ways, counts, cases)
+    return methods + counts, rows, {"chart": _draw(methods, counts, cases)}, _verdict(methods, counts, cases)
 
 
-def _quarter(settings: ObserverSettings, scene: VolumeSettings) -> Observer:
-    """Display, eye and distances a quarter as large: element by element the whole one needs 11 GB for 512 px."""
+def _settings() -> tuple[ObserverSettings, VolumeSettings]:
+    settings_file, scene_file = find_config("configs/eye/teapot.yaml"), find_config("configs/volume/c60.yaml")
+    assert settings_file is not None and scene_file is not None
+    settings, scene = load_config(settings_file), load_config(scene_file, [SCENE.format(SIDE, SIDE // 2)])
+    assert isinstance(settings, ObserverSettings) and isinstance(scene, VolumeSettings)
+    return settings, scene
+
+
+def _quarter_size(settings: ObserverSettings, scene: VolumeSettings) -> Observer:
+    """An observer whose display, eye and distances are scaled by 1/4.
+
+    At full size, the element-by-element propagation of 512 px takes 11 GB.
+    """
     display, eye = settings.display, settings.eye
     lengths = {name: value / 4 for name, value in display.model_dump().items() if isinstance(value, float)}
     smaller = {
         "display": display.model_copy(update=lengths),
         "eye": eye.model_copy(update={"pupil_radius": eye.pupil_radius / 4, "axial_length": eye.axial_length / 4}),
-        "focus": (7.5e-3,),
+        "focus": (FOCUS / 4,),
     }
-    near = scene.hologram.model_copy(update={"distance": 7.5e-3})
+    near = scene.hologram.model_copy(update={"distance": FOCUS / 4})
     return observer(settings.model_copy(update=smaller), scene.model_copy(update={"hologram": near}))
 
 
-def _scene() -> str:
-    return SCENE.format(SIDE, SIDE // 2)
+def _methods(observer: Observer) -> list[dict]:
+    """Collapsed and element-by-element propagation of green light, paraxial.
 
+    Errors are those of the intensity on the retina, relative to elements with 1.3 times the least oversampling.
+    """
+    grid, depth, wavelength = observer.scene.grid, observer.focus[0], observer.scene.settings.wavelengths[1]
+    hologram, _ = observer.scene.hologram(0)
+    field, eye, display = hologram[1].conj()[None], observer.eye(depth), observer.display
+    least = least_oversampling(grid, [wavelength], display, eye, plane=depth)
 
-def _ways(eye: Observer) -> list[dict]:
-    """Collapse and elements for green light, paraxial: error of the retina's intensity against finer elements."""
-    grid, depth, wave = eye.scene.grid, eye.focus[0], eye.scene.settings.wavelengths[1]
-    hologram, _ = eye.scene.hologram(0)
-    field, looking, display = hologram[1].conj()[None], eye.eye(depth), eye.display
-    least = least_oversampling(grid, [wave], display, looking, plane=depth)
-    wanted = intensity(
-        through_elements(field, grid, [wave], display, looking, plane=depth, sampling=_finer(least, 1.3), paraxial=True)
-    )
-    plan = plan_retina(grid, [wave], display, looking, plane=depth, paraxial=True)
+    def by_elements(factor: float) -> Tensor:
+        sampling = _scaled(least, factor)
+        return through_elements(field, grid, [wavelength], display, eye, plane=depth, sampling=sampling, paraxial=True)
+
+    reference = intensity(by_elements(1.3))
+    plan = plan_retina(grid, [wavelength], display, eye, plane=depth, paraxial=True)
     needed = max(least.oversampling)
     calls: dict[str, Any] = {
-        "collapse": lambda: imaged(field, grid, [wave], display, looking, plane=depth, paraxial=True)
+        "collapse": lambda: imaged(field, grid, [wavelength], display, eye, plane=depth, paraxial=True)
     }
     for factor in (*(f for f in FACTORS if f < 0.95 * needed), needed):
-        sampling = _finer(least, factor / needed)
         name = f"elements, {factor:.2g} x" + (", the thesis's sampling" if factor == 1 else "")
-        calls[name] = lambda sampling=sampling: through_elements(
-            field, grid, [wave], display, looking, plane=depth, sampling=sampling, paraxial=True
-        )
+        calls[name] = partial(by_elements, factor / needed)
     rows = []
     for name, call in calls.items():
-        with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the coarse ones alias: that is shown
-            call()
-            started = time.perf_counter()
-            seen = intensity(call())
-            seconds = time.perf_counter() - started
-        error = ((seen - wanted).square().sum() / wanted.square().sum()).sqrt().item()
+        with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the chart shows this aliasing
+            call()  # warms up
+            image, seconds = timed(call)
+        error = ((intensity(image) - reference).square().sum() / reference.square().sum()).sqrt().item()
         predicted = f"{plan.predicted_error:.1e}" if name == "collapse" else ""
-        rows.append(_row("way", name, seconds=f"{seconds:.3f}", error=f"{error:.1e}", predicted=predicted))
+        rows.append(_row("way", name, seconds, f"{error:.1e}", predicted))
     return rows
 
 
-def _finer(least: ElementSampling, factor: float) -> ElementSampling:
-    """``least`` with so many times its samples."""
+def _scaled(least: ElementSampling, factor: float) -> ElementSampling:
+    """``least`` with ``factor`` times its samples."""
     fine = tuple(good_length(math.ceil(size * factor / 2) * 2) for size in least.fine)
     times = tuple(m * now / size for m, now, size in zip(least.oversampling, fine, least.fine, strict=True))
     return replace(least, oversampling=times, fine=fine)  # type: ignore[arg-type]
 
 
-def _counts(eye: Observer) -> list[dict]:
-    """Error of a picture in green light by the number of wavelengths, against one every nanometre.
+def _counts(observer: Observer) -> list[dict]:
+    """Error of a picture in green light by the number of wavelengths, relative to one wavelength every nanometre.
 
-    Followed: all are in the sum, but only so many go through the optics. Alone: only so many are in the sum.
+    "followed": all wavelengths are in the sum, but only this many are propagated, and the others are derived from
+    their neighbours. "alone": only this many wavelengths are in the sum.
     """
-    depth, wave, grid = eye.focus[0], eye.scene.settings.wavelengths[1], eye.scene.grid
-    hologram, _ = eye.scene.hologram(0)
-    field, looking = hologram[1].conj(), eye.eye(depth)
-    light = seen_light(grid, wave, eye.display, looking, reach=eye.scene.width / 2)
+    depth, wavelength, grid = observer.focus[0], observer.scene.settings.wavelengths[1], observer.scene.grid
+    hologram, _ = observer.scene.hologram(0)
+    field, eye = hologram[1].conj(), observer.eye(depth)
+    light = seen_light(grid, wavelength, observer.display, eye, reach=observer.scene.width / 2)
+
+    def image(wavelengths: Tensor, weights: Tensor, count: int) -> Tensor:
+        return spectral_image(field, grid, wavelengths, weights, observer.display, eye, count=count)
+
     rows = []
     for source, make in PRESETS.items():
-        spectrum = make(wave)
-        places, weights = spectrum.every(1e-9)
-        wanted, slow = _timed(lambda p=places, w=weights: _sum(eye, field, p, w, len(p)))
-        rows.append(_row(source, f"{len(places)} of {len(places)} nm steps", seconds=f"{slow:.3f}", error="0"))
-        # Where the power is in few wavelengths, no more than these are followed.
-        for count in sorted({len(followed(places, weights, many)[0]) for many in (1, 2, 3, 7, 15, len(places) // 4)
-                             if many <= max(3, len(places) // 4)}):  # fmt: skip
-            seen, seconds = _timed(lambda p=places, w=weights, n=count: _sum(eye, field, p, w, n))
-            rows.append(
-                _row(source, f"{count} of {len(places)} followed", seconds=f"{seconds:.3f}", error=_error(seen, wanted),
-                     predicted=f"{neighbour_error(places, weights, count, light):.1e}")
-            )  # fmt: skip
-        for count in sorted({1, 2, 3, 4, 6, 9, 14, 20}):
-            if count < len(places):
+        spectrum = make(wavelength)
+        wavelengths, weights = spectrum.every(1e-9)
+        total = len(wavelengths)
+        reference, seconds = timed(partial(image, wavelengths, weights, total))
+        rows.append(_row(source, f"{total} of {total} nm steps", seconds, "0"))
+        most = total // 4
+        # Fewer are propagated than asked for where most of the power is in few wavelengths.
+        asked = [count for count in (1, 2, 3, 7, 15, most) if count <= max(3, most)]
+        for count in sorted({len(followed(wavelengths, weights, count)[0]) for count in asked}):
+            picture, seconds = timed(partial(image, wavelengths, weights, count))
+            predicted = f"{neighbour_error(wavelengths, weights, count, light):.1e}"
+            rows.append(_row(source, f"{count} of {total} followed", seconds, _error(picture, reference), predicted))
+        for count in (1, 2, 3, 4, 6, 9, 14, 20):
+            if count < total:
                 few = spectrum.samples(count, path_difference=light.path_difference, iris=False, step=1e-9)
-                seen, seconds = _timed(lambda few=few: _sum(eye, field, *few, len(few[0])))
-                rows.append(
-                    _row(
-                        source, f"{count} of {len(places)} alone", seconds=f"{seconds:.3f}", error=_error(seen, wanted)
-                    )
-                )
+                picture, seconds = timed(partial(image, *few, len(few[0])))
+                rows.append(_row(source, f"{count} of {total} alone", seconds, _error(picture, reference)))
     return rows
 
 
-def _sum(eye: Observer, field: Tensor, places: Tensor, weights: Tensor, count: int) -> Tensor:
-    looking = eye.eye(eye.focus[0])
-    return spectral_image(field, eye.scene.grid, places, weights, eye.display, looking, count=count)
+def _error(picture: Tensor, reference: Tensor) -> str:
+    return f"{((picture - reference).square().mean() / reference.square().mean()).sqrt().item():.1e}"
 
 
-def _timed(make: Callable[[], Tensor]) -> tuple[Tensor, float]:
-    started = time.perf_counter()
-    return make(), time.perf_counter() - started
+def _row(subject: str, what: str, seconds: float, error: str, predicted: str = "") -> dict:
+    return {"subject": subject, "what": what, "seconds": f"{seconds:.3f}", "error": error, "predicted": predicted}
 
 
-def _error(seen: Tensor, wanted: Tensor) -> str:
-    return f"{((seen - wanted).square().mean() / wanted.square().mean()).sqrt().item():.1e}"
-
-
-def _row(subject: str, what: str, **numbers: str) -> dict:
-    return {"subject": subject, "what": what, "seconds": "", "error": "", "predicted": ""} | numbers
-
-
-def _verdict(ways: list[dict], counts: list[dict], cases: list[Case]) -> list[str]:
+def _verdict(methods: list[dict], counts: list[dict], cases: list[Case]) -> list[str]:
     lines = [f"torch {torch.__version__}, {torch.get_num_threads()} threads; {SIDE} px, synthetic C60, 520 nm"]
-    for row in ways:
+    for row in methods:
         predicted = f" (predicted {row['predicted']})" if row["predicted"] else ""
         lines.append(f"{row['what']}: error {row['error']}{predicted}, {row['seconds']} s")
     for source in PRESETS:
-        own = [row for row in counts if row["subject"] == source]
-        full = float(own[0]["seconds"])
+        selected = [row for row in counts if row["subject"] == source]
+        full = float(selected[0]["seconds"])
         through = [
             f"{row['what']} {row['error']} (predicted {row['predicted']}), {full / float(row['seconds']):.1f} x as fast"
-            for row in own
+            for row in selected
             if "followed" in row["what"]
         ]
-        alone = [f"{row['what']} {row['error']}" for row in own if "alone" in row["what"]]
+        alone = [f"{row['what']} {row['error']}" for row in selected if "alone" in row["what"]]
         lines += [f"{source}: " + "; ".join(through), f"{source}: " + "; ".join(alone)]
     lines += in_words(cases)
     return lines
 
 
-def _draw(ways: list[dict], counts: list[dict], cases: list[Case]) -> bytes:
+def _draw(methods: list[dict], counts: list[dict], cases: list[Case]) -> bytes:
     figure = Figure(figsize=(16, 5), layout="constrained")
     first, second, third = (figure.add_subplot(1, 3, k + 1) for k in range(3))
-    for k, row in enumerate(ways):
+    for k, row in enumerate(methods):
         first.loglog(float(row["seconds"]), max(float(row["error"]), 1e-6), "os^vDP"[k % 6], label=row["what"])
     first.set_xlabel("seconds")
     first.set_ylabel("relative L2 error of the retina's intensity")
     for k, source in enumerate(PRESETS):
         for how, line in (("followed", "o-"), ("alone", "x:")):
-            own = [row for row in counts if row["subject"] == source and how in row["what"]]
-            numbers, errors = [int(row["what"].split()[0]) for row in own], [float(row["error"]) for row in own]
+            selected = [row for row in counts if row["subject"] == source and how in row["what"]]
+            numbers, errors = (
+                [int(row["what"].split()[0]) for row in selected],
+                [float(row["error"]) for row in selected],
+            )
             second.loglog(numbers, errors, line, color=f"C{k}", label=f"{source}, {how}")
     second.set_xlabel("wavelengths through the optics")
     second.set_ylabel("relative L2 error against one every nm")
@@ -205,6 +203,4 @@ def _draw(ways: list[dict], counts: list[dict], cases: list[Case]) -> bytes:
         axes.legend(fontsize=7)
     second.set_ylim(bottom=1e-4)
     second.legend(fontsize=7, ncols=2, loc="lower left")
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer)
-    return buffer.getvalue()
+    return figure_png(figure)

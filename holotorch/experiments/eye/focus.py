@@ -1,11 +1,9 @@
 """Where a volume looks sharp against where the eye is focused: a sweep of the accommodation (thesis Fig. 5.9)."""
 
-import io
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from skimage.filters import gaussian
 from torch import Tensor
@@ -13,6 +11,7 @@ from tqdm import tqdm
 
 from holotorch.experiments.eye.config import SweepSettings
 from holotorch.experiments.eye.experiment import Observer
+from holotorch.experiments.runs.pictures import figure_png
 
 _DETAIL = 6.0  # rays, standard deviation of the blur that is taken off: what is finer than it tells the focus
 _SEEN = 0.5  # opacity of a ray above which it shows a surface
@@ -159,9 +158,7 @@ def draw(sweep: FocusSweep) -> bytes:
         view.imshow(picture.movedim(0, -1).numpy(), interpolation="nearest")
         view.set_title(f"focus {places[nearest]:.2f} mm", fontsize=10)
         view.set_axis_off()
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer)
-    return buffer.getvalue()
+    return figure_png(figure)
 
 
 def _detail(pictures: Tensor) -> Tensor:

@@ -1,16 +1,15 @@
 """Geometry of a display and its observer, in numbers and to scale (thesis Sec. 5.4 and 5.6.2, Figs. 5.4 to 5.11)."""
 
-import io
 import math
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from holotorch.experiments.eye.config import MagnifyingSettings
 from holotorch.experiments.eye.experiment import PRESETS, Observer
+from holotorch.experiments.runs.pictures import figure_png
 from holotorch.optics.viewing import display_geometry as viewing
 
 _COLOURS = ("tab:red", "tab:green", "tab:blue")  # of the three channels, in the order of their wavelengths
@@ -103,9 +102,7 @@ def draw(eye: Observer) -> bytes:
     spectra.set_ylabel("power, of its peak; cut where it is left out")
     spectra.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.62, 1.0))
     spectra.grid(alpha=0.3)
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer)
-    return buffer.getvalue()
+    return figure_png(figure)
 
 
 def _draw_display(axes: Any, eye: Observer) -> None:

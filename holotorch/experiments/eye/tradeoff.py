@@ -1,7 +1,7 @@
-"""Speckle against sharpness: which spectral width shows a volume best, per colour and depth (thesis Sec. 6.4.2)."""
+"""Speckle against sharpness: the spectral width with the best picture, per colour and distance (thesis Sec. 6.4.2)."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,25 +21,33 @@ from holotorch.optics.light.spectrum import Spectrum
 from holotorch.optics.picture import equal_power, exposed
 from holotorch.optics.viewing.imaging import imaged
 
+# FWHM in metres of the spectra that are compared.
 WIDTHS = tuple(1e-9 * width for width in (1.4, 2.5, 4, 6, 9, 13, 19, 28, 40, 56))
-_AWAY = 1e-9 * np.concatenate([np.arange(0, 10, 0.5), np.arange(10, 85.0)])  # half a beat of a scene's corner
-_FOLLOWED = 16  # of all of these; 1 in 60 errs by 0.4 % (``holotorch chart eye``)
-_OTHERS = 1000  # seeds of the reference
+# Distances in metres from the central wavelength at which pictures are computed, to either side: up to 10 nm in steps
+# of half a beat at the corner of a scene.
+_OFFSETS = 1e-9 * np.concatenate([np.arange(0, 10, 0.5), np.arange(10, 85.0)])
+# Wavelengths of a colour that are propagated; the others are derived from them. Even 1 of 60 errs by 0.4 % only
+# (``holotorch chart eye``).
+_PROPAGATED = 16
+_REFERENCE_SEED = 1000  # first seed of the realisations of the reference
+_BRIGHTEST = 0.995  # quantile of the reference that is shown white
+_LIT = 0.05  # of the brightest pixel of the reference: speckle is measured on brighter pixels
 
 
 @dataclass(frozen=True)
 class Case:
-    """One colour at one distance.
+    """Measurements of one colour at one distance.
 
     Attributes:
         distance: Of the scene from the hologram, in metres.
         wavelength: In metres.
-        aperture: Sine up to which detail is carried: by the eye, the hologram, or the rays' own pitch.
-        ssim: Of each of ``WIDTHS``, against the mean of other realisations.
-        contrast: Of each.
-        sharpness: Of each.
-        best: FWHM of the highest SSIM, by a parabola through its neighbours, in metres.
-        inside: Whether it lies inside the range of widths.
+        aperture: Sine of the half angle of the light that carries detail; limited by the eye, the hologram or the
+            pitch of the rays.
+        ssim: For each of ``WIDTHS``, relative to the mean of other realisations.
+        contrast: Speckle contrast for each of ``WIDTHS``.
+        sharpness: For each of ``WIDTHS``.
+        best: FWHM in metres with the highest SSIM, by a parabola through it and its neighbours.
+        inside: Whether ``best`` lies inside the range of ``WIDTHS``.
     """
 
     distance: float
@@ -52,11 +60,15 @@ class Case:
     inside: bool
 
     def formula(self, prefactor: float) -> float:
-        """The closed form's FWHM in metres."""
+        """FWHM in metres by the closed form; NaN for a prefactor of NaN."""
+        if math.isnan(prefactor):
+            return prefactor
         return optimum_fwhm(self.wavelength, self.aperture, self.distance, defocus=prefactor)
 
     def row(self, prefactor: float) -> dict[str, Any]:
-        """A line of a table; ``prefactor`` is that of the closed form."""
+        """A row of the table; ``prefactor`` is that of the closed form."""
+        measured = (("ssim", self.ssim, 4), ("contrast", self.contrast, 3))
+        measured += (("predicted", tuple(map(self.predicted_contrast, WIDTHS)), 3),)
         return {
             "distance_mm": self.distance * 1e3,
             "wavelength_nm": round(self.wavelength * 1e9),
@@ -64,20 +76,19 @@ class Case:
             "best_fwhm_nm": round(self.best * 1e9, 2),
             "inside": self.inside,
             "formula_nm": round(self.formula(prefactor) * 1e9, 2),
-            **{f"ssim_{width * 1e9:g}": round(value, 4) for width, value in zip(WIDTHS, self.ssim, strict=True)},
-            **{
-                f"contrast_{width * 1e9:g}": round(value, 3) for width, value in zip(WIDTHS, self.contrast, strict=True)
-            },
-            **{f"predicted_{width * 1e9:g}": round(self.predicted(width), 3) for width in WIDTHS},
+        } | {
+            f"{name}_{width * 1e9:g}": round(value, digits)
+            for name, values, digits in measured
+            for width, value in zip(WIDTHS, values, strict=True)
         }
 
     @property
     def source(self) -> str:
-        """Preset whose FWHM is nearest to the best."""
+        """Preset source whose FWHM is nearest to ``best``, by ratio."""
         return min(PRESETS, key=lambda name: abs(math.log(PRESETS[name](self.wavelength).fwhm / self.best)))
 
-    def predicted(self, width: float) -> float:
-        """Contrast in closed form at a FWHM."""
+    def predicted_contrast(self, width: float) -> float:
+        """Speckle contrast in closed form for a FWHM."""
         spectrum = Spectrum.lorentzian(self.wavelength, width)
         return predicted_contrast(spectrum, path_difference(self.distance, self.aperture))
 
@@ -85,56 +96,54 @@ class Case:
 def tradeoff(
     settings: ObserverSettings, scene: VolumeSettings, distances: tuple[float, ...], *, seeds: int = 2, others: int = 12
 ) -> list[Case]:
-    """Cases for every distance and colour; the eye is focused on the middle of the scene.
+    """A case for every distance and colour, with the eye focused on the middle of the scene.
 
-    By the collapse throughout, as every hologram is looked at in 189 wavelengths of each colour.
+    Every picture is propagated collapsed, since each hologram is seen in 189 wavelengths per colour.
     """
     cases = []
     for distance in tqdm(distances, desc="speckle against sharpness", unit="distance"):
         moved = scene.model_copy(update={"hologram": scene.hologram.model_copy(update={"distance": distance})})
-        found = observer(settings.model_copy(update={"focus": (distance,)}), moved)
-        found = replace(found, focus=(distance,))
-        own = [found.scene.hologram(seed)[0] for seed in range(seeds)]
-        rest = [found.scene.hologram(_OTHERS + seed)[0] for seed in range(others)]
-        for colour, wave in enumerate(moved.wavelengths):
-            reference = seed_statistics(torch.stack([_seen(found, h[colour], wave) for h in rest])).mean
-            cases.append(_case(found, colour, wave, own, reference))
+        eye = observer(settings.model_copy(update={"focus": (distance,)}), moved)
+        holograms = [eye.scene.hologram(seed)[0] for seed in range(seeds)]
+        reference_holograms = [eye.scene.hologram(_REFERENCE_SEED + seed)[0] for seed in range(others)]
+        for colour, wavelength in enumerate(moved.wavelengths):
+            images = torch.stack([_image(eye, each[colour], wavelength) for each in reference_holograms])
+            cases.append(_case(eye, colour, wavelength, holograms, seed_statistics(images).mean))
     return cases
 
 
-def _seen(eye: Observer, field: Tensor, wave: float) -> Tensor:
+def _image(eye: Observer, field: Tensor, wavelength: float) -> Tensor:
     depth = eye.focus[0]
-    image = imaged(field.conj()[None], eye.scene.grid, [wave], eye.display, eye.eye(depth), plane=depth)
+    image = imaged(field.conj()[None], eye.scene.grid, [wavelength], eye.display, eye.eye(depth), plane=depth)
     return pooled(intensity(image[0]), eye.scene.stride)
 
 
-def _case(eye: Observer, colour: int, wave: float, holograms: list[Tensor], reference: Tensor) -> Case:
+def _case(eye: Observer, colour: int, wavelength: float, holograms: list[Tensor], reference: Tensor) -> Case:
     depth = eye.focus[0]
-    places = wave + np.concatenate([-_AWAY[:0:-1], _AWAY])
-    weights = np.stack([_weights(places, Spectrum.lorentzian(wave, width)) for width in WIDTHS])
+    wavelengths = wavelength + np.concatenate([-_OFFSETS[:0:-1], _OFFSETS])
+    weights = np.stack([_weights(wavelengths, Spectrum.lorentzian(wavelength, width)) for width in WIDTHS])
     shown = []
     for hologram in holograms:
-        seen = spectral_image(
+        images = spectral_image(
             hologram[colour].conj(),
             eye.scene.grid,
-            torch.from_numpy(places),
+            torch.from_numpy(wavelengths),
             torch.from_numpy(weights),
             eye.display,
             eye.eye(depth),
-            count=min(_FOLLOWED, len(places)),
+            count=min(_PROPAGATED, len(wavelengths)),
         )
-        shown.append(torch.stack([pooled(picture, eye.scene.stride) for picture in seen]))
+        shown.append(torch.stack([pooled(image, eye.scene.stride) for image in images]))
     pictures = equal_power(torch.stack(shown), reference.expand(len(holograms), len(WIDTHS), *reference.shape))
-    peak = reference.flatten().quantile(0.995)
+    peak = reference.flatten().quantile(_BRIGHTEST)
     tone = exposed(pictures[..., None, :, :], peak=peak), exposed(reference[None], peak=peak)
     quality = ssim(tone[0], tone[1].expand_as(tone[0]).contiguous(), data_range=1.0)[..., 0].mean(0)
-    mask = reference > 0.05 * reference.max()
-    contrast = speckle_contrast(pictures, reference=reference, mask=mask).mean(0)
+    contrast = speckle_contrast(pictures, reference=reference, mask=reference > _LIT * reference.max()).mean(0)
     best, inside = _peak(np.log(np.array(WIDTHS)), quality.numpy())
     return Case(
         depth,
-        wave,
-        eye.detail(depth, wave),
+        wavelength,
+        eye.detail(depth, wavelength),
         tuple(quality.tolist()),
         tuple(contrast.tolist()),
         tuple(sharpness(pictures, reference).mean(0).tolist()),
@@ -143,42 +152,46 @@ def _case(eye: Observer, colour: int, wave: float, holograms: list[Tensor], refe
     )
 
 
-def _weights(places: np.ndarray, spectrum: Spectrum) -> np.ndarray:
-    """Of the trapezoidal rule over wavelengths within the spectrum's band, pictures linear between ``places``."""
-    low, high = (float(np.clip(end, places[0], places[-1])) for end in spectrum.band())
-    nodes = np.concatenate([[low], places[(places > low + 1e-13) & (places < high - 1e-13)], [high]])
+def _weights(wavelengths: np.ndarray, spectrum: Spectrum) -> np.ndarray:
+    """Weights of pictures at ``wavelengths`` in the trapezoidal rule over the band of the spectrum.
+
+    The pictures are interpolated linearly at the ends of the band.
+    """
+    low, high = (float(np.clip(end, wavelengths[0], wavelengths[-1])) for end in spectrum.band())
+    inside = (wavelengths > low + 1e-13) & (wavelengths < high - 1e-13)
+    nodes = np.concatenate([[low], wavelengths[inside], [high]])
     gaps = np.diff(nodes)
     power = spectrum.power(torch.from_numpy(nodes)).numpy() * (np.append(gaps, 0) + np.insert(gaps, 0, 0)) / 2
-    after = np.searchsorted(places, nodes).clip(1, len(places) - 1)
-    share = (nodes - places[after - 1]) / (places[after] - places[after - 1])
-    weights = np.bincount(after - 1, power * (1 - share), len(places)) + np.bincount(after, power * share, len(places))
+    after, count = np.searchsorted(wavelengths, nodes).clip(1, len(wavelengths) - 1), len(wavelengths)
+    share = (nodes - wavelengths[after - 1]) / (wavelengths[after] - wavelengths[after - 1])
+    weights = np.bincount(after - 1, power * (1 - share), count) + np.bincount(after, power * share, count)
     return weights / weights.sum()
 
 
-def _peak(places: np.ndarray, values: np.ndarray) -> tuple[float, bool]:
+def _peak(positions: np.ndarray, values: np.ndarray) -> tuple[float, bool]:
+    """Position of the maximum by a parabola through it and its neighbours, and whether it has two neighbours."""
     i = int(values.argmax())
-    if not 0 < i < len(places) - 1:
-        return float(places[i]), False
-    a, b, _ = np.polyfit(places[i - 1 : i + 2], values[i - 1 : i + 2], 2)
+    if not 0 < i < len(positions) - 1:
+        return float(positions[i]), False
+    a, b, _ = np.polyfit(positions[i - 1 : i + 2], values[i - 1 : i + 2], 2)
     return float(-b / (2 * a)), True
 
 
 def fitted_prefactor(cases: list[Case]) -> float:
-    """Prefactor of the closed form that fits the measured optima best, in the mean of their logarithms."""
+    """Prefactor of the closed form that fits the optima best (mean of logarithms); NaN if none is inside the widths."""
     ratios = [np.log(case.best / case.formula(1.0)) for case in cases if case.inside]
     return float(np.exp(np.mean(ratios))) if ratios else float("nan")
 
 
 def in_words(cases: list[Case]) -> list[str]:
-    """What the cases say: the closed form that fits them, how far off it is, and the best source of each."""
-    lines = []
+    """Lines of text: the fitted closed form, its deviation from the optima, and the best source of each case."""
     prefactor = fitted_prefactor(cases)
     inside = [case for case in cases if case.inside]
     off = [case.best / case.formula(prefactor) - 1 for case in inside]
-    lines.append(
+    lines = [
         f"best FWHM = 2 x {prefactor:.2f} wavelength^2 / (aperture^2 distance): {len(inside)} of {len(cases)} optima "
         f"lie inside the widths tried, off by {min(off, default=0):+.0%} to {max(off, default=0):+.0%}"
-    )
+    ]
     for case in cases:
         lines.append(
             f"{case.distance * 1e3:g} mm, {case.wavelength * 1e9:.0f} nm, aperture {case.aperture:.3f}: best "

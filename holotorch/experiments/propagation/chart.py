@@ -1,6 +1,5 @@
 """Propagation: error against time for every method, and predicted against true error."""
 
-import io
 import math
 import platform
 import warnings
@@ -10,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
@@ -19,6 +17,7 @@ from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import phasor
 from holotorch.core.fourier import fft2, filter_spectrum, ifft2
 from holotorch.core.grid import Grid
+from holotorch.experiments.runs.pictures import figure_png
 from holotorch.experiments.timing import interleaved
 from holotorch.optics import AngularSpectrum, CroppedKernel, Fresnel, Propagator, unaliased_distance
 from holotorch.optics.free_space.plane_pair import PlanePair
@@ -237,7 +236,7 @@ def _draw(rows: list[dict]) -> bytes:
     figure.supylabel("relative L2 error")
     handles, labels = panels[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=4, fontsize=9)
-    return _png(figure)
+    return figure_png(figure)
 
 
 def _draw_validity(rows: list[dict]) -> bytes:
@@ -264,7 +263,7 @@ def _draw_validity(rows: list[dict]) -> bytes:
         axes.grid(alpha=0.3)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=4, fontsize=9)
-    return _png(figure)
+    return figure_png(figure)
 
 
 def _borders(name: str) -> list[float]:
@@ -284,9 +283,3 @@ def _borders(name: str) -> list[float]:
     else:
         return []
     return [z / unaliased_distance(grid, WAVELENGTH, 2) for z, grid in zip(distances, grids, strict=True)]
-
-
-def _png(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer)
-    return buffer.getvalue()

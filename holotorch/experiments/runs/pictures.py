@@ -21,7 +21,7 @@ def channel_maps(values: Tensor, names: Sequence[str], label: str, colormap: str
         axes.set_xticks([])
         axes.set_yticks([])
         figure.colorbar(drawn, ax=axes, label=label, shrink=0.85)
-    return _png(figure)
+    return figure_png(figure)
 
 
 def visual_field(values: Tensor, eccentricity: Tensor, field_deg: float, rings: Sequence[float], label: str) -> bytes:
@@ -43,7 +43,7 @@ def visual_field(values: Tensor, eccentricity: Tensor, field_deg: float, rings: 
     axes.set_ylabel("above the middle (deg)")
     axes.set_title("Dotted: eccentricities between which the report's zones lie", fontsize=9)
     figure.colorbar(drawn, ax=axes, label=label, shrink=0.85)
-    return _png(figure)
+    return figure_png(figure)
 
 
 def comparison(images: Sequence[Tensor], captions: Sequence[str]) -> bytes:
@@ -61,7 +61,7 @@ def comparison(images: Sequence[Tensor], captions: Sequence[str]) -> bytes:
         axes.imshow(shown, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
         axes.set_title(title, fontsize=10)
         axes.set_axis_off()
-    return _png(figure)
+    return figure_png(figure)
 
 
 def _title(caption: str) -> str:
@@ -76,7 +76,7 @@ def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[in
     relative = np.maximum((losses / losses[0].clamp(min=1e-30)).cpu().numpy(), 1e-16)
     stage, steps = _next_stage(relative), np.arange(len(relative))
     for i, name in enumerate(names):
-        style = {"linewidth": 1.2, "color": _LINES[i % len(_LINES)]}
+        style = {"linewidth": 1.2, "color": _COLOURS[i % len(_COLOURS)]}
         axes.semilogy(steps[:stage], relative[:stage, i], label=name, **style)
         if stage:
             axes.semilogy(steps[stage:], relative[stage:, i], **style)
@@ -94,7 +94,7 @@ def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[in
         if metric == "ssim":
             right.set_ylim(0, 1.02)
     figure.legend(loc="outside upper center", ncols=len(names) + 1, fontsize=8, frameon=False)
-    return _png(figure)
+    return figure_png(figure)
 
 
 def _next_stage(losses: np.ndarray) -> int | None:
@@ -130,13 +130,14 @@ def curves(rows: Sequence[dict[str, Any]], title: str) -> bytes:
         axes.set_title(f"{title}, {kind}", fontsize=9)
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)
-    return _png(figure)
+    return figure_png(figure)
 
 
-_LINES = ("#c0392b", "#27864a", "#2867b2")
+_COLOURS = ("#c0392b", "#27864a", "#2867b2")
 
 
-def _png(figure: Figure) -> bytes:
+def figure_png(figure: Figure) -> bytes:
+    """PNG of a figure, drawn without any global state of matplotlib."""
     buffer = io.BytesIO()
     FigureCanvasAgg(figure).print_png(buffer)
     return buffer.getvalue()

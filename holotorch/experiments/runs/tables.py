@@ -1,4 +1,4 @@
-"""Tables of a run, as CSV."""
+"""Tables of a run, as CSV files."""
 
 import csv
 import io
@@ -10,7 +10,7 @@ from holotorch.io.files import write_text
 
 
 def write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """CSV of rows that share their keys, whole or not at all."""
+    """Write rows with the same keys as CSV; the file is replaced only when all of it is written."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()

@@ -1,6 +1,5 @@
 """Holograms of volumes: error against time for every method, and time against planes, pixels and distance."""
 
-import io
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -9,13 +8,13 @@ from functools import partial
 from typing import Any
 
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
 from holotorch.core.fourier import fft2, good_length, ifft2
 from holotorch.core.grid import Grid
+from holotorch.experiments.runs.pictures import figure_png
 from holotorch.experiments.timing import interleaved
 from holotorch.hologram import AxialHologram, ConvolutionHologram, DirectHologram
 from holotorch.hologram.cone import cone_samples, spherical_wave
@@ -290,6 +289,4 @@ def _draw(rows: list[dict], scaling: list[dict]) -> bytes:
         axes.legend(fontsize=8)
     for axes in figure.axes:
         axes.grid(alpha=0.3, which="both")
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer)
-    return buffer.getvalue()
+    return figure_png(figure)

@@ -3,6 +3,8 @@
 import csv
 import json
 import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -124,6 +126,11 @@ def test_the_plan_says_how_the_scene_is_seen():
     assert "synthetic: a phantom was asked for" in text and "laser: " in text
     assert values["accommodation_mm"][0] == pytest.approx(120, rel=1e-6)  # the middle, where the display puts it
     assert main(["check", str(CONFIG), *SMALL]) == 0
+
+
+def test_a_check_does_not_load_the_template_engine():
+    code = "import sys; from holotorch.cli import main; assert not main(sys.argv[1:]) and 'jinja2' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code, "check", str(CONFIG), *SMALL], check=True, stdout=subprocess.DEVNULL)
 
 
 def test_the_plan_names_what_it_does_not_count(capsys):

@@ -26,24 +26,26 @@ def test_the_prefactor_is_that_of_the_cases():
     assert fitted_prefactor(cases) == pytest.approx(0.5, rel=1e-12)
     words = in_words(cases)
     assert "3 of 4 optima" in words[0] and "-9% to +10%" in words[0] and "nearest to a sled" in words[2]
+    # Without an optimum inside the widths there is no formula, and the measurements are written all the same.
     assert math.isnan(fitted_prefactor([cases[-1]]))
+    assert math.isnan(cases[-1].row(float("nan"))["formula_nm"]) and "0 of 1 optima" in in_words([cases[-1]])[0]
 
 
 @pytest.mark.parametrize("fwhm", [10e-9, 13e-9])
 def test_weights_are_those_of_the_spectrum(fwhm):
-    places = 520e-9 + np.arange(-40, 41) * 1e-9
+    wavelengths = 520e-9 + np.arange(-40, 41) * 1e-9
     spectrum = Spectrum.lorentzian(520e-9, fwhm)
     dense, weights = spectrum.measure()
     wanted = (weights * (dense - 520e-9).square()).sum().item()
-    found = (eye_tradeoff._weights(places, spectrum) * (places - 520e-9) ** 2).sum()
+    moment = (eye_tradeoff._weights(wavelengths, spectrum) * (wavelengths - 520e-9) ** 2).sum()
     # p = 1 / (1 + (x / 5)^2) in steps of 1 nm from -15 to 15 nm, where it has fallen to a tenth: h^2 / 12 times the
     # change of slope of p x^2, 0.6, is 0.05 in 437.8; that of p, -0.024, is -0.002 in 12.49; 3e-4 in all. At 13 nm the
     # ends, +-19.5 nm, lie between two samples: x^2 is 0.25 too large there, for a quarter of a step and p = 0.1: 1e-5.
-    assert found / wanted == pytest.approx(1, abs=5e-4)  # of 1: both are 1e-17 m^2, and approx allows 1e-12
+    assert moment / wanted == pytest.approx(1, abs=5e-4)  # of 1: both are 1e-17 m^2, and approx allows 1e-12
 
 
 def test_a_small_scene_has_its_cases(monkeypatch):
-    monkeypatch.setattr(eye_tradeoff, "_AWAY", 1e-9 * np.array([0, 5, 15, 40]))
+    monkeypatch.setattr(eye_tradeoff, "_OFFSETS", 1e-9 * np.array([0, 5, 15, 40]))
     looking, shown = find_config("configs/eye/teapot.yaml"), find_config("configs/volume/c60.yaml")
     assert looking is not None and shown is not None
     change = "hologram={shape: [128, 128], pitch: 3.74 um, distance: 12 mm, depths: 8, rays: 64}"

@@ -27,7 +27,7 @@ def drawn(monkeypatch):
         figures.append(figure)
         return b""
 
-    monkeypatch.setattr(pictures, "_png", keep)
+    monkeypatch.setattr(pictures, "figure_png", keep)
     return figures
 
 
