@@ -35,11 +35,12 @@ OUT = Grid((10, 9), 6e-6)
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_operators(case: Case):
-    operator, x = case.build(), case.field(3, 0).requires_grad_()
-    for y in (operator(x), operator.adjoint(x)):
-        assert y.shape == x.shape and y.dtype == x.dtype
-        (gradient,) = torch.autograd.grad(y.abs().sum(), x)
-        assert gradient.shape == x.shape
+    operator, x, y = case.build(), case.input(3, 0).requires_grad_(), case.output(3, 0).requires_grad_()
+    for call, given, wanted in ((operator, x, y), (operator.adjoint, y, x)):
+        out = call(given)
+        assert out.shape == wanted.shape and out.dtype == wanted.dtype
+        (gradient,) = torch.autograd.grad(out.abs().sum(), given)
+        assert gradient.shape == given.shape
 
 
 @pytest.mark.parametrize(

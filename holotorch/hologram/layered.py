@@ -1,4 +1,4 @@
-"""LayerHologram: what every way from planes of sources to a hologram has in common."""
+"""LayerHologram: what all methods from planes of sources to a hologram have in common."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ from holotorch.hologram.cone import Cone, check_cone, check_layers, check_scene
 class LayerHologram(nn.Module):
     """A linear map from layers of sources to the field on a hologram, with its conjugate transpose.
 
-    A way is its two halves ``_forward`` and ``_adjoint``; gradients of any order follow from them.
+    A method is its two halves ``_forward`` and ``_adjoint``; gradients of any order follow from them.
 
     Args:
         grid: Pixels of the hologram.
@@ -50,6 +50,8 @@ class LayerHologram(nn.Module):
         if shape is None:
             height, width = (-(-size // self.stride) for size in self.grid.shape)
             shape = height, width
+        if 0 in field.shape[:-2]:  # a batch of no fields
+            return field.sum((-2, -1))[..., None, None, None].expand(*field.shape[:-2], len(self.depths), *shape)
         return linear(field, lambda given: self._adjoint(given, shape), self._forward)
 
     def _forward(self, layers: Tensor) -> Tensor:
