@@ -92,8 +92,10 @@ def shells(shape: Shape = 128, *, width: float | None = None, dtype: torch.dtype
     def density(z: Tensor, y: Tensor, x: Tensor) -> Tensor:
         radius = torch.sqrt(z**2 + y**2 + x**2)
         walls = [h * torch.exp((radius - middle) ** 2 / (-2 * 0.04**2)) for h, middle in _SHELLS]
-        hole = torch.exp((x**2 + y**2) / (-2 * 0.2**2)) * (z < 0)
-        return (walls[0] + walls[1]) * (1 - hole) + walls[2]
+        outer = walls[0] + walls[1]
+        if z < 0:
+            outer = outer * (1 - torch.exp((x**2 + y**2) / (-2 * 0.2**2)))
+        return outer + walls[2]
 
     return _sampled(density, shape, width, dtype)
 

@@ -1,4 +1,4 @@
-"""The command stream: its arguments, and what it calls. Nothing loads before it is used."""
+"""The command ``stream``: its arguments and what it calls. Modules load when the command runs."""
 
 import argparse
 import sys

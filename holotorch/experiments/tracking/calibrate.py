@@ -1,4 +1,4 @@
-"""``holotorch calibrate``: photographs of a board in, a camera's file and a plain report out."""
+"""``holotorch calibrate``: a camera's intrinsics from photographs of a board, and a report in plain text."""
 
 import math
 import re
@@ -27,14 +27,14 @@ def calibrate_photographs(
 
     Args:
         files: Photographs, or folders of them, all of one size.
-        out: YAML file for the camera; not one that exists.
-        board: Words of :func:`parse_board`.
+        out: YAML file for the camera; must not exist yet.
+        board: Description of the board, as :func:`parse_board` takes it.
 
     Returns:
         The calibration, and the photographs in which no board was found, with the reason.
 
     Raises:
-        ConfigError: Unreadable photographs, different sizes, none with a board, views that determine no camera.
+        ConfigError: Photographs that cannot be read, differ in size, show no board, or do not determine a camera.
     """
     wanted = parse_board(board)
     if out.exists():
@@ -71,16 +71,16 @@ def calibrate_photographs(
     if mistakes:
         raise ConfigError(mistakes)
     try:
-        found = calibrate(views, next(iter(sizes.values())))
+        calibration = calibrate(views, next(iter(sizes.values())))
     except ValueError as error:
         raise ConfigError([str(error), *(f"{name}: {reason}" for name, reason in missing.items())]) from None
     out.parent.mkdir(parents=True, exist_ok=True)
-    save_camera(out, found)
-    return found, missing
+    save_camera(out, calibration)
+    return calibration, missing
 
 
 def parse_board(words: Sequence[str]) -> Chessboard | Charuco:
-    """The board that words of the command line name, quoted together or not; ConfigError says what is expected."""
+    """The board that the words after ``--board`` describe. ConfigError says what is expected instead."""
     kind, *rest = " ".join(words).split() or ("",)
     sides = re.fullmatch(r"(\d{1,3})x(\d{1,3})", rest[0]) if rest else None
     wanted = {"chessboard": 1, "charuco": 2}.get(kind, -1)
@@ -95,30 +95,32 @@ def parse_board(words: Sequence[str]) -> Chessboard | Charuco:
         raise ConfigError([f"--board: {error}"]) from None
 
 
-def calibration_text(found: Calibration, missing: dict[str, str], board: Sequence[str] = BOARD) -> str:
-    """What a calibration has given, in a few lines."""
-    matrix, distortion = found.camera.matrix, found.camera.distortion.tolist()
+def calibration_text(calibration: Calibration, missing: dict[str, str], board: Sequence[str] = BOARD) -> str:
+    """The result of a calibration in a few lines."""
+    matrix, distortion = calibration.camera.matrix, calibration.camera.distortion.tolist()
     values = [matrix[0, 0].item(), matrix[1, 1].item(), matrix[0, 2].item(), matrix[1, 2].item(), *distortion]
     words = [
-        f"{name} {_rounded(value, found.deviations[name])}" for name, value in zip(PARAMETERS, values, strict=True)
+        f"{name} {_rounded(value, calibration.deviations[name])}"
+        for name, value in zip(PARAMETERS, values, strict=True)
     ]
-    seen = found.coverage
-    between = f", {math.degrees(seen.between):.0f} deg between boards at most" if len(found.views) > 1 else ""
-    low, high = (math.degrees(angle) for angle in seen.tilts)
+    coverage = calibration.coverage
+    between = f", {math.degrees(coverage.between):.0f} deg between boards at most" if len(calibration.views) > 1 else ""
+    low, high = (math.degrees(angle) for angle in coverage.tilts)
     lines = [
-        f"Camera     {', '.join(words[:4])} px, for frames of {found.size[1]} x {found.size[0]} px",
+        f"Camera     {', '.join(words[:4])} px, for frames of {calibration.size[1]} x {calibration.size[0]} px",
         f"Distortion {', '.join(words[4:])}",
-        f"Board      {describe_board(parse_board(board))}, rms {found.rms_px:.2f} px, views: {len(found.views)}",
-        f"Coverage   {100 * seen.cells:.0f} % of the picture, {100 * seen.radius:.0f} % of the way to its corners, "
-        f"tilts of {low:.0f} to {high:.0f} deg{between}",
+        f"Board      {describe_board(parse_board(board))}, rms {calibration.rms_px:.2f} px, "
+        f"views: {len(calibration.views)}",
+        f"Coverage   {100 * coverage.cells:.0f} % of the picture, {100 * coverage.radius:.0f} % of the way to its "
+        f"corners, tilts of {low:.0f} to {high:.0f} deg{between}",
     ]
-    lines += [f"View       {name}: {error:.2f} px" for name, error in found.views.items()]
+    lines += [f"View       {name}: {error:.2f} px" for name, error in calibration.views.items()]
     lines += [
         f"Left out   {name}: {error:.2f} px, more than 3 times the median and 0.5 px"
-        for name, error in found.left_out.items()
+        for name, error in calibration.left_out.items()
     ]
     lines += [f"Not used   {name}: {reason}" for name, reason in missing.items()]
-    lines += [f"Warning    {text}" for text in found.warnings]
+    lines += [f"Warning    {text}" for text in calibration.warnings]
     return "\n".join(lines)
 
 
@@ -140,9 +142,9 @@ def _listed(files: Sequence[Path]) -> list[Path]:
             paths.append(path)
     if not paths:
         raise ConfigError(["no photographs given; expected files or folders of them"])
-    places = [path.resolve() for path in paths]
-    twice = {str(path) for path, place in zip(paths, places, strict=True) if places.count(place) > 1}
+    resolved = [path.resolve() for path in paths]
+    twice = {str(path) for path, place in zip(paths, resolved, strict=True) if resolved.count(place) > 1}
     if twice:
-        # The same view again would lower the stated deviations without making the camera any surer.
+        # A view that is counted twice lowers the stated deviations although it adds no information.
         raise ConfigError([f"{path}: given twice" for path in sorted(twice)])
     return paths

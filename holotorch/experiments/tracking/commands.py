@@ -1,4 +1,4 @@
-"""The commands track and calibrate: their arguments, and what they call. Nothing loads before it is used."""
+"""The commands ``track`` and ``calibrate``: their arguments and what they call. Modules load when a command runs."""
 
 import argparse
 import re
@@ -29,7 +29,7 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     calibrate.add_argument("files", nargs="+", type=Path, metavar="FILE", help="photographs, or folders of them")
     board = "chessboard 9x6 25mm (default; inner corners, square) or charuco 5x7 40mm 20mm DICT_6X6_250"
     calibrate.add_argument("--board", nargs="+", metavar="WORD", help=board)
-    # A size of -25mm is a wrong size, and no unknown option; argparse knows this of whole numbers only.
+    # argparse takes -25mm for an option unless told that it is a (wrong) number.
     calibrate._negative_number_matcher = re.compile(r"-\.?\d")
     calibrate.add_argument("--out", type=Path, default=Path("camera.yaml"), help="file (default: camera.yaml)")
     calibrate.set_defaults(action=_calibrate)
@@ -67,7 +67,7 @@ def _calibrate(options: argparse.Namespace) -> int:
     from holotorch.experiments.tracking.calibrate import BOARD, calibrate_photographs, calibration_text
 
     board = options.board or BOARD
-    found, missing = calibrate_photographs(options.files, options.out, board)
-    print(calibration_text(found, missing, board))
+    calibration, missing = calibrate_photographs(options.files, options.out, board)
+    print(calibration_text(calibration, missing, board))
     print(options.out)
     return OK

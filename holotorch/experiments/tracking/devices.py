@@ -1,4 +1,4 @@
-"""Files of what tracking needs to know: a camera, a catheter, and where the camera sits on a headset."""
+"""YAML files of cameras, of catheters, and of where a camera sits on a headset."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,10 +39,10 @@ Row = tuple[Number, Number, Number, Number]
 
 
 class EvidenceSettings(Settings):
-    """What a calibration says of itself; for the reader, and for a doubt that tracking notes. Angles in radians.
+    """How good a calibration is, for the reader and for warnings while tracking. Angles in radians.
 
-    ``deviations``: of each parameter. ``views`` and ``left_out``: rms in pixels by photograph. ``cells``, ``radius``,
-    ``tilts``, ``between``: see ``Coverage``.
+    ``deviations``: standard deviation of each parameter. ``views`` and ``left_out``: rms in pixels by
+    photograph. ``cells``, ``radius``, ``tilts``, ``between``: see ``Coverage``.
     """
 
     deviations: dict[str, Number]
@@ -59,7 +59,7 @@ class EvidenceSettings(Settings):
 class CameraSettings(Settings):
     """A camera; see ``Camera``.
 
-    ``distortion``: k1, k2, p1, p2, k3 in OpenCV's order. ``size``: rows and columns of the frames that it holds for.
+    ``distortion``: k1, k2, p1, p2, k3 in OpenCV's order. ``size``: rows and columns of its frames.
     ``tone``: srgb, linear, or the light of each of the 256 levels.
     """
 
@@ -85,8 +85,8 @@ class CatheterSettings(Settings):
 class HeadsetSettings(Settings):
     """Where a camera sits on a headset: rows of the 4 x 4 matrix from camera to headset, in metres.
 
-    ``residuals`` and ``leave_one_out``: of the alignments that it was found from, in metres; see ``Alignment``. Nothing
-    (null) where an alignment could not be left out.
+    ``residuals`` and ``leave_one_out``: errors of the alignments that it was computed from, in metres; see
+    ``Alignment``. Null where an alignment could not be left out.
     """
 
     headset_from_camera: tuple[Row, Row, Row, Row]
@@ -106,7 +106,7 @@ def load_camera(path: Path | str, overrides: Sequence[str] = ()) -> CameraSettin
 
 
 def build_camera(settings: CameraSettings) -> Camera:
-    """The camera that was described."""
+    """The camera that the settings describe."""
     matrix = [[settings.fx, 0.0, settings.cx], [0.0, settings.fy, settings.cy], [0.0, 0.0, 1.0]]
     tone = settings.tone if isinstance(settings.tone, str) else torch.tensor(settings.tone, dtype=torch.float64)
     distortion = torch.tensor(settings.distortion, dtype=torch.float64)
@@ -114,27 +114,27 @@ def build_camera(settings: CameraSettings) -> Camera:
 
 
 def save_camera(path: Path, camera: Camera | Calibration, size: tuple[int, int] | None = None) -> None:
-    """Write a camera, or a calibration with its evidence; ``size`` (H, W) of the frames that a bare camera is for."""
+    """Write a camera, or a calibration with its evidence. ``size`` (H, W): of the frames, for a camera without one."""
     values: dict[str, Any] = {}
     if isinstance(camera, Calibration):
         calibration, camera, size = camera, camera.camera, camera.size
-        seen = calibration.coverage
+        coverage = calibration.coverage
         values["calibration"] = EvidenceSettings(
             deviations=calibration.deviations,
             rms_px=calibration.rms_px,
             views=calibration.views,
             left_out=calibration.left_out,
-            cells=seen.cells,
-            radius=seen.radius,
-            tilts=seen.tilts,
-            between=seen.between,
+            cells=coverage.cells,
+            radius=coverage.radius,
+            tilts=coverage.tilts,
+            between=coverage.between,
             warnings=calibration.warnings,
         )
     matrix = camera.matrix.detach()
-    found = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
+    intrinsics = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
     tone = camera.tone if isinstance(camera.tone, str) else tuple(camera.tone.tolist())
     settings = CameraSettings(
-        **dict(zip(PARAMETERS, map(float, found), strict=False)),
+        **dict(zip(PARAMETERS, map(float, intrinsics), strict=False)),
         distortion=tuple(camera.distortion.detach().tolist()),
         size=size,
         tone=tone,
@@ -151,17 +151,17 @@ def load_catheter(path: Path | str, overrides: Sequence[str] = ()) -> CatheterSe
 
 
 def build_catheter(settings: CatheterSettings) -> Catheter:
-    """The catheter that was described."""
+    """The catheter that the settings describe."""
     return Catheter(settings.edges, settings.colours, settings.radius, settings.length)
 
 
 def misfit(path: Path, error: ValueError) -> ConfigError:
-    """What a tracker says of a catheter that it cannot see, where the colours stand, which it is always about."""
+    """A tracker's refusal of a catheter, at the place of its colours, which are always the reason."""
     return ConfigError([read_source(path, []).mistake(("colours",), str(error))])
 
 
 def save_catheter(path: Path, catheter: Catheter) -> None:
-    """Write a catheter, for instance one with edges that were measured."""
+    """Write a catheter, for instance one whose edges were measured."""
     settings = CatheterSettings(
         edges=catheter.edges, colours=catheter.colours, radius=catheter.radius, length=catheter.length
     )
@@ -178,9 +178,9 @@ def load_headset(path: Path | str, overrides: Sequence[str] = ()) -> HeadsetSett
 def build_headset(settings: HeadsetSettings) -> torch.Tensor:
     """[4, 4] float64, headset_from_camera; ValueError unless it is rigid."""
     matrix = torch.tensor(settings.headset_from_camera, dtype=torch.float64)
-    turn, last = matrix[:3, :3], torch.tensor([0.0, 0, 0, 1], dtype=torch.float64)
-    missed = (turn @ turn.mT - torch.eye(3, dtype=torch.float64)).abs().max()
-    if missed > 1e-6 or turn.det() < 0 or not torch.equal(matrix[3], last) or matrix[:3, 3].abs().max() > 10:
+    rotation, last = matrix[:3, :3], torch.tensor([0.0, 0, 0, 1], dtype=torch.float64)
+    missed = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().max()
+    if missed > 1e-6 or rotation.det() < 0 or not torch.equal(matrix[3], last) or matrix[:3, 3].abs().max() > 10:
         raise ValueError(
             "headset_from_camera must be a rotation without mirroring, a shift in metres, and the last row 0, 0, 0, 1"
         )
@@ -188,14 +188,14 @@ def build_headset(settings: HeadsetSettings) -> torch.Tensor:
 
 
 def save_headset(path: Path, alignment: Alignment) -> None:
-    """Write an alignment of camera and headset with its residuals."""
-    alone = [value if value != float("inf") else None for value in alignment.leave_one_out.tolist()]
+    """Write where the camera sits on a headset, with the residuals of the alignment."""
+    left_out = [value if value != float("inf") else None for value in alignment.leave_one_out.tolist()]
     rows = [(a, b, c, d) for a, b, c, d in alignment.headset_from_camera.detach().tolist()]
     settings = HeadsetSettings(
         headset_from_camera=(rows[0], rows[1], rows[2], rows[3]),
         residuals=tuple(alignment.residuals.tolist()),
-        leave_one_out=tuple(alone),
-        alignments=len(alone),
+        leave_one_out=tuple(left_out),
+        alignments=len(left_out),
     )
     _write(path, "From the camera's frame to the headset's: metres, points as columns.", settings)
 
@@ -208,7 +208,7 @@ def _read(model: type[AnySettings], path: Path | str, overrides: Sequence[str]) 
 
 
 def _tried(source: Source, build: Any, settings: Settings) -> None:
-    """Build what is described; what is wrong with it as a whole is said where its first word stands."""
+    """Build what the settings describe; an error that begins with the name of a key is reported at its place."""
     try:
         build(settings)
     except ValueError as error:

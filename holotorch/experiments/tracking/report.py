@@ -17,9 +17,10 @@ from holotorch.io.video import Frame, Frames
 from holotorch.tracking import Pose, Status
 from holotorch.tracking.evaluation.protocols import counts, s_rms
 
-# Of poses.csv, a line per frame. Lengths in metres in the camera's frame (x right, y down, z forward), directions from
-# the tip to the rear, the covariance of the tip by its upper triangle, the tracker's own time. Floats are exact to the
-# bit; what a refusal does not have is empty, and ``stage`` is the one that refused.
+# Columns of poses.csv, which has a line per frame. Lengths are in metres in the camera's frame (x right, y down, z
+# forward), directions point from the tip to the rear, the covariance of the tip is given by its upper triangle, and
+# ``milliseconds`` is the tracker's own time. Floats are exact to the bit. A refused frame has empty cells instead of a
+# pose, and ``stage`` names the stage that refused it.
 COLUMNS = (
     *("frame", "time_s", "status", "stage", "reason"),
     *("tip_x_m", "tip_y_m", "tip_z_m", "direction_x", "direction_y", "direction_z"),
@@ -29,20 +30,19 @@ COLUMNS = (
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 _STATED = "what the frames leave open; not what is unknown of the camera (its calibration) and of the catheter's edges"
-_MOVED = 3.0  # times the stated deviation that tips may spread about their mean and still be called at rest
-
-_SHOWN = 4  # statuses of which the page shows the first frame
+_MOVED = 3.0  # a catheter is called at rest if its tips spread by at most so many times their stated deviation
+_SHOWN = 4  # number of statuses whose first frame the page shows
 
 
 class Tracked(NamedTuple):
-    """One frame and what was found in it.
+    """One frame and its pose.
 
     Attributes:
         number: Of the frame, from 0.
         frame: As it came.
-        pose: Or refusal; BAD_FRAME where the frame could not be read.
-        seconds: That the tracker took; 0 where it was not asked.
-        stages: Seconds of its stages, where it tells.
+        pose: The pose or a refusal, BAD_FRAME for a frame that could not be read.
+        seconds: Time that the tracker took; 0 for a frame that could not be read.
+        stages: Seconds of each stage of the tracker, if it measures them.
     """
 
     number: int
@@ -53,26 +53,26 @@ class Tracked(NamedTuple):
 
     @property
     def status(self) -> Status:
-        """Of the pose, which is one and no batch."""
+        """Status of the pose, which is a single one."""
         assert isinstance(self.pose.status, Status)
         return self.pose.status
 
 
 def row(item: Tracked) -> list[str]:
-    """Cells of ``COLUMNS``, floats to the bit; what a refusal does not have is empty."""
+    """The frame as cells of ``COLUMNS``; floats exact to the bit, cells that a refusal does not have empty."""
     pose = item.pose
-    told = [str(item.number), repr(item.frame.seconds), item.status.name]
-    told += ["" if pose.answered else item.status.stage, " ".join(pose.reason.split())]
+    cells = [str(item.number), repr(item.frame.seconds), item.status.name]
+    cells += ["" if pose.answered else item.status.stage, " ".join(pose.reason.split())]
     taken = "" if item.frame.pixels is None else f"{1e3 * item.seconds:.3f}"
     if not pose.answered:
-        return [*told, *[""] * (len(COLUMNS) - len(told) - 1), taken]
+        return [*cells, *[""] * (len(COLUMNS) - len(cells) - 1), taken]
     values = [*pose.tip.tolist(), *pose.direction.tolist(), *(float(pose.covariance[i, j]) for i, j in _UPPER)]
     values += [float(pose.chi_square), float(pose.freedom)]
-    return [*told, *map(repr, values), taken]
+    return [*cells, *map(repr, values), taken]
 
 
 class Log:
-    """What a run remembers of its frames: numbers of all, and the first overlay of each status."""
+    """Numbers of all frames of a run, and the first overlay of each status."""
 
     def __init__(self, images: Path):
         self.images = images
@@ -86,16 +86,16 @@ class Log:
         self.pictures: dict[str, str] = {}
 
     def wants(self, item: Tracked) -> bool:
-        """Whether the overlay of this frame will be shown."""
+        """Whether the page will show the overlay of this frame."""
         return item.status.name not in self.pictures and len(self.pictures) < _SHOWN
 
     def take(self, item: Tracked, drawn: Tensor | None) -> None:
-        """Note a frame."""
+        """Add a frame."""
         pose = item.pose
         if drawn is not None and self.wants(item):
             write_bytes(self.images / f"{item.status.name}.png", encode_png(_smaller(drawn)))
-            said = f": {pose.reason}" if pose.reason else ""
-            self.pictures[item.status.name] = f"frame {item.number}, {item.status.name}{said}"
+            reason = f": {pose.reason}" if pose.reason else ""
+            self.pictures[item.status.name] = f"frame {item.number}, {item.status.name}{reason}"
         self.statuses.append(item.status)
         self.times.append(item.frame.seconds)
         self.tips.append(pose.tip.tolist() if pose.answered else [math.nan] * 3)
@@ -104,7 +104,7 @@ class Log:
             self.seconds.append(item.seconds)
         if item.stages:
             if self.timed == 1 and not self.warm:
-                self.warm = True  # the first call also builds its tables, and is left out where there are others
+                self.warm = True  # the first call also builds tables; it is left out if there are others
                 self.timed, self.stages = 0, {}
             self.timed += 1
             for name, value in item.stages.items():
@@ -112,7 +112,7 @@ class Log:
 
 
 def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, Any]:
-    """Plain JSON values of a run's summary; lengths in mm and times in ms, as their names say."""
+    """The summary of a run as plain JSON values; keys name their units (mm, ms)."""
     answered = sum(status.answered for status in log.statuses)
     summary: dict[str, Any] = {
         "experiment": "track",
@@ -146,21 +146,21 @@ def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, A
     notes = list(frames.notes)
     if still:
         try:
-            found = s_rms(torch.tensor(log.tips, dtype=torch.float64))
+            stability = s_rms(torch.tensor(log.tips, dtype=torch.float64))
             summary["stability"] = {
-                "s_rms_mm": 1e3 * found.s_rms,
-                "sd_mm": 1e3 * found.sd,
-                "differences": found.differences,
-                "answered": found.answered,
+                "s_rms_mm": 1e3 * stability.s_rms,
+                "sd_mm": 1e3 * stability.sd,
+                "differences": stability.differences,
+                "answered": stability.answered,
             }
-            notes += _moved(log, found.sd)
+            notes += _moved(log, stability.sd)
         except ValueError as error:
             notes.append(f"no stability: {error}")
     return summary | {"notes": notes, "pictures": log.pictures, "peak_memory_bytes": peak_memory()}
 
 
 def _moved(log: Log, spread: float) -> list[str]:
-    """A doubt where the tips spread (m, root mean square about their mean) by far more than is stated of them."""
+    """A note if the tips spread (root mean square about their mean, in metres) far beyond their stated deviation."""
     stated = torch.tensor([value for value in log.deviations if math.isfinite(value)], dtype=torch.float64)
     allowed = float(stated.square().mean().sqrt()) if len(stated) else math.inf
     if spread <= _MOVED * allowed:
@@ -213,22 +213,22 @@ def track_section(record: RunRecord) -> list[str]:
     return parts
 
 
-def _truth(found: dict[str, float]) -> str:
-    """HTML of how far the tips lie from where a synthetic recording has them."""
-    text = f"The recording is synthetic, and where the tip truly is is known. Of {found['frames']} frames with a pose "
-    text = element("p", text + f"{found.get('wrong', 0)} are wrong by more than 5 mm.")
+def _truth(truth: dict[str, float]) -> str:
+    """HTML of the tips' distances from the truth of a synthetic recording."""
+    text = f"The recording is synthetic, and where the tip truly is is known. Of {truth['frames']} frames with a pose "
+    text = element("p", text + f"{truth.get('wrong', 0)} are wrong by more than 5 mm.")
     shares = [
         (f"{name} (mm)", f"{value:.3f}")
         for name in ("median", "p95", "worst")
-        if (value := found.get(f"{name}_mm")) is not None
+        if (value := truth.get(f"{name}_mm")) is not None
     ]
-    if "coverage" in found:
-        shares.append(("truth within the stated 95 % ellipsoid", f"{100 * found['coverage']:.1f} % of the frames"))
+    if "coverage" in truth:
+        shares.append(("truth within the stated 95 % ellipsoid", f"{100 * truth['coverage']:.1f} % of the frames"))
     return text + table(["tip's distance from the truth", ""], [list(pair) for pair in shares])
 
 
 def _smaller(drawn: Tensor) -> Tensor:
-    """Frame [3, H, W] from 0 to 1, of a size for a page."""
+    """A frame [3, H, W] of levels as values from 0 to 1, reduced to a size for a page."""
     factor = max(1, min(drawn.shape[-2:]) // 400)
     return torch.nn.functional.avg_pool2d(drawn.double() / 255, factor)
 
@@ -240,7 +240,7 @@ def _at(values: Tensor, share: float) -> float:
 
 
 def drawn_track(log: Log) -> Any:
-    """Figure of the tip and of its stated deviation against time; it says so where there is no pose."""
+    """Figure of the tip and its stated deviation over time, with the words "no pose" where there is none."""
     from matplotlib.figure import Figure
 
     drawn = Figure(figsize=(9, 4.5), layout="constrained")

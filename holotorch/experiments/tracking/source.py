@@ -1,4 +1,4 @@
-"""What a tracking run is made from: a source of frames, its camera, the catheter, and the tracker."""
+"""The inputs of a tracking run: a source of frames, its camera, the catheter, and the tracker."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -22,14 +22,16 @@ from holotorch.tracking import Camera, Catheter, Pose
 from holotorch.tracking.camera.calibration import SURE
 from holotorch.tracking.detection.channels import ChannelOrder, ambiguities, ambiguity_text
 
-_OFF_CENTRE = 0.15  # of a side; two thirds of the resolution, as 720 to 1080 lines, shift the centre by a sixth
+# Share of a side by which a principal point may lie off the centre. Intrinsics of 1080 lines used for 720, or the
+# other way round, are off by a sixth and more.
+_OFF_CENTRE = 0.15
 Tracker = Callable[[Tensor, Sequence[Pose] | None], list[Pose]]
 
 
 class TrackingInputs(NamedTuple):
-    """What a run is made from; ``frames`` are to be closed by whoever opened them.
+    """The inputs of a run. Whoever opened them closes ``frames``.
 
-    ``paths``: of the two YAML files, by the names that their copies in the run folder get.
+    ``paths`` holds the two YAML files under the names of their copies in the run folder.
     """
 
     frames: Frames
@@ -46,13 +48,13 @@ def open_inputs(
 
     Args:
         source: A video, a folder of pictures, a folder of a recording, or the number of a camera.
-        camera: YAML file; that of the recording by default.
-        catheter: The same.
+        camera: YAML file; by default the one beside the recording.
+        catheter: Likewise.
         method: ours or thesis.
-        rate: Frames per second where the source has no times.
+        rate: Frames per second of a source without times.
 
     Raises:
-        ConfigError: One of them cannot be used, or not with the others.
+        ConfigError: One of them cannot be used, or they do not fit together.
     """
     replayed = _is_replay(source)
     files = {"camera.yaml": camera, "catheter.yaml": catheter}
@@ -84,7 +86,7 @@ def open_inputs(
 
 
 def _is_replay(source: str | Path) -> bool:
-    """Whether the source is a recording; ConfigError where there is none, or a part of one."""
+    """Whether the source is a recording. ConfigError for a source that does not exist, or an incomplete recording."""
     path = Path(source)
     if not (path.exists() or is_camera(source)):
         raise ConfigError([no_such_source(source)])
@@ -98,32 +100,32 @@ def _is_replay(source: str | Path) -> bool:
 
 
 def _loaded(paths: dict[str, Path]) -> tuple[CameraSettings, Catheter]:
-    """Camera and catheter of two files; ConfigError with the mistakes of both."""
+    """Camera and catheter from their files. ConfigError with the mistakes of both files."""
     mistakes: list[str] = []
-    found: list[Any] = []
+    loaded: list[Any] = []
     for load, name in ((load_camera, "camera.yaml"), (load_catheter, "catheter.yaml")):
         try:
-            found.append(load(paths[name]))
+            loaded.append(load(paths[name]))
         except ConfigError as error:
             mistakes += error.mistakes
     if mistakes:
         raise ConfigError(mistakes)
-    return found[0], build_catheter(found[1])
+    return loaded[0], build_catheter(loaded[1])
 
 
 def make_tracker(method: str, camera: Camera, catheter: Catheter) -> Tracker:
-    """The tracker of a method; ValueError for a catheter that it cannot see."""
+    """The tracker for a method. ValueError for a catheter whose colours it cannot tell apart."""
     if method == "thesis":
         from holotorch.tracking.thesis.tracker import ThesisTracker
 
         return _Cold(ThesisTracker(camera, catheter))
     from holotorch.tracking.detection.tracker import CatheterTracker
 
-    return CatheterTracker(camera, catheter, channels=ChannelOrder.RGB)  # as every source of frames gives them
+    return CatheterTracker(camera, catheter, channels=ChannelOrder.RGB)  # every source gives RGB
 
 
 class _Cold:
-    """A tracker that makes no use of the pose before."""
+    """Adapter for a tracker that takes no previous poses."""
 
     def __init__(self, tracker: Callable[[Tensor], list[Pose]]):
         self._tracker = tracker
@@ -137,7 +139,11 @@ class _Cold:
 
 
 def _check_intrinsics(lens: CameraSettings, frames: Frames) -> None:
-    """ConfigError, or a doubt noted, for intrinsics that make poses wrong, and plausible: rough, or of another size."""
+    """Check that the intrinsics belong to these frames.
+
+    ConfigError for another frame size; a note for a principal point far from the centre or a vague focal length. Such
+    intrinsics give wrong poses that look plausible.
+    """
     height, width = frames.shape
     if lens.size is not None and tuple(lens.size) != frames.shape:
         held = f"{lens.size[1]} x {lens.size[0]}"

@@ -1,4 +1,4 @@
-"""A synthetic recording of a catheter that moves over a drape, with where it truly is: something to track at once."""
+"""A synthetic recording of a catheter that moves over a drape, with its true poses."""
 
 import csv
 import io
@@ -121,9 +121,9 @@ def _render(folder: Path, frames: int, world: World) -> None:
 
 
 def read_truth(folder: Path) -> dict[str, list[float]]:
-    """True tips in metres by the number of their frame, of the truth.csv in a folder; empty where there is none.
+    """True tips in metres by frame number, from truth.csv in a folder; empty without such a table.
 
-    Beside pictures a table of that name may be about something else and is left alone; in a recording it is the truth.
+    A table of that name without the columns of a truth is ignored among pictures, and an error in a recording.
 
     Raises:
         ConfigError: A table that cannot be read as the truth, with the first line that is wrong.
@@ -131,7 +131,7 @@ def read_truth(folder: Path) -> dict[str, list[float]]:
     path = folder / "truth.csv"
     if not path.is_file():
         return {}
-    wanted, found = ("frame", *_TIP), dict[str, list[float]]()
+    wanted, truth = ("frame", *_TIP), dict[str, list[float]]()
     try:
         with open(path, newline="", encoding="utf-8") as stream:
             table = csv.DictReader(stream)
@@ -142,21 +142,21 @@ def read_truth(folder: Path) -> dict[str, list[float]]:
                 raise ConfigError([f"{path}:1: columns {', '.join(missing)} are missing, got {', '.join(names)}"])
             for row in table:
                 try:
-                    frame, place = str(int(row["frame"])), [float(row[name]) for name in _TIP]
-                    if not all(map(math.isfinite, place)) or frame in found:
+                    frame, tip = str(int(row["frame"])), [float(row[name]) for name in _TIP]
+                    if not all(map(math.isfinite, tip)) or frame in truth:
                         raise ValueError
                 except (TypeError, ValueError):
                     got = ",".join(str(row[name]) for name in wanted)
                     text = "the number of a frame, each once, and a finite tip in metres"
                     raise ConfigError([f"{path}:{table.line_num}: expected {text}, got {got}"]) from None
-                found[frame] = place
+                truth[frame] = tip
     except (UnicodeDecodeError, csv.Error):
         raise ConfigError([f"{path}: not a table in UTF-8 text"]) from None
-    return found
+    return truth
 
 
 def errors(poses: Path, true: Mapping[str, Sequence[float]]) -> dict[str, float]:
-    """How far the tips of a poses.csv lie from the truth, as plain JSON values in mm; nothing where none is known.
+    """Distances between the tips of a poses.csv and the truth, as plain JSON values in mm; empty without a truth.
 
     ``true``: as :func:`read_truth` gives it. ``coverage``: share of the answered frames whose truth lies in the 95 %
     ellipsoid of the stated covariance. ``wrong``: frames off by more than 5 mm.
@@ -166,29 +166,31 @@ def errors(poses: Path, true: Mapping[str, Sequence[float]]) -> dict[str, float]
     if not known:
         return {}
     rows = [row for row in known if row["tip_x_m"] not in ("", "nan")]
-    found: dict[str, float] = {"frames": len(rows), "refused": len(known) - len(rows)}
+    statistics: dict[str, float] = {"frames": len(rows), "refused": len(known) - len(rows)}
     if not rows:
-        return found
-    tips, places = (
+        return statistics
+    tips, true_tips = (
         torch.tensor([[float(value) for value in values] for values in part], dtype=torch.float64)
         for part in ([[row[name] for name in _TIP] for row in rows], [true[row["frame"]] for row in rows])
     )
-    away = (1e3 * (tips - places).norm(dim=-1)).sort().values
-    last = len(away) - 1
-    found |= {f"{name}_mm": float(away[round(share * last)]) for name, share in _SHARES.items()}
-    found["wrong"] = int((away > _WRONG).sum())
+    distances = (1e3 * (tips - true_tips).norm(dim=-1)).sort().values
+    last = len(distances) - 1
+    statistics |= {f"{name}_mm": float(distances[round(share * last)]) for name, share in _SHARES.items()}
+    statistics["wrong"] = int((distances > _WRONG).sum())
     if all(rows[0].get(name) for name in _COVARIANCE):
         upper = torch.tensor([[float(row[name]) for name in _COVARIANCE] for row in rows], dtype=torch.float64)
-        with suppress(ValueError):  # a covariance that is none has no ellipsoid
-            found["coverage"] = coverage(tips, upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3), places)[0]
-    return found
+        with suppress(ValueError):  # a singular covariance has no ellipsoid
+            statistics["coverage"] = coverage(tips, upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3), true_tips)[
+                0
+            ]
+    return statistics
 
 
-def compared(found: Mapping[str, float]) -> str:
-    """What :func:`errors` has found, in words."""
-    if not found["frames"]:
-        return f"Truth      no frame answered of {found['refused']} (synthetic)"
+def compared(statistics: Mapping[str, float]) -> str:
+    """The result of :func:`errors` in words."""
+    if not statistics["frames"]:
+        return f"Truth      no frame answered of {statistics['refused']} (synthetic)"
     return (
-        f"Truth      the tip is {found['median_mm']:.2f} mm off (median), {found['worst_mm']:.2f} at most, "
-        f"in {found['frames']} frames; {found['refused']} refused (synthetic)"
+        f"Truth      the tip is {statistics['median_mm']:.2f} mm off (median), {statistics['worst_mm']:.2f} at most, "
+        f"in {statistics['frames']} frames; {statistics['refused']} refused (synthetic)"
     )

@@ -54,7 +54,7 @@ class VolumeSource(Settings):
     path: ExistingArray | None = None
     scene: Scene | None = None
     phantom: Phantom | None = None
-    samples: Annotated[Count, Field(ge=4, le=1024)] = 128
+    samples: Annotated[Count, Field(ge=4, le=512)] = 128  # of a phantom, per axis; 512 take some seconds
     directory: str | None = None
     spacing: Annotated[tuple[Number, ...], BeforeValidator(several)] | None = None
     shape: tuple[Count, Count, Count] | None = None
