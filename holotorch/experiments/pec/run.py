@@ -82,7 +82,7 @@ def _fingerprint(experiment: PECExperiment) -> Fingerprint:
     if experiment.settings.solver.kind != "lbfgs":  # its stages divide the number of steps among them
         free.add("solver.max_steps")
     kept = fingerprint(experiment.settings, {"target.image": (experiment.source,)}, free)
-    # Up to version 0.1.0 checkpoints had joint frames as [C, F, H, W], which no shape tells where F = C.
+    # Refuses checkpoints of version 0.1.0, whose joint frames are [C, F, H, W]: where F = C the shape is the same.
     return kept | ({"axes of joint frames": "F, C, H, W"} if experiment.joint else {})
 
 

@@ -2,8 +2,10 @@
 
 import csv
 import io
+import math
 from collections.abc import Callable
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -125,7 +127,7 @@ def _verdict(compared: list[dict]) -> list[str]:
         f"how many times fewer evaluations / less time than {BASE} to equal SSIM, at its lowest and highest level",
         f"sigma: {SIGMA_MEANING}",
     ]
-    goals = yaml.safe_load(GOALS.read_text(encoding="utf-8")) if GOALS.is_file() else {"solver": {}, "targets": []}
+    goals = yaml.safe_load(GOALS.read_text(encoding="utf-8")) if GOALS.is_file() else {"solver": {}, "tables": {}}
     for kind in KINDS:
         for sigma in SIGMAS:
             rows = [row for row in compared if (row["kind"], row["sigma_px"]) == (kind, sigma)]
@@ -141,21 +143,43 @@ def _verdict(compared: list[dict]) -> list[str]:
                 wanted = goal["evaluations"], goal["seconds"]
                 met = [name for name, each in ratios.items() if all(a >= wanted[0] and b >= wanted[1] for a, b in each)]
                 lines[-1] += f" (goal {wanted[0]:g}/{wanted[1]:g}: {'met by ' + '; '.join(met) if met else 'not met'})"
-    return lines + _targets(goals["targets"])
+    return lines + _tables(goals["tables"])
 
 
-def _targets(goals: list[dict[str, Any]]) -> list[str]:
-    """A line on the goals for rows of the committed table of the study ``targets``."""
-    table = GOALS.parent / "targets" / "table.csv"
-    if not goals or not table.is_file():
-        return []
-    with open(table, newline="", encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
-    ssim = {(row["method"], row["kind"], float(row["sigma_px"])): float(row["ssim"]) for row in rows}
-    wanted = {(goal["method"], goal["kind"], sigma): least for goal in goals for sigma, least in goal["ssim"].items()}
-    missed = [key for key, least in wanted.items() if ssim.get(key, -1.0) < least]
-    words = "".join(f"; not met: {method}, {kind}, sigma {sigma:g}" for method, kind, sigma in missed)
-    return [f"targets: the SSIM of {len(wanted) - len(missed)} of {len(wanted)} cases meets its goal{words}"]
+def _tables(goals: dict[str, list[dict[str, Any]]]) -> list[str]:
+    """A line for each committed table of a study: how many of its goals and statements of the thesis are met."""
+    lines = []
+    for name, statements in goals.items():
+        path = GOALS.parent / name / "table.csv"
+        if not path.is_file():
+            continue
+        with open(path, newline="", encoding="utf-8") as stream:
+            rows = list(csv.DictReader(stream))
+        missed = []
+        for statement in statements:
+            value, (low, high) = _statistic(rows, statement), statement["within"]
+            if not low <= value <= high:
+                missed.append(f"; not met: {statement['says']} ({value:.3g}, expected {low:g} to {high:g})")
+        lines.append(f"{name}: {len(statements) - len(missed)} of {len(statements)} met" + "".join(missed))
+    return lines
+
+
+def _statistic(rows: list[dict[str, str]], statement: dict[str, Any]) -> float:
+    """Mean, range or ratio of means that a statement asks for, as goals.yaml explains; NaN without such rows."""
+
+    def column(cells: dict[str, Any]) -> list[float]:
+        allowed = {key: list(map(str, cell if isinstance(cell, list) else [cell])) for key, cell in cells.items()}
+        chosen = [row for row in rows if all(row[key] in each for key, each in allowed.items())]
+        return [float(row[name]) for row in chosen if row[name]]
+
+    name = statement.get("column", "ssim")
+    values = column(statement["rows"])
+    if not values:
+        return math.nan
+    if statement.get("statistic") == "range":
+        return max(values) - min(values)
+    base = column(statement["rows"] | statement["over"]) if "over" in statement else [1.0]
+    return fmean(values) / fmean(base) if base else math.nan
 
 
 def _draw(rows: list[dict]) -> bytes:

@@ -6,7 +6,6 @@ from typing import Any
 
 from holotorch.experiments.pec_study.bench import Bench
 from holotorch.experiments.pec_study.cases import Cases
-from holotorch.experiments.pec_study.claims import with_claims
 from holotorch.experiments.pec_study.config import StudySettings
 from holotorch.experiments.pec_study.studies import STUDIES
 from holotorch.experiments.runs.fingerprint import fingerprint
@@ -39,7 +38,7 @@ def run_study(study: Study, opened: RunFolder) -> bool:
     inputs = {"images": (bench.image,), "perceptual": ("none" if bench.perceptual is None else "LPIPS",)}
     cases = Cases(Checkpoint(folder / "checkpoint.pt", fingerprint(settings, inputs)))
     try:
-        rows = with_claims(settings.study, STUDIES[settings.study](bench, settings.sweep, settings.max_steps, cases))
+        rows = STUDIES[settings.study](bench, settings.sweep, settings.max_steps, cases)
     except KeyboardInterrupt:
         if not cases.saved:
             raise
@@ -50,13 +49,11 @@ def run_study(study: Study, opened: RunFolder) -> bool:
     files.write(write_text, folder / "table.txt", text)
     picture = curves(rows, f"{settings.study}: mean of {', '.join(settings.images)} at {settings.size} px")
     files.write(write_bytes, folder / "images" / "table.png", picture)
-    verdicts = [row["verdict"] for row in rows if row["verdict"]]
     summary = {
         "experiment": settings.experiment,
         "study": settings.study,
         "status": "",
         "rows": len(rows),
-        "verdicts": {verdict: verdicts.count(verdict) for verdict in dict.fromkeys(verdicts)},
         "seconds": round(cases.seconds, 1),
         "peak_memory_bytes": peak_memory(),
     }

@@ -1,7 +1,6 @@
 """Studies of proximity effect correction: the thesis's comparisons, and what goes beyond them, as tables.
 
-Every study returns rows with the same keys. ``thesis`` is the number printed in the thesis, if there is one, and
-``verdict`` says whether it is reproduced, exceeded or not reproduced.
+Every study returns rows with the same keys. The chart ``pec`` compares the committed tables with the thesis.
 """
 
 import math
@@ -29,18 +28,12 @@ VOLUME = f"synthetic volume, {SLICES} slices in turn"
 def reproduction(bench: Bench, sigmas: Sequence[float], steps: int, store: Cases) -> list[Row]:
     """Sec. 4.4.3.3, 4.4.5.3, 4.5.2.2: SSIM of every method by sigma, in the far field and the periodic near field."""
     rows = store.rows
-    printed = {("fourier", "PPEC", 1.5): 0.48, ("fourier", "PPEC", 2.0): 0.30}
-    # FPEC. The thesis does not give its start; only the cool one, which needs less heat, reaches these values.
-    printed |= {("fresnel", "PPEC, cool start", 1.5): 0.57, ("fresnel", "PPEC, cool start", 2.0): 0.34}
     for kind in ("fourier", "fresnel"):
         for sigma in store.each(sigmas, desc=f"reproduction, {kind}", unit="sigma"):
             setup = replace(bench, sigma_px=sigma, kind=kind)
             more = ("PPEC, cool start",) if kind == "fresnel" else ()
             for name, phase, seconds in _methods(setup, steps, (*_ALL, *more)):
-                scores = setup.scores(phase)
-                thesis = printed.get((kind, name, sigma))
-                rows.append(_row(setup, name, scores, seconds, thesis, _against(scores["ssim"], thesis, 0.04)))
-    rows += _gains(rows)
+                rows.append(_row(setup, name, setup.scores(phase), seconds))
     return rows
 
 
@@ -245,33 +238,10 @@ def _formed_of_slices(bench: Bench, phases: Tensor, weights: Tensor) -> Tensor:
     return torch.stack([bench.formed(p) * w[:, None, None] for p, w in zip(phases, weights, strict=True)]).sum(0)
 
 
-def _row(
-    bench: Bench, method: str, scores: dict[str, float], seconds: float, thesis: float | None = None, verdict: str = ""
-) -> Row:
+def _row(bench: Bench, method: str, scores: dict[str, float], seconds: float) -> Row:
     keys = ("ssim", "psnr", "perceptual", "error", "efficiency", "peak_rad", "power_rad")
     numbers = {key: round(scores[key], 4) if key in scores else "" for key in keys}
     kind = {"kind": bench.kind, "sigma_px": bench.sigma_px, "setting": "", "method": method}
     kelvin = round(scores["peak_rad"] * 175 / PI) if "peak_rad" in scores else ""
     more = {"peak_degC_at_630nm": kelvin, "seconds": round(seconds, 3), "count": ""}
-    return {**kind, **numbers, **more, "thesis": "" if thesis is None else thesis, "verdict": verdict}
-
-
-def _against(value: float, thesis: float | None, slack: float) -> str:
-    if thesis is None:
-        return ""
-    if value > thesis + slack:
-        return "exceeded"
-    return "reproduced" if value >= thesis - slack else "not reproduced"
-
-
-def _gains(rows: list[Row]) -> list[Row]:
-    """The thesis's gains at sigma 0.66 in the far field: IPEC +121 %, PPEC +250 % over basic IPEC."""
-    scored = {row["method"]: row for row in rows if row["kind"] == "fourier" and row["sigma_px"] == 0.66}
-    gains = []
-    for name, thesis in (("IPEC", 121.0), ("PPEC", 250.0)) if "basic IPEC" in scored else ():
-        gain = 100 * (scored[name]["ssim"] / scored["basic IPEC"]["ssim"] - 1)
-        row = dict.fromkeys(scored[name], "")
-        verdict = "reproduced" if abs(gain - thesis) <= 30 else "exceeded" if gain > thesis else "not reproduced"
-        row |= {"kind": "fourier", "sigma_px": 0.66, "method": name, "setting": f"gain {gain:.0f} % over basic IPEC"}
-        gains.append(row | {"thesis": thesis, "verdict": verdict})
-    return gains
+    return {**kind, **numbers, **more}

@@ -152,7 +152,7 @@ def test_error_moves_from_the_middle_to_the_far_periphery(tmp_path, tiny):
     assert weighted["far"]["psnr"] < alike["far"]["psnr"] - 3
     assert weighted["far"]["error"] > 1.5 * alike["far"]["error"]
     page = (folder / "report.html").read_text()
-    assert "By eccentricity" in page and "central, 0 to 8 deg" in page and "all errors alike" in page
+    assert "By eccentricity" in page and "central, 0 to 8 deg" in page and "errors weighted equally" in page
     assert (folder / "images" / "weight.png").is_file()
 
 
