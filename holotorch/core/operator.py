@@ -20,15 +20,27 @@ class LinearOperator(Protocol):
 
 
 def linear(x: Tensor, apply: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor]) -> Tensor:
-    """``apply(x)`` with ``adjoint`` as its derivative, of any order, whatever either does inside; keeps no tensor."""
+    """``apply(x)`` with ``adjoint`` as its derivative, of any order; no tensor is saved for the backward pass.
+
+    Both functions are linear and accept leading batch axes.
+    """
     return _Linear.apply(x, apply, adjoint)  # type: ignore[return-value]
 
 
 class _Linear(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, x: Tensor, apply: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor]) -> Tensor:
-        ctx.maps = adjoint, apply
+    def forward(x: Tensor, apply: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor]) -> Tensor:
         return apply(x)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.maps = inputs[2], inputs[1]
+
+    @staticmethod
+    def vmap(info, in_dims, *args):
+        # Operators accept leading batch axes, so the mapped axis becomes one.
+        x, *maps = args
+        return _Linear.apply(x.movedim(in_dims[0], 0), *maps), 0
 
     @staticmethod
     def backward(ctx, *grad_outputs):

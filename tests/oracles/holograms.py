@@ -60,24 +60,43 @@ def limited_wave(dy, dx, pitch, wavelength, depth, cone):
     return total
 
 
+def wave_of_source(sources, shape, pitch, wavelength, depth, cone, stride):
+    """Function of a source's index (i, j) on a plane of ``sources`` (h, w): its wave on the hologram, [H, W]."""
+    rows, columns = shape
+    ys, xs = (positions(n, stride) for n in sources)
+    # Displacements in samples from the least, of the last source and the first pixel, to the greatest.
+    first = [-(n // 2) - s.max() for n, s in zip(shape, (ys, xs), strict=True)]
+    last = [n - 1 - n // 2 - s.min() for n, s in zip(shape, (ys, xs), strict=True)]
+    dy, dx = ((np.arange(a, b + 1)) * p for a, b, p in zip(first, last, pitch, strict=True))
+    if cone in ("taper", "band"):
+        waves = limited_wave(dy, dx, pitch, wavelength, depth, cone)
+    else:
+        waves = wave(dy[:, None], dx[None], pitch, wavelength, depth, cone)
+
+    def on_hologram(i, j):
+        y, x = -(rows // 2) - ys[i] - first[0], -(columns // 2) - xs[j] - first[1]
+        return waves[y : y + rows, x : x + columns]
+
+    return on_hologram
+
+
 def direct(layers, shape, pitch, wavelength, depths, cone="box", stride=1):
     """Sum over every pair of a source and a pixel."""
-    rows, columns = shape
     out = np.zeros(shape, complex)
     for plane, depth in zip(layers, depths, strict=True):
-        ys, xs = (positions(n, stride) for n in plane.shape)
-        # Displacements in samples from the least, of the last source and the first pixel, to the greatest.
-        first = [-(n // 2) - s.max() for n, s in zip(shape, (ys, xs), strict=True)]
-        last = [n - 1 - n // 2 - s.min() for n, s in zip(shape, (ys, xs), strict=True)]
-        dy, dx = ((np.arange(a, b + 1)) * p for a, b, p in zip(first, last, pitch, strict=True))
-        if cone in ("taper", "band"):
-            waves = limited_wave(dy, dx, pitch, wavelength, depth, cone)
-        else:
-            waves = wave(dy[:, None], dx[None], pitch, wavelength, depth, cone)
+        on_hologram = wave_of_source(plane.shape, shape, pitch, wavelength, depth, cone, stride)
         for i, j in zip(*np.nonzero(plane), strict=True):
-            y, x = -(rows // 2) - ys[i] - first[0], -(columns // 2) - xs[j] - first[1]
-            out += plane[i, j] * waves[y : y + rows, x : x + columns]
+            out += plane[i, j] * on_hologram(i, j)
     return out
+
+
+def matrix(sources, shape, pitch, wavelength, depths, cone, stride=1):
+    """The same sum as a matrix from flattened layers (D, h, w) of ``sources`` (h, w) to the flattened (H, W)."""
+    columns = []
+    for depth in depths:
+        on_hologram = wave_of_source(sources, shape, pitch, wavelength, depth, cone, stride)
+        columns += [on_hologram(i, j).ravel() for i in range(sources[0]) for j in range(sources[1])]
+    return np.stack(columns, 1)
 
 
 @dataclass(frozen=True)

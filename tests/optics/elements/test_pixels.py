@@ -72,44 +72,6 @@ def test_point_pixels_light_the_samples_at_their_own_coordinates(shape, orders):
         assert extents[1] == pytest.approx(extents[0], rel=1e-15)
 
 
-@pytest.mark.parametrize("orders", [0, 2])
-def test_contracts(orders):
-    operator = PixelShape(GRID, fill=(1, 0.9), orders=orders)
-    x, y = white(3, 2, *GRID.shape), white(3, 2, *operator.out_grid.shape)
-    out, back = operator(x), operator.adjoint(y)
-    assert out.shape == y.shape and back.shape == x.shape
-    assert abs((out.conj() * y).sum() - (x.conj() * back).sum()) <= EXACT * out.norm() * y.norm()
-    torch.testing.assert_close(
-        operator(2 * x - 0.5j * x.flip(0)), 2 * out - 0.5j * out.flip(0), rtol=0, atol=10 * EXACT
-    )
-    for i in range(3):
-        torch.testing.assert_close(operator(x[i]), out[i], rtol=0, atol=EXACT)
-        torch.testing.assert_close(operator(x[i, :1]), out[i, :1], rtol=0, atol=EXACT)
-    torch.testing.assert_close(torch.vmap(operator)(x), out, rtol=0, atol=EXACT)
-    # float32 rounding of an FFT of length n grows like log2(n), as in test_operator_contracts.py.
-    single = operator(x.to(torch.complex64))
-    assert single.dtype == operator.adjoint(y.to(torch.complex64)).dtype == torch.complex64
-    assert (single - out).abs().max() <= 20 * torch.finfo(torch.float32).eps * out.abs().max()
-    for cast in (operator.double(), operator.float(), operator.half(), operator.to("cpu", torch.bfloat16)):
-        assert torch.equal(cast(x), out)
-    if torch.cuda.is_available():
-        torch.testing.assert_close(operator.cuda()(x.cuda()).cpu(), out, rtol=0, atol=EXACT)
-        operator.cpu()
-    assert torch.autograd.gradcheck(operator, (x[0].requires_grad_(),), fast_mode=True)
-    assert torch.autograd.gradcheck(operator.adjoint, (y[0].requires_grad_(),), fast_mode=True)
-
-
-def test_compiles_without_graph_breaks():
-    torch.compiler.reset()
-    operator, x = PixelShape(GRID, fill=0.8, orders=1), white(2, *GRID.shape).requires_grad_()
-    weight = white(2, *operator.out_grid.shape)
-    compiled = torch.compile(operator, fullgraph=True, backend="aot_eager")
-    torch.testing.assert_close(compiled(x), operator(x), rtol=0, atol=EXACT)
-    (got,) = torch.autograd.grad((compiled(x) * weight).abs().square().sum(), x)
-    (wanted,) = torch.autograd.grad((operator(x) * weight).abs().square().sum(), x)
-    torch.testing.assert_close(got, wanted, rtol=EXACT, atol=EXACT * wanted.abs().max().item())
-
-
 @pytest.mark.parametrize("fill", [(0.9, 0.6), (0.3, 1.0)])
 @pytest.mark.parametrize("blaze", [0.0, 0.25])
 def test_far_field_has_the_orders_of_a_grating(fill, blaze):

@@ -38,40 +38,6 @@ def test_equals_its_members(make):
         assert relative(out[..., d, :, :], make(z)(x)) <= EXACT
 
 
-@each_member
-def test_adjoint_is_the_conjugate_transpose(make):
-    operator, x, y = stack(make), field(2), field(2, 3)
-    left, right = (operator(x).conj() * y).sum(), (x.conj() * operator.adjoint(y)).sum()
-    assert (left - right).abs() <= EXACT * operator(x).norm() * y.norm()
-    assert operator.adjoint(field(4, 2, 3)).shape == (4, 2, *GRID.shape)
-
-
-@each_member
-def test_linear_and_a_batch_equals_its_items(make):
-    operator, x, y = stack(make), field(2, 2), field(2, 2)
-    assert relative(operator(2.5 * x - 0.3j * y), 2.5 * operator(x) - 0.3j * operator(y)) <= EXACT
-    for i in range(2):
-        assert relative(operator(x)[i], operator(x[i])) <= EXACT
-    assert relative(torch.vmap(operator)(x), operator(x)) <= EXACT
-
-
-@each_member
-def test_dtype_follows_the_input(make):
-    operator, x = stack(make), field(2)
-    single = operator(x.to(torch.complex64))
-    assert single.dtype == torch.complex64
-    assert operator.adjoint(single).dtype == torch.complex64
-    assert relative(single.to(x.dtype), operator(x)) <= 20 * torch.finfo(torch.float32).eps  # an FFT's rounding
-    assert torch.equal(stack(make).float()(x), operator(x))  # casting the module keeps its kernels whole
-
-
-def test_gradient():
-    operator, x = stack(MEMBERS["Fresnel"]), field(2).requires_grad_()
-    assert torch.autograd.gradcheck(operator, (x,), fast_mode=True)
-    compiled = torch.compile(operator, fullgraph=True, backend="aot_eager")
-    assert relative(compiled(x.detach()), operator(x.detach())) <= EXACT
-
-
 def test_one_depth_keeps_its_axis():
     assert DepthStack([Fresnel(GRID, WAVES, 1e-4)])(field(2)).shape == (2, 1, *GRID.shape)
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from holotorch import Grid
-from holotorch.optics import Propagator, ResampledKernel, ZoomedFilter
+from holotorch.optics import Propagator, ResampledKernel
 from holotorch.optics.free_space.zoomed import chirp, zoom, zoom_adjoint
 
 GRID, OUT, OFFSET = Grid((12, 17), (5e-6, 4e-6)), Grid((9, 14), (3e-6, 7e-6)), (11e-6, -30e-6)
@@ -26,39 +26,6 @@ def test_equals_the_fourier_sum(size, step, start, count):
     values = torch.randn(3, count, dtype=torch.complex128)
     back = torch.from_numpy(values.numpy() @ matrix.conj())
     torch.testing.assert_close(zoom_adjoint(values, factors), back, rtol=0, atol=1e-13)
-
-
-def filtered() -> tuple[ZoomedFilter, np.ndarray, np.ndarray]:
-    """A filter with a random kernel on 20 x 24 samples, and its two dense factors: to the spectrum, and to places."""
-    kernel = torch.randn(2, 20, 24, dtype=torch.complex128)
-    forward, back = [], []
-    for axis, padded in enumerate((20, 24)):
-        n, m, p, q = GRID.shape[axis], OUT.shape[axis], GRID.pitch[axis], OUT.pitch[axis]
-        f = np.fft.fftfreq(padded, p)
-        source, reached = np.arange(n) * p, (np.arange(m) - m // 2) * q + OFFSET[axis] + n // 2 * p
-        forward.append(np.exp(-2j * np.pi * np.outer(f, source)))
-        back.append(np.exp(2j * np.pi * np.outer(reached, f)) / padded)
-    to_spectrum, to_places = np.kron(*forward), np.kron(*back)
-    dense = np.stack([to_places @ (each.ravel()[:, None] * to_spectrum) for each in kernel.numpy()])
-    return ZoomedFilter(GRID, WAVES, kernel, OUT, offset=OFFSET), dense, kernel.numpy()
-
-
-def test_contracts():
-    operator, dense, _ = filtered()
-    x = torch.randn(3, 2, *GRID.shape, dtype=torch.complex128)
-    y = torch.randn(3, 2, *OUT.shape, dtype=torch.complex128)
-    out = operator(x)
-    wanted = np.einsum("cpq,bcq->bcp", dense, x.numpy().reshape(3, 2, -1)).reshape(out.shape)
-    torch.testing.assert_close(out, torch.from_numpy(wanted), rtol=0, atol=1e-12)
-    assert abs((out.conj() * y).sum() - (x.conj() * operator.adjoint(y)).sum()) <= 1e-12 * out.norm() * y.norm()
-    torch.testing.assert_close(operator(x[1]), out[1], rtol=0, atol=1e-13)
-    assert operator(x.to(torch.complex64)).dtype == torch.complex64
-    assert torch.equal(operator.float().half()(x), out)
-    assert torch.autograd.gradcheck(operator, (x[:1].requires_grad_(),), fast_mode=True)
-    compiled = torch.compile(operator, fullgraph=True, backend="aot_eager")
-    torch.testing.assert_close(compiled(x.detach()), out, rtol=0, atol=1e-12)
-    with pytest.raises(ValueError, match=r"field must end in \(C, H, W\)"):
-        operator(y)
 
 
 def test_the_planned_reading_equals_the_dense_one():
