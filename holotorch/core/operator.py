@@ -20,7 +20,10 @@ class LinearOperator(Protocol):
 
 
 def linear(x: Tensor, apply: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor]) -> Tensor:
-    """``apply(x)`` with ``adjoint`` as its derivative, of any order, whatever either does inside; keeps no tensor."""
+    """``apply(x)`` with ``adjoint`` as its derivative, of any order; no tensor is saved for the backward pass.
+
+    Both functions are linear and accept leading batch axes.
+    """
     return _Linear.apply(x, apply, adjoint)  # type: ignore[return-value]
 
 
@@ -34,10 +37,11 @@ class _Linear(torch.autograd.Function):
         ctx.maps = inputs[2], inputs[1]
 
     @staticmethod
-    def backward(ctx, *grad_outputs):
-        return _Linear.apply(*grad_outputs, *ctx.maps), None, None
+    def vmap(info, in_dims, *args):
+        # Operators accept leading batch axes, so the mapped axis becomes one.
+        x, *maps = args
+        return _Linear.apply(x.movedim(in_dims[0], 0), *maps), 0
 
     @staticmethod
-    def vmap(info, in_dims, *args):
-        x, apply, adjoint = args
-        return _Linear.apply(x.movedim(in_dims[0], 0), apply, adjoint), 0
+    def backward(ctx, *grad_outputs):
+        return _Linear.apply(*grad_outputs, *ctx.maps), None, None

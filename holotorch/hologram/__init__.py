@@ -1,4 +1,4 @@
-"""Holograms of light sources on planes: the exact sum, ways that cost less, what they show, and encodings."""
+"""Holograms of point sources on planes: the exact sum, faster methods, reconstruction, and phase-only encodings."""
 
 from holotorch.hologram.axial import AxialHologram
 from holotorch.hologram.convolution import ConvolutionHologram

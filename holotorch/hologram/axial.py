@@ -1,4 +1,4 @@
-"""AxialHologram: any number of planes by a few transforms, their spectra gathered on the way along the axis."""
+"""AxialHologram: many planes with few Fourier transforms, by interpolation onto nodes along the optical axis."""
 
 import math
 import warnings
@@ -13,35 +13,36 @@ from holotorch.core.complex import phasor
 from holotorch.core.fourier import multiply_even
 from holotorch.core.grid import Grid
 from holotorch.hologram.cone import Cone
-from holotorch.hologram.guard import Axis, choose_length
 from holotorch.hologram.layered import LayerHologram
 from holotorch.hologram.nodes import axial_range, choose_nodes
-from holotorch.hologram.raster import Raster, lit
-from holotorch.hologram.waves import AxialDesign, Waves
+from holotorch.hologram.padding import Axis, choose_length
+from holotorch.hologram.raster import Raster, has_light
+from holotorch.hologram.transfer import AxialDesign, TransferFactors
 from holotorch.optics.free_space.padding import FINEST
 
-_GROUP = 16  # planes that are spread at once, by a matrix product per line instead of a pass for each
+_GROUP = 16  # planes spread onto the nodes in one matrix product, which reads the block of open nodes once
 
 
 class AxialHologram(LayerHologram):
-    """The sum over planes of waves exp(i k r) / r, limited in frequency; one small transform per node, not per plane.
+    """Sum over planes of band-limited spherical waves exp(i k r) / r, with one small transform per node, not per plane.
 
-    Planes are spread onto the nodes (:class:`Nodes`), each node takes one transform at the sources' own resolution,
-    and spectra are summed by Horner's rule: on from node to node by one factor, the same each time. A factor for the
-    wave itself and one transform back end it. Evenly spaced planes are their own nodes where those would be more.
+    Planes are spread onto evenly spaced nodes along the axis (:class:`Nodes`). Each node takes one transform at the
+    resolution of the sources. The spectra are summed by Horner's rule: the partial sum is multiplied by the same
+    factor from each node to the next. Finally the sum is multiplied by the spectrum of the spherical wave and
+    transformed back. Evenly spaced planes serve as nodes themselves where they are fewer.
 
     Args:
         grid: Pixels of the hologram.
         wavelength: In metres.
-        depths: Of the planes, in metres, above 0; any order and spacing.
-        cone: "taper", "band" or "full", see ``holotorch.hologram.cone``; "full" only where every pixel lies within the
-            cone of every source, since steeper light is left out.
+        depths: Distances of the planes from the hologram in metres, above 0; any order and spacing.
+        cone: "taper", "band" or "full", see ``holotorch.hologram.cone``. "full" is allowed only where every pixel lies
+            within the cone of every source, since steeper light is left out.
         stride: Pixels between neighbouring sources of a plane.
-        tolerance: Relative L2 error to stay below for sources like noise; 1e-6 at least in complex64.
+        tolerance: Largest relative L2 error for layers of random noise; complex64 reaches 1e-6 at best.
 
     Raises:
-        TypeError, ValueError: Impossible arguments; in a call: layers that are not complex [..., D, h, w], or so wide
-            that ``full`` does not hold.
+        TypeError, ValueError: Invalid arguments; in a call: layers that are not complex [..., D, h, w], or so wide
+            that "full" is not allowed.
 
     Warns:
         SamplingWarning: In a call, where the predicted error exceeds the tolerance.
@@ -71,7 +72,7 @@ class AxialHologram(LayerHologram):
         self._designs: dict[tuple[int, int], AxialDesign] = {}
 
     def design(self, shape: tuple[int, int]) -> AxialDesign:
-        """Nodes and lengths for layers of ``shape`` (h, w)."""
+        """Nodes and transform sizes for layers of ``shape`` (h, w)."""
         if shape not in self._designs:
             axes = self._axes(shape)
             if self.cone == "full" and not all(axis.within_band for axis in axes):
@@ -88,8 +89,8 @@ class AxialHologram(LayerHologram):
             self._designs[shape] = AxialDesign(nodes, (height, width), error, error <= self.tolerance)
         return self._designs[shape]
 
-    def waves(self, shape: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Waves:
-        """Factors in frequency for layers of ``shape``."""
+    def transfer_factors(self, shape: tuple[int, int], dtype: torch.dtype, device: torch.device) -> TransferFactors:
+        """Transfer factors for layers of ``shape`` (h, w); warns where the predicted error exceeds the tolerance."""
         design = self.design(shape)
         if not design.adequate:
             warnings.warn(
@@ -99,7 +100,7 @@ class AxialHologram(LayerHologram):
                 stacklevel=2,
             )
         raster = Raster(self.grid, shape, self.stride, design.size)
-        return Waves(self.grid, self.wavelength, design, self._axes(shape), raster, dtype, device)
+        return TransferFactors(self.grid, self.wavelength, design, self._axes(shape), raster, dtype, device)
 
     def _axes(self, shape: tuple[int, int]) -> tuple[Axis, Axis]:
         near, far = min(self.depths), max(self.depths)
@@ -110,9 +111,10 @@ class AxialHologram(LayerHologram):
         return y, x
 
     def accumulate(self, planes: Iterable[Tensor], phase: Tensor | None = None) -> Tensor:
-        """Field [H, W] of planes [h, w], real or complex, as they come in the order of ``depths``; none is kept.
+        """Field [H, W] of planes [h, w], real or complex, in the order of ``depths``, which must rise or fall.
 
-        ``phase`` [h, w] in rad is common to all, and then costs nothing per plane. Depths must rise or fall.
+        The planes are read one after another and not kept. ``phase`` [h, w] in rad is common to all planes; it is
+        applied once per node.
         """
         if isinstance(planes, Tensor) and len(planes):
             total = self.accumulator((planes.shape[-2], planes.shape[-1]), phase)
@@ -127,53 +129,52 @@ class AxialHologram(LayerHologram):
         return total.finish()
 
     def accumulator(self, shape: tuple[int, int], phase: Tensor | None = None) -> "Accumulator":
-        """A sum that planes are added to one by one; see :meth:`accumulate`."""
+        """Running sum to which planes are added one by one; see :meth:`accumulate`."""
         return Accumulator(self, shape, phase)
 
     def _forward(self, layers: Tensor) -> Tensor:
         order = sorted(range(len(self.depths)), key=self.depths.__getitem__)
-        fields = []
-        for item in layers.reshape(-1, *layers.shape[-3:]):
+        fields = layers.new_zeros(len(layers), *self.grid.shape)
+        for item, field in zip(layers, fields, strict=True):
             total = self.accumulator((item.shape[-2], item.shape[-1]))
             for j in order:
                 total.add(j, item[j])
-            fields.append(total.finish())
-        return torch.stack(fields).reshape(*layers.shape[:-3], *self.grid.shape).to(layers.dtype)
+            field.copy_(total.finish())
+        return fields
 
     def _adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
-        waves = self.waves(shape, field.dtype, field.device)
-        nodes, raster = waves.design.nodes, waves.raster
-        flat = field.reshape(-1, *field.shape[-2:])
-        out = flat.new_zeros(len(flat), len(self.depths), *shape)
+        factors = self.transfer_factors(shape, field.dtype, field.device)
+        nodes, raster = factors.design.nodes, factors.raster
+        out = field.new_zeros(len(field), len(self.depths), *shape)
         begins, weights = nodes.weights(self.depths)
-        back = waves.step(-1)
-        for given, layers in zip(flat, out, strict=True):
-            spectrum = multiply_even(raster.spectrum_of_pixels(given), waves.last(0).conj())
+        back = factors.step(-1)
+        for item, layers in zip(field, out, strict=True):
+            spectrum = multiply_even(raster.spectrum_of_pixels(item), factors.last(0).conj())
             for m in range(nodes.count):
                 near = [j for j, begin in enumerate(begins) if begin <= m < begin + nodes.width]
                 layer = raster.layer(spectrum) if near else spectrum
                 for j in near:
                     layers[j] += layer * complex(weights[j, m - begins[j]].conj())
                 spectrum *= back
-        return out.reshape(*field.shape[:-2], len(self.depths), *shape)
+        return out
 
 
 class Accumulator:
-    """The sum of an :class:`AxialHologram` while planes arrive, from near to far or from far to near.
+    """Running sum of an :class:`AxialHologram` over planes that arrive in rising or falling depth.
 
-    Nodes that are still open lie in one block of memory, node m in row m modulo its rows, so that each group of planes
-    is one matrix product added in place: about what it takes to read them.
+    A node is open while planes that touch it may still arrive. The open nodes lie in one block of memory, node m in
+    row m modulo the number of rows, so that a group of planes is added in place by one matrix product.
     """
 
     def __init__(self, operator: AxialHologram, shape: tuple[int, int], phase: Tensor | None = None):
         self.operator, self.shape = operator, shape
-        self.turn = None if phase is None else phasor(phase)
+        self.phasor = None if phase is None else phasor(phase)
         self.nodes = operator.design(shape).nodes
         self.begins, self.weights = self.nodes.weights(operator.depths)
-        # Rows beyond a plane's own, so that a group holds several planes where they are sparse.
+        # Rows beyond the width of the window, so that a group holds several planes where they are far apart.
         spare = round(_GROUP / 2 * self.nodes.count / len(operator.depths))
         self.rows = self.nodes.width + min(spare, self.nodes.width)
-        self.waves: Waves | None = None
+        self.factors: TransferFactors | None = None
         self.total: Tensor | None = None
         self.step: Tensor | None = None
         self.at = 0
@@ -184,7 +185,7 @@ class Accumulator:
         self.block: Tensor | None = None  # [h, rows, w] complex, or [h, 2 rows, w] while all planes are real
 
     def add(self, j: int, plane: Tensor) -> None:
-        """Add the plane of depth number ``j``, real or complex [h, w]; dark ones cost nothing."""
+        """Add the plane at ``depths[j]``, real or complex [h, w]; a plane of zeros is skipped."""
         depth = self.operator.depths[j]
         if self.before is not None and depth != self.before:
             rising = depth > self.before
@@ -193,36 +194,36 @@ class Accumulator:
             self.rising = rising
         self.before = depth
         if plane.stride() == (0, 0) and not plane[0, 0]:
-            return  # one zero for all, as renderers give for planes that they have nothing on
+            return  # a single expanded zero, which renderers yield for an empty plane
         plane = plane.detach()
         if self.nodes.width == 1:
-            if lit(plane):
-                self._take(self.begins[j], plane * complex(self.weights[j, 0]))
+            if has_light(plane):
+                self._add_node(self.begins[j], plane * complex(self.weights[j, 0]))
             return
         if self.pending:
             span = abs(self.begins[j] - self.begins[self.pending[0][0]])
-            alike = plane.dtype == self.pending[0][1].dtype
-            if len(self.pending) == _GROUP or span > self.rows - self.nodes.width or not alike:
+            same_dtype = plane.dtype == self.pending[0][1].dtype
+            if len(self.pending) == _GROUP or span > self.rows - self.nodes.width or not same_dtype:
                 self._spread()
         self.pending.append((j, plane))
 
     def finish(self) -> Tensor:
-        """The field [H, W]; complex zeros where no plane was lit."""
+        """The field [H, W]; zeros where no plane emits light."""
         self._spread()
         self._close(self.open)
-        if self.total is None or self.waves is None:
+        if self.total is None or self.factors is None:
             return torch.zeros(self.operator.grid.shape, dtype=torch.complex64)
-        self.step = self.block = None  # makes room for the transform
-        return self.waves.raster.pixels(multiply_even(self.total, self.waves.last(self.at)))
+        self.step = self.block = None  # frees memory for the transform
+        return self.factors.raster.pixels(multiply_even(self.total, self.factors.last(self.at)))
 
     def _spread(self) -> None:
-        """Add the pending planes to the nodes around them, once the nodes that none of them touches are taken."""
+        """Add the pending planes to the nodes around them."""
         planes, self.pending = self.pending, []
         if planes:
             self._gather(_side_by_side([plane for _, plane in planes]), [j for j, _ in planes])
 
     def add_stack(self, planes: Tensor) -> None:
-        """Add all planes [D, h, w], number j at ``depths[j]``; the depths must rise or fall."""
+        """Add all planes [D, h, w], plane j at ``depths[j]``; the depths must rise or fall."""
         steps = np.diff(self.operator.depths)
         if self.nodes.width == 1 or not planes.is_contiguous() or not ((steps > 0).all() or (steps < 0).all()):
             for j, plane in enumerate(planes):
@@ -234,14 +235,14 @@ class Accumulator:
             end = start + 1
             while end < len(flat) and abs(self.begins[end] - self.begins[start]) <= spare:
                 end += 1
-            # Groups of even sizes, where many planes touch the same nodes.
+            # Groups of equal size, where many planes touch the same nodes.
             end = start + math.ceil((end - start) / math.ceil((end - start) / _GROUP))
             self._gather(flat[start:end], list(range(start, end)))
             start = end
 
     def _gather(self, stack: Tensor, order: list[int]) -> None:
-        """Add planes [J, h w] of numbers ``order``."""
-        if not lit(stack):
+        """Add planes [J, h w]; ``order`` holds their indices into the depths."""
+        if not has_light(stack):
             return
         begins = np.asarray([self.begins[j] for j in order])
         touched = {*range(begins.min(), begins.max() + self.nodes.width)}
@@ -260,39 +261,39 @@ class Accumulator:
         elif stack.is_complex() and not self.block.is_complex():
             self.block = torch.complex(self.block[:, ::2], self.block[:, 1::2])
         if not self.block.is_complex():
-            # Real planes: rows of real and imaginary parts in turn.
+            # Real planes: rows hold real and imaginary parts alternately.
             matrix = torch.view_as_real(matrix).movedim(-1, 1).flatten(0, 1)
-        # A product for each line of the picture: so short a matrix takes a third less than one for all of it, which is
-        # copied into another order first.
+        # One product for each line of the picture takes a third less time than one for the whole picture, which
+        # would first be copied into another memory order.
         lines = stack.to(self.block.dtype).view(len(order), height, width).transpose(0, 1)
         self.block.baddbmm_(matrix.to(self.block).expand(height, -1, -1), lines)
 
     def _close(self, nodes: set[int]) -> None:
-        """Take ``nodes``, that no later plane will touch, and make their rows free."""
+        """Add ``nodes``, which no later plane touches, to the sum and free their rows."""
         for index in sorted(nodes, reverse=self.rising is False):
             assert self.block is not None
             k = index % self.rows
             row = self.block[:, k] if self.block.is_complex() else self.block[:, 2 * k : 2 * k + 2]
-            self._take(index, row.clone() if row.is_complex() else torch.complex(row[:, 0], row[:, 1]))
+            self._add_node(index, row.clone() if row.is_complex() else torch.complex(row[:, 0], row[:, 1]))
             row.zero_()
         self.open = self.open - nodes
 
-    def _take(self, index: int, node: Tensor) -> None:
-        """Horner's rule: carry the sum on to node ``index`` and add the node."""
+    def _add_node(self, index: int, node: Tensor) -> None:
+        """Horner's rule: propagate the sum to node ``index`` and add the node."""
         node = node.reshape(self.shape)
-        if self.turn is not None:
-            node *= self.turn
-        if self.waves is None:
-            self.waves = self.operator.waves(self.shape, node.dtype, node.device)
-        raster = self.waves.raster
+        if self.phasor is not None:
+            node *= self.phasor
+        if self.factors is None:
+            self.factors = self.operator.transfer_factors(self.shape, node.dtype, node.device)
+        raster = self.factors.raster
         period = raster.spectrum(node)
         if self.total is None:
             self.total = raster.repeated(period)
         else:
-            # A deeper node's phase is ahead, so the sum falls behind.
+            # The phase at a deeper node is advanced, so the sum so far is retarded relative to it.
             forward = 1 if index > self.at else -1
             if self.step is None:
-                self.step = self.waves.step(-forward)
+                self.step = self.factors.step(-forward)
             for _ in range(abs(index - self.at) - 1):
                 self.total *= self.step
             total = raster.tiles(self.total)
@@ -301,7 +302,7 @@ class Accumulator:
 
 
 def _side_by_side(planes: list[Tensor]) -> Tensor:
-    """Planes [h, w] as [J, h w]; a view where they lie side by side in memory already, as slices of one tensor do."""
+    """Planes [h, w] as [J, h w]; a view where they are adjacent in memory, as the slices of one tensor are."""
     first = planes[0]
     size, store = first.numel(), first.untyped_storage().data_ptr()
     begin, step = first.data_ptr(), size * first.element_size()

@@ -1,8 +1,8 @@
-"""Waves of point sources whose spectrum is limited to the grid's band: their spectrum, and their values in space.
+"""Spherical waves limited to the band of a grid: their spectrum, and their values in space by quadrature.
 
-The wave of a point is the sum of plane waves exp(ikr) / r = i int exp(2 pi i (f x + z w)) / w df (Weyl), with
-w = sqrt(1 / wavelength^2 - fx^2 - fy^2). ``taper`` and ``band`` weight that sum in frequency. In space they have no
-closed form; here they are integrated, which is slow and exact.
+Weyl's expansion writes a spherical wave as a sum of plane waves, exp(ikr) / r = i int exp(2 pi i (f x + z w)) / w df
+with w = sqrt(1 / wavelength^2 - fx^2 - fy^2). The cones ``taper`` and ``band`` weight the integrand in frequency. The
+result has no closed form in space; it is integrated numerically, which is slow and exact to rounding.
 """
 
 import math
@@ -16,41 +16,42 @@ from holotorch.hologram.cone import TAPER_BEGIN, taper
 from holotorch.optics.free_space.kernels import carrier, turns_phasor
 
 _RULE = np.polynomial.legendre.leggauss(64)
-_CYCLES = 10.0  # of the integrand per 64 nodes of the rule, which is exact to rounding up to about 15
-_MOST_NODES = 30_000  # per axis: their product takes minutes
+_CYCLES = 10.0  # cycles of the integrand per panel of 64 nodes; the rule is exact to rounding up to about 15
+_MOST_NODES = 30_000  # quadrature nodes per axis; a sum over more of them on both axes takes minutes
 
 
 def point_spectrum(fy: Tensor, fx: Tensor, wavelength: float, depth: float) -> Tensor:
-    """Spectrum i exp(2 pi i z w) / w of the wave of a point at ``depth`` metres, complex128; fy, fx below 1/wavelength.
+    """Spectrum i exp(2 pi i z w) / w of a point source at z = ``depth`` metres, complex128.
 
-    z w is written z / wavelength - z f^2 / (w + 1 / wavelength), whose second term does not cancel.
+    Frequencies must stay below 1 / wavelength. The phase is written as z / wavelength - z f^2 / (w + 1 / wavelength),
+    to avoid the cancellation of w - 1 / wavelength.
     """
     square = fy.square() + fx.square()
     axial = torch.sqrt(wavelength**-2 - square)
-    turns = 0.25 - depth * square / (axial + 1 / wavelength)
-    return turns_phasor(turns) * (carrier(wavelength, depth).to(square.device) / axial)
+    cycles = 0.25 - depth * square / (axial + 1 / wavelength)
+    return turns_phasor(cycles) * (carrier(wavelength, depth).to(square.device) / axial)
 
 
 def band_limited_wave(
     dy: Tensor, dx: Tensor, pitch: tuple[float, float], wavelength: float, depth: float, *, soft: bool
 ) -> Tensor:
-    """The wave of a point with its spectrum cut at the pitch's highest frequency, complex128 [len(dy), len(dx)].
+    """Spherical wave with its spectrum limited to the highest frequency of the pitch, complex128 [len(dy), len(dx)].
 
     Args:
-        dy: Displacements of rows in metres, float64 [A].
-        dx: Of columns, [B].
+        dy: Displacements along y in metres, float64 [A].
+        dx: Displacements along x in metres, float64 [B].
         pitch: (y, x) in metres, at least 0.9 wavelengths.
         wavelength: In metres.
         depth: In metres, above 0.
-        soft: With the taper of ``cone.taper``, or with a sharp end.
+        soft: Whether the band ends with the taper of ``cone.taper`` or sharply.
 
     Raises:
-        ValueError: So deep that the integral over frequencies needs too many nodes.
+        ValueError: The depth is so large that the quadrature needs too many nodes.
     """
     fy, fx = (
         _nodes(displacement, step, wavelength, depth, soft) for displacement, step in zip((dy, dx), pitch, strict=True)
     )
-    # The spectrum is even in both frequencies: a quadrant of it, with cosines.
+    # The spectrum is even in both frequencies, so a cosine transform of one quadrant suffices.
     columns = 2 * fx[1] * torch.cos(2 * math.pi * dx[:, None] * fx[0])
     rows = 2 * fy[1] * torch.cos(2 * math.pi * dy[:, None] * fy[0])
     total = torch.zeros(len(dy), len(dx), dtype=torch.complex128, device=dy.device)
@@ -62,10 +63,10 @@ def band_limited_wave(
 
 
 def _nodes(displacement: Tensor, pitch: float, wavelength: float, depth: float, soft: bool) -> tuple[Tensor, Tensor]:
-    """Frequencies from 0 to the highest one, and their weights, which include the taper."""
+    """Quadrature nodes from frequency 0 to the highest one, and their weights, which include the taper."""
     highest = 1 / (2 * pitch)
     sine = wavelength * highest
-    # Sideways by the tangent of the steepest light, whose angle the other axis can widen.
+    # Derivative of the phase by frequency: the displacement plus the lateral spread of the steepest light.
     slope = displacement.abs().max().item() + depth * sine / math.sqrt(max(1 - 2 * sine**2, 0.1))
     if slope * highest / _CYCLES * 64 > _MOST_NODES:
         raise ValueError(
@@ -80,7 +81,7 @@ def _nodes(displacement: Tensor, pitch: float, wavelength: float, depth: float, 
 
 
 def _panels(ends: tuple[float, ...], cycles: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Nodes and weights of the rule on panels between ``ends``, with no more than ``_CYCLES`` of the integrand each."""
+    """Nodes and weights on panels between ``ends``, each with at most ``_CYCLES`` cycles of the integrand."""
     for low, high in zip(ends, ends[1:], strict=False):
         count = math.ceil(cycles * (high - low) / _CYCLES) or 1
         half = (high - low) / count / 2

@@ -1,17 +1,17 @@
-"""What a point of light sends to a sampled hologram: the spherical wave, and the cone of it that the pixels can carry.
+"""Spherical wave of a point source on a sampled hologram, and the cone of directions that the pixels can carry.
 
-The wave of a point is exp(+i k r) / r (thesis Eqs. 5.1, 5.13). A pitch p carries sines up to wavelength / (2 p) per
-axis only; beyond, the samples alias. What is kept of the wave is a definition, the same for all holograms:
+The wave of a point source is exp(+i k r) / r (thesis Eqs. 5.1, 5.13). A pitch p carries directions with sines up to
+wavelength / (2 p) per axis; steeper light aliases. All holograms share these definitions of the part that is kept:
 
-- ``full``: all of it. It aliases where the cone is narrower than the pixels (Algorithm 4 as printed).
+- ``full``: the whole wave. It aliases where the cone is narrower than the hologram (Algorithm 4 as printed).
 - ``box``: a sharp pyramid in space, |x| <= z tan(theta) and |y| <= z tan(theta): the thesis's K_z of Sec. 5.6.1.
 - ``disc``: a sharp cone in space, of the same half angle.
 - ``band``: the wave whose spectrum ends sharply at the highest frequency, all that a display with square pixels emits.
-- ``taper``: the wave whose spectrum falls to 0 over the last 30 % of the band of each axis, so that no edge rings.
+- ``taper``: the wave whose spectrum falls to 0 over the last 30 % of the band of each axis, to suppress ringing.
 
-Where every pixel lies well inside the cone of every source, ``taper`` is the plain wave, as are ``full``, ``box`` and
-``disc``: :func:`is_plain` says from where on. The ringing of ``band`` reaches farther: it is 0.6 / sqrt(K) of the wave
-on the axis, K the samples that the cone covers.
+Where every pixel lies well inside the cone of every source, ``full``, ``box``, ``disc`` and ``taper`` agree:
+:func:`is_plain` gives the criterion. ``band`` rings farther into the cone: on the axis, by 0.6 / sqrt(K) of the wave,
+where the cone covers K samples.
 """
 
 import math
@@ -28,27 +28,28 @@ from holotorch.optics.free_space.kernels import carrier, turns_phasor
 from holotorch.optics.free_space.padding import FINEST
 
 Cone = Literal["full", "box", "disc", "taper", "band"]
-TAPER_BEGIN = 0.7  # of the highest frequency
-_TAPER_RINGING = 2.0  # times sqrt(K) / n^3, K and n in samples; measured 0.9 to 2.5, with both ends of the band
+TAPER_BEGIN = 0.7  # fraction of the highest frequency at which the taper begins
+# Factor of sqrt(K) / n^3 in the ringing of the taper, see ``taper_margin``; 0.9 to 2.5 were measured.
+_TAPER_RINGING = 2.0
 
 
-def taper(part: Tensor) -> Tensor:
-    """1 up to 0.7, a half cosine down to 0 at 1, of a frequency's part of the highest one."""
-    edge = ((part.abs() - TAPER_BEGIN) / (1 - TAPER_BEGIN)).clamp(0, 1)
+def taper(fraction: Tensor) -> Tensor:
+    """Weight of a frequency, given as a fraction of the highest one: 1 up to 0.7, then a half cosine to 0 at 1."""
+    edge = ((fraction.abs() - TAPER_BEGIN) / (1 - TAPER_BEGIN)).clamp(0, 1)
     return (1 + torch.cos(math.pi * edge)) / 2
 
 
 def taper_margin(cone: float, error: float) -> float:
-    """Samples beside an end of the taper at which it changes the wave by a part ``error`` of it.
+    """Distance in samples from an end of the taper beyond which it changes the wave by less than ``error`` of it.
 
-    The taper's second derivative steps at its ends, which adds light of sqrt(K) / n^3 of the wave n samples from where
-    the geometry puts those ends; K = 2 ``cone`` samples is what the whole cone covers.
+    The second derivative of the taper is discontinuous at its ends. At n samples from the geometric image of an end
+    this adds a relative amplitude of sqrt(K) / n^3, where the whole cone covers K = 2 ``cone`` samples.
     """
     return (_TAPER_RINGING * math.sqrt(2 * cone) / error) ** (1 / 3)
 
 
 def is_plain(grid: Grid, wavelength: float, depth: float, apart: tuple[int, int], error: float) -> bool:
-    """Whether the taper changes the wave by a part below ``error`` at all displacements up to ``apart`` samples."""
+    """Whether the taper changes the wave by less than ``error`` of it at all displacements up to ``apart`` samples."""
     return all(
         math.isinf(cone) or TAPER_BEGIN * cone - distance >= taper_margin(cone, error / 2)
         for cone, distance in zip(cone_samples(grid, wavelength, depth), apart, strict=True)
@@ -73,8 +74,8 @@ def spherical_wave(dy: Tensor, dx: Tensor, pitch: tuple[float, float], wavelengt
         cone: "full", "box" or "disc"; the others have no closed form in space, see ``band_limited_wave``.
 
     Returns:
-        complex128. k r is written k z + k s / (r + z), s = dy^2 + dx^2, whose second term does not cancel; whole turns
-        of the first are taken off in float64.
+        complex128. k r is written as k z + k s / (r + z) with s = dy^2 + dx^2, to avoid the cancellation of r - z;
+        whole cycles of k z are removed in float64.
     """
     square = dy.square() + dx.square()
     distance = torch.sqrt(depth**2 + square)
@@ -84,14 +85,14 @@ def spherical_wave(dy: Tensor, dx: Tensor, pitch: tuple[float, float], wavelengt
     if cone == "full":
         return wave
     spread = lateral_spread(Grid(1, pitch), wavelength, depth)
-    # A pixel on the border belongs to the cone, whatever its position was rounded to.
+    # The relative margin keeps pixels on the border inside the cone in spite of rounding.
     y, x = (aside.abs() / (limit * (1 + 1e-12)) for aside, limit in zip((dy, dx), spread, strict=True))
     inside = (y.square() + x.square() <= 1) if cone == "disc" else (y <= 1) & (x <= 1)
     return torch.where(inside, wave, 0)
 
 
 def check_cone(cone: Cone, pitch: tuple[float, float], wavelength: float) -> None:
-    """Raise ValueError unless ``cone`` is one of the definitions, and one that a pitch so fine can have."""
+    """Raise ValueError unless ``cone`` is one of the definitions and the pitch is coarse enough for it."""
     if cone not in get_args(Cone):
         raise ValueError(f"cone must be one of {', '.join(map(repr, get_args(Cone)))}, got {cone!r}")
     if cone in ("taper", "band") and min(pitch) < FINEST * wavelength:
@@ -106,8 +107,7 @@ def check_scene(grid: Grid, wavelength: float, depths, stride: int) -> tuple[flo
 
     Raises:
         TypeError: Not numbers.
-        ValueError: Several wavelengths; no depth, or one that is not above zero (all points lie before the hologram)
-            or beyond 100 m.
+        ValueError: Several wavelengths; no depth, or a depth that is not above zero or exceeds 100 m.
     """
     first, *others = checks.wavelengths(wavelength)
     if others:

@@ -12,94 +12,96 @@ from holotorch.core.grid import Grid
 from holotorch.hologram.band_limited import point_spectrum
 from holotorch.hologram.cone import Cone, cone_samples, is_plain, spherical_wave, taper, taper_margin
 from holotorch.hologram.layered import LayerHologram
-from holotorch.hologram.raster import Raster, lit, span, strided_length
+from holotorch.hologram.raster import Raster, has_light, span, strided_length
 from holotorch.optics.free_space.plane_pair import plane_pair
 from holotorch.optics.free_space.transfer import transfer_function
 
-TAPER_ERROR = 2e-7  # part of the wave that wraps around, or by which the taper may differ from the plain wave
+# Relative amplitude, of the spherical wave, of the light that may wrap around the padded array, and of the difference
+# between a tapered and an unlimited wave where the closed form replaces the tapered one.
+TAPER_ERROR = 2e-7
 
 
 class ConvolutionHologram(LayerHologram):
-    """The sum of ``DirectHologram`` by transforms: thesis Eqs. 5.8 to 5.14 and Algorithm 5, without error or waste.
+    """The sum of ``DirectHologram`` by FFT: thesis Eqs. 5.8 to 5.14 and Algorithm 5, exact to rounding.
 
-    The waves' phases are float64 and cast last. A plane takes the transform of its own sources, which are ``stride``
-    apart, and half a transform of its kernel, of which a quadrant is computed; planes are summed in frequency and
-    transformed back together. The length max(V, H, (V + H + K) / 2) keeps light from wrapping around, V and H the
-    samples that sources and pixels cover and K those of the cone; Sec. 5.6.1 takes H + K.
+    Phases are computed in float64 and cast last. A plane takes one transform of its sources, which are ``stride``
+    apart, and half a transform of its kernel, of which a quadrant is computed. Planes are summed in frequency and
+    transformed back together. The padded length max(V, H, (V + H + K) / 2) keeps light from wrapping around, where
+    sources cover V samples, pixels H and the cone of light K; Sec. 5.6.1 takes H + K.
 
     Args:
         grid: Pixels of the hologram.
         wavelength: In metres.
-        depths: Of the planes, in metres, above 0; any order and spacing.
-        cone: What is kept of each wave, see ``holotorch.hologram.cone``. ``taper`` is applied in frequency, on arrays
-            so long that 2e-7 of a wave wraps around. The wave of ``band`` is that of ``CroppedKernel``, exact but for
-            about 2 s^2 / sqrt(N), s the sine of the steepest light.
+        depths: Distances of the planes from the hologram in metres, above 0; any order and spacing.
+        cone: The part of each spherical wave that is kept, see ``holotorch.hologram.cone``. ``taper`` is applied in
+            frequency, on arrays so long that at most 2e-7 of a wave wraps around. ``band`` uses the kernel of
+            ``CroppedKernel``, with a relative error of about 2 s^2 / sqrt(N), s the sine of the steepest light.
         stride: Pixels between neighbouring sources of a plane.
 
     Raises:
-        TypeError, ValueError: Impossible arguments; in a call: layers that are not complex [..., D, h, w].
+        TypeError, ValueError: Invalid arguments; in a call: layers that are not complex [..., D, h, w].
     """
 
     def __init__(self, grid: Grid, wavelength: float, depths: Sequence[float], *, cone: Cone = "box", stride: int = 1):
         super().__init__(grid, wavelength, depths, cone, stride)
 
     def padded(self, shape: tuple[int, int]) -> tuple[int, int]:
-        """Samples of the transforms for layers of ``shape`` (h, w)."""
+        """Size of the transforms in samples for layers of ``shape`` (h, w)."""
         apart, least = span(self.grid, shape, self.stride)
         extents = [self._extent(depth, apart) for depth in self.depths]
-        # Longer by one than the farthest pair and the farthest wave: no wave wraps around into a pair.
+        # One sample longer than the largest displacement of a pair plus that of a kernel: no wave wraps onto a pixel.
         y, x = (
-            strided_length(max(length, distance + max(wide) + 1), self.stride)
-            for length, distance, wide in zip(least, apart, zip(*extents, strict=True), strict=True)
+            strided_length(max(length, distance + max(extent) + 1), self.stride)
+            for length, distance, extent in zip(least, apart, zip(*extents, strict=True), strict=True)
         )
         return y, x
 
     def _extent(self, depth: float, apart: tuple[int, int]) -> tuple[int, int]:
-        """Farthest displacement (y, x) that the kernel of a depth has, in samples."""
+        """Largest displacement (y, x) at which the kernel of a depth is not zero, in samples."""
         if self._in_frequency(depth, apart):
             sines = [self.wavelength / (2 * pitch) for pitch in self.grid.pitch]
-            widest = depth / math.sqrt(1 - sines[0] ** 2 - sines[1] ** 2)
+            path = depth / math.sqrt(1 - sines[0] ** 2 - sines[1] ** 2)  # of the steepest light, in metres
             y, x = (
-                math.ceil(widest * sine / pitch + taper_margin(widest * sine / pitch, TAPER_ERROR))
+                math.ceil(path * sine / pitch + taper_margin(path * sine / pitch, TAPER_ERROR))
                 for sine, pitch in zip(sines, self.grid.pitch, strict=True)
             )
             return y, x
         if self.cone not in ("box", "disc"):
             return apart
         half = cone_samples(self.grid, self.wavelength, depth)
-        y, x = (math.floor(min(reach, wide * (1 + 1e-12))) for reach, wide in zip(apart, half, strict=True))
+        y, x = (math.floor(min(distance, width * (1 + 1e-12))) for distance, width in zip(apart, half, strict=True))
         return y, x
 
     def kernel_samples(self, depth: float, shape: tuple[int, int], size: tuple[int, int]) -> tuple[int, int]:
-        """Samples (y, x) of the quadrant of a plane's wave that are computed, for layers [h, w] padded to ``size``."""
+        """Size (y, x) in samples of the computed quadrant of a kernel, for layers of ``shape`` padded to ``size``."""
         apart, _ = span(self.grid, shape, self.stride)
         if self._in_frequency(depth, apart):
             return size[0] // 2 + 1, size[1] // 2 + 1
-        y, x = (min(wide, length // 2) + 1 for wide, length in zip(self._extent(depth, apart), size, strict=True))
+        y, x = (min(extent, length // 2) + 1 for extent, length in zip(self._extent(depth, apart), size, strict=True))
         return y, x
 
     def _in_frequency(self, depth: float, apart: tuple[int, int]) -> bool:
-        """Whether a plane's wave is tapered somewhere, and so made in frequency."""
+        """Whether the taper changes the kernel of a depth, which is then computed in frequency."""
         return self.cone == "taper" and not is_plain(self.grid, self.wavelength, depth, apart, TAPER_ERROR)
 
     def _kernel(self, depth: float, raster: Raster, layers: Tensor) -> Tensor:
-        """A quadrant of the transform of a plane's wave."""
+        """A quadrant of the transform of the spherical wave from a plane."""
         apart, _ = span(self.grid, raster.shape, self.stride)
         if self.cone == "band":
-            return self._limited(depth, raster, apart).to(layers.device, layers.dtype)
+            return self._band_kernel(depth, raster, apart).to(layers.device, layers.dtype)
         if self._in_frequency(depth, apart):
-            return self._tapered(depth, raster, layers.device).to(layers.dtype)
+            return self._tapered_kernel(depth, raster, layers.device).to(layers.dtype)
         extent = self._extent(depth, apart)
         dy, dx = (
-            torch.arange(min(far, size // 2) + 1, dtype=torch.float64, device=layers.device) * pitch
-            for far, size, pitch in zip(extent, raster.size, self.grid.pitch, strict=True)
+            torch.arange(min(count, size // 2) + 1, dtype=torch.float64, device=layers.device) * pitch
+            for count, size, pitch in zip(extent, raster.size, self.grid.pitch, strict=True)
         )
         cone: Cone = self.cone if self.cone in ("box", "disc") else "full"
         wave = spherical_wave(dy[:, None], dx[None], self.grid.pitch, self.wavelength, depth, cone)
         return even_fft2(wave.to(layers.dtype), raster.size)
 
-    def _tapered(self, depth: float, raster: Raster, device: torch.device) -> Tensor:
-        """The quadrant for ``taper``, per area of a sample."""
+    def _tapered_kernel(self, depth: float, raster: Raster, device: torch.device) -> Tensor:
+        """The quadrant for ``cone="taper"``, divided by the area of a sample."""
         fy, fx = (
             torch.arange(size // 2 + 1, dtype=torch.float64, device=device) / (size * pitch)
             for size, pitch in zip(raster.size, self.grid.pitch, strict=True)
@@ -108,67 +110,66 @@ class ConvolutionHologram(LayerHologram):
         spectrum = point_spectrum(fy[:, None], fx[None], self.wavelength, depth)
         return spectrum * (weights / math.prod(self.grid.pitch))
 
-    def _limited(self, depth: float, raster: Raster, apart: tuple[int, int]) -> Tensor:
-        """The quadrant for ``band``: propagation of band-limited samples, times Weyl's i / w, per area of a sample."""
-        path = plane_pair(
+    def _band_kernel(self, depth: float, raster: Raster, apart: tuple[int, int]) -> Tensor:
+        """The quadrant for ``cone="band"``: a band-limited transfer function times i / w over the area of a sample."""
+        planes = plane_pair(
             Grid((apart[0] + 1, apart[1] + 1), self.grid.pitch), None, (0.0, 0.0), (0.0, 0.0), [self.wavelength]
         )
-        wave, far = (torch.tensor(value, dtype=torch.float64) for value in (self.wavelength, depth))
+        wavelength, distance = (torch.tensor(value, dtype=torch.float64) for value in (self.wavelength, depth))
         padded = Grid(raster.size, self.grid.pitch)
-        kernel = transfer_function(path, padded, wave, far, sampled=(False, False), paraxial=False)
+        kernel = transfer_function(planes, padded, wavelength, distance, sampled=(False, False), paraxial=False)
         rows, columns = (size // 2 + 1 for size in raster.size)
         fy, fx = (frequency.abs() for frequency in padded.frequencies())
         axial = torch.sqrt(self.wavelength**-2 - fy[:rows].square() - fx[:, :columns].square())
         return 1j * kernel[:rows, :columns] / (axial * math.prod(self.grid.pitch))
 
     def accumulator(self, shape: tuple[int, int], phase: Tensor | None = None) -> "ConvolutionSum":
-        """A sum to which planes [h, w], real or complex, are added one by one; ``phase`` [h, w] is common to all."""
+        """Running sum to which planes [h, w], real or complex, are added; ``phase`` [h, w] is common to all planes."""
         return ConvolutionSum(self, shape, phase)
 
     def _forward(self, layers: Tensor) -> Tensor:
-        fields = []
-        for item in layers.reshape(-1, *layers.shape[-3:]):
+        fields = layers.new_zeros(len(layers), *self.grid.shape)
+        for item, field in zip(layers, fields, strict=True):
             total = self.accumulator((item.shape[-2], item.shape[-1]))
             for j, plane in enumerate(item):
                 total.add(j, plane)
-            fields.append(total.finish())
-        return torch.stack(fields).reshape(*layers.shape[:-3], *self.grid.shape).to(layers.dtype)
+            field.copy_(total.finish())
+        return fields
 
     def _adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
         raster = self._raster(shape)
-        flat = field.reshape(-1, *field.shape[-2:])
-        spectra = [raster.spectrum_of_pixels(item) for item in flat]
-        out = flat.new_zeros(len(flat), len(self.depths), *shape)
+        spectra = [raster.spectrum_of_pixels(item) for item in field]
+        out = field.new_zeros(len(field), len(self.depths), *shape)
         for j, depth in enumerate(self.depths):
             kernel = self._kernel(depth, raster, field).conj()
             for item, spectrum in enumerate(spectra):
                 out[item, j] = raster.layer(multiply_even(spectrum.clone(), kernel))
-        return out.reshape(*field.shape[:-2], len(self.depths), *shape)
+        return out
 
     def _raster(self, shape: tuple[int, int]) -> Raster:
         return Raster(self.grid, shape, self.stride, self.padded(shape))
 
 
 class ConvolutionSum:
-    """The sum of a :class:`ConvolutionHologram` while planes arrive, in any order."""
+    """Running sum of a :class:`ConvolutionHologram` over planes that arrive in any order."""
 
     def __init__(self, operator: ConvolutionHologram, shape: tuple[int, int], phase: Tensor | None):
         self.operator, self.raster, self.phase = operator, operator._raster(shape), phase
         self.total: Tensor | None = None
 
     def add(self, j: int, plane: Tensor) -> None:
-        """Add the plane of depth number ``j``; dark ones cost nothing."""
-        if not lit(plane):
+        """Add the plane at ``depths[j]``; a plane of zeros is skipped."""
+        if not has_light(plane):
             return
         plane = plane.detach().to(torch.promote_types(plane.dtype, torch.complex64))
         if self.phase is not None:
             plane = plane * phasor(self.phase).to(plane.dtype)
         kernel = self.operator._kernel(self.operator.depths[j], self.raster, plane)
-        added = multiply_even(self.raster.repeated(self.raster.spectrum(plane)), kernel)
-        self.total = added if self.total is None else self.total.add_(added)
+        spectrum = multiply_even(self.raster.repeated(self.raster.spectrum(plane)), kernel)
+        self.total = spectrum if self.total is None else self.total.add_(spectrum)
 
     def finish(self) -> Tensor:
-        """The field [H, W]; complex zeros where no plane was lit."""
+        """The field [H, W]; zeros where no plane emits light."""
         if self.total is None:
             return torch.zeros(self.operator.grid.shape, dtype=torch.complex64)
         return self.raster.pixels(self.total)

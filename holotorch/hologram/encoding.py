@@ -1,4 +1,4 @@
-"""Holograms for modulators of phase alone, and what is lost."""
+"""Encodings of complex holograms for phase-only modulators, and their loss."""
 
 import math
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from holotorch.core.complex import intensity, phasor
 
 
 def kinoform(field: Tensor) -> Tensor:
-    """Phase of a complex hologram [..., H, W] in rad; its amplitude is thrown away. Gradients as :func:`double_phase`.
+    """Phase of a complex hologram [..., H, W] in rad; the amplitude is discarded. Gradients as :func:`double_phase`.
 
     Raises:
         TypeError, ValueError: Not complex [..., H, W], no pixels, or values that are not finite.
@@ -20,14 +20,14 @@ def kinoform(field: Tensor) -> Tensor:
 
 
 def double_phase(field: Tensor) -> Tensor:
-    """Two phases whose phasors' mean is the field, in a checkerboard: real [..., H, W] in rad.
+    """Double-phase encoding: two phases in a checkerboard whose phasors average to the field, real [..., H, W] in rad.
 
-    The largest amplitude becomes 1. What neighbours differ by goes to the highest frequencies; an aperture in the
-    frequency plane takes it out again. Source: Hsueh and Sawchuk (1978), as used by Maimone et al. (2017). A black
-    hologram has no phase to show and gives the two that cancel.
+    The field is scaled to a largest amplitude of 1. The difference between neighbours goes to the highest frequencies,
+    which an aperture in the Fourier plane removes. A black hologram gives two phases that cancel. Source: Hsueh and
+    Sawchuk (1978), as used by Maimone et al. (2017).
 
-    Gradients are finite everywhere. Two terms have no derivative and pass zero: the phase of a pixel that is dark, and
-    the arccosine of a pixel that has the largest amplitude, which is 1 whatever that amplitude is.
+    Gradients are finite everywhere. Two terms without a derivative have gradient zero: the phase of a dark pixel, and
+    the arccosine of the pixel with the largest amplitude, whose scaled amplitude is always 1.
 
     Raises:
         TypeError, ValueError: Not complex [..., H, W], no pixels, or values that are not finite.
@@ -35,20 +35,21 @@ def double_phase(field: Tensor) -> Tensor:
     field = _checked(field)
     amplitude = field.abs()
     peak = amplitude.amax((-2, -1), keepdim=True)
-    part = amplitude / torch.where(peak > 0, peak, 1)
-    below = part < 1
-    aside = torch.where(below, torch.acos(torch.where(below, part, 0)), 0)
+    scaled = amplitude / torch.where(peak > 0, peak, 1)
+    below_peak = scaled < 1
+    offset = torch.where(below_peak, torch.acos(torch.where(below_peak, scaled, 0)), 0)
     height, width = field.shape[-2:]
     rows, columns = torch.arange(height, device=field.device), torch.arange(width, device=field.device)
     sign = 1 - 2 * ((rows[:, None] + columns) % 2)
-    return _phase(field) + sign * aside
+    return _phase(field) + sign * offset
 
 
 def error_diffused(field: Tensor) -> Tensor:
-    """Phase in rad of a complex hologram [..., H, W] in which each pixel's error is given on to four later ones.
+    """Phase in rad of a complex hologram [..., H, W] by error diffusion to the four next neighbours of each pixel.
 
-    Rows run to and fro. The error goes to high frequencies, where it is seen less. Source: Floyd and Steinberg (1976)
-    with the fields of Tsang and Poon (2013). Pixel after pixel: half a second for 512 x 512.
+    Rows are scanned in alternating direction. The error moves to high frequencies, where it is less visible. The scan
+    is sequential and takes half a second for 512 x 512 pixels. Source: Floyd and Steinberg (1976), applied to fields
+    by Tsang and Poon (2013).
 
     Raises:
         TypeError, ValueError: Not complex [..., H, W], no pixels, or values that are not finite.
@@ -56,7 +57,7 @@ def error_diffused(field: Tensor) -> Tensor:
     field = _checked(field)
     peak = field.abs().amax((-2, -1), keepdim=True)
     flat = (field / torch.where(peak > 0, peak, 1)).reshape(-1, *field.shape[-2:]).cpu()
-    found = []
+    encoded = []
     for item in flat:
         rows, phases = [list(map(complex, row)) for row in item.tolist()], []
         for i, row in enumerate(rows):
@@ -79,20 +80,20 @@ def error_diffused(field: Tensor) -> Tensor:
                     if 0 <= ahead < len(row):
                         below[ahead] += error * (1 / 16)
             phases.append(phase)
-        found.append(phases)
-    return torch.tensor(found, dtype=field.real.dtype, device=field.device).reshape(field.shape)
+        encoded.append(phases)
+    return torch.tensor(encoded, dtype=field.real.dtype, device=field.device).reshape(field.shape)
 
 
 def iterated(
     field: Tensor, propagate: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor], *, steps: int = 30
 ) -> Tensor:
-    """Phase in rad whose light, after ``propagate``, has the amplitude of the field's own there: Gerchberg-Saxton.
+    """Phase in rad whose propagated field has the amplitude of the propagated hologram, by Gerchberg-Saxton.
 
     Args:
         field: Complex hologram [..., H, W].
-        propagate: To the plane that counts; ``adjoint`` is its conjugate transpose, near enough its inverse.
-        adjoint: See ``propagate``.
-        steps: To and fro.
+        propagate: Propagation to the plane at which amplitudes are compared.
+        adjoint: Conjugate transpose of ``propagate``, used as its approximate inverse.
+        steps: Number of iterations.
 
     Raises:
         TypeError, ValueError: Not complex [..., H, W], no pixels, or values that are not finite.
@@ -111,9 +112,9 @@ def iterated(
 
 
 def encoding_loss(field: Tensor, phase: Tensor, view: Callable[[Tensor], Tensor]) -> Tensor:
-    """Relative squared error [...] of the picture |view(.)|^2 of a phase against that of the field, at its best scale.
+    """Relative squared error [...] of the image |view(.)|^2 of a phase against that of the field, at the best scale.
 
-    ``view`` maps holograms [..., H, W] to the plane that is looked at, through whatever aperture there is.
+    ``view`` maps holograms [..., H, W] to the image plane, including any aperture.
     """
     wanted, shown = intensity(view(field)), intensity(view(phasor(phase)))
     scale = (wanted * shown).sum((-2, -1)) / shown.square().sum((-2, -1)).clamp(min=torch.finfo(shown.dtype).tiny)
@@ -122,7 +123,7 @@ def encoding_loss(field: Tensor, phase: Tensor, view: Callable[[Tensor], Tensor]
 
 
 def _checked(field: Tensor) -> Tensor:
-    """The field with subnormal values, whose derivatives overflow, made zero. See callers for what is refused."""
+    """Check a field, see the callers, and set subnormal values, whose derivatives overflow, to zero."""
     if not isinstance(field, Tensor) or not field.is_complex():
         raise TypeError(f"field must be a complex tensor (..., H, W), got {getattr(field, 'dtype', type(field))}")
     if field.ndim < 2 or 0 in field.shape[-2:]:
@@ -132,6 +133,9 @@ def _checked(field: Tensor) -> Tensor:
 
 
 def _phase(field: Tensor) -> Tensor:
-    """Phase in rad, 0 where dark; differentiated through the unit phasor, as torch.angle squares small amplitudes."""
+    """Phase in rad, 0 where dark.
+
+    It is taken of the unit phasor, since the derivative of torch.angle squares the amplitude, which may underflow.
+    """
     amplitude = field.abs()
     return torch.angle(field / torch.where(amplitude > 0, amplitude, 1))

@@ -1,6 +1,7 @@
-"""LayerHologram: what all methods from planes of sources to a hologram have in common."""
+"""LayerHologram: the common part of all operators from planes of point sources to a hologram."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 
 from torch import Tensor, nn
 
@@ -11,19 +12,20 @@ from holotorch.hologram.cone import Cone, check_cone, check_layers, check_scene
 
 
 class LayerHologram(nn.Module):
-    """A linear map from layers of sources to the field on a hologram, with its conjugate transpose.
+    """A linear map from layers of point sources to the field on a hologram, with its conjugate transpose.
 
-    A method is its two halves ``_forward`` and ``_adjoint``; gradients of any order follow from them.
+    A subclass implements ``_forward`` and ``_adjoint`` for one batch axis B; gradients of any order and ``vmap`` follow
+    from the two.
 
     Args:
         grid: Pixels of the hologram.
         wavelength: In metres.
-        depths: Of the planes, in metres, above 0; any order and spacing.
-        cone: What is kept of each wave, see ``holotorch.hologram.cone``.
+        depths: Distances of the planes from the hologram in metres, above 0; any order and spacing.
+        cone: The part of each spherical wave that is kept, see ``holotorch.hologram.cone``.
         stride: Pixels between neighbouring sources of a plane.
 
     Raises:
-        TypeError, ValueError: Impossible arguments; in a call: layers that are not complex [..., D, h, w].
+        TypeError, ValueError: Invalid arguments; in a call: layers that are not complex [..., D, h, w].
     """
 
     def __init__(self, grid: Grid, wavelength: float, depths: Sequence[float], cone: Cone, stride: int):
@@ -37,25 +39,42 @@ class LayerHologram(nn.Module):
         """Field [..., H, W] of ``layers``, complex [..., D, h, w], whose samples h // 2, w // 2 lie on the axis."""
         check_layers(layers, len(self.depths))
         shape = (layers.shape[-2], layers.shape[-1])
-        if 0 in layers.shape[:-3]:  # a batch of no scenes
-            return (layers.sum((-3, -2, -1))[..., None, None]).expand(*layers.shape[:-3], *self.grid.shape)
-        return linear(layers, self._forward, lambda field: self._adjoint(field, shape))
+        return linear(layers, *self._maps(shape))
 
     def adjoint(self, field: Tensor, shape: tuple[int, int] | None = None) -> Tensor:
-        """Conjugate transpose: layers [..., D, h, w] from a field, complex [..., H, W].
+        """Apply the conjugate transpose to a field [..., H, W].
 
-        ``shape`` (h, w) is that of the layers; by default they cover the hologram, H / stride x W / stride rounded up.
+        Args:
+            field: Complex, on the grid of the hologram.
+            shape: Sources (h, w) of a layer; by default as many as the hologram has pixels, divided by ``stride``
+                and rounded up.
+
+        Returns:
+            Layers [..., D, h, w].
         """
         checks.field("field", field, self.grid.shape)
-        if shape is None:
-            height, width = (-(-size // self.stride) for size in self.grid.shape)
-            shape = height, width
-        if 0 in field.shape[:-2]:  # a batch of no fields
-            return field.sum((-2, -1))[..., None, None, None].expand(*field.shape[:-2], len(self.depths), *shape)
-        return linear(field, lambda given: self._adjoint(given, shape), self._forward)
+        height, width = shape or (-(-n // self.stride) for n in self.grid.shape)
+        forward, adjoint = self._maps((height, width))
+        return linear(field, adjoint, forward)
+
+    def _maps(self, shape: tuple[int, int]) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
+        """Operator and adjoint for layers of ``shape`` (h, w), with any number of batch axes."""
+        return (
+            lambda layers: _flattened(self._forward, layers, 3),
+            lambda field: _flattened(lambda flat: self._adjoint(flat, shape), field, 2),
+        )
 
     def _forward(self, layers: Tensor) -> Tensor:
+        """Fields [B, H, W] of layers [B, D, h, w]."""
         raise NotImplementedError
 
     def _adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
+        """Layers [B, D, h, w] of fields [B, H, W]; ``shape`` is (h, w)."""
         raise NotImplementedError
+
+
+def _flattened(function: Callable[[Tensor], Tensor], x: Tensor, axes: int) -> Tensor:
+    """Apply a function of one batch axis to ``x``, all of whose axes but the last ``axes`` are batch axes."""
+    batch = x.shape[:-axes]
+    out = function(x.reshape(math.prod(batch), *x.shape[-axes:]))
+    return out.reshape(*batch, *out.shape[1:])

@@ -1,4 +1,4 @@
-"""Which way to a hologram: the cheapest whose predicted error is within the tolerance, with its cost."""
+"""Plan of a hologram: the cheapest method whose predicted error is within the tolerance, with its cost."""
 
 import math
 from collections.abc import Sequence
@@ -15,31 +15,31 @@ from holotorch.hologram.convolution import TAPER_ERROR, ConvolutionHologram
 from holotorch.hologram.raster import span
 from holotorch.optics.free_space.padding import FINEST
 
-_ROUNDING = {torch.complex64: 5e-7, torch.complex128: 1e-12}
-# Arithmetic of a wave's sample in float64, measured against that of a transform; of passing over an array once.
-_WAVE, _PASS = 150.0, 12.0
-_FEW_SAMPLES = 4  # a cone of fewer pixels across is no wave any more
+_ROUNDING = {torch.complex64: 5e-7, torch.complex128: 1e-12}  # relative error of the sums
+_WAVE = 150.0  # operations per sample of a spherical wave in float64; measured against the time of an FFT
+_PASS = 12.0  # operations per sample of one pass over an array; measured likewise
+_FEW_SAMPLES = 4  # pixels; a narrower cone is not sampled well enough to act as a spherical wave
 
 
 @dataclass(frozen=True)
 class HologramPlan:
-    """The cheapest adequate way found, and the one that came next.
+    """The cheapest adequate method and the next best one.
 
     Attributes:
         method: "convolution" or "axial nodes".
         cone: Definition of the waves, see ``holotorch.hologram.cone``.
-        near: Whether some pixel lies so near the rim of some source's cone, or beyond it, that definitions may differ
-            by more than the tolerance there.
-        transforms: Of the sources, one per plane or per node.
-        size: Samples (y, x) of the whole spectrum.
-        predicted_error: Expected relative L2 error for sources like noise, against that definition.
-        memory_bytes: Largest extra memory of one colour.
-        flops: Arithmetic of one colour, transforms and passes over arrays.
-        reason: One sentence that says why this one.
-        runner_up: One sentence on the other.
-        notes: Where the scene comes near a border of validity.
+        near: Whether some pixel lies so near the edge of the cone of some source, or beyond it, that the definitions of
+            the cone may differ by more than the tolerance.
+        transforms: Number of transforms of sources, one per plane or per node.
+        size: Size (y, x) of the whole spectrum in samples.
+        predicted_error: Expected relative L2 error for random sources, against the wave that ``cone`` defines.
+        memory_bytes: Largest extra memory for one wavelength.
+        flops: Floating-point operations for one wavelength, for transforms and passes over arrays.
+        reason: One sentence that explains the choice.
+        runner_up: One sentence about the other method.
+        notes: Warnings where the scene is near a limit of validity.
         adequate: Whether ``predicted_error`` is within the tolerance.
-        operator: The module that does it.
+        operator: The module that computes the hologram.
     """
 
     method: str
@@ -69,22 +69,23 @@ def plan_hologram(
     dtype: torch.dtype = torch.complex64,
     memory_limit: int | None = None,
 ) -> HologramPlan:
-    """Choose how to form the hologram of layers of ``shape`` (h, w), the lit part of the scene.
+    """Choose the method for the hologram of layers of ``shape`` (h, w), the lit part of the scene.
 
     Args:
         grid: Pixels of the hologram.
         wavelength: In metres.
-        depths: Of the planes, in metres, above 0.
-        shape: Sources of a plane; only those that are lit need be counted.
+        depths: Distances of the planes from the hologram in metres, above 0.
+        shape: Sources (h, w) of a plane; a dark margin need not be counted.
         stride: Pixels between neighbouring sources.
-        tolerance: Relative L2 error that is wanted.
-        cone: Definition of the waves, which is kept. By default a soft rim, "taper", which costs least and rings least
-            ("box" at pitches below 0.9 wavelengths). Far away, where ``near`` is False, all but "band" are the same.
+        tolerance: Largest relative L2 error.
+        cone: Definition of the waves, which every method keeps. The default is "taper", which is the cheapest and rings
+            least, or "box" at pitches below 0.9 wavelengths. For distant planes, where ``near`` is False, all
+            definitions but "band" agree.
         dtype: complex64 or complex128.
         memory_limit: In bytes.
 
     Raises:
-        ValueError: Impossible arguments, no way within the tolerance, or none within the memory limit.
+        ValueError: Invalid arguments, no method within the tolerance, or none within the memory limit.
     """
     wavelength, listed, stride = check_scene(grid, wavelength, depths, stride)
     tolerance = checks.positive("tolerance", tolerance)
@@ -92,31 +93,31 @@ def plan_hologram(
         raise TypeError(f"dtype must be torch.complex64 or torch.complex128, got {dtype}")
     asked: Cone = cone or ("taper" if min(grid.pitch) >= FINEST * wavelength else "box")
     exact = ConvolutionHologram(grid, wavelength, listed, cone=asked, stride=stride)
-    found = [_convolution(exact, shape, dtype)]
+    methods = [_convolution(exact, shape, dtype)]
     apart, _ = span(grid, shape, stride)
     limited = _in_frequency(grid, wavelength, min(listed), apart, asked)
     if limited:
         axial = AxialHologram(grid, wavelength, listed, cone=limited, stride=stride, tolerance=tolerance)
-        found.append(_axial(axial, shape, dtype))
-    adequate = [way for way in found if way["predicted_error"] <= tolerance]
+        methods.append(_axial(axial, shape, dtype))
+    adequate = [method for method in methods if method["predicted_error"] <= tolerance]
     if not adequate:
-        best = min(found, key=lambda way: way["predicted_error"])
+        best = min(methods, key=lambda method: method["predicted_error"])
         raise ValueError(
             f"no method reaches a tolerance of {tolerance:.1e} for cone={asked!r}: {best['method']} comes to "
             f"{best['predicted_error']:.1e}; use cone='taper' or a larger tolerance"
         )
-    ordered = sorted(adequate, key=lambda way: way["flops"])
+    ordered = sorted(adequate, key=lambda method: method["flops"])
     if memory_limit is not None:
-        fitting = [way for way in ordered if way["memory_bytes"] <= memory_limit]
+        fitting = [method for method in ordered if method["memory_bytes"] <= memory_limit]
         if not fitting:
-            least = min(way["memory_bytes"] for way in ordered)
+            least = min(method["memory_bytes"] for method in ordered)
             raise ValueError(
                 f"the hologram needs {least / 1e9:.2f} GB and {memory_limit / 1e9:.2f} GB are allowed; use fewer "
                 "pixels or a larger tolerance"
             )
         ordered = fitting
-    best, others = ordered[0], [way for way in found if way is not ordered[0]]
-    runner_up = "there is no other way to this definition"
+    best, others = ordered[0], [method for method in methods if method is not ordered[0]]
+    runner_up = "there is no other method for this cone"
     if others:
         other = others[0]
         why = f"{other['flops'] / best['flops']:.1f} times the work" if other in adequate else "not accurate enough"
@@ -127,12 +128,12 @@ def plan_hologram(
 
 
 def _in_frequency(grid: Grid, wavelength: float, nearest: float, apart: tuple[int, int], asked: Cone) -> Cone | None:
-    """What an axial hologram is to be asked for, to do what ``asked`` defines; None if it cannot."""
+    """Cone with which an axial hologram computes the wave that ``asked`` defines, or None where it cannot."""
     if min(grid.pitch) < FINEST * wavelength:
         return None
     if asked in ("taper", "band"):
         return asked
-    # Where the sharp cone holds every pair, its wave is the plain one.
+    # Where the sharp cone contains every pair of a source and a pixel, its wave is the unlimited one.
     y, x = (distance / half for distance, half in zip(apart, cone_samples(grid, wavelength, nearest), strict=True))
     return "full" if max(y, x) < 1 and (asked != "disc" or math.hypot(y, x) < 1) else None
 
@@ -195,8 +196,8 @@ def _notes(grid: Grid, wavelength: float, depths: Sequence[float], near: bool) -
         )
     if near:
         notes.append(
-            "the rim of the cone of light falls on pixels: definitions of it may differ by more than the tolerance, by "
-            "up to tens of percent, and sources may light part of the hologram only"
+            "the edge of the cone of light falls on pixels: its definitions may differ by more than the tolerance, by "
+            "up to tens of percent, and a source may light only a part of the hologram"
         )
     if min(grid.pitch) <= wavelength / 2:
         notes.append("the pitch is at or below half a wavelength: light leaves in every direction")

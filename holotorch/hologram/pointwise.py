@@ -1,4 +1,4 @@
-"""DirectHologram: every light source on every pixel, the slow sum that judges the fast ones."""
+"""DirectHologram: the exact sum over all pairs of a source and a pixel, the reference for the faster methods."""
 
 from collections.abc import Callable, Iterator, Sequence
 
@@ -10,33 +10,35 @@ from holotorch.hologram.band_limited import band_limited_wave
 from holotorch.hologram.cone import Cone, cone_samples, is_plain, spherical_wave
 from holotorch.hologram.layered import LayerHologram
 
-_EXACT = 1e-8  # part of the wave by which the taper may change it where the closed form is taken
+# Largest relative change of the wave by the taper at which the closed form of the unlimited wave replaces it.
+_EXACT = 1e-8
 
 
 class DirectHologram(LayerHologram):
     """E(x) = sum_v A(v) exp(i phi(v)) exp(i k r) / r, thesis Eq. 5.1 and Algorithm 4, pair by pair in float64.
 
-    Sources lie on a raster, so pairs with one displacement share their wave: rows of sources are multiplied with the
-    matrix of one row of displacements, for both signs at once. No transform, no wrap-around, no approximation; dark
-    rows and columns of sources, and rows of pixels outside the cone, are left out.
+    Sources lie on a raster, so all pairs with the same displacement share one value of the spherical wave: rows of
+    sources are multiplied by the matrix of one row displacement, for both signs at once. There is no FFT, no
+    wrap-around and no approximation. Rows and columns of dark sources, and rows of pixels outside the cone, are
+    skipped.
 
     Args:
         grid: Pixels of the hologram.
         wavelength: In metres.
-        depths: Of the planes, in metres, above 0; any order and spacing.
-        cone: What is kept of each wave, see ``holotorch.hologram.cone``. ``taper`` and ``band`` are integrated over
-            frequencies, exact to 1e-8.
+        depths: Distances of the planes from the hologram in metres, above 0; any order and spacing.
+        cone: The part of each spherical wave that is kept, see ``holotorch.hologram.cone``. ``taper`` and ``band`` are
+            integrated over frequencies, exact to 1e-8.
         stride: Pixels between neighbouring sources of a plane.
 
     Raises:
-        TypeError, ValueError: Impossible arguments; in a call: layers that are not complex [..., D, h, w].
+        TypeError, ValueError: Invalid arguments; in a call: layers that are not complex [..., D, h, w].
     """
 
     def __init__(self, grid: Grid, wavelength: float, depths: Sequence[float], *, cone: Cone = "box", stride: int = 1):
         super().__init__(grid, wavelength, depths, cone, stride)
 
     def pairs(self, layers: Tensor) -> int:
-        """How many pairs of a lit source and a pixel inside its cone ``layers`` [D, h, w] have."""
+        """Number of pairs of a lit source of ``layers`` [D, h, w] and a pixel inside its cone."""
         total = 0
         for plane, depth in zip(layers, self.depths, strict=True):
             half = cone_samples(self.grid, self.wavelength, depth)
@@ -51,69 +53,67 @@ class DirectHologram(LayerHologram):
         return total
 
     def _forward(self, layers: Tensor) -> Tensor:
-        flat = layers.reshape(-1, *layers.shape[-3:]).to(torch.complex128)
-        out = flat.new_zeros(len(flat), *self.grid.shape)
-        for item, field in zip(flat, out, strict=True):
+        out = layers.new_zeros(len(layers), *self.grid.shape, dtype=torch.complex128)
+        for item, field in zip(layers.to(out.dtype), out, strict=True):
             for plane, depth in zip(item, self.depths, strict=True):
                 rows, columns = plane.any(1).nonzero()[:, 0], plane.any(0).nonzero()[:, 0]
                 if len(rows) == 0:
                     continue
                 low, high = int(columns[0]), int(columns[-1]) + 1
-                lit = plane[rows, low:high].flip(-1)
-                places = self._places(rows, plane.shape[-2])
-                for aside, matrix in self._rows(depth, plane.shape, (low, high), places):
-                    product = lit @ matrix
+                sources = plane[rows, low:high].flip(-1)
+                positions = self._pixel_rows(rows, plane.shape[-2])
+                for aside, matrix in self._row_matrices(depth, plane.shape, (low, high), positions):
+                    product = sources @ matrix
                     for sign in (1, -1) if aside else (1,):
-                        inside, target = self._hit(places, sign * aside)
+                        inside, target = self._rows_at_distance(positions, sign * aside)
                         field.index_add_(0, target, product[inside])
-        return out.reshape(*layers.shape[:-3], *self.grid.shape).to(layers.dtype)
+        return out.to(layers.dtype)
 
     def _adjoint(self, field: Tensor, shape: tuple[int, int]) -> Tensor:
-        flat = field.reshape(-1, *field.shape[-2:]).to(torch.complex128)
-        out = flat.new_zeros(len(flat), len(self.depths), *shape)
-        places = self._places(torch.arange(shape[0], device=field.device), shape[0])
-        for given, layers in zip(flat, out, strict=True):
+        out = field.new_zeros(len(field), len(self.depths), *shape, dtype=torch.complex128)
+        positions = self._pixel_rows(torch.arange(shape[0], device=field.device), shape[0])
+        for item, layers in zip(field.to(out.dtype), out, strict=True):
             for plane, depth in zip(layers, self.depths, strict=True):
                 back = torch.zeros_like(plane)
-                for aside, matrix in self._rows(depth, shape, (0, shape[1]), places):
-                    seen = given.new_zeros(shape[0], self.grid.shape[1])
+                for aside, matrix in self._row_matrices(depth, shape, (0, shape[1]), positions):
+                    received = item.new_zeros(shape[0], self.grid.shape[1])
                     for sign in (1, -1) if aside else (1,):
-                        inside, target = self._hit(places, sign * aside)
-                        seen[inside] += given[target]
-                    back += seen @ matrix.mH
+                        inside, target = self._rows_at_distance(positions, sign * aside)
+                        received[inside] += item[target]
+                    back += received @ matrix.mH
                 plane.copy_(back.flip(-1))
-        return out.reshape(*field.shape[:-2], len(self.depths), *shape).to(field.dtype)
+        return out.to(field.dtype)
 
-    def _places(self, rows: Tensor, height: int) -> Tensor:
-        """Rows of pixels on which rows of sources lie, counted from the hologram's first; may lie outside."""
+    def _pixel_rows(self, rows: Tensor, height: int) -> Tensor:
+        """Pixel row of each source row, counted from the first row of the hologram; may lie outside the hologram."""
         return (rows - height // 2) * self.stride + self.grid.shape[0] // 2
 
-    def _hit(self, places: Tensor, aside: int) -> tuple[Tensor, Tensor]:
-        """Which sources have a row of pixels so far aside, and which."""
-        target = places + aside
+    def _rows_at_distance(self, positions: Tensor, aside: int) -> tuple[Tensor, Tensor]:
+        """Mask of the source rows that have a pixel row ``aside`` rows away, and those pixel rows."""
+        target = positions + aside
         inside = (target >= 0) & (target < self.grid.shape[0])
         return inside, target[inside]
 
-    def _rows(
-        self, depth: float, shape: Sequence[int], columns: tuple[int, int], places: Tensor
+    def _row_matrices(
+        self, depth: float, shape: Sequence[int], columns: tuple[int, int], positions: Tensor
     ) -> Iterator[tuple[int, Tensor]]:
-        """For each distance between rows: the waves from a row's columns, last to first, to all pixels [w', W]."""
+        """For each row distance: the waves from the columns of a source row, last to first, to all pixels [w', W]."""
         (height, width), stride = self.grid.shape, self.stride
         low, high = columns
-        farthest = max(height - 1 - int(places.min()), int(places.max()))
+        farthest = max(height - 1 - int(positions.min()), int(positions.max()))
         if self.cone in ("box", "disc"):
             farthest = int(min(farthest, cone_samples(self.grid, self.wavelength, depth)[0] + 1))
         # Pixel b and source a lie b - W // 2 - (a - w // 2) stride samples apart; the last source comes first.
         first = -(width // 2) - (high - 1 - shape[1] // 2) * stride
-        index = torch.arange((high - low - 1) * stride + width, device=places.device) + first
-        waves = self._waves(depth, farthest, int(index.abs().max()), index.device)
+        index = torch.arange((high - low - 1) * stride + width, device=positions.device) + first
+        wave_row = self._wave_rows(depth, farthest, int(index.abs().max()), index.device)
         for aside in range(farthest + 1):
-            wave = waves(aside)[index.abs()]
+            wave = wave_row(aside)[index.abs()]
             if wave.any():
                 yield aside, wave.as_strided((high - low, width), (stride, 1)).clone()
 
-    def _waves(self, depth: float, rows: int, columns: int, device: torch.device) -> Callable[[int], Tensor]:
-        """What gives a row of the quadrant of a point's wave: [columns + 1], by the row's distance in samples."""
+    def _wave_rows(self, depth: float, rows: int, columns: int, device: torch.device) -> Callable[[int], Tensor]:
+        """Function of a row distance in samples: that row of the quadrant of a spherical wave, [columns + 1]."""
         pitch = self.grid.pitch
         dy, dx = (
             torch.arange(count + 1, dtype=torch.float64, device=device) * step

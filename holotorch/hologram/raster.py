@@ -1,4 +1,4 @@
-"""Layers of sources and pixels of a hologram on one periodic array: where they lie, their spectra, and back."""
+"""Sources and pixels on one periodic array: their positions, the spectra of layers, and the field on the pixels."""
 
 import math
 
@@ -8,13 +8,13 @@ from torch import Tensor
 from holotorch.core.fourier import fft2, good_length, ifft2
 from holotorch.core.grid import Grid
 
-_SOME = 251  # elements between those that are asked first
+_PROBE_STEP = 251  # distance between the elements that ``has_light`` tests before it tests all of them
 
 
 class Raster:
-    """A periodic array of ``size`` samples (N_y, N_x) in which sources ``stride`` apart and pixels share positions.
+    """A periodic array of ``size`` samples (N_y, N_x) that holds the pixels and the sources, ``stride`` samples apart.
 
-    Sources begin at sample 0. Their spectrum has the period N / stride, so it is a transform of that length, repeated.
+    The sources begin at sample 0. Their spectrum has the period N / stride: a transform of that length, repeated.
 
     Args:
         grid: Pixels of the hologram.
@@ -26,7 +26,7 @@ class Raster:
     def __init__(self, grid: Grid, shape: tuple[int, int], stride: int, size: tuple[int, int]):
         self.grid, self.shape, self.stride, self.size = grid, shape, stride, size
         self.period = size[0] // stride, size[1] // stride
-        # Sample that the first pixel of each axis falls on.
+        # Position of the first pixel along each axis, in samples.
         self.first = [
             (count // 2 * stride - pixels // 2) % length
             for count, pixels, length in zip(shape, grid.shape, size, strict=True)
@@ -37,16 +37,16 @@ class Raster:
         return fft2(layer, self.period)
 
     def repeated(self, period: Tensor) -> Tensor:
-        """The whole spectrum, as a new tensor of ``size``."""
+        """The whole spectrum of ``size`` from one period, as a new tensor."""
         return period.repeat(self.stride, self.stride)
 
     def tiles(self, spectrum: Tensor) -> Tensor:
-        """A view of a whole spectrum [..., N_y, N_x] as [..., s, N_y / s, s, N_x / s]: its periods."""
+        """View of a whole spectrum [..., N_y, N_x] by periods, [..., s, N_y / s, s, N_x / s], s the stride."""
         y, x = self.period
         return spectrum.view(*spectrum.shape[:-2], self.stride, y, self.stride, x)
 
     def pixels(self, spectrum: Tensor) -> Tensor:
-        """Field on the hologram [H, W] of a whole spectrum."""
+        """Field on the hologram [H, W] from a whole spectrum."""
         return ifft2(spectrum, self.grid.shape, (self.first[0], self.first[1]))
 
     def spectrum_of_pixels(self, field: Tensor) -> Tensor:
@@ -55,18 +55,18 @@ class Raster:
             (torch.arange(count, device=field.device) + first) % length
             for first, count, length in zip(self.first, self.grid.shape, self.size, strict=True)
         )
-        placed = field.new_zeros(self.size)
-        placed[rows[:, None], columns] = field
-        return fft2(placed) * (1 / math.prod(self.size))
+        padded = field.new_zeros(self.size)
+        padded[rows[:, None], columns] = field
+        return fft2(padded) * (1 / math.prod(self.size))
 
     def layer(self, spectrum: Tensor) -> Tensor:
-        """Adjoint of :meth:`spectrum` behind :meth:`repeated`: a layer [h, w] of a whole spectrum."""
+        """Adjoint of :meth:`spectrum` followed by :meth:`repeated`: a layer [h, w] from a whole spectrum."""
         folded = self.tiles(spectrum).sum((-4, -2))
         return ifft2(folded, self.shape) * math.prod(self.period)
 
 
 def span(grid: Grid, shape: tuple[int, int], stride: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Per axis: the farthest that a source and a pixel lie apart, and how many samples both need side by side."""
+    """Largest distance between a source and a pixel, and the extent of both together, in samples, each (y, x)."""
     apart, least = [], []
     for count, pixels in zip(shape, grid.shape, strict=True):
         low, high = -(count // 2) * stride, (count - 1 - count // 2) * stride
@@ -76,15 +76,15 @@ def span(grid: Grid, shape: tuple[int, int], stride: int) -> tuple[tuple[int, in
 
 
 def strided_length(minimum: int, stride: int) -> int:
-    """Smallest length >= ``minimum`` that is a multiple of ``stride`` and transforms fast."""
+    """Smallest length >= ``minimum`` that is ``stride`` times a length with small prime factors, for the FFT."""
     return stride * good_length(-(-minimum // stride))
 
 
-def lit(plane: Tensor) -> bool:
-    """Whether any element is not zero (NaN is not). A few are asked first, then all, faster than ``any`` does."""
+def has_light(plane: Tensor) -> bool:
+    """Whether any element is not zero (NaN counts as light). Tests a few elements first, then all of them."""
     if plane.is_complex():
         plane = torch.view_as_real(plane.resolve_conj())
-    if plane.is_contiguous() and plane.detach().view(-1)[::_SOME].any():
+    if plane.is_contiguous() and plane.detach().view(-1)[::_PROBE_STEP].any():
         return True
     low, high = torch.aminmax(plane.detach())
     return bool((low != 0) | (high != 0))

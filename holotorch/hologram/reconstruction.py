@@ -1,4 +1,4 @@
-"""What a hologram shows: refocused at a depth, through the whole window or a pupil that looks from the side."""
+"""Reconstruction of holograms: fields and intensities at a depth, and views through an off-axis pupil."""
 
 from collections.abc import Iterable, Iterator
 
@@ -15,10 +15,10 @@ from holotorch.optics.planning.propagate import propagate
 
 
 def refocused(hologram: Tensor, grid: Grid, wavelength: float, depth: float, *, tolerance: float = 1e-3) -> Tensor:
-    """Field [..., H, W] at ``depth`` metres from the hologram, where its sources are.
+    """Field [..., H, W] of a hologram at ``depth`` metres from it, on the side of its sources.
 
-    The hologram holds waves exp(+ikr) that come from there, so the light is followed back (Sec. 5.5.1). Brightness is
-    that of the waves: a source of amplitude A in focus has about A times a constant of the grid.
+    The hologram holds spherical waves exp(+ikr) from its sources, so the field is propagated back (Sec. 5.5.1). It is
+    not normalised: a source of amplitude A in focus has an amplitude of about A times a constant of the grid.
     """
     return propagate(hologram, grid, wavelength, -checks.quantity(DEPTH, depth), tolerance=tolerance)
 
@@ -34,17 +34,17 @@ def focal_stack(
 def perspective(
     hologram: Tensor, grid: Grid, wavelength: float, *, direction: tuple[float, float], aperture: float
 ) -> Tensor:
-    """The part of a hologram [..., H, W] that reaches a far pupil: light within a cone of directions.
+    """The part of a hologram [..., H, W] within a cone of directions, which reaches a distant pupil.
 
     Args:
         hologram: Complex.
         grid: Its pixels.
         wavelength: In metres.
         direction: Sines (y, x) of the pupil's centre as seen from the hologram.
-        aperture: Sine of the half angle of the pupil, above 0; its rim is soft over the last 30 %.
+        aperture: Sine of the half angle of the pupil, above 0; its edge is tapered over the last 30 %.
 
     Raises:
-        ValueError: A pupil that lies beyond the grid's band altogether.
+        ValueError: The pupil lies outside the band of the grid.
     """
     y, x = checks.pair("direction", direction, "sines")
     aperture = checks.positive("aperture", aperture)
@@ -55,5 +55,5 @@ def perspective(
                 f"{wavelength / (2 * pitch):.3g}"
             )
     fy, fx = grid.frequencies(hologram.device)
-    aside = torch.sqrt((fy * wavelength - y).square() + (fx * wavelength - x).square()) / aperture
-    return ifft2(fft2(hologram) * taper(aside).to(hologram.real.dtype))
+    radius = torch.sqrt((fy * wavelength - y).square() + (fx * wavelength - x).square()) / aperture
+    return ifft2(fft2(hologram) * taper(radius).to(hologram.real.dtype))

@@ -1,4 +1,4 @@
-"""Volumes, how they become light sources, and test scenes of known value."""
+"""Volumes, direct volume rendering to light sources, and analytic test volumes."""
 
 from holotorch.scene.adaptive import AdaptivePicture, AdaptiveReport, adaptive_report, render_adaptively
 from holotorch.scene.compositing import corrected_opacity, front_to_back, safe_sqrt

@@ -1,7 +1,7 @@
-"""Rays where the picture needs them: coarse first, dense where neighbours differ (Section 6.4.3).
+"""Adaptive ray sampling: a coarse lattice of rays first, all rays where neighbours differ (Section 6.4.3).
 
-The saving is in rays. The sampler passes over empty space and finished rays anyway, so that seconds are saved only
-where a ray is dear: in dense matter, under lights, or when it is turned.
+The sampler skips empty space and finished rays in any case. Fewer rays therefore save time only where a ray is
+expensive: in dense matter, with lighting, or in a rotated volume.
 """
 
 from dataclasses import dataclass
@@ -10,19 +10,19 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
-from holotorch.scene.reading import mixed
+from holotorch.scene.reading import interpolate
 from holotorch.scene.sampler import DVRSampler
 from holotorch.scene.volume import Volume
 
 
 @dataclass(frozen=True)
 class AdaptivePicture:
-    """A picture of which not all rays were followed.
+    """A picture rendered with a subset of the rays.
 
     Attributes:
         image: Red, green, blue, [3, h, w].
         opacity: [h, w].
-        followed: Whether a ray was followed or filled in between its neighbours, bool [h, w].
+        followed: Whether a ray was followed, bool [h, w]; the others are interpolated between their neighbours.
     """
 
     image: Tensor
@@ -31,17 +31,17 @@ class AdaptivePicture:
 
     @property
     def share(self) -> float:
-        """Part of the rays that were followed."""
+        """Fraction of the rays that were followed."""
         return self.followed.double().mean().item()
 
 
 @dataclass(frozen=True)
 class AdaptiveReport:
-    """What leaving out rays saves and costs.
+    """Savings and error of an adaptively rendered picture.
 
     Attributes:
-        share: Part of the rays that were followed.
-        error: Relative L2 error of the image against that of all rays; 0 for two black ones.
+        share: Fraction of the rays that were followed.
+        error: Relative L2 error of the image against that of all rays; 0 where both are black.
         largest: Largest difference of a pixel's colour.
     """
 
@@ -51,11 +51,11 @@ class AdaptiveReport:
 
 
 def render_adaptively(sampler: DVRSampler, volume: Volume, *, step: int = 4, contrast: float = 0.05) -> AdaptivePicture:
-    """Picture from every ``step``-th ray of each axis, and all rays of the cells between them that show a contrast.
+    """Picture from every ``step``-th ray of each axis, and from all rays in cells of high contrast between them.
 
-    A cell is refined if any colour, or the opacity, differs between its corners, or those of the cells around it, by
-    more than ``contrast``; rays in the others are interpolated linearly. What is finer than a cell and touches no
-    corner of it or its neighbours is missed. Differentiable; which rays are followed is not.
+    A cell is refined if any colour or the opacity differs by more than ``contrast`` between its corners or those of
+    the adjacent cells; rays in the other cells are interpolated linearly. Details smaller than a cell that touch no
+    corner of it or of its neighbours are missed. The picture is differentiable; the choice of rays is not.
 
     Raises:
         ValueError: A step below 1 or a contrast below 0.
@@ -71,46 +71,46 @@ def render_adaptively(sampler: DVRSampler, volume: Volume, *, step: int = 4, con
     first = torch.cat([part.reshape(-1, *shape) for part in sampler.render(volume, coarse)])
     corners = first[:, rows[:, None], columns]
     refined = _refined(corners.detach(), contrast)
-    down, across = (_cells(places, size) for places, size in zip((rows, columns), shape, strict=True))
+    down, across = (_cells(lattice, size) for lattice, size in zip((rows, columns), shape, strict=True))
     fine = refined[down[0]][:, across[0]] & ~coarse
     second = torch.cat([part.reshape(-1, *shape) for part in sampler.render(volume, fine)])
-    filled = mixed(mixed(corners, *across, -1), *down, -2)
+    filled = interpolate(interpolate(corners, *across, -1), *down, -2)
     picture = torch.where(coarse, first, torch.where(fine, second, filled))
     return AdaptivePicture(picture[:3], picture[3], coarse | fine)
 
 
 @torch.no_grad()
 def adaptive_report(sampler: DVRSampler, volume: Volume, *, step: int = 4, contrast: float = 0.05) -> AdaptiveReport:
-    """How far :func:`render_adaptively` is from the picture of all rays, and how many it follows."""
-    found = render_adaptively(sampler, volume, step=step, contrast=contrast)
+    """Error of :func:`render_adaptively` against the picture of all rays, and the fraction of rays that it follows."""
+    adaptive = render_adaptively(sampler, volume, step=step, contrast=contrast)
     whole, _ = sampler.render(volume)
-    difference, norm = found.image - whole, whole.norm().item()
+    difference, norm = adaptive.image - whole, whole.norm().item()
     error = difference.norm().item() / norm if norm else 0.0
-    return AdaptiveReport(found.share, error, difference.abs().max().item())
+    return AdaptiveReport(adaptive.share, error, difference.abs().max().item())
 
 
 def _lattice(size: int, step: int, device: torch.device) -> Tensor:
-    places = torch.arange(0, size, step, device=device)
-    # The last ray as well, so that nothing lies outside.
-    return places if places[-1] == size - 1 else torch.cat([places, places.new_tensor([size - 1])])
+    rays = torch.arange(0, size, step, device=device)
+    # The last ray is included, so that every ray lies within a cell.
+    return rays if rays[-1] == size - 1 else torch.cat([rays, rays.new_tensor([size - 1])])
 
 
 def _refined(corners: Tensor, contrast: float) -> Tensor:
-    """Which cells [n - 1, m - 1] (at least one each) of corners [c, n, m] are to be refined."""
+    """Mask of the cells to refine, [n - 1, m - 1] but at least one per axis, from corners [c, n, m]."""
     sizes = corners.shape[1:]
-    # Axes of one sample have one cell all the same.
+    # An axis of one sample has one cell.
     framed = torch.nn.functional.pad(corners[None], (0, int(sizes[1] == 1), 0, int(sizes[0] == 1)), mode="replicate")
     highest, lowest = (torch.nn.functional.max_pool2d(sign * framed, 2, 1) for sign in (1, -1))
-    # The cells around: an edge may run just inside the next one.
+    # Adjacent cells are included, since an edge may run just inside them.
     spread = [torch.nn.functional.max_pool2d(part, 3, 1, 1) for part in (highest, lowest)]
     return ((spread[0] + spread[1])[0] > contrast).any(0)
 
 
-def _cells(places: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Cell of every ray of an axis [size], and where in it, 0 to 1."""
-    rays = torch.arange(size, device=places.device)
-    cell = (torch.searchsorted(places, rays, right=True) - 1).clamp(max=max(0, len(places) - 2))
-    if len(places) == 1:
-        return cell, torch.zeros(size, device=places.device)
-    start, end = places[cell], places[cell + 1]
+def _cells(lattice: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Cell of every ray of an axis [size], and the position of the ray within it, 0 to 1."""
+    rays = torch.arange(size, device=lattice.device)
+    cell = (torch.searchsorted(lattice, rays, right=True) - 1).clamp(max=max(0, len(lattice) - 2))
+    if len(lattice) == 1:
+        return cell, torch.zeros(size, device=lattice.device)
+    start, end = lattice[cell], lattice[cell + 1]
     return cell, (rays - start).double() / (end - start)

@@ -1,4 +1,4 @@
-"""SourceLayers: point sources of light on planes, what a scene hands to a hologram."""
+"""SourceLayers: point sources of light on planes, the interface between a scene and a hologram."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ class SourceLayers:
 
     Attributes:
         grid: Samples (rays) of every plane, centred on the axis; pitch in metres.
-        depths: Of the planes, metres from the hologram, > 0, in the order of the planes (first = nearest to the
-            observer).
-        channels: Colours C.
-        amplitudes: Called for an iterator over the planes, real [C, h, w] each: the square root of the radiance.
-            Complex where every point has a phase of its own. It may be called again, and gives the same planes.
-        phase: In radians, [h, w], common to all planes and colours (one random phase per ray, for instance), or None.
+        depths: Distances of the planes from the hologram in metres, > 0; the first plane is nearest to the observer.
+        channels: Number of colours C.
+        amplitudes: Function that returns an iterator over the planes, [C, h, w] each: the square root of the radiance,
+            real, or complex where each point has its own phase. Every call yields the same planes.
+        phase: Phase in radians, [h, w], common to all planes and colours (for instance one random phase per ray), or
+            None.
 
     Raises:
         TypeError: ``amplitudes`` cannot be called, or the phase is not real.
@@ -58,19 +58,19 @@ class SourceLayers:
         Raises:
             ValueError: A plane of another shape, or not as many planes as depths.
         """
-        turn = None if self.phase is None else phasor(self.phase)
+        phase_factor = None if self.phase is None else phasor(self.phase)
         count = 0
         for count, amplitude in enumerate(self.amplitudes(), 1):
             self._check(amplitude, count)
-            if turn is not None:
-                yield amplitude * turn
+            if phase_factor is not None:
+                yield amplitude * phase_factor
             else:
                 yield amplitude if amplitude.is_complex() else torch.complex(amplitude, torch.zeros_like(amplitude))
         if count != len(self.depths):
             raise ValueError(f"layers must bring a plane for each of {len(self.depths)} depths, got {count}")
 
     def stack(self) -> Tensor:
-        """All planes at once, complex [D, C, h, w]: 8 bytes for every sample of every plane and colour."""
+        """All planes at once, complex [D, C, h, w]; takes 8 bytes per sample, plane and colour in complex64."""
         return torch.stack(list(self.planes()))
 
     def _check(self, amplitude: Tensor, count: int) -> None:

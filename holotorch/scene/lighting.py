@@ -10,27 +10,26 @@ from holotorch.core import checks
 from holotorch.scene.compositing import safe_sqrt
 from holotorch.scene.volume import Triple, Volume
 
-# Part of the range of values by which neighbours may differ and still count as flat.
-_FLAT = 1e-3
+_FLAT = 1e-3  # difference between neighbouring voxels, relative to the range of values, at which shading fades in
 
 
 @dataclass(frozen=True)
 class Lighting:
-    """A distant white light, and how matter answers it (Phong 1975).
+    """A distant white light and the reflectance of the volume in the Phong model (1975).
 
-    colour * (ambient + diffuse * (n . l)) + specular * (r . v)^shininess, where n is the direction of the gradient,
-    turned to the observer (both sides of a surface are lit), l the direction to the light, r its mirror image and v the
-    direction to the observer along the axis. Where the value does not change there is no surface, and the colour is
-    multiplied by ambient + diffuse: flat matter is lit from everywhere and does not shine. In between, at differences
-    of about a thousandth of the range of values from voxel to voxel, shading fades in as |g|^2 / (|g|^2 + flat^2), so
-    that the result and its gradient stay finite for every volume.
+    The shaded colour is colour * (ambient + diffuse * (n . l)) + specular * (r . v)^shininess, where n is the direction
+    of the gradient, oriented towards the observer (both sides of a surface are lit), l the direction to the light, r
+    its reflection and v the direction to the observer along the axis. Where the value is constant there is no surface:
+    the colour is multiplied by ambient + diffuse, without highlight. In between, at differences of about a thousandth
+    of the range of values from voxel to voxel, shading fades in as |g|^2 / (|g|^2 + flat^2), so that the result and its
+    gradient stay finite for every volume.
 
     Attributes:
         towards: Direction to the light, (z, y, x) in the scene, of any length; z points away from the hologram.
-        ambient: Light from everywhere, >= 0.
-        diffuse: Strength of the light on a matt surface that faces it, >= 0.
+        ambient: Strength of the ambient term, >= 0.
+        diffuse: Strength of the diffuse term, >= 0.
         specular: Strength of the highlight, >= 0.
-        shininess: Exponent of the highlight, >= 1; large is sharp.
+        shininess: Exponent of the highlight, >= 1; a larger exponent gives a sharper highlight.
 
     Raises:
         ValueError: A negative strength, a shininess below 1, or a direction of length zero.
@@ -55,11 +54,11 @@ class Lighting:
             raise ValueError(f"shininess must be at least 1, got {self.shininess}")
 
     def shade(self, colour: Tensor, slopes: Tensor, rotation: Tensor, observer: float) -> Tensor:
-        """Colour [3, n] of points of ``colour`` [3, n] whose :func:`slopes` are [3, n].
+        """Shaded colour [3, n] of n points.
 
         Args:
-            colour: Unlit, red, green, blue.
-            slopes: Change of the value along the volume's own (z, y, x), in flat steps.
+            colour: Colour without lighting, red, green, blue, [3, n].
+            slopes: Result of :func:`slopes` at the points, along the axes (z, y, x) of the volume, [3, n].
             rotation: Offset in the scene = rotation @ offset in the volume, [3, 3].
             observer: Sign of the axial direction to the observer: -1 where the hologram is between volume and observer.
         """
@@ -81,10 +80,10 @@ class Lighting:
 
 
 def flat_steps(volume: Volume) -> Triple:
-    """Differences between neighbours along (z, y, x) that make a slope of 1.
+    """Differences between neighbours along (z, y, x) that count as a slope of 1.
 
-    A thousandth of the range of values along the smallest spacing, more along longer ones; 1 for a volume of one value,
-    which has no slopes.
+    They are a thousandth of the range of values along the axis of the smallest spacing, and proportional to the spacing
+    along the others. For a constant volume, whose slopes vanish, they are 1.
     """
     least, most = volume.value_range()
     z, y, x = (_FLAT * (most - least or 1 / _FLAT) * spacing / min(volume.spacing) for spacing in volume.spacing)
@@ -108,8 +107,8 @@ def slice_slopes(slices: Sequence[Tensor], k: int, steps: Triple, dtype: torch.d
 
 
 def _difference(values: Tensor, axis: int, step: float) -> Tensor:
-    places = torch.arange(values.shape[axis], device=values.device)
-    before, after = (places - 1).clamp(min=0), (places + 1).clamp(max=len(places) - 1)
+    index = torch.arange(values.shape[axis], device=values.device)
+    before, after = (index - 1).clamp(min=0), (index + 1).clamp(max=len(index) - 1)
     scale = 1 / ((after - before).clamp(min=1).to(values.dtype) * step)
     difference = values.index_select(axis, after) - values.index_select(axis, before)
     return difference * scale.reshape([-1 if other == axis else 1 for other in range(values.ndim)])

@@ -1,4 +1,4 @@
-"""One volume and the rays that march through it, plane by plane."""
+"""Ray marching: front-to-back compositing of one volume along all rays, plane by plane."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -10,14 +10,14 @@ from torch import Tensor
 from holotorch.scene.compositing import absorb, corrected_opacity
 from holotorch.scene.lighting import Lighting, flat_steps, slice_slopes, slopes
 from holotorch.scene.placement import Placement, Rays
-from holotorch.scene.reading import BRICK, PointReader, SliceReader, Window, mixed, occupied_box
+from holotorch.scene.reading import BRICK, PointReader, SliceReader, Window, interpolate, occupied_box
 from holotorch.scene.transfer import TransferFunction
 from holotorch.scene.volume import Volume
 
 
 @dataclass(frozen=True)
 class Step:
-    """What a plane adds to ``rays`` [n], flat indices into the window: ``weight`` T alpha [n] and ``colour`` [3, n]."""
+    """Contribution of one plane: ``weight`` T alpha [n] and ``colour`` [3, n] of ``rays`` [n], flat window indices."""
 
     plane: int
     rays: Tensor
@@ -26,18 +26,18 @@ class Step:
 
 
 class March:
-    """Composites ``volume`` along ``rays``, slab by slab, for those rays only that meet anything visible.
+    """Composites ``volume`` along ``rays``, slab by slab, only for rays that may cross visible voxels.
 
-    ``visible`` is the smallest and largest depth of what has any opacity, to a brick, or None.
+    The attribute ``visible`` is the range of depths with any opacity, to the size of a brick, or None.
 
     Args:
         volume: Scalar field.
-        place: Where it stands.
+        place: Position, size and rotation of the volume.
         transfer: Colours and opacities.
         lighting: Shading, or None.
-        rays: Their course.
-        depths: Of the planes, front to back.
-        spans: Smallest and largest depth of the slab of every plane.
+        rays: Geometry of the rays.
+        depths: Depths of the planes, front to back.
+        spans: Smallest and largest depth of the slab of each plane.
         early: Transmittance below which rays end.
 
     Raises:
@@ -57,10 +57,8 @@ class March:
     ):
         self.volume, self.place, self.transfer, self.lighting = volume, place, transfer, lighting
         self.rays, self.depths, self.early = rays, depths, early
-        reach = place.reach()
-        self.spans = [
-            (max(low, reach[0]) - place.distance, min(high, reach[1]) - place.distance) for low, high in spans
-        ]
+        near, far = place.depth_range()
+        self.spans = [(max(low, near) - place.distance, min(high, far) - place.distance) for low, high in spans]
         self.dtype = transfer.colours.dtype
         if volume.values.is_floating_point():
             self.dtype = torch.promote_types(self.dtype, volume.values.dtype)
@@ -68,17 +66,20 @@ class March:
         self.unit = transfer.unit_distance * max(place.half) * 2
         self.steps_of_slope = flat_steps(volume) if lighting is not None else None
         low, high = volume.bricks(BRICK)
-        # A transparent voxel that is to be learned has a gradient, if it lies where opacity begins.
+        # Voxels that are optimised have a gradient even while they are transparent, so none may be skipped.
         self.learned = volume.values.requires_grad
         self.occupied = torch.ones_like(low, dtype=torch.bool) if self.learned else transfer.visible(low, high)
         box = occupied_box(self.occupied, volume.shape)
-        self.visible = place.reach(*box) if box is not None else None
+        self.visible = place.depth_range(*box) if box is not None else None
         rows, columns = place.footprint(rays, *box) if box is not None else (range(0), range(0))
         like = torch.empty((), dtype=self.dtype, device=self.device)
         self.window = Window.of(place, rays, rows, columns, like)
 
     def steps(self, wanted: Tensor | None = None) -> Iterator[Step]:
-        """What the planes add, front to back; planes that add nothing are left out. ``wanted``: rays, bool [h, w]."""
+        """Contributions of the planes, front to back; planes without any are left out.
+
+        Only the rays of ``wanted``, bool [h, w], are followed; None means all.
+        """
         if not self.window.size:
             return
         reader = self._reader()
@@ -90,21 +91,21 @@ class March:
             alive = transmittance.detach() > self.early
             if low >= high:
                 continue
-            found = reader.read(low, high, alive)
-            if found is None:
+            sampled = reader.read(low, high, alive)
+            if sampled is None:
                 if not alive.any():
                     return
                 continue
-            colour, opacity = self.transfer(found.samples[0])
+            colour, opacity = self.transfer(sampled.samples[0])
             if self.lighting is not None:
-                colour = self._lit(colour, found.samples[1:])
-            before = transmittance.index_select(0, found.rays)
-            weight, after = absorb(before, corrected_opacity(opacity, found.length * (1 / self.unit)))
-            transmittance.index_copy_(0, found.rays, after)
-            yield Step(plane, found.rays, weight, colour)
+                colour = self._shaded(colour, sampled.samples[1:])
+            before = transmittance.index_select(0, sampled.rays)
+            weight, after = absorb(before, corrected_opacity(opacity, sampled.length * (1 / self.unit)))
+            transmittance.index_copy_(0, sampled.rays, after)
+            yield Step(plane, sampled.rays, weight, colour)
 
     def planes(self, after: Callable[[Tensor], Tensor]) -> Iterator[Tensor]:
-        """The radiance of every plane on the grid, [3, h, w], through the function ``after``, zero to zero."""
+        """``after`` of the radiance of every plane on the grid, [3, h, w]; the function maps zero to zero."""
         done = 0
         for step in self.steps():
             yield from (self.empty() for _ in range(done, step.plane))
@@ -118,15 +119,15 @@ class March:
         yield from (self.empty() for _ in range(done, len(self.depths)))
 
     def zeros(self, channels: int) -> Tensor:
-        """[channels, rays of the window]."""
+        """Zeros [channels, rays of the window]."""
         return torch.zeros(channels, self.window.size, dtype=self.dtype, device=self.device)
 
     def empty(self) -> Tensor:
-        """A dark plane, [3, h, w]: a single zero, expanded, which consumers can tell from a plane of zeros."""
+        """A dark plane [3, h, w]: a single expanded zero, which consumers recognise by its strides and skip."""
         return torch.zeros((), dtype=self.dtype, device=self.device).expand(3, *self.rays.grid.shape)
 
     def whole(self, values: Tensor) -> Tensor:
-        """[c, rays of the window] on the grid, [c, h, w]."""
+        """Values [c, rays of the window] on the grid, [c, h, w]; zero outside the window."""
         (height, width), rows, columns = self.rays.grid.shape, self.window.rows, self.window.columns
         if not self.window.size:
             return values.new_zeros(len(values), height, width)
@@ -135,7 +136,7 @@ class March:
         return torch.nn.functional.pad(framed, margins)
 
     def whole_of(self, rays: Tensor, values: Tensor) -> Tensor:
-        """Values [3, n] of some ``rays`` [n] of the window on the grid, [3, h, w]."""
+        """Values [3, n] of ``rays`` [n], flat window indices, on the grid, [3, h, w]; zero elsewhere."""
         (height, width), rows, columns = self.rays.grid.shape, self.window.rows, self.window.columns
         if len(columns) < width:
             rays = rays + torch.div(rays, len(columns), rounding_mode="floor") * (width - len(columns))
@@ -157,32 +158,35 @@ class March:
         return torch.cat([values[None], slopes(values, self.steps_of_slope)])
 
     def _slice_fields(self) -> Callable[[int], Tensor]:
-        # One gradient for all slices instead of a whole volume of zeros for each.
+        # unbind has one gradient for all slices; indexing would make a volume of zeros for each slice.
         slices = self.volume.values.unbind(0)
         steps = self.steps_of_slope
         if steps is None:
             return lambda k: slices[k].to(self.dtype)[None]
         return lambda k: torch.cat([slices[k].to(self.dtype)[None], slice_slopes(slices, k, steps, self.dtype)])
 
-    def _lit(self, colour: Tensor, slope: Tensor) -> Tensor:
+    def _shaded(self, colour: Tensor, slope: Tensor) -> Tensor:
         assert self.lighting is not None
         rotation = torch.tensor(self.place.rotation, dtype=torch.float64, device=self.device)
-        rising = self.depths[-1] > self.depths[0] if len(self.depths) > 1 else self._eye_is_before()
+        rising = self.depths[-1] > self.depths[0] if len(self.depths) > 1 else self._eye_is_in_front()
         return self.lighting.shade(colour, slope, rotation, -1.0 if rising else 1.0)
 
-    def _eye_is_before(self) -> bool:
+    def _eye_is_in_front(self) -> bool:
         return self.rays.eye is None or self.rays.eye < self.depths[0]
 
     def _resampled(self, window: Tensor, scale: float) -> Tensor:
-        """Radiance [3, rays of the window] of rays ``scale`` times as far from the axis as on the grid, on the grid."""
+        """Resample radiance [3, rays of the window] to the grid.
+
+        At the depth of the plane the rays are ``scale`` times as far from the axis as the points of the grid.
+        """
         framed = window.unflatten(1, (len(self.window.rows), len(self.window.columns)))
         framed = torch.nn.functional.pad(framed, (1, 1, 1, 1))
         for axis, part, count in zip(
             (-2, -1), (self.window.rows, self.window.columns), self.rays.grid.shape, strict=True
         ):
-            place = (torch.arange(count, dtype=torch.float64, device=window.device) - count // 2) / scale + count // 2
-            # Into the padded window, whose border is dark.
-            place = (place - (part.start - 1)).clamp(0, len(part) + 1)
-            first = place.floor().clamp_(max=len(part))
-            framed = mixed(framed, first.to(torch.int64), place - first, axis)
+            index = (torch.arange(count, dtype=torch.float64, device=window.device) - count // 2) / scale + count // 2
+            # Index into the padded window, whose border is dark.
+            index = (index - (part.start - 1)).clamp(0, len(part) + 1)
+            first = index.floor().clamp_(max=len(part))
+            framed = interpolate(framed, first.to(torch.int64), index - first, axis)
         return framed

@@ -1,9 +1,8 @@
-"""Volumes whose value at every point is a formula, to measure renderers and holograms with.
+"""Analytic test volumes for renderers and holograms.
 
-All fill the cube [-1, 1]^3, coordinates (z, y, x), and are sampled in the middle of their voxels, so any shape
-(D, H, W) shows the same object and unequal ones have unequal spacings. ``width`` is the length of the cube's edges in
-metres; without it the volume is "relative", with edges of 2. Values lie in [0, 1]; torch.uint8 stores them times 255,
-rounded.
+All fill the cube [-1, 1]^3, coordinates (z, y, x), and are sampled at voxel centres: every shape (D, H, W) shows the
+same object, with unequal spacings where D, H and W differ. ``width`` is the edge length of the cube in metres; without
+it the volume is "relative", with edges of 2. Values lie in [0, 1]; torch.uint8 stores them times 255, rounded.
 """
 
 import itertools
@@ -19,10 +18,11 @@ from holotorch.scene.volume import Volume
 
 Shape = int | tuple[int, int, int]
 _GOLDEN = (1 + math.sqrt(5)) / 2
-# Angstrom. Bonds of C60 in the gas phase: between two hexagons, and around the pentagons (Hedberg et al. 1991).
-_DOUBLE_BOND, _SINGLE_BOND = 1.401, 1.458
-_ATOM_SIGMA = 0.35
-_MOLECULE_BOX = 9.6
+_DOUBLE_BOND = 1.401  # angstrom; bond between two hexagons of C60 in the gas phase (Hedberg et al. 1991)
+_SINGLE_BOND = 1.458  # angstrom; bond around a pentagon (the same source)
+_ATOM_SIGMA = 0.35  # angstrom; width of the Gaussian at an atom
+_MOLECULE_BOX = 9.6  # angstrom; edge of the cube around the molecule
+_SHELLS = ((1 / 3, 0.9), (2 / 3, 0.6), (1.0, 0.3))  # peak and radius of the three shells, from outside in
 
 
 def marschner_lobb(
@@ -50,7 +50,7 @@ def marschner_lobb(
 def gaussian_ball(
     shape: Shape = 64, *, sigma: float = 0.25, width: float | None = None, dtype: torch.dtype = torch.float32
 ) -> Volume:
-    """exp(-r^2 / (2 sigma^2)); the integral along a whole ray at distance b is sqrt(2 pi) sigma times that of b."""
+    """exp(-r^2 / (2 sigma^2)); along a line at distance b from the centre it integrates to sqrt(2 pi) sigma f(b)."""
     sigma = checks.positive("sigma", sigma)
     return _sampled(lambda z, y, x: torch.exp((z**2 + y**2 + x**2) / (-2 * sigma**2)), shape, width, dtype)
 
@@ -58,9 +58,9 @@ def gaussian_ball(
 def homogeneous_slab(
     shape: Shape = 64, *, thickness: float = 1.0, width: float | None = None, dtype: torch.dtype = torch.float32
 ) -> Volume:
-    """1 where abs(z) < ``thickness`` / 2, else 0; a voxel that an end face cuts holds the share that lies inside.
+    """1 where abs(z) < ``thickness`` / 2, else 0; a voxel on an end face holds the fraction that lies inside.
 
-    So the sum over z times the spacing is ``thickness`` at any resolution. With ``thickness`` = 2 all is 1.
+    The sum over z times the spacing is therefore ``thickness`` at any resolution. With ``thickness`` = 2 all is 1.
     """
     thickness = checks.positive("thickness", thickness)
     if thickness > 2:
@@ -86,7 +86,7 @@ def shells(shape: Shape = 128, *, width: float | None = None, dtype: torch.dtype
     """Three nested shells with peaks 1/3, 2/3 and 1 from outside in, at radii 0.9, 0.6 and 0.3.
 
     Sum of h exp(-(r - R)^2 / (2 w^2)) with w = 0.04. Those of the outer two are multiplied by 1 - exp(-(x^2 + y^2) /
-    (2 g^2)), g = 0.2, where z < 0: a hole towards the first slices, through which the inner one is seen.
+    (2 g^2)), g = 0.2, where z < 0: a hole towards the first slices, through which the inner shell is visible.
     """
 
     def density(z: Tensor, y: Tensor, x: Tensor) -> Tensor:
@@ -100,20 +100,17 @@ def shells(shape: Shape = 128, *, width: float | None = None, dtype: torch.dtype
     return _sampled(density, shape, width, dtype)
 
 
-_SHELLS = ((1 / 3, 0.9), (2 / 3, 0.6), (1.0, 0.3))
-
-
 def c60(shape: Shape = 128, *, width: float | None = None, dtype: torch.dtype = torch.float32) -> Volume:
     """Buckminsterfullerene: a Gaussian of sigma 0.35 angstrom at each of the 60 atoms, in a box of 9.6 angstrom.
 
-    Divided by the density at an atom, so that it is 1 there. ``width`` enlarges the box, 9.6e-10 m in nature.
+    The density is divided by its value at an atom. ``width`` enlarges the box, which is 9.6e-10 m in nature.
     """
     atoms = c60_atoms() * (2 / _MOLECULE_BOX)
     scale = -1 / (2 * (_ATOM_SIGMA * 2 / _MOLECULE_BOX) ** 2)
     peak = torch.exp((atoms - atoms[0]).square().sum(1) * scale).sum()
 
     def density(z: Tensor, y: Tensor, x: Tensor) -> Tensor:
-        # A Gaussian is the product of three: one matrix product per slice.
+        # The Gaussian is separable, so a slice is one matrix product.
         along_z, along_y, along_x = (
             torch.exp((axis.reshape(-1, 1) - atoms[:, i]).square() * scale) for i, axis in enumerate((z, y, x))
         )
@@ -125,8 +122,8 @@ def c60(shape: Shape = 128, *, width: float | None = None, dtype: torch.dtype = 
 def c60_atoms() -> Tensor:
     """Nuclei of C60 about its centre, float64 [60, 3], (z, y, x) in angstrom.
 
-    A truncated icosahedron: every edge of an icosahedron is cut at a pentagon bond's length from both of its ends;
-    what is left is the bond between two hexagons.
+    The shape is a truncated icosahedron: every edge of an icosahedron is cut at the length of a pentagon bond from
+    both ends; the remainder is the bond between two hexagons.
     """
     signs = itertools.product((-1.0, 1.0), repeat=2)
     corners = [_rotated((0.0, a, b * _GOLDEN), turn) for a, b in signs for turn in range(3)]
@@ -160,7 +157,7 @@ def _sampled(
     scale = 1.0 if width is None else checks.quantity(WIDTH, width) / 2
     z, y, x = ((2 * torch.arange(n, dtype=torch.float64) + 1) / n - 1 for n in sizes)
     values = torch.empty(sizes, dtype=dtype)
-    # Slice by slice: float64 for exactness, without float64 temporaries of the whole.
+    # Computed slice by slice in float64, which keeps temporaries small.
     for index in range(sizes[0]):
         plane = density(z[index], y[:, None], x[None, :])
         values[index] = plane if dtype.is_floating_point else (255 * plane).round()

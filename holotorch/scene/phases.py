@@ -1,7 +1,8 @@
-"""Initial phases of light sources: what a ray, or a point, is given besides its amplitude.
+"""Initial phases of light sources.
 
-No phase at all (None) is the constant 0: sharp where light is in focus, and all of it in one direction. A random phase
-per ray, as in the thesis, spreads it over the whole eye box and makes speckle. A smooth one is in between.
+A constant phase (None means 0) gives an image without speckle in focus, but sends the light in one direction only. A
+random phase per ray, as in the thesis, spreads the light over the whole eye box and causes speckle. A smooth random
+phase is a compromise.
 """
 
 import math
@@ -15,7 +16,7 @@ from holotorch.core.fourier import filter_real
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import WIDTH
 
-_WINDOWS = 64  # places of a window along each axis
+_WINDOWS = 64  # number of positions of a window along each axis
 
 
 def random_phase(grid: Grid, *, generator: torch.Generator | None = None) -> Tensor:
@@ -26,19 +27,20 @@ def random_phase(grid: Grid, *, generator: torch.Generator | None = None) -> Ten
 def smooth_phase(
     grid: Grid, length: float, *, spread: float = math.pi, generator: torch.Generator | None = None
 ) -> Tensor:
-    """Gaussian noise without its high frequencies: float32 [h, w] in radians, continuous, also across the borders.
+    """Low-pass filtered Gaussian noise: float32 [h, w] in radians, smooth, also across the periodic border.
 
     Args:
-        grid: Of the rays.
-        length: Metres over which phases are alike; their correlation is exp(-r^2 / (2 length^2)).
-        spread: Expected standard deviation in radians. Directions of light spread to wavelength spread / (2 pi length).
-        generator: Of the noise.
+        grid: Grid of the rays.
+        length: Correlation length in metres; the correlation is exp(-r^2 / (2 length^2)).
+        spread: Expected standard deviation in radians. The sines of the directions of the light have a standard
+            deviation of wavelength spread / (2 pi length).
+        generator: Random generator of the noise.
     """
     length, spread = checks.quantity(WIDTH, length, "length"), checks.positive("spread", spread, "radians")
     noise = torch.randn(grid.shape, generator=generator, device=_device(generator))
     fy, fx = grid.frequencies(noise.device)
     square = fy.square() + fx[:, : grid.shape[1] // 2 + 1].square()
-    # The root of the correlation's spectrum, scaled over all frequencies to variance 1.
+    # The root of the spectrum of the correlation, scaled to a variance of 1 over all frequencies.
     whole = torch.exp(-2 * (math.pi * length) ** 2 * (fy.square() + fx.square())).mean().item()
     kernel = torch.exp(-((math.pi * length) ** 2) * square) * (spread / math.sqrt(whole))
     return filter_real(noise, kernel.to(noise.dtype))
@@ -46,15 +48,15 @@ def smooth_phase(
 
 @dataclass(frozen=True, eq=False)
 class PointPhases:
-    """Random phases for every point of every plane: windows of one larger map, each plane its own.
+    """Random phases for every point of every plane: each plane uses another window of one larger map.
 
-    Points of one ray, and of planes near to each other, have independent phases, which is what keeps planes from
-    interfering; points that do share one lie at places without a pattern. Drawing new ones for every plane would cost
-    more than rendering it.
+    Points of one ray and of neighbouring planes have independent phases, so that the planes do not interfere
+    systematically; points with equal phases lie at random positions. Drawing new phases for every plane would take
+    longer than rendering it.
 
     Attributes:
         phase: In [0, 2 pi), [h + 63, w + 63].
-        order: Of the 64 x 64 windows, whole numbers [4096]; planes beyond begin anew.
+        order: Random order of the 64 x 64 windows, whole numbers [4096]; it repeats after 4096 planes.
     """
 
     phase: Tensor

@@ -1,4 +1,4 @@
-"""Where a volume stands in front of the hologram, which rays meet it, and how the planes cut it into slabs."""
+"""Position of a volume in front of the hologram, intersection with rays, and the slabs that the planes stand for."""
 
 import itertools
 import math
@@ -13,15 +13,15 @@ from holotorch.core.grid import Grid
 from holotorch.core.quantities import DEPTH, DISTANCE
 from holotorch.scene.volume import Triple, Volume
 
-# A ray that lies in a face of the box belongs to it, whatever rounding says.
-_ON_FACE = 1e-9
+_ON_FACE = 1e-9  # relative margin with which a ray in a face of the box counts as inside, in spite of rounding
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Straight rays, one per sample of ``grid``, which they pass at depth ``reference``.
+    """Straight rays, one through each sample of ``grid`` at depth ``reference``.
 
-    Parallel to the axis, or through a point of the axis at depth ``eye``; depths in metres from the hologram.
+    They are parallel to the axis (``eye`` is None), or pass through the point of the axis at depth ``eye``. Depths are
+    in metres from the hologram.
     """
 
     grid: Grid
@@ -40,15 +40,15 @@ class Rays:
 
 @dataclass(frozen=True)
 class Placement:
-    """A volume of ``shape`` whose centre stands on the axis at depth ``distance``.
+    """A volume of ``shape`` whose centre lies on the axis at depth ``distance``.
 
-    Positions are offsets (z, y, x) from that centre in metres. A sample is the middle of a box of one ``spacing``; the
-    volume ends where its outermost boxes do, half a spacing beyond the outermost samples.
+    Positions are offsets (z, y, x) from that centre in metres. A sample is the centre of a voxel; the volume ends half
+    a spacing beyond the outermost samples.
 
     Attributes:
-        shape: Samples (z, y, x).
-        spacing: Between samples, metres, after scaling the longest side to ``width``.
-        distance: Depth of the centre.
+        shape: Number of samples (z, y, x).
+        spacing: Distance between samples in metres, after scaling the longest side to ``width``.
+        distance: Depth of the centre in metres.
         rotation: Row-major 3 x 3 over (z, y, x): offset in the scene = rotation @ offset in the volume.
     """
 
@@ -59,14 +59,14 @@ class Placement:
 
     @classmethod
     def of(cls, volume: Volume, width: float, distance: float, rotation: tuple[Triple, Triple, Triple]) -> "Placement":
-        """Place ``volume`` so that its longest side measures ``width``, whatever its own unit."""
+        """Place ``volume`` with a longest side of ``width`` metres, whatever its unit."""
         scale = width / max(volume.extent)
         z, y, x = volume.spacing
         return cls(volume.shape, (z * scale, y * scale, x * scale), distance, rotation)
 
     @property
     def turned(self) -> bool:
-        """Whether the slices of the volume are not parallel to the hologram as they are."""
+        """Whether the volume is rotated, so that its slices are not parallel to the hologram."""
         return any(self.rotation[i][j] != (i == j) for i in range(3) for j in range(3))
 
     @property
@@ -75,7 +75,9 @@ class Placement:
         (d, h, w), (z, y, x) = self.shape, self.spacing
         return d * z / 2, h * y / 2, w * x / 2
 
-    def reach(self, low: Sequence[float] | None = None, high: Sequence[float] | None = None) -> tuple[float, float]:
+    def depth_range(
+        self, low: Sequence[float] | None = None, high: Sequence[float] | None = None
+    ) -> tuple[float, float]:
         """Smallest and largest depth of the box, or of its part between index coordinates ``low`` and ``high``."""
         if low is None or high is None:
             low, high = (-0.5, -0.5, -0.5), tuple(n - 0.5 for n in self.shape)
@@ -83,10 +85,12 @@ class Placement:
         return min(depths), max(depths)
 
     def offsets(self, rays: Rays, depth: float, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """Offsets in the volume at ``depth`` of the rays at ``rows`` [h] and ``columns`` [w] (metres at the reference).
+        """Offsets in the volume of rays at ``depth``.
+
+        ``rows`` [h] and ``columns`` [w] are the positions of the rays in metres at the reference depth.
 
         Returns:
-            [h, 3] and [w, 3], to be added for every pair.
+            [h, 3] and [w, 3]; the offset of a ray is the sum of those of its row and its column.
         """
         axial, vertical, horizontal = (rows.new_tensor(row) for row in self.rotation)
         scale = rays.scale(depth)
@@ -96,10 +100,10 @@ class Placement:
         )
 
     def crossing(self, rays: Rays, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the rays at ``rows`` [h] and ``columns`` [w] enter and leave the box, as depths from its centre.
+        """Depths from the centre at which the rays at ``rows`` [h] and ``columns`` [w] enter and leave the box.
 
         Returns:
-            Smallest and largest, [h, w] each, float64; the first is not below the second where a ray misses the box.
+            Entry and exit, float64, [h, w] each; the entry is not below the exit where a ray misses the box.
         """
         axial, vertical, horizontal = self.rotation
         near, far = rows.new_full((), -math.inf), rows.new_full((), math.inf)
@@ -108,72 +112,73 @@ class Placement:
             middle, slope = rays.scale(self.distance) * lateral, axial[axis] + rays.spread * lateral
             parallel = slope == 0
             one, other = ((end - middle) / torch.where(parallel, 1.0, slope) for end in (-half, half))
-            # A ray along the face never leaves, or never enters.
-            ever = torch.where(middle.abs() <= half * (1 + _ON_FACE), math.inf, -math.inf)
-            near = torch.maximum(near, torch.where(parallel, -ever, torch.minimum(one, other)))
-            far = torch.minimum(far, torch.where(parallel, ever, torch.maximum(one, other)))
+            # A ray parallel to the face stays between the two faces, or outside, at all depths.
+            always = torch.where(middle.abs() <= half * (1 + _ON_FACE), math.inf, -math.inf)
+            near = torch.maximum(near, torch.where(parallel, -always, torch.minimum(one, other)))
+            far = torch.minimum(far, torch.where(parallel, always, torch.maximum(one, other)))
         return near, far
 
     def footprint(self, rays: Rays, low: Sequence[float], high: Sequence[float]) -> tuple[range, range]:
         """Rows and columns of rays that may meet the part of the box between index coordinates ``low`` and ``high``."""
-        seen: list[list[float]] = [[], []]
+        projected: list[list[float]] = [[], []]
         for depth, *lateral in self._corners(low, high):
             scale = rays.scale(depth)
-            if scale <= 0:  # the eye is inside: any ray may
+            if scale <= 0:  # the eye lies within this range of depths, so any ray may meet it
                 return range(rays.grid.shape[0]), range(rays.grid.shape[1])
-            for place, found in zip(lateral, seen, strict=True):
-                found.append(place / scale)
+            for position, positions in zip(lateral, projected, strict=True):
+                positions.append(position / scale)
         rows, columns = (
             range(
-                max(0, math.ceil(min(found) / step - _ON_FACE * n) + n // 2),
-                max(0, min(n, math.floor(max(found) / step + _ON_FACE * n) + n // 2 + 1)),
+                max(0, math.ceil(min(positions) / step - _ON_FACE * n) + n // 2),
+                max(0, min(n, math.floor(max(positions) / step + _ON_FACE * n) + n // 2 + 1)),
             )
-            for found, n, step in zip(seen, rays.grid.shape, rays.grid.pitch, strict=True)
+            for positions, n, step in zip(projected, rays.grid.shape, rays.grid.pitch, strict=True)
         )
         return rows, columns
 
     def _corners(self, low: Sequence[float], high: Sequence[float]) -> list[Triple]:
         """Corners in the scene, (depth from the hologram, y, x), of the box between two index coordinates."""
         ends = [
-            [(place - (n - 1) / 2) * step for place in pair]
+            [(index - (n - 1) / 2) * step for index in pair]
             for *pair, n, step in zip(low, high, self.shape, self.spacing, strict=True)
         ]
         corners = []
-        for own in itertools.product(*ends):
-            z, y, x = (sum(r * c for r, c in zip(row, own, strict=True)) for row in self.rotation)
+        for corner in itertools.product(*ends):
+            z, y, x = (sum(r * c for r, c in zip(row, corner, strict=True)) for row in self.rotation)
             corners.append((z + self.distance, y, x))
         return corners
 
 
 def upright(volume: Volume, rotation: tuple[Triple, Triple, Triple]) -> tuple[Volume, tuple[Triple, Triple, Triple]]:
-    """``volume`` with its axes exchanged and reversed where ``rotation`` does no more, and the rotation that is left.
+    """Apply a rotation by right angles to the array of ``volume``, and return it with the identity as rotation.
 
-    Slices parallel to the hologram are read several times faster than points between them.
+    Other rotations are returned with the unchanged volume. Slices parallel to the hologram are read several times
+    faster than points between them.
     """
-    axes = [[j for j, part in enumerate(row) if abs(part) == 1] for row in rotation]
-    if any(len(found) != 1 for found in axes):
+    axes = [[j for j, cosine in enumerate(row) if abs(cosine) == 1] for row in rotation]
+    if any(len(candidates) != 1 for candidates in axes):
         return volume, rotation
-    order = [found[0] for found in axes]
+    order = [candidates[0] for candidates in axes]
     reverse = [i for i, j in enumerate(order) if rotation[i][j] < 0]
     if order == [0, 1, 2] and not reverse:
         return volume, rotation
     values = volume.values.permute(order)
     values = (values.flip(reverse) if reverse else values).contiguous()
     z, y, x = (volume.spacing[j] for j in order)
-    # Origin and orientation say where the file put the volume, which is of no matter to a scene.
+    # Origin and orientation, the position in the world of the file, are not used in a scene.
     return Volume(values, (z, y, x), volume.unit), check_rotation(None)
 
 
 def slabs(
-    depths: Sequence[float], boundaries: Sequence[float] | None, reach: tuple[float, float]
+    depths: Sequence[float], boundaries: Sequence[float] | None, whole: tuple[float, float]
 ) -> list[tuple[float, float]]:
     """Smallest and largest depth of the slab that each plane stands for.
 
-    Half-way to the neighbours, and as far beyond the first and last plane as before them; a single plane stands for
-    ``reach``, the whole volume. ``boundaries`` [D + 1] say otherwise.
+    Slabs meet half-way between planes. The first and the last extend equally far on both sides of their plane; a single
+    plane stands for ``whole``, the depth range of the volume. ``boundaries`` [D + 1] override this.
     """
     if boundaries is None and len(depths) == 1:
-        return [reach]
+        return [whole]
     if boundaries is None:
         between = [(a + b) / 2 for a, b in zip(depths, depths[1:], strict=False)]
         boundaries = [2 * depths[0] - between[0], *between, 2 * depths[-1] - between[-1]]
@@ -184,35 +189,35 @@ def check_planes(
     depths: Sequence[float], boundaries: Sequence[float] | None
 ) -> tuple[tuple[float, ...], tuple[float, ...] | None]:
     """Depths and boundaries as tuples, or ValueError unless both rise or both fall and enclose one another."""
-    found = tuple(checks.quantity(DEPTH, depth, "depth of a plane") for depth in depths)
-    if not found:
+    planes = tuple(checks.quantity(DEPTH, depth, "depth of a plane") for depth in depths)
+    if not planes:
         raise ValueError("depths must hold at least one distance from the hologram in metres, got none")
-    sign = -1 if len(found) > 1 and found[1] < found[0] else 1
-    for a, b in zip(found, found[1:], strict=False):
+    sign = -1 if len(planes) > 1 and planes[1] < planes[0] else 1
+    for a, b in zip(planes, planes[1:], strict=False):
         if sign * (b - a) <= 0:
             raise ValueError(f"depths must rise or fall throughout, front to back, got {a:g} before {b:g} m")
     if boundaries is None:
-        return found, None
+        return planes, None
     edges = tuple(checks.quantity(DISTANCE, edge, "boundary of a slab") for edge in boundaries)
-    if len(edges) != len(found) + 1:
-        raise ValueError(f"boundaries must be one more than the {len(found)} depths, got {len(edges)}")
-    if len(found) == 1 and edges[1] < edges[0]:
+    if len(edges) != len(planes) + 1:
+        raise ValueError(f"boundaries must be one more than the {len(planes)} depths, got {len(edges)}")
+    if len(planes) == 1 and edges[1] < edges[0]:
         sign = -1
-    for k, depth in enumerate(found):
+    for k, depth in enumerate(planes):
         if not sign * edges[k] <= sign * depth <= sign * edges[k + 1] or edges[k] == edges[k + 1]:
             raise ValueError(
                 f"plane {k} at {depth:g} m must lie within its slab, got {edges[k]:g} to {edges[k + 1]:g} m"
             )
-    return found, edges
+    return planes, edges
 
 
 def check_rotation(rotation: Tensor | None) -> tuple[Triple, Triple, Triple]:
-    """A rotation as rows of floats, or ValueError unless it is one to 1e-6. Cosines of right angles become exact."""
+    """A rotation matrix as rows of floats; ValueError unless it is orthonormal to 1e-6. Right angles become exact."""
     if rotation is None:
         return (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
     if not isinstance(rotation, Tensor) or tuple(rotation.shape) != (3, 3):
-        found = tuple(rotation.shape) if isinstance(rotation, Tensor) else type(rotation).__name__
-        raise ValueError(f"rotation must be a (3, 3) tensor over (z, y, x), got {found}")
+        given = tuple(rotation.shape) if isinstance(rotation, Tensor) else type(rotation).__name__
+        raise ValueError(f"rotation must be a (3, 3) tensor over (z, y, x), got {given}")
     if rotation.requires_grad:
         raise TypeError("rotation is fixed in a sampler and cannot carry a gradient; detach it")
     matrix = rotation.to("cpu", torch.float64)

@@ -1,8 +1,9 @@
-"""Samples of a volume where the rays meet a plane, without a look at rays that see nothing there.
+"""Samples of a volume at the intersections of rays and planes, limited to rays with something visible there.
 
-Both readers do the same: trilinear interpolation at the depth of a plane, up to the faces of the volume (the outermost
-half voxels have the value of the outermost sample), for the rays still alive that cross a visible value. One mixes two
-slices of a volume that stands straight, the other looks up every point of one that is turned.
+Both readers interpolate trilinearly at the depth of a plane, up to the faces of the volume (the outermost half voxels
+have the value of the outermost sample), for rays that have not ended and meet a visible value. ``SliceReader``
+interpolates between two slices that are parallel to the hologram; ``PointReader`` looks up each point of a rotated
+volume.
 """
 
 import math
@@ -14,14 +15,14 @@ from torch import Tensor
 
 from holotorch.scene.placement import Placement, Rays
 
-BRICK = 16
+BRICK = 16  # voxels along an edge of the bricks that are skipped as a whole where they are transparent
 
 
 @dataclass(frozen=True)
 class RaySamples:
-    """What the rays meet on one plane: which ``rays`` [n] (flat index into the footprint), ``samples`` [c, n] there.
+    """Samples on one plane: ``samples`` [c, n] of ``rays`` [n], flat indices into the window.
 
-    ``length`` is that of their paths through the slab in metres, [n] or one number for all.
+    ``length`` is the length of the paths through the slab in metres, [n] or one number for all rays.
     """
 
     rays: Tensor
@@ -31,17 +32,17 @@ class RaySamples:
 
 @dataclass(frozen=True)
 class Window:
-    """The part of the rays' grid that meets anything visible, and when it does.
+    """The part of the ray grid that may meet something visible, and the paths of its rays through the volume.
 
     Attributes:
-        rows: Samples of the grid.
-        columns: Likewise.
+        rows: Rows of the grid.
+        columns: Columns of the grid.
         down: Positions of the rows in metres at the reference depth, float64 [h].
-        across: Positions of the columns, float64 [w].
-        entry: Where every ray enters and leaves the box, depth from its centre, [h, w]; None: all rays are parallel to
-            the axis and pass through the front and the back.
-        exit: See ``entry``.
-        oblique: Path per depth, [h, w], or None for 1.
+        across: Positions of the columns in metres at the reference depth, float64 [w].
+        entry: Depth at which each ray enters the box, from its centre, [h, w]. None where all rays are parallel to the
+            axis and pass through the front and the back face.
+        exit: Depth at which each ray leaves the box, likewise.
+        oblique: Path length per depth, [h, w], or None for 1.
     """
 
     rows: range
@@ -54,7 +55,7 @@ class Window:
 
     @classmethod
     def of(cls, place: Placement, rays: Rays, rows: range, columns: range, like: Tensor) -> "Window":
-        """Window of ``rows`` and ``columns``, in dtype and on the device of ``like``."""
+        """Window of ``rows`` and ``columns``, with the dtype and device of ``like``."""
         y, x = (axis.flatten() for axis in rays.grid.coordinates(like.device))
         down, across = y[rows.start : rows.stop], x[columns.start : columns.stop]
         if not place.turned and rays.eye is None:
@@ -72,7 +73,7 @@ class Window:
         return len(self.rows) * len(self.columns)
 
     def length(self, low: float, high: float, rows: slice) -> Tensor | float:
-        """Path in the box between two depths from its centre: [rows, w], or the same number for all rays."""
+        """Path length within the box between two depths from its centre: [rows, w], or one number for all rays."""
         if self.entry is None or self.exit is None:
             return max(0.0, high - low)
         path = (self.exit[rows].clamp(max=high) - self.entry[rows].clamp(min=low)).clamp_(min=0)
@@ -80,11 +81,14 @@ class Window:
 
 
 class SliceReader:
-    """Reads a volume whose slices are parallel to the hologram: two slices are mixed, then columns, then rows.
+    """Reads a volume whose slices are parallel to the hologram: interpolates between slices, columns and rows in turn.
 
     Args:
-        fields: Slice number -> [c, H, W]; the first channel is the value.
-        occupied: Whether a brick holds anything visible, bool [Dz, Hy, Wx].
+        place: Position of the volume.
+        rays: Geometry of the rays.
+        window: Rays that are read.
+        fields: Function from a slice number to its channels [c, H, W]; the first channel is the value.
+        occupied: Whether a brick contains anything visible, bool [Dz, Hy, Wx].
         support: See ``TransferFunction.support``.
     """
 
@@ -101,7 +105,7 @@ class SliceReader:
         self.bands = [_band(layer.any(1)) for layer in occupied]
 
     def read(self, low: float, high: float, alive: Tensor) -> RaySamples | None:
-        """Samples half-way between two depths from the centre, of the rays ``alive`` (bool, flat) in the window."""
+        """Samples half-way between two depths from the centre, of the rays ``alive``, bool [rays of the window]."""
         place, width = self.place, len(self.window.columns)
         depth = (low + high) / 2
         index = min(max(depth / place.spacing[0] + (place.shape[0] - 1) / 2, 0.0), place.shape[0] - 1.0)
@@ -111,7 +115,7 @@ class SliceReader:
             return None
         scale = self.rays.scale(place.distance + depth)
         first, part = _taps(self.window.down * scale, place.shape[1], place.spacing[1])
-        # Rows come in the order of their voxels.
+        # The voxel index rises with the row of rays, so that the occupied rows are one range.
         limits = first.new_tensor([band.start * BRICK, band.stop * BRICK])
         start, stop = (int(row) for row in torch.searchsorted(first, limits))
         if start >= stop:
@@ -121,9 +125,9 @@ class SliceReader:
         if isinstance(length, Tensor):
             mask = mask & (length > 0).flatten()
         left, share = _taps(self.window.across * scale, place.shape[2], place.spacing[2])
-        lines = mixed(self._slice(k, index - k), left, share, -1)
+        lines = interpolate(self._slice(k, index - k), left, share, -1)
         first, part = first[start:stop], part[start:stop]
-        values = mixed(lines[:1], first, part, -2).flatten(1)
+        values = interpolate(lines[:1], first, part, -2).flatten(1)
         rays = _visible(mask, values[0], self.support)
         if not rays.numel():
             return None
@@ -139,12 +143,9 @@ class SliceReader:
 
 
 class PointReader:
-    """Reads a volume that is turned, point by point with ``grid_sample``.
+    """Reads a rotated volume point by point with ``grid_sample``.
 
-    Args:
-        fields: All channels, [c, D, H, W]; the first one is the value.
-        occupied: As for :class:`SliceReader`.
-        support: Likewise.
+    Arguments as for :class:`SliceReader`, but ``fields`` holds all channels, [c, D, H, W].
     """
 
     def __init__(
@@ -163,22 +164,22 @@ class PointReader:
         """As :meth:`SliceReader.read`."""
         place, window = self.place, self.window
         length = window.length(low, high, slice(None))
-        assert isinstance(length, Tensor)  # only straight volumes have one length for all
+        assert isinstance(length, Tensor)  # one length for all rays occurs only without rotation
         length = length.flatten()
         rays = (alive & (length > 0)).nonzero().flatten()
         down, across = place.offsets(self.rays, place.distance + (low + high) / 2, window.down, window.across)
-        # In samples from the middle one.
+        # In samples, counted from the centre.
         spacing = down.new_tensor(place.spacing)
         down, across = ((offset / spacing).to(self.fields.dtype) for offset in (down, across))
         row = torch.div(rays, len(window.columns), rounding_mode="floor")
         points = down.index_select(0, row) + across.index_select(0, rays - row * len(window.columns))
         if self.occupied is not None:
-            seen = self._in_bricks(points)
-            rays, points = rays[seen], points.index_select(0, seen)
+            visible = self._in_bricks(points)
+            rays, points = rays[visible], points.index_select(0, visible)
         if not rays.numel():
             return None
         ends = points.new_tensor([max(1, n - 1) / 2 for n in place.shape])
-        # align_corners: -1 and 1 are the first and the last sample; axes in the order (x, y, z).
+        # With align_corners the coordinates -1 and 1 are the first and the last sample; the order is (x, y, z).
         samples = torch.nn.functional.grid_sample(
             self.fields[None], (points / ends).flip(-1)[None, None, None], padding_mode="border", align_corners=True
         )[0, :, 0, 0]
@@ -197,7 +198,7 @@ class PointReader:
 
 
 def occupied_box(occupied: Tensor, shape: tuple[int, int, int]) -> tuple[list[float], list[float]] | None:
-    """Smallest box of index coordinates with all occupied bricks, out to the faces of the volume; None if none is."""
+    """Bounding box of all occupied bricks in index coordinates, within the volume; None if all are empty."""
     low, high = [], []
     for axis, n in enumerate(shape):
         others = [other for other in range(3) if other != axis]
@@ -209,20 +210,21 @@ def occupied_box(occupied: Tensor, shape: tuple[int, int, int]) -> tuple[list[fl
     return low, high
 
 
-def _band(seen: Tensor) -> range | None:
-    places = seen.nonzero().flatten().tolist()
-    return range(places[0], places[-1] + 1) if places else None
+def _band(occupied: Tensor) -> range | None:
+    """Range from the first to the last true element, or None."""
+    indices = occupied.nonzero().flatten().tolist()
+    return range(indices[0], indices[-1] + 1) if indices else None
 
 
 def _taps(offsets: Tensor, count: int, spacing: float) -> tuple[Tensor, Tensor]:
-    """First of two neighbouring samples [n] and the share of the second [n], for offsets from the middle in metres."""
+    """First of two neighbouring samples [n] and weight of the second [n], for offsets from the centre in metres."""
     index = (offsets / spacing + (count - 1) / 2).clamp(0, count - 1)
     first = index.floor().clamp_(max=max(0, count - 2)).to(torch.int64)
     return first, index - first
 
 
-def mixed(values: Tensor, first: Tensor, share: Tensor, axis: int) -> Tensor:
-    """Linear interpolation of ``values`` along ``axis`` (-2 or -1) between samples ``first`` [n] and the next ones."""
+def interpolate(values: Tensor, first: Tensor, share: Tensor, axis: int) -> Tensor:
+    """Linear interpolation along ``axis`` (-2 or -1); ``share`` [n] is the weight of the sample after ``first`` [n]."""
     one = values.index_select(axis, first)
     if values.shape[axis] == 1:
         return one
@@ -232,17 +234,17 @@ def mixed(values: Tensor, first: Tensor, share: Tensor, axis: int) -> Tensor:
 
 
 def _between_rows(lines: Tensor, first: Tensor, share: Tensor, rays: Tensor) -> Tensor:
-    """As :func:`mixed` along the rows of ``lines`` [c, n, w], for some ``rays`` [m] (flat in [h, w]) only: [c, m]."""
+    """As :func:`interpolate` along axis -2 of ``lines`` [c, n, w], for ``rays`` [m] (flat in [h, w]) only: [c, m]."""
     width = lines.shape[2]
     row = torch.div(rays, width, rounding_mode="floor")
-    place = rays + (first.index_select(0, row) - row) * width
-    following = place + width if lines.shape[1] > 1 else place
+    index = rays + (first.index_select(0, row) - row) * width
+    following = index + width if lines.shape[1] > 1 else index
     lines, share = lines.flatten(1), share.to(lines.dtype).index_select(0, row)
-    return torch.lerp(lines.index_select(1, place), lines.index_select(1, following), share)
+    return torch.lerp(lines.index_select(1, index), lines.index_select(1, following), share)
 
 
 def _visible(mask: Tensor | None, values: Tensor, support: tuple[float, float]) -> Tensor:
-    """Where ``mask`` holds and the values have an opacity, as flat indices."""
+    """Flat indices at which ``mask`` is true and the value lies within ``support``, where opacity is above zero."""
     low, high = support
     values = values.detach()
     if low > -math.inf:

@@ -1,4 +1,4 @@
-"""DVRSampler: direct volume rendering that ends in light sources on planes (Section 5.3.1, Algorithm 3)."""
+"""DVRSampler: direct volume rendering to light sources on planes (Section 5.3.1, Algorithm 3)."""
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -20,46 +20,50 @@ from holotorch.scene.transfer import TransferFunction
 from holotorch.scene.volume import Volume
 
 PhaseMaps = Tensor | PointPhases
-_LOST = 1e-3  # of the visible depth
+_LOST = 1e-3  # fraction of the visible depth range outside the slabs from which a warning is issued
 
 
 class DVRSampler(nn.Module):
-    """Light sources of a volume: rays are composited front to back, and what every step adds becomes a source.
+    """Light sources of a volume: each ray is composited front to back, and each step becomes a source on a plane.
 
-    A ray gains C_j = T_j alpha_j c_j on plane j (Eq. 5.6), with colour and opacity of the transfer function half-way
-    through the plane's slab and the opacity corrected for the length of the path within slab and volume. So a
-    homogeneous medium is exact for any planes, and the error elsewhere falls with the square of the slabs' thickness.
-    The source stands on the plane; its amplitude is the root of C_j.
+    A ray contributes C_j = T_j alpha_j c_j on plane j (Eq. 5.6). Colour and opacity are those of the transfer function
+    half-way through the slab of the plane; the opacity is corrected for the path length within slab and volume. A
+    homogeneous medium is therefore exact for any planes; elsewhere the error falls with the square of the slab
+    thickness. The source lies on the plane, and its amplitude is the square root of C_j.
 
-    Slabs meet half-way between planes; the outermost reach as far beyond their plane as before it, and a single plane
-    stands for the whole volume. Beyond its faces a volume is transparent; what the slabs leave out is announced by a
-    SamplingWarning.
+    Slabs meet half-way between planes. The outermost slabs extend equally far on both sides of their plane; a single
+    plane stands for the whole volume. Outside its faces the volume is transparent. A SamplingWarning is issued where
+    the slabs leave out a visible part of the volume.
 
-    Rays are parallel to the axis, or with ``eye`` come from a point on it. Then they pass the grid's points on the
-    first plane and spread from there: every ray keeps its own transmittance, and its sources, which lie between the
-    grid's points on the other planes, are put where they belong by linear interpolation of the radiance onto the grid,
-    along each axis. Light beyond the grid is cut off. ``phase`` belongs to the points of the grid, not to such rays.
+    Rays are parallel to the axis, or start at a point on it (``eye``). In the second case they pass through the points
+    of the grid on the first plane and diverge from there: each ray keeps its own transmittance, and on the other
+    planes, where its sources lie between the points of the grid, the radiance is interpolated linearly onto the grid
+    along each axis. Light beyond the grid is cut off. ``phase`` belongs to the points of the grid, not to the rays.
 
-    Places without opacity are skipped by bricks of the volume, and rays end below a transmittance of ``early``, which
-    is the most that an image can lose. Both change nothing else.
+    Transparent bricks of the volume are skipped, and a ray ends below a transmittance of ``early``, which bounds the
+    resulting error of an image.
 
     Args:
-        transfer: Colour and opacity of the volume's values.
-        rays: Their grid, centred on the axis, the same on all planes.
-        depths: Of the planes, metres from the hologram, front (towards the observer) to back: rising or falling.
-        width: Metres of the volume's longest side, whatever its own unit.
-        distance: Of the volume's centre from the hologram; half-way between first and last plane by default.
-        rotation: 3 x 3 over (z, y, x), about the volume's centre: offset in the scene = rotation @ offset in the
-            volume. Index 0 of z is nearest to the hologram without it.
-        eye: Depth of the observer, in front of all slabs (negative: on the other side of the hologram); None: far away.
-        lighting: Shading by the gradient of the volume; None: all points glow evenly.
-        phase: Grid -> phases in radians, [h, w] for every ray, or ``PointPhases``; see ``phases``. None: 0.
+        transfer: Colour and opacity of the values of the volume.
+        rays: Grid of the rays, centred on the axis, the same on all planes.
+        depths: Distances of the planes from the hologram in metres, front (towards the observer) to back: rising or
+            falling.
+        width: Length of the longest side of the volume in metres, whatever its unit.
+        distance: Distance of the centre of the volume from the hologram in metres; by default half-way between the
+            first and the last plane.
+        rotation: 3 x 3 over (z, y, x), about the centre of the volume: offset in the scene = rotation @ offset in the
+            volume. Without it, index 0 of z is nearest to the hologram.
+        eye: Depth of the observer in metres, in front of all slabs (negative on the other side of the hologram); None
+            for an observer at infinity.
+        lighting: Shading by the gradient of the volume; None for emission without shading.
+        phase: Function from the grid to phases in radians, [h, w] for every ray, or ``PointPhases``; see ``phases``.
+            None for a phase of 0.
         early: Transmittance below which a ray ends, in [0, 1).
-        boundaries: Of the slabs, [D + 1], if they are not half-way between the planes.
+        boundaries: Boundaries of the slabs in metres, [D + 1], if they are not half-way between the planes.
 
     Raises:
-        TypeError: An argument of another kind.
-        ValueError: Planes that do not follow one another, an eye among them, or another number out of range.
+        TypeError: An argument of a wrong type.
+        ValueError: Depths that are not monotonic, an eye that is not in front, or another number out of range.
     """
 
     def __init__(
@@ -90,7 +94,7 @@ class DVRSampler(nn.Module):
         self.early = float(early)
 
     def forward(self, volume: Volume) -> SourceLayers:
-        """Light sources of ``volume``, composited plane by plane when they are asked for.
+        """Light sources of ``volume``; the planes are composited one by one as the result is iterated.
 
         Raises:
             ValueError: A voxel is NaN or infinite, or the eye is not in front of the slabs.
@@ -98,21 +102,24 @@ class DVRSampler(nn.Module):
         march = self._march(volume)
         maps = self.phase(self.grid) if self.phase is not None else None
         common = maps.to(march.device, march.dtype) if isinstance(maps, Tensor) else None
-        own = maps if isinstance(maps, PointPhases) else None
-        turns = None if own is None else phasor(own.phase.to(march.device, march.dtype))
+        per_point = maps if isinstance(maps, PointPhases) else None
+        factors = None if per_point is None else phasor(per_point.phase.to(march.device, march.dtype))
 
         def amplitudes() -> Iterator[Tensor]:
             for plane, amplitude in enumerate(march.planes(safe_sqrt)):
-                yield amplitude if own is None or turns is None else _turned(amplitude, own.window(turns, plane))
+                if per_point is None or factors is None:
+                    yield amplitude
+                else:
+                    yield _with_phase(amplitude, per_point.window(factors, plane))
 
         return SourceLayers(self.grid, self.depths, 3, amplitudes, common)
 
     def render(self, volume: Volume, rays: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Picture of ``volume`` as the rays see it: the sum of all contributions.
+        """Rendered picture of ``volume``: the sum of all contributions along each ray.
 
         Args:
             volume: Scalar field.
-            rays: Which ones to follow, bool [h, w]; the others stay black. All by default.
+            rays: Mask of the rays to follow, bool [h, w]; the others stay black. All by default.
 
         Returns:
             Red, green, blue [3, h, w] and opacity [h, w], 1 - T behind the last plane; differentiable.
@@ -125,20 +132,20 @@ class DVRSampler(nn.Module):
         return march.whole(image), march.whole(opacity)[0]
 
     def depth_map(self, volume: Volume) -> Tensor:
-        """Mean depth in metres of what a ray sees, [h, w], weighted by its share in opacity; 0 where it sees none."""
+        """Mean depth in metres along each ray, [h, w], weighted by the contributions to opacity; 0 without opacity."""
         march = self._march(volume)
         sums = march.zeros(2)
         for step in march.steps(None):
             sums.index_add_(1, step.rays, torch.stack([step.weight, step.weight * self.depths[step.plane]]))
-        seen = sums[0] > 0
-        return march.whole((sums[1] / torch.where(seen, sums[0], 1) * seen)[None])[0]
+        visible = sums[0] > 0
+        return march.whole((sums[1] / torch.where(visible, sums[0], 1) * visible)[None])[0]
 
     def _march(self, volume: Volume) -> March:
         if not isinstance(volume, Volume):
             raise TypeError(f"volume must be a Volume, got {type(volume).__name__}; use Volume(values, spacing, unit)")
         volume, rotation = upright(volume, self.rotation)
         place = Placement.of(volume, self.width, self.distance, rotation)
-        spans = slabs(self.depths, self.boundaries, place.reach())
+        spans = slabs(self.depths, self.boundaries, place.depth_range())
         near, far = min(span[0] for span in spans), max(span[1] for span in spans)
         if self.eye is not None:
             falling = self.depths[-1] < self.depths[0] or (len(self.depths) == 1 and self.eye > self.depths[0])
@@ -156,15 +163,16 @@ class DVRSampler(nn.Module):
         lost = (max(0.0, min(near, end) - start) + max(0.0, end - max(far, start))) / (end - start)
         if lost > _LOST:
             warnings.warn(
-                f"the planes' slabs reach from {near:g} to {far:g} m, but there is something to see from {start:g} to "
-                f"{end:g} m: {lost:.0%} of that depth is cut off; add planes, or pass boundaries to cut on purpose",
+                f"the slabs of the planes extend from {near:g} to {far:g} m, but the visible part of the volume from "
+                f"{start:g} to {end:g} m: {lost:.0%} of that depth is cut off; add planes, or pass boundaries to cut "
+                "on purpose",
                 checks.SamplingWarning,
                 stacklevel=4,
             )
 
 
-def _turned(amplitude: Tensor, turn: Tensor) -> Tensor:
-    """Real [C, h, w] times complex [h, w], without making the real one complex first."""
+def _with_phase(amplitude: Tensor, factor: Tensor) -> Tensor:
+    """Real [C, h, w] times complex [h, w], without a complex copy of the real one."""
     if not any(amplitude.stride()):
-        return amplitude[0, 0, 0].to(turn.dtype).expand(amplitude.shape)  # a dark plane stays a single zero
-    return torch.view_as_complex(amplitude[..., None] * torch.view_as_real(turn))
+        return amplitude[0, 0, 0].to(factor.dtype).expand(amplitude.shape)  # a dark plane stays a single zero
+    return torch.view_as_complex(amplitude[..., None] * torch.view_as_real(factor))

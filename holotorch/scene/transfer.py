@@ -1,4 +1,4 @@
-"""TransferFunction: which colour and opacity a scalar gets."""
+"""TransferFunction: colour and opacity as functions of a scalar."""
 
 import math
 from collections.abc import Sequence
@@ -14,16 +14,16 @@ Numbers = Tensor | Sequence[float]
 class TransferFunction(nn.Module):
     """Piecewise-linear colour and opacity over the values of a volume; constant beyond the first and last position.
 
-    ``colours`` and ``opacities`` are parameters without gradient: ``transfer.requires_grad_()`` makes them learnable
-    (samplers then evaluate transparent places too, which they skip otherwise). Values outside [0, 1] count as 0 or 1
-    and have gradient 0; :meth:`clip_` after a step of an optimiser puts them back, so that none is stuck there.
+    ``colours`` and ``opacities`` are parameters without gradient; ``transfer.requires_grad_()`` makes them learnable
+    (samplers then also evaluate transparent regions, which they skip otherwise). Values outside [0, 1] count as 0 or 1
+    and have gradient 0; call :meth:`clip_` after each optimiser step, so that no value stays outside.
 
     Args:
-        positions: In the volume's own values, rising, shape [K], K >= 2.
-        colours: Red, green, blue in [0, 1], shape [K, 3]: what an opaque point radiates.
-        opacities: In [0, 1], shape [K]: the part of the light that is held back along ``unit_distance``.
-        unit_distance: As a fraction of the volume's width (its longest side), whatever the size at which it is placed:
-            the same picture at 8 mm and at 30 cm. 1 / 256 is a voxel of a cube of 256 voxels.
+        positions: Values of the volume, rising, shape [K], K >= 2.
+        colours: Red, green, blue in [0, 1], shape [K, 3]: radiance of an opaque point.
+        opacities: In [0, 1], shape [K]: fraction of the light that is absorbed along ``unit_distance``.
+        unit_distance: As a fraction of the longest side of the volume, so that the picture does not depend on the size
+            at which the volume is placed. 1 / 256 is a voxel of a cube of 256 voxels.
 
     Raises:
         TypeError: Not numbers.
@@ -41,53 +41,52 @@ class TransferFunction(nn.Module):
         unit_distance: float,
     ):
         super().__init__()
-        places, colour, opacity = (
-            _table("positions", positions),
-            _table("colours", colours),
-            _table("opacities", opacities),
+        position, colour, opacity = (
+            _table(name, values)
+            for name, values in (("positions", positions), ("colours", colours), ("opacities", opacities))
         )
-        count = places.numel()
-        if places.ndim != 1 or count < 2:
-            raise ValueError(f"positions must be a list of at least 2 values, got shape {tuple(places.shape)}")
+        count = position.numel()
+        if position.ndim != 1 or count < 2:
+            raise ValueError(f"positions must be a list of at least 2 values, got shape {tuple(position.shape)}")
         if tuple(colour.shape) != (count, 3):
             raise ValueError(f"colours must be (K, 3) = {(count, 3)}, one per position, got {tuple(colour.shape)}")
         if tuple(opacity.shape) != (count,):
             raise ValueError(f"opacities must be (K,) = {(count,)}, one per position, got {tuple(opacity.shape)}")
         for name, values in (("colours", colour), ("opacities", opacity)):
             if values.detach().min() < 0 or values.detach().max() > 1:
-                found = values.detach().aminmax()
-                raise ValueError(f"{name} must lie in [0, 1], got {found.min.item():g} to {found.max.item():g}")
-        falls = (places.diff() <= 0).nonzero()
+                ends = values.detach().aminmax()
+                raise ValueError(f"{name} must lie in [0, 1], got {ends.min.item():g} to {ends.max.item():g}")
+        falls = (position.diff() <= 0).nonzero()
         if falls.numel():
             k = int(falls[0])
-            raise ValueError(f"positions must rise, got {places[k].item():g} before {places[k + 1].item():g}")
+            raise ValueError(f"positions must rise, got {position[k].item():g} before {position[k + 1].item():g}")
         self.unit_distance = checks.positive("unit_distance", unit_distance, "widths of the volume")
-        self.register_buffer("positions", places)
+        self.register_buffer("positions", position)
         self.colours = nn.Parameter(colour, requires_grad=False)
         self.opacities = nn.Parameter(opacity, requires_grad=False)
 
     def forward(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Colour [3, ...] and opacity [...] per unit distance of ``values`` [...], in the wider of the two precisions.
+        """Colour [3, ...] and opacity [...] per unit distance for ``values`` [...].
 
-        Colour and opacity share one search. Differentiable to the values too; at a position itself the slope is that of
-        the interval above it.
+        The result has the higher precision of the values and the table. It is differentiable in the values, too; at a
+        position the derivative is that of the interval above it.
         """
         dtype = self.colours.dtype
         if values.is_floating_point():
             dtype = torch.promote_types(dtype, values.dtype)
-        values, places = values.to(dtype), self.positions.to(dtype)
-        interval = torch.bucketize(values.detach(), places[1:-1], right=True, out_int32=True)
+        values, positions = values.to(dtype), self.positions.to(dtype)
+        interval = torch.bucketize(values.detach(), positions[1:-1], right=True, out_int32=True)
         table = torch.cat([self.colours.T, self.opacities[None]]).clamp(0, 1).to(dtype)
         flat = interval.reshape(-1)
-        place = ((values - places[:-1][interval]) * (1 / places.diff())[interval]).clamp(0, 1)
+        fraction = ((values - positions[:-1][interval]) * (1 / positions.diff())[interval]).clamp(0, 1)
         start, step = (part.index_select(1, flat).reshape(4, *values.shape) for part in (table[:, :-1], table.diff()))
-        found = torch.addcmul(start, step, place)
-        return found[:3], found[3]
+        result = torch.addcmul(start, step, fraction)
+        return result[:3], result[3]
 
     def visible(self, low: Tensor, high: Tensor) -> Tensor:
-        """Whether any value between ``low`` and ``high`` [...] is not perfectly transparent, as bool [...].
+        """Whether any value between ``low`` and ``high`` [...] is not fully transparent, bool [...].
 
-        Everything is as long as the opacities are to be learned, for a transparent value has a gradient.
+        True everywhere while the opacities are learnable, since transparent values then have a gradient.
         """
         if self.opacities.requires_grad:
             return torch.ones_like(low, dtype=torch.bool)
@@ -100,18 +99,18 @@ class TransferFunction(nn.Module):
         return between | (self.forward(low)[1] > 0) | (self.forward(high)[1] > 0)
 
     def support(self) -> tuple[float, float]:
-        """Values up to the first of these two numbers and from the second on are perfectly transparent."""
+        """Two numbers: values up to the first and from the second on are fully transparent."""
         if self.opacities.requires_grad:
             return -math.inf, math.inf
-        seen = (self.opacities.detach() > 0).nonzero().flatten().tolist()
-        if not seen:
+        visible = (self.opacities.detach() > 0).nonzero().flatten().tolist()
+        if not visible:
             return math.inf, -math.inf
-        places = [-math.inf, *self.positions.tolist(), math.inf]
-        return places[seen[0]], places[seen[-1] + 2]
+        positions = [-math.inf, *self.positions.tolist(), math.inf]
+        return positions[visible[0]], positions[visible[-1] + 2]
 
     @torch.no_grad()
     def clip_(self) -> None:
-        """Put colours and opacities back into [0, 1]."""
+        """Clip colours and opacities to [0, 1]."""
         self.colours.clamp_(0, 1)
         self.opacities.clamp_(0, 1)
 

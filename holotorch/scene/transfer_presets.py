@@ -1,4 +1,4 @@
-"""Ready transfer functions, and those that ParaView and 3D Slicer save as JSON."""
+"""Transfer functions for common materials, and import of those that ParaView and 3D Slicer save as JSON."""
 
 import json
 import sys
@@ -9,10 +9,10 @@ import numpy as np
 from holotorch.core import checks
 from holotorch.scene.transfer import TransferFunction
 
-UNIT_DISTANCE = 0.01  # of the volume's width
-_STEP = 1e-6  # of the range of positions, the width given to a jump
+UNIT_DISTANCE = 0.01  # fraction of the longest side of the volume
+_STEP = 1e-6  # width of the slope that replaces a jump, as a fraction of the range of positions
 
-# Position between the two given values, red, green, blue, opacity.
+# Rows of the tables: position from 0 (``low``) to 1 (``high``), red, green, blue, opacity.
 _BONE = [
     (0.00, 0.50, 0.10, 0.08, 0.00),
     (0.32, 0.60, 0.22, 0.16, 0.00),
@@ -45,7 +45,7 @@ _INDUSTRIAL = [
 
 
 def bone(low: float, high: float, *, unit_distance: float = UNIT_DISTANCE) -> TransferFunction:
-    """Bone in computed tomography: ivory, what is softer transparent. ``low`` is air, ``high`` the densest bone."""
+    """Ivory bone in computed tomography; softer tissue is transparent. ``low`` is air, ``high`` the densest bone."""
     return _scaled(_BONE, low, high, unit_distance)
 
 
@@ -55,7 +55,7 @@ def soft_tissue(low: float, high: float, *, unit_distance: float = UNIT_DISTANCE
 
 
 def vessels(low: float, high: float, *, unit_distance: float = UNIT_DISTANCE) -> TransferFunction:
-    """Vessels filled with contrast agent, red; ``low`` is what surrounds them, ``high`` the brightest vessel."""
+    """Vessels filled with contrast agent, red; ``low`` is the surrounding tissue, ``high`` the brightest vessel."""
     return _scaled(_VESSELS, low, high, unit_distance)
 
 
@@ -69,17 +69,17 @@ def transfer_from_json(text: str, *, unit_distance: float = UNIT_DISTANCE) -> Tr
 
     ParaView: the first map of the list, ``RGBPoints`` [x, r, g, b, ...] and ``Points`` [x, opacity, midpoint,
     sharpness, ...]. 3D Slicer (volume property, schema 1): the first component's ``rgbTransferFunction`` and
-    ``scalarOpacity``. Colours and opacities keep their own positions, both are piecewise linear between all of them; a
-    jump becomes a slope over a millionth of the range. Lighting is left out.
+    ``scalarOpacity``. The positions of colours and opacities are merged; both are piecewise linear between them. A jump
+    becomes a slope over a millionth of the range. Lighting is ignored.
 
     Args:
-        text: Of the file.
-        unit_distance: Of the opacities, as a fraction of the volume's width. Neither file can tell: Slicer's
-            ``scalarOpacityUnitDistance`` is in millimetres of a volume that it does not name.
+        text: Content of the file.
+        unit_distance: Unit distance of the opacities, as a fraction of the longest side of the volume. Neither format
+            states it: ``scalarOpacityUnitDistance`` of Slicer is in millimetres of a volume of unknown size.
 
     Raises:
-        ValueError: No such file, or something in it that a piecewise-linear function of one scalar cannot do; names
-            the field.
+        ValueError: Another format, or a feature that a piecewise-linear function of one scalar cannot represent; the
+            message names the field.
     """
     try:
         content = json.loads(text)
@@ -96,13 +96,13 @@ def transfer_from_json(text: str, *, unit_distance: float = UNIT_DISTANCE) -> Tr
             f"'volumeProperties', got {_kind(first)}"
         )
     positions = np.union1d(colours[0], opacities[0])
-    found = np.stack([np.interp(positions, colours[0], channel) for channel in colours[1].T], -1)
+    colour = np.stack([np.interp(positions, colours[0], channel) for channel in colours[1].T], -1)
     opacity = np.interp(positions, opacities[0], opacities[1][:, 0])
-    return TransferFunction(positions.tolist(), found.tolist(), opacity.tolist(), unit_distance=unit_distance)
+    return TransferFunction(positions.tolist(), colour.tolist(), opacity.tolist(), unit_distance=unit_distance)
 
 
 Curve = tuple[np.ndarray, np.ndarray]  # positions [K] that rise, values [K, n]
-Point = tuple[str, float, list[float], float, float]  # its name, position, values, midpoint, sharpness
+Point = tuple[str, float, list[float], float, float]  # name in messages, position, values, midpoint, sharpness
 
 
 def _paraview(content: dict[str, Any]) -> tuple[Curve, Curve]:
@@ -135,7 +135,7 @@ def _points(where: str, component: dict[str, Any], key: str) -> list[Point]:
     function = component.get(where.rsplit(".", 1)[1])
     if not isinstance(function, dict):
         raise ValueError(f"{where} must be an object with 'points', got {_kind(function)}")
-    found: list[Point] = []
+    points: list[Point] = []
     for k, point in enumerate(_objects(f"{where}.points", function.get("points"))):
         name = f"{where}.points[{k}]"
         value = point.get(key) if key == "color" else [point.get(key)]
@@ -145,22 +145,22 @@ def _points(where: str, component: dict[str, Any], key: str) -> list[Point]:
             _number(f"{name}.{part}", point.get(part, usual))
             for part, usual in (("x", None), ("midpoint", 0.5), ("sharpness", 0.0))
         )
-        found.append((name, x, [_number(f"{name}.{key}", part) for part in value], middle, sharp))
-    return found
+        points.append((name, x, [_number(f"{name}.{key}", part) for part in value], middle, sharp))
+    return points
 
 
 def _curve(where: str, points: list[Point]) -> Curve:
-    """Positions and values, with a point more where a midpoint is not in the middle, and no two at one position."""
-    places: list[float] = []
+    """Distinct positions and their values, with an additional point where a midpoint is not half-way."""
+    positions: list[float] = []
     values: list[list[float]] = []
     for k, (name, x, value, middle, sharp) in enumerate(points):
-        # Positions are kept in single precision: what is apart here must be apart there.
+        # The transfer function stores float32, in which positions must be distinct, too.
         x = float(np.float32(x))
         if k and x < float(np.float32(points[k - 1][1])):
             raise ValueError(f"{name} must not lie below the one before, got {points[k - 1][1]:g} before {x:g}")
         if min(value) < 0 or max(value) > 1:
             raise ValueError(f"{name} must hold colours and opacities in [0, 1], got {value}")
-        places.append(x)
+        positions.append(x)
         values.append(value)
         if k + 1 == len(points):
             break
@@ -170,24 +170,24 @@ def _curve(where: str, points: list[Point]) -> Curve:
             raise ValueError(f"{name} must have its midpoint between 0 and 1, got {middle:g}")
         if middle != 0.5:
             _, following, other, _, _ = points[k + 1]
-            places.append(float(np.float32(x + middle * (following - x))))
+            positions.append(float(np.float32(x + middle * (following - x))))
             values.append([(one + two) / 2 for one, two in zip(value, other, strict=True)])
-    span = places[-1] - places[0]
+    span = positions[-1] - positions[0]
     if span == 0:
-        raise ValueError(f"{where} must hold at least two different positions, got {places[0]:g} only")
-    for k in range(1, len(places)):
-        least = np.float32(places[k - 1] + _STEP * span)
-        if places[k] < least:
-            places[k] = float(max(least, np.nextafter(np.float32(places[k - 1]), np.float32(np.inf))))
-    return np.array(places), np.array(values)
+        raise ValueError(f"{where} must hold at least two different positions, got {positions[0]:g} only")
+    for k in range(1, len(positions)):
+        least = np.float32(positions[k - 1] + _STEP * span)
+        if positions[k] < least:
+            positions[k] = float(max(least, np.nextafter(np.float32(positions[k - 1]), np.float32(np.inf))))
+    return np.array(positions), np.array(values)
 
 
 def _fours(name: str, content: dict[str, Any]) -> list[tuple[str, list[float]]]:
     numbers = _list(name, content.get(name))
     if len(numbers) % 4:
         raise ValueError(f"{name} must hold four numbers per point, got {len(numbers)} in all")
-    found = [_number(f"{name}[{k}]", number) for k, number in enumerate(numbers)]
-    return [(f"{name}[{k}:{k + 4}]", found[k : k + 4]) for k in range(0, len(found), 4)]
+    values = [_number(f"{name}[{k}]", number) for k, number in enumerate(numbers)]
+    return [(f"{name}[{k}:{k + 4}]", values[k : k + 4]) for k in range(0, len(values), 4)]
 
 
 def _list(name: str, value: Any) -> list[Any]:

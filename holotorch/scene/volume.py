@@ -1,4 +1,4 @@
-"""Volume: a scalar sampled on a box, with the size of the box."""
+"""Volume: a scalar field sampled on a box, with its spacing."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -11,25 +11,25 @@ from holotorch.core.quantities import VOXEL
 
 Triple = tuple[float, float, float]
 IDENTITY: tuple[Triple, Triple, Triple] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-_SLAB = 1 << 22  # samples looked at together: tens of megabytes of temporaries, whatever the volume's size
-_RIGHT_ANGLE = 1e-3  # direction cosines are printed to three digits or more
+_SLAB = 1 << 22  # samples processed at once, which bounds temporary memory to tens of megabytes
+_RIGHT_ANGLE = 1e-3  # tolerance of direction cosines, which files give with three digits or more
 
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Samples of a scalar on a box, axes (z, y, x) throughout.
+    """Samples of a scalar field on a box, with axes in the order (z, y, x).
 
     Attributes:
-        values: Real [D, H, W], in the type of the file: a uint8 volume stays uint8. May be a memory-mapped file.
+        values: Real [D, H, W], in the dtype of the file: a uint8 volume stays uint8. May be a memory-mapped file.
         spacing: Distance between samples along (z, y, x), in ``unit``.
-        unit: "m", or "relative": such a volume has proportions, but no size until it is placed in a scene.
-        origin: Position of sample [0, 0, 0] along the world's (z, y, x), in ``unit``. Kept as read.
-        orientation: Directions of the axes z, y, x as unit rows of (z, y, x) components in the world. Kept as read.
+        unit: "m", or "relative" for a volume that has proportions but no size until it is placed in a scene.
+        origin: World position (z, y, x) of sample [0, 0, 0], in ``unit``, as the file states it.
+        orientation: World directions of the axes z, y, x, as unit rows of (z, y, x), as the file states them.
 
     Raises:
-        TypeError: ``values`` is no real tensor, or a spacing no number.
-        ValueError: Not three axes, no voxel, a spacing that is not finite and positive, another unit, or axes that do
-            not stand at right angles.
+        TypeError: ``values`` is not a real tensor, or a spacing is not a number.
+        ValueError: Not three axes, no voxel, a spacing that is not finite and positive, another unit, or axes that are
+            not at right angles.
     """
 
     values: Tensor
@@ -62,7 +62,7 @@ class Volume:
 
     @property
     def extent(self) -> Triple:
-        """Size (z, y, x) in ``unit``, a whole spacing per voxel."""
+        """Size (z, y, x) in ``unit``, one spacing per voxel."""
         (depth, height, width), (z, y, x) = self.shape, self.spacing
         return depth * z, height * y, width * x
 
@@ -75,19 +75,19 @@ class Volume:
         return least, most
 
     def check_finite(self) -> None:
-        """Raise ValueError naming the first NaN or infinite voxel and their number; integers need no look."""
+        """Raise ValueError with the position of the first NaN or infinite voxel and their number, if there are any."""
         if not self.values.is_floating_point():
             return
         first, count = "", 0
         for start, slab in self._slabs():
             bad = ~torch.isfinite(slab)
-            found = int(bad.sum())
-            if found and not count:
-                # argmax of bytes is the first one; nonzero would list them all.
-                place = int(bad.flatten().to(torch.uint8).argmax())
-                z, y, x = (int(i) for i in torch.unravel_index(torch.tensor(place), slab.shape))
+            bad_voxels = int(bad.sum())
+            if bad_voxels and not count:
+                # argmax gives the first one without the memory that nonzero takes for all.
+                index = bad.flatten().to(torch.uint8).argmax()
+                z, y, x = (int(i) for i in torch.unravel_index(index, slab.shape))
                 first = f"voxel (z, y, x) = ({start + z}, {y}, {x}) is {slab[z, y, x].item()}"
-            count += found
+            count += bad_voxels
         if count:
             raise ValueError(
                 f"volume must be finite, but {first} ({count} of {self.values.numel()} in all); repair it first, for "
@@ -97,9 +97,10 @@ class Volume:
     def bricks(self, size: int = 16) -> Tensor:
         """Smallest and largest value of every brick, [2, ceil(D / size), ceil(H / size), ceil(W / size)].
 
-        Brick b holds the samples from b ``size`` to (b + 1) ``size``, both included: trilinear interpolation at index
-        coordinates within [b size, (b + 1) size] never leaves the two. So the brick of a position between 0 and n - 1
-        is floor(position / size) along every axis. In the type of the values (int64 for unsigned ones above 8 bits).
+        Brick b holds the samples from b ``size`` to (b + 1) ``size``, both included, so that a value interpolated
+        linearly at an index coordinate within these limits lies between the smallest and the largest of the brick. The
+        brick of a position is floor(position / size) along every axis. The dtype is that of the values, or int64 for
+        unsigned integers above 8 bits.
 
         Raises:
             ValueError: A voxel is NaN or infinite, as from :meth:`check_finite`.

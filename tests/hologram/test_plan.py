@@ -56,7 +56,7 @@ def test_what_no_way_reaches_is_refused():
 def test_borders_of_validity_are_said():
     cone = 2 * 30e-6 * math.tan(math.asin(WAVE / 2 / PITCH)) / PITCH
     close = plan_hologram(Grid(32, PITCH), WAVE, [30e-6], (32, 32))
-    assert f"covers {cone:.2g} pixels" in close.notes[0] and "rim of the cone of light" in close.notes[1]
+    assert f"covers {cone:.2g} pixels" in close.notes[0] and "edge of the cone of light" in close.notes[1]
     assert plan_hologram(Grid(32, PITCH), WAVE, [0.1], (32, 32)).notes == ()
     fine = plan_hologram(Grid(16, 0.2e-6), WAVE, [5e-6], (8, 8), cone="box")
     assert any("half a wavelength" in note for note in fine.notes)
@@ -75,7 +75,7 @@ def test_definitions_agree_to_the_tolerance_where_the_plan_says_so(tolerance):
         assert plan.near or error < 1.5 * tolerance
         if depth < 14e-3:
             assert plan.near and error > 0.04
-            assert "definitions of it may differ by more than the tolerance" in plan.notes[0]
+            assert "its definitions may differ by more than the tolerance" in plan.notes[0]
     assert near[16e-3] and near[20e-3] == (tolerance < 1e-3)
 
 

@@ -23,21 +23,20 @@ def centred_unitary_dft(shape):
 
 
 def spectral_filter(shape, transfer, out_shape=None):
-    """Zero-pad to the transfer function's size, DFT, multiply, inverse DFT, crop; as one matrix."""
-    (h, w), (big_h, big_w) = shape, transfer.shape
-    out_h, out_w = out_shape or shape
+    """Zero-pad to the transfer function's size, DFT, multiply, inverse DFT, crop to ``out_shape``; as one matrix."""
+    (h, w), (big_h, big_w), (out_h, out_w) = shape, transfer.shape, out_shape or shape
     forward = np.kron(dft(big_h)[:, :h], dft(big_w)[:, :w])
     inverse = np.kron(dft(big_h).conj()[:out_h], dft(big_w).conj()[:out_w]) / (big_h * big_w)
     return inverse @ (transfer.reshape(-1, 1) * forward)
 
 
 def zoomed_filter(shape, pitch, transfer, out_shape, out_pitch, offset):
-    """Zero-pad, DFT, multiply, and sum the Fourier series at the samples of another grid, whose axis is at offset."""
+    """DFT on the transfer function's size, multiply, and sum the spectrum at the points of another grid."""
     forward, back = [], []
-    for n, p, padded, m, q, aside in zip(shape, pitch, transfer.shape, out_shape, out_pitch, offset, strict=True):
+    for n, m, p, q, aside, padded in zip(shape, out_shape, pitch, out_pitch, offset, transfer.shape, strict=True):
         f = frequencies(padded, p)
-        reached = (np.arange(m) - m // 2) * q + aside + n // 2 * p
-        forward.append(np.exp(-2j * np.pi * np.outer(f, np.arange(n) * p)))
+        source, reached = np.arange(n) * p, (np.arange(m) - m // 2) * q + aside + n // 2 * p
+        forward.append(np.exp(-2j * np.pi * np.outer(f, source)))
         back.append(np.exp(2j * np.pi * np.outer(reached, f)) / padded)
     return np.kron(*back) @ (transfer.reshape(-1, 1) * np.kron(*forward))
 

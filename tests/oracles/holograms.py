@@ -60,8 +60,8 @@ def limited_wave(dy, dx, pitch, wavelength, depth, cone):
     return total
 
 
-def pairs(sources, shape, pitch, wavelength, depth, cone="box", stride=1):
-    """The field [H, W] of each source (i, j) of a plane of ``sources`` (h, w), as a function of i and j."""
+def wave_of_source(sources, shape, pitch, wavelength, depth, cone, stride):
+    """Function of a source's index (i, j) on a plane of ``sources`` (h, w): its wave on the hologram, [H, W]."""
     rows, columns = shape
     ys, xs = (positions(n, stride) for n in sources)
     # Displacements in samples from the least, of the last source and the first pixel, to the greatest.
@@ -73,30 +73,30 @@ def pairs(sources, shape, pitch, wavelength, depth, cone="box", stride=1):
     else:
         waves = wave(dy[:, None], dx[None], pitch, wavelength, depth, cone)
 
-    def field(i, j):
+    def on_hologram(i, j):
         y, x = -(rows // 2) - ys[i] - first[0], -(columns // 2) - xs[j] - first[1]
         return waves[y : y + rows, x : x + columns]
 
-    return field
+    return on_hologram
 
 
 def direct(layers, shape, pitch, wavelength, depths, cone="box", stride=1):
     """Sum over every pair of a source and a pixel."""
     out = np.zeros(shape, complex)
     for plane, depth in zip(layers, depths, strict=True):
-        field = pairs(plane.shape, shape, pitch, wavelength, depth, cone, stride)
+        on_hologram = wave_of_source(plane.shape, shape, pitch, wavelength, depth, cone, stride)
         for i, j in zip(*np.nonzero(plane), strict=True):
-            out += plane[i, j] * field(i, j)
+            out += plane[i, j] * on_hologram(i, j)
     return out
 
 
-def matrix(sources, shape, pitch, wavelength, depths, cone="box", stride=1):
-    """The same sum as a matrix [H W, D h w], for ``sources`` (h, w) on each plane."""
+def matrix(sources, shape, pitch, wavelength, depths, cone, stride=1):
+    """The same sum as a matrix from flattened layers (D, h, w) of ``sources`` (h, w) to the flattened (H, W)."""
     columns = []
     for depth in depths:
-        field = pairs(sources, shape, pitch, wavelength, depth, cone, stride)
-        columns += [field(i, j).ravel() for i in range(sources[0]) for j in range(sources[1])]
-    return np.stack(columns, -1)
+        on_hologram = wave_of_source(sources, shape, pitch, wavelength, depth, cone, stride)
+        columns += [on_hologram(i, j).ravel() for i in range(sources[0]) for j in range(sources[1])]
+    return np.stack(columns, 1)
 
 
 @dataclass(frozen=True)

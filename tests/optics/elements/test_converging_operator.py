@@ -1,4 +1,4 @@
-"""What ConvergingFresnel promises as an operator, and how far its warning can be believed."""
+"""ConvergingFresnel: the phase beyond Fresnel that its warning estimates, and refused arguments."""
 
 import math
 import warnings
