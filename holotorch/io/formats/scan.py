@@ -1,4 +1,4 @@
-"""What a file of voxels states, before it becomes a Volume, and the checks that all formats share."""
+"""Scan: voxels and geometry as stated by a file, and the checks that all formats share."""
 
 import importlib
 import math
