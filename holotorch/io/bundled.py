@@ -1,4 +1,4 @@
-"""Pictures and configurations that come with the package. Free of torch: configurations are checked before it loads."""
+"""Bundled pictures and configurations. Imports no torch, so that configurations can be checked before it loads."""
 
 import difflib
 from pathlib import Path
@@ -16,11 +16,11 @@ def no_such_picture(source: str) -> str:
 
 
 def find_config(name: str | Path) -> Path | None:
-    """A configuration by its path, or one of the project such as "configs/demo.yaml" from wherever it is called.
+    """Path of a configuration: ``name`` itself, or a bundled one such as "configs/demo.yaml"; None if there is neither.
 
-    That is inside an installed package, or beside the package in a checkout; None where there is none of that name.
+    Bundled configurations lie inside an installed package, or beside the package in a checkout.
     """
     path, package = Path(name), Path(__file__).parents[1]
     below = Path(*path.parts[1:]) if path.parts[:1] == ("configs",) else path
-    places = (path, package / "configs" / below, package.parent / "configs" / below)
-    return next((place for place in places if place.is_file()), None)
+    candidates = (path, package / "configs" / below, package.parent / "configs" / below)
+    return next((candidate for candidate in candidates if candidate.is_file()), None)

@@ -1,4 +1,4 @@
-"""Volumes of the thesis that can be fetched: those of Table 5.2 whose checksum is known."""
+"""Download of published volumes: those of Table 5.2 of the thesis whose checksum is known."""
 
 import difflib
 from dataclasses import dataclass

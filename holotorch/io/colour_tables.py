@@ -1,4 +1,4 @@
-"""Colours of light by the tables of colour-science: the matrix from wavelengths to linear sRGB."""
+"""Colours of monochromatic light: colour-matching functions and the matrix from wavelengths to linear sRGB."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ _OBSERVER = "CIE 1931 2 Degree Standard Observer"
 def tristimulus(wavelengths: float | Sequence[float]) -> Tensor:
     """CIE 1931 colour-matching functions (2 degrees) X, Y, Z at wavelengths in metres, float64 [3, K].
 
-    Spline between the table's whole nanometres (Sprague's, recommended by CIE 167).
+    Values between the whole nanometres of the table are interpolated by Sprague's method, as CIE 167 recommends.
 
     Raises:
         ValueError: A wavelength outside the table, 360 to 830 nm.
@@ -22,14 +22,14 @@ def tristimulus(wavelengths: float | Sequence[float]) -> Tensor:
     from colour import MSDS_CMFS, SpragueInterpolator
 
     table = MSDS_CMFS[_OBSERVER]
-    places = np.array(checks.wavelengths(wavelengths)) * 1e9
+    nanometres = np.array(checks.wavelengths(wavelengths)) * 1e9
     first, last = float(table.wavelengths[0]), float(table.wavelengths[-1])
-    wrong = places[(places < first) | (places > last)]
+    wrong = nanometres[(nanometres < first) | (nanometres > last)]
     if wrong.size:
         raise ValueError(
             f"wavelength {wrong[0]:g} nm has no colour: the CIE 1931 table covers {first:g} to {last:g} nm"
         )
-    columns = [SpragueInterpolator(table.wavelengths, table.values[:, i])(places) for i in range(3)]
+    columns = [SpragueInterpolator(table.wavelengths, table.values[:, i])(nanometres) for i in range(3)]
     return torch.from_numpy(np.stack(columns).reshape(3, -1))
 
 
@@ -42,10 +42,10 @@ def srgb_matrix(
         wavelengths: In metres.
         weights: Power of each, 1 by default, such as the weights of the rules of
             :class:`~holotorch.optics.light.spectrum.Spectrum`.
-        white: Intensities [K] of a picture's white, for a luminance of 1; all ones by default.
+        white: Intensities [K] of the white of a picture, which gets a luminance of 1; all ones by default.
 
-    The colours are those of the light itself: equal intensities of three sources show the white of equal energy of the
-    three, not the grey of D65. :func:`white_balance` gives weights that show D65.
+    The colours are not adapted to a white point: equal intensities of three sources give the colour of their sum, which
+    is not D65. :func:`white_balance` gives weights for which they give D65.
 
     Raises:
         ValueError: Wavelengths outside the table, weights that do not match or are negative, or a white without light.
@@ -69,7 +69,7 @@ def srgb_matrix(
 def white_balance(wavelengths: Sequence[float]) -> Tensor:
     """Powers [3] of three sources whose sum is the white of sRGB, D65, relative to the strongest one, float64.
 
-    The rule for a picture's white: a display is balanced so that equal values are neutral grey.
+    A display that is balanced this way shows equal values as neutral grey.
 
     Raises:
         ValueError: Not three wavelengths, or three that cannot mix D65.
@@ -82,6 +82,6 @@ def white_balance(wavelengths: Sequence[float]) -> Tensor:
     wanted = torch.from_numpy(np.linalg.inv(RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB) @ np.ones(3))
     powers = torch.linalg.solve(matching, wanted) if torch.linalg.matrix_rank(matching) == 3 else -torch.ones(3)
     if (powers <= 0).any():
-        found = ", ".join(f"{value * 1e9:g}" for value in wavelengths)
-        raise ValueError(f"{found} nm cannot mix the white D65; take one red, one green and one blue source")
+        listed = ", ".join(f"{value * 1e9:g}" for value in wavelengths)
+        raise ValueError(f"{listed} nm cannot mix the white D65; take one red, one green and one blue source")
     return powers / powers.max()

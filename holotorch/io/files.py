@@ -1,4 +1,4 @@
-"""Whole files or none: everything is written under a temporary name and renamed when complete."""
+"""Atomic writing of files: everything is written under a temporary name and renamed when complete."""
 
 import errno
 import io
@@ -18,8 +18,9 @@ from torch import Tensor
 def replacing(path: Path, *, buffering: int = -1, needed: int | None = None) -> Iterator[IO[bytes]]:
     """Open a temporary file beside ``path`` that takes its name when the block ends without an error.
 
-    With ``buffering`` 0 and :func:`append` a block that caught the error of a full disk can end so too: nothing is left
-    in a buffer that could fail once more. ``needed``: how many bytes will be written, for the message of a full disk.
+    With ``buffering`` 0 and :func:`append`, a block that handles the error of a full disk can end normally, since no
+    buffered data remain whose writing could fail again. ``needed`` is the number of bytes to be written, for the
+    message about a full disk.
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -31,14 +32,14 @@ def replacing(path: Path, *, buffering: int = -1, needed: int | None = None) -> 
     except OSError as error:
         with suppress(OSError):  # before the free space is measured
             partial.unlink()
-        # The user knows the final name only.
+        # The message names the final path, since the temporary one means nothing to the user.
         raise OSError(error.errno, _reason(error, path, needed), str(path)) from None
     finally:
         partial.unlink(missing_ok=True)
 
 
 def _reason(error: OSError, path: Path, needed: int | None) -> str:
-    """What the system says; of a full disk also how much is missing."""
+    """Message of the system; for a full disk, with the needed and the free space."""
     reason = error.strerror or str(error)
     if needed is None or error.errno not in (errno.ENOSPC, errno.EDQUOT):
         return reason
@@ -47,7 +48,7 @@ def _reason(error: OSError, path: Path, needed: int | None) -> str:
 
 
 def append(stream: IO[bytes], data: bytes | memoryview) -> None:
-    """Write ``data`` at the end of an unbuffered file, or nothing: after an OSError it is as long as before."""
+    """Append ``data`` to an unbuffered file; after an OSError the file has its previous length."""
     start, done = stream.tell(), 0
     try:
         while done < len(data):  # a single call may write less
@@ -82,7 +83,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file holds; ValueError for damage of any kind, a nesting without end among it."""
+    """Content of a JSON file; ValueError where it is damaged or nested too deeply."""
     try:
         return json.loads(read_bytes(path).decode("utf-8"))
     except RecursionError:

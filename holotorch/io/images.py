@@ -1,4 +1,4 @@
-"""Pictures: bundled ones, files of the usual formats, and how one is fitted to a grid."""
+"""Loading of bundled pictures and image files, fitting to a grid, and PNG encoding."""
 
 from pathlib import Path
 
@@ -10,9 +10,9 @@ from holotorch.core import checks
 from holotorch.io.bundled import BUNDLED_IMAGES, no_such_picture
 from holotorch.io.formats.decoding import check_exr, decode
 
-_MEMORY = 56  # bytes of a pixel in load_image: three numbers of 8 bytes, their copy and the decoded ones
-SMALLEST_SIDE = 11  # pixels; the window of ssim
-_LUMINANCE = (0.2126, 0.7152, 0.0722)  # ITU-R BT.709
+_MEMORY = 56  # bytes per pixel in load_image: three values of 8 bytes, a copy of them, and the decoded pixel
+SMALLEST_SIDE = 11  # pixels; the size of the window of ssim
+_LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of red, green and blue, ITU-R BT.709
 
 
 def load_image(source: str | Path) -> Tensor:
@@ -20,8 +20,8 @@ def load_image(source: str | Path) -> Tensor:
 
     Returns:
         float64 [C, H, W] in [0, 1], C = 3 (red, green, blue) or 1. 8 and 16 bit integers are divided by 255 and 65535
-        and not linearised: as in the thesis, pixel values are taken as intensities. All others are divided by their
-        maximum where that exceeds 1. Transparency shows black.
+        and not linearised: as in the thesis, pixel values are interpreted as intensities. Other types are divided by
+        their maximum if it exceeds 1. Transparent pixels are composited over black.
 
     Raises:
         ValueError: No such picture, not decodable, beyond the memory limit of :mod:`holotorch.io.formats.limits`,
@@ -44,10 +44,10 @@ def load_image(source: str | Path) -> Tensor:
 
 
 def fit_image(image: Tensor, shape: tuple[int, int], fit: str = "crop") -> Tensor:
-    """Bring ``image`` [C, h, w] to ``shape`` (H, W); a picture that has it already is returned as it is.
+    """Resize ``image`` [C, h, w] to ``shape`` (H, W); a picture of that size is returned unchanged.
 
-    First its aspect is changed as :func:`frame_image` says, then it is resampled bilinearly with antialiasing: that
-    never overshoots, so it makes no negative and no new black pixels.
+    The aspect ratio is changed by :func:`frame_image`, then the picture is resampled bilinearly with antialiasing,
+    which does not overshoot and therefore creates no negative values.
     """
     if tuple(image.shape[-2:]) == tuple(shape):
         return image
@@ -57,9 +57,9 @@ def fit_image(image: Tensor, shape: tuple[int, int], fit: str = "crop") -> Tenso
 
 
 def frame_image(image: Tensor, aspect: float, fit: str = "crop") -> Tensor:
-    """Bring ``image`` [C, h, w] to ``aspect`` (width / height) without resampling.
+    """Change the aspect ratio (width / height) of ``image`` [C, h, w] without resampling.
 
-    ``fit="crop"`` cuts the longer side, centred; ``fit="pad"`` adds black instead.
+    ``fit="crop"`` crops the longer side symmetrically; ``fit="pad"`` pads the shorter side with black.
     """
     if fit not in ("crop", "pad"):
         raise ValueError(f"fit must be 'crop' or 'pad', got {fit!r}")
@@ -67,7 +67,7 @@ def frame_image(image: Tensor, aspect: float, fit: str = "crop") -> Tensor:
     choose = min if fit == "crop" else max
     size = max(1, choose(height, round(width / aspect))), max(1, choose(width, round(height * aspect)))
     top, left = (size[0] - height) // 2, (size[1] - width) // 2
-    # Negative padding crops.
+    # Negative padding crops the image.
     return torch.nn.functional.pad(image, (left, size[1] - width - left, top, size[0] - height - top))
 
 
@@ -110,7 +110,7 @@ def _decode(path: Path) -> np.ndarray:
     import cv2
 
     data = path.read_bytes()
-    # JPEG through the colour reader, which turns the picture as its orientation tag says.
+    # JPEG is read in colour mode, in which OpenCV applies the orientation tag.
     flags = cv2.IMREAD_COLOR if data.startswith(b"\xff\xd8") else cv2.IMREAD_UNCHANGED
     pixels = decode(path, flags, data=data, memory=_MEMORY)
     if pixels.ndim == 3 and pixels.shape[2] >= 3:

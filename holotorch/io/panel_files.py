@@ -1,4 +1,4 @@
-"""Files that a phase panel shows: grey levels as PNG or BMP, phases as EXR, each with what it was made from."""
+"""Files for a phase panel: grey levels as PNG or BMP and phases as EXR, each with metadata."""
 
 import json
 import struct
@@ -16,14 +16,14 @@ from holotorch.core import checks
 from holotorch.io.files import write_bytes
 from holotorch.io.formats.decoding import PNG, check_exr, decode
 
-_KEY = "holotorch"  # of the PNG text chunk and the EXR attribute that hold the metadata as JSON
+_KEY = "holotorch"  # key of the PNG text chunk and of the EXR attribute that contain the metadata as JSON
 
 
 def write_levels(path: Path, levels: Tensor, metadata: Mapping[str, Any]) -> None:
     """Write a frame of grey levels, uint8 or uint16 [H, W], as ``.png`` or (uint8 only) ``.bmp``, whole or not at all.
 
-    Levels are stored as they are: those of a panel of 10 bits are 0 to 1023 in a file of 16. The metadata, anything
-    that JSON holds, go into a text chunk of the PNG, and into ``NAME.bmp.json`` beside a BMP, which has no room.
+    Levels are stored without scaling: those of a 10-bit panel are 0 to 1023 in a 16-bit file. The metadata, any JSON
+    value, are stored in a text chunk of a PNG, or in ``NAME.bmp.json`` beside a BMP, which has no text chunks.
 
     Raises:
         TypeError: Levels of another kind, or metadata that JSON does not hold.
@@ -85,10 +85,10 @@ def write_phases(path: Path, phase: Tensor, metadata: Mapping[str, Any]) -> None
     checks.all_finite("phase", phase)
     if path.suffix.lower() != ".exr":
         raise ValueError(f"{path}: phases are written as .exr, got {path.suffix or 'no ending'}")
-    # A copy in rows: the library reads the memory of its arrays without looking at their strides.
+    # A contiguous copy: the library ignores the strides of its arrays.
     pixels = np.array(phase.detach().cpu().numpy(), dtype=np.float32, order="C", copy=True)
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, _KEY: _json(metadata)}
-    with tempfile.TemporaryDirectory() as folder:  # the library writes to names only
+    with tempfile.TemporaryDirectory() as folder:  # the library writes only to a path
         made = Path(folder) / "phase.exr"
         OpenEXR.File(header, {"Y": pixels}).write(str(made))
         data = made.read_bytes()

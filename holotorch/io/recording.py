@@ -1,4 +1,4 @@
-"""Lossless recording of frames as they came, and its replay to the bit.
+"""Lossless recording of frames, and bit-exact replay.
 
 A recording is a folder::
 
@@ -8,9 +8,9 @@ A recording is a folder::
     times.csv        frame,seconds,crc32,problem: a line per frame, written after the frame; a frame that could not be
                      read has a problem and no checksum, and no bytes in frames.rgb
 
-Both are only ever appended to, so that what was recorded before a crash of the program can be replayed; where the disk
-is full, what there is of the frame that did not fit is taken away again. The bytes are raw, since compressing a 1080p
-frame to PNG takes longer than a camera's period. ``ffplay -f rawvideo -pixel_format rgb24 -video_size WxH frames.rgb``
+Both files are only appended to, so that frames recorded before a crash of the program can be replayed. When the disk is
+full, an incomplete frame is removed. The pixels are not compressed, since encoding a 1080p frame as PNG takes longer
+than the frame period of a camera. ``ffplay -f rawvideo -pixel_format rgb24 -video_size WxH frames.rgb``
 shows them.
 """
 
@@ -32,7 +32,7 @@ from holotorch.io.files import append, read_json, write_bytes, write_json
 from holotorch.io.video import Frame, Frames
 
 _FORMAT = 1
-_CHANNELS = "RGB"  # of every recording; those of before this was written down have nothing
+_CHANNELS = "RGB"  # channel order of every recording; files of older versions do not state it
 _COLUMNS = ("frame", "seconds", "crc32", "problem")
 
 
@@ -47,12 +47,12 @@ def is_recording(path: Path) -> bool:
 
 
 class Recorder:
-    """Appends frames to a new recording; a context that closes it."""
+    """Appends frames to a new recording; a context manager that closes it."""
 
     def __init__(
         self, folder: Path, shape: tuple[int, int], rate: float, source: str, copies: Mapping[str, Path] | None = None
     ):
-        """Begin a recording.
+        """Start a recording.
 
         Args:
             folder: New or empty.
@@ -98,7 +98,7 @@ class Recorder:
         checks.finite("time of a frame", frame.seconds, "seconds")
         # repr of a float is read back to the same bits.
         if frame.pixels is None:
-            problem = " ".join(frame.problem.split())  # a line is a line
+            problem = " ".join(frame.problem.split())  # without line breaks
             self._row((str(self.frames), repr(float(frame.seconds)), "", problem or "not readable"))
         else:
             if frame.pixels.dtype != torch.uint8 or tuple(frame.pixels.shape) != (3, *self.shape):
@@ -135,10 +135,10 @@ class Recorder:
 
 
 def open_recording(folder: Path) -> Frames:
-    """Frames of a recording, as they were, with their times.
+    """Recorded frames with their times.
 
-    Of a recording that was cut off, all frames that are whole, and ``notes`` says so. A frame whose bytes have changed
-    since is a frame with a problem.
+    A truncated recording yields all complete frames and a remark in ``notes``. A frame whose checksum does not match
+    has a problem instead of pixels.
 
     Raises:
         ValueError: No recording, of a later format, damaged, or without a whole frame.
@@ -150,7 +150,7 @@ def open_recording(folder: Path) -> Frames:
     size = recording_bytes(shape, 1)
     rows = _rows(folder)
     present = (folder / "frames.rgb").stat().st_size if (folder / "frames.rgb").is_file() else 0
-    # A line is written after its frame, so that a cut leaves at most pixels without a line.
+    # A line is written after its frame, so that an interruption leaves at most pixels without a line.
     kept, place = [], 0
     for seconds, crc, problem in rows:
         if crc is not None and place + size > present:
@@ -183,7 +183,7 @@ def open_recording(folder: Path) -> Frames:
 
 
 def free_bytes(folder: Path) -> int:
-    """Room on the disk that ``folder``, or the nearest folder above it that exists, lies on."""
+    """Free bytes on the disk of ``folder``, or of its nearest parent that exists."""
     folder = folder.resolve()
     while not folder.exists():
         folder = folder.parent

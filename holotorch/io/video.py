@@ -1,4 +1,4 @@
-"""Frames and their times from a video file, a folder of pictures or a camera; videos written whole or not at all."""
+"""Frames with their times from a video file, a folder of pictures or a camera, and atomic writing of videos."""
 
 import math
 import os
@@ -18,11 +18,11 @@ from holotorch.io.formats.decoding import decode
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
-_ASSUMED_RATE = 30.0  # Hz, where nothing states one
+_ASSUMED_RATE = 30.0  # Hz; frame rate of sources that state none
 
 
 class Frame(NamedTuple):
-    """One frame: ``seconds`` and ``pixels``, uint8 [3, H, W] RGB, or None and the ``problem`` that it has."""
+    """One frame: time in ``seconds`` and ``pixels``, uint8 [3, H, W] RGB, or None with a ``problem``."""
 
     seconds: float
     pixels: Tensor | None
@@ -30,15 +30,15 @@ class Frame(NamedTuple):
 
 
 class Frames:
-    """Frames of a source, once through, in their order; a context that closes what it has opened.
+    """Iterator over the frames of a source, for one pass; a context manager that closes the source.
 
     Attributes:
-        name: Of the source.
-        shape: (H, W).
-        total: Number of frames that the source states, or None where it states none, as a camera.
-        rate: Frames per second that the source states, or that were assumed.
-        live: Whether it is a camera, which never ends.
-        notes: What the user should know of the source, such as an assumed rate; complete when the frames are read.
+        name: Name of the source.
+        shape: (H, W) of the frames.
+        total: Number of frames that the source states, or None where it states none, such as a camera.
+        rate: Frames per second that the source states, or an assumed rate.
+        live: Whether the source is a camera, which does not end.
+        notes: Remarks about the source for the user, such as an assumed rate; complete after the last frame.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Frames:
         if close is not None:
             close()
         if self._close is not None:
-            self._close()  # closing a generator that was never begun runs nothing of it
+            self._close()  # closing a generator that has not started does not run its cleanup
 
 
 def open_frames(source: str | Path, rate: float | None = None) -> Frames:
@@ -92,7 +92,7 @@ def open_frames(source: str | Path, rate: float | None = None) -> Frames:
 
 
 def no_such_source(source: str | Path) -> str:
-    """Message for a source that is neither there nor the number of a camera."""
+    """Message for a source that does not exist and is not the number of a camera."""
     return f"no such video, folder or camera: {source}; a camera is given by its number, such as 0"
 
 
@@ -146,7 +146,7 @@ def _video(path: Path, rate: float | None) -> Frames:
 
 
 def _taken(take: Callable[[], tuple[bool, Any]]) -> tuple[bool, Any]:
-    """A frame, or (False, None) where OpenCV's own demuxer stumbles over what a damaged file says of it."""
+    """Result of ``take``, or (False, None) where OpenCV raises an error for a damaged file."""
     import cv2
 
     try:
@@ -185,7 +185,7 @@ def _camera(index: int, rate: float | None) -> Frames:
     import cv2
 
     capture = cv2.VideoCapture(index)
-    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest frame, not the oldest that waits
+    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # deliver the newest frame, not the oldest one in a queue
     if rate is not None:
         capture.set(cv2.CAP_PROP_FPS, rate)
     fine, first = capture.read() if capture.isOpened() else (False, None)
@@ -194,7 +194,7 @@ def _camera(index: int, rate: float | None) -> Frames:
         raise ValueError(f"no frame from camera {index}; is it plugged in, free, and may this user read it?")
     stated = capture.get(cv2.CAP_PROP_FPS)
     stated = stated if math.isfinite(stated) and stated > 0 else _ASSUMED_RATE
-    # Video4Linux gives the driver's time of each frame; other systems nothing.
+    # Video4Linux provides the driver's time of each frame; other systems provide none.
     driver = capture.get(cv2.CAP_PROP_POS_MSEC) > 0
     notes = [] if driver else ["times are those of arrival in this program, the camera's driver gives none"]
 
@@ -277,7 +277,7 @@ def replacing_video(path: Path, shape: tuple[int, int], rate: float) -> Iterator
 
 
 def _picture(path: Path) -> np.ndarray | None:
-    """BGR [H, W, 3], turned upright as its tag says; None where it cannot be decoded."""
+    """BGR [H, W, 3] with the orientation tag applied; None where the picture cannot be decoded."""
     import cv2
 
     try:

@@ -1,4 +1,4 @@
-"""Volumes from files: one call for every format, which refuses what a file does not say."""
+"""Loading of volumes: one call for all formats, which raises an error for geometry that a file does not state."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -24,7 +24,7 @@ _READERS: dict[str, Callable[[Path], Scan]] = {
     ".nii": medical.read_nifti,
     ".nii.gz": medical.read_nifti,
 }
-# Files that may hold several arrays, written as path::name.
+# Readers of files that may hold several arrays, selected as path::name.
 _MEMBER_READERS: dict[str, Callable[[Path, str | None], Scan]] = {
     ".npz": array_files.read_npz,
     ".vti": vti.read_vti,
@@ -82,7 +82,7 @@ def load_volume(
             "unit='relative'"
         )
     unit = unit or "m"
-    # A position in another unit than the spacing means nothing.
+    # The origin is meaningful only in the unit of the spacing.
     origin = scan.origin if scan.spacing is not None and scan.unit == unit else (0.0, 0.0, 0.0)
     return Volume(_tensor(scan.values, file), steps, unit, origin, scan.orientation)  # type: ignore[arg-type]
 
@@ -150,7 +150,7 @@ def _tensor(values: np.ndarray, file: Path) -> torch.Tensor:
             raise ValueError(f"{file} holds unsigned 64-bit values above 2^63; divide or convert them first")
         values = values.astype(np.int64)
     if not values.dtype.isnative:
-        # torch knows only the native order: these are read here.
+        # torch supports only the native byte order, so other arrays are converted here.
         values = values.astype(values.dtype.newbyteorder("="))
     if not values.flags.writeable or any(stride < 0 for stride in values.strides):
         values = values.copy()

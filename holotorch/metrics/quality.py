@@ -1,4 +1,4 @@
-"""Image quality, one value per image and channel."""
+"""Image quality metrics, one value per image and channel."""
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +13,7 @@ def psnr(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
     """Peak signal-to-noise ratio in dB, [...] for images [..., H, W]; infinite for equal images.
 
     The peak is ``data_range``, not the maximum of the reference as printed in thesis Eq. 4.37. ValueError for unequal
-    shapes or a range that is not positive. In float32 at least.
+    shapes or a range that is not positive. Computed in float32 at least.
     """
     image, reference = _checked_pair(image, reference, data_range)
     error = (image - reference).square().mean((-2, -1))
@@ -59,7 +59,7 @@ class PerceptualSimilarity(nn.Module):
 
     Raises:
         ImportError: The extra is missing.
-        OSError: The weights are neither in the cache nor to be had.
+        OSError: The weights are not in the cache and cannot be downloaded.
 
     Source: Zhang et al. (2018).
     """
@@ -75,9 +75,10 @@ class PerceptualSimilarity(nn.Module):
         self.distance = LPIPS(net="alex", verbose=False).requires_grad_(False)
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """[...] for images [..., C, H, W] with values in 0..1; C is 3, or 1, which is shown as grey.
+        """Similarity [...] of images [..., C, H, W] with values in 0..1; C is 3, or 1, which is repeated as grey.
 
-        ValueError for unequal shapes or another C.
+        Raises:
+            ValueError: Unequal shapes or another C.
         """
         _checked_pair(image, reference, 1.0)
         if image.ndim < 3 or image.shape[-3] not in (1, 3):

@@ -1,4 +1,4 @@
-"""Pictures of one scene under several random phases: the speckle-free mean, and errors freed of its residual noise."""
+"""Statistics over pictures of one scene with several random phases, and errors corrected for residual speckle."""
 
 from typing import NamedTuple
 
@@ -10,13 +10,14 @@ from holotorch.core.precision import at_least_single
 
 
 class SeedStatistics(NamedTuple):
-    """What independent seeds say together.
+    """Statistics over pictures of independent seeds.
 
     Attributes:
-        mean: Speckle-free picture as far as known, [..., H, W].
-        variance: Of a single picture about the true mean, per pixel and without bias, [..., H, W].
-        contrast: Of a single picture, [...]: root of mean variance over mean squared true mean.
-        noise: Expected mean square of what speckle is left in ``mean``, [...].
+        mean: Estimate of the speckle-free picture, [..., H, W].
+        variance: Unbiased variance of a single picture about the true mean, per pixel, [..., H, W].
+        contrast: Speckle contrast of a single picture, [...]: root of the mean variance over the mean square of the
+            true mean.
+        noise: Expected mean square of the speckle left in ``mean``, [...].
     """
 
     mean: Tensor
@@ -28,8 +29,8 @@ class SeedStatistics(NamedTuple):
 def seed_statistics(pictures: Tensor) -> SeedStatistics:
     """Statistics of ``pictures`` [S, ..., H, W], S >= 2 of independent seeds.
 
-    The mean of S pictures keeps 1 / S of their variance, which would count as brightness in mean squared: that is
-    subtracted, so that ``contrast`` does not depend on S (6.4.2). 0 for a black scene. In float32 at least.
+    The mean of S pictures keeps 1 / S of their variance, which biases its mean square. This bias is subtracted, so that
+    ``contrast`` does not depend on S (Sec. 6.4.2). The contrast of a black scene is 0. Computed in float32 at least.
 
     Raises:
         TypeError: Pictures that are not real floating-point.
@@ -41,36 +42,35 @@ def seed_statistics(pictures: Tensor) -> SeedStatistics:
     variance, mean = torch.var_mean(at_least_single(pictures), 0)
     noise = variance.mean((-2, -1)) / pictures.shape[0]
     true = mean.square().mean((-2, -1)) - noise
-    some = (true > 0) & (noise > 0)
-    ratio = torch.where(some, noise * pictures.shape[0], 1.0) / torch.where(some, true, 1.0)
-    return SeedStatistics(mean, variance, torch.where(some, torch.sqrt(ratio), 0.0), noise)
+    defined = (true > 0) & (noise > 0)
+    ratio = torch.where(defined, noise * pictures.shape[0], 1.0) / torch.where(defined, true, 1.0)
+    return SeedStatistics(mean, variance, torch.where(defined, torch.sqrt(ratio), 0.0), noise)
 
 
 def squared_blur(pictures: Tensor, references: Tensor) -> Tensor:
-    """Mean square difference of the two speckle-free scenes, estimated without bias from few seeds of each: [...].
+    """Unbiased estimate of the mean square difference of two speckle-free scenes from a few seeds of each: [...].
 
-    mean |mean(pictures) - mean(references)|^2 less the noise of both means. Being an estimate, it can come out below 0
-    where the scenes are alike.
+    It is mean |mean(pictures) - mean(references)|^2 less the noise of both means, and can be negative for equal scenes.
 
     Args:
         pictures: [S, ..., H, W] with S >= 2, such as those under a wide spectrum.
-        references: [R, ..., H, W] with R >= 2, of seeds other than those of ``pictures``: shared ones are not
-            independent, and the noise subtracted would be too much.
+        references: [R, ..., H, W] with R >= 2, of other seeds than ``pictures``: with shared seeds the noise would not
+            be independent and too much would be subtracted.
     """
-    ours, theirs = seed_statistics(pictures), seed_statistics(references)
+    first, second = seed_statistics(pictures), seed_statistics(references)
     if pictures.shape[1:] != references.shape[1:]:
         shapes = f"{tuple(pictures.shape)} and {tuple(references.shape)}"
-        raise ValueError(f"pictures and references must match but in seeds, got {shapes}")
-    return (ours.mean - theirs.mean).square().mean((-2, -1)) - ours.noise - theirs.noise
+        raise ValueError(f"pictures and references must match except in seeds, got {shapes}")
+    return (first.mean - second.mean).square().mean((-2, -1)) - first.noise - second.noise
 
 
 def squared_error(picture: Tensor, references: Tensor) -> Tensor:
-    """Mean square error of one ``picture`` [..., H, W] against the true speckle-free scene, without bias: [...].
+    """Unbiased mean square error of one ``picture`` [..., H, W] against the true speckle-free scene: [...].
 
-    The error against the mean of ``references`` [R, ..., H, W], R >= 2 seeds other than the picture's, less that mean's
-    own noise. Speckle of the picture and its blur both count.
+    It is the error against the mean of ``references`` [R, ..., H, W], of R >= 2 other seeds, less the noise of that
+    mean. Speckle of the picture and its blur both count.
     """
-    theirs = seed_statistics(references)
+    reference = seed_statistics(references)
     if picture.shape != references.shape[1:]:
         raise ValueError(f"picture must be {tuple(references.shape[1:])} as the references, got {tuple(picture.shape)}")
-    return (picture - theirs.mean).square().mean((-2, -1)) - theirs.noise
+    return (picture - reference.mean).square().mean((-2, -1)) - reference.noise

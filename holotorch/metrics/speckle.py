@@ -1,4 +1,4 @@
-"""Speckle of a single picture: how strong, how coarse, how elongated, how sharp still; in float32 at least."""
+"""Speckle of a single picture: contrast, power spectrum, grain size, anisotropy and sharpness; float32 at least."""
 
 import math
 from collections.abc import Sequence
@@ -11,12 +11,12 @@ from holotorch.core import checks
 from holotorch.core.fourier import fft2
 from holotorch.core.precision import at_least_single
 
-_BAND = (0.05, 0.25)  # cycles per sample, the middle of what a picture can hold
-_FINE = 16  # places per sample at which a correlation is looked up
+_BAND = (0.05, 0.25)  # cycles per sample; the middle of the band of a sampled picture
+_FINE = 16  # lags per sample at which a correlation is evaluated
 
 
 class Anisotropy(NamedTuple):
-    """Length over width of the grains, at least 1, and the angle of their length from x towards y in (-pi/2, pi/2]."""
+    """``ratio`` of length to width of the grains, at least 1, and ``angle`` of the length, x to y, in (-pi/2, pi/2]."""
 
     ratio: Tensor
     angle: Tensor
@@ -32,7 +32,7 @@ def speckle_contrast(intensity: Tensor, *, reference: Tensor | None = None, mask
         mask: Region of pixels, bool [..., H, W]; all by default.
 
     Returns:
-        0 for a region that is black. Differentiable; where there is no speckle at all the gradient is 0.
+        Contrast, 0 for a black region. Differentiable; the gradient is 0 where there is no speckle.
 
     Raises:
         TypeError: An intensity that is not real floating-point, or a mask that is not bool.
@@ -63,26 +63,27 @@ def speckle_contrast(intensity: Tensor, *, reference: Tensor | None = None, mask
 
 
 def power_spectrum(intensity: Tensor) -> Tensor:
-    """Share of each frequency in the squared contrast, [..., H, W] in FFT order, cycles per sample; 0 at frequency 0.
+    """Contribution of each frequency to the squared contrast, [..., H, W] in FFT order; 0 at frequency 0.
 
-    |DFT(I - mean)|^2 / (H W mean)^2, which adds up to ``speckle_contrast(I)**2``. The picture is taken as periodic: a
-    step from one border to the opposite one shows as a cross. All 0 for a black picture.
+    |DFT(I - mean)|^2 / (H W mean)^2, which adds up to ``speckle_contrast(I)**2``. The picture is treated as periodic: a
+    step between opposite borders appears as a cross. The spectrum of a black picture is 0.
 
     Source: Goodman, Speckle Phenomena in Optics, Sec. 4.3; Parseval's theorem.
     """
     intensity = _picture("intensity", intensity)
     mean = intensity.mean((-2, -1), keepdim=True)
-    away = fft2((intensity - mean).to(_complex(intensity)))
+    deviation = fft2((intensity - mean).to(intensity.dtype.to_complex()))
     size = intensity.shape[-2] * intensity.shape[-1]
-    return (away / torch.where(mean == 0, 1.0, mean * size)).abs().square()
+    return (deviation / torch.where(mean == 0, 1.0, mean * size)).abs().square()
 
 
 def grain_size(intensity: Tensor, *, level: float = 0.5) -> Tensor:
     """Full width (y, x) of the speckle's autocorrelation at ``level``, in samples: [..., 2] for [..., H, W].
 
-    The correlation of I - mean along each axis, free of wrap-around, each lag divided by the number of its pairs, and
-    band-limited between the lags, so that grains of two samples are measured as well. Infinite where it never falls to
-    ``level`` within half the picture. Divide pictures of scenes that are not uniform by their speckle-free mean first.
+    The autocorrelation of I - mean is taken along each axis, without wrap-around; each lag is divided by the number of
+    its pairs. It is interpolated between the lags as a band-limited function, so that grains of two samples can be
+    measured. The width is infinite where the correlation does not fall to ``level`` within half the picture. Divide
+    pictures of scenes that are not uniform by their speckle-free mean first.
 
     At half height a square pupil of side D at distance z gives 0.8859 wavelength z / D, a round one of that diameter
     1.0290 wavelength z / D; ``level=1/e`` gives the other usual width.
@@ -95,31 +96,31 @@ def grain_size(intensity: Tensor, *, level: float = 0.5) -> Tensor:
     intensity = _picture("intensity", intensity)
     if not 0 < checks.finite("level", level) < 1:
         raise ValueError(f"level must lie between 0 and 1, got {level!r}")
-    away = intensity - intensity.mean((-2, -1), keepdim=True)
-    if not away.detach().flatten(-2).any(-1).all():
+    deviation = intensity - intensity.mean((-2, -1), keepdim=True)
+    if not deviation.detach().flatten(-2).any(-1).all():
         raise ValueError("intensity is uniform: there are no grains to measure")
     height, width = intensity.shape[-2:]
-    power = fft2(away.to(_complex(intensity)), (2 * height, 2 * width)).abs().square()
+    power = fft2(deviation.to(intensity.dtype.to_complex()), (2 * height, 2 * width)).abs().square()
     return torch.stack([_width(power.sum(-1), level), _width(power.sum(-2), level)], -1)
 
 
 def anisotropy(intensity: Tensor) -> Anisotropy:
-    """Elongation of the grains in whatever direction, from the second moments of the power spectrum under Hann windows.
+    """Elongation of the grains in any direction, from second moments of the power spectrum under a Hann window.
 
     Returns:
-        ``ratio`` and ``angle``, each [...] for [..., H, W]. An elliptical pupil gives the ratio of its diameters; the
-        grains lie along the shorter one. A ratio of 1 has no direction. White noise, being isotropic and strong at high
-        frequencies, draws the ratio towards 1.
+        ``ratio`` and ``angle``, each [...] for [..., H, W]. For an elliptical pupil the ratio is that of its diameters,
+        and the grains are long in the direction of the shorter one. A ratio of 1 has no direction. White noise is
+        isotropic and strong at high frequencies, so it biases the ratio towards 1.
     """
     intensity = _picture("intensity", intensity)
     windows = [torch.hann_window(n, dtype=intensity.dtype, device=intensity.device) for n in intensity.shape[-2:]]
     weight = windows[0][:, None] * windows[1]
     mean = (intensity * weight).sum((-2, -1), keepdim=True) / weight.sum()
-    power = fft2(((intensity - mean) * weight).to(_complex(intensity))).abs().square()
+    power = fft2(((intensity - mean) * weight).to(intensity.dtype.to_complex())).abs().square()
     fy, fx = _frequencies(intensity)
     yy, xx, xy = ((power * part).sum((-2, -1)) for part in (fy.square(), fx.square(), fx * fy))
     half, split = (xx + yy) / 2, torch.hypot((xx - yy) / 2, xy)
-    # The long side of a grain lies across its widest spectrum.
+    # A grain is long at right angles to the direction in which its spectrum is widest.
     angle = torch.atan2(2 * xy, xx - yy) / 2 + math.pi / 2
     angle = torch.where(angle > math.pi / 2, angle - math.pi, angle)
     least = (half - split).clamp_min(torch.finfo(intensity.dtype).tiny)
@@ -145,11 +146,11 @@ def sharpness(intensity: Tensor, reference: Tensor, *, band: tuple[float, float]
         raise ValueError(f"band must be 0 <= low < high in cycles per sample, got {band!r}")
     radius = torch.hypot(*_frequencies(intensity))
     inside = ((radius >= low) & (radius <= high) & (radius > 0)).to(intensity.dtype)
-    seen, true = (fft2(part.to(_complex(part))) * inside for part in (intensity, reference))
+    observed, true = (fft2(part.to(part.dtype.to_complex())) * inside for part in (intensity, reference))
     power = true.abs().square().sum((-2, -1))
     if not torch.compiler.is_compiling() and (power == 0).any():
         raise ValueError(f"reference has no detail between {low:g} and {high:g} cycles per sample")
-    return (seen * true.conj()).real.sum((-2, -1)) / power
+    return (observed * true.conj()).real.sum((-2, -1)) / power
 
 
 def _fits(shape: Sequence[int], whole: Sequence[int]) -> bool:
@@ -162,17 +163,17 @@ def _width(power: Tensor, level: float) -> Tensor:
     double = power.shape[-1]
     window = double // 2
     lag = torch.arange(1, _FINE * window // 2 + 1, dtype=power.dtype, device=power.device) / _FINE
-    place = torch.fft.fftfreq(double, dtype=power.dtype, device=power.device)
-    # Pairs at a lag become fewer in proportion to the overlap.
-    correlation = power @ torch.cos(2 * math.pi * place[:, None] * lag) / (1 - lag / window)
+    frequency = torch.fft.fftfreq(double, dtype=power.dtype, device=power.device)
+    # The number of pairs at a lag is proportional to the overlap.
+    correlation = power @ torch.cos(2 * math.pi * frequency[:, None] * lag) / (1 - lag / window)
     correlation = correlation / power.sum(-1, keepdim=True)
     below = correlation <= level
     first = below.int().argmax(-1, keepdim=True)
     here = correlation.gather(-1, first)
     before = torch.where(first > 0, correlation.gather(-1, (first - 1).clamp_min(0)), 1.0)
     part = (before - level) / (before - here).clamp_min(torch.finfo(power.dtype).tiny)
-    found = 2 * (first + part)[..., 0] / _FINE
-    return torch.where(below.any(-1), found, math.inf)
+    width = 2 * (first + part)[..., 0] / _FINE
+    return torch.where(below.any(-1), width, math.inf)
 
 
 def _frequencies(image: Tensor) -> tuple[Tensor, Tensor]:
@@ -181,13 +182,9 @@ def _frequencies(image: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _root(square: Tensor) -> Tensor:
-    # The mask before the root keeps the gradient finite at 0.
-    some = square > 0
-    return torch.where(some, torch.sqrt(torch.where(some, square, 1.0)), 0.0)
-
-
-def _complex(image: Tensor) -> torch.dtype:
-    return torch.complex128 if image.dtype == torch.float64 else torch.complex64
+    """Square root with gradient 0 at 0."""
+    positive = square > 0
+    return torch.where(positive, torch.sqrt(torch.where(positive, square, 1.0)), 0.0)
 
 
 def _picture(name: str, image: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Volumes in general array files: NumPy, HDF5 and Zarr, axes (z, y, x). None of them states a spacing."""
+"""General array files without a spacing: NumPy, HDF5 and Zarr, axes (z, y, x)."""
 
 import math
 from pathlib import Path
@@ -32,7 +32,7 @@ def read_npz(path: Path, member: str | None = None) -> Scan:
 
 
 def _check_member(path: Path, archive: Any, name: str) -> None:
-    """Raise ValueError for an array that states more than it holds, before numpy allocates what it states."""
+    """Raise ValueError for an array whose stated size differs from its data, before numpy allocates the stated size."""
     entry = next(item for item in archive.zip.infolist() if item.filename in (name, f"{name}.npy"))
     with archive.zip.open(entry) as stream:
         version = np.lib.format.read_magic(stream)

@@ -1,4 +1,4 @@
-"""Pictures decoded by OpenCV, once their own header has said what that takes."""
+"""Decoding of pictures by OpenCV, after a check of the memory that their header asks for."""
 
 import io
 import math
@@ -96,7 +96,7 @@ def check_exr(path: Path, *, memory: int) -> None:
 
 
 def _scans(data: bytes) -> int:
-    """How many scans a JPEG has, those of a thumbnail in its metadata not counted."""
+    """Number of scans of a JPEG, without those of a thumbnail in its metadata."""
     count, place = 0, 2
     while (match := _MARKER.search(data, place)) and (kind := match[1][0]) != 0xD9:
         count += kind == 0xDA

@@ -1,4 +1,4 @@
-"""What a file may cost: its contents are unpacked no further than it states, and it may not state too much."""
+"""Memory limits of files: contents are unpacked only up to the stated size, which is itself limited."""
 
 import bz2
 import os
@@ -8,14 +8,15 @@ from pathlib import Path
 
 from holotorch.core.memory import available_memory
 
-MEMORY_LIMIT = 1 << 30  # bytes that a small file may take when unpacked
-RATIO = 500  # memory by size of a larger file; photographs and scans stay below 300, a file of zeros has 1000
-VARIABLE = "HOLOTORCH_MEMORY_LIMIT"  # of the environment: bytes in place of MEMORY_LIMIT
+MEMORY_LIMIT = 1 << 30  # bytes of memory allowed for any file
+# Memory allowed for a larger file, relative to its size: photographs and scans need less than 300, zeros up to 1000.
+RATIO = 500
+VARIABLE = "HOLOTORCH_MEMORY_LIMIT"  # environment variable with a number of bytes that replaces MEMORY_LIMIT
 _CHUNK = 1 << 20  # bytes unpacked at once
 
 
 def affordable(source: Path | str, needed: int, stored: int) -> None:
-    """Raise ValueError where a file asks for more memory than its size makes likely.
+    """Raise ValueError where a file needs more memory than is plausible for its size.
 
     Allowed are :data:`MEMORY_LIMIT` bytes, or :data:`RATIO` times the file's size where that is more. The environment
     variable :data:`VARIABLE` raises the former.

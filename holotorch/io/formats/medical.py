@@ -1,4 +1,4 @@
-"""Volumes of medical formats: NIfTI files and folders of DICOM slices. Their lengths are millimetres."""
+"""Medical formats: NIfTI files and folders of DICOM slices, with lengths in millimetres."""
 
 import math
 from collections.abc import Sequence
@@ -12,13 +12,13 @@ from holotorch.io.formats.limits import affordable, readable_at_once
 from holotorch.io.formats.scan import Scan, extra, placed, readable, three_axes
 
 _NIFTI_METRES = {"unknown": 1e-3, "mm": 1e-3, "meter": 1.0, "micron": 1e-6}
-_UNEVEN = 0.05  # of a spacing: positions are printed in hundredths of a millimetre
+_UNEVEN = 0.05  # tolerated deviation of a slice distance, relative to the median; files round positions to 0.01 mm
 
 
 def read_nifti(path: Path) -> Scan:
     """NIfTI, .nii (mapped if large) or .nii.gz, in the type of the file, or float32 where it states a scale.
 
-    A file that names no unit is in millimetres, as every reader of the format takes it.
+    A file that states no unit is in millimetres, as in other readers of the format.
     """
     nibabel = extra("nibabel", "reading NIfTI")
     with readable(path, "NIfTI file"):
@@ -29,21 +29,21 @@ def read_nifti(path: Path) -> Scan:
         matrix = np.asarray(image.affine, dtype=np.float64)
         unit = image.header.get_xyzt_units()[0]
     if values.dtype != image.get_data_dtype() and values.dtype.kind == "f":
-        # nibabel scales in float64, more than the stored integers are worth.
+        # nibabel scales in float64; float32 is precise enough for scaled integers.
         values = values.astype(np.float32)
     values = three_axes(values.T, path)
     return placed(values, matrix[:3, :3].T, matrix[:3, 3], "m", _NIFTI_METRES[unit])
 
 
 def is_dicom(path: Path) -> bool:
-    """Whether the file has the mark of DICOM, which often comes without an extension."""
+    """Whether the file has the DICOM signature; such files often have no extension."""
     with open(path, "rb") as stream:
         return stream.read(132)[128:] == b"DICM"
 
 
 @dataclass(frozen=True, eq=False)
 class _Slice:
-    """What the header of one DICOM slice says; lengths in millimetres, vectors (x, y, z)."""
+    """Header of one DICOM slice; lengths in millimetres, vectors (x, y, z)."""
 
     path: Path
     series: str
@@ -67,7 +67,7 @@ class _Slice:
 
 
 def read_dicom(folder: Path) -> Scan:
-    """One DICOM series of single slices, sorted by position, rescaled as its headers say.
+    """One DICOM series of single slices, sorted by position and rescaled as stated in the headers.
 
     Integers stay integers where slope and intercept are whole and the same for all slices; else float32.
     """
@@ -171,5 +171,5 @@ def _rescaled_type(slices: Sequence[_Slice]) -> np.dtype:
         return np.dtype(f"{'i' if slices[0].signed else 'u'}{allocated // 8}")
     limits = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if slices[0].signed else (0, 2**bits - 1)
     ends = [int(slope) * limit + int(intercept) for limit in limits]
-    # The smallest signed type that holds both ends: that of the lower end, or of the upper one mirrored.
+    # The smallest signed type that holds both ends: -max - 1 needs the same signed type as max.
     return np.min_scalar_type(min(-1, *ends, -max(ends) - 1))

@@ -1,4 +1,4 @@
-"""Volumes whose voxels lie in a file as they are, or compressed: raw, MetaImage and NRRD."""
+"""Formats with raw or compressed voxels and a simple header or none: raw, MetaImage and NRRD."""
 
 import math
 import re
@@ -24,7 +24,7 @@ from holotorch.io.formats.scan import (
     unpacked,
 )
 
-_HEADER = 1 << 20  # bytes, at most, of a header of unknown length within compressed data
+_HEADER = 1 << 20  # bytes; longest header of unknown length that is accepted within compressed data
 _META_TYPES = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4",
     "MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4", "MET_DOUBLE": "f8",
@@ -44,9 +44,10 @@ _NRRD_TYPES = {
 
 
 def read_raw(path: Path, shape: Sequence[int] | None, dtype: DTypeLike | None) -> Scan:
-    """Voxels without a header, x fastest; what is not given comes from a name such as bonsai_256x256x256_uint8.raw.
+    """Voxels without a header, x fastest; a missing shape or dtype is taken from the file name.
 
-    That naming, of the Open SciVis Datasets, gives (x, y, z). ``path`` may end in .gz.
+    Names follow the Open SciVis Datasets, with sizes (x, y, z), such as bonsai_256x256x256_uint8.raw. ``path`` may end
+    in .gz.
     """
     stated = re.search(r"_(\d+)x(\d+)x(\d+)_(u?int\d+|float\d+)\.", path.name)
     if stated:

@@ -1,4 +1,4 @@
-"""What a file of voxels states, before it becomes a Volume, and the checks that all formats share."""
+"""Scan: voxels and geometry as stated by a file, and the checks that all formats share."""
 
 import importlib
 import math
@@ -16,7 +16,7 @@ from numpy.typing import DTypeLike
 from holotorch.io.formats.limits import affordable, readable_at_once
 from holotorch.scene.volume import IDENTITY, Triple
 
-_MAP_NORESERVE = 0x4000  # of Linux; Python has no name for it before 3.13
+_MAP_NORESERVE = 0x4000  # flag of mmap on Linux; Python has no name for it before 3.13
 _METRES = {
     "m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 1e-2, "mm": 1e-3, "millimeter": 1e-3, "um": 1e-6, "µm": 1e-6,
     "micron": 1e-6, "nm": 1e-9, "angstrom": 1e-10,
@@ -28,8 +28,8 @@ class Scan:
     """Voxels and the geometry that their file states.
 
     Attributes:
-        values: [D, H, W] in the file's type, possibly mapped.
-        spacing: Along (z, y, x) in ``unit``, or None where the file does not say.
+        values: [D, H, W] in the dtype of the file, possibly memory-mapped.
+        spacing: Along (z, y, x) in ``unit``, or None where the file states none.
         unit: "m" or "relative".
         origin: Of voxel [0, 0, 0], (z, y, x) in ``unit``.
         orientation: Unit rows for the axes z, y, x, with (z, y, x) components.
@@ -153,8 +153,8 @@ def uncompressed(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int 
 def uncompressed_from(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int) -> np.ndarray:
     """Voxels from ``offset`` bytes on: read, or mapped where they are over 1 GiB and more than half of the free memory.
 
-    A mapped voxel is read when it is touched, and the system ends the program where the file has been cut short since.
-    So only volumes that may be larger than memory are mapped. What is written to them never reaches the file.
+    A mapped voxel is read on access, and the system terminates the program if the file has been truncated meanwhile.
+    Only volumes that may exceed the memory are therefore mapped. Changes to mapped voxels are not written to the file.
     """
     size = math.prod(shape) * dtype.itemsize
     if readable_at_once(size):
@@ -163,7 +163,7 @@ def uncompressed_from(path: Path, shape: Sequence[int], dtype: np.dtype, offset:
         return values.reshape(tuple(shape))
     if sys.platform != "linux":
         return np.memmap(path, dtype, "c", offset, tuple(shape))
-    # numpy's mapping reserves memory for a copy of it all, so that volumes larger than memory would be refused.
+    # numpy.memmap reserves memory for a copy of the whole file, which fails for volumes larger than memory.
     with open(path, "rb") as stream:
         access = {"flags": mmap.MAP_PRIVATE | _MAP_NORESERVE, "prot": mmap.PROT_READ | mmap.PROT_WRITE}
         return np.ndarray(tuple(shape), dtype, mmap.mmap(stream.fileno(), 0, **access), offset)
@@ -179,13 +179,13 @@ def stated_bytes(path: Path, shape: Sequence[int], dtype: np.dtype) -> int:
 def unpacked(path: Path, data: bytes | bytearray, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
     """Voxels of decompressed ``data``."""
     expect_bytes(path, len(data), shape, dtype)
-    # A bytearray is writable, as torch wants it.
+    # torch needs a writable buffer, which a bytearray is.
     return np.frombuffer(data if isinstance(data, bytearray) else bytearray(data), dtype).reshape(tuple(shape))
 
 
 def from_words(words: Sequence[str] | Sequence[bytes], dtype: np.dtype) -> np.ndarray:
     """Numbers written as text, of a type in the native byte order."""
-    # numpy's own conversion makes every word as wide as the longest.
+    # numpy's conversion from strings would store every word with the width of the longest.
     number = float if dtype.kind == "f" else int
     return np.array([number(word) for word in words], dtype.newbyteorder("="))
 
@@ -207,7 +207,7 @@ def three_axes(values: np.ndarray, path: Path) -> np.ndarray:
 
 @contextmanager
 def readable(path: Path, kind: str) -> Iterator[None]:
-    """Around a decoder: whatever it raises for a damaged file becomes a ValueError that names the file."""
+    """Context for a decoder that turns any of its errors into a ValueError with the name of the file."""
     try:
         yield
     except MemoryError:

@@ -1,4 +1,4 @@
-"""Volumes as pictures of their slices: TIFF stacks, folders of numbered pictures, and tiles in one picture."""
+"""Volumes stored as pictures of slices: TIFF stacks, folders of numbered pictures, and tiles in one picture."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -53,9 +53,9 @@ def read_folder(folder: Path) -> Scan:
 
 
 def read_tiles(path: Path, shape: Sequence[int] | None) -> Scan:
-    """Slices side by side in one picture, row by row from the top left; ``shape`` = (D, H, W) says how they lie.
+    """Slices as tiles of one picture, row by row from the top left; ``shape`` is (D, H, W).
 
-    Tiles behind the last slice must be empty, as they are where a table of tiles was filled up.
+    Tiles after the last slice must be empty.
     """
     if shape is None:
         raise ValueError(f"{path} is one picture: pass shape=(D, H, W) if it is tiled with slices, or its folder")
@@ -102,9 +102,10 @@ def _stacked(slices: Iterable[np.ndarray], sources: Sequence[str]) -> Scan:
 
 
 def _tiff_pages(path: Path) -> int:
-    """Number of pages by the chain of directories: OpenCV leaves out silently what it cannot decode.
+    """Number of pages by the chain of directories, since OpenCV omits pages that it cannot decode without an error.
 
-    ValueError where their pixels need more than the memory limit.
+    Raises:
+        ValueError: A damaged file, or pages whose pixels need more than the memory limit.
     """
     data = np.memmap(path, np.uint8, "r")
     order = "big" if data[:2].tobytes() == b"MM" else "little"
@@ -121,7 +122,7 @@ def _tiff_pages(path: Path) -> int:
         return int.from_bytes(data[place : place + size].tobytes(), order)
 
     def fact(directory: int, tag: int, default: int) -> int:
-        """The number in the entry ``tag``: one of 2, 4 or 8 bytes by its type, or the first of several elsewhere."""
+        """Value of the entry ``tag``, a number of 2, 4 or 8 bytes by its type; the first one where it has several."""
         for place in range(directory + counter, directory + counter + entry * number(directory, counter), entry):
             if number(place, 2) == tag:
                 size = {3: 2, 4: 4, 16: 8}.get(number(place + 2, 2), 1)
@@ -140,6 +141,6 @@ def _tiff_pages(path: Path) -> int:
         bits = max(8, fact(place, _TIFF_BITS, 1)) * fact(place, _TIFF_SAMPLES, 1)
         needed += fact(place, _TIFF_WIDTH, 1) * fact(place, _TIFF_HEIGHT, 1) * bits // 8
         place = number(place + counter + entry * number(place, counter), length)
-    # The pages, and the volume that they are copied to.
+    # Memory for the decoded pages and for the volume that they are copied to.
     affordable(path, 2 * needed, data.size)
     return len(directories)

@@ -26,7 +26,7 @@ _TYPES = {
     "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4", "Int64": "i8",
     "UInt64": "u8", "Float32": "f4", "Float64": "f8",
 }  # fmt: skip
-# Bounded, since every part may match what the next one does: a file of nothing but such beginnings takes linear time.
+# Repetitions are bounded, so that a search takes linear time in a file of many partial matches.
 _APPENDED = re.compile(
     rb"<AppendedData\s[^<>]{0,200}encoding\s{0,9}=\s{0,9}[\"'](\w{1,20})[\"'][^<>]{0,200}>\s{0,999}_"
 )
@@ -70,7 +70,7 @@ def read_vti(path: Path, member: str | None = None) -> Scan:
 
 
 def _document(path: Path) -> tuple[ElementTree.Element, int, bool]:
-    """XML without appended data, where those start in the file, and whether they are base64."""
+    """XML without the appended data, the offset of these data in the file, and whether they are base64."""
     data = np.memmap(path, np.uint8, "r")
     match = _APPENDED.search(data)  # type: ignore[arg-type]
     text = bytes(data[: match.start()]) + b"</VTKFile>" if match else bytes(data)
@@ -82,7 +82,7 @@ def _document(path: Path) -> tuple[ElementTree.Element, int, bool]:
 
 
 def _array(piece: ElementTree.Element, member: str | None, path: Path) -> tuple[ElementTree.Element, int]:
-    """The wanted array, and 1 where it belongs to cells, of which there is one less per axis than of points."""
+    """The selected array, and 1 for cell data, which has one value less per axis than point data, else 0."""
     for name, cells in (("PointData", 0), ("CellData", 1)):
         holder = piece.find(name)
         arrays = {item.get("Name", ""): item for item in (holder if holder is not None else ())}
@@ -142,16 +142,16 @@ def _length(data: bytes, count: np.dtype) -> int:
 
 
 def _decoded(text: str) -> bytes:
-    # The length in front is encoded on its own, so that "=" may stand in the middle; what follows "<" is no data.
+    # The length at the beginning is encoded separately, so padding "=" may occur inside; the data end at "<".
     parts = re.findall(r"[A-Za-z0-9+/]+=*", "".join(text.partition("<")[0].split()))
-    # A file cut short may end within a group of four.
+    # A truncated file may end within a group of four characters.
     return b"".join(base64.b64decode(part[: len(part) // 4 * 4]) for part in parts)
 
 
 def _inflated(path: Path, data: bytes, count: np.dtype, size: int) -> bytearray:
-    """Blocks of compressed data behind a table: their number, full size, the last one's size, compressed sizes.
+    """Decompress blocks that follow a table of their number, full size, size of the last one, and compressed sizes.
 
-    ``size``: bytes of all content, beyond which nothing is unpacked.
+    At most ``size`` bytes are unpacked.
     """
     try:
         blocks = int(np.frombuffer(data, count, 1)[0])
