@@ -25,6 +25,7 @@ from typing import Any
 from aiohttp import web
 
 from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.perception.study.records import SessionRequest, parse_record
 from holotorch.experiments.perception.study.session import StudySession
 
 _LARGEST = 10_000  # bytes of a request's body; a result has about 200
@@ -132,9 +133,10 @@ class StudyServer:
             raise web.HTTPNotFound(text="expected JSON at /session or /trial")
         value = await _read_json(request)
         if request.path == "/session":
-            window = value.get("window") if isinstance(value, dict) else None
-            if not isinstance(window, str) or not window:
-                raise web.HTTPBadRequest(text="expected the name of the window")
+            try:
+                window = parse_record(SessionRequest, value).window
+            except ValueError as error:
+                raise web.HTTPBadRequest(text=str(error)) from None
             return _json(HTTPStatus.OK, self.session.open(window))
         response = _json(*self.session.record(value))
         if self.session.complete:

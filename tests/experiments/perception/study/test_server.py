@@ -81,7 +81,7 @@ def test_results_that_cannot_be_are_refused(tmp_path):
         ({"onset_s": 10**400}, "onset_s: expected seconds"),
         ({"frame_s": 0}, "frame_s: expected more than 0"),
         ({"response_s": 0.5}, "response_s: expected a time after onset_s"),
-        ({"early": -1}, "expected counts"),
+        ({"early": -1}, "early: expected a count, 0 or more, got -1"),
         ({"device": "voice"}, "device: expected key"),
         ({"window": 3}, "window"),
         ({"index": 1}, "trial 1 is not the next one, 0"),
