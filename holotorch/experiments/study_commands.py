@@ -1,4 +1,4 @@
-"""The command study: its arguments, and what it calls. The browser part is loaded by it alone."""
+"""The command ``holotorch study``. The server of the study is imported only when the command runs."""
 
 import argparse
 from pathlib import Path
@@ -8,9 +8,9 @@ def add_study(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -
     """Add the command to the parser of ``holotorch``."""
     study = commands.add_parser("study", help="the far-periphery study with one participant, in a browser")
     study.add_argument("config", metavar="CONFIG", help="YAML file, such as configs/perception/study.yaml")
-    study.add_argument("--port", type=int, help="of the local server (default: any that is free)")
+    study.add_argument("--port", type=int, help="port of the local server (default: any free port)")
     study.add_argument("--participant", type=int, default=1, metavar="N", help="number of the participant (default: 1)")
-    study.add_argument("--out", type=Path, help="folder for the logs; a log that is there is continued")
+    study.add_argument("--out", type=Path, help="folder for the logs; an existing log is continued")
     study.set_defaults(action=_study)
 
 

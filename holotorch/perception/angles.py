@@ -1,4 +1,4 @@
-"""Checks of angles and sizes in one voice, and tensors of them."""
+"""Conversion of angles and sizes to tensors, with consistent checks and error messages."""
 
 from typing import Any
 
@@ -7,11 +7,13 @@ from torch import Tensor
 
 
 def as_tensor(name: str, value: Any, unit: str = "degrees") -> Tensor:
-    """A number, a list or a tensor as a floating tensor; numbers are float64, tensors keep dtype, device and graph.
+    """Convert a number, list or tensor to a floating-point tensor.
+
+    Numbers become float64; tensors keep their dtype, device and computation graph.
 
     Raises:
-        TypeError: It is no real number and no tensor of them.
-        ValueError: It is empty, or NaN or infinite somewhere.
+        TypeError: The value is neither a real number nor a list or tensor of real numbers.
+        ValueError: The value is empty or contains NaN or infinity.
     """
     if isinstance(value, Tensor):
         if value.dtype == torch.bool or value.is_complex():
@@ -33,17 +35,17 @@ def as_tensor(name: str, value: Any, unit: str = "degrees") -> Tensor:
 
 
 def eccentricity(value: Any, name: str = "eccentricity_deg") -> Tensor:
-    """Angles from the fixation point, 0 to 180 deg. ValueError outside: a side of the field is no sign here."""
+    """Convert eccentricities to a tensor. ValueError outside 0 to 180 deg; left and right have no sign here."""
     tensor = as_tensor(name, value)
     bad = (tensor < 0) | (tensor > 180)
     if bad.any():
-        cure = "it is an angle from the fixation point, without a side; take the absolute value"
+        cure = "it is an angle from the fixation point without a sign for left or right; take the absolute value"
         raise ValueError(f"{name} must be within 0 to 180 degrees, got {first(tensor, bad):g}; {cure}")
     return tensor
 
 
 def size(value: Any, name: str = "size_deg") -> Tensor:
-    """Sizes of patterns above zero and at most 360 deg, or ValueError."""
+    """Convert sizes of patterns to a tensor. ValueError for sizes that are not above 0 or exceed 360 deg."""
     tensor = as_tensor(name, value)
     bad = (tensor <= 0) | (tensor > 360)
     if bad.any():
@@ -52,5 +54,5 @@ def size(value: Any, name: str = "size_deg") -> Tensor:
 
 
 def first(tensor: Tensor, where: Tensor) -> float:
-    """The first element of ``tensor`` at which ``where`` holds, as a number."""
+    """The first element of ``tensor`` at which the mask ``where`` is true, as a number."""
     return tensor.detach()[where].flatten()[0].item()

@@ -1,4 +1,4 @@
-"""Laws of how content must grow towards the periphery to stimulate equally much cortex, and empirical ones."""
+"""Size of content over eccentricity, from cortical magnification and from empirical laws."""
 
 import math
 from collections.abc import Callable
@@ -37,7 +37,7 @@ class LinearMagnification:
         return (1 + angles.eccentricity(eccentricity_deg) / self.e2_deg) / self.m0
 
 
-# The thesis prints E / E2 for Cowey and Rolls (1974), which would shrink the fovea's content to nothing.
+# The thesis prints E / E2 for Cowey and Rolls (1974), without the 1, which would give the size 0 at the fovea.
 COWEY_ROLLS = LinearMagnification(8.55, 1.746)
 HORTON_HOYT = LinearMagnification(17.3 / 0.75, 0.75)  # printed as M = 17.3 / (E + 0.75)
 DOUGHERTY = LinearMagnification(29.2 / 3.67, 3.67)  # printed as M = 29.2 / (E + 3.67)
@@ -45,12 +45,12 @@ DOUGHERTY = LinearMagnification(29.2 / 3.67, 3.67)  # printed as M = 29.2 / (E +
 
 @dataclass(frozen=True)
 class RovamoVirsu:
-    """1 / M = (1 + a E + b E^3) / M0; Rovamo and Virsu (1979), one pair (a, b) for each half-meridian.
+    """1 / M = (1 + a E + b E^3) / M0; Rovamo and Virsu (1979), with one pair (a, b) per half-meridian.
 
     Attributes:
-        a: Per degree.
-        b: Per cubic degree.
-        m0: In mm/deg.
+        a: Linear coefficient, 1/deg.
+        b: Cubic coefficient, 1/deg^3.
+        m0: Foveal magnification in mm/deg.
     """
 
     a: float
@@ -66,7 +66,7 @@ class RovamoVirsu:
         return (1 + self.a * where + self.b * where**3) / self.m0
 
 
-# The thesis gives no coefficients; these are those commonly quoted, by half of the visual field.
+# The thesis gives no coefficients; these are the commonly quoted ones for each half of the visual field.
 NASAL, TEMPORAL = RovamoVirsu(0.33, 7e-5), RovamoVirsu(0.29, 1.2e-5)
 SUPERIOR, INFERIOR = RovamoVirsu(0.42, 1.2e-4), RovamoVirsu(0.42, 5.5e-5)
 
@@ -76,8 +76,8 @@ class TolhurstLing:
     """1 / M = (1 + a E)^1.1 / M0; Tolhurst and Ling (1988). The thesis gives M0 and not a, which must be chosen.
 
     Attributes:
-        a: Per degree.
-        m0: In mm/deg.
+        a: Linear coefficient, 1/deg.
+        m0: Foveal magnification in mm/deg.
     """
 
     a: float
@@ -95,8 +95,8 @@ class TolhurstLing:
 class StrasburgerLetters:
     """S = 0.022 E + 0.25 / (log10 C + 2.07 - 0.0345 E), the size in degrees at which a letter is recognised.
 
-    Its pole, where the denominator is zero, lies at E = (log10 C + 2.07) / 0.0345: 60 deg at full contrast, and at the
-    fovea for C = 0.0085. From there on the formula means nothing (negative sizes), and is refused.
+    The denominator is zero at E = (log10 C + 2.07) / 0.0345, which is 60 deg at full contrast and 0 deg at C = 0.0085.
+    At this pole and beyond, where sizes would be negative, the formula raises ValueError.
 
     Attributes:
         contrast: Michelson contrast C of the letter, above 0.0085 and at most 1.
@@ -113,11 +113,11 @@ class StrasburgerLetters:
 
     @property
     def pole_deg(self) -> float:
-        """Eccentricity in degrees that the formula cannot reach."""
+        """Eccentricity of the pole in degrees."""
         return (math.log10(self.contrast) + 2.07) / 0.0345
 
     def __call__(self, eccentricity_deg: Any) -> Tensor:
-        """S in degrees. ValueError from the pole on."""
+        """S in degrees. ValueError at the pole and beyond."""
         where = angles.eccentricity(eccentricity_deg)
         if (bad := where >= self.pole_deg).any():
             limit = f"below {self.pole_deg:.4g} degrees, its pole at a contrast of {self.contrast:g}"
@@ -127,12 +127,12 @@ class StrasburgerLetters:
 
 @dataclass(frozen=True)
 class LinearSize:
-    """S = slope E + foveal_deg within 0 .. 40 deg, the form Grogorick et al. found; the thesis gives no numbers.
+    """S = slope E + foveal_deg within 0 .. 40 deg, as in Grogorick et al.; the thesis gives no coefficients.
 
     Attributes:
         slope: Degrees of size per degree of eccentricity.
         foveal_deg: Size at the fixation point.
-        high_deg: Greatest eccentricity, beyond which it is refused.
+        high_deg: Greatest eccentricity for which the law is valid.
     """
 
     slope: float
@@ -155,38 +155,38 @@ Law = Callable[[Any], Tensor]
 
 
 def cortical_scale(eccentricity_deg: Any, law: Law, size_deg: float = 1.0) -> Tensor:
-    """The size in degrees at an eccentricity of content that is ``size_deg`` wide at the fixation point.
+    """Size in degrees, at an eccentricity, of content that has the size ``size_deg`` at the fixation point.
 
     Args:
         eccentricity_deg: Angles from the fixation point, >= 0, any shape; numbers give float64.
-        law: One of this module's, such as ``COWEY_ROLLS``, or any function of the eccentricity that is proportional to
-            the size: ``size_deg * law(E) / law(0)`` is returned.
-        size_deg: At the fixation point; 1 gives the magnification itself.
+        law: A law of this module, such as ``COWEY_ROLLS``, or any function of the eccentricity that is proportional to
+            the size. The result is ``size_deg * law(E) / law(0)``.
+        size_deg: Size at the fixation point; 1 gives the ratio law(E) / law(0).
 
     Raises:
-        ValueError: Eccentricities below 0, above 180, or where the law does not hold.
+        ValueError: An eccentricity is below 0, above 180, or outside the validity of the law.
     """
     where, foveal = angles.eccentricity(eccentricity_deg), angles.size(size_deg)
     return foveal.to(where) * law(where) / law(torch.zeros_like(where))
 
 
 def peripheral_weight(eccentricity_deg: Any, law: Law, *, least: float = 0.0) -> Tensor:
-    """Weights for the squared error of each sample of an image, by what the eye can use of it; mean 1.
+    """Weights of the squared error of each image sample by the eye's resolution at its eccentricity; mean 1.
 
-    A detail must be law(E) / law(0) times as wide as at the fixation point to be seen as well; of an error whose energy
-    lies evenly over the frequencies of both axes, the share (law(0) / law(E))^2 is coarse enough. That is the weight.
+    To be equally visible, a detail must be law(E) / law(0) times as wide as at the fixation point. If the energy of an
+    error is uniform over the frequencies of both axes, the share (law(0) / law(E))^2 of it is visible: the weight.
 
     Args:
-        eccentricity_deg: Of the samples, [..., H, W]; see ``Display.eccentricity_map``.
+        eccentricity_deg: Eccentricities of the samples, [..., H, W]; see ``Display.eccentricity_map``.
         law: As in :func:`cortical_scale`.
-        least: Lower limit of the weight relative to that at the fixation point, within 0 .. 1, so that the far
-            periphery is not given up entirely.
+        least: Lower limit of the weight, relative to the weight at the fixation point, within 0 .. 1. It keeps errors
+            in the far periphery from being ignored.
 
     Returns:
         Real [..., H, W] with mean 1 over the last two axes, dtype and device of the eccentricities.
 
     Raises:
-        ValueError: As :func:`cortical_scale`; eccentricities without two axes; ``least`` outside 0 .. 1.
+        ValueError: As :func:`cortical_scale`; eccentricities with fewer than two axes; ``least`` outside 0 .. 1.
     """
     least = checks.finite("least", least)
     if not 0 <= least <= 1:

@@ -1,4 +1,4 @@
-"""Thesis Table 2.1 as data, and whether a display can show what the scale asks for."""
+"""Thesis Table 2.1 as data, and a check whether a display can show the sizes of a scale."""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -14,17 +14,18 @@ Axis = Literal["horizontal", "diagonal", "full"]
 
 @dataclass(frozen=True)
 class WideDisplay:
-    """A display technique of Table 2.1, with its greatest field and its angular resolution.
+    """A display technique of Table 2.1, with its largest field of view and its angular resolution.
 
     Attributes:
-        name: As printed, with examples; ``year`` where one is printed.
+        name: Name in the table, with examples.
         field_deg: Field of view along ``axis``.
-        height_deg: Vertical field, where it is reported.
-        axis: Along which ``field_deg`` is. "full" surrounds the viewer.
-        arcmin: Size of a pixel, (finest, coarsest) in minutes of arc; None where only a pitch is known.
-        pitch: In metres, of a holographic display inside its depth of field; its angle depends on the eyepiece.
-        colour: RGB, or else one colour.
-        derived: Calculated from other reported numbers (* in the table).
+        height_deg: Vertical field of view; None if it is not reported.
+        axis: Axis of ``field_deg``; "full" surrounds the viewer.
+        arcmin: Size of a pixel, (finest, coarsest) in minutes of arc; None if only a pitch is known.
+        pitch: Pixel pitch in metres of a holographic display, whose angular size depends on the eyepiece.
+        colour: Whether the display shows RGB; otherwise one colour.
+        derived: Whether the values are calculated from other reported numbers (* in the table).
+        year: Year in the table; None if there is none.
     """
 
     name: str
@@ -39,12 +40,12 @@ class WideDisplay:
 
     @property
     def half_field_deg(self) -> float:
-        """Greatest eccentricity that it covers on the horizon; for a diagonal field, more than that."""
+        """Greatest eccentricity on the horizon; an upper bound if the field of view is diagonal."""
         return self.field_deg / 2
 
     @property
     def pixels_per_degree(self) -> float | None:
-        """Of its coarsest pixels; None where only a pitch is known."""
+        """Resolution of the coarsest pixels; None if only a pitch is known."""
         return None if self.arcmin is None else 60 / self.arcmin[1]
 
 
@@ -70,16 +71,16 @@ TABLE_2_1 = (
 
 @dataclass(frozen=True, eq=False)
 class DisplayCheck:
-    """What a display can do of what a scale asks, for N eccentricities to both sides of the fixation point.
+    """Whether a display can show the sizes of a scale, for N eccentricities on both sides of the fixation point.
 
     Attributes:
         size_deg: S(E), [N].
-        covered: The pattern lies within the field of view entirely, [N] bool. For a diagonal field, whose horizontal
-            part is smaller, True is a "perhaps".
-        needed: Pixels per degree to draw it with the samples asked for, [N].
-        resolved: The display has as many, [N] bool; None where its angular resolution is not known.
-        reach_deg: Half the field of view.
-        tested: Sizes among those that the study showed, [N] bool.
+        covered: Whether the whole pattern lies within the field of view, [N] bool. For a diagonal field of view, whose
+            horizontal part is smaller, True only means that it is possible.
+        needed: Pixels per degree needed to draw the pattern with the requested samples, [N].
+        resolved: Whether the display has this resolution, [N] bool; None if its angular resolution is not known.
+        reach_deg: Half the field of view in degrees.
+        tested: Whether the size was tested in the study, [N] bool.
     """
 
     size_deg: Tensor
@@ -98,24 +99,24 @@ def check_display(
     samples: int = 12,
     extrapolate: bool = False,
 ) -> DisplayCheck:
-    """Compare a display with the patterns that ``scale`` asks for on the horizon.
+    """Compare a display with the sizes of patterns on the horizon that ``scale`` gives.
 
     Args:
-        display: A row of ``TABLE_2_1``, or one's own.
-        scale: Gives the sizes.
-        eccentricity_deg: Where patterns are wanted, [N].
-        samples: Pixels across a pattern that tell it from others; 12 leave a cross or a ring a stroke of two and gaps
-            of four. The eye's own limit is not part of this: at these sizes it is no stricter.
+        display: A row of ``TABLE_2_1``, or another display.
+        scale: Scale of the sizes.
+        eccentricity_deg: Eccentricities of the patterns, [N].
+        samples: Pixels across a pattern needed to recognise it. With 12, a cross or ring has strokes of two pixels and
+            gaps of four. The resolution of the eye is not considered, because it is no stricter at these sizes.
         extrapolate: As in the call of ``scale``.
 
     Raises:
-        ValueError: As the call of ``scale``; ``samples`` below 1.
+        ValueError: As in the call of ``scale``, or ``samples`` is below 1.
     """
     checks.whole("samples", samples, 1)
     where = angles.eccentricity(eccentricity_deg)
     sizes = scale(where, extrapolate=extrapolate)
     needed = samples / sizes
-    have = display.pixels_per_degree
-    resolved = None if have is None else needed <= have
+    available = display.pixels_per_degree
+    resolved = None if available is None else needed <= available
     covered = where + sizes / 2 <= display.half_field_deg
     return DisplayCheck(sizes, covered, needed, resolved, display.half_field_deg, scale.tested(where))

@@ -1,4 +1,4 @@
-"""Where things on a display are seen: degrees, metres and pixels, exactly, for flat, curved and headset displays.
+"""Geometry of flat, curved and headset displays: conversion between directions in degrees, metres and pixels.
 
 The eye is at the origin and fixates straight ahead. A direction is (elevation, azimuth) in degrees: the elevation above
 the horizontal plane, positive upwards, and the azimuth within that plane, positive to the right. Pixels and metres on a
@@ -18,19 +18,19 @@ from holotorch.perception import angles
 
 
 def eccentricity_of(elevation_deg: Any, azimuth_deg: Any) -> Tensor:
-    """Angle in degrees between a direction and the fixation point, exact to both sides and near 0."""
+    """Angle in degrees between a direction and the fixation point, accurate at all angles."""
     return separation(elevation_deg, azimuth_deg, 0.0, 0.0)
 
 
 def separation(elevation_deg: Any, azimuth_deg: Any, other_elevation_deg: Any, other_azimuth_deg: Any) -> Tensor:
-    """Angle in degrees between two directions; they broadcast. Its gradient at 0 is 0.
+    """Angle in degrees between two directions, which broadcast. Its gradient at 0 is 0.
 
-    Half-angle formula: the arc cosine of cos cos would lose half of the digits near 0.
+    Uses the half-angle formula, because the arc cosine would lose half of the digits near 0.
     """
-    given = (elevation_deg, azimuth_deg, other_elevation_deg, other_azimuth_deg)
-    e1, a1, e2, a2 = (angles.as_tensor("angles", value).deg2rad() for value in given)
+    directions = (elevation_deg, azimuth_deg, other_elevation_deg, other_azimuth_deg)
+    e1, a1, e2, a2 = (angles.as_tensor("angles", value).deg2rad() for value in directions)
     half = torch.sin((e1 - e2) / 2).square() + e1.cos() * e2.cos() * torch.sin((a1 - a2) / 2).square()
-    # Masked before the roots, whose gradients are infinite at 0 and at 1.
+    # Masked before the square roots, whose gradients are infinite at 0 and 1.
     inside = (half > 0) & (half < 1)
     safe = torch.where(inside, half, 0.5)
     angle = 2 * torch.atan2(safe.sqrt(), (1 - safe).sqrt())
@@ -39,10 +39,10 @@ def separation(elevation_deg: Any, azimuth_deg: Any, other_elevation_deg: Any, o
 
 @dataclass(frozen=True)
 class Display:
-    """What all displays share. ``shape`` is (H, W) in pixels.
+    """Base class of all displays. ``shape`` is (H, W) in pixels.
 
-    Subclasses say where a direction meets the display and the other way round, and how fast the direction turns. Their
-    functions take numbers or tensors that broadcast against each other, [...], and return two tensors [...].
+    Subclasses convert between pixels and directions, and compute pixels per degree. Their methods take numbers or
+    tensors that broadcast to [...], and return two tensors [...].
     """
 
     shape: tuple[int, int]
@@ -54,18 +54,18 @@ class Display:
             checks.whole("shape", side, 1)
 
     def angles(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
-        """(elevation, azimuth) in degrees of points of the display, which may lie beyond its edge."""
+        """(elevation, azimuth) in degrees of points on the display surface, also beyond the edge of the display."""
         raise NotImplementedError
 
     def pixels(self, elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
-        """(y, x) in pixels of directions, also beyond the edge; NaN for those that meet no point of the surface.
+        """(y, x) in pixels of directions, also beyond the edge; NaN for directions that do not meet the surface.
 
         ValueError for elevations beyond 90 or azimuths beyond 180 deg.
         """
         raise NotImplementedError
 
     def pixels_per_degree(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
-        """Pixels per degree of turn of the eye along (y, x) at points of the display: exact derivatives."""
+        """Pixels per degree of eye rotation along (y, x) at points of the display, as exact derivatives."""
         raise NotImplementedError
 
     def eccentricity(self, y_px: Any, x_px: Any) -> Tensor:
@@ -73,24 +73,24 @@ class Display:
         return eccentricity_of(*self.angles(y_px, x_px))
 
     def eccentricity_map(self, *, dtype: torch.dtype = torch.float64) -> Tensor:
-        """That of every pixel's centre, [H, W] in degrees."""
+        """Eccentricity of every pixel centre in degrees, [H, W]."""
         y, x = (torch.arange(side, dtype=torch.float64) for side in self.shape)
         return self.eccentricity(y[:, None], x[None, :]).to(dtype)
 
     def shows(self, elevation_deg: Any, azimuth_deg: Any) -> Tensor:
-        """Whether a direction meets a pixel; bool."""
+        """Whether a direction meets a pixel of the display; bool."""
         y, x = self.pixels(elevation_deg, azimuth_deg)
         return (y >= -0.5) & (y <= self.shape[0] - 0.5) & (x >= -0.5) & (x <= self.shape[1] - 0.5)
 
     def width_px(self, azimuth_deg: Any, size_deg: Any) -> Tensor:
-        """Pixels in x that a pattern of ``size_deg`` centred at this azimuth, on the horizon, spans."""
+        """Width in pixels of a pattern of ``size_deg`` centred at an azimuth on the horizon."""
         middle, half = angles.as_tensor("azimuth_deg", azimuth_deg), angles.size(size_deg) / 2
         level = torch.zeros_like(middle)
         return self.pixels(level, middle + half)[1] - self.pixels(level, middle - half)[1]
 
     @property
     def field_deg(self) -> tuple[float, float]:
-        """Field of view through the middle of the display, vertical and horizontal, edge to edge."""
+        """Field of view (vertical, horizontal) in degrees from edge to edge, through the middle of the display."""
         height, width = self.shape
         middle = (height - 1) / 2, (width - 1) / 2
         top, bottom = self.angles([-0.5, height - 0.5], middle[1])[0].tolist()
@@ -101,13 +101,13 @@ class Display:
         y, x = angles.as_tensor("y_px", y_px, "pixels"), angles.as_tensor("x_px", x_px, "pixels")
         return torch.broadcast_tensors(y - (self.shape[0] - 1) / 2, x - (self.shape[1] - 1) / 2)
 
-    def _placed(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+    def _from_middle(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         return y + (self.shape[0] - 1) / 2, x + (self.shape[1] - 1) / 2
 
 
 @dataclass(frozen=True)
 class _Screen(Display):
-    """A screen with a size in metres, (height, width) along its surface, and the eye ``distance`` before its middle."""
+    """A screen of ``size`` (height, width) in metres along its surface, viewed from ``distance`` before its middle."""
 
     size: tuple[float, float]
     distance: float
@@ -120,7 +120,7 @@ class _Screen(Display):
 
     @property
     def pitch(self) -> tuple[float, float]:
-        """Of the pixels in metres, (y, x)."""
+        """Pixel pitch (y, x) in metres."""
         return self.size[0] / self.shape[0], self.size[1] / self.shape[1]
 
     def metres(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
@@ -131,18 +131,21 @@ class _Screen(Display):
     def pixels_at(self, y_m: Any, x_m: Any) -> tuple[Tensor, Tensor]:
         """(y, x) in pixels of points in metres from the middle, along the surface."""
         y, x = angles.as_tensor("y_m", y_m, "metres"), angles.as_tensor("x_m", x_m, "metres")
-        return self._placed(*torch.broadcast_tensors(y / self.pitch[0], x / self.pitch[1]))
+        return self._from_middle(*torch.broadcast_tensors(y / self.pitch[0], x / self.pitch[1]))
 
-    def _turn(self, point: Tensor, tangent: Tensor, pitch: float) -> Tensor:
-        """Pixels per degree along a unit tangent [..., 3] at a point [..., 3]: d(p/|p|) = (t - (t.u) u) ds / |p|."""
-        far = point.square().sum(-1)
+    def _pixels_per_degree(self, point: Tensor, tangent: Tensor, pitch: float) -> Tensor:
+        """Pixels per degree along a unit tangent t [..., 3] at a point p [..., 3].
+
+        With u = p / |p|, a step ds changes the direction by du = (t - (t.u) u) ds / |p|.
+        """
+        distance_squared = point.square().sum(-1)
         across = torch.linalg.cross(point, tangent.expand_as(point)).square().sum(-1).sqrt()
-        return math.radians(1) * far / (across * pitch)
+        return math.radians(1) * distance_squared / (across * pitch)
 
 
 @dataclass(frozen=True)
 class FlatScreen(_Screen):
-    """A monitor, or a headset whose image is rectilinear (as seen through an ideal lens), at its virtual distance."""
+    """A monitor, or the virtual image of a headset with rectilinear projection (an ideal lens)."""
 
     @classmethod
     def spanning(cls, shape: tuple[int, int], field_deg: tuple[float, float], distance: float = 1.0) -> "FlatScreen":
@@ -160,26 +163,26 @@ class FlatScreen(_Screen):
         return torch.atan2(-y, torch.hypot(x, ahead)).rad2deg(), torch.atan2(x, ahead).rad2deg()
 
     def pixels(self, elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
-        """See :class:`Display`; NaN at the side of the eye and behind it."""
+        """See :class:`Display`; NaN for directions at 90 deg and beyond."""
         up, side = _directions(elevation_deg, azimuth_deg)
-        seen = (side.abs() < math.pi / 2) & (up.abs() < math.pi / 2)
-        up, side = torch.where(seen, up, 0), torch.where(seen, side, 0)
+        in_front = (side.abs() < math.pi / 2) & (up.abs() < math.pi / 2)
+        up, side = torch.where(in_front, up, 0), torch.where(in_front, side, 0)
         y, x = -self.distance * up.tan() / side.cos(), self.distance * side.tan()
-        return tuple(torch.where(seen, part, math.nan) for part in self.pixels_at(y, x))  # type: ignore[return-value]
+        return tuple(torch.where(in_front, part, math.nan) for part in self.pixels_at(y, x))  # type: ignore[return-value]
 
     def pixels_per_degree(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
         """See :class:`Display`."""
         y, x = self.metres(y_px, x_px)
         point = torch.stack([x, y, torch.full_like(x, self.distance)], -1)
         down, right = point.new_tensor([0.0, 1.0, 0.0]), point.new_tensor([1.0, 0.0, 0.0])
-        return self._turn(point, down, self.pitch[0]), self._turn(point, right, self.pitch[1])
+        return self._pixels_per_degree(point, down, self.pitch[0]), self._pixels_per_degree(point, right, self.pitch[1])
 
 
 @dataclass(frozen=True)
 class CurvedScreen(_Screen):
-    """Part of an upright cylinder of ``radius`` in metres, concave towards the eye, which sees its middle ahead.
+    """Part of an upright cylinder of ``radius`` metres, concave towards the eye; its middle is straight ahead.
 
-    ``size`` is (height, arc). The eye need not be on the axis, as that of the thesis's study is not required to be.
+    ``size`` is (height, arc length). The eye may be off the axis of the cylinder.
     """
 
     radius: float
@@ -196,37 +199,37 @@ class CurvedScreen(_Screen):
         return torch.atan2(-y, torch.hypot(x, z)).rad2deg(), torch.atan2(x, z).rad2deg()
 
     def pixels(self, elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
-        """See :class:`Display`; of two points on one ray, the farther. NaN where the ray misses the cylinder."""
+        """See :class:`Display`; the farther of two intersections of a ray. NaN if the ray misses the cylinder."""
         up, side = _directions(elevation_deg, azimuth_deg)
-        offset = self.distance - self.radius  # of the axis, ahead of the eye
+        offset = self.distance - self.radius  # distance from the eye to the axis of the cylinder
         root = self.radius**2 - offset**2 * side.sin().square()
-        seen = (root > 0) & (up.abs() < math.pi / 2)
-        reach = offset * side.cos() + torch.where(seen, root, 1).sqrt()
-        seen = seen & (reach > 0)
-        x, y = reach * side.sin(), -reach * torch.where(seen, up, 0).tan()
-        arc = self.radius * torch.atan2(x, reach * side.cos() - offset)
-        return tuple(torch.where(seen, part, math.nan) for part in self.pixels_at(y, arc))  # type: ignore[return-value]
+        visible = (root > 0) & (up.abs() < math.pi / 2)
+        distance = offset * side.cos() + torch.where(visible, root, 1).sqrt()  # in the horizontal plane
+        visible = visible & (distance > 0)
+        x, y = distance * side.sin(), -distance * torch.where(visible, up, 0).tan()
+        arc = self.radius * torch.atan2(x, distance * side.cos() - offset)
+        return tuple(torch.where(visible, part, math.nan) for part in self.pixels_at(y, arc))  # type: ignore[return-value]
 
     def pixels_per_degree(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
         """See :class:`Display`."""
         y, arc = self.metres(y_px, x_px)
-        point, turn = self._point(y, arc), arc / self.radius
-        along = torch.stack([turn.cos(), torch.zeros_like(turn), -turn.sin()], -1)
+        point, angle = self._point(y, arc), arc / self.radius
+        along = torch.stack([angle.cos(), torch.zeros_like(angle), -angle.sin()], -1)
         down = point.new_tensor([0.0, 1.0, 0.0])
-        return self._turn(point, down, self.pitch[0]), self._turn(point, along, self.pitch[1])
+        return self._pixels_per_degree(point, down, self.pitch[0]), self._pixels_per_degree(point, along, self.pitch[1])
 
     def _point(self, y: Tensor, arc: Tensor) -> Tensor:
-        turn = arc / self.radius
-        ahead = self.distance - self.radius + self.radius * turn.cos()
-        return torch.stack([self.radius * turn.sin(), y, ahead], -1)
+        angle = arc / self.radius
+        ahead = self.distance - self.radius + self.radius * angle.cos()
+        return torch.stack([self.radius * angle.sin(), y, ahead], -1)
 
 
 @dataclass(frozen=True)
 class Headset(Display):
-    """A headset with equal angles per pixel from its middle outwards (f-theta); for rectilinear ones, FlatScreen.
+    """A headset with a constant angle per pixel along each radius (f-theta); FlatScreen describes rectilinear headsets.
 
     Attributes:
-        resolution: Pixels per degree, outwards from the middle.
+        resolution: Pixels per degree along a radius from the middle.
     """
 
     resolution: float
@@ -239,7 +242,7 @@ class Headset(Display):
 
     @property
     def field_deg(self) -> tuple[float, float]:
-        """See :class:`Display`; at more than 180 deg in height, elevations do not tell it."""
+        """See :class:`Display`; computed from the resolution, as elevations are limited to 90 deg."""
         return self.shape[0] / self.resolution, self.shape[1] / self.resolution
 
     def angles(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
@@ -252,26 +255,29 @@ class Headset(Display):
         return up.rad2deg(), torch.atan2(x * share, angle.cos()).rad2deg()
 
     def pixels(self, elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
-        """See :class:`Display`; NaN straight behind, which is a whole circle of the image."""
+        """See :class:`Display`; NaN for the direction straight behind, which is a circle in the image."""
         up, side = _directions(elevation_deg, azimuth_deg)
         x, y = up.cos() * side.sin(), -up.sin()
         sine = _norm(y, x)
         angle = torch.atan2(sine, up.cos() * side.cos()).rad2deg()
-        # Masked before the division, whose gradient at 0 is NaN.
+        # Masked before the division, which has a NaN gradient at 0.
         share = angle * self.resolution / torch.where(sine > 0, sine, 1)
         share = torch.where(sine > 0, share, self.resolution * math.degrees(1))
         share = torch.where((sine < 1e-12) & (angle > 90), math.nan, share)
-        return self._placed(y * share, x * share)
+        return self._from_middle(y * share, x * share)
 
     def pixels_per_degree(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
-        """See :class:`Display`: ``resolution`` outwards, r / sin r as many around (r the eccentricity in radians)."""
+        """See :class:`Display`: ``resolution`` along a radius, and r / sin r times as many along a circle.
+
+        r is the eccentricity in radians.
+        """
         y, x = self._middle(y_px, x_px)
         radius = _norm(y, x)
         angle = (radius / self.resolution).deg2rad()
         around = torch.where(radius > 0, angle.sin() / torch.where(radius > 0, angle, 1), 1)
         safe = torch.where(radius > 0, radius, 1)
         cosine, sine = torch.where(radius > 0, x / safe, 1), y / safe
-        turn_x = torch.hypot(cosine, sine * around)  # of the direction per outward angle
+        turn_x = torch.hypot(cosine, sine * around)  # eye rotation per radial angle
         turn_y = torch.hypot(sine, cosine * around)
         return self.resolution / turn_y, self.resolution / turn_x
 
@@ -287,6 +293,6 @@ def _directions(elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
 
 
 def _norm(y: Tensor, x: Tensor) -> Tensor:
-    """Length of (y, x) with gradient 0 at 0."""
+    """Norm of (y, x), with gradient 0 at 0."""
     square = y.square() + x.square()
     return torch.where(square > 0, torch.where(square > 0, square, 1).sqrt(), 0)

@@ -1,4 +1,4 @@
-"""How large a pattern must be at an eccentricity to be perceived as soon as a target pattern nearer the centre."""
+"""Size of a pattern, over eccentricity, for the perception time of a target pattern nearer to the fixation point."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,8 +11,8 @@ from holotorch.perception import angles
 from holotorch.perception.table import TABLE_2_2
 from holotorch.perception.time import PerceptionTime
 
-TESTED_DEG = (5.0, 26.0)  # sizes that the study showed in the far periphery
-FITTED_DEG = (40.0, 70.0)  # eccentricities over which it fitted its lines
+TESTED_DEG = (5.0, 26.0)  # sizes of the patterns that the study showed in the far periphery
+FITTED_DEG = (40.0, 70.0)  # eccentricities to which the study fitted lines
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,9 +22,9 @@ class EqualEfficiencyScale:
     Attributes:
         alpha: Slope, degrees of size per degree of eccentricity; a number or a tensor of one value.
         beta: Intercept in degrees.
-        low_deg: Least eccentricity for which the line was fitted.
-        high_deg: Greatest.
-        covariance: Of (alpha, beta), [2, 2]; None for the table's lines, of which the thesis prints none.
+        low_deg: Smallest eccentricity of the fit.
+        high_deg: Greatest eccentricity of the fit.
+        covariance: Covariance of (alpha, beta), [2, 2]; None for the lines of Table 2.2, where it is not printed.
 
     Source: thesis Sec. 2.4.3.
     """
@@ -48,7 +48,7 @@ class EqualEfficiencyScale:
     def from_table(cls, size_deg: float, eccentricity_deg: float) -> "EqualEfficiencyScale":
         """The line of Table 2.2 whose target is a pattern of this size at this eccentricity, both in degrees.
 
-        ValueError for a target that is not in the table; nothing is interpolated between its rows.
+        ValueError for a target that is not in the table; rows are not interpolated.
         """
         for row in TABLE_2_2:
             if (row.size_deg, row.eccentricity_deg) == (size_deg, eccentricity_deg):
@@ -58,12 +58,14 @@ class EqualEfficiencyScale:
 
     @classmethod
     def fit(cls, eccentricity_deg: Any, size_deg: Any) -> "EqualEfficiencyScale":
-        """Least squares through sizes of equal time [N] at eccentricities [N], of which those in 40 .. 70 deg count.
+        """Fit a line by least squares to sizes of equal time [N] at eccentricities [N] within 40 .. 70 deg.
 
-        Differentiable in the sizes, float64. The covariance is NaN for two points, which any line meets.
+        Points at other eccentricities are ignored. The fit is differentiable in the sizes and uses float64. For two
+        points, the covariance is NaN.
 
         Raises:
-            ValueError: Fewer than two different eccentricities within 40 .. 70 deg, or a size there that is not finite.
+            ValueError: There are fewer than two different eccentricities within 40 .. 70 deg, or a size there is not
+                finite.
         """
         where = angles.eccentricity(eccentricity_deg).double()
         sizes = size_deg if isinstance(size_deg, Tensor) else torch.as_tensor(size_deg, dtype=torch.float64)
@@ -84,9 +86,9 @@ class EqualEfficiencyScale:
 
     @classmethod
     def from_time(cls, seconds: float | Tensor, times: PerceptionTime, eccentricity_deg: Any) -> "EqualEfficiencyScale":
-        """The line of the sizes that take ``seconds``, from laws ``times`` [N] at eccentricities [N] in degrees.
+        """The line of the sizes with the time ``seconds``, from laws ``times`` [N] at eccentricities [N] in degrees.
 
-        Only laws within 40 .. 70 deg are asked, as in the thesis. ValueError where one of them has a >= 0.
+        As in the thesis, only laws within 40 .. 70 deg are used. ValueError if one of them has a >= 0.
         """
         where = angles.eccentricity(eccentricity_deg).double()
         if where.ndim != 1 or times.slope.shape != where.shape:
@@ -102,9 +104,9 @@ class EqualEfficiencyScale:
     def from_surface(
         cls, size_deg: float, target_deg: float, times: PerceptionTime, eccentricity_deg: Any
     ) -> "EqualEfficiencyScale":
-        """The same for the time of a pattern of ``size_deg`` at ``target_deg``, one of the eccentricities.
+        """Like :meth:`from_time`, with the time of a pattern of ``size_deg`` at the eccentricity ``target_deg``.
 
-        ValueError where there is no law at ``target_deg``.
+        ValueError if there is no law at ``target_deg``.
         """
         where = angles.eccentricity(eccentricity_deg).double()
         at = (where == target_deg).nonzero()
@@ -113,55 +115,55 @@ class EqualEfficiencyScale:
         return cls.from_time(times[int(at[0])].seconds(size_deg), times, where)
 
     def __call__(self, eccentricity_deg: Any, *, extrapolate: bool = False) -> Tensor:
-        """S(E) in degrees; a tensor of the input's dtype and device, float64 for numbers.
+        """S(E) in degrees, a tensor with the dtype and device of the input; float64 for numbers.
 
         Args:
             eccentricity_deg: Angles from the fixation point, >= 0, any shape.
-            extrapolate: Follow the line beyond the eccentricities it was fitted to.
+            extrapolate: Use the line beyond the eccentricities of the fit.
 
         Raises:
-            ValueError: An eccentricity outside ``low_deg`` .. ``high_deg`` without ``extrapolate``; one at which the
-                extrapolated line is not above zero.
+            ValueError: An eccentricity is outside ``low_deg`` .. ``high_deg`` without ``extrapolate``, or the
+                extrapolated line is not above zero there.
         """
         where = angles.eccentricity(eccentricity_deg)
         if not extrapolate and not (inside := self.inside(where)).all():
             limits = f"{self.low_deg:g} .. {self.high_deg:g} degrees, where the line was fitted"
             got = angles.first(where, ~inside)
-            raise ValueError(f"eccentricity_deg must be within {limits}, got {got:g}; or say extrapolate=True")
+            raise ValueError(f"eccentricity_deg must be within {limits}, got {got:g}; or pass extrapolate=True")
         sizes = self._line(where)
         if (bad := sizes <= 0).any():
             got = f"{angles.first(sizes, bad):.3g} degrees at {angles.first(where, bad):g}"
-            raise ValueError(f"the line gives no size there: {got} degrees of eccentricity; it is a far-periphery line")
+            raise ValueError(f"the line holds in the far periphery only: its size is {got} degrees of eccentricity")
         return sizes
 
     def inverse(self, size_deg: Any, *, extrapolate: bool = False) -> Tensor:
-        """The eccentricity E in degrees at which S(E) is ``size_deg``; the same rules. ValueError if alpha is 0."""
+        """The eccentricity E in degrees with S(E) = ``size_deg``, within the same limits. ValueError if alpha is 0."""
         if not torch.as_tensor(self.alpha).detach().any():
-            raise ValueError("alpha is 0: the size is the same everywhere and tells no eccentricity")
+            raise ValueError("alpha is 0: the size is the same at every eccentricity, so that there is no inverse")
         sizes = angles.size(size_deg)
         where = (sizes - self._like(self.beta, sizes)) / self._like(self.alpha, sizes)
-        slack = _slack(sizes)
-        off = (where < self.low_deg - slack) | (where > self.high_deg + slack)
-        if not extrapolate and off.any():
+        tolerance = _tolerance(sizes)
+        outside = (where < self.low_deg - tolerance) | (where > self.high_deg + tolerance)
+        if not extrapolate and outside.any():
             ends = self._line(torch.tensor([self.low_deg, self.high_deg], dtype=torch.float64)).detach().sort().values
-            span = f"{ends[0]:.4g} .. {ends[1]:.4g} degrees, as the line has them"
+            span = f"{ends[0]:.4g} .. {ends[1]:.4g} degrees, the sizes of the line"
             raise ValueError(
-                f"size_deg must be within {span}, got {angles.first(sizes, off):g}; or say extrapolate=True"
+                f"size_deg must be within {span}, got {angles.first(sizes, outside):g}; or pass extrapolate=True"
             )
         if extrapolate:
             return angles.eccentricity(where, "the eccentricity of size_deg")
         return where.clamp(self.low_deg, self.high_deg)
 
     def inside(self, eccentricity_deg: Any) -> Tensor:
-        """Whether the line was fitted there; bool, of the shape given. A rounding beyond the ends is inside."""
+        """Whether eccentricities lie within those of the fit, up to rounding errors; bool, of the given shape."""
         where = angles.eccentricity(eccentricity_deg)
-        slack = _slack(where)
-        return (where >= self.low_deg - slack) & (where <= self.high_deg + slack)
+        tolerance = _tolerance(where)
+        return (where >= self.low_deg - tolerance) & (where <= self.high_deg + tolerance)
 
     def tested(self, eccentricity_deg: Any) -> Tensor:
-        """Whether S(E) is among the sizes that the study showed, 5 .. 26 deg; bool, at any eccentricity.
+        """Whether S(E) is within the sizes tested in the study, 5 .. 26 deg; bool, at any eccentricity.
 
-        Table 2.2 keeps lines that reach up to 4 deg beyond them at 70 deg: such sizes are flagged, not refused.
+        Lines of Table 2.2 exceed the tested sizes by up to 4 deg at 70 deg; such sizes are allowed and only marked.
         """
         sizes = self._line(angles.eccentricity(eccentricity_deg))
         return (sizes >= TESTED_DEG[0]) & (sizes <= TESTED_DEG[1])
@@ -174,6 +176,6 @@ class EqualEfficiencyScale:
         return torch.as_tensor(value, dtype=torch.float64).to(other)
 
 
-def _slack(values: Tensor) -> float:
-    """Degrees that rounding may bring beyond the ends, as of an angle found from coordinates, or of an inverse."""
+def _tolerance(values: Tensor) -> float:
+    """Tolerance in degrees for rounding errors of angles computed from coordinates or by ``inverse``."""
     return 1e-9 if values.dtype == torch.float64 else 1e-4

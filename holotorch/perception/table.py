@@ -1,4 +1,4 @@
-"""Thesis Table 2.2 as data: the lines of equal perception time, and how sure the study was of them."""
+"""Thesis Table 2.2: the lines of equal perception time and their analyses of variance."""
 
 from dataclasses import dataclass
 
@@ -9,12 +9,12 @@ class EqualEfficiencyRow:
 
     Attributes:
         size_deg: Size of the target pattern.
-        eccentricity_deg: Where the target pattern is seen.
+        eccentricity_deg: Eccentricity of the target pattern.
         alpha: Slope, degrees of size per degree of eccentricity.
         beta: Intercept in degrees.
-        freedom: Degrees of freedom between the groups, four eccentricities less one.
-        f: The statistic F. It takes the participants' sizes at different eccentricities as independent.
-        p: Its p-value.
+        freedom: Degrees of freedom between the groups: four eccentricities minus one.
+        f: The F statistic, which treats a participant's sizes at different eccentricities as independent.
+        p: p-value of ``f``.
     """
 
     size_deg: float

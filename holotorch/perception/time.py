@@ -1,4 +1,4 @@
-"""How long a pattern takes to be perceived: a logarithmic law in its size, one per eccentricity."""
+"""Perception time of a pattern as a logarithmic law of its size, one law per eccentricity."""
 
 import math
 from dataclasses import dataclass
@@ -9,21 +9,21 @@ from torch import Tensor
 
 from holotorch.perception import angles
 
-_LARGEST = 360.0  # degrees; the visual field holds no larger pattern
+_LARGEST = 360.0  # degrees; largest possible size of a pattern
 
 
 @dataclass(frozen=True, eq=False)
 class PerceptionTime:
-    """T(S) = a ln S + b, seconds for a pattern of S degrees. One law, or [...] of them, such as one per eccentricity.
+    """T(S) = a ln S + b in seconds for a pattern of S degrees: one law or a batch [...], such as one per eccentricity.
 
-    The time contains the decision and the press of a button, as in the thesis. The logarithm is natural.
+    As in the thesis, the time includes the decision and the press of a button. The logarithm is natural.
 
     Attributes:
-        slope: a in seconds, [...]; below zero where a larger pattern is perceived sooner.
+        slope: a in seconds, [...]; negative if a larger pattern is perceived sooner.
         intercept: b in seconds, [...]: the time at 1 degree.
-        covariance: Of (a, b) in s^2, [..., 2, 2]; NaN without it, or where two points leave nothing to judge it by.
-        deviation: Standard deviation of the residuals in seconds, [...]; NaN as above.
-        freedom: Points less two, [...].
+        covariance: Covariance of (a, b) in s^2, [..., 2, 2]; NaN for a fit to two points.
+        deviation: Standard deviation of the residuals in seconds, [...]; NaN for a fit to two points.
+        freedom: Degrees of freedom of the residuals, the number of points minus two, [...].
 
     Source: thesis Eq. 2.3 (in milliseconds there).
     """
@@ -43,15 +43,15 @@ class PerceptionTime:
 
     @classmethod
     def fit(cls, size_deg: Any, seconds: Any, *, seen: Tensor | None = None) -> "PerceptionTime":
-        """Least squares over the last axis, in float64; differentiable in the times.
+        """Fit laws by least squares over the last axis, in float64; differentiable with respect to the times.
 
         Args:
             size_deg: Sizes of the patterns, [N] or [..., N].
-            seconds: Times measured with them, [..., N].
-            seen: bool [..., N]: False for patterns that were missed, whose ``seconds`` may be anything, NaN included.
+            seconds: Measured times, [..., N].
+            seen: bool [..., N]; False for missed patterns, whose ``seconds`` are ignored and may be NaN.
 
         Raises:
-            ValueError: Times that are not above zero, or a law that has fewer than two different sizes to stand on.
+            ValueError: A time is not above zero, or a law has fewer than two different sizes.
         """
         times = seconds if isinstance(seconds, Tensor) else torch.as_tensor(seconds, dtype=torch.float64)
         if seen is not None:
@@ -59,56 +59,56 @@ class PerceptionTime:
                 raise TypeError(f"seen must be a bool tensor, got {seen.dtype}")
             times = torch.where(seen, times, torch.ones_like(times))
         times = angles.as_tensor("seconds", times, "seconds").double()
-        known = times.detach() if seen is None else times.detach()[seen.expand_as(times)]
+        measured = times.detach() if seen is None else times.detach()[seen.expand_as(times)]
         if times.ndim == 0 or (times <= 0).any():
             raise ValueError("seconds must be times above zero with the patterns on their last axis")
-        if known.median() > 30:
-            raise ValueError(f"seconds must be in seconds, got a median of {known.median():g}; 450 ms is 0.45")
+        if measured.median() > 30:
+            raise ValueError(f"seconds must be in seconds, got a median of {measured.median():g}; 450 ms is 0.45")
         x, times = torch.broadcast_tensors(angles.size(size_deg).to(times).log(), times)
         weight = torch.ones_like(times) if seen is None else seen.to(times).expand_as(times)
         count = weight.sum(-1)
-        middle = (weight * x).sum(-1, keepdim=True) / count.clamp(min=1)[..., None]
-        spread = (weight * (x - middle).square()).sum(-1)
+        mean_x = (weight * x).sum(-1, keepdim=True) / count.clamp(min=1)[..., None]
+        spread = (weight * (x - mean_x).square()).sum(-1)
         bad = ~(spread > 1e-12)
         if bad.any():
             which = f", as {int(bad.sum())} of {bad.numel()} have" if bad.ndim else ""
             got = "no seen pattern" if angles.first(count, bad) == 0 else "one size only"
             raise ValueError(f"a law T(S) = a ln S + b needs patterns of two sizes or more, got {got}{which}")
         mean = (weight * times).sum(-1) / count
-        slope = (weight * (x - middle) * times).sum(-1) / spread
-        intercept = mean - slope * middle[..., 0]
+        slope = (weight * (x - mean_x) * times).sum(-1) / spread
+        intercept = mean - slope * mean_x[..., 0]
         freedom = count - 2
-        rest = times - slope[..., None] * x - intercept[..., None]
-        variance = (weight * rest.square()).sum(-1) / freedom.clamp(min=1)
+        residual = times - slope[..., None] * x - intercept[..., None]
+        variance = (weight * residual.square()).sum(-1) / freedom.clamp(min=1)
         variance = torch.where(freedom > 0, variance, math.nan)
-        low, across = 1 / spread, -middle[..., 0] / spread
-        rows = [low, across, across, 1 / count + middle[..., 0].square() / spread]
+        slope_variance, mixed = 1 / spread, -mean_x[..., 0] / spread  # per unit variance of the residuals
+        rows = [slope_variance, mixed, mixed, 1 / count + mean_x[..., 0].square() / spread]
         covariance = variance[..., None, None] * torch.stack(rows, -1).unflatten(-1, (2, 2))
-        # The root's gradient is infinite at 0, where the data lie on the line; nothing there depends on 1e-300.
+        # The square root has an infinite gradient at 0, for data exactly on the line; 1e-300 changes no other result.
         return cls(slope, intercept, covariance, (variance + 1e-300).sqrt(), freedom)
 
     @property
     def falls(self) -> Tensor:
-        """Whether a larger pattern is perceived sooner (a < 0), so that :meth:`size` exists; bool [...]."""
+        """Whether a larger pattern is perceived sooner (a < 0), as :meth:`size` requires; bool [...]."""
         return self.slope < 0
 
     def __getitem__(self, index) -> "PerceptionTime":
-        """Some of the laws: an index, a slice or a mask over [...]."""
+        """Select laws by an index, a slice or a mask over [...]."""
         rest = (self.covariance, self.deviation, self.freedom)
         rest = (None if part is None else part[index] for part in rest)
         return PerceptionTime(self.slope[index], self.intercept[index], *rest)
 
     def seconds(self, size_deg: Any) -> Tensor:
-        """T(S) in seconds for sizes that broadcast against [...]. ValueError for sizes that are not above zero."""
+        """T(S) in seconds for sizes that broadcast with [...]. ValueError for sizes that are not above zero."""
         return self.slope * angles.size(size_deg).to(self.slope.device).log() + self.intercept
 
     def size(self, seconds: Any) -> Tensor:
-        """The size in degrees that takes ``seconds``, which broadcast against [...]; infinite above 360 deg.
+        """The size in degrees with the time ``seconds``, which broadcast with [...]; infinite above 360 deg.
 
-        An infinite size has gradient 0. Whether a size was among those tested is for :class:`EqualEfficiencyScale`.
+        An infinite size has gradient 0. :class:`EqualEfficiencyScale` tells whether a size was tested in the study.
 
         Raises:
-            ValueError: A law has a >= 0: larger is not faster there, and no size answers the question.
+            ValueError: A law has a >= 0, so that larger patterns are not perceived sooner and no size is a solution.
         """
         times = angles.as_tensor("seconds", seconds, "seconds").to(self.slope.device)
         if not self.falls.all():

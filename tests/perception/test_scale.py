@@ -35,7 +35,7 @@ def test_what_lies_outside_is_refused_or_extrapolated_by_name():
     assert scale(80, extrapolate=True).item() == pytest.approx(26.56)  # 0.47 * 80 - 11.04
     assert not scale.tested(80) and not scale.inside(80)
     assert scale(30, extrapolate=True).item() == pytest.approx(3.06)
-    with pytest.raises(ValueError, match=r"gives no size there: -6\.34 degrees at 10"):
+    with pytest.raises(ValueError, match=r"far periphery only: its size is -6\.34 degrees at 10"):
         scale(10, extrapolate=True)
     with pytest.raises(ValueError, match=r"within 7\.76 \.\. 21\.86 degrees"):
         scale.inverse(22.0)
@@ -47,7 +47,7 @@ def test_what_lies_outside_is_refused_or_extrapolated_by_name():
 @pytest.mark.parametrize("call", ["__call__", "inside", "tested"])
 def test_negative_and_impossible_angles(call):
     use = getattr(EqualEfficiencyScale.from_table(5, 10), call)
-    with pytest.raises(ValueError, match="without a side; take the absolute value"):
+    with pytest.raises(ValueError, match="without a sign for left or right; take the absolute value"):
         use(-50.0)
     with pytest.raises(ValueError, match="within 0 to 180 degrees, got 181"):
         use(181.0)

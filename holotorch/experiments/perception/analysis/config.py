@@ -1,4 +1,4 @@
-"""What the configuration of the analysis of a perception study may say."""
+"""Settings of the analysis of a perception study."""
 
 from typing import Annotated, Literal
 
@@ -27,7 +27,7 @@ Sizes = Annotated[tuple[Size, Size], AfterValidator(_rising)]
 
 
 class TargetTimeSettings(Settings):
-    """The time to reach elsewhere: each participant's own for a pattern that was shown, or ``seconds`` for all."""
+    """The target time: each participant's time for a pattern that was shown, or ``seconds`` for all participants."""
 
     size_deg: Size | None = None
     eccentricity_deg: Angle | None = None
@@ -47,12 +47,13 @@ class TargetTimeSettings(Settings):
 
 
 class CleaningSettings(Settings):
-    """The rule for reaction times, applied in this order; what each part leaves out is counted.
+    """Criteria for valid reaction times, applied in this order; the answers excluded by each one are counted.
 
-    ``fastest``, ``slowest``: bounds in seconds; outside, a press is an anticipation or no answer to the pattern.
-    ``deviations``: a time is an outlier where its logarithm is further than this from the median of its condition, in
-    units of 1.4826 times the participant's median absolute distance. ``responses``: a condition with fewer is missing.
-    ``sizes``: an eccentricity with fewer sizes left has no curve.
+    ``fastest``, ``slowest``: bounds in seconds; a faster answer is an anticipation, a slower one is not an answer to
+    the pattern. ``deviations``: a time is an outlier if its logarithm differs from the median of its condition by more
+    than this number of standard deviations, estimated as 1.4826 times the participant's median absolute deviation.
+    ``responses``: a condition with fewer valid answers is missing. ``sizes``: an eccentricity with fewer sizes has no
+    curve.
     """
 
     fastest: Seconds = 0.1
@@ -71,16 +72,17 @@ class CleaningSettings(Settings):
 class SimulationSettings(Settings):
     """Simulated participants whose equal-efficiency scales are known: alpha E + beta for a 5 deg pattern at 10 deg.
 
-    The defaults have the thesis's noise level. ``slope``: of the time over ln S in seconds; 5 deg patterns at 40 and
-    80 deg then differ by 150 ms (Sec. 2.4.2). The spreads and the deviation of a trial were set so that the analysis of
-    variance comes out as in the first row of Table 2.2: F near 7, which is a spread of about 14.5 deg between
-    participants, and 2 to 5 % of the scales undefined, as its p-values have denominators of 148 to 153, not 156.
+    The default noise reproduces the first row of Table 2.2: F is near 7, which corresponds to a standard deviation of
+    about 14.5 deg between participants, and 2 to 5 % of the scales are undefined (the p-values of the table belong to
+    148 to 153 degrees of freedom within the groups instead of 156).
 
-    ``slope_spread``, ``scale_spread``, ``local_spread``: standard deviations of the logarithm of a participant's slope,
-    of all their scales, and of those at each eccentricity. ``time_spread``: of their times, in seconds. ``trial``:
-    deviation of one reaction in seconds, a Gaussian plus an exponential; ``gaussian``: the Gaussian's part of it.
-    ``miss``, ``false_alarm``, ``lapse``: shares of targets missed, distractions answered, and answers that come up to
-    1.5 s late.
+    ``slope``: derivative of the time with respect to ln S, in seconds; with the default, times of 5 deg patterns at 40
+    and 80 deg differ by 150 ms (thesis Sec. 2.4.2). ``slope_spread``, ``scale_spread``, ``local_spread``: standard
+    deviations of the logarithms of a participant's slope, of all scales of a participant, and of the scale at each
+    eccentricity. ``time_spread``: standard deviation of a participant's times in seconds. ``trial``: standard deviation
+    of a single reaction time in seconds, a Gaussian plus an exponential; ``gaussian``: the Gaussian's share of it.
+    ``miss``: share of missed targets. ``false_alarm``: share of answered distractions. ``lapse``: share of answers that
+    are delayed by up to 1.5 s.
     """
 
     participants: Annotated[Count, Field(le=100_000)] = 40
@@ -109,9 +111,10 @@ class SimulationSettings(Settings):
 
 
 class PowerSettings(Settings):
-    """How often studies of so many participants would find a slope of so many degrees per degree to differ from 0.
+    """Simulated studies that determine how often a slope, in degrees per degree, is found to differ from 0.
 
-    The lines of all slopes have the simulation's scale in the middle of ``range_deg``.
+    ``studies``: number of simulated studies per slope. ``participants``: sizes of these studies. The lines of all
+    slopes have the scale of the simulation in the middle of ``range_deg``.
     """
 
     slopes: Annotated[tuple[Annotated[Number, Field(ge=0, lt=5)], ...], BeforeValidator(several), Field(min_length=1)]
@@ -121,12 +124,12 @@ class PowerSettings(Settings):
 
 
 class AnalysisSettings(Settings):
-    """Analysis of the logs of a perception study, or of a simulated one where no ``logs`` are given.
+    """Analysis of the logs of a perception study, or of a simulated study if there are no ``logs``.
 
-    ``range_deg``: eccentricities of the lines. ``limits_deg``: scales outside count as being at these limits.
-    ``tested_deg``: sizes within which scales are more than an extrapolation. ``confidence``: of intervals.
-    ``shown``: the participant of Fig. 2.5, the first by default. ``repeated_measures``: and a mixed model beside the
-    one-way analysis, which need statsmodels; where nothing is said, they are made if it is installed.
+    ``range_deg``: eccentricities to which lines are fitted. ``limits_deg``: scales outside are clipped to these limits.
+    ``tested_deg``: sizes shown in the study; scales outside are extrapolated. ``confidence``: level of all intervals.
+    ``shown``: the participant of Fig. 2.5, by default the first. ``repeated_measures``: whether to add a
+    repeated-measures analysis and a mixed model, which need statsmodels; by default, if it is installed.
     """
 
     experiment: Literal["perception_analysis"]

@@ -1,4 +1,4 @@
-"""Figures 2.3 to 2.7 of the thesis from the answers of a study, and the power of such studies: bytes of PNG files."""
+"""Figures 2.3 to 2.7 of the thesis for the answers of a study, and its power; functions return bytes of PNG files."""
 
 import io
 from collections.abc import Sequence
@@ -21,12 +21,12 @@ _COLOURS = "viridis"
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What the pictures of one target time show.
+    """The data of one target time for the figures.
 
     Attributes:
-        name: The target, in words.
+        name: The target in words.
         eccentricities: Degrees [K].
-        line: Its line and medians.
+        line: Line and medians of the target.
     """
 
     name: str
@@ -35,9 +35,9 @@ class Shown:
 
 
 def surface(times: Times, levels: Sequence[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sizes [N] and quantiles over participants of the time in ms at them, [len(levels), E, N].
+    """Sizes [N], and quantiles over the participants of the times in ms at these sizes, [len(levels), E, N].
 
-    Between the sizes that were shown at an eccentricity the time is linear in ln S; beyond them it is NaN.
+    Between the sizes shown at an eccentricity, times are interpolated linearly in ln S; beyond them they are NaN.
     """
     fine = np.linspace(times.sizes[0], times.sizes[-1], 64)
     fine = np.unique(np.concatenate([fine, times.sizes, [s for s, _ in _SLICES if fine[0] <= s <= fine[-1]]]))
@@ -54,7 +54,7 @@ def surface(times: Times, levels: Sequence[float]) -> tuple[NDArray[np.float64],
 
 
 def time_surface(times: Times) -> bytes:
-    """Fig. 2.3: quartiles of all participants as surfaces, and the median at three sizes on them."""
+    """Fig. 2.3: surfaces of the quartiles over all participants, and the median with lines at three sizes."""
     sizes, levels = surface(times, (0.25, 0.5, 0.75))
     figure = Figure(figsize=(11, 4.6), layout="constrained", dpi=110)
     low, high = np.nanmin(levels), np.nanmax(levels)
@@ -89,11 +89,11 @@ def time_surface(times: Times) -> bytes:
 
 
 def time_map(times: Times, targets: Sequence[Shown], fitted: tuple[float, float], tested: tuple[float, float]) -> bytes:
-    """Fig. 2.4: the median time in colour, the conditions as dots, and lines of equal time."""
+    """Fig. 2.4: the median time as colour, the conditions as dots, and lines of equal time."""
     sizes, (median,) = surface(times, (0.5,))
     figure = Figure(figsize=(7.6, 4.8), layout="constrained", dpi=110)
     axes = figure.add_subplot()
-    # Each eccentricity has a column of its own, as none were shown between them.
+    # Each eccentricity is one column, without interpolation between eccentricities.
     drawn = axes.pcolormesh(times.eccentricities, sizes, median.T, cmap=_COLOURS, shading="nearest")
     figure.colorbar(drawn, ax=axes, label="median perception time (ms)")
     e, s = np.nonzero(np.isfinite(times.seconds).any(0))
@@ -111,7 +111,7 @@ def time_map(times: Times, targets: Sequence[Shown], fitted: tuple[float, float]
     return _png(figure, "Median perception time and scales of equal time", times)
 
 
-def single_participant(times: Times, curves: Curves, place: int) -> bytes:
+def single_participant(times: Times, curves: Curves, index: int) -> bytes:
     """Fig. 2.5: times of one participant over the size at the last four eccentricities, and T(S) = a ln S + b."""
     last = curves.eccentricities[-4:]
     figure = Figure(figsize=(3.1 * len(last), 3.3), layout="constrained", dpi=110)
@@ -121,8 +121,8 @@ def single_participant(times: Times, curves: Curves, place: int) -> bytes:
         axes = figure.add_subplot(1, len(last), k + 1, sharey=first)
         first = first or axes
         e, f = np.flatnonzero(times.eccentricities == angle)[0], len(curves.eccentricities) - len(last) + k
-        axes.plot(times.sizes, 1e3 * times.seconds[place, e], "o", color="#2867b2", ms=4)
-        a, b = 1e3 * curves.a[place, f], 1e3 * curves.b[place, f]
+        axes.plot(times.sizes, 1e3 * times.seconds[index, e], "o", color="#2867b2", ms=4)
+        a, b = 1e3 * curves.a[index, f], 1e3 * curves.b[index, f]
         title = f"{angle:g}°: too few sizes"
         if np.isfinite(a):
             axes.plot(fine, a * np.log(fine) + b, color="#c0392b")
@@ -132,11 +132,11 @@ def single_participant(times: Times, curves: Curves, place: int) -> bytes:
         axes.grid(alpha=0.3)
         if k == 0:
             axes.set_ylabel("perception time (ms)")
-    return _png(figure, f"Participant {times.participants[place]}", times)
+    return _png(figure, f"Participant {times.participants[index]}", times)
 
 
 def time_slices(times: Times) -> bytes:
-    """Fig. 2.6: the median time over the eccentricity for patterns of three sizes, and the middle half of people."""
+    """Fig. 2.6: median and interquartile range of the time over the eccentricity, for patterns of three sizes."""
     sizes, levels = surface(times, (0.25, 0.5, 0.75))
     figure = Figure(figsize=(6.4, 4.2), layout="constrained", dpi=110)
     axes = figure.add_subplot()
@@ -156,7 +156,7 @@ def time_slices(times: Times) -> bytes:
 def scale_lines(
     times: Times, targets: Sequence[Shown], fitted: tuple[float, float], tested: tuple[float, float], confidence: float
 ) -> bytes:
-    """Fig. 2.7: median scales with their intervals, the line through those in the range, and the sizes tested."""
+    """Fig. 2.7: median scales with intervals, the line fitted within the range, and the tested sizes."""
     columns = min(len(targets), 3)
     rows = -(-len(targets) // columns)
     figure = Figure(figsize=(4.2 * columns, 3.7 * rows), layout="constrained", dpi=110)
@@ -172,13 +172,15 @@ def scale_lines(
 
 
 def power_curves(rows: Sequence[dict[str, Any]], confidence: float) -> bytes:
-    """Share of simulated studies that see a slope, over the number of participants."""
+    """Share of simulated studies that detect a slope, over the number of participants."""
     figure = Figure(figsize=(6.2, 4), layout="constrained", dpi=110)
     axes = figure.add_subplot()
     for alpha in dict.fromkeys(row["alpha"] for row in rows):
-        own = [row for row in rows if row["alpha"] == alpha]
-        people, power = [row["participants"] for row in own], [row["power"] for row in own]
-        axes.errorbar(people, power, [2 * row["error"] for row in own], fmt="o-", ms=4, capsize=2, label=f"{alpha:g}")
+        results = [row for row in rows if row["alpha"] == alpha]
+        people, power = [row["participants"] for row in results], [row["power"] for row in results]
+        axes.errorbar(
+            people, power, [2 * row["error"] for row in results], fmt="o-", ms=4, capsize=2, label=f"{alpha:g}"
+        )
     axes.axhline(0.8, color="grey", lw=1, ls="--")
     axes.set(xlabel="participants", ylabel=f"studies whose {100 * confidence:g} % interval excludes 0", ylim=(0, 1.03))
     axes.grid(alpha=0.3)
@@ -194,7 +196,9 @@ def _points(axes: Axes, target: Shown, fitted: tuple[float, float], confidence: 
         if not part.any():
             continue
         ends = np.stack([line.medians - below, above - line.medians])[:, part]
-        interval = f" and {100 * confidence:g} % interval" if np.isfinite(ends).any() else ""  # too few people for one
+        interval = (
+            f" and {100 * confidence:g} % interval" if np.isfinite(ends).any() else ""
+        )  # no interval with too few participants
         axes.errorbar(
             where[part],
             line.medians[part],

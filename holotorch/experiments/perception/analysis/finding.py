@@ -1,4 +1,4 @@
-"""What the analysis of a perception study found, as a row of a table and in words."""
+"""Results of the analysis of a perception study, as a row of a table and in words."""
 
 import math
 from dataclasses import dataclass
@@ -14,7 +14,19 @@ from holotorch.experiments.perception.study.frames import Quantisation
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """What was found for one target time."""
+    """Results for one target time.
+
+    Attributes:
+        name: The target in words.
+        scales: Scales of all participants at all eccentricities.
+        line: Line through the medians.
+        thesis: One-way analysis of variance, as in the thesis.
+        repeated: Repeated-measures analysis; None if it was not requested.
+        mixed: Mixed model; None if it was not requested or not fitted.
+        undefined: Number of undefined scales within the range of the line.
+        limited: Number of defined scales there that are clipped to a limit.
+        missing: Number of scales there without a measured time.
+    """
 
     name: str
     scales: Scales
@@ -27,7 +39,7 @@ class Finding:
     missing: int
 
     def row(self, truth: tuple[float, float] | None) -> dict[str, Any]:
-        """A line of metrics.csv."""
+        """The row of metrics.csv; ``truth`` is the true (alpha, beta) of simulated participants."""
         line = self.line
         row: dict[str, Any] = {"target": self.name, "alpha": line.alpha, "beta": line.beta}
         row |= dict(zip(("alpha_low", "alpha_high"), line.alpha_interval, strict=True))
@@ -49,19 +61,25 @@ class Finding:
 
 
 def in_words(
-    settings: AnalysisSettings, times: Times, curves: Curves, found: list[Finding], frames: Quantisation, on: float
+    settings: AnalysisSettings,
+    times: Times,
+    curves: Curves,
+    findings: list[Finding],
+    frames: Quantisation,
+    whole_frames: float,
 ) -> str:
-    """What was found, line by line; ``on``: share of the times that are whole frames."""
+    """The results line by line; ``whole_frames`` is the share of reaction times that are whole numbers of frames."""
     who = "simulated participants" if times.simulated else "participants"
-    some = np.isfinite(curves.a)
+    fitted = np.isfinite(curves.a)
     lines = [
         f"Study      {len(times.participants)} {who}",
         "Answers    " + ", ".join(f"{number} {key}" for key, number in times.counts.items()),
-        f"Frames     {frames}; {100 * on:.0f} % of the times are whole frames",
-        f"Curves     T = a ln S + b: {int((curves.a[some] >= 0).sum())} of {int(some.sum())} do not fall with the size"
-        f", {int((~some).sum())} have too few sizes",
+        f"Frames     {frames}; {100 * whole_frames:.0f} % of the times are whole frames",
+        f"Curves     T = a ln S + b: {int((curves.a[fitted] >= 0).sum())} of {int(fitted.sum())} do not fall with the "
+        f"size, {int((~fitted).sum())} have too few sizes",
     ]
-    for f in found:
+    low, high = settings.limits_deg
+    for f in findings:
         line = f.line
         if line.refused:
             lines.append(f"Scale      as fast as {f.name}: no line, as {line.refused}")
@@ -69,36 +87,37 @@ def in_words(
         (a, b), (c, d) = line.alpha_interval, line.beta_interval
         lines.append(
             f"Scale      as fast as {f.name}: {line.alpha:.3g} [{a:.3g}, {b:.3g}] E {line.beta:+.3g} [{c:.3g}, {d:.3g}]"
-            f" deg; {100 * settings.confidence:g} % intervals; {f.undefined} scales undefined, {f.limited} at limits"
+            f" deg; {100 * settings.confidence:g} % intervals; {f.undefined} scales undefined "
+            f"(time does not fall with size), {f.limited} clipped to {low:g} or {high:g} deg"
         )
-        lines.append(_tested("one-way ANOVA, as in the thesis", f.thesis, f.thesis.p))
+        lines.append(_test_line("one-way ANOVA, as in the thesis", f.thesis, f.thesis.p))
         if f.repeated is not None:
-            share = f.repeated.epsilon
-            words = _tested("repeated measures, Greenhouse-Geisser", f.repeated, f.repeated.p_corrected, share)
-            lines.append(f"{words}, epsilon {share:.3g}")
+            epsilon = f.repeated.epsilon
+            words = _test_line("repeated measures, Greenhouse-Geisser", f.repeated, f.repeated.p_corrected, epsilon)
+            lines.append(f"{words}, epsilon {epsilon:.3g}")
         if f.mixed is not None:
             a, b = f.mixed.alpha_interval
             lines.append(f"             mixed model: alpha {f.mixed.alpha:.3g} [{a:.3g}, {b:.3g}], p = {f.mixed.p:.3g}")
     return "\n".join(lines)
 
 
-def _tested(name: str, found: Anova, p: float, share: float = 1.0) -> str:
-    """``share``: of the degrees of freedom with which ``p`` was found."""
-    first, second = (f"{share * freedom:.4g}" for freedom in found.freedom)
-    return f"             {name}: F({first}, {second}) = {found.f:.3g}, p = {p:.3g}"
+def _test_line(name: str, anova: Anova, p: float, epsilon: float = 1.0) -> str:
+    """An F test in words; ``epsilon`` multiplies both degrees of freedom."""
+    first, second = (f"{epsilon * freedom:.4g}" for freedom in anova.freedom)
+    return f"             {name}: F({first}, {second}) = {anova.f:.3g}, p = {p:.3g}"
 
 
-def _anova(name: str, found: Anova) -> dict[str, Any]:
+def _anova(name: str, anova: Anova) -> dict[str, Any]:
     return {
-        f"{name}_f": found.f,
-        f"{name}_p": found.p,
-        f"{name}_df": found.freedom[0],
-        f"{name}_error_df": found.freedom[1],
+        f"{name}_f": anova.f,
+        f"{name}_p": anova.p,
+        f"{name}_df": anova.freedom[0],
+        f"{name}_error_df": anova.freedom[1],
     }
 
 
 def in_json(value: Any) -> Any:
-    """Numbers that JSON has; None for NaN and infinity."""
+    """The value for JSON: None instead of NaN and infinity."""
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     return value

@@ -1,4 +1,4 @@
-"""Power of a perception study: how many participants see a slope of a given size."""
+"""Statistical power of a perception study: how many participants are needed to detect a given slope."""
 
 import math
 from collections.abc import Iterator
@@ -21,25 +21,26 @@ _TARGET = TargetTimeSettings(size_deg=5, eccentricity_deg=10)
 
 
 def with_slope(settings: SimulationSettings, alpha: float, middle_deg: float) -> SimulationSettings:
-    """Participants whose line has another slope and the same scale at ``middle_deg``.
+    """Settings whose line has the slope ``alpha`` and an unchanged scale at ``middle_deg``.
 
     Raises:
-        ValueError: The line reaches sizes below zero between 40 and 80 deg.
+        ValueError: The line has sizes below zero between 40 and 80 deg.
     """
     beta = settings.beta + (settings.alpha - alpha) * middle_deg
     return SimulationSettings.model_validate({**settings.model_dump(), "alpha": alpha, "beta": beta})
 
 
 def power_rows(settings: AnalysisSettings, power: PowerSettings) -> Iterator[dict[str, Any]]:
-    """A row per slope and number of participants: in what share of simulated studies the interval of alpha excludes 0.
+    """Yield a row per slope and number of participants, from simulated studies with a target of 5 deg at 10 deg.
 
-    That share, ``power``, has a binomial ``error`` of one deviation. ``refused`` is the share of studies without a
-    line or its interval, which see nothing; of the others, ``covered`` is the share whose interval holds the slope.
-    Smaller studies are parts of the largest. The target is a 5 deg pattern at 10 deg.
+    ``power`` is the share of studies in which the interval of alpha excludes 0, and ``error`` its binomial standard
+    deviation. ``refused`` is the share of studies without a line or an interval, which detect no slope. ``covered`` is
+    the share of the remaining studies whose interval contains the true slope. Smaller studies consist of the first
+    participants of the largest one.
     """
     low, high = settings.range_deg
     pattern = (_TARGET.eccentricity_deg, _TARGET.size_deg)
-    # Conditions that nothing here depends on are not simulated.
+    # Only conditions that affect the line or the target time are simulated.
     conditions = [(e, s) for e, s in THESIS_CONDITIONS if low <= e <= high or (e, s) == pattern]
     most = max(power.participants)
     for k, alpha in enumerate(power.slopes):
@@ -78,15 +79,17 @@ def power_rows(settings: AnalysisSettings, power: PowerSettings) -> Iterator[dic
 
 
 def needed(rows: list[dict[str, Any]], power: float = 0.8) -> list[str]:
-    """In words: the smallest number of participants that was tried and reaches a power, for each slope."""
+    """Describe, for each slope, the smallest simulated number of participants that reaches ``power``."""
     lines = []
     for alpha in dict.fromkeys(row["alpha"] for row in rows):
-        own = sorted((row["participants"], row["power"]) for row in rows if row["alpha"] == alpha)
+        results = sorted((row["participants"], row["power"]) for row in rows if row["alpha"] == alpha)
         if alpha == 0:
-            worst = max(share for _, share in own)
-            lines.append(f"no slope: found by mistake in {100 * worst:.1f} % of the studies at most")
+            worst = max(share for _, share in results)
+            lines.append(f"no slope: a slope is detected by mistake in at most {100 * worst:.1f} % of the studies")
             continue
-        enough = [people for people, share in own if share >= power]
-        say = f"{enough[0]} participants" if enough else f"more than the {own[-1][0]} participants that were tried"
-        lines.append(f"a slope of {alpha:g} deg/deg is seen in {100 * power:g} % of the studies with {say}")
+        enough = [people for people, share in results if share >= power]
+        number = (
+            f"{enough[0]} participants" if enough else f"more than the {results[-1][0]} participants that were tried"
+        )
+        lines.append(f"a slope of {alpha:g} deg/deg is detected in {100 * power:g} % of the studies with {number}")
     return lines

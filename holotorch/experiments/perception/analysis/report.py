@@ -16,18 +16,28 @@ _CAPTIONS = {
 
 
 def analysis_section(record: RunRecord) -> list[str]:
-    """HTML of an analysis: what it found in words, its lines, its figures, and the power of the study."""
+    """HTML of an analysis: the results in words and numbers, the figures, and the power of the study."""
     summary = record.summary
     parts = [heading(record.title, summary["status"]), element("pre", "\n".join(summary["lines"]))]
-    parts.append(_table(summary["rows"]))
+    parts.append(_results(summary["rows"]))
     for name, caption in _CAPTIONS.items():
         if source := record.picture(name):
             parts.append(figure(source, caption, "wide"))
-    return parts + ([_table(summary["power"])] if summary["power"] else [])
+    if power := summary["power"]:
+        parts.append(table([_words(key) for key in power[0]], [[_cell(v) for v in row.values()] for row in power]))
+    return parts
 
 
-def _table(rows: list[dict[str, Any]]) -> str:
-    def cell(value: Any) -> str:
-        return "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+def _results(rows: list[dict[str, Any]]) -> str:
+    """A table with one column per target and one line per quantity, without quantities that no target has."""
+    lines = [[_words(key), *(_cell(row[key]) for row in rows)] for key in rows[0]]
+    (_, *targets), *lines = lines
+    return table(["target", *targets], [line for line in lines if any(line[1:])])
 
-    return table([key.replace("_", " ") for key in rows[0]], [[cell(value) for value in row.values()] for row in rows])
+
+def _words(key: str) -> str:
+    return key.replace("_", " ")
+
+
+def _cell(value: Any) -> str:
+    return "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,4 +1,4 @@
-"""A run of the analysis: logs, or simulated participants, to tables, pictures and a page."""
+"""A run of the analysis: reads logs or simulates participants, and writes tables, pictures and the summary."""
 
 import math
 import time
@@ -45,12 +45,12 @@ LEFT_OUT = (
 )
 
 
-def find(settings: AnalysisSettings, times: Times, curves: Curves) -> list[Finding]:
-    """Analyse all target times. ConfigError for a target that was not shown, or where statsmodels is asked for."""
+def analyse(settings: AnalysisSettings, times: Times, curves: Curves) -> list[Finding]:
+    """Analyse all target times. ConfigError for a target that was not shown, or if statsmodels is missing."""
     low, high = settings.range_deg
     inside = (curves.eccentricities >= low) & (curves.eccentricities <= high)
-    found = []
-    beside = _beside(settings)
+    findings = []
+    repeated = _uses_repeated_measures(settings)
     for k, target in enumerate(settings.targets):
         scales = equal_efficiency(curves, times.of(target), settings.limits_deg)
         line = fit_line(
@@ -62,37 +62,37 @@ def find(settings: AnalysisSettings, times: Times, curves: Curves) -> list[Findi
             resamples=settings.resamples,
             confidence=settings.confidence,
         )
-        known, there = scales.known[:, inside], np.isfinite(scales.degrees[:, inside])
-        found.append(
+        defined, measured = scales.defined_degrees[:, inside], np.isfinite(scales.degrees[:, inside])
+        findings.append(
             Finding(
                 str(target),
                 scales,
                 line,
-                one_way(known),
-                repeated_measures(known) if beside else None,
-                mixed_model(curves.eccentricities[inside], known, settings.confidence) if beside else None,
-                int((there & ~scales.defined[:, inside]).sum()),
+                one_way(defined),
+                repeated_measures(defined) if repeated else None,
+                mixed_model(curves.eccentricities[inside], defined, settings.confidence) if repeated else None,
+                int((measured & ~scales.defined[:, inside]).sum()),
                 int(scales.limited[:, inside].sum()),
-                int((~there).sum()),
+                int((~measured).sum()),
             )
         )
-    return found
+    return findings
 
 
-def _beside(settings: AnalysisSettings) -> bool:
-    """Whether a repeated-measures analysis and a mixed model stand beside the line."""
+def _uses_repeated_measures(settings: AnalysisSettings) -> bool:
+    """Whether a repeated-measures analysis and a mixed model are computed."""
     return has_statsmodels() if settings.repeated_measures is None else settings.repeated_measures
 
 
 def on_frames(responses: Responses) -> float:
-    """Share of the reaction times within a tenth of a frame of a whole number of frames; 0.2 by chance."""
+    """Share of the reaction times within 0.1 frames of a whole number of frames; 0.2 is expected by chance."""
     answered = np.isfinite(responses.reaction_s)
     frames = responses.reaction_s[answered] / responses.frame_s[answered]
     return float((np.abs(frames - np.round(frames)) <= 0.1).mean()) if len(frames) else math.nan
 
 
 def prepare_analysis(settings: AnalysisSettings) -> None:
-    """ConfigError for what the analysis would fail at."""
+    """Raise ConfigError for settings with which the analysis would fail later."""
     if settings.repeated_measures:
         need_statsmodels()
     if settings.power:
@@ -104,7 +104,7 @@ def prepare_analysis(settings: AnalysisSettings) -> None:
 
 
 def run_analysis(settings: AnalysisSettings, opened: RunFolder) -> bool:
-    """Carry an analysis out and fill the folder; whether it is complete."""
+    """Run the analysis and write all files of the run folder. Returns whether the run is complete."""
     started = time.perf_counter()
     folder, files = opened.path, Results()
     if settings.logs:
@@ -116,26 +116,26 @@ def run_analysis(settings: AnalysisSettings, opened: RunFolder) -> bool:
     shown = int(times.participants[0]) if settings.shown is None else settings.shown
     if shown not in times.participants:
         raise ConfigError([f"shown: no participant {shown}; there are {', '.join(map(str, times.participants))}"])
-    found = find(settings, times, curves)
+    findings = analyse(settings, times, curves)
     frames = quantisation(responses.frame_s.tolist())
-    assert frames is not None  # as there are trials
+    assert frames is not None  # there is at least one trial
     truths = [true_line(settings.simulation, target) if not settings.logs else None for target in settings.targets]
-    rows = [finding.row(truth) for finding, truth in zip(found, truths, strict=True)]
+    rows = [finding.row(truth) for finding, truth in zip(findings, truths, strict=True)]
     whole = on_frames(responses)
-    text = in_words(settings, times, curves, found, frames, whole)
-    if settings.repeated_measures is None and not _beside(settings):
+    text = in_words(settings, times, curves, findings, frames, whole)
+    if settings.repeated_measures is None and not _uses_repeated_measures(settings):
         text += f"\nLeft out   {LEFT_OUT}"
     print(text, flush=True)
     (folder / "arrays").mkdir(exist_ok=True)
     files.write(write_json, folder / "plan.json", {"rule": settings.cleaning.model_dump(), "counts": times.counts})
     files.write(save_array, folder / "arrays" / "times.npy", torch.from_numpy(times.seconds))
     files.write(
-        save_array, folder / "arrays" / "scales.npy", torch.from_numpy(np.stack([f.scales.degrees for f in found]))
+        save_array, folder / "arrays" / "scales.npy", torch.from_numpy(np.stack([f.scales.degrees for f in findings]))
     )
     files.write(write_table, folder / "metrics.csv", rows)
     files.write(write_table, folder / "conditions.csv", _conditions(times))
     files.write(write_table, folder / "curves.csv", _curves(times, curves))
-    drawn = [figures.Shown(f.name, curves.eccentricities, f.line) for f in found]
+    drawn = [figures.Shown(f.name, curves.eccentricities, f.line) for f in findings]
     place = int(np.flatnonzero(times.participants == shown)[0])
     images = {
         "time_surface": figures.time_surface(times),
@@ -150,16 +150,16 @@ def run_analysis(settings: AnalysisSettings, opened: RunFolder) -> bool:
         power = list(tqdm(power_rows(settings, settings.power), total=total, desc="power", dynamic_ncols=True))
         files.write(write_table, folder / "power.csv", power)
         images["power"] = figures.power_curves(power, settings.confidence)
-        said = needed(power)
-        text += "\n" + "\n".join(f"Power      {line}" for line in said)
-        print("\n".join(said), flush=True)
+        power_text = needed(power)
+        text += "\n" + "\n".join(f"Power      {line}" for line in power_text)
+        print("\n".join(power_text), flush=True)
     for key, data in images.items():
         files.write(write_bytes, folder / "images" / f"{key}.png", data)
     summary = {
         "experiment": "perception_analysis",
         "status": "",
         "simulated": times.simulated,
-        "repeated_measures": _beside(settings),
+        "repeated_measures": _uses_repeated_measures(settings),
         "participants": len(times.participants),
         "counts": times.counts,
         "quantisation": asdict(frames) | {"on_frames": in_json(whole)},

@@ -1,7 +1,8 @@
 """Simulated participants of the perception study, whose equal-efficiency scales are known.
 
-Their spread was fitted to what the thesis prints: F = 7.02 for 5 deg at 10 deg in Table 2.2, and how often a scale is
-undefined. A perception time is the expected median as a screen records it, half a frame late.
+The spread between participants reproduces two results of the thesis: F = 7.02 for the target of 5 deg at 10 deg in
+Table 2.2, and the share of undefined scales. Perception times are expected medians of recorded times, which are half a
+frame longer than the true ones.
 """
 
 import math
@@ -9,31 +10,35 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
+from scipy import special, stats
 
 from holotorch.experiments.perception.analysis.config import SimulationSettings, TargetTimeSettings
 from holotorch.experiments.perception.analysis.curves import Responses
 from holotorch.experiments.perception.study.design import THESIS_CONDITIONS
 
-_INNER = 40.0  # degrees; within, only the target times are measured
-_LATE = 1.5  # seconds, of a lapse at most
+_INNER = 40.0  # degrees; nearer to the fixation point, patterns only define target times
+_LATE = 1.5  # seconds; longest delay of a lapse
 
 
 def inner_seconds(size_deg: float, eccentricity_deg: float) -> float:
-    """How much longer than a 5 deg pattern at 10 deg one within 40 deg takes, in seconds.
+    """Time in seconds by which a pattern within 40 deg takes longer than one of 5 deg at 10 deg.
 
-    From the distances between the lines of Table 2.2 at 55 deg, at 122 ms per factor e of the size: 27 ms less per
-    factor e, and 0.3 ms more per degree.
+    The time falls by 27 ms when the size grows by a factor of e, and rises by 0.3 ms per degree of eccentricity. Both
+    numbers follow from the distances between the lines of Table 2.2 at 55 deg, with 122 ms per factor of e.
     """
     return 3e-4 * (eccentricity_deg - 10) - 0.027 * math.log(size_deg / 5)
 
 
 def true_line(settings: SimulationSettings, target: TargetTimeSettings) -> tuple[float, float]:
-    """(alpha, beta) of the participants' median scale for a target time; exact, as medians pass through exp."""
+    """(alpha, beta) of the participants' median scale for a target time.
+
+    The result is exact, because the median of exp(x) is exp of the median of x.
+    """
     if target.seconds is not None:
         factor = math.exp((target.seconds - settings.seconds) / settings.slope)
     else:
         size, angle = target.size_deg, target.eccentricity_deg
-        assert size is not None and angle is not None  # as the settings have checked
+        assert size is not None and angle is not None  # checked by TargetTimeSettings
         if angle < _INNER:
             factor = math.exp(inner_seconds(size, angle) / settings.slope)
         else:
@@ -51,15 +56,16 @@ def simulate(
 ) -> Responses:
     """Answers of ``settings.participants`` simulated participants.
 
-    A participant takes T = T0 + a ln(S / S(E)) from 40 deg on, S(E) being their scale for the time T0 of a 5 deg
-    pattern at 10 deg. The logarithm of S(E) is Gaussian around that of alpha E + beta, so the line is that of medians.
+    At 40 deg and beyond, a participant's time is T = T0 + a ln(S / S(E)), where S(E) is the participant's scale for the
+    time T0 of a 5 deg pattern at 10 deg. ln S(E) is Gaussian around ln(alpha E + beta), so that alpha E + beta is the
+    median scale.
 
     Args:
-        settings: The truth and the noise.
+        settings: True scales and noise.
         generator: Source of all randomness.
         conditions: (eccentricity, size) in degrees.
-        targets: Trials to answer per condition.
-        distractions: Trials not to answer per condition.
+        targets: Trials per condition with the target pattern.
+        distractions: Trials per condition with the other pattern, not to be answered.
     """
     people = settings.participants
     where = np.array(conditions, dtype=float).reshape(-1, 2)
@@ -71,7 +77,7 @@ def simulate(
     times = np.empty((people, len(where)))
     for k, (angle, size) in enumerate(where):
         if angle < _INNER:
-            # In proportion to the slope: so the scale for each target time changes by the same factor for everyone.
+            # Proportional to the slope, so that a change of the target time scales all participants' S(E) equally.
             times[:, k] = base + slope / settings.slope * inner_seconds(size, angle)
         else:
             middle = math.log(settings.alpha * angle + settings.beta)
@@ -80,7 +86,7 @@ def simulate(
     shape = (people, len(where), repeats)
     reaction = times[..., None] + _trials(settings, generator, shape, targets)
     reaction = reaction + np.where(generator.random(shape) < settings.lapse, _LATE * generator.random(shape), 0)
-    # Patterns appear at the start of a frame, and the button is looked at once per frame.
+    # Patterns appear at the start of a frame, and the button is read once per frame.
     reaction = np.ceil(np.maximum(reaction, 0) / settings.frame) * settings.frame
     target = np.broadcast_to(np.arange(repeats) < targets, shape)
     chance = generator.random(shape)
@@ -100,39 +106,32 @@ def simulate(
 def _trials(
     settings: SimulationSettings, generator: np.random.Generator, shape: tuple[int, ...], answers: int
 ) -> "np.ndarray[tuple[int, ...], np.dtype[np.float64]]":
-    """Gaussian plus exponential; the median of so many ``answers``, recorded with the frames, has the mean 0."""
+    """Gaussian plus exponential noise; the median of ``answers`` samples, rounded up to frames, has mean 0."""
     gaussian = settings.trial * settings.gaussian
     scale = math.sqrt(settings.trial**2 - gaussian**2)
     noise = gaussian * generator.standard_normal(shape) + scale * generator.exponential(size=shape)
-    return noise - _centre(gaussian, scale, answers) - settings.frame / 2
+    return noise - _mean_of_medians(gaussian, scale, answers) - settings.frame / 2
 
 
 @lru_cache
-def _centre(gaussian: float, scale: float, answers: int) -> float:
-    """Mean of the median of so many answers: above that of the distribution, which is skewed (12 ms for ten)."""
+def _mean_of_medians(gaussian: float, scale: float, answers: int) -> float:
+    """Mean of the median of ``answers`` samples of the noise; it exceeds the distribution's median, which is skewed.
+
+    The noise is a Gaussian of standard deviation ``gaussian`` plus an exponential of mean ``scale``. The cumulative
+    distribution of the k-th of n ordered samples at t is I_p(k, n - k + 1), with p = P(noise <= t) and I the
+    regularised incomplete beta function.
+    """
     if not gaussian and not scale:
         return 0.0
     t = np.linspace(-8 * gaussian, 8 * gaussian + 40 * scale, 20001)
-    below = np.array([_distribution(value, gaussian, scale) for value in t])
-    lower, upper = (answers + 1) // 2, answers // 2 + 1  # the places in order that a median is of
-    late = [
-        sum(math.comb(answers, j) * below**j * (1 - below) ** (answers - j) for j in range(place, answers + 1))
-        for place in (lower, upper)
-    ]
-    share = (late[0] + late[1]) / 2  # of medians up to t
-    return float((np.diff(share) * (t[1:] + t[:-1]) / 2).sum())
-
-
-def _distribution(t: float, gaussian: float, scale: float) -> float:
-    """P(Z + X <= t) of a Gaussian plus an exponential."""
     if not gaussian:
-        return -math.expm1(-max(t, 0) / scale)
-    if not scale:
-        return _phi(t / gaussian)
-    z, ratio = t / gaussian, gaussian / scale
-    late = math.exp(min(-t / scale + ratio**2 / 2, 700)) * _phi(z - ratio)
-    return max(_phi(z) - late, 0.0)
-
-
-def _phi(z: float) -> float:
-    return math.erfc(-z / math.sqrt(2)) / 2
+        noise = stats.expon(scale=scale)
+    elif not scale:
+        noise = stats.norm(scale=gaussian)
+    else:
+        noise = stats.exponnorm(scale / gaussian, scale=gaussian)
+    below = noise.cdf(t)
+    middle = ((answers + 1) // 2, answers // 2 + 1)  # ranks of the one or two samples that define the median
+    first, second = (special.betainc(rank, answers - rank + 1, below) for rank in middle)
+    cumulative = (first + second) / 2
+    return float((np.diff(cumulative) * (t[1:] + t[:-1]) / 2).sum())

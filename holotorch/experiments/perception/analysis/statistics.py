@@ -8,26 +8,27 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from holotorch.experiments.config.errors import ConfigError
 
 Array = NDArray[np.float64]
-LEAST = 5  # participants for an interval; the resamples of fewer repeat themselves
+LEAST = 5  # participants needed for an interval; fewer give too few distinct bootstrap resamples
 
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """S(E) = alpha E + beta through the medians over participants, and intervals.
+    """The line S(E) = alpha E + beta through the medians over participants, with confidence intervals.
 
     Attributes:
-        alpha: Degrees per degree; NaN where a median is missing, or half the scales or more are at a limit.
+        alpha: Degrees per degree; NaN if a median is missing, or if half the scales or more are at a limit.
         beta: Degrees.
-        alpha_interval: Lower and upper end; NaN with fewer than ``LEAST`` participants who have a scale.
-        beta_interval: As above.
+        alpha_interval: Lower and upper end; NaN if fewer than ``LEAST`` participants have a scale.
+        beta_interval: As ``alpha_interval``.
         medians: Degrees [K].
-        quartiles: 25 % and 75 % of the participants, [2, K].
-        median_intervals: [2, K].
-        refused: Why there is no line, or nothing.
+        quartiles: 25 % and 75 % quantiles over the participants, [2, K].
+        median_intervals: Lower and upper ends of the medians' intervals, [2, K].
+        refused: The reason why there is no line; empty if there is one.
     """
 
     alpha: float
@@ -50,17 +51,17 @@ def fit_line(
     resamples: int,
     confidence: float,
 ) -> Line:
-    """Least squares through the medians of ``degrees`` [P, K] at those eccentricities [K] that are ``inside``.
+    """Fit a line by least squares to the medians of ``degrees`` [P, K] at the eccentricities [K] that are ``inside``.
 
-    One participant gives a scale at every eccentricity, and these go together, as they share one target time. So whole
-    participants are drawn with replacement, and the ends of an interval are percentiles of the lines that result. As
-    percentiles are too narrow for few participants, the levels are those at which they equal a t interval for a mean
-    (Hesterberg 2015, "expanded" percentiles).
+    The scales of one participant are correlated, because they share one target time. The bootstrap therefore draws
+    whole participants with replacement, and the intervals are percentiles of the resulting lines. Plain percentiles are
+    too narrow for few participants; the levels used here are expanded to match a t interval of a mean (Hesterberg
+    2015).
     """
-    some = degrees[np.isfinite(degrees).any(1)]  # who has no scale at all is no participant of this line
+    some = degrees[np.isfinite(degrees).any(1)]  # participants without any scale do not count
     people, number = len(some), np.isfinite(degrees).sum(0)
     medians, quartiles = _median(degrees), _quantiles(degrees, [0.25, 0.75])
-    # Half of them are enough: the mean of two in the middle, one of them at a limit, would say what the limit is.
+    # Exactly half is already too many: the median would then average a scale with the limit itself.
     at_limit = np.maximum((degrees <= limits[0]).sum(0), (degrees >= limits[1]).sum(0))
     refused = ""
     if inside.sum() < 2:
@@ -73,15 +74,15 @@ def fit_line(
         refused = (
             f"half the participants or more have no scale within {limits[0]:g} .. {limits[1]:g} deg at {where} deg"
         )
-    nowhere, wide = (math.nan, math.nan), np.full((2, len(medians)), np.nan)
-    level = _expanded(people, confidence) if people >= LEAST else None
+    no_interval, median_intervals = (math.nan, math.nan), np.full((2, len(medians)), np.nan)
+    level = _expanded_level(people, confidence) if people >= LEAST else None
     if level is not None:
         drawn = _median(some[generator.integers(people, size=(resamples, people))], 1)
-        wide = _quantiles(drawn, [level, 1 - level])
+        median_intervals = _quantiles(drawn, [level, 1 - level])
     else:
         drawn = np.empty((0, len(medians)))
     if refused:
-        return Line(math.nan, math.nan, nowhere, nowhere, medians, quartiles, wide, refused)
+        return Line(math.nan, math.nan, no_interval, no_interval, medians, quartiles, median_intervals, refused)
     design = np.stack([eccentricities[inside], np.ones(int(inside.sum()))], -1)
     solve = np.linalg.pinv(design)
     alpha, beta = solve @ medians[inside]
@@ -95,23 +96,22 @@ def fit_line(
         (float(ends[0, 1]), float(ends[1, 1])),
         medians,
         quartiles,
-        wide,
+        median_intervals,
     )
 
 
-def _expanded(people: int, confidence: float) -> float:
-    from scipy import stats
-
+def _expanded_level(people: int, confidence: float) -> float:
+    """Lower percentile level that makes a percentile interval as wide as a t interval of a mean."""
     t = stats.t.ppf((1 - confidence) / 2, people - 1)
     return float(stats.norm.cdf(math.sqrt(people / (people - 1)) * t))
 
 
 def _median(values: Array, axis: int = 0) -> Array:
-    return _ignoring(np.median, np.nanmedian, values, axis)
+    return _ignore_nan(np.median, np.nanmedian, values, axis)
 
 
 def _quantiles(values: Array, levels: Sequence[float]) -> Array:
-    return _ignoring(
+    return _ignore_nan(
         lambda v, axis: np.quantile(v, levels, axis=axis),
         lambda v, axis: np.nanquantile(v, levels, axis=axis),
         values,
@@ -119,27 +119,27 @@ def _quantiles(values: Array, levels: Sequence[float]) -> Array:
     )
 
 
-def _ignoring(whole: Callable[..., Array], holed: Callable[..., Array], values: Array, axis: int) -> Array:
-    """The first of two functions where nothing is missing, as it is many times faster; NaN for a column of NaN."""
+def _ignore_nan(plain: Callable[..., Array], nan_aware: Callable[..., Array], values: Array, axis: int) -> Array:
+    """Call ``plain``, which is much faster, if no value is NaN, otherwise ``nan_aware``; NaN for a column of NaN."""
     if not np.isnan(values).any():
-        return whole(values, axis=axis)
+        return plain(values, axis=axis)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "All-NaN slice")
-        return holed(values, axis=axis)
+        return nan_aware(values, axis=axis)
 
 
 @dataclass(frozen=True)
 class Anova:
-    """An analysis of variance.
+    """Result of an analysis of variance.
 
     Attributes:
-        f: The statistic; NaN where there is too little to compare, or nothing to compare it with.
+        f: The F statistic; NaN if there are too few values, or no variance within the groups.
         p: Its p-value.
-        freedom: Degrees of freedom between, and within or of the error.
-        participants: How many were used.
-        left_out: Scales (one-way) or participants (repeated measures) that were missing or undefined.
-        epsilon: Greenhouse and Geisser's; 1 for a one-way analysis.
-        p_corrected: p with both degrees of freedom times epsilon.
+        freedom: Degrees of freedom between the groups, and within them (one-way) or of the error (repeated).
+        participants: Number of participants used.
+        left_out: Number of scales (one-way) or participants (repeated measures) left out as missing or undefined.
+        epsilon: Greenhouse-Geisser epsilon; 1 for a one-way analysis.
+        p_corrected: p-value with both degrees of freedom multiplied by epsilon.
     """
 
     f: float
@@ -152,12 +152,10 @@ class Anova:
 
 
 def one_way(values: Array) -> Anova:
-    """The thesis's analysis: the columns of ``values`` [P, K] as independent groups, NaN left out. SciPy.
+    """One-way ANOVA of the columns of ``values`` [P, K] as independent groups, as in the thesis; NaN is left out.
 
-    It takes a participant's values as independent, which they are not: its p is not what it says.
+    The values of one participant are not independent, so that the p-value is only nominal.
     """
-    from scipy import stats
-
     groups = [column[np.isfinite(column)] for column in values.T]
     groups = [group for group in groups if len(group)]
     number, missing = sum(map(len, groups)), int((~np.isfinite(values)).sum())
@@ -166,34 +164,34 @@ def one_way(values: Array) -> Anova:
     if min(freedom) < 1:
         return Anova(math.nan, math.nan, freedom, people, missing)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # equal values throughout: F is NaN or infinite, which says it
+        warnings.simplefilter("ignore")  # SciPy warns if all values are equal; F is then NaN or infinite
         f, p = stats.f_oneway(*groups)
     return Anova(float(f), float(p), freedom, people, missing, p_corrected=float(p))
 
 
 def repeated_measures(values: Array) -> Anova:
-    """The same with participants as blocks (statsmodels' AnovaRM); those with a NaN are left out, as it needs all.
+    """Repeated-measures ANOVA with participants as blocks (AnovaRM of statsmodels); participants with NaN are left out.
 
-    AnovaRM takes the differences between all pairs of columns to vary alike; ``p_corrected`` does not.
+    The uncorrected p-value assumes sphericity: differences between all pairs of columns have the same variance.
+    ``p_corrected`` does not assume it.
 
     Raises:
-        ConfigError: statsmodels is missing.
+        ConfigError: statsmodels is not installed.
     """
     need_statsmodels()
     import pandas
-    from scipy import stats
     from statsmodels.stats.anova import AnovaRM
 
-    whole = values[np.isfinite(values).all(1)]
-    people, columns = whole.shape
+    complete = values[np.isfinite(values).all(1)]
+    people, columns = complete.shape
     freedom = (columns - 1, (columns - 1) * (people - 1))
     if min(freedom) < 1:
         return Anova(math.nan, math.nan, freedom, people, len(values) - people, math.nan)
-    person, column = np.indices(whole.shape)
-    frame = pandas.DataFrame({"scale": whole.ravel(), "participant": person.ravel(), "place": column.ravel()})
+    person, column = np.indices(complete.shape)
+    frame = pandas.DataFrame({"scale": complete.ravel(), "participant": person.ravel(), "place": column.ravel()})
     centred = np.eye(columns) - 1 / columns
-    spread = centred @ np.cov(whole.T) @ centred
-    if np.trace(spread) <= 1e-24 * np.square(whole).mean():  # all alike but for rounding, which F would be made of
+    spread = centred @ np.cov(complete.T) @ centred
+    if np.trace(spread) <= 1e-24 * np.square(complete).mean():  # all equal within rounding errors
         return Anova(math.nan, math.nan, freedom, people, len(values) - people, math.nan)
     row = AnovaRM(frame, "scale", "participant", within=["place"]).fit().anova_table.iloc[0]
     f, p = float(row["F Value"]), float(row["Pr > F"])
@@ -207,14 +205,14 @@ class Mixed:
     """A linear mixed model of the scale over the eccentricity.
 
     Attributes:
-        alpha: Slope of the participants' mean, degrees per degree.
+        alpha: Slope of the mean over participants, degrees per degree.
         beta: Intercept in degrees.
         alpha_interval: Lower and upper end.
-        beta_interval: As above.
-        p: Of alpha = 0.
-        effects: What differs between participants: "line" (both alpha and beta) or "intercept".
-        participants: How many were used.
-        values: How many scales.
+        beta_interval: Lower and upper end.
+        p: p-value of the hypothesis alpha = 0.
+        effects: Random effects of a participant: "line" (alpha and beta) or "intercept".
+        participants: Number of participants used.
+        values: Number of scales used.
     """
 
     alpha: float
@@ -228,18 +226,18 @@ class Mixed:
 
 
 def mixed_model(eccentricities: Array, values: Array, confidence: float = 0.95) -> Mixed | None:
-    """Fit S = alpha E + beta with lines or, where that does not converge, intercepts of participants (MixedLM, REML).
+    """Fit the mixed model S = alpha E + beta by REML (MixedLM of statsmodels).
 
-    It is a model of means, which a few large scales move, and takes those missing to be missing at random.
+    The random effects are a line for each participant or, if that fit does not converge, an intercept. The model
+    describes means, which are sensitive to a few large scales, and assumes that values are missing at random.
 
     Returns:
-        None where there is too little to fit, or nothing converges.
+        None if there are too few values or neither fit converges.
 
     Raises:
-        ConfigError: statsmodels is missing.
+        ConfigError: statsmodels is not installed.
     """
     need_statsmodels()
-    from scipy import stats
     from statsmodels.regression.mixed_linear_model import MixedLM
 
     person, column = np.nonzero(np.isfinite(values))
@@ -251,7 +249,7 @@ def mixed_model(eccentricities: Array, values: Array, confidence: float = 0.95) 
     design = np.stack([np.ones_like(where), (where - middle) / unit], -1)
     for effects in ("line", "intercept"):
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # whether it converged is asked below
+            warnings.simplefilter("ignore")  # convergence is checked below
             try:
                 random = design if effects == "line" else design[:, :1]
                 fit = MixedLM(scale, design, groups=person, exog_re=random).fit(reml=True)
@@ -260,8 +258,8 @@ def mixed_model(eccentricities: Array, values: Array, confidence: float = 0.95) 
         covariance = np.asarray(fit.cov_params())[:2, :2]
         if not (fit.converged and np.isfinite(covariance).all() and (np.diag(covariance) > 0).all()):
             continue
-        back = np.array([[0, 1 / unit], [1, -middle / unit]])  # (alpha, beta) from the centred line
-        (alpha, beta), covariance = back @ np.asarray(fit.fe_params), back @ covariance @ back.T
+        to_line = np.array([[0, 1 / unit], [1, -middle / unit]])  # (alpha, beta) from the normalised coefficients
+        (alpha, beta), covariance = to_line @ np.asarray(fit.fe_params), to_line @ covariance @ to_line.T
         t = float(stats.t.isf((1 - confidence) / 2, people - 1))
         a, b = np.sqrt(np.diag(covariance))
         return Mixed(
@@ -278,12 +276,12 @@ def mixed_model(eccentricities: Array, values: Array, confidence: float = 0.95) 
 
 
 def has_statsmodels() -> bool:
-    """Whether the extra is installed."""
+    """Whether statsmodels is installed."""
     return importlib.util.find_spec("statsmodels") is not None
 
 
 def need_statsmodels() -> None:
-    """ConfigError with the line that installs it where it is missing."""
+    """Raise ConfigError with the command that installs statsmodels if it is missing."""
     if not has_statsmodels():
         raise ConfigError(
             ["statsmodels is missing: pip install 'holotorch[stats]', or leave it out with repeated_measures=false"]

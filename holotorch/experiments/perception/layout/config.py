@@ -1,4 +1,4 @@
-"""What the configuration of a layout over a wide field may say."""
+"""Settings of a layout over a wide field."""
 
 from typing import Annotated, Literal
 
@@ -11,14 +11,19 @@ Angle = Annotated[Number, Field(ge=-180, le=180)]
 
 
 class TargetPatternSettings(Settings):
-    """A row of thesis Table 2.2: the pattern as soon as which all others are to be perceived."""
+    """A row of thesis Table 2.2: the pattern whose perception time all icons must have."""
 
     size_deg: Annotated[Number, Field(gt=0, le=90)]
     eccentricity_deg: Annotated[Number, Field(ge=0, le=90)]
 
+    @property
+    def name(self) -> str:
+        """Size and eccentricity in words."""
+        return f"{self.size_deg:g} deg at {self.eccentricity_deg:g} deg"
+
 
 class ItemSettings(Settings):
-    """A place of the layout: its icon and label, and where its centre is; azimuths to the left are negative."""
+    """An item of the layout: its icon, label and the direction of its centre; azimuths to the left are negative."""
 
     icon: Icon
     label: str = ""
@@ -27,10 +32,10 @@ class ItemSettings(Settings):
 
 
 class LayoutSettings(Settings):
-    """Icons over a wide field, scaled so that each is perceived in equal time (thesis Fig. 2.8), a panel per target.
+    """Icons over a wide field, scaled for equal perception time (thesis Fig. 2.8); the picture has a panel per target.
 
-    ``extrapolate``: follow the lines beyond 70 deg of eccentricity; otherwise such icons keep the target's size.
-    ``field_deg``: what the picture spans, (vertical, horizontal), at equal angles per pixel.
+    ``extrapolate``: use the lines of Table 2.2 beyond 70 deg of eccentricity; otherwise such icons have the target's
+    size. ``field_deg``: field of the picture (vertical, horizontal), with equal angles per pixel.
     """
 
     experiment: Literal["perception_layout"]

@@ -1,4 +1,4 @@
-"""A notional theme park: its ground, and icons as plain shapes in a unit square. Our own drawings, of no real place."""
+"""Drawings of a fictional theme park: the background, and icons made of simple shapes in a unit square."""
 
 import math
 from collections.abc import Callable
@@ -7,11 +7,11 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.patches import Ellipse, FancyBboxPatch, Polygon, Rectangle
 
-Place = Callable[[float, float], tuple[float, float]]
+Position = Callable[[float, float], tuple[float, float]]
 
 
 def draw_ground(axes: Axes, field_deg: tuple[float, float]) -> None:
-    """Sky, hills, paths and a pond behind the icons, over (vertical, horizontal) degrees."""
+    """Draw the sky, hills, paths and a pond behind the icons; ``field_deg`` is (vertical, horizontal)."""
     high, wide = field_deg[0] / 2, field_deg[1] / 2
     axes.add_patch(Rectangle((-wide, -high), 2 * wide, 2 * high, color="#cfe4f2", zorder=0))
     steps = [wide * (i / 60 - 1) for i in range(121)]
@@ -26,7 +26,7 @@ def draw_ground(axes: Axes, field_deg: tuple[float, float]) -> None:
 
 
 def draw_icon(axes: Axes, name: str, centre: tuple[float, float], size: tuple[float, float], zorder: float) -> None:
-    """An icon on its plate, (x, y) and (height, width) in the axes' units."""
+    """Draw an icon on a rounded plate; ``centre`` (x, y) and ``size`` (height, width) are in the units of the axes."""
     height, width = size
     left, bottom = centre[0] - width / 2, centre[1] - height / 2
 
@@ -48,13 +48,13 @@ def draw_icon(axes: Axes, name: str, centre: tuple[float, float], size: tuple[fl
 
 
 class _Pen:
-    """Draws white (or coloured) shapes in the unit square of an icon."""
+    """Draws shapes, white by default, in the unit square of an icon."""
 
-    def __init__(self, axes: Axes, at: Place, width: float, height: float, zorder: float):
+    def __init__(self, axes: Axes, at: Position, width: float, height: float, zorder: float):
         self.axes, self.at, self.width, self.height, self.zorder = axes, at, width, height, zorder
 
     def line(self, *points: tuple[float, float], thick: float = 0.05, **options: Any) -> None:
-        # As polygons: a line's width would be in points, and not grow with the icon.
+        # Lines are polygons, because Matplotlib line widths are in points and do not scale with the icon.
         for (x0, y0), (x1, y1) in zip(points, points[1:], strict=False):
             length = math.hypot(x1 - x0, y1 - y0) or 1.0
             dx, dy = (x1 - x0) / length * thick / 2, (y1 - y0) / length * thick / 2
@@ -74,8 +74,8 @@ class _Pen:
 def _wheel(pen: _Pen) -> None:
     pen.line((0.5, 0.54), (0.3, 0.12))
     pen.line((0.5, 0.54), (0.7, 0.12))
-    rim = [(0.5 + 0.29 * math.cos(t * math.pi / 16), 0.54 + 0.29 * math.sin(t * math.pi / 16)) for t in range(33)]
-    pen.line(*rim, thick=0.04)
+    ring = [(0.5 + 0.29 * math.cos(t * math.pi / 16), 0.54 + 0.29 * math.sin(t * math.pi / 16)) for t in range(33)]
+    pen.line(*ring, thick=0.04)
     for k in range(8):
         x, y = 0.5 + 0.29 * math.cos(k * math.pi / 4), 0.54 + 0.29 * math.sin(k * math.pi / 4)
         pen.line((0.5, 0.54), (x, y), thick=0.02)

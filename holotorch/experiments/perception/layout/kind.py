@@ -29,7 +29,7 @@ class LayoutKind(ExperimentKind[LayoutSettings, "Layouts"]):
     def plan(self, experiment: Layouts) -> RunPlan:
         from holotorch.experiments.perception.layout.run import layout_text
 
-        return RunPlan(layout_text(experiment.settings))
+        return RunPlan(layout_text(experiment))
 
     def run(self, experiment: Layouts, folder: RunFolder) -> bool:
         from holotorch.experiments.perception.layout.run import run_layout

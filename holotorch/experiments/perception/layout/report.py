@@ -8,15 +8,15 @@ from holotorch.experiments.runs.record import RunRecord
 
 
 def layout_section(record: RunRecord) -> list[str]:
-    """HTML of a layout: its picture, what it asks for in words, its sizes and the displays that show it."""
+    """HTML of a layout: the picture, its description, the sizes, and the displays that can show it."""
     rows = record.summary["items"]
     parts = [heading(record.title, record.summary["status"])]
-    caption = "Icons of a notional theme park with their sizes. Those framed in grey are not scaled"
+    caption = "Icons of a notional theme park with their sizes. Icons framed in grey are not scaled"
     caption += "; * extrapolated." if any(row["note"].startswith("extrapolated") for row in rows) else "."
     if source := record.picture("layout"):
         parts.append(figure(source, caption, "wide"))
     parts.append(element("pre", "\n".join(record.summary["lines"])))
-    displays = "Displays of thesis Table 2.1: how far out they show what is asked"
+    displays = "Displays of thesis Table 2.1: greatest eccentricity at which they show the sizes"
     for title, lines in (("Sizes", rows), (displays, record.rows("displays.csv"))):
         parts += [element("h2", title), *_table(lines)]
     return parts

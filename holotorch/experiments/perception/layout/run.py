@@ -1,4 +1,4 @@
-"""A layout over a wide field, scaled for equal perception time: picture, tables and report (thesis Fig. 2.8)."""
+"""Layouts of icons over a wide field, scaled for equal perception time: picture and tables (thesis Fig. 2.8)."""
 
 import io
 import math
@@ -32,63 +32,63 @@ from holotorch.perception import (
 )
 
 _HALO = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.7}
+_ROUNDING_DEG = 1e-9  # an icon that touches the edge of the field is not cut
 _FITTED, _KEPT, _BEYOND, _UNTESTED, _ENDS = "#1b5e20", "#555555", "#d35400", "#b000b0", "#1a4a8a"
 _STYLES = {
     (_FITTED, "-"): "scaled by Table 2.2, 40 to 70 deg",
-    (_UNTESTED, "-"): "the same, size outside the tested 5 to 26 deg",
-    (_KEPT, ":"): "not scaled: beyond the line's ends (size of the target)",
+    (_UNTESTED, "-"): "scaled by Table 2.2, size outside the tested 5 to 26 deg",
+    (_KEPT, ":"): "not scaled: outside 40 to 70 deg (size of the target)",
     (_BEYOND, "--"): "* extrapolated beyond 70 deg",
 }
 
 
-def scaled(settings: LayoutSettings) -> list[tuple[str, ScaledLayout]]:
-    """Each target in words, and the layout for it. ConfigError for a target that Table 2.2 does not have."""
-    found = []
-    for i, target in enumerate(settings.targets):
-        try:
-            scale = EqualEfficiencyScale.from_table(target.size_deg, target.eccentricity_deg)
-        except ValueError as error:
-            raise ConfigError([f"targets.{i}: {error}"]) from None
-        size = torch.full((len(settings.items), 2), target.size_deg, dtype=torch.float64)
-        name = f"{target.size_deg:g} deg at {target.eccentricity_deg:g} deg"
-        found.append((name, scale_layout(_centres(settings), size, scale, extrapolate=settings.extrapolate)))
-    return found
-
-
-def layout_text(settings: LayoutSettings) -> str:
-    """What the layouts ask for, in words."""
-    lines = []
-    for name, layout in scaled(settings):
-        sizes = layout.size_deg.amax(-1)[~layout.kept].tolist()
-        span = f"{min(sizes):.1f} to {max(sizes):.1f} deg; " if sizes else ""
-        parts = [f"{int(layout.fitted.sum())} icons on the line", f"{int(layout.kept.sum())} keep their size"]
-        if layout.extrapolated.any():
-            parts.append(f"{int(layout.extrapolated.sum())} extrapolated")
-        if untested := int((~layout.tested).sum()):
-            parts.append(f"{untested} of a size that was not tested")
-        pairs = len(overlaps(_centres(settings), layout.size_deg)[0])
-        parts.append(f"{pairs} pairs overlap" if pairs else "none overlap")
-        lines.append(f"As soon as {name}: {span}{', '.join(parts)}")
-    return "\n".join(lines)
-
-
 @dataclass(frozen=True)
 class Layouts:
-    """A configuration, and the layout for each of its targets in words."""
+    """A configuration, and for each of its targets the description and the scaled layout."""
 
     settings: LayoutSettings
     scaled: list[tuple[str, ScaledLayout]]
 
 
 def build_layouts(settings: LayoutSettings) -> Layouts:
-    """Scale the icons for all targets. ConfigError for a target that Table 2.2 does not have."""
-    return Layouts(settings, scaled(settings))
+    """Scale the icons for all targets. ConfigError for a target that Table 2.2 does not contain."""
+    layouts = []
+    for i, target in enumerate(settings.targets):
+        try:
+            scale = EqualEfficiencyScale.from_table(target.size_deg, target.eccentricity_deg)
+        except ValueError as error:
+            raise ConfigError([f"targets.{i}: {error}"]) from None
+        size = torch.full((len(settings.items), 2), target.size_deg, dtype=torch.float64)
+        layout = scale_layout(_centres(settings), size, scale, extrapolate=settings.extrapolate)
+        layouts.append((target.name, layout))
+    return Layouts(settings, layouts)
+
+
+def layout_text(layouts: Layouts) -> str:
+    """Describe the scaled layouts, one line per target."""
+    lines = []
+    for name, layout in layouts.scaled:
+        sizes = layout.size_deg.amax(-1)[~layout.kept].tolist()
+        span = f"{min(sizes):.1f} to {max(sizes):.1f} deg; " if sizes else ""
+        fitted, kept = int(layout.fitted.sum()), int(layout.kept.sum())
+        parts = [f"{fitted} icons scaled by Table 2.2", f"{kept} with the size of the target"]
+        if layout.extrapolated.any():
+            parts.append(f"{int(layout.extrapolated.sum())} extrapolated")
+        if untested := int((~layout.tested).sum()):
+            parts.append(f"{untested} of a size that was not tested")
+        pairs = len(overlaps(_centres(layouts.settings), layout.size_deg)[0])
+        parts.append(f"{pairs} pairs of icons overlap" if pairs else "no icons overlap")
+        cut = [_name(layouts.settings.items[i]) for i in _cut(layouts.settings, layout).nonzero()[:, 0].tolist()]
+        edge = "cut by the edge of the field"
+        parts.append(f"{len(cut)} {edge} ({', '.join(cut)})" if cut else f"none {edge}")
+        lines.append(f"Perceived as soon as {name}: {span}{', '.join(parts)}")
+    return "\n".join(lines)
 
 
 def run_layout(layouts: Layouts, opened: RunFolder) -> bool:
-    """Draw the layouts and fill the folder; whether the run is complete."""
+    """Draw the layouts and write all files of the run folder. Returns whether the run is complete."""
     settings = layouts.settings
-    folder, files, text = opened.path, Results(), layout_text(settings)
+    folder, files, text = opened.path, Results(), layout_text(layouts)
     rows = [row for title, layout in layouts.scaled for row in _rows(settings, title, layout)]
     files.write(write_table, folder / "layout.csv", rows)
     picture = _picture(settings, layouts.scaled)
@@ -102,6 +102,7 @@ def run_layout(layouts: Layouts, opened: RunFolder) -> bool:
             "extrapolated": int(layout.extrapolated.sum()),
             "untested_size": int((~layout.tested).sum()),
             "overlaps": overlaps(_centres(settings), layout.size_deg)[0].tolist(),
+            "cut": _cut(settings, layout).nonzero()[:, 0].tolist(),
         }
         for title, layout in layouts.scaled
     }
@@ -121,8 +122,18 @@ def _centres(settings: LayoutSettings) -> Tensor:
     return torch.tensor([[item.elevation_deg, item.azimuth_deg] for item in settings.items], dtype=torch.float64)
 
 
-def _note(layout: ScaledLayout, i: int) -> str:
-    """What must be known of a size; "" for one on the line and among those tested."""
+def _name(item: ItemSettings) -> str:
+    return item.label or item.icon.replace("_", " ")
+
+
+def _cut(settings: LayoutSettings, layout: ScaledLayout) -> Tensor:
+    """Whether a part of each icon lies outside the field of the picture, [N] bool."""
+    half_field = torch.tensor(settings.field_deg, dtype=torch.float64) / 2
+    return (_centres(settings).abs() + layout.size_deg / 2 > half_field + _ROUNDING_DEG).any(-1)
+
+
+def _note(layout: ScaledLayout, i: int, cut: bool) -> str:
+    """Warnings about an icon's size; empty if Table 2.2 gives the size, the study tested it and the icon is not cut."""
     parts = []
     if layout.extrapolated[i]:
         parts.append("extrapolated beyond 70 deg")
@@ -133,10 +144,13 @@ def _note(layout: ScaledLayout, i: int) -> str:
         )
     if not layout.tested[i]:
         parts.append("size not tested")
+    if cut:
+        parts.append("cut by the edge of the field")
     return "; ".join(parts)
 
 
 def _rows(settings: LayoutSettings, title: str, layout: ScaledLayout) -> list[dict[str, Any]]:
+    cut = _cut(settings, layout).tolist()
     return [
         {
             "target": title,
@@ -146,28 +160,27 @@ def _rows(settings: LayoutSettings, title: str, layout: ScaledLayout) -> list[di
             "elevation_deg": item.elevation_deg,
             "eccentricity_deg": round(layout.eccentricity_deg[i].item(), 3),
             "size_deg": round(layout.size_deg[i].max().item(), 3),
-            "note": _note(layout, i),
+            "note": _note(layout, i, cut[i]),
         }
         for i, item in enumerate(settings.items)
     ]
 
 
 def _displays(settings: LayoutSettings) -> list[dict[str, Any]]:
-    """Each display of Table 2.1 against the most that the targets ask for at the ends of the lines."""
+    """For each display of Table 2.1, the greatest eccentricity at which it can show each target's sizes."""
     ends = torch.tensor(FITTED_DEG, dtype=torch.float64)
     rows = []
     for display in TABLE_2_1:
         row: dict[str, Any] = {"display": display.name, "half_field_deg": display.half_field_deg}
         for target in settings.targets:
             scale = EqualEfficiencyScale.from_table(target.size_deg, target.eccentricity_deg)
-            found = check_display(display, scale, ends)
+            resolved = check_display(display, scale, ends).resolved
             grid = torch.linspace(*FITTED_DEG, 301, dtype=torch.float64)
             covered = grid[check_display(display, scale, grid).covered].tolist()
-            finest = "resolution unknown" if found.resolved is None else ("" if found.resolved.all() else "too coarse")
-            words = f"to {math.floor(max(covered) + 1e-9)} deg" if covered else "not at 40 deg"
-            perhaps = " at most (diagonal)" if covered and display.axis == "diagonal" else ""
-            name = f"{target.size_deg:g} deg at {target.eccentricity_deg:g} deg"
-            row[name] = words + perhaps + (f", {finest}" if finest else "")
+            resolution = "resolution unknown" if resolved is None else ("" if resolved.all() else "too coarse")
+            limit = f"to {math.floor(max(covered) + 1e-9)} deg" if covered else "not at 40 deg"
+            diagonal = " at most (diagonal)" if covered and display.axis == "diagonal" else ""
+            row[target.name] = limit + diagonal + (f", {resolution}" if resolution else "")
         rows.append(row)
     return rows
 
@@ -188,7 +201,7 @@ def _picture(settings: LayoutSettings, layouts: list[tuple[str, ScaledLayout]]) 
             draw_icon(axes, item.icon, centre, size, 10 + i)
             _frame(axes, item, size, layout, i)
             if abs(layout.eccentricity_deg[i].item() - target.eccentricity_deg) < 0.05:
-                # Drawn a little around the target; at 40 deg the line, which is a fit, gives a smaller size than it.
+                # 0.4 deg around the target, whose size differs from that of the fitted line at 40 deg.
                 _box(axes, centre, (target.size_deg + 0.8, target.size_deg + 0.8), "#d00000", "--")
         axes.plot(0, 0, "k+", markersize=11, zorder=400)
         axes.set(xlim=(-wide, wide), ylim=(-high, high), aspect="equal")
@@ -210,13 +223,13 @@ def _frame(axes: Axes, item: ItemSettings, size: tuple[float, float], layout: Sc
     colour, style = _style(layout, i)
     _box(axes, centre, size, colour, style)
     words = f"{max(size):.1f} deg" + (" *" if layout.extrapolated[i] else "")
-    place = centre[0], centre[1] - max(size[0] / 2, 3.0) - 0.4  # below the target's box
-    label = f"{item.label or item.icon.replace('_', ' ')}\n{words}"
-    axes.text(*place, label, ha="center", va="top", fontsize=7.5, color=colour, zorder=301, bbox=_HALO)
+    position = centre[0], centre[1] - max(size[0] / 2, 3.0) - 0.4  # below the box of the target
+    label = f"{_name(item)}\n{words}"
+    axes.text(*position, label, ha="center", va="top", fontsize=7.5, color=colour, zorder=301, bbox=_HALO)
 
 
 def _style(layout: ScaledLayout, i: int) -> tuple[str, str]:
-    """Colour and line of an icon's frame."""
+    """Colour and line style of an icon's frame."""
     if layout.extrapolated[i]:
         return _BEYOND, "--"
     if layout.kept[i]:
@@ -225,7 +238,7 @@ def _style(layout: ScaledLayout, i: int) -> tuple[str, str]:
 
 
 def _legend(layouts: list[tuple[str, ScaledLayout]]) -> list[Artist]:
-    """What is drawn, and nothing else."""
+    """Legend entries of the frame styles that occur in the picture."""
     used = {_style(layout, i) for _, layout in layouts for i in range(len(layout.kept))}
     frames = [
         Rectangle((0, 0), 1, 1, fill=False, edgecolor=key[0], linestyle=key[1], label=words)

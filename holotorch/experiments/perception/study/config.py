@@ -1,17 +1,17 @@
-"""What the file of a perception study may say: its screen, patterns, order and times."""
+"""Settings of a perception study: screen, patterns, order of trials and times."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field
 from pydantic_core import PydanticCustomError
 from torch import Tensor
 
-from holotorch.core.quantities import SCREEN
+from holotorch.core.quantities import SCREEN, shown
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.config.messages import validated
 from holotorch.experiments.config.settings import (
@@ -34,9 +34,22 @@ Eccentricity = Annotated[
 ]
 Size = Annotated[Number, within(0.1, 80, "a size between 0.1 and 80 deg")]
 Metres = Annotated[Length, plausible(SCREEN)]
+
+
+def _unit_if_unusual(value: Any) -> Any:
+    """Refuse a number without a unit that is unusual in metres: a distance of 21 was probably meant in centimetres."""
+    low, high = SCREEN.usual
+    if isinstance(value, int | float) and not isinstance(value, bool) and high < value <= SCREEN.high:
+        words = f"a distance in metres, usually {shown(low, 'm')} to {shown(high, 'm')}"
+        cure = f"write {value:g} cm, or {value:g} m if metres are meant"
+        raise PydanticCustomError("quantity", "expected {words}", {"words": words, "cure": f"; {cure}"})
+    return value
+
+
+Distance = Annotated[Metres, BeforeValidator(_unit_if_unusual)]
 Seconds = Annotated[Number, within(0.02, 60, "a time between 0.02 and 60 seconds, not milliseconds")]
 Whole = Annotated[int, BeforeValidator(number), Field(ge=0)]
-_SLACK_PX = 0.5
+_TOLERANCE_PX = 0.5  # of a pattern's outline beyond the edge of the screen, where nothing visible is lost
 
 
 def _ordered(times: tuple[float, float]) -> tuple[float, float]:
@@ -52,11 +65,11 @@ def _some(items: tuple) -> tuple:
 
 
 class _ScreenSettings(Settings):
-    """``shape``: pixels (rows, columns). ``size``: metres (height, width). ``cut``: show what fits of a pattern."""
+    """``shape``: pixels (rows, columns). ``size``: metres (height, width). ``cut``: allow patterns cut by the edge."""
 
     shape: tuple[Side, Side]
     size: tuple[Metres, Metres]
-    distance: Metres
+    distance: Distance
     cut: bool = False
 
 
@@ -67,28 +80,28 @@ class FlatSettings(_ScreenSettings):
 
 
 class CurvedSettings(_ScreenSettings):
-    """A screen on an upright cylinder of ``radius`` metres, hollow towards the eye; its width is along the arc."""
+    """A screen on an upright cylinder of ``radius`` metres, concave towards the eye; its width is along the arc."""
 
     kind: Literal["curved"]
-    radius: Metres
+    radius: Distance
 
 
 class ConditionSettings(Settings):
-    """Eccentricities that are shown with the same sizes, both in degrees."""
+    """Eccentricities in degrees, each shown with all of the sizes in degrees."""
 
     eccentricities_deg: Annotated[tuple[Eccentricity, ...], BeforeValidator(several), AfterValidator(_some)]
     sizes_deg: Annotated[tuple[Size, ...], BeforeValidator(several), AfterValidator(_some)]
 
 
 class RepeatSettings(Settings):
-    """How often each condition comes for each pattern as the target and as the distraction."""
+    """Number of trials of each condition and pattern, as the target and as the distraction."""
 
     target: Count = 5
     distraction: Whole = 2
 
 
 class TimingSettings(Settings):
-    """Seconds: the wait before a pattern (shortest, longest), how long it stays, how long a mistake is shown."""
+    """Times in seconds: the wait before a pattern (shortest, longest), its duration, and that of an error message."""
 
     wait_s: Annotated[tuple[Seconds, Seconds], AfterValidator(_ordered)] = (0.8, 1.6)
     show_s: Seconds = 2.0
@@ -96,7 +109,7 @@ class TimingSettings(Settings):
 
 
 class StudySettings(Settings):
-    """A study; see ``make_design``. ``practice``: trials before the first round, which no analysis counts."""
+    """A study; see ``make_design``. ``practice``: number of trials before the first round, which are not analysed."""
 
     seed: Whole
     screen: Annotated[FlatSettings | CurvedSettings, Discriminator("kind")]
@@ -114,7 +127,7 @@ class StudySettings(Settings):
 
     @property
     def trials(self) -> int:
-        """How many each participant has after the practice."""
+        """Number of trials of each participant after the practice."""
         conditions = sum(len(group.eccentricities_deg) * len(group.sizes_deg) for group in self.patterns)
         return 2 * conditions * (self.repeats.target + self.repeats.distraction)
 
@@ -135,7 +148,7 @@ class StudySettings(Settings):
 
 @dataclass(frozen=True)
 class Cut:
-    """A pattern that does not fit the screen, and by how much."""
+    """A pattern that extends beyond the edge of the screen; ``text`` says how far."""
 
     eccentricity_deg: float
     size_deg: float
@@ -143,77 +156,77 @@ class Cut:
 
 
 def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudySettings:
-    """Read, override and check the file of a study.
+    """Read the file of a study, apply the overrides and check the settings.
 
     Raises:
-        ConfigError: Everything that is wrong with it, one line per mistake with its file, line and column.
+        ConfigError: All mistakes in the file, one line per mistake with file, line and column.
     """
     source = read_source(Path(path), list(overrides))
     settings = validated(source, StudySettings)
-    found: list[tuple[Key, str]] = []
+    mistakes: list[tuple[Key, str]] = []
     screen = settings.screen
     if isinstance(screen, CurvedSettings):
         if screen.distance >= 2 * screen.radius:
-            found.append((("screen", "distance"), "expected an eye inside the cylinder: less than twice the radius"))
+            mistakes.append((("screen", "distance"), "expected an eye inside the cylinder: less than twice the radius"))
         if screen.size[1] > 2 * math.pi * screen.radius:
-            found.append((("screen", "size"), "expected an arc of one turn at most: 2 pi times the radius"))
-    if settings.trials > MOST_TRIALS:  # not to be listed
+            mistakes.append((("screen", "size"), "expected an arc of at most one turn, 2 pi times the radius"))
+    if settings.trials > MOST_TRIALS:  # too many to list the conditions
         raise ConfigError([source.mistake(("repeats",), too_many(settings.trials))])
-    seen: set[tuple[float, float]] = set()
+    conditions: set[tuple[float, float]] = set()
     for i, group in enumerate(settings.patterns):
         for pair in [(e, s) for e in group.eccentricities_deg for s in group.sizes_deg]:
-            if pair in seen:
+            if pair in conditions:
                 words = f"{pair[0]:g} deg with size {pair[1]:g} deg is there twice; raise the repeats instead"
-                found.append((("patterns", i), words))
-            seen.add(pair)
-    if not found:
+                mistakes.append((("patterns", i), words))
+            conditions.add(pair)
+    if not mistakes:
         cuts = beyond_screen(settings)
         shows = build_screen(screen).shows
         middles = sorted({cut.eccentricity_deg for cut in cuts if not shows(0.0, cut.eccentricity_deg)})
         if cuts and not screen.cut:
             words = "; sit nearer, use a larger screen, leave them out, or say 'cut: true' to show the part that fits"
-            shown = "; ".join(cut.text for cut in cuts[:4]) + (f"; and {len(cuts) - 4} more" if len(cuts) > 4 else "")
-            found.append((("screen",), f"patterns beyond the screen: {shown}{words}"))
+            listed = "; ".join(cut.text for cut in cuts[:4]) + (f"; and {len(cuts) - 4} more" if len(cuts) > 4 else "")
+            mistakes.append((("screen",), f"patterns beyond the screen: {listed}{words}"))
         elif middles:
             names = ", ".join(f"{eccentricity:g} deg" for eccentricity in middles)
-            found.append((("screen", "cut"), f"at {names} even the middle of a pattern is beyond the screen"))
-    if found:
-        raise ConfigError([source.mistake(key, message) for key, message in found])
+            mistakes.append((("screen", "cut"), f"at {names} even the middle of a pattern is beyond the screen"))
+    if mistakes:
+        raise ConfigError([source.mistake(key, message) for key, message in mistakes])
     return settings
 
 
 def beyond_screen(settings: StudySettings) -> list[Cut]:
-    """The patterns that do not fit the screen, with the reason."""
+    """The patterns that extend beyond the edge of the screen."""
     screen = build_screen(settings.screen)
     rows, columns = screen.shape
-    found = []
+    cuts = []
     for eccentricity, size in settings.conditions:
         y, x = screen.pixels(*_outline(eccentricity, size))
-        # Centres of pixels count from 0, so the screen ends half a pixel beyond the last; half a pixel more is no loss.
-        # NaN, in both, where a direction meets no point of the screen: nothing is within a limit there.
-        wide = ((x - (columns - 1) / 2).abs() <= columns / 2 + _SLACK_PX).all()
+        # Pixel centres have integer coordinates, so that the screen ends half a pixel beyond the last centre.
+        # Directions that do not meet the screen surface give NaN, which compares as outside.
+        fits_width = ((x - (columns - 1) / 2).abs() <= columns / 2 + _TOLERANCE_PX).all()
         high = (y - (rows - 1) / 2).abs().max().item()
         name = f"{size:g} deg at {eccentricity:g} deg"
-        if not wide:
-            reach, covered = eccentricity + size / 2, screen.field_deg[1] / 2
-            found.append(Cut(eccentricity, size, f"{name} reaches {reach:g} deg and the screen {covered:.1f} deg"))
-        elif high > rows / 2 + _SLACK_PX:
+        if not fits_width:
+            extent, half_field = eccentricity + size / 2, screen.field_deg[1] / 2
+            cuts.append(Cut(eccentricity, size, f"{name} reaches {extent:g} deg and the screen {half_field:.1f} deg"))
+        elif high > rows / 2 + _TOLERANCE_PX:
             text = f"{name} takes {math.ceil(2 * high)} pixels in height and the screen has {rows}"
-            found.append(Cut(eccentricity, size, text))
-    return found
+            cuts.append(Cut(eccentricity, size, text))
+    return cuts
 
 
 def build_screen(settings: FlatSettings | CurvedSettings) -> FlatScreen | CurvedScreen:
-    """The screen as geometry."""
+    """The geometry of the screen."""
     if isinstance(settings, FlatSettings):
         return FlatScreen(settings.shape, settings.size, settings.distance)
     return CurvedScreen(settings.shape, settings.size, settings.distance, settings.radius)
 
 
 def _outline(eccentricity: float, size: float) -> tuple[Tensor, Tensor]:
-    """(elevation, azimuth) in degrees of points of the circle, which the cross lies within."""
+    """(elevation, azimuth) in degrees of points on the circle pattern, which also encloses the cross pattern."""
     turn = torch.arange(0, 360, 5, dtype=torch.float64).deg2rad()
     centre, half = math.radians(eccentricity), math.tan(math.radians(size) / 2)
-    u, v = half * turn.cos(), half * turn.sin()  # in the plane that touches the unit sphere there
+    u, v = half * turn.cos(), half * turn.sin()  # in the plane tangent to the unit sphere at the centre
     x, z = math.sin(centre) + u * math.cos(centre), math.cos(centre) - u * math.sin(centre)
     return torch.atan2(v, torch.hypot(x, z)).rad2deg(), torch.atan2(x, z).rad2deg()

@@ -1,7 +1,8 @@
-"""The plan of a study of perception time: which pattern appears where, how large, on which side and in which order.
+"""Design of a study of perception time: the patterns, sizes, eccentricities, sides and order of all trials.
 
-After Sec. 2.3: crosses and circles at nine eccentricities; every pair of eccentricity and size comes five times for
-each pattern as the target and twice for each as the distraction; four rounds, two of them with the cross as the target.
+As in thesis Sec. 2.3, crosses and circles appear at nine eccentricities. Each pair of eccentricity and size is shown
+five times per pattern as the target and twice per pattern as the distraction. There are four rounds; the cross is the
+target in two of them.
 """
 
 import hashlib
@@ -15,11 +16,11 @@ Pattern = Literal["cross", "circle"]
 Side = Literal["left", "right"]
 _Appearance = tuple[float, float, Side, Pattern, bool]  # eccentricity, size, side, pattern, target
 ORDERS = ("thesis", "williams")
-# The thesis: nine eccentricities, three sizes at the inner four and eight at the outer five. Degrees.
+# (eccentricity, size) in degrees: three sizes at the inner four eccentricities, eight at the outer five.
 THESIS_CONDITIONS = tuple((float(e), float(s)) for e in (0, 10, 20, 30) for s in (5, 10, 15)) + tuple(
     (float(e), float(s)) for e in (40, 50, 60, 70, 80) for s in (5, 8, 11, 14, 17, 20, 23, 26)
 )
-MOST_TRIALS = 10_000  # of a participant; at 2.5 s each, seven hours
+MOST_TRIALS = 10_000  # per participant; seven hours at 2.5 s per trial
 _ROUNDS: tuple[tuple[Pattern, int], ...] = (("cross", 1), ("circle", 1), ("cross", 2), ("circle", 2))
 
 
@@ -32,10 +33,10 @@ class Trial:
         trial: 1, 2, ... within the round.
         eccentricity_deg: Angle between the fixation point and the pattern's centre, >= 0.
         size_deg: Angle that the pattern subtends.
-        side: Of the fixation point.
-        pattern: What appears.
-        target: Whether it is to be answered.
-        wait_s: From the end of the trial before to the appearance, in seconds.
+        side: Side of the fixation point.
+        pattern: Shape of the pattern.
+        target: Whether the pattern is the target of the round, which is to be answered.
+        wait_s: Time from the end of the previous trial to the appearance, in seconds.
     """
 
     round: int
@@ -49,12 +50,12 @@ class Trial:
 
     @property
     def practice(self) -> bool:
-        """Whether it belongs to the practice round."""
+        """Whether the trial belongs to the practice round."""
         return self.round == 0
 
     @property
     def goal(self) -> Pattern:
-        """The pattern to answer in this round."""
+        """The target pattern of this round."""
         return self.pattern if self.target else "circle" if self.pattern == "cross" else "cross"
 
 
@@ -67,12 +68,12 @@ class Design:
 
     @property
     def name(self) -> str:
-        """A short fingerprint of the trials: equal only where every one of them is."""
+        """A short hash of all trials, which differs if any trial differs."""
         text = json.dumps([asdict(trial) for trial in self.trials], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data that ``from_json`` reads back."""
+        """The design as JSON data, which ``from_json`` reads."""
         return {
             "format": "holotorch-design",
             "version": 1,
@@ -83,7 +84,7 @@ class Design:
 
     @staticmethod
     def from_json(data: dict[str, Any]) -> "Design":
-        """The design that was written; ValueError for other data, and where a trial was changed since."""
+        """Read the data of ``to_json``. ValueError for other data, and if a trial was changed."""
         if not isinstance(data, dict) or data.get("format") != "holotorch-design" or data.get("version") != 1:
             raise ValueError("expected a design of format holotorch-design, version 1")
         try:
@@ -98,8 +99,8 @@ class Design:
 def williams(n: int) -> tuple[tuple[int, ...], ...]:
     """Orders of 0 ... n - 1 balanced for carry-over (Williams 1949).
 
-    Every item stands equally often at every place and directly after every other item: n orders where n is even, 2 n
-    where it is odd.
+    Every item occurs equally often at every position, and directly after every other item. There are n orders for even
+    n, and 2 n for odd n.
     """
     if n < 1:
         raise ValueError(f"expected at least one item to order, got {n}")
@@ -109,7 +110,7 @@ def williams(n: int) -> tuple[tuple[int, ...], ...]:
 
 
 def round_orders(order: str) -> tuple[tuple[int, ...], ...]:
-    """Orders of the rounds cross 1, circle 1, cross 2, circle 2 that participants take in turn."""
+    """Orders of the rounds cross 1, circle 1, cross 2, circle 2, which are assigned to participants in turn."""
     if order not in ORDERS:
         raise ValueError(f"order: expected one of {', '.join(ORDERS)}, got {order!r}")
     return ((0, 1, 2, 3), (1, 0, 3, 2)) if order == "thesis" else williams(4)
@@ -127,26 +128,26 @@ def make_design(
     wait_s: tuple[float, float] = (0.8, 1.6),
     seed: int = 0,
 ) -> Design:
-    """Plan the trials of one participant; the same arguments give the same trials.
+    """Draw the trials of one participant; equal arguments give equal trials.
 
     Args:
-        participant: 1, 2, ...; chooses the order of the rounds.
-        conditions: (eccentricity, size) in degrees.
-        target_repeats: Of each condition for each pattern as the target.
-        distraction_repeats: Of each condition for each pattern as the distraction.
-        order: "thesis": the four rounds are the same for everybody; odd numbers take them as cross, circle, cross,
-            circle and even ones as circle, cross, circle, cross. "williams": the four orders of a Williams square in
-            turn, and the trials shuffled anew for each participant.
-        sides: "left", "right", or "both": then in each condition, role and pattern the sides differ by one at most (the
-            thesis does not state its sides).
-        practice: Trials of the practice round, which has the first round's target; at most as many as the two rounds
-            with that target have together.
-        wait_s: Bounds of the time before each appearance, drawn evenly between them.
-        seed: Of everything drawn.
+        participant: Number of the participant, 1, 2, ..., which determines the order of the rounds.
+        conditions: Pairs (eccentricity, size) in degrees.
+        target_repeats: Trials per condition and pattern as the target.
+        distraction_repeats: Trials per condition and pattern as the distraction.
+        order: "thesis": all participants have the same four rounds; odd numbers have the targets cross, circle, cross,
+            circle, even numbers circle, cross, circle, cross. "williams": the four orders of a Williams square are
+            assigned in turn, and the trials are shuffled for each participant.
+        sides: "left", "right" or "both". With "both", the numbers of trials on the two sides differ by at most one in
+            each condition, role and pattern. The thesis does not state the sides.
+        practice: Number of practice trials, which have the target of the first round; limited to the number of trials
+            in the two rounds with this target.
+        wait_s: Bounds of the uniformly distributed time before each appearance.
+        seed: Seed of the random numbers.
 
     Raises:
-        ValueError: A participant below 1, no condition, the same one twice, negative or impossible angles, counts or
-            times, or more trials than ``MOST_TRIALS``.
+        ValueError: The participant is below 1, there are no conditions or duplicates, an angle, count or time is out
+            of range, or there are more than ``MOST_TRIALS`` trials.
     """
     if isinstance(participant, bool) or participant < 1:
         raise ValueError(f"participant: expected a number from 1, got {participant}")
@@ -162,8 +163,7 @@ def make_design(
         half = (len(drawn) + 1) // 2
         blocks[goal, 1], blocks[goal, 2] = drawn[:half], drawn[half:]
     waits = {name: [_wait(rng, wait_s) for _ in block] for name, block in blocks.items()}
-    turn = orders[(participant - 1) % len(orders)]
-    sequence = [_ROUNDS[i] for i in turn]
+    sequence = [_ROUNDS[i] for i in orders[(participant - 1) % len(orders)]]
     exercise = random.Random(f"holotorch practice {seed} {participant}")
     pool = _shuffled(exercise, conditions, sequence[0][0], target_repeats, distraction_repeats, sides)
     trials = [Trial(0, i, *item, _wait(exercise, wait_s)) for i, item in enumerate(pool[:practice], 1)]
@@ -174,7 +174,7 @@ def make_design(
 
 
 def too_many(trials: int) -> str:
-    """What to say of more trials than ``MOST_TRIALS``."""
+    """Error message for more than ``MOST_TRIALS`` trials."""
     return f"expected at most {MOST_TRIALS} trials for a participant, got {trials}; lower the repeats or conditions"
 
 
@@ -183,16 +183,16 @@ def _shuffled(
 ) -> list[_Appearance]:
     other: Pattern = "circle" if goal == "cross" else "cross"
     roles: tuple[tuple[Pattern, int], ...] = ((goal, targets), (other, distractions))
-    found: list[_Appearance] = []
+    appearances: list[_Appearance] = []
     for eccentricity, size in conditions:
         for pattern, count in roles:
             start = rng.randrange(2)
             for i in range(count):
-                turn: Side = "right" if (start + i) % 2 else "left"
-                side: Side = turn if sides == "both" else "left" if sides == "left" else "right"
-                found.append((float(eccentricity), float(size), side, pattern, pattern == goal))
-    rng.shuffle(found)
-    return found
+                alternating: Side = "right" if (start + i) % 2 else "left"
+                side: Side = alternating if sides == "both" else "left" if sides == "left" else "right"
+                appearances.append((float(eccentricity), float(size), side, pattern, pattern == goal))
+    rng.shuffle(appearances)
+    return appearances
 
 
 def _wait(rng: random.Random, bounds: tuple[float, float]) -> float:

@@ -1,4 +1,4 @@
-"""How finely the reaction times of a study are known: to the frames of its display."""
+"""Quantisation of the reaction times of a study by the frames of the display."""
 
 import math
 import statistics
@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Quantisation:
-    """How finely reaction times are known, from the frame intervals that the browser measured.
+    """Quantisation of reaction times, from the frame intervals measured by the browser.
 
     Attributes:
-        trials: Trials that it is taken from.
-        frame_s: Median frame interval in seconds: patterns appear in steps of this.
-        least_s: The shortest.
-        most_s: The longest.
-        deviation_s: Standard deviation that the steps add to a reaction time, frame / sqrt(12).
+        trials: Number of trials.
+        frame_s: Median frame interval in seconds: patterns can only appear at multiples of it.
+        least_s: Shortest frame interval in seconds.
+        most_s: Longest frame interval in seconds.
+        deviation_s: Standard deviation of the quantisation error of a reaction time, frame / sqrt(12).
     """
 
     trials: int
@@ -35,7 +35,7 @@ class Quantisation:
 
 
 def quantisation(frames: Sequence[float]) -> Quantisation | None:
-    """The quantisation of reaction times from the frame intervals of trials in seconds; None where there are none."""
+    """Compute the quantisation from the frame intervals of all trials, in seconds; None if there are no trials."""
     if not frames:
         return None
     median = statistics.median(frames)

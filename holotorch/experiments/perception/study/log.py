@@ -1,8 +1,8 @@
 """Log of a study: one line of JSON per trial, on the disk before the next trial begins.
 
 The first line is a header, ``{"format": "holotorch-trials", "version": 1, ...}``; each other line is a trial. Lines are
-only ever appended, each in one write followed by fsync, so that whatever ends the program costs the trial on the screen
-at most. What a crash leaves of a line has no line end; readers leave it out and say so, and ``TrialLog`` cuts it off.
+only ever appended, and each is followed by fsync, so that a crash loses at most the trial on the screen. A line that a
+crash interrupts has no line end: readers ignore it and set ``torn``, and ``TrialLog`` removes it.
 """
 
 import contextlib
@@ -11,29 +11,24 @@ import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
-from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.config.errors import ConfigError, short
 from holotorch.experiments.config.messages import position
+from holotorch.experiments.perception.study.records import FORMAT, VERSION, LogHeader, TrialRecord, parse_record
 from holotorch.io.files import read_bytes
-
-FORMAT, VERSION = "holotorch-trials", 1
-_NUMBERS = ("eccentricity_deg", "size_deg", "onset_s", "frame_s")
-_COUNTS = ("participant", "round", "trial")
-_FLAGS = ("target", "practice", "responded")
-_TEXTS = ("design", "time_utc")
 
 
 @dataclass
 class Trials:
-    """What a log holds.
+    """The content of a log.
 
     Attributes:
         path: The file.
-        header: Its first line.
-        trials: The others, as dictionaries, in order.
-        torn: Whether an unfinished line at the end was left out.
-        size: Bytes up to the end of the last whole line.
+        header: The first line of the file.
+        trials: The other lines, as dictionaries, in order.
+        torn: Whether an unfinished line at the end was ignored.
+        size: Bytes up to the end of the last complete line.
     """
 
     path: Path
@@ -47,46 +42,50 @@ def read_log(path: Path) -> Trials:
     """Read and check a log.
 
     Raises:
-        ConfigError: It cannot be read, is empty, has no header, or has lines that are no trials: all of them, a line
-            each, as ``file:line:column``.
+        ConfigError: The file cannot be read, is empty, has no header, or has lines that are not trials. Every mistake
+            is listed as ``file:line:column``.
     """
     try:
         data = read_bytes(path)
     except OSError as error:
         raise ConfigError([f"{path}: cannot read the log: {error.strerror}"]) from None
-    whole, _, rest = data.rpartition(b"\n")
-    lines = whole.split(b"\n") if whole else []
+    complete, _, torn = data.rpartition(b"\n")
+    lines = complete.split(b"\n") if complete else []
     if not lines:
         raise ConfigError([f"{path}:1:1: the log is empty; expected a header and trials written by 'holotorch study'"])
     mistakes: list[str] = []
-    found = [_parse(path, number, line, mistakes) for number, line in enumerate(lines, 1)]
-    header = found[0]
-    if header is not None and (header.get("format") != FORMAT or header.get("version") != VERSION):
-        raise ConfigError(
-            [f"{path}:1:1: not a log of a study: expected a header of format {FORMAT}, version {VERSION}"]
-        )
-    if header is not None and not _is_whole(header.get("participant")):
-        mistakes.append(f"{path}:1:1: participant: expected a whole number, got {_short(header.get('participant'))}")
-    seen: dict[tuple[int, int], int] = {}
-    for number, trial in enumerate(found[1:], 2):
+    header, *trials = [_parse(path, number, line, mistakes) for number, line in enumerate(lines, 1)]
+    if header is not None:
+        if header.get("format") != FORMAT or header.get("version") != VERSION:
+            raise ConfigError(
+                [f"{path}:1:1: not a log of a study: expected a header of format {FORMAT}, version {VERSION}"]
+            )
+        try:
+            parse_record(LogHeader, header)
+        except ValueError as error:
+            mistakes.append(f"{path}:1:1: {error}")
+    first_lines: dict[tuple[int, int], int] = {}  # of each (round, trial)
+    for number, trial in enumerate(trials, 2):
         if trial is None:
             continue
-        if problem := _problem(trial):
-            mistakes.append(f"{path}:{number}:1: not a trial: {problem}")
+        try:
+            record = parse_record(TrialRecord, trial)
+        except ValueError as error:
+            mistakes.append(f"{path}:{number}:1: not a trial: {error}")
             continue
-        key = (trial["round"], trial["trial"])
-        if key in seen:
-            mistakes.append(f"{path}:{number}:1: round {key[0]}, trial {key[1]} stands in line {seen[key]} already")
-        elif header is not None and trial["participant"] != (owner := header.get("participant")):
-            mistakes.append(f"{path}:{number}:1: participant {trial['participant']} in the log of {_short(owner)}")
-        seen.setdefault(key, number)
+        key = (record.round, record.trial)
+        if key in first_lines:
+            mistakes.append(f"{path}:{number}:1: round {key[0]}, trial {key[1]} is already in line {first_lines[key]}")
+        elif header is not None and record.participant != (owner := header.get("participant")):
+            mistakes.append(f"{path}:{number}:1: participant {record.participant} in the log of {short(owner)}")
+        first_lines.setdefault(key, number)
     if mistakes:
         raise ConfigError(sorted(mistakes, key=position))
-    return Trials(path, found[0] or {}, [trial for trial in found[1:] if trial], bool(rest), len(data) - len(rest))
+    return Trials(path, header or {}, [trial for trial in trials if trial], bool(torn), len(data) - len(torn))
 
 
 def read_logs(paths: Iterable[Path]) -> list[Trials]:
-    """Read several logs; ConfigError lists what is wrong with all of them, and a number that two participants have."""
+    """Read several logs. ConfigError lists the mistakes in all of them, and participant numbers that occur twice."""
     logs: list[Trials] = []
     mistakes: list[str] = []
     for path in paths:
@@ -110,31 +109,31 @@ def read_logs(paths: Iterable[Path]) -> list[Trials]:
 
 
 class TrialLog:
-    """Appends trials to a log, new or begun before; a context that closes it.
+    """Appends trials to a new or existing log; a context manager that closes the log.
 
-    Only one program at a time can have a log open, where the system has file locks (not on Windows).
+    On systems with ``fcntl`` file locks (not Windows), only one program at a time can have a log open.
     """
 
     def __init__(self, path: Path, header: dict[str, Any]):
         """Open a log.
 
         Args:
-            path: The file; its folder must be there.
-            header: What the first line says; must hold ``participant``. A log that was begun must say the same.
+            path: The file; its folder must exist.
+            header: Content of the first line, with the key ``participant``. An existing log must have the same header.
 
         Raises:
-            ConfigError: Another program has it open, it cannot be read, or it was begun with another header.
-            OSError: It cannot be written.
+            ConfigError: Another program has the log open, it cannot be read, or it has another header.
+            OSError: The log cannot be written.
         """
         self.path = path
-        # As it reads back: tuples become lists.
+        # The round trip through JSON turns tuples into lists, so that the header equals the one read from the file.
         self.header = json.loads(json.dumps({"format": FORMAT, "version": VERSION, **header}, allow_nan=False))
         self.trials: list[dict[str, Any]] = []
-        self._size = 0  # of the whole lines, in bytes
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)  # answers of a person
+        self._size = 0  # bytes of all complete lines
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)  # personal data
         try:
             self._lock()
-            # A crash may have come before the header was whole.
+            # After a crash, the header itself may be incomplete.
             if b"\n" in path.read_bytes():
                 self._continue()
             else:
@@ -145,14 +144,16 @@ class TrialLog:
             raise
 
     def append(self, trial: dict[str, Any]) -> None:
-        """Write a trial to the disk; ValueError for what is not a trial."""
-        if problem := _problem(trial):
-            raise ValueError(f"not a trial: {problem}")
+        """Write a trial to the disk. ValueError for a dictionary that is not a trial."""
+        try:
+            parse_record(TrialRecord, trial)
+        except ValueError as error:
+            raise ValueError(f"not a trial: {error}") from None
         self._write(trial)
         self.trials.append(trial)
 
     def close(self) -> None:
-        """Close the file; what is appended from then on is refused with OSError."""
+        """Close the file; ``append`` then raises OSError."""
         os.close(self._file)
         self._file = -1
 
@@ -181,8 +182,8 @@ class TrialLog:
             if self.header.get(key) != log.header.get(key):
                 raise ConfigError(
                     [
-                        f"{self.path}:1:1: this log was begun with another {key}: {_short(log.header.get(key))}, now "
-                        f"{_short(self.header.get(key))}; restore the configuration, or choose another participant "
+                        f"{self.path}:1:1: this log was begun with another {key}: {short(log.header.get(key))}, now "
+                        f"{short(self.header.get(key))}; restore the configuration, or choose another participant "
                         "or another folder"
                     ]
                 )
@@ -193,11 +194,11 @@ class TrialLog:
         line = memoryview(json.dumps(value, allow_nan=False, ensure_ascii=False).encode() + b"\n")
         end = self._size + len(line)
         try:
-            os.ftruncate(self._file, self._size)  # what a failure left of a line, and could not cut off
-            while line:  # a single call may write less
+            os.ftruncate(self._file, self._size)  # removes an incomplete line of an earlier failure
+            while line:  # os.write may write only a part
                 line = line[os.write(self._file, line) :]
             os.fsync(self._file)
-        except OSError as error:  # a full disk: leave whole lines only
+        except OSError as error:  # such as a full disk: leave complete lines only
             with contextlib.suppress(OSError):
                 os.ftruncate(self._file, self._size)
             raise OSError(error.errno, error.strerror, str(self.path)) from None
@@ -211,53 +212,17 @@ def _parse(path: Path, number: int, line: bytes, mistakes: list[str]) -> dict[st
         mistakes.append(f"{path}:{number}:{error.colno}: not a line of JSON: {error.msg}")
     except UnicodeDecodeError as error:
         mistakes.append(f"{path}:{number}:{error.start + 1}: not UTF-8 text")
-    except (ValueError, RecursionError):  # a number of thousands of digits; brackets without end
+    except (ValueError, RecursionError):  # a number of thousands of digits, or brackets nested too deeply
         mistakes.append(f"{path}:{number}:1: not a line of JSON that can be read")
     else:
         if isinstance(value, dict):
             return value
-        mistakes.append(f"{path}:{number}:1: expected {{...}}, got {_short(value)}")
+        mistakes.append(f"{path}:{number}:1: expected {{...}}, got {short(value)}")
     return None
 
 
-def _problem(trial: dict[str, Any]) -> str:
-    """What is wrong with a trial, or nothing."""
-    wanted = {
-        **{name: (is_number, "a finite number") for name in _NUMBERS},
-        **{name: (_is_whole, "a whole number") for name in _COUNTS},
-        **{name: (lambda v: isinstance(v, bool), "true or false") for name in _FLAGS},
-        **{name: (lambda v: isinstance(v, str), "text") for name in _TEXTS},
-        "pattern": (lambda v: v in ("cross", "circle"), "cross or circle"),
-        **{name: (lambda v: v is None or is_number(v), "a number or null") for name in ("response_s", "reaction_s")},
-    }
-    for name, (right, words) in wanted.items():
-        if name not in trial:
-            return f"{name} is missing"
-        if not right(trial[name]):
-            return f"{name}: expected {words}, got {_short(trial[name])}"
-    if trial["responded"] == (trial["reaction_s"] is None) or trial["responded"] == (trial["response_s"] is None):
-        return "response_s and reaction_s: expected numbers where responded is true, and null where it is false"
-    if trial["frame_s"] <= 0 or (trial["responded"] and trial["reaction_s"] < 0):
-        return "expected frame_s above 0 and reaction_s not below 0"
-    return ""
-
-
-def is_number(value: Any) -> TypeGuard[float]:
-    """Whether it is a finite number, as true and false are not."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
-
-
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
 def _sync_folder(folder: Path) -> None:
-    """Make a new file's name as lasting as its content; folders cannot be opened everywhere."""
+    """Write the folder's entry of a new file to the disk, on systems that can open folders."""
     try:
         handle = os.open(folder, os.O_RDONLY)
     except OSError:

@@ -1,4 +1,4 @@
-"""The study of one participant, from the files it begins with to the summary at its end."""
+"""Run the study of one participant: load the settings, serve the page until the end, and print a summary."""
 
 import asyncio
 import os
@@ -25,24 +25,24 @@ def run_study_server(
     out: Path | None = None,
     script: str | None = None,
 ) -> int:
-    """Run the study of one participant in a browser, from where the log ends, until it is complete or interrupted.
+    """Run the study of one participant in a browser until it is complete or interrupted; an existing log is continued.
 
-    SIGINT, SIGTERM and SIGHUP interrupt it. The token is in participant-NNN.token beside the log, so that a page which
-    is open goes on with the next start; it is removed when the study is complete.
+    SIGINT, SIGTERM and SIGHUP interrupt the study. The access token is stored in participant-NNN.token beside the log,
+    so that an open page can continue after a restart; the file is removed when the study is complete.
 
     Args:
-        config: File of the study.
-        port: Of the server; None for any free one.
-        participant: 1, 2, ...
+        config: Configuration file of the study.
+        port: Port of the server; None for any free port.
+        participant: Number of the participant, 1, 2, ...
         out: Folder of the logs and designs of all participants; runs/CONFIG by default.
-        script: See ``StudyServer``.
+        script: JavaScript to add to the page; see ``StudyServer``.
 
     Returns:
-        0 when every trial is recorded, 130 when it was interrupted before; what was recorded is on the disk.
+        0 if every trial is recorded, 130 if the study was interrupted. All recorded trials are on the disk.
 
     Raises:
-        ConfigError: A mistake in the file; a number that is in use, complete, or was begun with another configuration;
-            a port that is taken; a log that cannot be read.
+        ConfigError: The file has a mistake; the participant is being recorded, is complete, or was begun with another
+            configuration; the port is in use; or the log cannot be read.
     """
     settings = load_study(config)
     try:
@@ -90,8 +90,8 @@ def _introduction(server: StudyServer) -> str:
     field = build_screen(settings.screen).field_deg[1]
     lines.append(f"screen: {field:.1f} deg wide, {settings.screen.distance:g} m away")
     if done:
-        place = f"trial {done + 1} of {len(design.trials)}"
-        lines.append(f"participant {design.participant} goes on at {place}; a new person needs a new number")
+        trial = f"trial {done + 1} of {len(design.trials)}"
+        lines.append(f"participant {design.participant} goes on at {trial}; a new person needs a new number")
     rows, columns = settings.screen.shape
     lines.append(f"open in full screen ({columns} x {rows} pixels): {server.address}#{server.token}")
     return "\n".join(lines)
@@ -100,15 +100,15 @@ def _introduction(server: StudyServer) -> str:
 def _summary(session: StudySession) -> str:
     log = session.log
     trials = [trial for trial in log.trials if not trial["practice"]]
-    right = sum(trial["responded"] == trial["target"] for trial in trials)
+    correct = sum(trial["responded"] == trial["target"] for trial in trials)
     total = len(session.design.trials)
-    lines = [f"{len(log.trials)} of {total} trials in {log.path}; without practice {right} of {len(trials)} right"]
+    lines = [f"{len(log.trials)} of {total} trials in {log.path}; without practice {correct} of {len(trials)} correct"]
     steps = quantisation([trial["frame_s"] for trial in log.trials])
     return "\n".join(lines + ([str(steps)] if steps else []))
 
 
 def _token(path: Path) -> str:
-    """The token in a file that only its owner can read, a new one where there is none; the log's lock is held."""
+    """Read the token from a file that only its owner can read, or write a new one. The caller holds the log's lock."""
     with suppress(OSError, ValueError):
         text = path.read_text(encoding="ascii")
         if (os.name == "nt" or path.stat().st_mode & 0o077 == 0) and re.fullmatch(r"[\w-]{43}", text):

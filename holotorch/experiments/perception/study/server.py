@@ -1,13 +1,14 @@
-"""The study in the browser: a server that only this machine reaches.
+"""Server of the study page, reachable only from the machine that it runs on.
 
-The page (page.html) gets the design once and sends one result per trial; the trial is on the disk before the
-answer goes back. Nothing but the page is served. All but the page, which holds nothing of the study, is for those who
-know the participant's token. It is in the fragment of the printed address, which browsers send to no server, and not in
-a cookie, which all servers on this machine would get.
+The page (page.html) requests the design once and sends one result per trial; a trial is on the disk before its request
+is answered. The page itself contains no data of the study. All other requests need the participant's token, which is
+in the fragment of the printed address: browsers never send fragments to a server, whereas a cookie would go to all
+servers on the machine.
 
-``onset_s`` is the stamp of the first frame after the one that drew the pattern, the earliest moment at which it can be
-on the screen; ``response_s`` that of the key's event, on the same clock, or of the frame for a gamepad, which is asked
-once per frame. What the screen and the keyboard add is theirs, much the same in every trial, and not known here.
+``onset_s`` is the time stamp of the first frame after the one that drew the pattern, the earliest moment at which the
+pattern can be visible. ``response_s`` is the time stamp of the key event on the same clock or, for a gamepad, which is
+polled once per frame, that of the frame. The delays of the screen and the keyboard, which vary little between trials,
+are not measured.
 """
 
 import asyncio
@@ -25,34 +26,35 @@ from typing import Any
 from aiohttp import web
 
 from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.perception.study.records import SessionRequest, parse_record
 from holotorch.experiments.perception.study.session import StudySession
 
-_LARGEST = 10_000  # bytes of a request's body; a result has about 200
-_CONNECTIONS = 64  # at once; a browser opens six
-_SECONDS = 10.0  # of a connection, in which a request is read and answered; an answer takes milliseconds
+_LARGEST = 10_000  # largest body of a request in bytes; a result has about 200
+_CONNECTIONS = 64  # largest number of simultaneous connections; a browser opens six
+_SECONDS = 10.0  # longest duration of a connection; an answer takes milliseconds
 _HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
     "Content-Security-Policy": "frame-ancestors 'none'",
 }
-# aiohttp logs every malformed request with a traceback; what fails in here is printed by StudyServer.
+# aiohttp would log every malformed request with a traceback; StudyServer prints the errors of its own code.
 _QUIET = logging.getLogger(f"{__name__}.requests")
 _QUIET.disabled = True
 
 
 class _Connections(web.Server):
-    """The connections: each for one request and ``_SECONDS`` at most; where there are too many, the oldest is closed.
+    """Connections for one request each, which last ``_SECONDS`` at most; beyond ``_CONNECTIONS``, the oldest is closed.
 
-    A request that has come in whole is answered at once, so that the oldest is one that keeps the server waiting.
+    A complete request is answered immediately, so that the oldest connection is one whose request is incomplete.
     """
 
     def __init__(self, handler: Any):
-        # handler_cancellation: aiohttp would wait 10 s for the rest of a request whose connection is gone.
+        # Without handler_cancellation, aiohttp waits 10 s for the rest of a request whose connection is closed.
         super().__init__(handler, handler_cancellation=True, auto_decompress=False, logger=_QUIET, access_log=None)
         self._ends: dict[web.RequestHandler, tuple[asyncio.Transport, asyncio.TimerHandle]] = {}
 
     def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
-        """Start the connection's time."""
+        """Start the time limit of the connection."""
         super().connection_made(handler, transport)
         if len(self._ends) >= _CONNECTIONS:
             self._end(next(iter(self._ends)))
@@ -74,13 +76,13 @@ class StudyServer:
     """Serves the page and the session of one participant.
 
     Args:
-        session: Of the participant.
-        token: What every request but the one for the page must bear.
-        script: JavaScript to put into the page: the scripted participant of a test.
+        session: Session of the participant.
+        token: Token that every request must contain, except the one for the page.
+        script: JavaScript to add to the page, such as the scripted participant of a test.
 
     Attributes:
-        stop: Set when the study is complete, or to end the server.
-        address: Where the page is, once the server is listening.
+        stop: Event that ends the server; set when the study is complete.
+        address: Address of the page, once the server is listening.
     """
 
     def __init__(self, session: StudySession, token: str, script: str | None = None):
@@ -91,7 +93,7 @@ class StudyServer:
 
     @asynccontextmanager
     async def listening(self, port: int = 0) -> AsyncIterator[None]:
-        """Answer requests at ``port``, 0 for any free one; ConfigError where it is taken or may not be used."""
+        """Answer requests at ``port``, 0 for any free port. ConfigError if the port cannot be used."""
         try:
             listener = socket.create_server(("127.0.0.1", port))
         except (OSError, OverflowError) as error:
@@ -101,9 +103,9 @@ class StudyServer:
         runner = web.ServerRunner(_Connections(self._handle), shutdown_timeout=1.0)
         await runner.setup()
         try:
-            # asyncio accepts as many at a time as it lets wait, and each takes one of the process's open files.
+            # asyncio accepts up to ``backlog`` connections at a time, and each uses a file descriptor of the process.
             await web.SockSite(runner, listener, backlog=_CONNECTIONS // 4).start()
-            listener.listen(16 * _CONNECTIONS)  # those beyond wait a second and more until they ask again
+            listener.listen(16 * _CONNECTIONS)  # further clients retry after a second or more
             yield
         finally:
             await runner.cleanup()
@@ -121,40 +123,41 @@ class StudyServer:
         return response
 
     async def _answer(self, request: web.BaseRequest) -> web.Response:
-        """The page, the session of a window, or what became of a result."""
+        """Answer with the page, the session of a window, or the status of a result."""
         self._check_host(request)
         if request.method == "GET" and request.path == "/":
             return web.Response(text=self._page, content_type="text/html")
         self._check_sender(request)
-        # Other pages may send forms here unasked, but JSON only by permission, which is not given.
-        known = request.method == "POST" and request.path in ("/session", "/trial")
-        if not known or request.content_type != "application/json":
+        # Pages of other origins can send forms here, but JSON only with a CORS permission, which is not given.
+        accepted = request.method == "POST" and request.path in ("/session", "/trial")
+        if not accepted or request.content_type != "application/json":
             raise web.HTTPNotFound(text="expected JSON at /session or /trial")
         value = await _read_json(request)
         if request.path == "/session":
-            window = value.get("window") if isinstance(value, dict) else None
-            if not isinstance(window, str) or not window:
-                raise web.HTTPBadRequest(text="expected the name of the window")
+            try:
+                window = parse_record(SessionRequest, value).window
+            except ValueError as error:
+                raise web.HTTPBadRequest(text=str(error)) from None
             return _json(HTTPStatus.OK, self.session.open(window))
         response = _json(*self.session.record(value))
         if self.session.complete:
-            self.stop.set()  # requests that are being answered are answered first
+            self.stop.set()  # pending requests are answered before the server ends
         return response
 
     def _check_host(self, request: web.BaseRequest) -> None:
-        """Refuse a page that was asked for by a foreign name that points here."""
-        name = request.headers.get("Host", "").partition(":")[0]  # browsers leave out the port 80
+        """Refuse requests whose host name is foreign but resolves to this machine (DNS rebinding)."""
+        name = request.headers.get("Host", "").partition(":")[0]  # browsers omit port 80
         if name not in ("127.0.0.1", "localhost"):
             raise web.HTTPForbidden(text=f"open {self.address}")
 
     def _check_sender(self, request: web.BaseRequest) -> None:
-        """Refuse all but the study's own page, as far as the browser says, and those who do not know the token."""
+        """Refuse requests from other pages, which the headers of the browser identify, and those without the token."""
         origin = request.headers.get("Origin")
         site = request.headers.get("Sec-Fetch-Site", "same-origin")
         if site != "same-origin" or origin not in (None, f"http://{request.headers.get('Host', '')}"):
             raise web.HTTPForbidden(text=f"another page asks; open {self.address}")
-        given = request.headers.get("Authorization", "").encode(errors="surrogateescape")
-        if not hmac.compare_digest(given, f"Bearer {self.token}".encode()):
+        authorization = request.headers.get("Authorization", "").encode(errors="surrogateescape")
+        if not hmac.compare_digest(authorization, f"Bearer {self.token}".encode()):
             raise web.HTTPForbidden(text="open the whole address that the recording program has printed, with its end")
 
 
@@ -170,11 +173,11 @@ async def _read_json(request: web.BaseRequest) -> Any:
         return json.loads(await request.read())
     except (ValueError, RecursionError):
         raise web.HTTPBadRequest(text="not JSON") from None
-    except (OSError, web.RequestPayloadError):  # the connection is gone, or its time is over
+    except (OSError, web.RequestPayloadError):  # the connection was closed, by the client or by its time limit
         raise web.HTTPBadRequest(text="the request was cut off") from None
 
 
 def page(script: str | None = None) -> str:
-    """The page, with ``script`` at its end."""
+    """The HTML of the page, with ``script`` at the end of the body."""
     text = resources.files("holotorch.experiments.perception.study").joinpath("page.html").read_text(encoding="utf-8")
     return text.replace("</body>", f"<script>{script}</script></body>") if script else text

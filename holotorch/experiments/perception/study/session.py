@@ -1,4 +1,4 @@
-"""The session of one participant: what the page needs to begin, and the trials that it sends back."""
+"""The session of one participant: gives the design to the page and records the results that the page sends."""
 
 import sys
 from dataclasses import asdict
@@ -9,21 +9,21 @@ from typing import Any
 from holotorch.experiments.perception.study.config import StudySettings
 from holotorch.experiments.perception.study.design import Design
 from holotorch.experiments.perception.study.log import TrialLog
-from holotorch.experiments.perception.study.result import checked_result
+from holotorch.experiments.perception.study.records import TrialResult, parse_record
 
 
 class StudySession:
-    """Gives the design to the page, and appends the results it sends to the log, each on the disk before the answer.
+    """Gives the design to the page and appends its results to the log; each result is on the disk before the answer.
 
     Args:
         settings: The study.
         design: The participant's trials.
-        log: Open; what it holds already is not asked again.
+        log: An open log. The session continues after the trials that it already contains.
     """
 
     def __init__(self, settings: StudySettings, design: Design, log: TrialLog):
         self.settings, self.design, self.log = settings, design, log
-        self.holder: str | None = None  # the window that asked last
+        self.holder: str | None = None  # the window that requested the session last
 
     @property
     def complete(self) -> bool:
@@ -31,7 +31,7 @@ class StudySession:
         return len(self.log.trials) >= len(self.design.trials)
 
     def open(self, window: str) -> dict[str, Any]:
-        """What the page needs; ``window`` becomes the only one whose results count."""
+        """Return the data that the page needs; from now on only the results of ``window`` are recorded."""
         self.holder = window
         return {
             "participant": self.design.participant,
@@ -41,32 +41,36 @@ class StudySession:
             "next": len(self.log.trials),
         }
 
-    def record(self, result: Any) -> tuple[HTTPStatus, dict[str, Any]]:
-        """Append a result of the page, and say which trial is next; a result that came before is not written again."""
+    def record(self, request: Any) -> tuple[HTTPStatus, dict[str, Any]]:
+        """Append a result sent by the page; return the HTTP status and the answer, which says which trial is next.
+
+        A result that is already in the log is not written again.
+        """
         try:
-            index, window, values = checked_result(result)
+            result = parse_record(TrialResult, request)
         except ValueError as error:
             return HTTPStatus.BAD_REQUEST, {"error": str(error)}
-        # After a restart the window that is there goes on.
-        self.holder = self.holder or window
-        if window != self.holder:
+        index = result.index
+        # After a restart of the server, the window that is already open continues.
+        self.holder = self.holder or result.window
+        if result.window != self.holder:
             return HTTPStatus.CONFLICT, {"error": "the study was opened in another window; close this one"}
         done = len(self.log.trials)
         if index > done or index >= len(self.design.trials):
             return HTTPStatus.BAD_REQUEST, {"error": f"trial {index} is not the next one, {done}; load the page again"}
         if index == done:
             try:
-                self.log.append(self._line(index, values))
+                self.log.append(self._line(result))
             except OSError as error:
                 reason = f"{error.filename}: {error.strerror}"
                 print(f"cannot write a trial: {reason}", file=sys.stderr)
-                return HTTPStatus.SERVICE_UNAVAILABLE, {"error": reason}  # the page tries again
+                return HTTPStatus.SERVICE_UNAVAILABLE, {"error": reason}  # the page repeats the request
         return HTTPStatus.OK, {"next": len(self.log.trials)}
 
-    def _line(self, index: int, values: dict[str, Any]) -> dict[str, Any]:
-        trial = self.design.trials[index]
+    def _line(self, result: TrialResult) -> dict[str, Any]:
+        trial = self.design.trials[result.index]
         planned = asdict(trial)
         del planned["wait_s"]
         now = datetime.now(UTC).isoformat(timespec="milliseconds")
-        facts = {"practice": trial.practice, **values, "design": self.design.name, "time_utc": now}
-        return {"participant": self.design.participant, **planned, **facts}
+        outcome = {"practice": trial.practice, **result.measured(), "design": self.design.name, "time_utc": now}
+        return {"participant": self.design.participant, **planned, **outcome}

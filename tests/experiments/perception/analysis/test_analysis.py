@@ -20,7 +20,7 @@ from holotorch.experiments.perception.analysis.curves import (
     perception_times,
     read_responses,
 )
-from holotorch.experiments.perception.analysis.run import find, on_frames
+from holotorch.experiments.perception.analysis.run import analyse, on_frames
 from holotorch.experiments.perception.analysis.simulation import simulate
 
 RULE = CleaningSettings()
@@ -187,12 +187,12 @@ def test_times_that_rise_with_the_size_have_no_scale_but_a_place():
     curves = fit_curves(times, 40, 3)
     assert (curves.a > 0).all()
     scales = equal_efficiency(curves, np.full(6, 0.45), (1, 60))
-    assert not scales.defined.any() and not scales.limited.any() and np.isnan(scales.known).all()
+    assert not scales.defined.any() and not scales.limited.any() and np.isnan(scales.defined_degrees).all()
     assert scales.degrees[:, 0].tolist() == [60, 60, 60, 1, 1, 1]
-    (found,) = find(settings(), times, curves)
+    (found,) = analyse(settings(), times, curves)
     assert found.undefined == 24 and math.isnan(found.thesis.f)
     slow = study(lambda p, e, s: 0.6 + 0.01 * math.log(s))
-    (refused,) = find(settings(), slow, fit_curves(slow, 40, 3))
+    (refused,) = analyse(settings(), slow, fit_curves(slow, 40, 3))
     assert "no scale within 1 .. 60 deg at 40, 50, 60, 70 deg" in refused.line.refused
     assert refused.row(None)["alpha"] is None
 
@@ -205,7 +205,7 @@ def test_80_deg_is_shown_and_outside_the_line():
         return 0.45 - 0.12 * math.log(s / scale)
 
     times = study(curve)
-    (found,) = find(settings(), times, fit_curves(times, 40, 3))
+    (found,) = analyse(settings(), times, fit_curves(times, 40, 3))
     assert (found.line.alpha, found.line.beta) == pytest.approx((0.5, -15))
     assert found.line.medians[-1] == pytest.approx(40)
 

@@ -51,15 +51,31 @@ def test_one_command_draws_the_layout(tmp_path, capsys):
 def test_extrapolation_and_small_lines_are_flagged(capsys):
     assert main(["check", str(LAYOUT), "extrapolate=true"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert "1 extrapolated, 1 of a size that was not tested" in lines[0] and "to 26.6 deg" in lines[0]
+    assert (
+        "1 extrapolated, 1 of a size that was not tested, no icons overlap, none cut by the edge" in lines[0]
+        and "to 26.6 deg" in lines[0]
+    )
     assert main(["check", str(LAYOUT), "items=[{icon: boat, azimuth_deg: 10}]"]) == 0
-    assert "As soon as 5 deg at 10 deg: 0 icons on the line, 1 keep their size, none" in capsys.readouterr().out
+    words = "Perceived as soon as 5 deg at 10 deg: 0 icons scaled by Table 2.2, 1 with the size of the target, no icons"
+    assert words in capsys.readouterr().out
     with pytest.raises(ConfigError, match=r"targets\.0: Table 2\.2 has no target of 7"):
-        from holotorch.experiments.perception.layout.run import scaled
-
-        scaled(load_config(LAYOUT, ["targets=[{size_deg: 7, eccentricity_deg: 10}]"]))
+        perception_layout.build_layouts(load_config(LAYOUT, ["targets=[{size_deg: 7, eccentricity_deg: 10}]"]))
     with pytest.raises(ConfigError, match=r"items\.0\.azimuth_deg.*180"):
         load_config(LAYOUT, ["items=[{icon: boat, azimuth_deg: 200}]"])
+
+
+def test_icons_at_the_edge_of_the_field_are_reported(tmp_path, capsys):
+    # The tent of 5 deg at 27.5 deg ends exactly at the edge of the field; the boat at 65 deg is scaled to
+    # 0.47 * 65 - 11.04 = 19.51 deg and extends to 74.755 deg, beyond 74.75 deg.
+    assert main(["run", str(LAYOUT), "field_deg=[60, 149.5]", "items=[{icon: boat, azimuth_deg: 65}, "
+                 "{icon: first_aid, azimuth_deg: 20, elevation_deg: 28}, {icon: tent, azimuth_deg: -20, "
+                 "elevation_deg: 27.5}]", "--out", str(tmp_path / "a")]) == 0  # fmt: skip
+    assert "2 cut by the edge of the field (boat, first aid)" in capsys.readouterr().out
+    summary = read(tmp_path / "a")
+    assert summary["targets"]["5 deg at 10 deg"]["cut"] == [0, 1]
+    notes = [row["note"] for row in summary["items"][:3]]
+    assert notes[0] == "cut by the edge of the field" and "cut" not in notes[2]
+    assert "cut by the edge of the field" in (tmp_path / "a" / "report.html").read_text()
 
 
 @pytest.mark.parametrize("extrapolate", [False, True])

@@ -81,7 +81,7 @@ def test_results_that_cannot_be_are_refused(tmp_path):
         ({"onset_s": 10**400}, "onset_s: expected seconds"),
         ({"frame_s": 0}, "frame_s: expected more than 0"),
         ({"response_s": 0.5}, "response_s: expected a time after onset_s"),
-        ({"early": -1}, "expected counts"),
+        ({"early": -1}, "early: expected a count, 0 or more, got -1"),
         ({"device": "voice"}, "device: expected key"),
         ({"window": 3}, "window"),
         ({"index": 1}, "trial 1 is not the next one, 0"),
@@ -297,7 +297,13 @@ def test_the_study_of_the_thesis():
         (["screen.cut=false"], "23 deg at 80 deg reaches 91.5 deg and the screen 90.0 deg.*cut: true"),
         (["screen.size=[0.9, 7.4142]"], "23 deg at 40 deg takes 2241 pixels in height and the screen has 2100"),
         (["screen.distance=5 m"], "screen.distance: expected an eye inside the cylinder"),
-        (["screen.size=[2, 20]"], "expected an arc of one turn"),
+        (["screen.distance=21"], "usually 50 mm to 5 m, got 21; write 21 cm, or 21 m if metres are meant"),
+        (["screen.distance=21 m"], "screen.distance: expected an eye inside the cylinder"),
+        (
+            ["screen.radius=236"],
+            "screen.radius: expected a length .*, got 236; 236 looks like millimetres",
+        ),
+        (["screen.size=[2, 20]"], "expected an arc of at most one turn"),
         (["screen={kind: flat, shape: [1080, 1920], size: [0.3, 0.53], distance: 0.5, cut: true}"], "even the middle"),
         (["screen={kind: round}"], "screen.kind: expected one of flat, curved, got 'round'"),
         (
