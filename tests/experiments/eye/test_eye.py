@@ -94,9 +94,9 @@ def test_few_wavelengths_are_as_good_as_many():
     few = found.image(hologram, "led", depth)
 
     class Dense(eye_module.Observer):
-        def samples(self, source, wave, depth):
-            places, weights = eye_module.PRESETS[source](wave).every(1e-9)
-            return places, weights, len(places)
+        def samples(self, source, wavelength, depth):
+            wavelengths, weights = eye_module.PRESETS[source](wavelength).every(1e-9)
+            return wavelengths, weights, len(wavelengths)
 
     many = Dense(found.settings, found.scene, found.focus).image(hologram, "led", depth)
     error = (few - many).square().mean().sqrt() / many.square().mean().sqrt()
