@@ -1,4 +1,4 @@
-"""What one begins a configuration of a kind with: an example, and the schema that an editor completes and checks by."""
+"""Help for writing a configuration: an example of each kind, and the JSON schema for editors."""
 
 import json
 from pathlib import Path
@@ -13,9 +13,9 @@ from holotorch.io.files import write_text
 
 
 def write_example(name: str, path: Path) -> None:
-    """Write a configuration of a kind to begin with. ConfigError for an unknown kind and for a file that is there."""
-    source = find_config(_named(name).example)
-    assert source is not None  # it comes with the package
+    """Write an example configuration of a kind. ConfigError for an unknown kind, or for a file that exists already."""
+    source = find_config(_kind(name).example)
+    assert source is not None  # bundled with the package
     if path.exists():
         raise ConfigError([f"{path} is there already; choose another --out"])
     try:
@@ -27,14 +27,14 @@ def write_example(name: str, path: Path) -> None:
 def schema(name: str) -> str:
     """JSON Schema of the configurations of a kind. ConfigError for an unknown kind.
 
-    An editor completes by it; ``holotorch check`` alone is strict. Numbers may be text with a unit, and a single value
-    may stand for a list of one.
+    Editors use it to complete keys; only ``holotorch check`` validates fully. Numbers may be text with a unit, and a
+    single value may replace a list.
     """
-    return json.dumps(_loosened(_named(name).settings.model_json_schema()), indent=2)
+    return json.dumps(_loosened(_kind(name).settings.model_json_schema()), indent=2)
 
 
 _LIMITS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}
-_WRITTEN_AS = {
+_ACCEPTED = {
     "number": ["number", "string"],
     "integer": ["integer", "string"],
     "array": ["array", "number", "string"],
@@ -42,17 +42,17 @@ _WRITTEN_AS = {
 
 
 def _loosened(value: Any) -> Any:
-    """A schema with its limits by their standard names, and the types that the settings' own validators take."""
+    """A schema with the standard names of limits, and with all types that the validators of settings accept."""
     if isinstance(value, list):
         return [_loosened(each) for each in value]
     if not isinstance(value, dict):
         return value
     loose = {_LIMITS.get(key, key): _loosened(each) for key, each in value.items()}
-    kind = value.get("type")
-    return loose | {"type": _WRITTEN_AS[kind]} if isinstance(kind, str) and kind in _WRITTEN_AS else loose
+    type_ = value.get("type")
+    return loose | {"type": _ACCEPTED[type_]} if isinstance(type_, str) and type_ in _ACCEPTED else loose
 
 
-def _named(name: str) -> ExperimentKind:
+def _kind(name: str) -> ExperimentKind:
     if name not in KINDS:
         raise ConfigError([f"no kind {name!r}{nearest(name, list(KINDS))}; known: {', '.join(KINDS)}"])
     return find_kind(name)

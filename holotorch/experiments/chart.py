@@ -1,4 +1,4 @@
-"""Charts of speed against accuracy: every method on the same work, drawn and tabled."""
+"""Charts of speed against accuracy: every method on the same task, as a figure and a table."""
 
 from importlib import import_module
 from pathlib import Path
@@ -7,7 +7,7 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.runs.tables import write_table
 from holotorch.io.files import write_bytes, write_text
 
-# Where each is drawn, and the name of its second table; that of tracking is one of several, which it names itself.
+# The module that draws each chart, and the name of its second table. The chart of tracking names its further tables.
 CHARTS = {
     "eye": ("holotorch.experiments.eye.chart", "tradeoff"),
     "pec": ("holotorch.experiments.pec_study.chart", "comparison"),
@@ -18,7 +18,7 @@ CHARTS = {
 
 
 def chart(subject: str, out: Path) -> list[str]:
-    """Draw the chart of a subject into the folder ``out`` and return its verdict, line by line."""
+    """Draw the chart of a subject into the folder ``out``; returns the lines of its verdict."""
     if subject not in CHARTS:
         raise ConfigError([f"no chart of {subject!r}; known: {', '.join(CHARTS)}"])
     module, second = CHARTS[subject]

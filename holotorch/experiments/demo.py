@@ -10,13 +10,13 @@ from holotorch.io.bundled import find_config
 
 
 def demo(out: Path | None) -> tuple[Path, bool]:
-    """Carry the runs out and write one page of all; returns the folder and whether all are complete."""
+    """Carry out the runs and write one page for all; returns the folder, and whether all are complete."""
     changes = {"demo": [], "demo_volume": [], "tracking/track": ["frames=10"], "perception/layout": []}
     paths = [(find_config(f"configs/{name}.yaml"), overrides) for name, overrides in changes.items()]
     image, scene, tracking, layout = (load_config(path, words) for path, words in paths if path is not None)
     folder = claim(out, "demo")
     if (folder / "images").is_dir():
-        (folder / "images").rmdir()  # the claim's; each run has a folder of its own
+        (folder / "images").rmdir()  # made by ``claim``; the runs have their own folders
     parts, complete = [], True
     for settings, name in ((image, "correction"), (scene, "volume")):
         if complete:

@@ -1,4 +1,4 @@
-"""Is this installation sound? One line per question: OK, or the command that repairs it."""
+"""Checks of an installation: each prints one line, OK or the command that repairs it."""
 
 import platform
 import re
@@ -19,7 +19,7 @@ def diagnose() -> bool:
     for name, check in _CHECKS.items():
         try:
             lines = list(check())
-        except Exception as error:  # a doctor reports what it meets, whatever it is
+        except Exception as error:  # whatever fails is reported
             lines = [(False, f"{type(error).__name__}: {error}")]
         for passed, text in lines:
             sound &= passed
@@ -37,11 +37,11 @@ def _packages() -> Iterator[tuple[bool, str]]:
         wanted = Requirement(line)
         if wanted.marker and "extra" in str(wanted.marker):
             continue
-        found = _version(wanted.name)
-        if found and wanted.specifier.contains(found, prereleases=True):
-            yield True, f"{wanted.name} {found}"
+        version = _version(wanted.name)
+        if version and wanted.specifier.contains(version, prereleases=True):
+            yield True, f"{wanted.name} {version}"
         else:
-            yield False, f"{wanted} needed, {found or 'nothing'} found; run: pip install '{wanted}'"
+            yield False, f"{wanted} needed, {version or 'nothing'} found; run: pip install '{wanted}'"
 
 
 def _devices() -> Iterator[tuple[bool, str]]:
@@ -77,7 +77,7 @@ def _fft() -> Iterator[tuple[bool, str]]:
         advice = "" if fine else "; run: pip install --force-reinstall torch"
         yield fine, f"round trip of {size[0]} x {size[1]} samples errs by {error:.1e}{advice}"
     if (torch.fft.ifft2(torch.fft.fft2(x)) - x).abs().max() > 1e-3:
-        yield True, "torch.fft.ifft2 itself is wrong at 2048 x 2048 here (pytorch#169670); holotorch goes around it"
+        yield True, "torch.fft.ifft2 itself is wrong at 2048 x 2048 here (pytorch#169670); holotorch avoids it"
 
 
 def _exr() -> Iterator[tuple[bool, str]]:
@@ -97,7 +97,7 @@ def _udp() -> Iterator[tuple[bool, str]]:
         receiver.settimeout(2)
         sender.sendto(b"holotorch", receiver.getsockname())
         fine = receiver.recv(64) == b"holotorch"
-    yield fine, "loopback works" if fine else "loopback garbles packets; look at the firewall"
+    yield fine, "loopback works" if fine else "loopback garbles packets; check the firewall"
 
 
 def _extras() -> Iterator[tuple[bool, str]]:

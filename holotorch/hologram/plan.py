@@ -117,11 +117,12 @@ def plan_hologram(
             )
         ordered = fitting
     best, others = ordered[0], [method for method in methods if method is not ordered[0]]
-    runner_up = "there is no other method for this cone"
+    runner_up = "no other method computes this cone of light"
     if others:
         other = others[0]
-        why = f"{other['flops'] / best['flops']:.1f} times the work" if other in adequate else "not accurate enough"
-        runner_up = f"{other['method']}: {other['transforms']} transforms, {other['predicted_error']:.0e}, {why}"
+        ratio = other["flops"] / best["flops"]
+        verdict = f"would take {ratio:.1f} times as long" if other in adequate else "is not accurate enough"
+        runner_up = f"{other['method']} (error {other['predicted_error']:.0e}) {verdict}"
     near = not is_plain(grid, wavelength, min(listed), apart, tolerance)
     notes = _notes(grid, wavelength, listed, near)
     return HologramPlan(**best, cone=asked, near=near, runner_up=runner_up, notes=notes, adequate=True)
@@ -174,7 +175,7 @@ def _axial(operator: AxialHologram, shape: tuple[int, int], dtype: torch.dtype) 
     spread = 8 * design.nodes.width * planes * math.prod(shape)
     flops = nodes * (_transform(sources) + _PASS * samples) + spread + _transform(samples) + _WAVE * samples / 2
     slab = math.prod(shape) * (8 + 2 * (8 + design.nodes.width)) * dtype.itemsize
-    what = "planes as their own nodes" if design.nodes.width == 1 else f"{planes} planes on {nodes} nodes"
+    spread_onto = "" if design.nodes.width == 1 else f" spread onto {nodes} nodes along the axis"
     return {
         "method": "axial nodes",
         "transforms": nodes,
@@ -182,7 +183,7 @@ def _axial(operator: AxialHologram, shape: tuple[int, int], dtype: torch.dtype) 
         "predicted_error": max(design.predicted_error, _ROUNDING[dtype] * math.sqrt(nodes) / 2),
         "memory_bytes": round(dtype.itemsize * (3 * samples + 2 * sources) + slab),
         "flops": flops,
-        "reason": f"{what}, one small transform each and one large one in all",
+        "reason": f"{planes} planes{spread_onto}, with one small transform each and a single large one",
         "operator": operator,
     }
 
@@ -196,8 +197,8 @@ def _notes(grid: Grid, wavelength: float, depths: Sequence[float], near: bool) -
         )
     if near:
         notes.append(
-            "the edge of the cone of light falls on pixels: its definitions may differ by more than the tolerance, by "
-            "up to tens of percent, and a source may light only a part of the hologram"
+            "at this distance the light of each point may fill only part of the hologram; how its edge is defined "
+            "(hologram.cone) then changes the field by more than the tolerance, by up to tens of percent"
         )
     if min(grid.pitch) <= wavelength / 2:
         notes.append("the pitch is at or below half a wavelength: light leaves in every direction")

@@ -33,7 +33,7 @@ KINDS = {
     ),
     "eye": (
         ("eye.chromatic=true", "eye.chromatic was false and is true"),
-        (eye.Observer, "seen", 9, 1),
+        (eye.Observer, "image", 9, 1),
     ),
     "study": (
         ("max_steps=5", "max_steps was 4 and is 5"),

@@ -18,7 +18,7 @@ def test_the_cheaper_way_is_taken_and_does_what_is_said():
     many = plan_hologram(grid, WAVE, depths(400), (32, 32), stride=2)
     assert many.method == "axial nodes" and isinstance(many.operator, AxialHologram)
     assert many.transforms < 100 and many.predicted_error <= 1e-3 and many.adequate
-    assert "400 planes on" in many.reason and "convolution: 400 transforms" in many.runner_up
+    assert "400 planes spread onto" in many.reason and "convolution (error" in many.runner_up
     layers = torch.randn(400, 32, 32, dtype=torch.complex128)
     exact = DirectHologram(grid, WAVE, depths(400), stride=2, cone="full")(layers)
     assert (many.operator(layers) - exact).norm() < 1e-3 * exact.norm()
@@ -56,7 +56,7 @@ def test_what_no_way_reaches_is_refused():
 def test_borders_of_validity_are_said():
     cone = 2 * 30e-6 * math.tan(math.asin(WAVE / 2 / PITCH)) / PITCH
     close = plan_hologram(Grid(32, PITCH), WAVE, [30e-6], (32, 32))
-    assert f"covers {cone:.2g} pixels" in close.notes[0] and "edge of the cone of light" in close.notes[1]
+    assert f"covers {cone:.2g} pixels" in close.notes[0] and "how its edge is defined" in close.notes[1]
     assert plan_hologram(Grid(32, PITCH), WAVE, [0.1], (32, 32)).notes == ()
     fine = plan_hologram(Grid(16, 0.2e-6), WAVE, [5e-6], (8, 8), cone="box")
     assert any("half a wavelength" in note for note in fine.notes)
@@ -75,7 +75,7 @@ def test_definitions_agree_to_the_tolerance_where_the_plan_says_so(tolerance):
         assert plan.near or error < 1.5 * tolerance
         if depth < 14e-3:
             assert plan.near and error > 0.04
-            assert "its definitions may differ by more than the tolerance" in plan.notes[0]
+            assert "changes the field by more than the tolerance" in plan.notes[0]
     assert near[16e-3] and near[20e-3] == (tolerance < 1e-3)
 
 

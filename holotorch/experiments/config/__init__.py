@@ -1,1 +1,1 @@
-"""YAML configurations: positions, fields, and mistakes in words."""
+"""YAML configurations: their positions in the file, their fields, and error messages."""

@@ -1,12 +1,12 @@
-"""The error that a user can mend."""
+"""The error for mistakes that a user can correct."""
 
 from typing import Any
 
-_LONGEST = 200  # characters that a message repeats of a value
+_LONGEST = 200  # characters of a value that a message repeats
 
 
 class ConfigError(ValueError):
-    """One or more mistakes in what the user gave, a line each; in a file ``file:line:column: key: what is wrong``."""
+    """Mistakes in the input, one line each; those in a file read ``file:line:column: key: what is wrong``."""
 
     def __init__(self, mistakes: list[str]):
         super().__init__("\n".join(mistakes))
@@ -14,6 +14,6 @@ class ConfigError(ValueError):
 
 
 def short(value: Any) -> str:
-    """What came, as a message repeats it: without what no line has room for."""
+    """A value as a message repeats it, cut off after 200 characters."""
     text = repr(value)
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}... ({len(text)} characters)"

@@ -1,4 +1,4 @@
-"""Validation errors in words that say what was expected, what came and what to write instead."""
+"""Messages for validation errors: what was expected, what was given, and what to write instead."""
 
 import difflib
 import math
@@ -24,10 +24,10 @@ _EXPECTED = {
 
 
 def validated(source: Source, model: type[Model]) -> Model:
-    """The settings that a file holds.
+    """The settings in a file.
 
     Raises:
-        ConfigError: All mistakes, each a line once, in the order of the file.
+        ConfigError: All mistakes, one line each, in the order of the file.
     """
     try:
         return model.model_validate(source.data)
@@ -41,14 +41,14 @@ def validated(source: Source, model: type[Model]) -> Model:
 
 
 def _follows(entry: Any, others: list[Any]) -> bool:
-    """Whether a list is too short only for pydantic, which does not count the entries that are wrong themselves."""
-    place = entry["loc"]
-    inside = (len(other["loc"]) > len(place) and other["loc"][: len(place)] == place for other in others)
+    """Whether "too short" is only a consequence of other errors: pydantic does not count entries that are invalid."""
+    location = entry["loc"]
+    inside = (len(other["loc"]) > len(location) and other["loc"][: len(location)] == location for other in others)
     return entry["type"] == "too_short" and any(inside)
 
 
 def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
-    """One line for one entry of ``ValidationError.errors()``: place, key, what was expected, what came, a hint."""
+    """One line for an entry of ``ValidationError.errors()``: position, key, what was expected and given, a hint."""
     key = _written_key(source, entry["loc"])
     kind, given = entry["type"], entry["input"]
     if kind == "extra_forbidden":
@@ -70,11 +70,11 @@ def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
         return source.mistake(key, f"expected at {bound} {number} {'entry' if number == 1 else 'entries'}, got {got}")
     wanted = next((text for start, text in _EXPECTED.items() if kind.startswith(start)), None)
     wanted = wanted or entry["msg"].replace("Input should be ", "").removeprefix("expected ")
-    near = difflib.get_close_matches(str(given)[:100], re.findall(r"'([^']+)'", wanted), 1)
-    # A length with a unit, such as "8 m", has not lost one.
-    cure = entry["ctx"]["cure"] if kind == "quantity" and not isinstance(given, str) else ""
+    near = difflib.get_close_matches(str(given)[:100].lower(), re.findall(r"'([^']+)'", wanted), 1)
+    # Only a number without a unit may lack one.
+    hint = entry["ctx"]["hint"] if kind == "quantity" and not isinstance(given, str) else ""
     shown = "nothing" if given is None else "NaN" if isinstance(given, float) and math.isnan(given) else short(given)
-    return source.mistake(key, f"expected {wanted}, got {shown}" + (f"; did you mean {near[0]!r}?" if near else cure))
+    return source.mistake(key, f"expected {wanted}, got {shown}" + (f"; did you mean {near[0]!r}?" if near else hint))
 
 
 def _unknown(model: type[BaseModel], location: tuple[str | int, ...], name: str) -> str:
@@ -91,13 +91,13 @@ def _unknown(model: type[BaseModel], location: tuple[str | int, ...], name: str)
 
 
 def position(mistake: str) -> tuple[int, int]:
-    """Line and column of a mistake, so that a file's mistakes come in its order and the arguments' after them."""
+    """Line and column of a mistake, to sort by; mistakes of arguments come after those of the file."""
     match = re.search(r":(\d+):(\d+): ", mistake)
     return (int(match[1]), int(match[2])) if match else (2**31, 0)
 
 
 def _written_key(source: Source, location: tuple[str | int, ...]) -> Key:
-    """The location without the union tags that pydantic puts between a section and its settings."""
+    """The location without the union tags that pydantic inserts between a section and its settings."""
     key: list[str | int] = []
     value: Any = source.data
     for i, part in enumerate(location):
@@ -105,7 +105,7 @@ def _written_key(source: Source, location: tuple[str | int, ...]) -> Key:
         if tagged and part not in value:
             continue
         if isinstance(part, int) and not isinstance(value, list):
-            break  # a single value that stands for a list
+            break  # a single value instead of a list
         key.append(part)
         try:
             value = value[part]  # type: ignore[index]
@@ -115,7 +115,7 @@ def _written_key(source: Source, location: tuple[str | int, ...]) -> Key:
 
 
 def _options_at(model: type[BaseModel], location: tuple[str | int, ...]) -> list[type[BaseModel]]:
-    """The sections that may stand at ``location``: several where a ``kind`` chooses and it is not part of it."""
+    """The sections that are possible at ``location``: several if ``kind`` selects one and is not in the location."""
     options: list[type[BaseModel]] = [model]
     for part in location:
         fields = [option.model_fields[str(part)] for option in options if str(part) in option.model_fields]
@@ -133,6 +133,6 @@ def _tags(option: type[BaseModel]) -> tuple[str, ...]:
 
 
 def nearest(word: str, options: list[str]) -> str:
-    """A hint: the option nearest to ``word``, or all of them."""
-    near = difflib.get_close_matches(word, options, 1)
+    """A hint: the option most similar to ``word``, or all options; upper case does not matter."""
+    near = difflib.get_close_matches(word, options, 1) or difflib.get_close_matches(word.lower(), options, 1)
     return f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(options)}" if options else ""

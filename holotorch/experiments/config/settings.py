@@ -1,5 +1,6 @@
-"""Building blocks of configurations: units, ranges, and sections that all kinds share."""
+"""Building blocks of configurations: units, ranges, and sections that several kinds share."""
 
+import math
 import re
 from collections.abc import Callable
 from decimal import Decimal
@@ -12,13 +13,14 @@ from pydantic_core import PydanticCustomError
 from holotorch.core.quantities import PITCH, PLANE, WAVELENGTH, Quantity
 from holotorch.experiments.config.errors import short
 
-_POWERS = {"m": 0, "cm": -2, "mm": -3, "um": -6, "µm": -6, "μm": -6, "nm": -9}  # of ten, in metres
-# No two parts of it match the same characters, so that a text that fits in no way takes linear time.
+_POWERS = {"m": 0, "cm": -2, "mm": -3, "um": -6, "µm": -6, "μm": -6, "nm": -9}  # powers of ten, in metres
+_UNITS = ("nm", "um", "mm", "cm")  # that a number without a unit may have been meant in
+# No two parts of the pattern match the same characters, so that a text without a match takes linear time.
 _LENGTH = re.compile(r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-zµμ]*)")
 
 
 def metres(value: Any) -> Any:
-    """A length with its unit, or a number of metres, as metres."""
+    """A length in metres, from a text with a unit or a number of metres."""
     if isinstance(value, str):
         match = _LENGTH.fullmatch(value.strip())
         if not match or (match[2] and match[2] not in _POWERS):
@@ -26,21 +28,21 @@ def metres(value: Any) -> Any:
                 "length", "expected a length such as 530 nm, 3.74 um, 100 mm or a number of metres"
             )
         try:
-            return float(Decimal(match[1]).scaleb(_POWERS[match[2] or "m"]))  # rounded once: 0.57 um is 5.7e-07
-        except ArithmeticError:  # an exponent beyond those of a decimal
+            return float(Decimal(match[1]).scaleb(_POWERS[match[2] or "m"]))  # rounded only once: 0.57 um is 5.7e-07
+        except ArithmeticError:  # the exponent is too large
             raise PydanticCustomError("length", "expected a length that a number can hold, such as 100 mm") from None
     return number(value)
 
 
 def number(value: Any) -> Any:
-    """Anything but true and false, which are numbers in Python."""
+    """Any value except true and false, which Python takes as numbers."""
     if isinstance(value, bool):
         raise PydanticCustomError("number", "expected a number")
     return value
 
 
 def within(least: float, most: float, words: str) -> AfterValidator:
-    """A range, and the words for it."""
+    """A validator of a range; ``words`` describe the range in the message."""
 
     def check(value: float) -> float:
         if not least <= value <= most:
@@ -51,20 +53,28 @@ def within(least: float, most: float, words: str) -> AfterValidator:
 
 
 def plausible(kind: Quantity) -> AfterValidator:
-    """The range of a quantity, in the words of :mod:`holotorch.core.quantities`."""
+    """A validator of the range of a quantity, see :mod:`holotorch.core.quantities`."""
 
     def check(value: float) -> float:
         if kind.problem(value):
-            what = "a length" if kind.unit == "m" else f"a number of {kind.words}"
-            words = {"words": f"{what} {kind.range}", "cure": kind.cure(value) if kind.unit == "m" else ""}
+            name = "a length" if kind.unit == "m" else f"a number of {kind.words}"
+            words = {"words": f"{name} {kind.range}", "hint": _missing_unit(kind, value) if kind.unit == "m" else ""}
             raise PydanticCustomError("quantity", "expected {words}", words)
         return value
 
     return AfterValidator(check)
 
 
+def _missing_unit(kind: Quantity, value: float) -> str:
+    """A hint for a number of metres outside of the range: the unit that makes it a usual length."""
+    for unit in _UNITS:
+        if math.isfinite(value) and kind.usual[0] <= abs(metres(f"{value!r} {unit}")) <= kind.usual[1]:
+            return f"; {value:g} means metres: did you mean '{value:g} {unit}'?"
+    return kind.cure(value)
+
+
 def pair(value: Any) -> Any:
-    """One value for both axes."""
+    """A single value as a pair for both axes."""
     return value if isinstance(value, list | tuple) else (value, value)
 
 
@@ -74,7 +84,12 @@ def several(value: Any) -> Any:
 
 
 def existing(there: Callable[[str], object], missing: Callable[[str], str]) -> BeforeValidator:
-    """A path that ``there`` accepts; ``missing`` words the refusal of any other, such as a name too long for a file."""
+    """A validator of paths that exist.
+
+    Args:
+        there: Whether, or where, a path exists.
+        missing: The message for a path that does not exist or cannot exist, such as a name that is too long.
+    """
 
     def check(value: Any) -> Any:
         reason = ""
@@ -98,7 +113,7 @@ Number = Annotated[float, BeforeValidator(number), Field(allow_inf_nan=False)]
 Count = Annotated[int, BeforeValidator(number), Field(ge=1)]
 Length = Annotated[float, BeforeValidator(metres), Field(allow_inf_nan=False)]
 Wavelength = Annotated[Length, plausible(WAVELENGTH)]
-Distance = Annotated[Length, plausible(PLANE)]  # of an image or a plane, either side of the hologram
+Distance = Annotated[Length, plausible(PLANE)]  # of an image or a plane, on either side of the hologram
 Pitch = Annotated[Length, plausible(PITCH)]
 ExistingPath = Annotated[str, existing(lambda value: Path(value).exists(), _no_path)]
 ExistingArray = Annotated[str, existing(lambda value: Path(value.split("::")[0]).exists(), _no_path)]
@@ -112,7 +127,7 @@ class Settings(BaseModel):
 
 
 class GridSettings(Settings):
-    """Samples (H, W) and their pitch (y, x); one pitch means both axes."""
+    """Samples (H, W) and their pitch (y, x); a single value is used for both axes."""
 
     shape: Annotated[tuple[Side, Side], BeforeValidator(pair)]
     pitch: Annotated[tuple[Pitch, Pitch], BeforeValidator(pair)]

@@ -1,4 +1,4 @@
-"""YAML with positions: every value knows its place in the file, so that every mistake can be pointed at."""
+"""YAML files with the position of every value, so that messages can point at mistakes."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,32 +9,44 @@ import yaml
 from holotorch.experiments.config.errors import ConfigError, short
 
 Key = tuple[str | int, ...]
-_LARGEST = 1 << 17  # bytes of a file, which take up to 4 s to parse
-_MOST = 100_000  # values of a file, more than one of that size can write out
-MOST_MISTAKES = 50  # that are listed
+_LARGEST = 1 << 17  # largest file in bytes; it takes up to 4 s to parse
+_MOST = 100_000  # largest number of values; a file of that size can only have more through aliases
+MOST_MISTAKES = 50  # largest number of mistakes that are listed
 
 
 @dataclass
 class Source:
-    """Plain data of a configuration and where each of its keys stands."""
+    """Data of a configuration, and the position of each of its keys.
+
+    Attributes:
+        path: The file.
+        data: Plain values.
+        positions: ``file:line:column`` of each key, or the argument that sets it.
+    """
 
     path: Path
     data: dict[str, Any]
-    places: dict[Key, str] = field(default_factory=dict)
+    positions: dict[Key, str] = field(default_factory=dict)
 
     def mistake(self, key: Key, message: str) -> str:
-        """A line that names the place of ``key`` (or of its nearest parent that is written down) and the message."""
-        known = key
-        while known and known not in self.places:
-            known = known[:-1]
+        """A line with the position of ``key``, or of its nearest parent in the file, and the message."""
+        parent = key
+        while parent and parent not in self.positions:
+            parent = parent[:-1]
         name = ".".join(str(part) for part in key)
-        return f"{self.places.get(known, f'{self.path}:1:1')}: {name + ': ' if name else ''}{message}"
+        return f"{self.positions.get(parent, f'{self.path}:1:1')}: {name + ': ' if name else ''}{message}"
 
 
 def read_source(path: Path, overrides: list[str], wanted: str = "settings such as 'experiment: pec'") -> Source:
-    """Read a YAML file and apply ``key.sub=value`` words to it; ConfigError lists all that cannot be read.
+    """Read a YAML file and apply overrides to it.
 
-    ``wanted`` says what such a file holds, to whoever gives one that holds nothing of the kind.
+    Args:
+        path: The file.
+        overrides: Arguments ``key.sub=value``.
+        wanted: What such a file contains, for messages.
+
+    Raises:
+        ConfigError: All mistakes that prevent reading.
     """
     try:
         with open(path, "rb") as stream:
@@ -49,7 +61,7 @@ def read_source(path: Path, overrides: list[str], wanted: str = "settings such a
         )
     source = Source(path, {})
     mistakes: list[str] = []
-    data = _parse(text, str(path), source.places, (), mistakes)
+    data = _parse(text, str(path), source.positions, (), mistakes)
     if data is None and not mistakes:
         mistakes.append(f"{path}:1:1: the file is empty; expected {wanted}")
     elif not isinstance(data, dict) and not mistakes:
@@ -77,25 +89,24 @@ def _override(source: Source, word: str, mistakes: list[str]) -> None:
             mistakes.append(f"argument {word!r}: {part!r} is a single value and has no settings inside")
             return
         parent = child
-    place = f"argument {word!r}"
-    for stale in [known for known in source.places if known[: len(key)] == key]:
-        del source.places[stale]
+    position = f"argument {word!r}"
+    for replaced in [other for other in source.positions if other[: len(key)] == key]:
+        del source.positions[replaced]
     for end in range(1, len(key) + 1):
-        source.places.setdefault(key[:end], place)
-    value = _parse(text, place, {}, key, mistakes)
-    parent[key[-1]] = value
+        source.positions.setdefault(key[:end], position)
+    parent[key[-1]] = _parse(text, position, {}, key, mistakes)
 
 
-def _parse(text: str, name: str, places: dict[Key, str], key: Key, mistakes: list[str]) -> Any:
+def _parse(text: str, name: str, positions: dict[Key, str], key: Key, mistakes: list[str]) -> Any:
     try:
         loader = yaml.SafeLoader(text)
         loader.name = name
         node = loader.get_single_node()
-        return None if node is None else _construct(loader, node, name, places, key, mistakes)
+        return None if node is None else _construct(loader, node, name, positions, key, mistakes)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        place = f"{name}:{mark.line + 1}:{mark.column + 1}" if mark else name
-        mistakes.append(f"{place}: not valid YAML: {error.problem or error.context}")
+        position = f"{name}:{mark.line + 1}:{mark.column + 1}" if mark else name
+        mistakes.append(f"{position}: not valid YAML: {error.problem or error.context}")
     except yaml.YAMLError as error:
         mistakes.append(f"{name}: not valid YAML: {' '.join(str(error).split())}")
     except _Expanded as error:
@@ -108,28 +119,28 @@ def _parse(text: str, name: str, places: dict[Key, str], key: Key, mistakes: lis
 
 
 class _Expanded(Exception):
-    """Aliases of aliases, whose values no memory could hold; the place of the first value too many."""
+    """Aliases expand to too many values; the message is the position of the first value too many."""
 
 
-def _construct(loader, node: yaml.Node, name: str, places: dict[Key, str], key: Key, mistakes: list[str]) -> Any:
-    places.setdefault(key, f"{name}:{node.start_mark.line + 1}:{node.start_mark.column + 1}")
-    if len(places) > _MOST:  # every value has its place
-        raise _Expanded(places[key])
+def _construct(loader, node: yaml.Node, name: str, positions: dict[Key, str], key: Key, mistakes: list[str]) -> Any:
+    positions.setdefault(key, f"{name}:{node.start_mark.line + 1}:{node.start_mark.column + 1}")
+    if len(positions) > _MOST:  # every value has a position
+        raise _Expanded(positions[key])
     if isinstance(node, yaml.MappingNode):
         result: dict[str, Any] = {}
         for key_node, value_node in node.value:
             part = key_node.value if isinstance(key_node, yaml.ScalarNode) else "?"
-            place = f"{name}:{key_node.start_mark.line + 1}:{key_node.start_mark.column + 1}"
+            position = f"{name}:{key_node.start_mark.line + 1}:{key_node.start_mark.column + 1}"
             if part in result:
-                mistakes.append(f"{place}: {'.'.join(map(str, (*key, part)))}: written twice; keep one")
-            places[(*key, part)] = place
-            result[part] = _construct(loader, value_node, name, places, (*key, part), mistakes)
+                mistakes.append(f"{position}: {'.'.join(map(str, (*key, part)))}: written twice; keep one")
+            positions[(*key, part)] = position
+            result[part] = _construct(loader, value_node, name, positions, (*key, part), mistakes)
         return result
     if isinstance(node, yaml.SequenceNode):
-        return [_construct(loader, item, name, places, (*key, i), mistakes) for i, item in enumerate(node.value)]
+        return [_construct(loader, item, name, positions, (*key, i), mistakes) for i, item in enumerate(node.value)]
     try:
         return loader.construct_object(node)
     except (ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as error:
-        # An impossible date, a number beyond all, a tag that does not fit.
-        mistakes.append(f"{places[key]}: {'.'.join(map(str, key))}: not a value: {error}")
+        # For example an impossible date, a number that is too large, or a tag that does not fit.
+        mistakes.append(f"{positions[key]}: {'.'.join(map(str, key))}: not a value: {error}")
         return None

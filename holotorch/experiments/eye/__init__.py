@@ -1,1 +1,1 @@
-"""What an observer sees of a volume's hologram."""
+"""An observer's view of the hologram of a volume."""

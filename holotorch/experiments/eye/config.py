@@ -1,4 +1,4 @@
-"""What the configuration of an observer's view may say."""
+"""Settings of an observer's view of a hologram."""
 
 from typing import Annotated, Literal
 
@@ -27,16 +27,17 @@ Positive = Annotated[Length, AfterValidator(_above_zero)]
 
 
 class SceneSettings(Settings):
-    """The hologram that is looked at: a volume's configuration, with settings to change as on the command line."""
+    """The hologram to look at: the configuration of a volume, and ``change``s to it as on the command line."""
 
     config: Annotated[str, existing(find_config, _no_scene)]
     change: Annotated[tuple[str, ...], BeforeValidator(several)] = ()
 
 
 class MagnifyingSettings(Settings):
-    """The thesis's display (Fig. 5.5): an eyepiece beyond the volume, whose magnified image the eye sees.
+    """The display of the thesis (Fig. 5.5): the eye sees the image of the volume that an eyepiece magnifies.
 
-    ``lens_distance``: from hologram to eyepiece; by default where the volume's middle appears at ``focus_distance``.
+    ``lens_distance`` is the distance from hologram to eyepiece; by default, the middle of the volume appears at
+    ``focus_distance`` from the eye.
     """
 
     kind: Literal["magnifying"]
@@ -54,7 +55,7 @@ class PlanarSettings(Settings):
 
 
 class EyeSettings(Settings):
-    """The eye: radius of its pupil, distance of its retina, and whether it has the colour error of human eyes."""
+    """The eye: radius of its pupil, distance of its retina, and whether it has human chromatic aberration."""
 
     pupil_radius: Annotated[Length, plausible(PUPIL_RADIUS)] = 1.5e-3
     axial_length: Annotated[Length, plausible(EYE_LENGTH)] = 24e-3
@@ -62,11 +63,11 @@ class EyeSettings(Settings):
 
 
 class LightSettings(Settings):
-    """Sources to compare, by name or by their FWHM.
+    """Sources to compare, with FWHM of 1.4, 5, 10 and 20 nm.
 
-    ``tolerance``: of the sum over wavelengths, and of making most of them from few, relative to a picture's rms
-    brightness.
-    ``extent``: sine of the half angle under which the hologram sees the sources, discs; 0 for points.
+    ``tolerance`` bounds the error of the sum over wavelengths, of which few are propagated, relative to the rms
+    brightness of a picture. ``extent`` is the sine of the half angle of the sources, which are discs, seen from the
+    hologram; 0 for points.
     """
 
     sources: Annotated[tuple[Source, ...], BeforeValidator(several), Field(min_length=1)] = (
@@ -80,7 +81,7 @@ class LightSettings(Settings):
 
 
 class SweepSettings(Settings):
-    """Focus swept over the scene in ``steps``, whose surface is cut into ``bands`` of depth."""
+    """A sweep of the focus over the scene in ``steps``; its surface is divided into ``bands`` of depth."""
 
     bands: Annotated[Count, Field(le=64)] = 5
     steps: Annotated[Count, Field(ge=3, le=256)] = 11
@@ -88,14 +89,14 @@ class SweepSettings(Settings):
 
 
 class ObserverSettings(Settings):
-    """What an observer sees of a volume's hologram, for several light sources and depths of focus.
+    """An observer's view of the hologram of a volume, for several light sources and depths of focus.
 
-    ``focus``: depths of the scene in which the eye is focused; a tenth, half and nine tenths of it by default.
-    ``seeds``: realisations of the phases, which are compared with the mean of eight times as many others.
-    ``tolerance``: error of the way to the retina, relative L2 of the intensity; below what the collapse keeps, elements
-    take 10 to 300 times as long and much memory.
-    ``sweep``: the eye's focus is swept over the scene as well, to see where each part of it looks sharpest.
-    ``tradeoff``: distances at which the best spectral width is looked for as well, colour by colour.
+    ``focus``: depths of the scene at which the eye is focused; by default, the depths of 10, 50 and 90 % of the rays.
+    ``seeds``: realisations of the random phases; they are compared with the mean of eight times as many others.
+    ``tolerance``: relative L2 error of the intensity on the retina. If collapsed propagation exceeds it, light is
+    propagated element by element, which takes 10 to 300 times as long and much memory.
+    ``sweep``: also sweep the focus over the scene, to find the focus at which each part looks sharpest.
+    ``tradeoff``: distances at which the best spectral width is determined as well, for each colour.
     """
 
     experiment: Literal["eye"]

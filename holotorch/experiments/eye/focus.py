@@ -1,4 +1,4 @@
-"""Where a volume looks sharp against where the eye is focused: a sweep of the accommodation (thesis Fig. 5.9)."""
+"""A sweep of the eye's focus over a scene: the focus at which each part looks sharpest (thesis Fig. 5.9)."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,35 +13,36 @@ from holotorch.experiments.eye.config import SweepSettings
 from holotorch.experiments.eye.experiment import Observer
 from holotorch.experiments.runs.pictures import figure_png
 
-_DETAIL = 6.0  # rays, standard deviation of the blur that is taken off: what is finer than it tells the focus
-_SEEN = 0.5  # opacity of a ray above which it shows a surface
-_LEAST = 100  # rays of a band
-_ENDS = (0.02, 0.98)  # share of the rays nearer than the first band's beginning and the last one's end
+_BLUR = 6.0  # rays: standard deviation of the Gaussian that is subtracted, so that only fine detail is compared
+_OPAQUE = 0.5  # opacity above which a ray shows a surface
+_LEAST = 100  # rays that a band needs
+_ENDS = (0.02, 0.98)  # quantiles of the depths of the surface at which the first band begins and the last one ends
 
 
 @dataclass(frozen=True)
 class Band:
-    """What lies within a range of depths, and how much like its rendering it looks at each focus.
+    """The part of a scene within a range of depths, and its similarity to the rendering at each focus.
 
     Attributes:
         depth: Mean, in metres from the hologram.
         spread: Standard deviation of the depths, in metres.
-        rays: How many show it.
-        likeness: Correlation of its fine detail with the rendering's, one for each focus of the sweep.
-        sharpest: Focus at which that is greatest, between the steps, in metres; NaN where it is at an end of them.
+        rays: Number of rays that show it.
+        correlation: Of its fine detail with that of the rendering, one for each focus of the sweep.
+        sharpest: Focus in metres with the largest correlation, interpolated between the steps; NaN if it is at an end
+            of the sweep.
         depth_of_focus: wavelength / aperture^2 of the middle colour, in metres.
     """
 
     depth: float
     spread: float
     rays: int
-    likeness: tuple[float, ...]
+    correlation: tuple[float, ...]
     sharpest: float
     depth_of_focus: float
 
     @property
     def row(self) -> dict[str, Any]:
-        """For a table, in millimetres."""
+        """A row of the table, in millimetres."""
         return {
             "depth_mm": f"{1e3 * self.depth:.4f}",
             "spread_mm": f"{1e3 * self.spread:.4f}",
@@ -54,7 +55,13 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class FocusSweep:
-    """Focus depths in metres, mean pictures [F, 3, h, w] on the rays, and the bands of depth, near ones first."""
+    """The result of a sweep.
+
+    Attributes:
+        depths: Of the focus, in metres from the hologram.
+        pictures: Mean over realisations [F, 3, h, w] on the rays.
+        bands: Of depth, near ones first.
+    """
 
     depths: tuple[float, ...]
     pictures: Tensor
@@ -67,9 +74,9 @@ class Surface:
 
     Attributes:
         rendering: [3, h, w].
-        opaque: Rays that show it, [h, w].
-        depth: Where they do, in metres from the hologram, [h, w].
-        ends: Depths at which it begins and ends, but for the outermost rays.
+        opaque: Whether a ray shows the surface, [h, w].
+        depth: Of the surface along each ray, in metres from the hologram, [h, w].
+        ends: Depths at which the surface begins and ends, without outliers.
     """
 
     rendering: Tensor
@@ -79,15 +86,16 @@ class Surface:
 
 
 def visible_surface(eye: Observer) -> Surface:
-    """The surface that a sweep needs; ValueError for a scene without one, or with one at a single depth."""
+    """The visible surface of a scene. ValueError for a scene without a surface, or with one at a single depth."""
     sampler = eye.scene.sampler()
     with torch.no_grad():
         rendering, opacity = (part.cpu() for part in sampler.render(eye.scene.volume))
         depth = sampler.depth_map(eye.scene.volume).cpu()
-    opaque = opacity > _SEEN
+    opaque = opacity > _OPAQUE
     shown = depth[opaque].sort().values
     if len(shown) < _LEAST:
-        raise ValueError(f"a sweep needs a surface: {len(shown)} of the rays are {_SEEN:.0%} opaque, not {_LEAST}")
+        few = f"only {len(shown)} rays are {_OPAQUE:.0%} opaque or more"
+        raise ValueError(f"a sweep needs a surface: {few}, and at least {_LEAST} are needed")
     low, high = (shown[round(part * (len(shown) - 1))].item() for part in _ENDS)
     if not high > low:
         raise ValueError(f"the whole surface lies at {1e3 * low:.4g} mm: there is nothing to sweep")
@@ -95,56 +103,62 @@ def visible_surface(eye: Observer) -> Surface:
 
 
 def focus_sweep(eye: Observer, settings: SweepSettings, surface: Surface | None = None) -> FocusSweep:
-    """Look at an observer's scene with the eye focused at one depth after another, in light of one wavelength each.
+    """Compute the observer's view for one focus after another, with one wavelength per colour.
 
-    The scene's visible surface is cut into bands of depth. Of each band the fine detail of the picture is correlated
-    with that of the volume's rendering, which has no focus: an eye that accommodates rightly sees a band best when it
-    is focused at it.
+    The visible surface of the scene is divided into bands of depth. The fine detail of each band is correlated with
+    that of the rendering, which is sharp everywhere: a band looks sharpest when the eye is focused at its depth.
 
-    ``surface``: of :func:`visible_surface`, which is called without it, and raises what it does.
+    Args:
+        eye: The observer.
+        settings: Numbers of bands, steps and realisations.
+        surface: Result of :func:`visible_surface`; computed if it is not given.
+
+    Raises:
+        ValueError: As by :func:`visible_surface`.
     """
     scene, surface = eye.scene, surface or visible_surface(eye)
-    rendering, seen, depth, (low, high) = surface.rendering, surface.opaque, surface.depth, surface.ends
-    room = 0.1 * (high - low)
-    focus = torch.linspace(low - room, high + room, settings.steps).tolist()
-    total = torch.zeros(len(focus), *rendering.shape)
+    depth, (low, high) = surface.depth, surface.ends
+    margin = 0.1 * (high - low)
+    focus = torch.linspace(low - margin, high + margin, settings.steps).tolist()
+    total = torch.zeros(len(focus), *surface.rendering.shape)
     with tqdm(total=settings.realisations * len(focus), desc="sweeping", unit="picture", dynamic_ncols=True) as bar:
         for k in range(settings.realisations):
             hologram, _ = scene.hologram(eye.settings.seed + k)
-            for f, place in enumerate(focus):
-                total[f] += eye.seen(hologram, None, place)
+            for f, position in enumerate(focus):
+                total[f] += eye.image(hologram, None, position)
                 bar.update()
-    pictures, wave = total / settings.realisations, eye.reference_wavelength
-    fine, wanted = _detail(pictures), _detail(rendering[None].float())[0]
+    pictures, wavelength = total / settings.realisations, eye.reference_wavelength
+    details, wanted = _fine_detail(pictures), _fine_detail(surface.rendering[None].float())[0]
     bands = []
     ends = torch.linspace(low, high, settings.bands + 1).tolist()
     for near, far in zip(ends, ends[1:], strict=False):
-        part = seen & (depth >= near) & (depth <= far)
+        part = surface.opaque & (depth >= near) & (depth <= far)
         if int(part.sum()) < _LEAST:
             continue
         mean = depth[part].mean().item()
-        likeness = tuple(_likeness(picture[:, part], wanted[:, part]) for picture in fine)
-        spread, deep = depth[part].std().item(), wave / eye.detail(mean, wave) ** 2
-        bands.append(Band(mean, spread, int(part.sum()), likeness, _peak(focus, likeness), deep))
+        correlation = tuple(_correlation(detail[:, part], wanted[:, part]) for detail in details)
+        spread, depth_of_focus = depth[part].std().item(), wavelength / eye.detail(mean, wavelength) ** 2
+        sharpest = _peak(focus, correlation)
+        bands.append(Band(mean, spread, int(part.sum()), correlation, sharpest, depth_of_focus))
     return FocusSweep(tuple(focus), pictures, tuple(bands))
 
 
 def in_words(sweep: FocusSweep) -> list[str]:
     """A line for each band."""
     return [
-        f"Focus      what lies at {1e3 * band.depth:.3f} mm looks sharpest with the eye at {1e3 * band.sharpest:.3f} "
-        f"mm (depth of focus {1e3 * band.depth_of_focus:.3f} mm)"
+        f"Focus      the part at {1e3 * band.depth:.3f} mm looks sharpest with the eye focused at "
+        f"{1e3 * band.sharpest:.3f} mm (depth of focus {1e3 * band.depth_of_focus:.3f} mm)"
         for band in sweep.bands
     ]
 
 
 def draw(sweep: FocusSweep) -> bytes:
-    """PNG of the likeness of each band against the focus, and of the first, middle and last band in focus."""
+    """PNG: correlation of each band against the focus, and pictures focused on the first, middle and last band."""
     figure = Figure(figsize=(17, 4.6), layout="constrained")
     curves, *views = figure.subplots(1, 4, width_ratios=(1.3, 1, 1, 1))
-    places = [1e3 * depth for depth in sweep.depths]
+    positions = [1e3 * depth for depth in sweep.depths]
     for k, band in enumerate(sweep.bands):
-        curves.plot(places, band.likeness, "o-", color=f"C{k}", label=f"what lies at {1e3 * band.depth:.2f} mm")
+        curves.plot(positions, band.correlation, "o-", color=f"C{k}", label=f"part at {1e3 * band.depth:.2f} mm")
         curves.axvline(1e3 * band.depth, color=f"C{k}", linestyle=":")
     curves.set_xlabel("focus of the eye (mm from the hologram); dotted: where each part lies")
     curves.set_ylabel("correlation of fine detail with the rendering")
@@ -153,28 +167,28 @@ def draw(sweep: FocusSweep) -> bytes:
     bright = sweep.pictures.flatten().quantile(0.999) if sweep.pictures.numel() < 1 << 24 else sweep.pictures.max() / 3
     count = len(sweep.bands)
     for view, band in zip(views, (sweep.bands[0], sweep.bands[count // 2], sweep.bands[-1]), strict=True):
-        nearest = min(range(len(places)), key=lambda f: abs(sweep.depths[f] - band.depth))
+        nearest = min(range(len(positions)), key=lambda f: abs(sweep.depths[f] - band.depth))
         picture = (sweep.pictures[nearest] / bright).clamp(0, 1).sqrt()
         view.imshow(picture.movedim(0, -1).numpy(), interpolation="nearest")
-        view.set_title(f"focus {places[nearest]:.2f} mm", fontsize=10)
+        view.set_title(f"focus {positions[nearest]:.2f} mm", fontsize=10)
         view.set_axis_off()
     return figure_png(figure)
 
 
-def _detail(pictures: Tensor) -> Tensor:
-    """Pictures [F, 3, h, w] less their blur."""
-    blur: Any = (0, 0, _DETAIL, _DETAIL)
+def _fine_detail(pictures: Tensor) -> Tensor:
+    """Pictures [F, 3, h, w] minus their Gaussian blur."""
+    blur: Any = (0, 0, _BLUR, _BLUR)
     return pictures - torch.from_numpy(gaussian(pictures.numpy(), sigma=blur))
 
 
-def _likeness(first: Tensor, second: Tensor) -> float:
+def _correlation(first: Tensor, second: Tensor) -> float:
     return ((first * second).sum() / (first.norm() * second.norm()).clamp(min=1e-30)).item()
 
 
-def _peak(places: list[float], values: tuple[float, ...]) -> float:
-    """Of the parabola through the greatest value and its neighbours."""
+def _peak(positions: list[float], values: tuple[float, ...]) -> float:
+    """Position of the maximum of the parabola through the largest value and its neighbours; NaN without both."""
     at = max(range(len(values)), key=values.__getitem__)
     if at in (0, len(values) - 1):
         return float("nan")
     before, best, after = values[at - 1 : at + 2]
-    return places[at] + 0.5 * (places[1] - places[0]) * (before - after) / (before - 2 * best + after)
+    return positions[at] + 0.5 * (positions[1] - positions[0]) * (before - after) / (before - 2 * best + after)

@@ -1,4 +1,4 @@
-"""Geometry of a display and its observer, in numbers and to scale (thesis Sec. 5.4 and 5.6.2, Figs. 5.4 to 5.11)."""
+"""Geometry of a display and its observer: numbers and a drawing to scale (thesis Sec. 5.4 and 5.6.2)."""
 
 import math
 from typing import Any
@@ -12,32 +12,39 @@ from holotorch.experiments.eye.experiment import PRESETS, Observer
 from holotorch.experiments.runs.pictures import figure_png
 from holotorch.optics.viewing import display_geometry as viewing
 
-_COLOURS = ("tab:red", "tab:green", "tab:blue")  # of the three channels, in the order of their wavelengths
-_REGIONS = {1: "finest spots", 2: "the hologram gives part of the cone", 3: "spots grow with distance only"}
+_COLOURS = ("tab:red", "tab:green", "tab:blue")  # colours of the curves of the three wavelengths
+_REGIONS = {
+    0: "no light of the point reaches the hologram",
+    1: "the hologram holds the whole cone of light of a point, so spots are smallest",
+    2: "the hologram holds part of the cone of light",
+    3: "the cone of light covers the whole hologram, so spots grow with distance",
+}
+_ROMAN = {0: "none", 1: "I", 2: "II", 3: "III"}
+_INVISIBLE = 0.005  # share of its light that enters the pupil, below which the edge of the scene counts as lost
 
 
 def geometry(eye: Observer) -> dict[str, Any]:
-    """Fields of view, boxes and regions of an observer's display, as JSON values in degrees and millimetres."""
+    """Fields of view, eye box, regions and spots of an observer's display, as JSON values in degrees and mm."""
     scene, given = eye.scene, eye.settings.display
-    width, pitch, waves = scene.grid.extent[1], scene.grid.pitch[1], scene.settings.wavelengths
+    width, pitch, wavelengths = scene.grid.extent[1], scene.grid.pitch[1], scene.settings.wavelengths
     near, far = min(scene.depths), max(scene.depths)
     values: dict[str, Any] = {
-        "wavelengths_nm": [1e9 * wave for wave in waves],
-        "planar_fov_deg": [math.degrees(viewing.planar_fov(pitch, wave)) for wave in waves],
+        "wavelengths_nm": [1e9 * w for w in wavelengths],
+        "planar_fov_deg": [math.degrees(viewing.planar_fov(pitch, w)) for w in wavelengths],
         "scene_mm": [1e3 * scene.width, 1e3 * (far - near)],
-        "region_of_centre": [viewing.region(0.0, scene.distance, width, pitch, wave) for wave in waves],
-        "region_of_edge": [viewing.region(scene.width / 2, near, width, pitch, wave) for wave in waves],
-        "placement_mm": 1e3 * max(viewing.placement(scene.width, width, pitch, wave, far - near) for wave in waves),
+        "region_of_centre": [viewing.region(0.0, scene.distance, width, pitch, w) for w in wavelengths],
+        "region_of_edge": [viewing.region(scene.width / 2, near, width, pitch, w) for w in wavelengths],
+        "placement_mm": 1e3 * max(viewing.placement(scene.width, width, pitch, w, far - near) for w in wavelengths),
         "smallest_spot_um": [
-            [1e6 * viewing.smallest_spot(wave, z, viewing.section(0.0, z, width, pitch, wave)) for wave in waves]
+            [1e6 * viewing.smallest_spot(w, z, viewing.section(0.0, z, width, pitch, w)) for w in wavelengths]
             for z in (near, far)
         ],
-        "accommodation_mm": [_seen_from(eye, z) for z in (far, near)],
+        "accommodation_mm": [_accommodation_mm(eye, z) for z in (far, near)],
     }
     first, second, _, _ = (float(value) for value in eye.display.matrix(scene.distance))
     pupil = eye.settings.eye.pupil_radius
-    # Light of a point leaves within the pitch's cone, and only that which the hologram's width holds.
-    sines = [min(wave / (2 * pitch), math.sin(math.atan(width / 2 / scene.distance))) for wave in waves]
+    # The pitch limits the cone of light of a point, and the width of the hologram cuts off part of it.
+    sines = [min(w / (2 * pitch), math.sin(math.atan(width / 2 / scene.distance))) for w in wavelengths]
     values["eye_box_mm"] = [1e3 * viewing.eye_box(scene.width, first, second, sine) for sine in sines]
     values["light_of_edge"] = [viewing.vignetting(scene.width / 2, first, second, pupil, sine) for sine in sines]
     if isinstance(given, MagnifyingSettings):
@@ -56,27 +63,35 @@ def geometry(eye: Observer) -> dict[str, Any]:
 
 def in_words(values: dict[str, Any]) -> list[str]:
     """Lines of a plan."""
-    fields = f"planar {_span(values['planar_fov_deg'])} deg"
+    fields = f"of view {_span(values['planar_fov_deg'])} deg without an eyepiece"
     if "scene_fov_deg" in values:
         fields += (
-            f", with the eyepiece {values['magnified_fov_deg']:.4g} deg, of which the scene spans "
-            f"{values['scene_fov_deg']:.3g} deg; one {values['filling_scene_mm']:.4g} mm wide would fill it"
+            f", {values['magnified_fov_deg']:.4g} deg with it, of which the scene spans {values['scene_fov_deg']:.3g} "
+            f"deg; a scene {values['filling_scene_mm']:.4g} mm wide would fill it"
         )
     near, far = (f"{z:.4g}" if z else "beyond infinity" for z in values["accommodation_mm"])
     regions = sorted({*values["region_of_centre"], *values["region_of_edge"]})
-    told = "; ".join(f"{number}: {_REGIONS[number]}" if number else "0: no light arrives" for number in regions)
+    meanings = "; ".join(f"{_ROMAN[number]}: {_REGIONS[number]}" for number in regions)
     spots = [_span(row) for row in values["smallest_spot_um"]]
-    return [
+    entering = _span([100 * share for share in values["light_of_edge"]])
+    lines = [
         f"Field      {fields}",
-        f"Eye box    {_span(values['eye_box_mm'])} mm; of its light the scene's edge keeps "
-        f"{_span([100 * share for share in values['light_of_edge']])} %; seen from {near} to {far} mm",
-        f"Regions    centre {_list(values['region_of_centre'])}, edge {_list(values['region_of_edge'])} ({told}); all "
-        f"in region III from {values['placement_mm']:.4g} mm; spots {spots[0]} um near, {spots[1]} um far",
+        f"Eye box    {_span(values['eye_box_mm'])} mm wide; {entering} % of the light from the scene's edge enters the "
+        f"pupil; the scene appears {near} to {far} mm from the eye",
+        f"Regions    centre {_list(values['region_of_centre'])}, edge {_list(values['region_of_edge'])} ({meanings}); "
+        f"the whole scene is in region III from {values['placement_mm']:.4g} mm; spots of {spots[0]} um at the near "
+        f"end, {spots[1]} um at the far end",
     ]
+    if min(values["light_of_edge"]) < _INVISIBLE:
+        lines.append(
+            "WARNING    the edge of the scene is invisible to this eye; enlarge eye.pupil_radius or narrow the scene "
+            "(view.width of its configuration)"
+        )
+    return lines
 
 
-def _seen_from(eye: Observer, depth: float) -> float | None:
-    """Distance in mm at which the eye sees a depth; None beyond the eyepiece's focal length, where no eye focuses."""
+def _accommodation_mm(eye: Observer, depth: float) -> float | None:
+    """Distance in mm at which a depth appears; None beyond the focal length of the eyepiece, where no eye focuses."""
     try:
         return 1e3 * eye.accommodation(depth)
     except ValueError:
@@ -84,29 +99,28 @@ def _seen_from(eye: Observer, depth: float) -> float | None:
 
 
 def draw(eye: Observer) -> bytes:
-    """PNG: display and eye to scale along the axis, regions I to III with the scene, and the spectra of the sources."""
+    """PNG: display and eye to scale along the axis, regions I to III with the scene, and spectra of the sources."""
     figure = Figure(figsize=(17, 4.8), layout="constrained")
     along, regions, spectra = figure.subplots(1, 3, width_ratios=(1.5, 1, 1))
     _draw_display(along, eye)
     _draw_regions(regions, eye)
     for source in eye.settings.light.sources:
-        for wave, colour in zip(eye.scene.settings.wavelengths, _COLOURS, strict=True):
-            spectrum = PRESETS[source](wave)
-            low, high = spectrum.band()
-            places = np.linspace(low, high, 201)
-            power = spectrum.power(places).numpy()
+        for wavelength, colour in zip(eye.scene.settings.wavelengths, _COLOURS, strict=True):
+            spectrum = PRESETS[source](wavelength)
+            band = np.linspace(*spectrum.band(), 201)
+            power = spectrum.power(band).numpy()
             style = ("-", "--", "-.", ":")[list(PRESETS).index(source)]
-            label = source.replace("_", " ") if wave == eye.scene.settings.wavelengths[0] else None
-            spectra.plot(1e9 * places, power / power.max(), style, color=colour, label=label)
+            label = source.replace("_", " ") if wavelength == eye.scene.settings.wavelengths[0] else None
+            spectra.plot(1e9 * band, power / power.max(), style, color=colour, label=label)
     spectra.set_xlabel("wavelength (nm)")
-    spectra.set_ylabel("power, of its peak; cut where it is left out")
+    spectra.set_ylabel("power relative to its peak, within the band that is used")
     spectra.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.62, 1.0))
     spectra.grid(alpha=0.3)
     return figure_png(figure)
 
 
 def _draw_display(axes: Any, eye: Observer) -> None:
-    """Hologram, scene, eyepiece and eye, with rays from the scene's ends through the rims of the pupil."""
+    """Hologram, scene, eyepiece and eye, with rays from the ends of the scene to the edges of the pupil."""
     scene, given = eye.scene, eye.settings.display
     half, pupil = 1e3 * scene.grid.extent[0] / 2, 1e3 * eye.settings.eye.pupil_radius
     lens, back = (1e3 * float(value) for value in (eye.display.lens_distance, eye.display.eye_distance))
@@ -117,18 +131,19 @@ def _draw_display(axes: Any, eye: Observer) -> None:
     first, second, _, _ = (float(value) for value in eye.display.matrix(scene.distance))
     focal = given.focal_length if isinstance(given, MagnifyingSettings) else math.inf
     for height in (-scene.width / 2, 0.0, scene.width / 2):
-        for rim in (-1, 1):
-            # The slope that leads from this height through the pupil's rim, by the ray matrix to the pupil.
-            slope = (rim * pupil / 1e3 - first * height) / second
+        for side in (-1, 1):
+            # The ray matrix to the pupil gives the slope of the ray from this height to the edge of the pupil.
+            slope = (side * pupil / 1e3 - first * height) / second
             at = height + slope * (lens / 1e3 - scene.distance)
             after = slope - at / focal
-            places = [scene.distance * 1e3, lens, end]
+            positions = [scene.distance * 1e3, lens, end]
             heights = [height, at, at + after * back / 1e3]
-            axes.plot(places, [1e3 * value for value in heights], color="tab:orange", linewidth=0.8)
+            axes.plot(positions, [1e3 * value for value in heights], color="tab:orange", linewidth=0.8)
     if math.isfinite(focal):
-        reach = max(half, pupil) * 1.6
-        axes.annotate("", (lens, reach), (lens, -reach), arrowprops={"arrowstyle": "<->", "color": "tab:blue"})
-        axes.text(lens, -reach * 1.05, f"eyepiece, f {1e3 * focal:.3g} mm", ha="center", va="top", fontsize=8)
+        half_width = max(half, pupil) * 1.6
+        arrow = {"arrowstyle": "<->", "color": "tab:blue"}
+        axes.annotate("", (lens, half_width), (lens, -half_width), arrowprops=arrow)
+        axes.text(lens, -half_width * 1.05, f"eyepiece, f {1e3 * focal:.3g} mm", ha="center", va="top", fontsize=8)
     for sign in (-1, 1):
         axes.plot([end, end], [sign * pupil, sign * max(2.5 * pupil, half)], "k", linewidth=2)
     axes.plot([end + retina] * 2, [-retina / 6, retina / 6], color="0.4", linewidth=3)
@@ -136,29 +151,29 @@ def _draw_display(axes: Any, eye: Observer) -> None:
     axes.text(end + retina, 0.97, "eye  ", ha="right", va="top", fontsize=8, transform=share)
     axes.set_xlabel("along the axis (mm from the hologram)")
     axes.set_ylabel("height (mm)")
-    axes.set_title("display and eye: rays from the scene to the rim of the pupil", fontsize=10)
+    axes.set_title("display and eye: rays from the scene to the edge of the pupil", fontsize=10)
     axes.grid(alpha=0.3)
 
 
 def _draw_regions(axes: Any, eye: Observer) -> None:
-    """Which region a point is in for the shortest wavelength, whose cone is the narrowest, and the scene in it."""
+    """Regions of points for the shortest wavelength, whose cone is the narrowest, and the scene in them."""
     scene = eye.scene
-    width, pitch, wave = scene.grid.extent[0], scene.grid.pitch[0], min(scene.settings.wavelengths)
-    apex = viewing.region_apex(width, pitch, wave)
+    width, pitch, wavelength = scene.grid.extent[0], scene.grid.pitch[0], min(scene.settings.wavelengths)
+    apex = viewing.region_apex(width, pitch, wavelength)
     deep = 1.15 * max(2 * apex, max(scene.depths))
     high = 1.1 * max(width, scene.width)
     z, y = np.linspace(1e-4 * deep, deep, 300), np.linspace(-high, high, 241)
-    kinds = [[viewing.region(height, place, width, pitch, wave) for place in z] for height in y]
+    kinds = [[viewing.region(height, distance, width, pitch, wavelength) for distance in z] for height in y]
     mesh = axes.pcolormesh(1e3 * z, 1e3 * y, kinds, cmap="Blues", vmin=0, vmax=4, shading="nearest")
-    for number, place in ((1, 0.5 * apex), (3, 1.6 * apex)):
-        axes.text(1e3 * place, 0, "I" * number, ha="center", va="center")
+    for number, distance in ((1, 0.5 * apex), (3, 1.6 * apex)):
+        axes.text(1e3 * distance, 0, "I" * number, ha="center", va="center")
     axes.text(1e3 * apex, 1e3 * width / 2, "II", ha="center", va="center")
     mesh.set_rasterized(True)
     axes.plot([0, 0], [-1e3 * width / 2, 1e3 * width / 2], "k", linewidth=4)
     _box(axes, eye)
     axes.set_xlabel("distance from the hologram (mm)")
     axes.set_ylabel("height (mm)")
-    axes.set_title(f"regions of a point at {1e9 * wave:.0f} nm, and the scene", fontsize=10)
+    axes.set_title(f"regions of a point at {1e9 * wavelength:.0f} nm, and the scene", fontsize=10)
 
 
 def _box(axes: Any, eye: Observer) -> None:
@@ -177,6 +192,4 @@ def _span(values: list[float]) -> str:
 
 
 def _list(values: list[int]) -> str:
-    numbers = {*values}
-    roman = {0: "none", 1: "I", 2: "II", 3: "III"}
-    return roman[values[0]] if len(numbers) == 1 else " / ".join(roman[value] for value in values)
+    return _ROMAN[values[0]] if len({*values}) == 1 else " / ".join(_ROMAN[value] for value in values)

@@ -1,4 +1,4 @@
-"""The kind ``eye``: what an observer sees of a volume's hologram."""
+"""The kind ``eye``: an observer's view of the hologram of a volume."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class ObserverKind(ExperimentKind[ObserverSettings, "Observer"]):
-    """See :mod:`holotorch.experiments.kind`."""
+    """An observer's view of the hologram of a volume; see :mod:`holotorch.experiments.kind`."""
 
     settings = ObserverSettings
     example = "configs/eye/teapot.yaml"

@@ -1,4 +1,4 @@
-"""A run of the observer: holograms once, then every source and focus, pictures, a table and a page."""
+"""A run of the observer: pictures of every source and focus, their measurements, and a page."""
 
 import time
 from pathlib import Path
@@ -25,7 +25,7 @@ from holotorch.experiments.runs.saving import Checkpoint, Results
 from holotorch.experiments.runs.signals import deferred
 from holotorch.experiments.runs.tables import write_table
 from holotorch.experiments.volume.config import VolumeSettings
-from holotorch.experiments.volume.run import described
+from holotorch.experiments.volume.run import fingerprint_inputs
 from holotorch.io.bundled import find_config
 from holotorch.io.colour_tables import srgb_matrix, white_balance
 from holotorch.io.files import save_array, write_bytes
@@ -33,17 +33,17 @@ from holotorch.io.images import encode_png
 from holotorch.optics.picture import desaturated, equal_power, exposed, linear_srgb
 
 _SAVE_EVERY = 30.0  # seconds between two checkpoints
-_BRIGHT = 0.995  # of the reference's pixels are at most as bright as what is shown white
+_WHITE = 0.995  # quantile of the reference's brightness that is shown white
 
 
 def scene_settings(settings: ObserverSettings) -> VolumeSettings:
-    """The volume's configuration with its changes. ConfigError for one of another kind."""
+    """The configuration of the volume with its changes. ConfigError for a configuration of another kind."""
     path = find_config(settings.scene.config)
-    assert path is not None  # as its settings have checked
-    found = load_config(path, list(settings.scene.change))
-    if not isinstance(found, VolumeSettings):
-        raise ConfigError([f"scene.config: {settings.scene.config} describes no volume but {found.experiment!r}"])
-    return found
+    assert path is not None  # validated with the settings
+    scene = load_config(path, list(settings.scene.change))
+    if not isinstance(scene, VolumeSettings):
+        raise ConfigError([f"scene.config: {settings.scene.config} describes no volume but {scene.experiment!r}"])
+    return scene
 
 
 def build_observer(settings: ObserverSettings) -> Observer:
@@ -52,22 +52,22 @@ def build_observer(settings: ObserverSettings) -> Observer:
 
 
 def visible_surface(eye: Observer) -> eye_focus.Surface | None:
-    """What a sweep of the focus looks for, if there is one. ConfigError for a scene in which it is not to be found."""
+    """The surface for a sweep of the focus, or None without a sweep. ConfigError for a scene without a surface."""
     try:
         return eye_focus.visible_surface(eye) if eye.settings.sweep else None
-    except ValueError as error:  # said before hours of work, not after it
+    except ValueError as error:
         raise ConfigError([f"sweep: {error}; leave it out"]) from None
 
 
 def run_observer(eye: Observer, opened: RunFolder) -> bool:
-    """Look at the scene as planned and fill the folder; whether the run is complete."""
+    """Compute the observer's view as planned and fill the folder; True if the run is complete."""
     settings, folder, files, done = eye.settings, opened.path, Results(), False
     values, surface = opened.plan.values, visible_surface(eye)
     (folder / "arrays").mkdir(exist_ok=True)
     files.write(write_bytes, folder / "images" / "geometry.png", eye_geometry.draw(eye))
-    looked = _Looked(eye, Checkpoint(folder / "checkpoint.pt", _fingerprint(eye)))
+    views = _Views(eye, Checkpoint(folder / "checkpoint.pt", _fingerprint(eye)))
     try:
-        looked.look(opened.pressed)
+        views.compute(opened.pressed)
         if settings.sweep:
             sweep = eye_focus.focus_sweep(eye, settings.sweep, surface)
             files.write(write_table, folder / "focus.csv", [band.row for band in sweep.bands])
@@ -79,83 +79,82 @@ def run_observer(eye: Observer, opened: RunFolder) -> bool:
             print("\n".join(in_words(cases)))
         done = True
     except KeyboardInterrupt:
-        if not looked.references:
+        if not views.references:
             raise
     with deferred(opened.pressed):
-        summary = {"experiment": "eye", "status": "", "realisations": len(looked.seen)}
-        if not looked.seen:
-            opened.write_page = None  # of pictures that are not there yet
-            return conclude(opened, summary, files, done=False, checkpoint=looked.checkpoint)
-        summary |= _write(folder, eye, looked, values, files)
-        summary |= {"seconds": round(looked.seconds, 2), "peak_memory_bytes": peak_memory()}
-        return conclude(opened, summary, files, done=done, checkpoint=looked.checkpoint)
+        summary = {"experiment": "eye", "status": "", "realisations": len(views.pictures)}
+        if not views.pictures:
+            opened.write_page = None  # there is nothing to show yet
+            return conclude(opened, summary, files, done=False, checkpoint=views.checkpoint)
+        summary |= _write(folder, eye, views, values, files)
+        summary |= {"seconds": round(views.seconds, 2), "peak_memory_bytes": peak_memory()}
+        return conclude(opened, summary, files, done=done, checkpoint=views.checkpoint)
 
 
 def _fingerprint(eye: Observer) -> Fingerprint:
-    """Realisations may be added, and what is done after all pictures may change."""
-    settings, inputs, free = described(eye.scene)
+    """Without the number of realisations and the sweeps after them, which may change before a run is resumed."""
+    settings, inputs, free = fingerprint_inputs(eye.scene)
     scene = fingerprint(settings, inputs, {*free, "report"})
     own = fingerprint(eye.settings, {}, {"seeds", "sweep", "tradeoff", "scene"})
     return own | {f"scene.{key}": value for key, value in scene.items()}
 
 
-class _Looked:
-    """What was seen so far, on disk now and then: sums of references, and pictures of each realisation.
+class _Views:
+    """The pictures computed so far, saved to disk from time to time.
 
     Attributes:
-        total: Sum of the references [F, 3, h, w].
-        references: How many are in it.
-        seen: [sources, F, 3, h, w] of each realisation.
-        checkpoint: Where they are kept.
+        total: Sum of the pictures of the reference [F, 3, h, w].
+        references: Number of realisations in ``total``.
+        pictures: [sources, F, 3, h, w] of each realisation.
+        checkpoint: The file that keeps them.
     """
 
     def __init__(self, eye: Observer, checkpoint: Checkpoint):
         self.eye, self.checkpoint = eye, checkpoint
         self.total, self.references = torch.zeros(()), 0
-        self.seen: list[Tensor] = []
+        self.pictures: list[Tensor] = []
         self._before, self._started = 0.0, time.perf_counter()
         self._saved = self._started
         if content := checkpoint.load():
             try:
                 self.total, self.references = content["total"], content["references"]
-                self.seen, self._before = content["seen"], content["seconds"]
+                self.pictures, self._before = content["seen"], content["seconds"]
             except KeyError as error:
                 raise checkpoint.unreadable(error) from None
-        if len(self.seen) > (seeds := eye.settings.seeds):
-            config = checkpoint.path.parent / "config.yaml"
-            cure = f"set it to that in {config}, or run into a new folder"
-            raise ConfigError([f"seeds: expected at least the {len(self.seen)} done, got {seeds}; {cure}"])
+        if (done := len(self.pictures)) > (seeds := eye.settings.seeds):
+            hint = f"set it to that in {checkpoint.path.parent / 'config.yaml'}, or run into a new folder"
+            raise ConfigError([f"seeds: expected at least the {done} done, got {seeds}; {hint}"])
 
     @property
     def seconds(self) -> float:
-        """Spent so far, also before an interruption."""
+        """Time spent so far, including that before an interruption."""
         return self._before + time.perf_counter() - self._started
 
     @property
     def reference(self) -> Tensor:
-        """Mean of the references."""
+        """Mean picture of the reference [F, 3, h, w]."""
         return self.total / self.references
 
-    def look(self, pressed: list[int]) -> None:
-        """See what is still to be seen. KeyboardInterrupt, with all whole realisations saved, where a signal comes."""
+    def compute(self, pressed: list[int]) -> None:
+        """Compute the remaining pictures. A signal raises KeyboardInterrupt after all whole realisations are saved."""
         eye, sources, focus = self.eye, self.eye.settings.light.sources, self.eye.focus
         seeds = eye.settings.seeds
         references, own = realisations(8 * seeds, reference=True), realisations(seeds, reference=False)
         each = [1 + len(focus), 1 + len(focus) * len(sources)]
-        before = self.references * each[0] + len(self.seen) * each[1]
+        before = self.references * each[0] + len(self.pictures) * each[1]
         total = len(references) * each[0] + len(own) * each[1]
-        with tqdm(total=total, initial=before, desc="looking", unit="picture", dynamic_ncols=True) as bar:
+        with tqdm(total=total, initial=before, desc="imaging", unit="picture", dynamic_ncols=True) as bar:
             try:
                 for seed in references[self.references :]:
                     hologram = _hologram(eye, seed, bar)
-                    pictures = torch.stack([_seen(eye, hologram, None, depth, bar) for depth in focus])
+                    pictures = torch.stack([_image(eye, hologram, None, depth, bar) for depth in focus])
                     with deferred(pressed):
                         self.total, self.references = self.total + pictures, self.references + 1
                     self._keep(pressed)
-                for seed in own[len(self.seen) :]:
+                for seed in own[len(self.pictures) :]:
                     hologram = _hologram(eye, seed, bar)
-                    rows = [torch.stack([_seen(eye, hologram, source, at, bar) for at in focus]) for source in sources]
-                    self.seen.append(torch.stack(rows))
+                    rows = [torch.stack([_image(eye, hologram, source, at, bar) for at in focus]) for source in sources]
+                    self.pictures.append(torch.stack(rows))
                     self._keep(pressed)
             except Exception:
                 self._save()
@@ -170,13 +169,13 @@ class _Looked:
                 raise KeyboardInterrupt
 
     def _keep(self, pressed: list[int]) -> None:
-        if pressed:  # it came while it was held back
+        if pressed:  # the signal came while signals were deferred
             raise KeyboardInterrupt
         if time.perf_counter() - self._saved > _SAVE_EVERY:
             self._save()
 
     def _save(self) -> None:
-        content = {"total": self.total, "references": self.references, "seen": self.seen, "seconds": self.seconds}
+        content = {"total": self.total, "references": self.references, "seen": self.pictures, "seconds": self.seconds}
         if self.references:
             self.checkpoint.save(content)
         self._saved = time.perf_counter()
@@ -189,29 +188,29 @@ def _hologram(eye: Observer, seed: int, bar: tqdm) -> Tensor:
     return hologram
 
 
-def _seen(eye: Observer, hologram: Tensor, source: str | None, depth: float, bar: tqdm) -> Tensor:
-    picture = eye.seen(hologram, source, depth)
+def _image(eye: Observer, hologram: Tensor, source: str | None, depth: float, bar: tqdm) -> Tensor:
+    picture = eye.image(hologram, source, depth)
     bar.update()
     return picture
 
 
-def _write(out: Path, eye: Observer, looked: _Looked, values: dict[str, Any], files: Results) -> dict[str, Any]:
-    """Arrays, pictures and the table of what was seen; returns its numbers."""
-    reference, seen = looked.reference, torch.stack(looked.seen)  # [F, 3, h, w], [S, sources, F, 3, h, w]
+def _write(out: Path, eye: Observer, views: _Views, values: dict[str, Any], files: Results) -> dict[str, Any]:
+    """Write arrays, pictures and the table; returns the numbers for the summary."""
+    reference, images = views.reference, torch.stack(views.pictures)  # [F, 3, h, w], [S, sources, F, 3, h, w]
     sources, focus = eye.settings.light.sources, eye.focus
-    files.write(save_array, out / "arrays" / "retina.npy", seen[0])
+    files.write(save_array, out / "arrays" / "retina.npy", images[0])
     files.write(save_array, out / "arrays" / "reference.npy", reference)
-    # Sources are set so that equal values are neutral grey, and each colour's light is that of the rendering.
-    waves = eye.scene.settings.wavelengths
-    matrix = srgb_matrix(waves, white_balance(waves)).float()
+    # The sources are balanced so that equal values are neutral grey, and each colour has the power of the rendering.
+    wavelengths = eye.scene.settings.wavelengths
+    matrix = srgb_matrix(wavelengths, white_balance(wavelengths)).float()
     with torch.no_grad():
         rendering = eye.scene.sampler().render(eye.scene.volume)[0].cpu()
     reference = equal_power(reference, rendering.expand_as(reference))
     shown, captions = [], []
     for f, depth in enumerate(focus):
-        peak = desaturated(linear_srgb(reference[f], matrix)).flatten().quantile(_BRIGHT)
+        peak = desaturated(linear_srgb(reference[f], matrix)).flatten().quantile(_WHITE)
         for s, source in enumerate(("reference", *sources)):
-            light = reference[f] if s == 0 else equal_power(seen[0, s - 1, f], reference[f])
+            light = reference[f] if s == 0 else equal_power(images[0, s - 1, f], reference[f])
             picture = exposed(desaturated(linear_srgb(light, matrix)), peak=peak)
             files.write(write_bytes, out / "images" / f"{source}_{f}.png", encode_png(picture))
             shown.append(picture)
@@ -223,12 +222,12 @@ def _write(out: Path, eye: Observer, looked: _Looked, values: dict[str, Any], fi
     ]
     for f, data in enumerate(rows):
         files.write(write_bytes, out / "images" / f"comparison_{f}.png", data)
-    found = [
-        eye.row(source, depth, seen[:, s, f], reference[f])
+    measured = [
+        eye.row(source, depth, images[:, s, f], reference[f])
         for s, source in enumerate(sources)
         for f, depth in enumerate(focus)
     ]
-    lengths = [wave * 1e9 for wave in waves]
-    flat = [by_wavelength(row, lengths) for row in found]
+    lengths = [wavelength * 1e9 for wavelength in wavelengths]
+    flat = [by_wavelength(row, lengths) for row in measured]
     files.write(write_table, out / "table.csv", [{key: plain(value) for key, value in row.items()} for row in flat])
-    return {"synthetic": values["synthetic"], "wavelengths_nm": lengths, "rows": found}
+    return {"synthetic": values["synthetic"], "wavelengths_nm": lengths, "rows": measured}

@@ -13,7 +13,7 @@ from holotorch.core.complex import intensity
 from holotorch.experiments.eye.config import ObserverSettings
 from holotorch.experiments.eye.experiment import PRESETS, Observer, observer
 from holotorch.experiments.volume.config import VolumeSettings
-from holotorch.experiments.volume.judge import pooled
+from holotorch.experiments.volume.evaluation import pooled
 from holotorch.metrics import seed_statistics, sharpness, speckle_contrast, ssim
 from holotorch.optics.light.coherence import optimum_fwhm, path_difference, predicted_contrast
 from holotorch.optics.light.spectral import spectral_image

@@ -1,10 +1,11 @@
-"""Propagation: error against time for every method, and predicted against true error."""
+"""Chart of free-space propagation: error against time for every method, and predicted against true error."""
 
 import math
 import platform
 import warnings
 from collections.abc import Callable
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -24,12 +25,14 @@ from holotorch.optics.free_space.plane_pair import PlanePair
 from holotorch.optics.planning.plan import find
 from holotorch.optics.planning.propagate import kernel_of
 
-WAVELENGTH = 530e-9
-DISTANCES = (1e-3, 5e-3, 20e-3, 60e-3, 200e-3, 2.0)
+WAVELENGTH = 530e-9  # metres
+DISTANCES = (1e-3, 5e-3, 20e-3, 60e-3, 200e-3, 2.0)  # metres
+# Pixels along each side, and pitch in metres.
 CASES = ((256, 8e-6), (512, 8e-6), (1024, 8e-6), (2048, 8e-6), (256, 3.74e-6), (512, 3.74e-6), (1024, 3.74e-6))
-SHOWN = (512, 8e-6)  # the case whose error is drawn against its time
-FEW_DISTANCES, LARGE = (5e-3, 60e-3, 2.0), 2000  # px from which only these are measured
-PEER_LIMIT = 512  # px up to which torchoptics is measured: it takes minutes beyond
+SHOWN = (512, 8e-6)  # the case whose error is drawn against time
+LARGE = 2000  # px from which only FEW_DISTANCES are measured
+FEW_DISTANCES = (5e-3, 60e-3, 2.0)
+PEER_LIMIT = 512  # px up to which torchoptics is measured; larger grids take minutes
 SOURCES = ("smooth", "slm", "white", "hard edge")
 PREDICTION_CASES, TOLERANCE = 40, 1e-3
 
@@ -44,7 +47,10 @@ def propagation() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
 
 
 def source(kind: str, grid: Grid) -> Tensor:
-    """Fields for tests, complex128 [H, W]: smooth, phase-only with smooth phase, white phase, and a bright disc."""
+    """A test field, complex128 [H, W].
+
+    ``kind``: "smooth", a Gaussian; "slm", smooth phase with amplitude 1; "white", white phase; "hard edge", a disc.
+    """
     generator = torch.Generator().manual_seed(1)
     y, x = grid.coordinates()
     square = y**2 + x**2
@@ -68,16 +74,16 @@ def _measure(size: int, pitch: float) -> list[dict[str, Any]]:
     wide = Grid(2 * size, pitch)
     distances = [z for z in DISTANCES if size < LARGE or z in FEW_DISTANCES]
     for distance in tqdm(distances, desc=f"{size} px, {pitch * 1e6:g} um", unit="distance"):
-        judge = CroppedKernel(wide, WAVELENGTH, distance)
+        reference = CroppedKernel(wide, WAVELENGTH, distance)
         pad = (0, size, 0, size)
-        exact = {kind: judge(torch.nn.functional.pad(f, pad)[None])[0, :size, :size] for kind, f in fields.items()}
+        exact = {kind: reference(torch.nn.functional.pad(f, pad)[None])[0, :size, :size] for kind, f in fields.items()}
         methods = _methods(grid, distance)
-        work = {name: torch.complex128 if "complex128" in name else torch.complex64 for name in methods}
-        calls = {name: partial(call, fields["white"].to(work[name])) for name, call in methods.items()}
+        dtypes = {name: torch.complex128 if "complex128" in name else torch.complex64 for name in methods}
+        calls = {name: partial(call, fields["white"].to(dtypes[name])) for name, call in methods.items()}
         seconds = interleaved(calls, rounds=5 if size < LARGE else 3)
         for name, call in methods.items():
             for kind, field in fields.items():
-                error = (call(field.to(work[name])).to(torch.complex128) - exact[kind]).norm() / exact[kind].norm()
+                error = (call(field.to(dtypes[name])).to(torch.complex128) - exact[kind]).norm() / exact[kind].norm()
                 rows.append(
                     {
                         "size_px": size,
@@ -95,17 +101,16 @@ def _measure(size: int, pitch: float) -> list[dict[str, Any]]:
 
 
 def _methods(grid: Grid, distance: float) -> dict[str, Callable[[Tensor], Tensor]]:
-    """Calls on a field [H, W]; everything that can be prepared is prepared."""
+    """Propagations of a field [H, W], with kernels computed in advance."""
     height, width = grid.shape
     padded = grid.padded(2)
     fy, fx = (f.float() for f in padded.frequencies())
     root = torch.sqrt(torch.clamp(1 / WAVELENGTH**2 - fy**2 - fx**2, min=0))
-    naive = torch.exp(2j * math.pi * distance * root) / math.prod(
-        padded.shape
-    )  # all of it in float32, as is often seen
+    # Computed in float32, as it is often done.
+    naive = torch.exp(2j * math.pi * distance * root) / math.prod(padded.shape)
 
     def bare(field: Tensor) -> Tensor:
-        # Not scaled: see core.fourier for why; the scale stands in the kernel.
+        # The kernel contains the scale of the inverse transform; core.fourier explains why.
         return torch.fft.ifft2(torch.fft.fft2(field, s=padded.shape) * naive, norm="forward")[:height, :width]
 
     modules = {
@@ -133,7 +138,7 @@ def _methods(grid: Grid, distance: float) -> dict[str, Callable[[Tensor], Tensor
 
 
 def _predictions() -> list[dict[str, Any]]:
-    """True and predicted error of every way, for random grids, distances and bands of noise."""
+    """True and predicted error of every method, for random grids, distances and bands of noise."""
     generator, rows = np.random.default_rng(11), []
     for case in tqdm(range(PREDICTION_CASES), desc="predictions", unit="case"):
         pitch, share = float(generator.choice([3.74e-6, 8e-6])), float(generator.uniform(0.2, 1.0))
@@ -145,24 +150,25 @@ def _predictions() -> list[dict[str, Any]]:
         large = torch.nn.functional.pad(field, (0, 3 * grid.shape[1], 0, 3 * grid.shape[0]))
         exact = CroppedKernel(wide, wavelength, distance)(large[None])[0, : grid.shape[0], : grid.shape[1]]
         path = PlanePair(grid, grid)
-        for way in find(path, [wavelength], [distance], band=(share / 2 / pitch, share / 2 / pitch)):
-            wave, far = (torch.tensor(value, dtype=torch.float64) for value in (wavelength, distance))
-            kernel = kernel_of(path, way, wave, far, torch.complex64)
+        for method in find(path, [wavelength], [distance], band=(share / 2 / pitch, share / 2 / pitch)):
+            values = [torch.tensor(value, dtype=torch.float64) for value in (wavelength, distance)]
+            kernel = kernel_of(path, method, values[0], values[1], torch.complex64)
             out = filter_spectrum(field.to(torch.complex64), kernel).to(torch.complex128)
             rows.append(
                 {
                     "case": case,
-                    "method": way.method,
-                    "padded": f"{way.padded[0]}x{way.padded[1]}",
-                    "predicted": f"{way.error:.3e}",
+                    "method": method.method,
+                    "padded": f"{method.padded[0]}x{method.padded[1]}",
+                    "predicted": f"{method.error:.3e}",
                     "true": f"{((out - exact).norm() / exact.norm()).item():.3e}",
-                    "flops": f"{way.flops:.3e}",
+                    "flops": f"{method.flops:.3e}",
                 }
             )
     return rows
 
 
 def _noise(grid: Grid, share: float, seed: int) -> Tensor:
+    """Noise, complex128 [H, W], that fills ``share`` of the band of the grid."""
     generator = torch.Generator().manual_seed(seed)
     wide = [8 * size for size in grid.shape]
     fy, fx = (torch.fft.fftfreq(size, dtype=torch.float64).abs() <= share / 2 for size in wide)
@@ -177,9 +183,9 @@ def _verdict(rows: list[dict], prediction: list[dict]) -> list[str]:
     ]
     names = list(dict.fromkeys(row["method"] for row in rows))
     for name in names:
-        own = [row for row in rows if row["method"] == name]
-        worst = {kind: max(float(row["error"]) for row in own if row["source"] == kind) for kind in SOURCES}
-        ratio = np.median([row["ratio_to_bare"] for row in own])
+        selected = [row for row in rows if row["method"] == name]
+        worst = {kind: max(float(row["error"]) for row in selected if row["source"] == kind) for kind in SOURCES}
+        ratio = np.median([row["ratio_to_bare"] for row in selected])
         lines.append(
             f"{name}: worst error "
             + ", ".join(f"{kind} {value:.0e}" for kind, value in worst.items())
@@ -187,34 +193,31 @@ def _verdict(rows: list[dict], prediction: list[dict]) -> list[str]:
         )
     peers = [row for row in rows if row["method"].startswith("torchoptics") and row["source"] == "white"]
     if peers:
-        ours = {
-            (row["size_px"], row["pitch_um"], row["distance_m"]): row["ratio_to_bare"]
-            for row in rows
-            if row["method"].startswith("planned, tol")
-        }
-        ratios = [row["ratio_to_bare"] / ours[row["size_px"], row["pitch_um"], row["distance_m"]] for row in peers]
+        case = itemgetter("size_px", "pitch_um", "distance_m")
+        planned = {case(row): row["ratio_to_bare"] for row in rows if row["method"].startswith("planned, tol")}
+        ratios = [row["ratio_to_bare"] / planned[case(row)] for row in peers]
         at_512 = [ratio for row, ratio in zip(peers, ratios, strict=True) if row["size_px"] == SHOWN[0]]
         lines.append(
-            f"torchoptics takes {min(ratios):.1f} to {max(ratios):.1f} times as long as the planned way, at "
+            f"torchoptics takes {min(ratios):.1f} to {max(ratios):.1f} times as long as the planned method, at "
             f"{SHOWN[0]} px at least {min(at_512):.1f} times"
         )
     checked = [row for row in prediction if 1e-6 < float(row["predicted"]) < 0.05]
     factors = [float(row["true"]) / float(row["predicted"]) for row in checked]
-    best = 0
-    for case in range(PREDICTION_CASES):
-        ways = [row for row in prediction if row["case"] == case]
-        adequate = [float(row["flops"]) for row in ways if float(row["true"]) <= TOLERANCE]
-        chosen = [float(row["flops"]) for row in ways if float(row["predicted"]) <= TOLERANCE]
-        best += min(chosen) <= min(adequate) * 1.001
+    optimal = 0
+    for number in range(PREDICTION_CASES):
+        methods = [row for row in prediction if row["case"] == number]
+        adequate = [float(row["flops"]) for row in methods if float(row["true"]) <= TOLERANCE]
+        chosen = [float(row["flops"]) for row in methods if float(row["predicted"]) <= TOLERANCE]
+        optimal += min(chosen) <= min(adequate) * 1.001
     lines.append(
         f"predicted error: true / predicted from {min(factors):.2f} to {max(factors):.2f} over {len(factors)} cases; "
-        f"the cheapest adequate way chosen in {best} of {PREDICTION_CASES}"
+        f"the cheapest adequate method chosen in {optimal} of {PREDICTION_CASES}"
     )
     return lines
 
 
 def _draw(rows: list[dict]) -> bytes:
-    """Error against time, one panel per source and distance, at 512 px and 8 um."""
+    """PNG of error against time, one panel for each source and distance, at 512 px and 8 um."""
     size, pitch = SHOWN
     shown = [row for row in rows if row["size_px"] == size and row["pitch_um"] == pitch * 1e6]
     names = list(dict.fromkeys(row["method"] for row in shown))
@@ -240,18 +243,18 @@ def _draw(rows: list[dict]) -> bytes:
 
 
 def _draw_validity(rows: list[dict]) -> bytes:
-    """Error against distance, in cross-over distances; each method's own border of validity at the top."""
+    """PNG of error against distance, in cross-over distances; bars at the top mark where methods become invalid."""
     names = list(dict.fromkeys(row["method"] for row in rows))
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     panels = figure.subplots(1, 2)
     for axes, kind in zip(panels, ("white", "smooth"), strict=True):
         for k, name in enumerate(names):
-            own = sorted(
+            points = sorted(
                 (row["crossovers"], min(float(row["error"]), 10))
                 for row in rows
                 if row["method"] == name and row["source"] == kind
             )
-            axes.loglog(*zip(*own, strict=True), "os^vD*PhX"[k % 9], color=f"C{k}", label=name, alpha=0.8)
+            axes.loglog(*zip(*points, strict=True), "os^vD*PhX"[k % 9], color=f"C{k}", label=name, alpha=0.8)
         for k, name in enumerate(names):
             for border in _borders(name):
                 axes.axvline(border, ymin=0.9, color=f"C{k}", linewidth=2)
@@ -267,10 +270,11 @@ def _draw_validity(rows: list[dict]) -> bytes:
 
 
 def _borders(name: str) -> list[float]:
-    """Distances, in cross-over distances of each grid, from which a method's own rule says that it errs.
+    """Distances, in cross-over distances z_c of each grid, at which a method becomes inaccurate by its error model.
 
-    Padding by P holds light up to (P - 1) z_c; Fresnel leaves out pi z s^4 / (4 wavelength), s up to the corner of the
-    band; float32 rounds k z to 6e-8 of it. The last two are drawn where they reach the tolerance.
+    Padding by a factor P contains the light up to (P - 1) z_c. The Fresnel approximation neglects a phase of
+    pi z s^4 / (4 wavelength) for the sine s, up to the corner of the band. float32 rounds k z to a relative 6e-8. The
+    last two give the distance at which the error reaches the tolerance.
     """
     if name.startswith("angular spectrum"):
         return [float(name.split()[-1]) - 1]

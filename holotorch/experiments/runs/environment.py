@@ -1,4 +1,4 @@
-"""Versions, device, seed and git state: what is needed to repeat a run."""
+"""Versions, device, seed and git state, which are needed to repeat a run."""
 
 import datetime
 import platform
@@ -16,22 +16,19 @@ _PACKAGES = ("torch", "numpy", "kornia", "scikit-image", "opencv-contrib-python-
 
 
 def environment(seed: int, device: torch.device) -> dict[str, Any]:
-    """Plain JSON values for env.json."""
+    """Contents of env.json, as plain JSON values."""
+    cpu = f"CPU, {torch.get_num_threads()} threads"
     return {
         "holotorch": holotorch.__version__,
         "git": _git_state(Path(holotorch.__file__).parents[1]),
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in _PACKAGES},
         "platform": platform.platform(),
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _cpu(),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else cpu,
         "seed": seed,
         "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "command": ["holotorch", *sys.argv[1:]],
     }
-
-
-def _cpu() -> str:
-    return f"CPU, {torch.get_num_threads()} threads"
 
 
 def _version(name: str) -> str | None:
@@ -42,7 +39,7 @@ def _version(name: str) -> str | None:
 
 
 def _git_state(checkout: Path) -> str | None:
-    """Commit of this checkout, "-dirty" when changed; None for an installed package, also inside another repository."""
+    """Commit of this checkout, with "-dirty" if files have changed; None for an installed package."""
     if not (checkout / ".git").exists():
         return None
     try:

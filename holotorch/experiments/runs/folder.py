@@ -1,4 +1,4 @@
-"""The folder of a run: claimed by one run alone, and never emptied of what was computed, whatever fails."""
+"""The folder of a run: used by one run at a time; results in it are kept whatever fails."""
 
 import os
 import re
@@ -23,12 +23,12 @@ from holotorch.experiments.runs.saving import Checkpoint, Results
 from holotorch.experiments.runs.signals import Pressed, deferred, interruptible
 from holotorch.io.files import write_json, write_text
 
-_HALF = re.compile(r"\.(env\.json|config\.yaml)\.\d+\.partial")  # the first files of a run that was killed at once
-_SETUP = {"config.yaml", "env.json", "plan.json"}  # what is written before anything is computed
+_HALF = re.compile(r"\.(env\.json|config\.yaml)\.\d+\.partial")  # the first files of a run, half written
+_SETUP = {"config.yaml", "env.json", "plan.json"}  # files written before the computation starts
 
 
 def claim(out: Path | None, name: str) -> Path:
-    """Make the folder of a run so that no other run can have it too. ConfigError where that is not possible."""
+    """Create the folder of a run: ``out``, or the next free ``runs/NAME-001``. ConfigError if it is not free."""
     if out is None:
         parent = Path("runs")
         pattern = re.compile(re.escape(name) + r"-(\d+)")
@@ -41,14 +41,14 @@ def claim(out: Path | None, name: str) -> Path:
                     folder.mkdir()
                     return folder
                 except FileExistsError:
-                    continue  # another run was faster
+                    continue  # another run has just created it
         except OSError as error:
             raise ConfigError([f"cannot write to {parent}: {error.strerror}; choose a place with --out"]) from None
     try:
         out.mkdir(parents=True, exist_ok=True)
         if any(out.iterdir()):
             raise ConfigError([f"{out} holds files already; choose another --out or delete it"])
-        (out / "images").mkdir()  # the claim: of two runs only one can make it
+        (out / "images").mkdir()  # succeeds for only one of two runs that start at the same time
     except FileExistsError:
         raise ConfigError([f"{out} is a file, or in use by another run; choose another --out"]) from None
     except OSError as error:
@@ -58,15 +58,15 @@ def claim(out: Path | None, name: str) -> Path:
 
 @dataclass
 class RunFolder:
-    """The folder of a run at work.
+    """The folder of a running experiment.
 
     Attributes:
         path: The folder.
-        name: Of the run.
-        plan: What the run is to do.
-        pressed: Signals that have come.
+        name: Name of the run.
+        plan: Plan of the run.
+        pressed: Signals that have been received.
         resumes: Whether the run can be continued after an interruption.
-        write_page: Writes the page of the folder to a path, from what is in the folder; None where there is none yet.
+        write_page: Writes the report of the folder to a path; None if there is nothing to show yet.
     """
 
     path: Path
@@ -81,20 +81,20 @@ class RunFolder:
 def open_run(
     out: Path | None, name: str, settings: BaseModel, plan: RunPlan, device: str, *, resumes: bool = True
 ) -> Iterator[RunFolder]:
-    """Fill a folder within this block: a new one, or ``out`` where that holds an unfinished run of the same settings.
+    """Fill a folder within this block: a new one, or ``out`` if it holds an unfinished run of the same settings.
 
     A run that cannot be continued (not ``resumes``) always takes a new folder.
 
-    The folder is this run's alone, on systems that can lock one, and gets config.yaml and env.json at once. Within the
-    block the first signal raises KeyboardInterrupt. Where the block fails, the folder keeps what was computed; a new
-    one in which nothing was is removed, so that a corrected run can have it.
+    The folder is locked against other runs, where the system can do that; config.yaml and env.json are written at once.
+    Within the block, the first signal raises KeyboardInterrupt. If the block fails, the folder keeps all results; a new
+    folder without results is removed, so that a corrected run can use it.
 
     Raises:
-        ConfigError: The folder is in use, holds something else, or cannot be written.
+        ConfigError: The folder is in use, holds other files, or cannot be written.
     """
     with interruptible() as pressed, ExitStack() as stack:
         if out is not None:
-            with suppress(OSError):  # the claim says what is wrong
+            with suppress(OSError):  # ``claim`` reports the error
                 out.mkdir(parents=True, exist_ok=True)
             if out.is_dir():
                 stack.enter_context(_locked(out))
@@ -102,7 +102,7 @@ def open_run(
         folder = claim(out, name) if new or out is None else out
         if out is None:
             stack.enter_context(_locked(folder))
-        with _kept(folder, new, resumes):
+        with _keep_results(folder, new, resumes):
             (folder / "images").mkdir(exist_ok=True)
             write_json(folder / "env.json", environment(getattr(settings, "seed", 0), torch.device(device)))
             if new:
@@ -111,16 +111,16 @@ def open_run(
 
 
 def _unfinished(folder: Path, settings: BaseModel) -> bool:
-    """Whether a folder holds a run of these settings that is not complete; ConfigError for one of other settings.
+    """Whether a folder holds an unfinished run of these settings; ConfigError for an unfinished run of other settings.
 
-    What a killed run leaves is cleared away: half-written files, and folders without a file.
+    Half-written files and empty folders of a killed run are removed.
     """
     if not folder.is_dir():
         return False
     files = {path.name for path in folder.rglob("*") if not path.is_dir()}
     halves = {name for name in files if _HALF.fullmatch(name)}
     if files - halves <= {"env.json"}:
-        with suppress(OSError):  # the claim says what is wrong
+        with suppress(OSError):  # ``claim`` reports the error
             for name in (*halves, "env.json"):
                 (folder / name).unlink(missing_ok=True)
             for path in (folder / "arrays", folder / "images"):
@@ -133,28 +133,29 @@ def _unfinished(folder: Path, settings: BaseModel) -> bool:
     except ConfigError:
         return False
     if changed := differences(fingerprint(held, {}), fingerprint(settings, {})):
-        cure = f"choose another --out, or go on with that one: holotorch resume {folder}"
-        raise ConfigError([f"{folder} holds an unfinished run of another configuration: {', '.join(changed)}; {cure}"])
+        hint = f"choose another --out, or go on with that one: holotorch resume {folder}"
+        raise ConfigError([f"{folder} holds an unfinished run of another configuration: {', '.join(changed)}; {hint}"])
     for path in folder.rglob(".*.partial"):
         path.unlink()
     return True
 
 
 def tidied(folder: Path) -> bool:
-    """Clear away what a run that was killed after its last number has left; whether its page is missing.
+    """Remove temporary files of a run that was killed after its last result; returns whether its page is missing.
 
-    ConfigError where a run is in the folder.
+    Raises:
+        ConfigError: A run is using the folder.
     """
     with _locked(folder):
         for path in (*folder.rglob(".*.partial"), folder / "checkpoint.pt", folder / "interrupted.json"):
-            with suppress(OSError):  # what cannot be removed does no harm
+            with suppress(OSError):  # a remaining file does no harm
                 path.unlink(missing_ok=True)
         return not (folder / "report.html").is_file()
 
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Keep other runs out of a folder until the block, or the process, ends. ConfigError where one is in it."""
+    """Lock a folder until the block or the process ends. ConfigError if another run has locked it."""
     try:
         import fcntl
     except ImportError:  # not on Windows
@@ -162,7 +163,7 @@ def _locked(folder: Path) -> Iterator[None]:
         return
     handle = os.open(folder, os.O_RDONLY)
     try:
-        with suppress(OSError):  # of a network's file system without locks
+        with suppress(OSError):  # a network file system may have no locks
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -173,7 +174,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _kept(folder: Path, new: bool, resumes: bool) -> Iterator[None]:
+def _keep_results(folder: Path, new: bool, resumes: bool) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
@@ -185,19 +186,19 @@ def _kept(folder: Path, new: bool, resumes: bool) -> Iterator[None]:
     except BaseException as error:
         removed = new and _remove_setup(folder)
         if not removed and not isinstance(error, ConfigError):
-            cure = f"; when the cause is mended, go on with: holotorch resume {folder}" if resumes else ""
+            hint = f"; once the cause is removed, go on with: holotorch resume {folder}" if resumes else ""
             if (folder / "summary.json").is_file():
-                cure = f"; make its page with: holotorch report {folder}"
-            print(f"failed; what was computed until then is in {folder}{cure}", file=sys.stderr)
+                hint = f"; make its page with: holotorch report {folder}"
+            print(f"failed; the results so far are in {folder}{hint}", file=sys.stderr)
         raise
 
 
 def _remove_setup(folder: Path) -> bool:
-    """Remove a folder that holds nothing but what is written before the work begins; whether that was so."""
+    """Remove a folder if it holds only the files that are written before the work begins; whether it was removed."""
     files = [path for path in folder.rglob("*") if not path.is_dir()]
     if not {path.name for path in files} <= _SETUP:
         return False
-    with suppress(OSError):  # what cannot be removed does no harm
+    with suppress(OSError):  # a remaining file does no harm
         for path in files:
             path.unlink()
         for path in (folder / "arrays", folder / "images", folder):
@@ -214,20 +215,21 @@ def conclude(
     done: bool,
     checkpoint: Checkpoint | None = None,
 ) -> bool:
-    """Write the numbers of a run, last of all: what has summary.json is complete, what has interrupted.json is not.
+    """Write the numbers of a run as its last file: summary.json if it is complete, otherwise interrupted.json.
 
     Args:
-        run: The run, whose signals no longer count once it is complete.
-        summary: Numbers, with a ``status`` that is set here.
-        results: Files written so far.
-        done: Whether all was computed.
-        checkpoint: Removed from a complete run. Of one that is not done, that it was written.
+        run: The run; its signals are ignored once it is complete.
+        summary: Numbers; ``status`` is set here.
+        results: The files written so far.
+        done: Whether everything was computed.
+        checkpoint: Of the run; an error in writing it counts as an error of an unfinished run. A complete run's
+            checkpoint is removed.
 
     Returns:
         Whether the run is complete.
 
     Raises:
-        OSError: A file could not be written; everything else is.
+        OSError: A file could not be written; all others have been written.
     """
     with deferred(run.pressed):
         if not done and checkpoint is not None:
@@ -242,7 +244,7 @@ def conclude(
                 run.pressed.settled = True
                 for path in (run.path / "checkpoint.pt", run.path / "interrupted.json"):
                     path.unlink(missing_ok=True)
-            if run.write_page is not None:  # last, as it shows what is in the folder
+            if run.write_page is not None:  # after all other files, which it shows
                 results.write(run.write_page, run.path / "report.html")
         if results.failure is not None:
             raise results.failure

@@ -1,4 +1,4 @@
-"""How much memory this process has used, and whether a run fits into what is free."""
+"""Memory that this process has used, and whether a run fits into the free memory."""
 
 import re
 import resource
@@ -20,7 +20,7 @@ def peak_memory() -> int:
 
 
 def shortage(values: dict[str, Any]) -> str | None:
-    """A line that says that the planned run does not fit into the memory that is free, or None."""
+    """A message if the planned run does not fit into the free memory, otherwise None."""
     needed, free = values["predicted_peak_bytes"], available_memory()
     if free is None or needed <= free:
         return None

@@ -25,7 +25,7 @@ def channel_maps(values: Tensor, names: Sequence[str], label: str, colormap: str
 
 
 def visual_field(values: Tensor, eccentricity: Tensor, field_deg: float, rings: Sequence[float], label: str) -> bytes:
-    """PNG of a map [H, W] over ``field_deg`` of width, and the rings (deg) that its eccentricities [H, W] reach."""
+    """PNG of a map [H, W] that is ``field_deg`` wide, with rings of equal eccentricity (deg)."""
     height, width = values.shape
     x, y = field_deg / 2, field_deg / 2 * height / width
     figure = Figure(figsize=(7.2, 1.0 + 6.0 * height / width), layout="constrained")
@@ -33,7 +33,7 @@ def visual_field(values: Tensor, eccentricity: Tensor, field_deg: float, rings: 
     drawn = axes.imshow(values.numpy(), cmap="magma", extent=(-x, x, -y, y), interpolation="nearest")
     inside = [ring for ring in rings if eccentricity.min() < ring < eccentricity.max()]
     if inside:
-        # At the middles of the pixels.
+        # Coordinates of pixel centres.
         across, up = ((np.arange(n) + 0.5) / n * 2 - 1 for n in (width, height))
         lines = axes.contour(
             x * across, -y * up, eccentricity.numpy(), inside, colors="white", linewidths=1, linestyles=":"
@@ -47,7 +47,7 @@ def visual_field(values: Tensor, eccentricity: Tensor, field_deg: float, rings: 
 
 
 def comparison(images: Sequence[Tensor], captions: Sequence[str]) -> bytes:
-    """PNG of pictures [C, H, W] in [0, 1] side by side with their captions, a score on a line of its own."""
+    """PNG of pictures [C, H, W] in [0, 1] side by side with captions; a score stands on a separate line."""
     height, width = images[0].shape[-2:]
     titles = [_title(caption) for caption in captions]
     wide, gap, top = 3.1, 0.1, 0.14 + 0.18 * max(title.count("\n") + 1 for title in titles)  # inches
@@ -98,10 +98,10 @@ def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[in
 
 
 def _next_stage(losses: np.ndarray) -> int | None:
-    """First step whose losses [steps + 1, C] are those of another objective, or None.
+    """First step whose losses [steps + 1, C] belong to a second objective, or None.
 
-    L-BFGS begins with the amplitude's loss and goes on with the intensity's, where all colours jump up at once that had
-    only fallen before. The momentum of Adam lets single colours rise from the start.
+    L-BFGS minimises the error of the amplitude first and that of the intensity then: at the change, the losses of all
+    colours, which only fell before, rise at once. The momentum of Adam lets single colours rise from the start.
     """
     change = losses[1:] / losses[:-1]
     jumps = np.flatnonzero((change > 1.5).all(1))
@@ -110,21 +110,22 @@ def _next_stage(losses: np.ndarray) -> int | None:
 
 
 def curves(rows: Sequence[dict[str, Any]], title: str) -> bytes:
-    """PNG of SSIM against what a study sweeps, a line per method, a panel per kind of propagation."""
+    """PNG of SSIM against the swept setting of a study: a line per method, a panel per kind of propagation."""
     scored = [row for row in rows if row["ssim"] != ""]
     kinds = list(dict.fromkeys(row["kind"] for row in scored))
     figure = Figure(figsize=(7.5 * len(kinds), 4.2), layout="constrained")
     for i, kind in enumerate(kinds):
         axes = figure.add_subplot(1, len(kinds), i + 1)
-        own = [row for row in scored if row["kind"] == kind]
-        # Swept is sigma, or the setting where there is one.
-        places = list(dict.fromkeys((row["setting"], row["sigma_px"]) for row in own))
-        for k, method in enumerate(dict.fromkeys(row["method"] for row in own)):
-            points = [(places.index((r["setting"], r["sigma_px"])), r["ssim"]) for r in own if r["method"] == method]
+        selected = [row for row in scored if row["kind"] == kind]
+        # The study sweeps a setting if it has one, otherwise sigma.
+        positions = list(dict.fromkeys((row["setting"], row["sigma_px"]) for row in selected))
+        for k, method in enumerate(dict.fromkeys(row["method"] for row in selected)):
+            rows_of = [row for row in selected if row["method"] == method]
+            points = [(positions.index((row["setting"], row["sigma_px"])), row["ssim"]) for row in rows_of]
             axes.plot(*zip(*points, strict=True), "os^vD*PhX"[k % 9] + "-", label=method, markersize=5)
-        step = max(1, len(places) // 12)
-        words = [f"{setting}\n{sigma:g} px" if setting else f"{sigma:g} px" for setting, sigma in places]
-        axes.set_xticks(range(0, len(places), step), words[::step], fontsize=7, rotation=30 if step > 1 else 0)
+        step = max(1, len(positions) // 12)
+        words = [f"{setting}\n{sigma:g} px" if setting else f"{sigma:g} px" for setting, sigma in positions]
+        axes.set_xticks(range(0, len(positions), step), words[::step], fontsize=7, rotation=30 if step > 1 else 0)
         axes.set_ylim(0, 1.02)
         axes.set_ylabel("mean SSIM")
         axes.set_title(f"{title}, {kind}", fontsize=9)

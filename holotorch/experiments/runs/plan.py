@@ -1,4 +1,4 @@
-"""RunPlan: what a run will do, before it starts."""
+"""RunPlan: description, cost and feasibility of a run."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -6,13 +6,12 @@ from typing import Any
 
 @dataclass(frozen=True)
 class RunPlan:
-    """What a run will do, before anything is computed.
+    """The plan of a run, made before anything is computed.
 
     Attributes:
-        text: In words, for a display engineer.
-        values: Choices with their reasons, cost and physics, as plain JSON values; written to plan.json if there are
-            any.
-        shortage: Why the run cannot be carried out on this machine, or None.
+        text: Lines to print.
+        values: Choices with their reasons, cost and physics, as plain JSON values; written to plan.json unless empty.
+        shortage: The reason why this machine cannot carry out the run, or None.
     """
 
     text: str

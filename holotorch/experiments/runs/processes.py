@@ -10,9 +10,9 @@ from torch import Tensor
 
 @contextmanager
 def joined_processes(parallel: bool = True) -> Iterator[int]:
-    """Join the processes that ``torchrun`` has started, within this block; yields the number of this one.
+    """Connect the processes that ``torchrun`` has started, within this block; yields the rank of this process.
 
-    Where they do not share a run (``parallel`` False), each is the first.
+    With ``parallel`` False, the processes do not share a run, and each has rank 0.
     """
     if not parallel or int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield 0
@@ -25,13 +25,13 @@ def joined_processes(parallel: bool = True) -> Iterator[int]:
 
 
 def process_count() -> tuple[int, int]:
-    """Number of this process and of all that share the run."""
+    """Rank of this process, and number of processes that share the run."""
     if torch.distributed.is_available() and torch.distributed.is_initialized():
         return torch.distributed.get_rank(), torch.distributed.get_world_size()
     return 0, 1
 
 
 def from_first(value: Tensor) -> Tensor:
-    """The first process's value, in all."""
+    """The value of the first process, in all processes."""
     torch.distributed.broadcast(value, 0)
     return value

@@ -1,4 +1,4 @@
-"""RunRecord: what the folder of a run says of it."""
+"""RunRecord: the contents of a run folder, for reports."""
 
 import base64
 import csv
@@ -14,42 +14,42 @@ class RunRecord:
     """The files of a run, complete or interrupted.
 
     Attributes:
-        folder: Where they are.
+        folder: The run folder.
         title: Name of the folder.
-        summary: Its numbers.
-        kind: Name of its kind.
+        summary: Numbers of summary.json, or of interrupted.json.
+        kind: Name of the kind of experiment.
 
     Raises:
-        ConfigError: A folder that holds no run.
+        ConfigError: The folder holds no run.
     """
 
     def __init__(self, folder: Path):
         self.folder, self.title = folder, folder.resolve().name
         names = [name for name in ("summary.json", "interrupted.json") if (folder / name).is_file()]
         if not names:
-            cure = f"; finish it with: holotorch resume {folder}" if (folder / "plan.json").is_file() else ""
-            raise ConfigError([f"{folder} holds no run: neither summary.json nor interrupted.json is there{cure}"])
+            hint = f"; finish it with: holotorch resume {folder}" if (folder / "plan.json").is_file() else ""
+            raise ConfigError([f"{folder} holds no run: neither summary.json nor interrupted.json is there{hint}"])
         self.summary: dict[str, Any] = read_json(folder / names[0])
         self.kind = str(self.summary["experiment"])
 
     def load(self) -> None:
-        """Read what a section of a page is made of: ``plan``, where there is one, ``env`` and ``config``."""
+        """Read the files that a section of a page needs into ``plan`` (empty if there is none), ``env``, ``config``."""
         plan = self.folder / "plan.json"
         self.plan: dict[str, Any] = read_json(plan) if plan.is_file() else {}
         self.env: dict[str, Any] = read_json(self.folder / "env.json")
         self.config = (self.folder / "config.yaml").read_text(encoding="utf-8")
 
     def text(self, name: str) -> str:
-        """A text file of the folder, or nothing where there is none."""
+        """The contents of a text file in the folder; empty if there is no such file."""
         path = self.folder / name
         return path.read_text(encoding="utf-8") if path.is_file() else ""
 
     def rows(self, name: str) -> list[dict[str, str]]:
-        """Rows of a table of the folder, none where there is none."""
+        """Rows of a table in the folder; none if there is no such file."""
         return list(csv.DictReader(io.StringIO(self.text(name))))
 
     def picture(self, name: str) -> str:
-        """A picture of the folder as a data URL, or nothing where there is none."""
+        """A picture in the folder as a data URL; empty if there is no such file."""
         path = self.folder / "images" / f"{name}.png"
         if not path.is_file():
             return ""

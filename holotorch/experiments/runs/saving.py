@@ -1,4 +1,4 @@
-"""Checkpoints and results on a disk that may be full: what cannot be written is told, and the rest is written."""
+"""Checkpoints and results on a disk that may be full: errors are reported, and all other files are written."""
 
 import hashlib
 import math
@@ -18,103 +18,104 @@ from holotorch.io.files import replacing
 
 
 class Checkpoint:
-    """What it takes to go on with a run. A failure to write it is told once per cause, and is no reason to stop.
+    """The state from which a run can be resumed. An error in writing it is reported once and does not stop the run.
 
     Attributes:
-        path: The file; the one before stays until a new one is complete.
-        fingerprint: Of the configuration and inputs of the run; what another one has left is refused.
-        failure: Why the last :meth:`save` wrote nothing, or None.
+        path: The file; it is replaced only when a new checkpoint is complete.
+        fingerprint: Of the configuration and inputs of the run; a checkpoint with another fingerprint is refused.
+        failure: The error of the last :meth:`save`, or None.
     """
 
     def __init__(self, path: Path, fingerprint: Fingerprint):
         self.path, self.fingerprint = path, fingerprint
         self.failure: OSError | None = None
-        self._told: set[int | None] = set()
+        self._reported: set[int | None] = set()
 
     def load(self) -> dict[str, Any] | None:
-        """What was saved last; None where nothing was. ConfigError for one of another configuration, or damaged."""
+        """The last saved content, or None. ConfigError for a checkpoint of another configuration, or a damaged one."""
         if not self.path.is_file():
             return None
         try:
             with zipfile.ZipFile(self.path) as archive:
                 if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
-                    raise ValueError("packed, which may take any memory to unpack, and torch packs nothing")
+                    raise ValueError("compressed, which torch never does, and might need any memory to decompress")
             content = torch.load(self.path, weights_only=True)
             stated = content.pop("checksum", None)
             if "fingerprint" in content and stated != checksum(content, self.path.stat().st_size):
                 raise ValueError("changed after it was written")
-        except Exception as error:  # what damaged bytes raise when unpickled is anyone's guess
+        except Exception as error:  # unpickling damaged bytes can raise anything
             raise self.unreadable(error) from None
         self._check(content.get("fingerprint"))
         return content
 
     def _check(self, before: Fingerprint | None) -> None:
         config = self.path.parent / "config.yaml"
-        cure = f"run into a new folder: holotorch run {config} --out NEW"
+        hint = f"run into a new folder: holotorch run {config} --out NEW"
         if not isinstance(before, dict):
             words = f"{self.path} does not say which configuration it belongs to, as those of older versions do not"
-            raise ConfigError([f"{words}; {cure}"])
+            raise ConfigError([f"{words}; {hint}"])
         if changed := differences(before, self.fingerprint):
             words = f"{self.path} belongs to another configuration: {', '.join(changed)}"
-            raise ConfigError([f"{words}; undo that in {config}, or {cure}"])
+            raise ConfigError([f"{words}; undo that in {config}, or {hint}"])
 
     def unreadable(self, error: Exception) -> ConfigError:
-        """What to say of a checkpoint whose content is not what it should be."""
+        """The error for a checkpoint that cannot be read or has unexpected content."""
         reason = error.strerror if isinstance(error, OSError) else "it is damaged"
         return ConfigError([f"{self.path} cannot be read: {reason}; delete the folder and run again"])
 
     def save(self, content: dict[str, Any]) -> bool:
-        """Write tensors and plain values; False where that is not possible."""
+        """Write tensors and plain values; returns False if that fails."""
         self.failure = None
         try:
             with replacing(self.path, needed=_bytes(content)) as stream:
                 try:
                     content = content | {"fingerprint": self.fingerprint}
                     torch.save(content | {"checksum": checksum(content)}, stream)
-                except RuntimeError as error:  # torch's own, raised while it handled the one of the disk
+                except RuntimeError as error:  # torch raises it while it handles the error of the disk
                     raise error.__context__ if isinstance(error.__context__, OSError) else error from None
         except (OSError, RuntimeError) as error:
             is_disk = isinstance(error, OSError)
             self.failure = error if is_disk else OSError(None, str(error), str(self.path))
-            if self.failure.errno not in self._told:
-                self._told.add(self.failure.errno)
-                left = "that of before stays" if self.path.is_file() else "there is none before it"
+            if self.failure.errno not in self._reported:
+                self._reported.add(self.failure.errno)
+                left = "the previous one stays" if self.path.is_file() else "there is no previous one"
                 _warn(f"{self.path} cannot be written: {self.failure.strerror}; {left}, and the run goes on")
         return self.failure is None
 
 
 class Results:
-    """Files of results. One that cannot be written is told, once per cause, and the others are written all the same.
+    """Files of results. An error in writing one is reported once, and the others are written all the same.
 
     Attributes:
-        failure: The first error.
+        failure: The first error, or None.
     """
 
     def __init__(self):
         self.failure: OSError | None = None
-        self._told: set[int | None] = set()
+        self._reported: set[int | None] = set()
 
     def fail(self, error: OSError | None) -> None:
-        """Take note of an error that was told already."""
+        """Record an error that has been reported already."""
         self.failure = self.failure or error
 
     def write(self, write: Callable[..., Any], *words: Any) -> bool:
-        """Call ``write(*words)``; False where the disk does not take it."""
+        """Call ``write(*words)``; returns False if the disk refuses it."""
         try:
             write(*words)
             return True
         except OSError as error:
-            if error.errno not in self._told:
-                self._told.add(error.errno)
+            if error.errno not in self._reported:
+                self._reported.add(error.errno)
                 _warn(f"{error.filename} cannot be written: {error.strerror}; the other results are written")
             self.fail(error)
             return False
 
 
 def checksum(content: Any, most: float = math.inf) -> str:
-    """Of tensors and plain values, nested as they may be; ValueError for others, and for tensors beyond ``most`` bytes.
+    """Checksum of nested tensors and plain values; torch itself does not detect damaged numbers when it loads a file.
 
-    torch checks nothing that it reads: a run would go on from damaged numbers as if they were its own.
+    Raises:
+        ValueError: Other types, or a tensor of more than ``most`` bytes.
     """
     total = hashlib.blake2b(digest_size=16)
 
@@ -139,11 +140,11 @@ def checksum(content: Any, most: float = math.inf) -> str:
 
 
 def _warn(text: str) -> None:
-    tqdm.write(f"warning: {text}", file=sys.stderr)  # beside a progress bar
+    tqdm.write(f"warning: {text}", file=sys.stderr)  # does not break a progress bar
 
 
 def _bytes(content: Any) -> int:
-    """Of the tensors in a checkpoint; what else is in it is small."""
+    """Size of the tensors in a checkpoint; everything else in it is small."""
     if isinstance(content, Tensor):
         return content.nbytes
     values = content.values() if isinstance(content, dict) else content if isinstance(content, list | tuple) else ()

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP of a run: they end its work, and never the saving of what it has found."""
+"""Handling of Ctrl-C, SIGTERM and SIGHUP: they end the computation of a run, but not the saving of its results."""
 
 import signal
 import threading
@@ -8,25 +8,25 @@ from typing import Any
 
 
 class Pressed(list[int]):
-    """Numbers of the signals that have come.
+    """Numbers of the signals that have been received.
 
     Attributes:
-        settled: The outcome is on the disk, so that a signal no longer changes it.
+        settled: The results are on the disk, so signals are ignored.
     """
 
     settled = False
 
 
-_current: Pressed | None = None  # of the outermost block that is open in the main thread
+_current: Pressed | None = None  # the list of the outermost open block of the main thread
 
 
 @contextmanager
 def interruptible() -> Iterator[Pressed]:
-    """Let SIGTERM and SIGHUP (a closed terminal) act as Ctrl-C, and note in the list which have come.
+    """Treat SIGTERM and SIGHUP (a closed terminal) like Ctrl-C within this block, and record the signals in a list.
 
-    Only the first raises KeyboardInterrupt: another would come while what was found is being saved, and end that. Once
-    the list is ``settled`` none raises. A block within another one shares its list; it begins with KeyboardInterrupt
-    where a signal came before it.
+    Only the first signal raises KeyboardInterrupt, so that a second one does not interrupt saving. No signal raises it
+    once the list is ``settled``. A nested block shares the list of the outer one, and raises KeyboardInterrupt at its
+    start if a signal has been received before.
     """
     global _current
     if threading.current_thread() is not threading.main_thread():  # signals reach the main thread only
@@ -52,14 +52,14 @@ def interruptible() -> Iterator[Pressed]:
 
 @contextmanager
 def deferred(pressed: list[int]) -> Iterator[None]:
-    """Only note that one of the signals has come."""
+    """Record signals within this block without raising KeyboardInterrupt."""
     with handling(lambda number, _: pressed.append(number)):
         yield
 
 
 @contextmanager
 def handling(handler: Callable[[int, Any], object]) -> Iterator[None]:
-    """Have ``handler`` called for each of the signals, with its number first."""
+    """Call ``handler`` for each signal within this block, with its number as first argument."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

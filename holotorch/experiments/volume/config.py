@@ -1,4 +1,4 @@
-"""What the configuration of a volume's hologram may say."""
+"""Settings of the hologram of a volume."""
 
 from typing import Annotated, Any, Literal
 
@@ -33,22 +33,22 @@ def _number_type(value: Any) -> Any:
     return value
 
 
-def _ahead(value: float) -> float:
+def _in_front(value: float) -> float:
     if not value > 0:
-        raise PydanticCustomError("depth", "expected a distance above zero: the scene lies before the hologram")
+        raise PydanticCustomError("depth", "expected a distance above zero: the scene lies in front of the hologram")
     return value
 
 
-Depth = Annotated[Distance, AfterValidator(_ahead)]
+Depth = Annotated[Distance, AfterValidator(_in_front)]
 
 
 class VolumeSource(Settings):
-    """A file, a scene of the public catalogue, or a synthetic phantom: the first of them that is given.
+    """A file, a scene of the public catalogue, or a synthetic phantom: the first of these that is given.
 
-    A phantom beside a scene stands in for it where it cannot be fetched.
+    A phantom that is given with a scene replaces it if the scene cannot be fetched.
 
-    ``spacing`` (z, y, x), ``shape`` (D, H, W), ``dtype`` and ``unit`` say what a file does not: see ``load_volume``.
-    ``directory``: where scenes are kept once fetched.
+    ``spacing`` (z, y, x), ``shape`` (D, H, W), ``dtype`` and ``unit`` add what a file does not state, see
+    ``load_volume``. ``directory``: cache of fetched scenes.
     """
 
     path: ExistingArray | None = None
@@ -63,10 +63,10 @@ class VolumeSource(Settings):
 
 
 class TransferSettings(Settings):
-    """Colour and opacity: a preset between two values of the volume, a JSON file, or points of one's own.
+    """Colour and opacity: a preset between two values of the volume, a JSON file, or a list of points.
 
-    ``points``: [value, red, green, blue, opacity] each, in 0..1 but for the value; ``unit_distance`` is the part of the
-    volume's longest side along which the opacity holds.
+    ``points``: [value, red, green, blue, opacity] each, all but the value in 0..1. The opacity is that of a path of
+    ``unit_distance``, relative to the longest side of the volume.
     """
 
     preset: Literal["bone", "soft_tissue", "vessels", "industrial"] | None = None
@@ -78,10 +78,10 @@ class TransferSettings(Settings):
 
 
 class ViewSettings(Settings):
-    """How the volume stands: degrees about the vertical (y) and then about the horizontal axis (x); its width.
+    """Orientation and size of the volume: rotations in degrees about the vertical axis (y), then the horizontal (x).
 
-    ``width``: metres of its longest side; that of the hologram by default. ``front``: which end of the volume the
-    observer sees first. ``lighting``: shade by the gradient instead of letting all points glow evenly.
+    ``width``: length of its longest side in metres; by default that of the hologram. ``front``: the end of the volume
+    that faces the observer. ``lighting``: shade by the gradient; otherwise all points emit evenly.
     """
 
     azimuth_deg: Number = 0.0
@@ -92,9 +92,10 @@ class ViewSettings(Settings):
 
 
 class HologramSettings(GridSettings):
-    """Pixels, the distance of the volume's middle, the number of planes (or where they lie), and rays per side.
+    """Pixels, distance of the volume's middle, number (or distances) of the planes, and rays along each side.
 
-    ``cone``: which definition of a wave's limits, see ``holotorch.hologram.cone``; the cheapest soft one by default.
+    ``cone``: how the cone of light of a point ends, see ``holotorch.hologram.cone``; by default the soft edge that
+    costs least.
     """
 
     distance: Depth
@@ -104,9 +105,9 @@ class HologramSettings(GridSettings):
 
 
 class VolumeReport(Settings):
-    """Depths of the refocused pictures, and random phases that are averaged in them.
+    """Depths of the refocused pictures, and number of realisations of the random phases to average.
 
-    By default a tenth, half and nine tenths of the rays see something nearer than the depths.
+    The default depths are the 10, 50 and 90 % quantiles of the depths of the rays.
     """
 
     refocus: Annotated[tuple[Depth, ...], BeforeValidator(several)] | None = None
@@ -114,11 +115,11 @@ class VolumeReport(Settings):
 
 
 class VolumeSettings(Settings):
-    """The hologram of a volume, rendered directly into light sources, and what it shows.
+    """The hologram of a volume, which is rendered directly into light sources, and its refocused pictures.
 
-    ``phase``: of the sources. ``point``: random, each its own, so that planes add without interference; ``ray``: one
-    for each ray, as in the thesis, whose planes interfere colour by colour; ``smooth``; ``constant``. ``scale`` divides
-    pixels, rays, distances, the volume's width and a given number of planes, for a small version of a scene.
+    ``phase`` of the sources: ``point``, random for each source, so that planes do not interfere on average; ``ray``,
+    random for each ray, as in the thesis, so that the planes of a colour interfere; ``smooth``; ``constant``. ``scale``
+    divides pixels, rays, distances, the volume's width and a given number of planes, for a small version of a scene.
     """
 
     experiment: Literal["volume"]
@@ -136,32 +137,33 @@ class VolumeSettings(Settings):
 
 
 def contradictions(settings: VolumeSettings) -> list[tuple[tuple[str | int, ...], str]]:
-    """Settings that are fine one by one and not together."""
-    found: list[tuple[tuple[str | int, ...], str]] = []
+    """Settings that contradict each other: their keys, and what to change."""
+    problems: list[tuple[tuple[str | int, ...], str]] = []
     source, transfer, hologram = settings.volume, settings.transfer, settings.hologram
     if not (source.path or source.scene or source.phantom):
-        found.append((("volume",), "expected a path, a scene or a phantom"))
+        problems.append((("volume",), "expected a path, a scene or a phantom"))
     if sum(item is not None for item in (transfer.preset, transfer.file, transfer.points)) != 1:
-        found.append((("transfer",), "expected one of preset, file or points"))
+        problems.append((("transfer",), "expected one of preset, file or points"))
     if transfer.preset and (transfer.low is None or transfer.high is None or transfer.low >= transfer.high):
-        found.append((("transfer",), "a preset needs low and high, the values between which it lies, low < high"))
+        problems.append((("transfer",), "a preset needs low < high, the values of the volume between which it lies"))
     if transfer.points is not None and len(transfer.points) < 2:
-        found.append((("transfer", "points"), "expected at least 2 points"))
+        problems.append((("transfer", "points"), "expected at least 2 points"))
     if hologram.depths == ():
-        found.append((("hologram", "depths"), "expected a number of planes, or one distance at least, got none"))
+        problems.append((("hologram", "depths"), "expected a number of planes, or at least one distance, got none"))
     if isinstance(hologram.depths, tuple) and len(set(hologram.depths)) < len(hologram.depths):
         twice = next(depth for k, depth in enumerate(hologram.depths) if depth in hologram.depths[:k])
-        found.append((("hologram", "depths"), f"expected distances that all differ, got {twice:g} m twice"))
+        problems.append((("hologram", "depths"), f"expected distances that all differ, got {twice:g} m twice"))
     if len(settings.wavelengths) != 3:
-        found.append((("wavelengths",), f"expected 3 (red, green, blue), got {len(settings.wavelengths)}"))
+        problems.append((("wavelengths",), f"expected 3 (red, green, blue), got {len(settings.wavelengths)}"))
     side, rays = hologram.shape, hologram.rays
     if rays is not None and (side[0] % rays or side[1] % rays or side[0] // rays != side[1] // rays):
-        found.append((("hologram", "rays"), f"expected a number that divides the hologram's sides {side}, got {rays}"))
+        words = f"expected a number that divides the hologram's sides {side}, got {rays}"
+        problems.append((("hologram", "rays"), words))
     width = settings.view.width or max(side[0] * hologram.pitch[0], side[1] * hologram.pitch[1])
     if isinstance(hologram.depths, int) and hologram.distance <= width / 2:
         hint = f"a volume {width:.3g} m wide needs more than {width / 2:.3g} m"
-        found.append((("hologram", "distance"), f"expected the whole volume before the hologram; {hint}"))
+        problems.append((("hologram", "distance"), f"expected the whole volume in front of the hologram; {hint}"))
     least = min(side) // settings.scale
     if least < 8 or any(size % settings.scale for size in side) or (rays is not None and rays % settings.scale):
-        found.append((("scale",), f"expected a divisor of the pixels {side} and rays that leaves 8 at least"))
-    return found
+        problems.append((("scale",), f"expected a divisor of the pixels {side} and the rays that leaves at least 8"))
+    return problems

@@ -1,4 +1,4 @@
-"""The volume experiment: a configuration made into a volume, its renderer and a hologram per colour."""
+"""The volume experiment: the volume of a configuration, its renderer and a hologram for each colour."""
 
 import math
 import time
@@ -24,19 +24,19 @@ from holotorch.scene.sampler import DVRSampler
 from holotorch.scene.transfer import TransferFunction
 from holotorch.scene.volume import Volume
 
-_CATALOGUE = {"teapot": "boston_teapot"}  # the thesis's name: that of the catalogue
-_SMOOTH = 8  # rays over which smooth phases are alike
+_CATALOGUE = {"teapot": "boston_teapot"}  # names of the thesis that differ from those of the catalogue
+_SMOOTH = 8  # rays: correlation length of smooth phases
 
 
 @dataclass(frozen=True)
 class VolumeExperiment:
-    """A configuration made into what it means.
+    """The volume, geometry and operators that a configuration describes.
 
     Attributes:
         settings: The configuration.
-        volume: What is shown.
-        synthetic: Why it is a phantom, or an empty text for real data.
-        device: Where it runs.
+        volume: The volume to show.
+        synthetic: The reason why the volume is a phantom; empty for real data.
+        device: Device of the computation.
     """
 
     settings: VolumeSettings
@@ -52,7 +52,7 @@ class VolumeExperiment:
 
     @property
     def distance(self) -> float:
-        """Of the volume's middle, in metres."""
+        """Distance of the volume's middle from the hologram, in metres."""
         return self.settings.hologram.distance / self.settings.scale
 
     @property
@@ -63,19 +63,19 @@ class VolumeExperiment:
 
     @property
     def rays(self) -> Grid:
-        """Grid of the rays, the same on all planes."""
+        """Grid of the rays, which is the same on all planes."""
         (height, width), (py, px) = self.grid.shape, self.grid.pitch
         return Grid((height // self.stride, width // self.stride), (py * self.stride, px * self.stride))
 
     @property
     def width(self) -> float:
-        """Of the volume's longest side, in metres."""
+        """Length of the volume's longest side, in metres."""
         width = self.settings.view.width
         return max(self.grid.extent) if width is None else width / self.settings.scale
 
     @cached_property
     def rotation(self) -> Tensor:
-        """Of the volume about its middle, over (z, y, x)."""
+        """Rotation matrix of the volume about its middle, over (z, y, x)."""
         view = self.settings.view
         a, e = math.radians(view.azimuth_deg), math.radians(view.elevation_deg)
         about_y = torch.tensor([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
@@ -84,32 +84,32 @@ class VolumeExperiment:
 
     @cached_property
     def depths(self) -> tuple[float, ...]:
-        """Of the planes, in the order in which rays meet them."""
-        wanted, scale = self.settings.hologram.depths, self.settings.scale
-        if isinstance(wanted, int):
-            wanted, middle = max(1, wanted // scale), self.distance
+        """Depths of the planes in metres, in the order in which rays meet them."""
+        depths, scale = self.settings.hologram.depths, self.settings.scale
+        if isinstance(depths, int):  # planes in the middle of slabs of equal thickness
+            count, middle = max(1, depths // scale), self.distance
             extent = torch.tensor(self.volume.extent, dtype=torch.float64)
             half = (self.rotation.abs()[0] @ (extent / extent.max() * self.width)).item() / 2
-            step = 2 * half / wanted  # the middle of each slab
-            wanted = tuple(scale * (middle - half + (j + 0.5) * step) for j in range(wanted))
-        return tuple(sorted((depth / scale for depth in wanted), reverse=self.settings.view.front == "far"))
+            step = 2 * half / count
+            depths = tuple(scale * (middle - half + (j + 0.5) * step) for j in range(count))
+        return tuple(sorted((depth / scale for depth in depths), reverse=self.settings.view.front == "far"))
 
     @cached_property
     def plans(self) -> list[HologramPlan]:
-        """One per colour."""
+        """The plan of each colour's hologram."""
         hologram = self.settings.hologram
         try:
             return [
                 plan_hologram(
                     self.grid,
-                    wave,
+                    wavelength,
                     self.depths,
                     self.rays.shape,
                     stride=self.stride,
                     tolerance=self.settings.tolerance,
                     cone=hologram.cone,
                 )
-                for wave in self.settings.wavelengths
+                for wavelength in self.settings.wavelengths
             ]
         except ValueError as error:
             raise ConfigError([f"hologram: {error}"]) from error
@@ -120,7 +120,7 @@ class VolumeExperiment:
         return _transfer(self.settings.transfer).to(self.device)
 
     def sampler(self, seed: int = 0) -> DVRSampler:
-        """The renderer with the phases of a realisation."""
+        """The renderer with the random phases of a realisation."""
         generator = torch.Generator().manual_seed(self.settings.seed + seed)
         phases: dict[str, Callable[[Grid], Tensor | PointPhases] | None] = {
             "ray": lambda grid: random_phase(grid, generator=generator),
@@ -140,17 +140,17 @@ class VolumeExperiment:
         )
 
     def hologram(
-        self, seed: int = 0, seen: Callable[[], object] = lambda: None, part: "Part | None" = None
+        self, seed: int = 0, advance: Callable[[], object] = lambda: None, part: "Part | None" = None
     ) -> tuple[Tensor, float]:
         """Holograms [3, H, W] of one realisation, rendered plane by plane into all colours at once.
 
         Args:
-            seed: Which realisation of the phases.
-            seen: Called after every plane.
-            part: Which planes of which colours to add up; all by default.
+            seed: Number of the realisation of the phases.
+            advance: Called after every plane.
+            part: Planes and colours to add up; all by default.
 
         Returns:
-            The fields, and the seconds that rendering took of the whole.
+            The fields, and the seconds spent on rendering.
         """
         layers = self.sampler(seed)(self.volume)
         sums = []
@@ -164,28 +164,28 @@ class VolumeExperiment:
                 for colour, total in enumerate(sums):
                     if part is None or part.takes(colour, j):
                         total.add(j, plane[colour])
-                seen()
+                advance()
                 started = time.perf_counter()
         fields = []
-        while sums:  # one after another: a spectrum's memory is free before the next is transformed
+        while sums:  # one at a time, so that the memory of a spectrum is free before the next is transformed
             fields.append(sums.pop(0).finish().to(self.device))
         return torch.stack(fields), rendering
 
     @property
     def refocus(self) -> list[float] | None:
-        """Depths of the report's pictures, if they are given."""
-        wanted = self.settings.report.refocus
-        return None if wanted is None else [depth / self.settings.scale for depth in wanted]
+        """Depths of the refocused pictures in metres, if they are configured."""
+        depths = self.settings.report.refocus
+        return None if depths is None else [depth / self.settings.scale for depth in depths]
 
 
 @dataclass(frozen=True)
 class Part:
-    """What one of several processes adds up: colours first, then blocks of planes.
+    """The share of one of several processes: colours are divided first, then blocks of planes.
 
     Attributes:
-        rank: Number of the process.
-        count: Of all processes.
-        planes: Of all planes.
+        rank: Index of this process.
+        count: Number of processes.
+        planes: Number of planes.
     """
 
     rank: int
@@ -196,12 +196,12 @@ class Part:
         """Whether this process adds ``plane`` of ``colour``."""
         if self.count <= 3:
             return colour % self.count == self.rank
-        blocks = (self.count - colour + 2) // 3  # processes whose number is this colour's, modulo 3
+        blocks = (self.count - colour + 2) // 3  # processes whose rank modulo 3 is this colour
         return self.rank % 3 == colour and plane * blocks // self.planes == self.rank // 3
 
 
 def build(settings: VolumeSettings) -> VolumeExperiment:
-    """Read the volume. ConfigError for what cannot be read, or has no voxel that can be seen."""
+    """Read the volume. ConfigError for a volume that cannot be read or used."""
     volume, synthetic = _volume(settings.volume)
     try:
         volume.check_finite()
@@ -213,7 +213,7 @@ def build(settings: VolumeSettings) -> VolumeExperiment:
         raise ConfigError([f"transfer.file: {error.filename}: {error.strerror}"]) from error
     if min(experiment.depths) <= 0:
         raise ConfigError(
-            [f"hologram.distance: the volume reaches beyond the hologram, to {min(experiment.depths):g} m"]
+            [f"hologram.distance: the volume extends behind the hologram, to {min(experiment.depths):g} m"]
         )
     return experiment
 
@@ -222,9 +222,9 @@ def _volume(source: VolumeSource) -> tuple[Volume, str]:
     spacing = source.spacing[0] if source.spacing and len(source.spacing) == 1 else source.spacing
     try:
         if source.path:
-            asked = {"spacing": spacing, "shape": source.shape, "dtype": source.dtype, "unit": source.unit}
-            return load_volume(source.path, **asked), ""
-        why = "a phantom was asked for"
+            options = {"spacing": spacing, "shape": source.shape, "dtype": source.dtype, "unit": source.unit}
+            return load_volume(source.path, **options), ""
+        reason = "a phantom was asked for"
         if source.scene:
             name = _CATALOGUE.get(source.scene, source.scene)
             if name in PUBLISHED:
@@ -232,11 +232,11 @@ def _volume(source: VolumeSource) -> tuple[Volume, str]:
                     return fetch_volume(name, source.directory), ""
                 except (OSError, ValueError) as error:
                     cause = " ".join(str(error).split())
-                    why = f"{source.scene} could not be fetched ({cause}); give its file as volume.path=FILE"
+                    reason = f"{source.scene} could not be fetched ({cause}); give its file as volume.path=FILE"
             else:
-                why = f"no checksum of {source.scene} is published; give its file as volume.path=FILE"
+                reason = f"no checksum of {source.scene} is published; give its file as volume.path=FILE"
             if not source.phantom:
-                raise ConfigError([f"volume.scene: {why}, or volume.phantom to stand in for it"])
+                raise ConfigError([f"volume.scene: {reason}, or volume.phantom to stand in for it"])
     except ValueError as error:
         raise ConfigError([f"volume: {error}"]) from error
     except OSError as error:
@@ -248,7 +248,7 @@ def _volume(source: VolumeSource) -> tuple[Volume, str]:
         "gaussian_ball": phantoms.gaussian_ball,
     }
     assert source.phantom is not None
-    return make[source.phantom](source.samples, dtype=torch.uint8), why
+    return make[source.phantom](source.samples, dtype=torch.uint8), reason
 
 
 def _transfer(settings: TransferSettings) -> TransferFunction:

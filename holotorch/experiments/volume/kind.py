@@ -1,4 +1,4 @@
-"""The kind ``volume``: holograms of a volume, realisation after realisation."""
+"""The kind ``volume``: the hologram of a volume."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class VolumeKind(ExperimentKind[VolumeSettings, "VolumeExperiment"]):
-    """See :mod:`holotorch.experiments.kind`."""
+    """The hologram of a volume; see :mod:`holotorch.experiments.kind`."""
 
     settings = VolumeSettings
     example = "configs/volume/tooth.yaml"

@@ -1,4 +1,4 @@
-"""What a volume's run will do, what it will cost and what its physics says, before it starts."""
+"""The plan of a volume's run: methods, cost and physics, before anything is computed."""
 
 import math
 from typing import Any
@@ -8,12 +8,16 @@ import torch
 from holotorch.core.grid import Grid
 from holotorch.experiments.volume.experiment import VolumeExperiment
 from holotorch.optics import diffraction_angle
+from holotorch.optics.light.coherence import depth_of_focus
 from holotorch.scene import DVRSampler
 
-# Seconds per flop of the plan's own measure, and per ray and plane of the renderer, on two CPU cores.
-_FLOP_SECONDS, _RAY_SECONDS = 4.2e-11, 1.5e-8
-_BASE_BYTES, _RAY_BYTES, _SLAB = 500e6, 120, 42
-_COARSE = 64  # rays along each side of a rendering that tells how much is cut off
+# Cost on two CPU cores, as measured.
+_FLOP_SECONDS = 4.2e-11  # seconds per operation of a HologramPlan
+_RAY_SECONDS = 1.5e-8  # seconds of rendering per ray and plane
+_BASE_BYTES = 500e6  # libraries
+_RAY_BYTES = 120  # bytes per ray of the renderer
+_SLAB = 42  # rendered planes that wait to be spread onto the nodes of an axial hologram
+_COARSE = 64  # rays along each side of the rendering that estimates how much light is cut off
 
 
 def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
@@ -23,7 +27,7 @@ def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
     flops = sum(each.flops for each in plans)
     seconds = settings.report.seeds * (_FLOP_SECONDS * flops + _RAY_SECONDS * rays * len(depths))
     samples = [8 * math.prod(each.size) for each in plans]
-    # A sum and a step per colour while planes arrive; in the end a transform of one more. Planes that wait for nodes.
+    # While planes are added, each colour holds a sum and a step; at the end, one more spectrum is transformed.
     slab = 8 * rays * _SLAB * len(plans)
     peak = _BASE_BYTES + 2 * sum(samples) + 1.5 * max(samples) + slab + _RAY_BYTES * rays
     peak += experiment.volume.values.numel() * experiment.volume.values.element_size()
@@ -39,7 +43,7 @@ def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
         "rays": list(experiment.rays.shape),
         "holograms": [
             {
-                "wavelength_nm": wave * 1e9,
+                "wavelength_nm": wavelength * 1e9,
                 "method": each.method,
                 "cone": each.cone,
                 "near": each.near,
@@ -49,7 +53,7 @@ def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
                 "reason": each.reason,
                 "runner_up": each.runner_up,
             }
-            for wave, each in zip(settings.wavelengths, plans, strict=True)
+            for wavelength, each in zip(settings.wavelengths, plans, strict=True)
         ],
         "predicted_seconds": round(seconds, 2),
         "predicted_peak_bytes": round(peak),
@@ -74,28 +78,32 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
         f"Hologram   {grid.shape[0]} x {grid.shape[1]} px of {grid.pitch[1] * 1e6:.4g} um; field of view "
         f"{', '.join(f'{angle:.2f}' for angle in physics['field_of_view_deg'])} deg",
     ]
+    if settings.scale > 1:
+        divided = "pixels, rays, distances, width and a given number of planes"
+        lines.append(f"Scale      1 / {settings.scale} of the configuration: {divided} are divided by {settings.scale}")
     for each in values["holograms"]:
-        where = f", {each['cone']} cone" if each["near"] else ""
+        cone = f", {each['cone']} cone of light" if each["near"] else ""
         lines.append(
-            f"{each['wavelength_nm']:.0f} nm     {each['method']}{where}: {each['reason']}; {each['samples'][0]} "
-            f"samples, error {each['predicted_error']:.1e}; next: {each['runner_up']}"
+            f"{each['wavelength_nm']:.0f} nm     method: {each['method']}{cone} (predicted error "
+            f"{each['predicted_error']:.1e}); {each['runner_up']}"
         )
     lines.append(
         f"Cost       about {values['predicted_seconds']:.2g} s on two idle cores for {settings.report.seeds} "
-        f"realisation(s), {values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak"
+        "realisation(s) of the random phases, without start-up, refocusing and figures; "
+        f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak"
     )
     lines += [f"Note       {note}" for note in values["notes"]]
     return "\n".join(lines)
 
 
 def _physics(experiment: VolumeExperiment) -> dict[str, Any]:
-    grid, waves = experiment.grid, experiment.settings.wavelengths
-    angles = [diffraction_angle(grid, wave)[1] for wave in waves]
+    grid, wavelengths = experiment.grid, experiment.settings.wavelengths
+    angles = [diffraction_angle(grid, wavelength)[1] for wavelength in wavelengths]
     middle = (min(experiment.depths) + max(experiment.depths)) / 2
     return {
         "field_of_view_deg": [2 * math.degrees(angle) for angle in angles],
-        "spot_um": [wave * middle / min(grid.extent) * 1e6 for wave in waves],
-        # Beyond, every pixel sees every source (region III); nearer, a source sees part of the hologram.
+        "spot_um": [wavelength * middle / min(grid.extent) * 1e6 for wavelength in wavelengths],
+        # From this distance on, the light of every source covers the whole hologram (region III).
         "whole_cone_from_mm": [
             (experiment.width + min(grid.extent)) / 2 / math.tan(angle) * 1e3 if angle < math.pi / 2 else 0.0
             for angle in angles
@@ -105,18 +113,26 @@ def _physics(experiment: VolumeExperiment) -> dict[str, Any]:
 
 def _notes(experiment: VolumeExperiment) -> list[str]:
     notes = list(dict.fromkeys(note for each in experiment.plans for note in each.notes))
-    lost = _beyond(experiment)
+    lost = _lost_light(experiment)
     if lost > 0.005:
         notes.append(f"{100 * lost:.1f} % of the volume's light lies beside the rays and is cut off")
+    near, far = min(experiment.depths), max(experiment.depths)
+    half_angle = math.atan(min(experiment.grid.extent) / 2 / near)
+    wavelength = min(experiment.settings.wavelengths)
+    aperture = min(math.sin(half_angle), wavelength / (2 * max(experiment.rays.pitch)))
+    if 0 < far - near < (depth := depth_of_focus(wavelength, aperture)):
+        notes.append(
+            f"the scene is {(far - near) * 1e3:.3g} mm deep and the depth of focus {depth * 1e3:.3g} mm: refocusing "
+            "makes no visible difference; use a deeper scene, a smaller distance, or a wider hologram with finer rays"
+        )
     return notes
 
 
-def _beyond(experiment: VolumeExperiment) -> float:
-    """Part of the volume's light that lies beside the rays, by a coarse rendering of the whole."""
+def _lost_light(experiment: VolumeExperiment) -> float:
+    """Share of the volume's light that lies beside the rays, from a coarse rendering of the whole volume."""
     extent = torch.tensor(experiment.volume.extent, dtype=torch.float64)
     sides = (experiment.rotation.abs() @ extent / extent.max() * experiment.width).tolist()
-    inside = [min(1.0, size / side) for size, side in zip(experiment.rays.extent, sides[1:], strict=True)]
-    if min(inside) == 1:
+    if all(size >= side for size, side in zip(experiment.rays.extent, sides[1:], strict=True)):
         return 0.0
     middle, half, planes = experiment.distance, sides[0] / 2, 24
     coarse = Grid(_COARSE, (sides[1] / _COARSE, sides[2] / _COARSE))
@@ -135,7 +151,7 @@ def _beyond(experiment: VolumeExperiment) -> float:
     if total == 0:
         return 0.0
     y, x = (
-        (place.abs() <= size / 2).to(light)
-        for place, size in zip(coarse.coordinates(light.device), experiment.rays.extent, strict=True)
+        (position.abs() <= size / 2).to(light)
+        for position, size in zip(coarse.coordinates(light.device), experiment.rays.extent, strict=True)
     )
     return 1 - (light * y * x).sum().item() / total

@@ -1,4 +1,4 @@
-"""The part of a report page that shows a volume's run."""
+"""The section of a report page for a volume's run."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,22 +18,21 @@ def volume_section(
     parts = [heading(title, summary["status"])]
     if summary["synthetic"]:
         parts.append(element("p", f"Synthetic volume: {summary['synthetic']}.", "warn"))
-    parts.append('<div class="row">')
-    captions = dict(_FIGURES)
     depths: list[float] = summary["refocused_m"]
-    captions |= {f"focus_{f}": f"Refocused at {depth * 1e3:.4g} mm" for f, depth in enumerate(depths)}
-    for name, caption in captions.items():
-        if source := picture(name):
-            parts.append(figure(source, caption + (", synthetic" if summary["synthetic"] else ""), "picture"))
+    captions = _FIGURES | {f"focus_{f}": f"Refocused at {depth * 1e3:.4g} mm" for f, depth in enumerate(depths)}
+    synthetic = ", synthetic" if summary["synthetic"] else ""
+    sources = {caption: picture(name) for name, caption in captions.items()}
+    parts.append('<div class="row">')
+    parts += [figure(source, caption + synthetic, "picture") for caption, source in sources.items() if source]
     parts.append("</div>")
     if source := picture("depth"):
-        parts.append(figure(source, "Mean depth of what a ray sees", "wide"))
+        parts.append(figure(source, "Mean depth along each ray", "wide"))
     parts.append(_scores(summary, depths))
     parts.append(element("p", _cost(summary)))
     shown = {name.replace("_", " "): value for name, value in plan.items() if name not in ("notes", "holograms")}
     rows = [[name, plain(value)] for name, value in shown.items()]
     rows += [[f"{each['wavelength_nm']:.0f} nm", plain(each)] for each in plan["holograms"]]
-    parts.append("<h2>Plan</h2>" + table(["", ""], rows, head=False))
+    parts += [element("h2", "Plan"), table(["", ""], rows, head=False)]
     return parts + [element("p", note, "warn") for note in plan["notes"]]
 
 
@@ -43,15 +42,13 @@ def _scores(summary: dict[str, Any], depths: list[float]) -> str:
         [f"{depth * 1e3:.4g} mm", *("" if value is None else f"{value:.3f}" for value in errors)]
         for depth, errors in zip(depths, summary["error_of_band_at_depth"], strict=True)
     ]
-    scores = [
-        f"SSIM of the picture in focus to the rendering {summary['ssim_in_focus']:.3f}"
-        if "ssim_in_focus" in summary
-        else "",
-        f"{summary['realisations']} realisation(s) of the phases",
-        "" if summary["speckle_contrast"] is None else f"speckle contrast {summary['speckle_contrast']:.2f}",
-    ]
-    words = "; ".join(score for score in scores if score)
-    return element("p", f"{words}. Relative error of each part of the scene, by focus:") + table(names, rows)
+    scores = [f"{summary['realisations']} realisation(s) of the random phases"]
+    if "ssim_in_focus" in summary:
+        scores.insert(0, f"SSIM between the picture in focus and the rendering {summary['ssim_in_focus']:.3f}")
+    if summary["speckle_contrast"] is not None:
+        scores.append(f"speckle contrast {summary['speckle_contrast']:.2f}")
+    words = f"{'; '.join(scores)}. Relative error of each part of the scene, by focus:"
+    return element("p", words) + table(names, rows)
 
 
 def _cost(summary: dict[str, Any]) -> str:
@@ -59,5 +56,5 @@ def _cost(summary: dict[str, Any]) -> str:
     return (
         f"Holograms took {summary['seconds']:.2f} s, {100 * share:.0f} % of it for rendering, and refocusing them "
         f"{summary['refocus_seconds']:.2f} s. Peak memory {summary['peak_memory_bytes'] / 1e9:.2f} GB. Waves are "
-        "exp(+ikr) / r: the hologram is that of a scene behind it; its conjugate forms a real image in front."
+        "exp(+ikr) / r, so the scene is a virtual image behind the hologram; the conjugate field forms it in front."
     )

@@ -152,6 +152,7 @@ solver: {kind: apg, tolerance: .nan, start: warm}
         ("target.region=[12,0]", "target.region.1: expected greater than or equal to 1, got 0"),
         ("target.regoin=12", "target.regoin: unknown setting; did you mean 'region'?"),
         ("target.depths=band", "target.depths: expected 'bands' or 'full', got 'band'; did you mean 'bands'?"),
+        ("target.depths=FULL", "target.depths: expected 'bands' or 'full', got 'FULL'; did you mean 'full'?"),
         ("propagator={kind: fresnel, distance: [8 mm, 0]}", "distance.1: expected a distance of 1 um or more"),
         ("propagator={kind: fresnel, distance: []}", "propagator.distance: expected"),
         ("modulator.bits=0", "modulator.bits: expected greater than or equal to 1, got 0"),

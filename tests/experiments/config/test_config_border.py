@@ -66,11 +66,11 @@ def mistakes(path: Path, *overrides: str) -> list[str]:
             "propagator={kind: fresnel, distance: 1e308}",
             "propagator.distance: expected a length within -10 m .. 10 m",
         ),
-        (VOLUME, "hologram.depths=[]", "hologram.depths: expected a number of planes, or one distance at least"),
+        (VOLUME, "hologram.depths=[]", "hologram.depths: expected a number of planes, or at least one distance"),
         (
             VOLUME,
             "hologram.distance=360",
-            "hologram.distance: expected a length within -10 m .. 10 m, got 360; 360 looks like millimetres",
+            "expected a length within -10 m .. 10 m, got 360; 360 means metres: did you mean '360 mm'?",
         ),
         (VOLUME, "volume.dtype=cpu", "volume.dtype: expected a type of number, such as uint8, float32"),
         (VOLUME, "volume.dtype=O", "volume.dtype: expected a type of number"),
@@ -79,7 +79,7 @@ def mistakes(path: Path, *overrides: str) -> list[str]:
         (
             EYE,
             "eye.axial_length=24",
-            "eye.axial_length: expected a length within 1 mm .. 200 mm, got 24; 24 looks like millimetres",
+            "eye.axial_length: expected a length within 1 mm .. 200 mm, got 24; 24 means metres: did you mean '24 mm'?",
         ),
     ],
 )

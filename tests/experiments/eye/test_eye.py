@@ -91,14 +91,14 @@ def test_few_wavelengths_are_as_good_as_many():
     found = observer(settings(), scene_settings(settings()))
     hologram, _ = found.scene.hologram(0)
     depth = found.focus[0]
-    few = found.seen(hologram, "led", depth)
+    few = found.image(hologram, "led", depth)
 
     class Dense(eye_module.Observer):
-        def samples(self, source, wave, depth):
-            places, weights = eye_module.PRESETS[source](wave).every(1e-9)
-            return places, weights, len(places)
+        def samples(self, source, wavelength, depth):
+            wavelengths, weights = eye_module.PRESETS[source](wavelength).every(1e-9)
+            return wavelengths, weights, len(wavelengths)
 
-    many = Dense(found.settings, found.scene, found.focus).seen(hologram, "led", depth)
+    many = Dense(found.settings, found.scene, found.focus).image(hologram, "led", depth)
     error = (few - many).square().mean().sqrt() / many.square().mean().sqrt()
     # 1 % expected for the integral; the sum over whole nanometres is itself that far from it.
     assert error < 0.03
@@ -114,7 +114,7 @@ def test_the_eye_sees_sharply_where_it_is_focused():
     layers = torch.zeros(2, 64, 64, dtype=torch.complex64)
     layers[0, 32, 20] = layers[1, 32, 44] = 1.0
     fields = [ConvolutionHologram(grid, wave, (10e-3, 14e-3), cone="taper", stride=2)(layers) for wave in waves]
-    near, far = (found.seen(torch.stack(fields), None, depth)[1] for depth in found.focus)
+    near, far = (found.image(torch.stack(fields), None, depth)[1] for depth in found.focus)
     assert near[32, 20] > 1.5 * far[32, 20] and far[32, 44] > 1.5 * near[32, 44]
     assert found.accommodation(14e-3) < found.accommodation(10e-3)  # nearer to the eyepiece: the image is nearer
 
@@ -123,7 +123,8 @@ def test_the_plan_says_how_the_scene_is_seen():
     found = observer(settings(), scene_settings(settings()))
     values = plan_values(found)
     text = plan_text(found, values)
-    assert "synthetic: a phantom was asked for" in text and "laser: " in text
+    assert "synthetic: a phantom was asked for" in text
+    assert "wavelengths simulated; the others are derived from them" in text and "without start-up and figures" in text
     assert values["accommodation_mm"][0] == pytest.approx(120, rel=1e-6)  # the middle, where the display puts it
     assert main(["check", str(CONFIG), *SMALL]) == 0
 
@@ -137,8 +138,8 @@ def test_the_plan_names_what_it_does_not_count(capsys):
     words = [*TINY, "tolerance=0.1", "tradeoff=[2 mm, 3 mm]", "sweep={steps: 5, realisations: 2}"]
     assert main(["check", str(CONFIG), *words]) == 0
     lines = capsys.readouterr().out.splitlines()[-2:]
-    assert lines[0].startswith("Sweep      5 depths of focus besides, 2 realisation(s) each")
-    assert lines[1] == "Trade-off  at 2, 3 mm besides, all of it by the collapse; its cost is not in the above"
+    assert lines[0].startswith("Sweep      in addition, 5 depths of focus, 2 realisation(s) each")
+    assert lines[1] == "Trade-off  in addition, at 2, 3 mm, by collapsed propagation; the cost above excludes it"
 
 
 @pytest.mark.parametrize(("tolerance", "method"), [(0.05, "collapse"), (0.03, "elements")])
@@ -182,7 +183,7 @@ def test_both_ways_show_the_same_and_the_plan_tells_their_costs():
     given = [load_config(CONFIG, [*TINY, f"tolerance={tolerance}"]) for tolerance in (0.05, 0.03)]
     short, long = (observer(each, scene_settings(each)) for each in given)
     hologram, _ = short.scene.hologram(0)
-    seen = [found.seen(hologram, None, 2e-3) for found in (short, long)]
+    seen = [found.image(hologram, None, 2e-3) for found in (short, long)]
     error = (seen[0] - seen[1]).norm() / seen[1].norm()
     ways = [found.retina(2e-3) for found in (short, long)]
     assert [way.method for way in ways] == ["collapse", "elements"]
@@ -211,7 +212,7 @@ def test_the_teapot_of_the_thesis_is_collapsed():
 
 
 def test_interrupted_runs_keep_what_was_seen(tmp_path, monkeypatch):
-    original = eye_module.Observer.seen
+    original = eye_module.Observer.image
     seen = []
 
     def pressed(self, hologram, source, depth):
@@ -220,7 +221,7 @@ def test_interrupted_runs_keep_what_was_seen(tmp_path, monkeypatch):
             signal.raise_signal(signal.SIGINT)
         return original(self, hologram, source, depth)
 
-    monkeypatch.setattr(eye_module.Observer, "seen", pressed)
+    monkeypatch.setattr(eye_module.Observer, "image", pressed)
     folder, complete = execute(settings("seeds=2"), tmp_path / "a", "a")
     saved = json.loads((folder / "interrupted.json").read_text())
     assert not complete and saved["realisations"] == 1 and not (folder / "summary.json").exists()
@@ -244,7 +245,7 @@ def test_bad_settings_are_named(override, message):
 
 def test_a_scene_that_the_display_cannot_show_is_refused():
     wrong = settings("focus=[40 mm]")  # beyond the eyepiece
-    with pytest.raises(ConfigError, match=r"display: .*; a depth of 40 mm cannot be looked at"):
+    with pytest.raises(ConfigError, match=r"display: .*; the eye cannot focus at a depth of 40 mm"):
         observer(wrong, scene_settings(wrong))
     other = settings("scene={config: configs/demo.yaml}")
     with pytest.raises(ConfigError, match="describes no volume but 'pec'"):

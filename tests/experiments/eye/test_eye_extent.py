@@ -28,9 +28,9 @@ def test_an_extended_laser_has_less_speckle_and_less_detail():
     """2 mrad at 12 mm move the picture by 24 um to every side, two spots of 13 um: of order four cells that add up."""
     small, large = looking(0.0), looking(2e-3)
     hologram, _ = small.scene.hologram(1)
-    reference = torch.stack([small.seen(small.scene.hologram(k)[0], None, 12e-3) for k in range(10, 18)]).mean(0)
+    reference = torch.stack([small.image(small.scene.hologram(k)[0], None, 12e-3) for k in range(10, 18)]).mean(0)
     mask = reference > 0.05 * reference.amax((-2, -1), keepdim=True)
-    point, disc = (eye.seen(hologram, "laser", 12e-3) for eye in (small, large))
+    point, disc = (eye.image(hologram, "laser", 12e-3) for eye in (small, large))
     seen = [speckle_contrast(each, reference=reference, mask=mask) for each in (point, disc)]
     assert (seen[1] < 0.75 * seen[0]).all()
     assert (sharpness(disc, reference) < sharpness(point, reference)).all()

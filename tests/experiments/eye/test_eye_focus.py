@@ -63,13 +63,13 @@ def test_a_run_with_a_sweep_writes_its_table_and_picture(tmp_path, capsys):
 
 
 def test_a_scene_without_a_surface_is_a_mistake_of_the_sweep_before_the_work(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("holotorch.experiments.eye.experiment.Observer.seen", lambda *_: pytest.fail("looked already"))
+    monkeypatch.setattr("holotorch.experiments.eye.experiment.Observer.image", lambda *_: pytest.fail("looked already"))
     small = PHANTOM.replace("256", "64")
     words = [small, "focus=[6 mm]", "sweep={bands: 2, steps: 5, realisations: 1}", "light={sources: [laser]}"]
-    monkeypatch.setattr("holotorch.experiments.eye.focus._SEEN", 1.1)  # which no ray is opaque to
+    monkeypatch.setattr("holotorch.experiments.eye.focus._OPAQUE", 1.1)  # which no ray is opaque to
     assert main(["run", str(CONFIG), *words, "--out", str(tmp_path / "a")]) == 2
     error = capsys.readouterr().err
-    assert "sweep: a sweep needs a surface: 0 of the rays" in error and "leave it out" in error
+    assert "sweep: a sweep needs a surface: only 0 rays" in error and "leave it out" in error
     assert not (tmp_path / "a").exists()
 
 
@@ -90,7 +90,7 @@ def test_without_a_surface_there_is_nothing_to_sweep(monkeypatch):
         def depth_map(self, _):
             return torch.full((16, 16), 6e-3)
 
-    for sampler, why in ((Clear, "a sweep needs a surface: 0 of the rays"), (Wall, "surface lies at 6 mm")):
+    for sampler, why in ((Clear, "a sweep needs a surface: only 0 rays"), (Wall, "surface lies at 6 mm")):
         monkeypatch.setattr(type(eye.scene), "sampler", lambda _, sampler=sampler: sampler())
         with pytest.raises(ValueError, match=why):
             focus_sweep(eye, SweepSettings())

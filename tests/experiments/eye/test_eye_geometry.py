@@ -43,6 +43,7 @@ def test_the_thesis_display_has_the_thesis_numbers():
     assert json.loads(json.dumps(values)) == values
     words = " ".join(in_words(values))
     assert "9.76 deg" in words and "beyond infinity" in words and "centre I, edge II" in words
+    assert "WARNING    the edge of the scene is invisible to this eye; enlarge eye.pupil_radius" in words
 
 
 def test_a_small_scene_far_away_is_in_region_three_and_seen_whole():
@@ -52,6 +53,8 @@ def test_a_small_scene_far_away_is_in_region_three_and_seen_whole():
     assert values["placement_mm"] > 30 and 2 in values["region_of_edge"]
     near, far = values["accommodation_mm"]
     assert near < 220 < far
+    words = " ".join(in_words(values))
+    assert "100 % of the light from the scene's edge enters the pupil" in words and "WARNING" not in words
 
 
 @pytest.mark.parametrize("display", ["magnifying", "planar"])

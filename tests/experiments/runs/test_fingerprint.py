@@ -95,10 +95,10 @@ def edited(folder: Path, key: str, value) -> None:
     [
         ("pec", "seed", 8, "seed was 7 and is 8"),
         ("pec", "modulator.sigma_px", 1.0, "modulator.sigma_px was 0.66 and is 1.0"),
-        ("pec", "target.image", "coffee", "target.image holds another content"),
+        ("pec", "target.image", "coffee", "target.image has other contents"),
         ("pec", "solver.max_steps", 20, "solver.max_steps was 8 and is 20"),
         ("volume", "view.azimuth_deg", 30.0, "view.azimuth_deg was 0.0 and is 30.0"),
-        ("volume", "volume.spacing", [1.0, 1.0, 2.0], "volume holds another content"),
+        ("volume", "volume.spacing", [1.0, 1.0, 2.0], "volume has other contents"),
         ("volume", "report.refocus", [0.003], "report.refocus was null and is [0.003]"),
     ],
 )
@@ -126,7 +126,7 @@ def test_other_contents_of_a_file_are_refused(tiny, tmp_path, capsys, picture, s
     else:
         np.save(own, np.load(own)[::-1])
     assert main(["resume", str(folder)]) == 2
-    assert "holds another content" in capsys.readouterr().err
+    assert "has other contents" in capsys.readouterr().err
     shutil.copy(given, own)
     assert main(["resume", str(folder)]) == 0
 
@@ -193,6 +193,6 @@ def test_large_inputs_are_sampled_from_end_to_end(monkeypatch):
         if row is not None:
             changed[row, 3] = -1
         marks[row] = fingerprint(settings, {"target": (changed,)})
-    assert differences(marks[None], marks[0]) == differences(marks[0], marks[9]) == ["target holds another content"]
+    assert differences(marks[None], marks[0]) == differences(marks[0], marks[9]) == ["target has other contents"]
     assert differences(marks[None], fingerprint(settings, {"target": (values.T.contiguous().T,)})) == []
     assert not any(key.startswith("target.") for key in marks[0]) and marks[0]["modulator.sigma_px"] == 0.66

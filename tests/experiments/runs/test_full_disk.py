@@ -1,4 +1,4 @@
-"""Disks that are full: what was computed stays, what cannot be written is told, and the exit status is truthful."""
+"""Full disks: results stay, files that cannot be written are reported, and the exit status is right."""
 
 import errno
 import json
@@ -114,7 +114,7 @@ def test_a_checkpoint_that_cannot_be_written_is_told_once_and_the_run_goes_on(ki
     (told,) = (line for line in capsys.readouterr().err.splitlines() if "warning" in line)
     assert re.search(
         r"checkpoint.pt cannot be written: No space left on device \(0\.\d+ MB needed, [\d.]+ MB free\); "
-        "there is none before it, and the run goes on$",
+        "there is no previous one, and the run goes on$",
         told,
     )
 
@@ -126,7 +126,8 @@ def test_an_interrupted_run_that_cannot_be_saved_says_so(kind, whole, tmp_path, 
         press(patch, kind)
         assert main(command(kind, folder)) == 1
     error = capsys.readouterr().err
-    assert f"failed; what was computed until then is in {folder}; when the cause is mended" in error
+    hint = f"once the cause is removed, go on with: holotorch resume {folder}"
+    assert f"failed; the results so far are in {folder}; {hint}" in error
     assert f"{folder / 'checkpoint.pt'}: No space left on device" in error and "saved what" not in error
     assert "checkpoint.pt: No space" in json.loads((folder / "interrupted.json").read_text())["failure"]
     assert main(["resume", str(folder)]) == 0

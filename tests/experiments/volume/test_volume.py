@@ -19,8 +19,8 @@ from holotorch.experiments.execute import execute
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.runs import pictures
 from holotorch.experiments.volume import run as volume_run
+from holotorch.experiments.volume.evaluation import pooled
 from holotorch.experiments.volume.experiment import Part, build
-from holotorch.experiments.volume.judge import pooled
 from holotorch.experiments.volume.plan import plan_text, plan_values
 from holotorch.hologram import ConvolutionHologram
 
@@ -84,10 +84,10 @@ def test_more_realisations_have_less_speckle(tmp_path):
 def press_in(monkeypatch, realisation: int | None):
     original = volume_run.VolumeExperiment.hologram
 
-    def pressed(self, seed=0, seen=lambda: None, part=None):
+    def pressed(self, seed=0, advance=lambda: None, part=None):
         if seed == realisation:
             signal.raise_signal(signal.SIGINT)
-        return original(self, seed, seen, part)
+        return original(self, seed, advance, part)
 
     monkeypatch.setattr(volume_run.VolumeExperiment, "hologram", pressed)
 
@@ -151,6 +151,8 @@ def test_the_thesis_scenes_have_its_numbers(name):
     assert small.width == pytest.approx(128 * 3.74e-6) and small.distance == pytest.approx(planes[name][0] / 16e3)
     text = plan_text(small, plan_values(small))
     assert "synthetic: a phantom was asked for" in text and "GB of memory" in text
+    assert "Scale      1 / 16 of the configuration: pixels, rays, distances" in text
+    assert "nm     method: " in text and "without start-up, refocusing and figures" in text
 
 
 def test_a_scene_that_cannot_be_had_is_said(monkeypatch):
@@ -200,13 +202,13 @@ def test_an_empty_volume_is_black(tmp_path):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("hologram.distance=50 um", "hologram.distance: expected the whole volume before the hologram"),
+        ("hologram.distance=50 um", "hologram.distance: expected the whole volume in front of the hologram"),
         ("hologram.distance=-3 mm", "hologram.distance: expected a distance above zero"),
         ("hologram.rays=33", "hologram.rays: expected a number that divides the hologram's sides"),
         ("volume={}", "volume: expected a path, a scene or a phantom"),
         ("volume={path: no/such.nrrd}", "volume.path: expected a file or folder that exists, got 'no/such.nrrd'"),
         ("volume={scene: tooht}", "did you mean 'tooth'"),
-        ("transfer={preset: bone}", "transfer: a preset needs low and high"),
+        ("transfer={preset: bone}", "transfer: a preset needs low < high"),
         ("transfer={}", "transfer: expected one of preset, file or points"),
         ("wavelengths=[520 nm]", "wavelengths: expected 3"),
         ("scale=3", "scale: expected a divisor of the pixels"),
@@ -233,6 +235,15 @@ def test_light_beside_the_rays_is_said(tmp_path):
     (note,) = (note for note in plan_values(wide)["notes"] if "beside the rays" in note)
     assert float(note.split(" %")[0]) == pytest.approx(50, abs=2)
     assert not any("beside" in note for note in plan_values(build(settings(source)))["notes"])
+
+
+def test_a_scene_within_the_depth_of_focus_is_noted():
+    """The rays' pitch of 7.48 um limits the sine to 0.0304 for 455 nm: a depth of focus of 0.49 mm."""
+    shallow = settings("hologram.depths=[2.9 mm, 3.1 mm]", "wavelengths=[636 nm, 520 nm, 455 nm]")
+    (note,) = (note for note in plan_values(build(shallow))["notes"] if "depth of focus" in note)
+    assert note.startswith("the scene is 0.2 mm deep and the depth of focus 0.49") and "wider hologram" in note
+    deep = settings("hologram.depths=[2 mm, 4 mm]")
+    assert not any("depth of focus" in note for note in plan_values(build(deep))["notes"])
 
 
 def test_cells_around_rays_do_not_wrap():
