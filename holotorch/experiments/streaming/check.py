@@ -1,4 +1,4 @@
-"""``holotorch stream --check``: does streaming work on this computer, and where to send to?"""
+"""``holotorch stream --check``: a test of streaming on this computer, and its address for senders."""
 
 import asyncio
 import importlib.util
@@ -14,12 +14,15 @@ from holotorch.tracking.pose.status import Pose, Status
 from holotorch.tracking.streaming.packet import now
 from holotorch.tracking.streaming.stream import PORT, PoseReceiver, PoseSender
 
-_EVERY = 50  # one packet in so many is a refusal
-_FAST = 1e-3  # seconds, the median transit on the loopback
+_EVERY = 50  # packets per refusal
+_FAST = 1e-3  # seconds: largest accepted median transit on the loopback
 
 
 def check(port: int = PORT, *, packets: int = 1000, show: Callable[[str], None] = print) -> bool:
-    """Send ``packets`` over the loopback to two receivers and through a lossy relay to a third; print and judge."""
+    """Send ``packets`` over the loopback to two receivers and through a lossy relay to a third.
+
+    Prints the results by ``show``, and returns whether all of them are good.
+    """
     sound = True
     for fine, text in asyncio.run(_rows(port, packets)):
         sound &= fine
@@ -73,28 +76,30 @@ async def _send(sender: PoseSender, packets: int) -> None:
 
 
 def _direct(name: str, receiver: PoseReceiver, packets: int) -> Iterator[tuple[bool, str]]:
-    found = receiver.statistics
-    whole = found.received == packets and not (found.lost or found.reordered or found.duplicated or found.invalid)
+    statistics = receiver.statistics
+    whole = statistics.received == packets and not (
+        statistics.lost or statistics.reordered or statistics.duplicated or statistics.invalid
+    )
     advice = "" if whole else "; look at the firewall's rules for the loopback, and at how busy this computer is"
-    yield whole, f"{name}: {found.received} of {packets} packets, {found.refused} refusals{advice}"
-    times = found.latency()
+    yield whole, f"{name}: {statistics.received} of {packets} packets, {statistics.refused} refusals{advice}"
+    times = statistics.latency()
     fast = times["transit_median"] < _FAST
     advice = "" if fast else f"; above {_FAST * 1e3:g} ms: close what keeps this computer busy, and try again"
     text = f"median {times['transit_median'] * 1e3:.3f} ms, p95 {times['transit_p95'] * 1e3:.3f} ms"
-    yield fast, f"{name}: added latency {text}, jitter {found.jitter * 1e3:.3f} ms{advice}"
-    if found.offset is None or found.round_trip is None:
+    yield fast, f"{name}: added latency {text}, jitter {statistics.jitter * 1e3:.3f} ms{advice}"
+    if statistics.offset is None or statistics.round_trip is None:
         yield False, f"{name}: clock request not answered; packets reach it, but none get back to the sender"
     else:
-        offset, bound = found.offset * 1e3, found.round_trip * 5e2
+        offset, bound = statistics.offset * 1e3, statistics.round_trip * 5e2
         yield True, f"{name}: clock offset {offset:+.3f} ms, within {bound:.3f} ms"
 
 
 def _lossy(receiver: PoseReceiver, relay: "Relay") -> tuple[bool, str]:
-    found = receiver.statistics
+    statistics = receiver.statistics
     text = (
         f"lossy way: of {relay.came} packets {relay.dropped} lost, {relay.overtaken} reordered, {relay.repeated} twice"
     )
-    got = (found.received, found.reordered, found.duplicated)
+    got = (statistics.received, statistics.reordered, statistics.duplicated)
     wanted = (relay.came - relay.dropped, relay.overtaken, relay.repeated)
     newest = receiver.packet is not None and receiver.packet.sequence == relay.newest
     if got == wanted and newest:
@@ -103,11 +108,11 @@ def _lossy(receiver: PoseReceiver, relay: "Relay") -> tuple[bool, str]:
 
 
 class Relay(asyncio.DatagramProtocol):
-    """A bad network: of all packets 20 % are lost, 10 % overtaken by up to three later ones, 2 % come twice.
+    """A simulated bad network: it loses 20 % of the packets, reorders 10 % by up to three, and repeats 2 %.
 
     Attributes:
-        came, dropped, overtaken, repeated: Counts. ``overtaken`` has those that a later packet got ahead of.
-        newest: Highest number, in the order of coming, that was let through.
+        came, dropped, overtaken, repeated: Numbers of packets; ``overtaken`` ones were sent on after a later packet.
+        newest: Largest number, in the order of arrival, of a packet that was sent on.
     """
 
     def __init__(self, port: int, seed: int = 7):
@@ -131,7 +136,7 @@ class Relay(asyncio.DatagramProtocol):
         self._transport = transport
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
-        """Called by asyncio; the receiver's clock requests are lost, too."""
+        """Called by asyncio; clock requests of the receiver are dropped."""
         if addr[1] == self._to[1]:
             return
         number, self.came = self.came, self.came + 1
@@ -148,7 +153,7 @@ class Relay(asyncio.DatagramProtocol):
         self.release(number)
 
     def release(self, upto: int | None = None) -> None:
-        """Let held packets go that are due at the packet ``upto``; all of them without a number."""
+        """Send on the held packets that are due at packet ``upto``, or all of them."""
         for item in list(self._held):
             if upto is None or item[0] <= upto:
                 self._held.remove(item)

@@ -1,4 +1,4 @@
-"""What ``holotorch stream`` does: send recorded or tracked poses, and show what arrives."""
+"""``holotorch stream``: sends recorded or tracked poses, and prints statistics of received ones."""
 
 import asyncio
 import csv
@@ -24,12 +24,12 @@ _COLUMNS = ("time_s", "status", "reason", *_PLACE, *_SPREAD, "chi_square", "free
 
 
 class Streamed(NamedTuple):
-    """What became of a stream.
+    """Result of a stream.
 
     Attributes:
-        frames: Poses and refusals that were handed on.
-        complete: Whether it came to its end; False where the user ended it.
-        delivered: False where every packet to every receiver met an error, and no OpenIGTLink was served.
+        frames: Number of poses and refusals sent.
+        complete: Whether all poses were sent; False where the user interrupted.
+        delivered: False where every packet to every receiver failed, and there was no OpenIGTLink server.
     """
 
     frames: int
@@ -38,9 +38,9 @@ class Streamed(NamedTuple):
 
 
 def read_poses(path: Path) -> list[tuple[float, Pose]]:
-    """Capture times and poses of a poses.csv of ``holotorch track``; of its columns those that a packet has.
+    """Capture times and poses from a poses.csv of ``holotorch track``.
 
-    The table has no covariance of the direction. It becomes 1 along each axis: a unit vector that is not known at all.
+    The table has no covariance of the direction. A variance of 1 along each axis stands for an unknown unit vector.
 
     Raises:
         ConfigError: Not such a file, a line that cannot be read or sent, or times that do not rise.
@@ -50,21 +50,21 @@ def read_poses(path: Path) -> list[tuple[float, Pose]]:
             table = csv.DictReader(stream)
             if missing := [name for name in _COLUMNS if name not in (table.fieldnames or ())]:
                 raise ConfigError([f"{path}: not a table of poses, columns {', '.join(missing[:4])} ... are missing"])
-            found: list[tuple[float, Pose]] = []
+            poses: list[tuple[float, Pose]] = []
             for row in table:
                 try:
-                    found.append(_pose(row))
+                    poses.append(_pose(row))
                 except (KeyError, TypeError, ValueError) as error:
                     raise ConfigError([f"{path}:{table.line_num}: cannot be read as a pose: {error}"]) from None
-                if len(found) > 1 and found[-1][0] <= found[-2][0]:
+                if len(poses) > 1 and poses[-1][0] <= poses[-2][0]:
                     raise ConfigError([f"{path}:{table.line_num}: time_s must rise from line to line"])
     except (UnicodeDecodeError, csv.Error):
         raise ConfigError([f"{path}: no poses.csv as holotorch track writes it: not a text file"]) from None
     except OSError as error:
         raise ConfigError([f"{path}: {error.strerror or error}"]) from None
-    if not found:
+    if not poses:
         raise ConfigError([f"{path}: no poses in it"])
-    return found
+    return poses
 
 
 def _pose(row: dict[str, str]) -> tuple[float, Pose]:
@@ -82,7 +82,7 @@ def _pose(row: dict[str, str]) -> tuple[float, Pose]:
     covariance[upper[0], upper[1]] = covariance[upper[1], upper[0]] = values[6:]
     chi, freedom = torch.tensor([float(row[name]) for name in _COLUMNS[-2:]], dtype=torch.float64)
     pose = Pose(values[:3], values[3:6], covariance, chi, freedom, status, reason)
-    encode(PosePacket(pose, 0.0, 0.0, 0))  # what cannot be sent is said now, with its line
+    encode(PosePacket(pose, 0.0, 0.0, 0))  # raises for a pose that cannot be sent, so that the error names its line
     return captured, pose
 
 
@@ -108,11 +108,11 @@ def stream(
     Args:
         sources: One poses.csv, or what ``track`` understands: videos, folders, a camera's index.
         to: Receivers, each ``HOST`` or ``HOST:PORT``.
-        igtl: Port for OpenIGTLink, where Slicer connects; None for no such server.
+        igtl: Port of an OpenIGTLink server, to which Slicer connects; None for no server.
         rate: Poses per second of a poses.csv, instead of the recorded pace.
-        smooth: Pass them through :class:`OneEuro`; packets then tell the lag.
-        track: From sources to capture times (by ``packet.now``) and poses, one after the other as frames come. One with
-            a time that is still to come is sent then.
+        smooth: Whether to smooth the poses by :class:`OneEuro`; the packets then state its lag.
+        track: Yields capture times (by ``packet.now``) and poses for the sources, as frames arrive. A pose with a
+            future time is sent at that time.
         show: Takes the lines to print.
 
     Raises:
@@ -226,21 +226,21 @@ def _line(receiver: PoseReceiver) -> str:
 
 def statistics_text(receiver: PoseReceiver) -> list[str]:
     """A receiver's statistics in a few lines."""
-    found = receiver.statistics
-    if not found.received:
-        text = f"Received   nothing; {found.invalid} unreadable packets {found.last_error}".rstrip()
-        return [f"{text}; {found.future} captured in the future" if found.future else text]
-    ms = {name: value * 1e3 for name, value in found.latency().items()}
+    counts = receiver.statistics
+    if not counts.received:
+        text = f"Received   nothing; {counts.invalid} unreadable packets {counts.last_error}".rstrip()
+        return [f"{text}; {counts.future} captured in the future" if counts.future else text]
+    ms = {name: value * 1e3 for name, value in counts.latency().items()}
     clock = "not measured: transit counted from the fastest packet"
-    if found.offset is not None and found.round_trip is not None:
-        clock = f"sender's is {found.offset * 1e3:+.3f} ms ahead, within {found.round_trip * 5e2:.3f} ms"
+    if counts.offset is not None and counts.round_trip is not None:
+        clock = f"sender's is {counts.offset * 1e3:+.3f} ms ahead, within {counts.round_trip * 5e2:.3f} ms"
     return [
-        f"Received   {found.received}, lost {found.lost}, reordered {found.reordered}, repeated {found.duplicated}",
-        f"Of these   refused {found.refused}, late {found.late}",
-        f"Not used   unreadable {found.invalid}, foreign {found.foreign}, captured in the future {found.future}, "
-        f"not continuing the stream {found.jumped}",
+        f"Received   {counts.received}, lost {counts.lost}, reordered {counts.reordered}, repeated {counts.duplicated}",
+        f"Of these   refused {counts.refused}, late {counts.late}",
+        f"Not used   unreadable {counts.invalid}, foreign {counts.foreign}, captured in the future {counts.future}, "
+        f"not continuing the stream {counts.jumped}",
         f"Transit    median {ms['transit_median']:.2f} ms, p95 {ms['transit_p95']:.2f} ms, "
-        f"jitter {found.jitter * 1e3:.3f} ms",
+        f"jitter {counts.jitter * 1e3:.3f} ms",
         f"Latency    median {ms['latency_median']:.2f} ms, p95 {ms['latency_p95']:.2f} ms since capture",
         f"Clock      {clock}",
     ]

@@ -1,4 +1,4 @@
-"""What catheter trackers are held to, on synthetic frames: each part streams over its frames and returns rows."""
+"""Measurements of catheter trackers on synthetic frames: each part streams over its frames and returns rows."""
 
 import math
 import statistics
@@ -19,7 +19,7 @@ from holotorch.tracking.simulation.world import World
 
 Row = dict[str, Any]
 
-# Distance in mm and tilt in degrees: what S_RMS may be in mm, or where efficiency is asked for.
+# Goals of S_RMS in mm for poses by distance in mm and tilt in degrees; None for poses whose efficiency is measured.
 STILL: dict[tuple[int, int], float | None] = {
     (450, 20): 0.05,
     (520, 5): 0.12,
@@ -28,8 +28,8 @@ STILL: dict[tuple[int, int], float | None] = {
     (520, 0): None,
     (520, 20): None,
 }
-# Which point lies at that distance, in metres from the tip; tilt brings the bands nearer to the camera than the tip. A
-# pose is told by its tip, so that is how the goals are read; the second moves S_RMS by a half at 450 and 700 mm.
+# Point of the catheter at that distance, in metres from the tip; None for the middle of the bands. The goals refer to
+# the tip. Tilt brings the bands nearer to the camera than the tip, so that the choice changes S_RMS by up to a half.
 TIP, MIDDLE = "tip", "middle of the bands"
 POINTS: dict[str, float | None] = {TIP: 0.0, MIDDLE: None}
 _CODECS: dict[str, dict[str, Any]] = {
@@ -45,8 +45,8 @@ _LIGHTS: dict[str, dict[str, Any]] = {
     "half of it": {"gain": 0.5},
     "a quarter of it": {"gain": 0.25},
 }
-_PLACES = 5  # less than a pixel apart
-# What a refusal may say of scenes that cannot be answered, by what their names begin with.
+_PLACES = 5  # positions of a catheter at rest, less than a pixel apart
+# Fitting reasons for the refusal of unanswerable scenes, by the beginnings of their names.
 _UNSEEN = frozenset({Status.NO_CATHETER, Status.BANDS_MISSING, Status.NO_AXIS})
 _SAYS: dict[str, frozenset[Status]] = {
     "motion across": _UNSEEN | {Status.TOO_NARROW, Status.EDGES_UNCLEAR, Status.INCONSISTENT},
@@ -60,13 +60,13 @@ _SAYS: dict[str, frozenset[Status]] = {
 
 
 def still(world: World, trackers: dict[str, Method], count: int) -> tuple[list[Row], list[Answer]]:
-    """Catheters at rest, ``count`` frames at each pose of ``STILL``: stability, bias, coverage, efficiency.
+    """Stability, bias, coverage and efficiency for catheters at rest, ``count`` frames at each pose of ``STILL``.
 
-    With the tip at that distance, and once more with the middle of the bands there, which is what the frame's middle
-    shows both times.
+    Each pose is measured twice: with the tip at the given distance, and with the middle of the bands at that distance.
+    The middle of the bands appears at the centre of the frame in both cases.
 
-    Each pose is measured at five places less than a pixel apart, and spreads are the root of their mean square: where
-    edges fall between pixels moves the spread at one place by a tenth and more.
+    Each pose is measured at five positions less than a pixel apart. The spread of a pose is the root mean square over
+    these positions, since the spread at one position depends on where edges fall between pixels, by 10 % or more.
     """
     rows, said = [], []
     pixel = 1 / float(world.camera.matrix[0, 0])
@@ -106,7 +106,7 @@ def still(world: World, trackers: dict[str, Method], count: int) -> tuple[list[R
 
 
 def grids(world: World, trackers: dict[str, Method], share: float = 1.0) -> tuple[list[Row], list[Answer]]:
-    """Tips over the sheet and the three faces of Sec. 3.5.2 and 3.5.3: absolute, after a rigid fit, and Acc."""
+    """Errors over the sheet of Sec. 3.5.2 and the faces of Sec. 3.5.3: absolute, after a rigid fit, and Acc."""
     parts = {"2D": world.grid_2d()} | {f"3D {face}": cases for face, cases in world.grid_3d().items()}
     every = max(1, round(1 / share))
     said = {part: list(answers(cases[::every], trackers, f"grid {part}")) for part, cases in parts.items()}
@@ -116,13 +116,13 @@ def grids(world: World, trackers: dict[str, Method], share: float = 1.0) -> tupl
         faces = [_grid_row(part, name, answers_) for part, answers_ in own.items()]
         whole = _grid_row("3D", name, [answer for part, found in own.items() if part != "2D" for answer in found])
         seen = [row["acc_mm"] for row in faces[1:] if row["acc_mm"] != ""]
-        whole["acc_mm"] = round(sum(seen) / len(seen), 4) if seen else ""  # the thesis's is the mean of its faces, too
+        whole["acc_mm"] = round(sum(seen) / len(seen), 4) if seen else ""  # the mean over the faces, as in the thesis
         rows += [*faces, whole]
     return rows, [answer for found in said.values() for answer in found]
 
 
 def codecs(world: World, trackers: dict[str, Method], share: float = 1.0) -> tuple[list[Row], list[Answer]]:
-    """Every fourth tip of the sheet, with all colours and through codecs that keep fewer of them."""
+    """Errors over every fourth point of the sheet, for frames without compression and with several codecs."""
     every = max(1, round(4 / share))
     rows, said = [], []
     for codec, changes in _CODECS.items():
@@ -137,7 +137,7 @@ def codecs(world: World, trackers: dict[str, Method], share: float = 1.0) -> tup
 
 
 def lights(world: World, tracker: Method, count: int, share: float = 1.0) -> list[Row]:
-    """What light is worth: S_RMS of a catheter at rest, ``count`` frames a pose, and every second tip of the sheet."""
+    """Influence of light on S_RMS (``count`` frames per pose) and on errors over every second point of the sheet."""
     rows = []
     for light, changes in _LIGHTS.items():
         lit = replace(world, look=replace(world.look, **changes))
@@ -157,9 +157,14 @@ def lights(world: World, tracker: Method, count: int, share: float = 1.0) -> lis
 def scenes(
     world: World, trackers: dict[str, Method], count: int, kind: str, share: float = 1.0
 ) -> tuple[list[Row], list[Answer]]:
-    """``kind`` "conditions" (from as many seeds) or "occlusions" (at as many poses), a row for each name and method.
+    """Outcomes of difficult scenes, one row for each scene and method.
 
-    Each seed has three of the world's photographs behind the catheter.
+    Args:
+        world: World of the scenes; each seed of the conditions uses three of its photographs.
+        trackers: Methods by name.
+        count: Number of seeds of conditions, or of poses of occlusions.
+        kind: "conditions" or "occlusions".
+        share: Share of the cases that is measured.
     """
     if kind == "conditions":
         worlds = [_seeded(world, i) for i in range(count)]
@@ -187,7 +192,7 @@ def scenes(
                 "reason_fits": fitting,
                 "median_error_mm": _mm(errors[len(errors) // 2]) if errors else "",
                 "worst_error_mm": _mm(errors[-1]) if errors else "",
-                "statuses": told(answer.status for answer in own),
+                "statuses": count_statuses(answer.status for answer in own),
                 "reason": next((answer.reason for answer in refused), ""),
             }
         )
@@ -195,24 +200,24 @@ def scenes(
 
 
 def empty(world: World, trackers: dict[str, Method], count: int) -> tuple[list[Row], list[Answer]]:
-    """``count`` frames without the catheter, a row for each kind and method, with the names of those answered."""
+    """Outcomes of ``count`` frames without the catheter, one row for each kind and method, with the false poses."""
     found = list(answers(negatives(world, count), trackers, "negatives"))
     rows = []
     for (kind, method), own in _by(found, lambda answer: (_kind(answer.name), answer.method)).items():
         false = [answer.name.split(",")[0].split()[-1] for answer in own if answer.answered]
         row: Row = {"kind": kind, "method": method, "frames": len(own), "false": len(false)}
-        row["statuses"] = told(answer.status for answer in own)
+        row["statuses"] = count_statuses(answer.status for answer in own)
         rows.append(row | {"seed": world.seed, "numbers_of_false": " ".join(false)})
     return rows, found
 
 
 def one(rows: list[Row], **wanted: Any) -> Row:
-    """The first row with these values."""
+    """The first row that has these values."""
     return next(row for row in rows if all(row[key] == value for key, value in wanted.items()))
 
 
 def covered(own: Sequence[Answer]) -> float | str:
-    """Share of answers whose 95 % ellipsoid holds the truth; "" without any."""
+    """Share of poses whose 95 % ellipsoid contains the true tip; "" without any pose."""
     seen = [answer for answer in own if answer.answered and answer.truth is not None]
     if not seen:
         return ""
@@ -220,8 +225,8 @@ def covered(own: Sequence[Answer]) -> float | str:
     return round(protocols.coverage(tips_of(seen), covariance, truth_of(seen))[0], 3)
 
 
-def told(statuses: Iterable[Status]) -> str:
-    """Statuses and how often, the most frequent first."""
+def count_statuses(statuses: Iterable[Status]) -> str:
+    """Statuses with their numbers of frames, the most frequent one first."""
     return ", ".join(f"{status.name} {times}" for status, times in Counter(statuses).most_common())
 
 
@@ -235,7 +240,7 @@ def _grid_row(part: str, name: str, own: list[Answer]) -> Row:
     known = tips.isfinite().all(-1).nonzero()[:, 0].tolist()
     right, down, _ = torch.eye(3, dtype=torch.float64)
     if len(known) >= 3:
-        # The point in the middle, or the nearest to it that was answered, is the one that all others refer to.
+        # The reference is the point with a pose that is nearest to the middle of the grid.
         reference = min(known, key=lambda i: abs(i - len(own) // 2))
         seen = protocols.grid_accuracy(tips, truth, reference, truth)
         row |= dict(zip(("median_mm", "p95_mm", "worst_mm"), map(_mm, seen.absolute), strict=True))
@@ -253,13 +258,13 @@ def _by(found: Iterable[Answer], key: Callable[[Answer], Any]) -> dict[Any, list
 
 
 def _seeded(world: World, i: int) -> World:
-    """The same with another seed and the next three photographs."""
+    """The same world with another seed and the next three photographs."""
     images = [world.photographs[(3 * i + k) % len(world.photographs)] for k in range(min(3, len(world.photographs)))]
     return replace(world, photographs=tuple(images), seed=world.seed + i)
 
 
 def _plain(name: str) -> str:
-    """A scene's name without the number of its pose; of photographs, which are many, one name."""
+    """Name of a scene without the number of its pose; all photographs have the same name."""
     return "photograph" if name.startswith("photograph") else name.split(",")[0]
 
 
@@ -268,7 +273,7 @@ def _kind(name: str) -> str:
 
 
 def _error(values: list[float]) -> float:
-    """Standard error of the root mean square of a few values; NaN of one."""
+    """Standard error of the root mean square of a few values; NaN for a single value."""
     squares = [value * value for value in values]
     if len(values) < 2:
         return math.nan

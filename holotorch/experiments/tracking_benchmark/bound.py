@@ -1,4 +1,4 @@
-"""How well a tip can be told from a frame at all: Cramér-Rao bounds of the bands' pixels, and of their edges alone."""
+"""Cramér-Rao bounds on the tip of a catheter in one frame, from all pixels of the bands and from their edges alone."""
 
 import math
 from dataclasses import replace
@@ -12,18 +12,18 @@ from holotorch.tracking.pose.catheter import Catheter
 from holotorch.tracking.simulation.render import render
 from holotorch.tracking.simulation.world import World
 
-_STEP = 0.15  # pixels, to either side: the slope of a blurred edge then comes out 0.6 % low
-_MARGIN = 10.0  # pixels around the bands; the rest of the tube is not asked
-_DITHER = 0.6  # levels of noise, so that rounded frames have the mean of frames that are not
+_STEP = 0.15  # pixels: step of the central differences; derivatives of a blurred edge are 0.6 % too small
+_MARGIN = 10.0  # pixels: distance from the bands up to which pixels count
+_DITHER = 0.6  # levels: noise of rendered frames, which makes the mean of rounded frames unbiased
 
 
 class Bounds(NamedTuple):
-    """Least covariances [3, 3] in m^2 that an unbiased estimate of the tip from one synthetic frame can have.
+    """Smallest covariances [3, 3] in m^2 of an unbiased estimate of the tip from one synthetic frame.
 
     Attributes:
-        pixels: Of all that the pixels tell; who knows the light can tell a slant from how the tube shines.
-        edges: Of where the bands' edges lie along the tube, and the tube across it: what trackers look at. The light
-            to both sides is known; who must find it, too, stays some per cent above.
+        pixels: Bound from all pixels. It includes the shading, from which the slant follows if the light is known.
+        edges: Bound from the positions of the band edges along the tube and of the tube across it, which trackers use.
+            The light on both sides of an edge is taken as known; estimating it costs a few per cent.
     """
 
     pixels: Tensor
@@ -31,19 +31,19 @@ class Bounds(NamedTuple):
 
 
 def tip_bounds(world: World, pose: tuple[Tensor, Tensor], frames: int = 2) -> Bounds:
-    """How well one frame can tell a tip: by all its pixels, and by the edges of the bands alone.
+    """Cramér-Rao bounds on the tip in one frame.
 
-    Known are camera, colours, light and background; unknown the pose's five numbers, the radius and the blur. What
-    counts are the pixels within 10 px of the bands: an end of the tube that happens to be in view does not. Noise is
-    that of the world's look, and rounding.
+    Camera, colours, light and background are known. The five parameters of the pose, the radius and the blur are
+    unknown. Only pixels within 10 px of the bands count, so that a visible end of the tube does not contribute. The
+    noise is that of the world's look, plus rounding.
 
     Args:
-        world: Camera, catheter and look; on its desk.
+        world: World with camera, catheter and look; the background is its desk.
         pose: Tip and direction, [3] each.
-        frames: Renderings that are averaged for each side of each slope, twice: the information is made of products
-            of two slopes with independent noise, which have no bias.
+        frames: Number of renderings that are averaged for each side of a difference. Each derivative is computed twice
+            with independent noise, so that their product is an unbiased estimate of the information.
 
-    Source: information matrix of white Gaussian noise, with slopes from rendered frames, e.g. Kay (1993) Sec. 3.9.
+    Source: Fisher information for white Gaussian noise, e.g. Kay (1993) Sec. 3.9, with derivatives of rendered frames.
     """
     catheter, corner, size = world.catheter, *_window(world, pose)
     shift = torch.zeros(3, 3, dtype=torch.float64)
@@ -53,18 +53,18 @@ def tip_bounds(world: World, pose: tuple[Tensor, Tensor], frames: int = 2) -> Bo
     look = replace(world.look, background=background, noise_dn=_DITHER, jpeg_quality=None)
     near = _near(camera, catheter, pose, size)
     axes = _axes(*pose)
-    # Steps that move the bands' ends and middle by a pixel each: in them the information is far from singular.
+    # In steps that move the ends and the middle of the bands by one pixel, the information is well conditioned.
     slopes = torch.linalg.inv(_image_slopes(camera, catheter, pose, axes))
     generator = torch.Generator().manual_seed(world.seed)
     zero, count = torch.zeros(5, dtype=torch.float64), len(catheter.edges)
     still = torch.zeros(count, dtype=torch.float64)
 
-    def mean(way: int, moved: Tensor, painted: Tensor, radius: float, blur: float) -> Tensor:
-        """Levels of the bands' pixels, averaged over noise; ``way`` is 1 or -1, edges are ``painted`` metres aside."""
-        tip, direction = pose[0] + way * moved[:3], pose[1] + way * axes @ moved[3:]
-        edges = tuple((catheter.positions + way * painted).tolist())
-        tool = replace(catheter, edges=edges, radius=catheter.radius * (1 + way * radius))
-        seen = replace(look, blur_px=look.blur_px + way * blur)
+    def mean(sign: int, moved: Tensor, painted: Tensor, radius: float, blur: float) -> Tensor:
+        """Mean levels of the bands' pixels after a step of sign ``sign``; ``painted`` [N] moves edges, in metres."""
+        tip, direction = pose[0] + sign * moved[:3], pose[1] + sign * axes @ moved[3:]
+        edges = tuple((catheter.positions + sign * painted).tolist())
+        tool = replace(catheter, edges=edges, radius=catheter.radius * (1 + sign * radius))
+        seen = replace(look, blur_px=look.blur_px + sign * blur)
         total = torch.zeros(int(near.sum()) * 3, dtype=torch.float64)
         for _ in range(frames):
             frame = render(tool, camera, tip, direction / direction.norm(), size, seen, generator=generator)
@@ -84,7 +84,7 @@ def tip_bounds(world: World, pose: tuple[Tensor, Tensor], frames: int = 2) -> Bo
     information = (product + product.T) / 2
     moves = _STEP * slopes[:3]
     whole = torch.linalg.inv(information[:7, :7])[:5, :5]
-    # Of edges along and ends across, in steps; then of the pose that moves them so.
+    # Covariance of the edges along and the ends across, in steps; then of the pose that moves them.
     some = torch.linalg.inv(information[3:, 3:])
     seen = torch.cat([torch.arange(4, 4 + count), torch.arange(2)])
     lever = torch.zeros(count + 2, 5, dtype=torch.float64)
@@ -106,14 +106,14 @@ def _marks(camera: Camera, catheter: Catheter, tip: Tensor, direction: Tensor) -
 
 
 def _axes(tip: Tensor, direction: Tensor) -> Tensor:
-    """[3, 2]: two directions at right angles to the tool, the first across the view."""
+    """[3, 2] two directions perpendicular to the tool, the first also perpendicular to the ray to the tip."""
     across = torch.linalg.cross(tip, direction)
     across = across / across.norm()
     return torch.stack([across, torch.linalg.cross(direction, across)], -1)
 
 
 def _image_slopes(camera: Camera, catheter: Catheter, pose: tuple[Tensor, Tensor], axes: Tensor) -> Tensor:
-    """[5, 5]: places of both ends (along, across) and the middle (along) in pixels, by tip in metres and two turns."""
+    """[5, 5] derivatives of the image: both ends (along, across) and middle (along), by the tip and two rotations."""
     marks = _marks(camera, catheter, *pose)
     along = (marks[2] - marks[0]) / (marks[2] - marks[0]).norm()
     across = torch.stack([-along[1], along[0]])
@@ -131,7 +131,7 @@ def _image_slopes(camera: Camera, catheter: Catheter, pose: tuple[Tensor, Tensor
 def _edge_slopes(
     camera: Camera, catheter: Catheter, pose: tuple[Tensor, Tensor], axes: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """[N, 5] how the edges move along the image in pixels, as :func:`_image_slopes`, and [N] per metre on the tube."""
+    """Derivatives of the edges along the image: [N, 5] as :func:`_image_slopes`, [N] by positions on the tube."""
     first, _, last = _marks(camera, catheter, *pose)
     along = (last - first) / (last - first).norm()
 
@@ -149,7 +149,7 @@ def _window(world: World, pose: tuple[Tensor, Tensor]) -> tuple[tuple[int, int],
     """Corner (x, y) and size (h, w) of the part of the frame that holds the bands."""
     marks = _marks(world.camera, world.catheter, *pose)
     limits = torch.tensor(world.size[::-1], dtype=torch.float64) - 1
-    if not bool(((marks >= 0) & (marks <= limits)).all()):  # NaN is not
+    if not bool(((marks >= 0) & (marks <= limits)).all()):  # also false for NaN
         raise ValueError("the bands must lie within the frame")
     low = [max(math.floor(float(value)) - 30, 0) for value in marks.amin(0)]
     high = [
@@ -167,5 +167,5 @@ def _near(camera: Camera, catheter: Catheter, pose: tuple[Tensor, Tensor], size:
     t = offset @ along
     u = offset[..., 1] * along[0] - offset[..., 0] * along[1]
     half = catheter.radius * float(camera.matrix[0, 0]) / float(_middle(catheter, pose)[2])
-    # The lens bends the line by less than the margin.
+    # The distortion of the lens bends the line by less than the margin.
     return (t > -_MARGIN) & (t < (last - first).norm() + _MARGIN) & (u.abs() < 1.3 * half + _MARGIN)

@@ -1,7 +1,8 @@
-"""Catheter trackers on synthetic frames: error against time, precision against its bound, and what they refuse."""
+"""Chart of catheter trackers on synthetic frames: error against time, precision against its bound, refusals."""
 
 import math
 import os
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -35,31 +36,37 @@ from holotorch.tracking.simulation.world import World
 
 
 class Amount(NamedTuple):
-    """How much is measured: frames of each catheter at rest, seeds of conditions, poses of occlusions, negatives.
+    """Numbers of frames that are measured."""
 
-    ``share`` of grids, conditions, occlusions and of the frames among which the slowest is sought.
-    """
-
-    still: int = 1000
-    seeds: int = 2
-    poses: int = 4
-    negatives: int = 1000
-    rounds: int = 15
-    share: float = 1.0
+    still: int = 1000  # frames of each catheter at rest
+    seeds: int = 2  # seeds of the conditions
+    poses: int = 4  # poses of the occlusions
+    negatives: int = 1000  # frames without a catheter
+    rounds: int = 15  # repetitions of each measurement of time
+    share: float = 1.0  # share of the grids, conditions, occlusions, and of the frames whose times are compared
 
 
 AMOUNT = Amount()
 _PLAIN, _ALL = "plain desk", "all with a catheter but at rest"
 
 
-def scene() -> World:
-    """The world that all is measured in: 1920 x 1080, with photographs where they are at hand."""
-    return World(photographs=photographs())
+def scene(folder: Path | None = None) -> World:
+    """World of the chart, 1920 x 1080 pixels; backgrounds are photographs of ``folder``, or else of scikit-image."""
+    return World(photographs=photographs(folder))
 
 
-def tracking() -> tuple[list[Row], dict[str, list[Row]], dict[str, bytes], list[str]]:
-    """Rows of methods, further tables by name, pictures by name, and the verdict; some 20 minutes on two cores."""
-    world, amount = scene(), AMOUNT
+def tracking(
+    photographs_folder: Path | None = None,
+) -> tuple[list[Row], dict[str, list[Row]], dict[str, bytes], list[str]]:
+    """Measure all trackers; this takes about 20 minutes on two cores.
+
+    Args:
+        photographs_folder: Folder with photographs for backgrounds; without it, those of scikit-image.
+
+    Returns:
+        Rows of the methods, further tables by name, pictures by name, and the lines of the verdict.
+    """
+    world, amount = scene(photographs_folder), AMOUNT
     trackers = methods(world, (BASE, COLD, PRIOR, FEWER))
     three = {name: trackers[name] for name in (BASE, COLD, PRIOR)}
     tables: dict[str, list[Row]] = {"times": timing(world, amount.rounds), "stages": stages(world, amount.rounds)}
@@ -73,7 +80,7 @@ def tracking() -> tuple[list[Row], dict[str, list[Row]], dict[str, bytes], list[
         tables[kind], said[kind] = scenes(world, three, count, kind, amount.share)
     two = {name: trackers[name] for name in (BASE, COLD)}
     tables["negatives"], said["negatives"] = empty(world, two, amount.negatives)
-    # At rest it is a few poses again and again.
+    # The frames of catheters at rest are left out: they repeat a few poses.
     some = (found for kind, found in said.items() if kind not in ("negatives", "still"))
     said[_ALL] = [answer for found in some for answer in found]
     tables["reliability"] = [
@@ -87,7 +94,7 @@ def tracking() -> tuple[list[Row], dict[str, list[Row]], dict[str, bytes], list[
 
 
 def _share(kind: str, name: str, own: list[Answer]) -> Row:
-    """One method on one kind of frames; of a negative a refusal is what is right."""
+    """Outcomes of one method on one kind of frames; a frame without a catheter is to be refused."""
     refused = [answer for answer in own if not answer.answered]
     answerable = sum(answer.answerable for answer in own)
     lost = sum(answer.answerable for answer in refused)
@@ -108,7 +115,7 @@ def _share(kind: str, name: str, own: list[Answer]) -> Row:
 
 
 def _methods(tables: dict[str, list[Row]], said: dict[str, list[Answer]]) -> list[Row]:
-    """A row for each method: accuracy against time."""
+    """Accuracy and time, one row for each method."""
     rows = []
     for name in (BASE, COLD, PRIOR, FEWER):
         row: Row = {"method": name, "data": "synthetic"}
@@ -122,7 +129,7 @@ def _methods(tables: dict[str, list[Row]], said: dict[str, list[Answer]]) -> lis
         for depth, tilt in STILL:
             found = one(tables["still"], depth_mm=depth, tilt_deg=tilt, point=TIP, method=name)
             row[f"s_rms_mm_{depth}_{tilt}"] = found["s_rms_mm"]
-        # Apart: at rest it is the same few errors again and again.
+        # Separately, since the frames of catheters at rest repeat a few errors.
         for kind in ("grids", "still"):
             row[f"coverage_{kind}"] = covered([answer for answer in said[kind] if answer.method == name])
         rows.append(row)
@@ -141,7 +148,7 @@ def _verdict(world: World, rows: list[Row], tables: dict[str, list[Row]]) -> lis
     lines += [f"synthetic {line}" for name in (COLD, PRIOR) for line in _accuracy(name, rows, tables)]
     for row in tables["reliability"]:
         if row["frames_of"] in ("still", "grids", "codecs"):
-            continue  # they are in the sum, and their errors are above
+            continue  # their errors are above, and the sum over all kinds includes them
         lines += [f"synthetic {line}" for line in _reliability(row)]
     for row in tables["codecs"]:
         error = f"median {row['median_mm']} mm, worst {row['worst_mm']} mm, {row['refused']} of {row['points']} refused"
@@ -164,8 +171,8 @@ def _verdict(world: World, rows: list[Row], tables: dict[str, list[Row]]) -> lis
         lines.append(f"synthetic {text}, {row['ratio']:.2f} times the median" + _goal(row["ratio"], goal, "<="))
     for name in dict.fromkeys(row["method"] for row in tables["stages"]):
         parts = [row for row in tables["stages"] if row["method"] == name]
-        told = "; ".join(f"{row['stage']} {row['milliseconds']:.2f} ms {row['percent']:.1f} %" for row in parts)
-        lines.append(f"synthetic stages, {name}: {told}")
+        text = "; ".join(f"{row['stage']} {row['milliseconds']:.2f} ms {row['percent']:.1f} %" for row in parts)
+        lines.append(f"synthetic stages, {name}: {text}")
     return lines
 
 
@@ -194,8 +201,8 @@ def _accuracy(name: str, rows: list[Row], tables: dict[str, list[Row]]) -> list[
             lines.append(f"{text}, sd {row['sd_mm']} mm, Cramer-Rao {row['bound_mm']} mm, bias {row['bias_mm']} mm")
     row = one(rows, method=name)
     share = row["coverage_grids"]
-    told = "" if share == "" else " (goal 0.90 to 0.98: " + ("met)" if 0.9 <= share <= 0.98 else "missed)")
-    text = f"grids, {name}: the 95 % ellipsoid holds the truth in {share} of the answers{told}"
+    met = "" if share == "" else " (goal 0.90 to 0.98: " + ("met)" if 0.9 <= share <= 0.98 else "missed)")
+    text = f"grids, {name}: the 95 % ellipsoid holds the truth in {share} of the answers{met}"
     return [*lines, f"{text}, at rest in {row['coverage_still']}"]
 
 
@@ -218,7 +225,7 @@ def _reliability(row: Row) -> list[str]:
 
 
 def _unanswerable(tables: dict[str, list[Row]]) -> list[str]:
-    """Scenes that cannot be answered: how many refusals say why."""
+    """Unanswerable scenes: how many refusals give a fitting reason."""
     lines = []
     for name in (COLD, PRIOR):
         found = [row for kind in ("conditions", "occlusions") for row in tables[kind]]
@@ -236,7 +243,7 @@ def _unanswerable(tables: dict[str, list[Row]]) -> list[str]:
 
 
 def _goal(value: float | str, limit: float, sign: str) -> str:
-    """The goal in words, and whether it is met."""
+    """The goal, and whether it is met, as text for the verdict; empty for an infinite limit."""
     if not math.isfinite(limit):
         return ""
     if isinstance(value, str):

@@ -1,12 +1,11 @@
-"""Trackers side by side on synthetic frames with exact truth: what each says of each frame, and how long it takes."""
+"""Trackers compared on synthetic frames with exact ground truth: the answer of each to each frame, and its time."""
 
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
-from unittest import mock
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,33 +13,34 @@ from tqdm import tqdm
 
 from holotorch.experiments.tracking_benchmark.thesis_opencv import ThesisOpenCV
 from holotorch.io.images import load_image
-from holotorch.tracking.detection import stations
 from holotorch.tracking.detection.channels import ChannelOrder
+from holotorch.tracking.detection.stations import StationPlan
 from holotorch.tracking.detection.tracker import CatheterTracker
 from holotorch.tracking.pose.status import Pose, Status
 from holotorch.tracking.simulation.world import Case, World
 
 BASE, COLD, PRIOR, FEWER = "thesis, OpenCV", "ours, cold", "ours, prior", "ours, fewer stations"
 LITERAL = "thesis, OpenCV, maps anew"
-STATIONS = 6  # of the one with fewer
-WRONG = 5e-3  # metres from the truth
-# Photographs for backgrounds: a folder beside the checkout, or else those that scikit-image brings.
-PHOTOGRAPHS = Path(__file__).parents[3] / "shared" / "data" / "images"
-_BUNDLED = ("astronaut", "coffee", "chelsea")
+FEWER_STATIONS = StationPlan(most=6)  # cross-sections of the tube that the method FEWER uses
+WRONG = 5e-3  # metres: error of the tip above which an answer counts as wrong
+_BUNDLED = ("astronaut", "coffee", "chelsea")  # colour photographs that scikit-image contains
 
 Method = Callable[[Tensor, Case], Pose]
 
 
 class Answer(NamedTuple):
-    """What one method said of one frame, and in how many seconds.
+    """Answer of one method to one frame.
 
-    Plain numbers: of thousands, tensors between the frames of a case would keep the memory of all of them.
+    It holds plain numbers, because thousands of small tensors between the frames would fragment the memory.
 
     Attributes:
-        name, answerable: The case's.
-        truth: Of the tip in metres; None where the frame shows no catheter.
-        tip: In metres; NaN where refused.
-        covariance: Of the tip, three rows of three, in m^2.
+        method: Name of the method.
+        name, answerable: Attributes of the case.
+        truth: True position of the tip in metres; None where the frame shows no catheter.
+        status, reason: Status and reason of the pose.
+        tip: Position of the tip in metres; NaN where refused.
+        covariance: Covariance of the tip, three rows of three, in m^2.
+        seconds: Time that the method took.
     """
 
     method: str
@@ -55,64 +55,65 @@ class Answer(NamedTuple):
 
     @staticmethod
     def of(method: str, case: Case, pose: Pose, seconds: float) -> "Answer":
-        """Of a pose that is one and no batch."""
+        """Answer that a single pose, not a batch, stands for."""
         assert isinstance(pose.status, Status) and isinstance(pose.reason, str)
-        truth, told = None if case.tip is None else case.tip.tolist(), (pose.status, pose.reason)
+        truth = None if case.tip is None else case.tip.tolist()
         tip, covariance = pose.tip.tolist(), pose.covariance[:3, :3].tolist()
-        return Answer(method, case.name, case.answerable, truth, *told, tip, covariance, seconds)
+        return Answer(method, case.name, case.answerable, truth, pose.status, pose.reason, tip, covariance, seconds)
 
     @property
     def answered(self) -> bool:
-        """Not refused."""
+        """Whether the method gave a pose."""
         return self.status.answered
 
     @property
     def error(self) -> float:
-        """Of the tip in metres; NaN where refused or without a catheter."""
+        """Error of the tip in metres; NaN where refused or without a catheter."""
         return math.nan if self.truth is None else math.dist(self.tip, self.truth)
 
     @property
     def right(self) -> bool:
-        """Answered, a catheter there, and near enough."""
+        """Whether the method gave a pose of a visible catheter, with a small error."""
         return self.error <= WRONG
 
     @property
     def wrong(self) -> bool:
-        """Answered, and too far away or with no catheter there."""
+        """Whether the method gave a pose with a large error, or without a catheter in the frame."""
         return self.answered and not self.right
 
 
-def photographs() -> tuple[Tensor, ...]:
-    """Photographs uint8 [3, h, w] for the world's backgrounds."""
-    found: list[Any] = sorted(path for path in PHOTOGRAPHS.glob("*") if path.suffix in (".png", ".jpg"))
-    images = [load_image(source) for source in found or _BUNDLED]
+def photographs(folder: Path | None = None) -> tuple[Tensor, ...]:
+    """Colour photographs uint8 [3, h, w] for backgrounds: PNG and JPEG files of ``folder``, or scikit-image's own.
+
+    Raises:
+        ValueError: ``folder`` holds no colour photograph.
+    """
+    files = sorted(path for path in folder.glob("*") if path.suffix in (".png", ".jpg")) if folder else _BUNDLED
+    images = [load_image(source) for source in files]
+    if not any(len(image) == 3 for image in images):
+        raise ValueError(f"{folder} must hold colour photographs, PNG or JPEG files, got none")
     return tuple((255 * image).round().to(torch.uint8) for image in images if len(image) == 3)
 
 
 def methods(world: World, names: Sequence[str] = (BASE, LITERAL, COLD, PRIOR, FEWER)) -> dict[str, Method]:
-    """Trackers by name, each as a function of one frame [3, H, W] and its case (whose truth only the prior reads)."""
+    """Trackers by name, each a function of one frame [3, H, W] and its case; only PRIOR uses the truth of the case."""
     camera, catheter = world.camera, world.catheter
     thesis, ours = ThesisOpenCV(camera, catheter), CatheterTracker(camera, catheter, channels=ChannelOrder.RGB)
     literal = ThesisOpenCV(camera, catheter, literal=True)
-    expected = lru_cache(maxsize=16)(before)  # made once for a frame, so that its making is not the tracker's time
-
-    def fewer(frame: Tensor, _: Case) -> Pose:
-        # The tracker has no option for this: nothing but this comparison wants it.
-        with mock.patch.object(stations, "_STATIONS", STATIONS):
-            return ours(frame[None])[0]
-
+    fewer = CatheterTracker(camera, catheter, channels=ChannelOrder.RGB, stations=FEWER_STATIONS)
+    expected = lru_cache(maxsize=16)(before)  # cached, so that its computation does not count as time of the tracker
     known: dict[str, Method] = {
         BASE: lambda frame, _: thesis(frame[None])[0],
         LITERAL: lambda frame, _: literal(frame[None])[0],
         COLD: lambda frame, _: ours(frame[None])[0],
         PRIOR: lambda frame, case: ours(frame[None], [expected(case)])[0],
-        FEWER: fewer,
+        FEWER: lambda frame, _: fewer(frame[None])[0],
     }
     return {name: known[name] for name in names}
 
 
 def before(case: Case, moved: tuple[float, float, float] = (2e-3, -1.5e-3, 3e-3), turned: float = 0.01) -> Pose:
-    """The pose that a tracker may have found 1/30 s earlier: 4 mm off, at 120 mm/s, and turned by 0.6 degrees."""
+    """Pose of the catheter 1/30 s before a case: 4 mm away (a speed of 120 mm/s) and rotated by 0.6 degrees."""
     if case.tip is None or case.direction is None:
         return Pose.refused(Status.NO_CATHETER, "no catheter was there")
     direction = case.direction + turned * torch.tensor([0.6, -0.6, 0.5], dtype=torch.float64)
@@ -122,7 +123,7 @@ def before(case: Case, moved: tuple[float, float, float] = (2e-3, -1.5e-3, 3e-3)
 
 
 def answers(cases: Iterable[Case], trackers: dict[str, Method], label: str = "frames") -> Iterator[Answer]:
-    """What each method says of each frame, with a bar; a frame lives only as long as it is looked at."""
+    """Answers of all methods to all frames, with a progress bar; only one frame at a time is in memory."""
     for case in tqdm(list(cases), desc=label, unit="frame", dynamic_ncols=True):
         frame = as_camera(case.frame())
         for name, track in trackers.items():
@@ -132,15 +133,15 @@ def answers(cases: Iterable[Case], trackers: dict[str, Method], label: str = "fr
 
 
 def as_camera(frame: Tensor) -> Tensor:
-    """The same frame [3, H, W] with the memory of a camera's, [H, W, 3]."""
+    """The same frame [3, H, W] in the memory layout of a camera, [H, W, 3]."""
     return frame.permute(1, 2, 0).contiguous().permute(2, 0, 1)
 
 
 def tips_of(own: Sequence[Answer]) -> Tensor:
-    """[n, 3] in metres; NaN where refused."""
+    """Tips [n, 3] of answers in metres; NaN where refused."""
     return torch.tensor([answer.tip for answer in own], dtype=torch.float64)
 
 
 def truth_of(own: Sequence[Answer]) -> Tensor:
-    """[n, 3] in metres, of frames with a catheter."""
+    """True tips [n, 3] in metres of the answers to frames with a catheter."""
     return torch.tensor([answer.truth for answer in own if answer.truth is not None], dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The picture of the chart of trackers."""
+"""Figure of the chart of trackers."""
 
 import io
 import math
@@ -46,16 +46,16 @@ def _errors(axes: Axes, rows: list[Row]) -> None:
 
 
 def _precision(axes: Axes, rows: list[Row]) -> None:
-    places = list(STILL)
+    poses = list(STILL)
     for name, (colour, marker) in _STYLE.items():
-        found = [one(rows, depth_mm=depth, tilt_deg=tilt, point=TIP, method=name) for depth, tilt in places]
-        values = [row["sd_mm"] if row["sd_mm"] != "" else math.nan for row in found]
-        axes.semilogy(range(len(places)), values, marker, color=colour, label=name)
-    own = [one(rows, depth_mm=depth, tilt_deg=tilt, point=TIP, method=BASE) for depth, tilt in places]
+        own_rows = [one(rows, depth_mm=depth, tilt_deg=tilt, point=TIP, method=name) for depth, tilt in poses]
+        values = [row["sd_mm"] if row["sd_mm"] != "" else math.nan for row in own_rows]
+        axes.semilogy(range(len(poses)), values, marker, color=colour, label=name)
+    own = [one(rows, depth_mm=depth, tilt_deg=tilt, point=TIP, method=BASE) for depth, tilt in poses]
     for of, colour, label in (("edges_bound_mm", "gray", ", of edges"), ("bound_mm", "black", ", of all pixels")):
         bounds = [row[of] for row in own]
-        axes.semilogy(range(len(places)), bounds, "_", color=colour, markersize=20, label=f"Cramér-Rao bound{label}")
-    axes.set_xticks(range(len(places)), [f"{depth} mm\n{tilt}°" for depth, tilt in places])
+        axes.semilogy(range(len(poses)), bounds, "_", color=colour, markersize=20, label=f"Cramér-Rao bound{label}")
+    axes.set_xticks(range(len(poses)), [f"{depth} mm\n{tilt}°" for depth, tilt in poses])
     axes.set_ylim(top=8 * axes.get_ylim()[1])  # room for the legend
     axes.set_xlabel("distance of the tip and tilt")
     axes.set_ylabel("sd of a resting tip, unfiltered (mm)")

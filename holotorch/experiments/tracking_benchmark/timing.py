@@ -1,4 +1,4 @@
-"""How long trackers take on the same synthetic frames, turn by turn in one process, and where their time goes."""
+"""Times of trackers on the same synthetic frames, measured alternately in one process, and of their stages."""
 
 import statistics
 import time
@@ -10,7 +10,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from holotorch.experiments.timing import interleaved
-from holotorch.experiments.tracking_benchmark.bench import Row, told
+from holotorch.experiments.tracking_benchmark.bench import Row, count_statuses
 from holotorch.experiments.tracking_benchmark.methods import BASE, COLD, PRIOR, Method, as_camera, before, methods
 from holotorch.experiments.tracking_benchmark.thesis_opencv import ThesisOpenCV
 from holotorch.tracking.detection.channels import ChannelOrder
@@ -21,27 +21,27 @@ from holotorch.tracking.simulation.world import Case, World
 from holotorch.tracking.thesis.tracker import ThesisTracker
 
 KORNIA = "thesis, kornia"
-# What is timed, by the names of the world's conditions; the last ones need a photograph or make do without.
+# Names of the conditions that are timed, by kind of frame.
 _FRAMES = {"plain desk": ("plain",), "clutter": ("heavy clutter",), "drape": ("cloth as band 3",)}
-_PHOTOGRAPH = ("photograph 0", "texture")
-_STREAM = 6  # different frames of each kind, of 6 MB each
-_REPEATS = 9  # so many, since the machine sometimes stalls for 50 ms
+_PHOTOGRAPH = ("photograph 0", "texture")  # a texture where the world has no photograph
+_STREAM = 6  # different frames of each kind, 6 MB each: more than the caches of a processor hold
+_REPEATS = 9  # repetitions of a call, whose median is not affected by single stalls of the machine
 
 
 def timing(world: World, rounds: int) -> list[Row]:
-    """Milliseconds of each method for a frame of each kind, medians over rounds, and their ratio to the baseline's.
+    """Milliseconds per frame of each method and kind of frame, medians over rounds, and ratios to the baseline.
 
-    In a round each method in turn takes a few different frames one after another, as it would those of a camera: they
-    do not fit into the processor's caches together, while what the method itself needs may stay there.
+    In each round, each method processes a few different frames one after another, as from a camera. The frames do not
+    fit into the caches of the processor together, while the data of the method itself may stay there.
     """
     kornia = ThesisTracker(world.camera, world.catheter)
     trackers: dict[str, Method] = methods(world) | {KORNIA: lambda frame, _: kornia(frame[None])[0]}
     worlds = [replace(world, seed=world.seed + i) for i in range(_STREAM)]
-    known = [{case.name: case for case in conditions(one)} for one in worlds]
+    scenes = [{case.name: case for case in conditions(one)} for one in worlds]
     rows = []
     for kind, names in tqdm((_FRAMES | {"photograph": _PHOTOGRAPH}).items(), desc="times", unit="frame"):
-        name = next(name for name in names if name in known[0])
-        frames = [(as_camera(cases[name].frame()), cases[name]) for cases in known]
+        name = next(name for name in names if name in scenes[0])
+        frames = [(as_camera(cases[name].frame()), cases[name]) for cases in scenes]
         seconds = interleaved({name: partial(_all, track, frames) for name, track in trackers.items()}, rounds)
         rows += [
             {
@@ -49,7 +49,7 @@ def timing(world: World, rounds: int) -> list[Row]:
                 "method": name,
                 "milliseconds": round(1e3 * value / _STREAM, 2),
                 "ratio": round(value / seconds[BASE], 3),
-                "status": told(Status(pose.status) for pose in _all(trackers[name], frames)),
+                "status": count_statuses(Status(pose.status) for pose in _all(trackers[name], frames)),
             }
             for name, value in seconds.items()
         ]
@@ -61,7 +61,7 @@ def _all(track: Method, frames: list[tuple[Tensor, Case]]) -> list[Pose]:
 
 
 def stages(world: World, rounds: int) -> list[Row]:
-    """Mean time of each stage and its share of the whole, in the form of Table 3.1; a catheter on the plain desk."""
+    """Mean time of each stage and its share of the total, as in Table 3.1, for a catheter on a plain desk."""
     case = next(case for case in conditions(world) if case.name == "plain")
     frames = as_camera(case.frame())[None]
     expected = [before(case)]
@@ -99,10 +99,11 @@ def stages(world: World, rounds: int) -> list[Row]:
 
 
 def spread(world: World, seeds: int, share: float = 1.0) -> list[Row]:
-    """Slowest frame over the median one of each method: conditions, occlusions and one negative of each kind.
+    """Time of the slowest frame relative to the median frame, for each method.
 
-    From as many seeds, each with two of the world's photographs. Each frame counts with the median of a few calls, each
-    of them over one for a plain frame right before it, so that what the machine does meanwhile is not the frame's.
+    The frames are all conditions and occlusions, and one negative of each kind, from ``seeds`` seeds with two
+    photographs of the world each. The time of a frame is a median over a few calls, each divided by the time of a plain
+    frame directly before it, which removes most of the influence of other load on the machine.
     """
     cases, plain = [], next(case for case in conditions(world) if case.name == "plain")
     usual = as_camera(plain.frame()), plain
@@ -117,7 +118,7 @@ def spread(world: World, seeds: int, share: float = 1.0) -> list[Row]:
         frame = as_camera(case.frame())
         for name, track in trackers.items():
             if name == PRIOR and case.tip is None:
-                continue  # nothing was there before
+                continue  # a frame without a catheter has no previous pose
             track(frame, case)
             pairs = [(_seconds(track, *usual), _seconds(track, frame, case)) for _ in range(_REPEATS)]
             taken[name].append((statistics.median(own / beside for beside, own in pairs), case.name))

@@ -1,4 +1,4 @@
-"""Calibration boards in photographs: which corners of a chessboard or ChArUco board are seen, and where."""
+"""Corners of chessboards and ChArUco boards in photographs."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,8 @@ from holotorch.core import checks
 from holotorch.core.quantities import BOARD_SQUARE
 
 _DICTIONARIES = {name: getattr(cv2.aruco, name) for name in dir(cv2.aruco) if name.startswith("DICT_")}
-_FEWEST = 8  # corners of a view: a homography takes 4, the rest checks them
+_FEWEST = 8  # least corners of a view: 4 determine a homography, and the others check it
+# Refinement of corners ends after 50 steps, or with a step below 1e-3 pixels.
 _REFINED = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
 
 
@@ -20,7 +21,7 @@ class Chessboard:
     """A plain chessboard.
 
     Attributes:
-        columns, rows: Inner corners along both sides (a board of 10 x 7 squares has 9 x 6).
+        columns, rows: Numbers of inner corners along both sides (a board of 10 x 7 squares has 9 x 6).
         square: Side of a square in metres.
     """
 
@@ -36,12 +37,12 @@ class Chessboard:
 
 @dataclass(frozen=True)
 class Charuco:
-    """A chessboard with a marker in each white square, which may be partly hidden or out of the picture.
+    """A chessboard with a marker in each white square. It may be partly hidden or outside the picture.
 
     Attributes:
-        columns, rows: Squares along both sides.
+        columns, rows: Numbers of squares along both sides.
         square, marker: Sides of a square and of a marker in metres.
-        dictionary: Of the markers, by its name in OpenCV, such as DICT_6X6_250.
+        dictionary: Name of the dictionary of the markers in OpenCV, such as DICT_6X6_250.
     """
 
     columns: int
@@ -64,12 +65,12 @@ class Charuco:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What one photograph shows of a board.
+    """Corners of a board in one photograph.
 
     Attributes:
-        points: float64 [n, 3] in metres on the board, z = 0.
-        pixels: float64 [n, 2], where they are seen.
-        name: Of the photograph.
+        points: float64 [n, 3] corners on the board in metres, z = 0.
+        pixels: float64 [n, 2] their images (x, y).
+        name: Name of the photograph.
     """
 
     points: Tensor
@@ -93,16 +94,16 @@ class View:
 
 
 def find_board(image: Tensor, board: Chessboard | Charuco, name: str = "") -> View:
-    """Find the corners of ``board`` in a photograph, to a fraction of a pixel.
+    """Detect the corners of ``board`` in a photograph, with subpixel accuracy.
 
     Args:
         image: uint8, grey [H, W] or RGB [3, H, W].
-        board: What to look for. Which corner of a chessboard is the first one is left open where the board looks the
-            same turned by half a turn; a camera's intrinsics do not depend on it.
-        name: Of the photograph, for messages.
+        board: Board to detect. Where a chessboard is symmetric under half a rotation, its first corner is arbitrary;
+            the intrinsics of a camera do not depend on it.
+        name: Name of the photograph, for messages.
 
     Raises:
-        TypeError, ValueError: No such image, or the board is not found in it.
+        TypeError, ValueError: ``image`` has another type or shape, or does not show the board.
     """
     if not isinstance(image, Tensor) or image.dtype != torch.uint8:
         raise TypeError(f"image must be a uint8 tensor, got {getattr(image, 'dtype', type(image).__name__)}")
@@ -114,18 +115,18 @@ def find_board(image: Tensor, board: Chessboard | Charuco, name: str = "") -> Vi
         if values.ndim == 2
         else cv2.cvtColor(np.ascontiguousarray(values.transpose(1, 2, 0)), cv2.COLOR_RGB2GRAY)
     )
-    found = _chessboard(grey, board) if isinstance(board, Chessboard) else _charuco(grey, board)
-    if found is None:
+    corners = _chessboard(grey, board) if isinstance(board, Chessboard) else _charuco(grey, board)
+    if corners is None:
         raise ValueError(
             f"no {describe_board(board)} found; is its size right, is it flat, sharp, evenly lit and, with a white "
-            "rim, in the picture?"
+            "margin, in the picture?"
         )
-    points, pixels = (torch.from_numpy(np.asarray(part, dtype=np.float64)) for part in found)
+    points, pixels = (torch.from_numpy(np.asarray(part, dtype=np.float64)) for part in corners)
     return View(points, pixels, name)
 
 
 def describe_board(board: Chessboard | Charuco) -> str:
-    """The board in words, for messages."""
+    """Description of the board for messages."""
     if isinstance(board, Chessboard):
         return f"chessboard of {board.columns} x {board.rows} inner corners"
     return f"ChArUco board of {board.columns} x {board.rows} squares ({board.dictionary})"
@@ -135,13 +136,13 @@ def _chessboard(grey: np.ndarray, board: Chessboard) -> tuple[np.ndarray, np.nda
     shape = (board.columns, board.rows)
     found, corners = cv2.findChessboardCorners(grey, shape)
     if found:
-        # The window must not reach the next corner: of the samples that come with OpenCV, one view's corners are
-        # 1.2 px off after a fixed window of 11 px, and the focal length 3 px.
+        # The window must not contain the next corner. In one of OpenCV's sample photographs, a fixed window of 11 px
+        # causes errors of 1.2 px in the corners, and of 3 px in the focal length.
         lattice = corners.reshape(board.rows, board.columns, 2)
         steps = [np.linalg.norm(np.diff(lattice, axis=axis), axis=-1).min() for axis in (0, 1)]
         window = int(np.clip(0.4 * min(steps), 2, 11))
         corners = cv2.cornerSubPix(grey, corners, (window, window), (-1, -1), _REFINED)
-    else:  # finds some that the other misses, and the other way round
+    else:  # each of the two methods detects some boards that the other one misses
         flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
         found, corners = cv2.findChessboardCornersSB(grey, shape, flags=flags)
     if not found:
@@ -162,7 +163,7 @@ def _charuco(grey: np.ndarray, board: Charuco) -> tuple[np.ndarray, np.ndarray] 
             continue
         numbers = np.asarray(numbers, dtype=np.int64).reshape(-1)
         points = np.asarray(pattern.getChessboardCorners(), dtype=np.float64)[numbers]
-        # A single row or column determines nothing.
+        # The corners of a single row or column do not determine a homography.
         if np.linalg.matrix_rank(points[:, :2] - points[:, :2].mean(0), tol=1e-9) == 2:
             return points, np.asarray(corners).reshape(-1, 2)
     return None

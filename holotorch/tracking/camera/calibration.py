@@ -1,4 +1,4 @@
-"""A camera's intrinsics from photographs of a board, with the deviations that the photographs really give them."""
+"""Intrinsics of a camera from photographs of a board, with standard deviations from a jackknife over the views."""
 
 import math
 from collections.abc import Sequence
@@ -14,21 +14,21 @@ from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.camera.few_views import estimate
 
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-SURE = 2e-3  # relative deviation of the focal length: moves a tip at 0.5 m by 1 mm
-_CHECKED = 4  # views; of fewer, leaving one out tells nothing
-_ADVISED = 10
-_SAME_TILT = math.radians(10)  # boards nearer to parallel leave the focal length open
-_WORST = 0.2  # relative deviation of the focal length: two of them make 1.4 or 0.6 of it, nothing was determined
-_GROUPS = 20  # of views, left out one after the other
-_CELLS = (6, 8)  # rows and columns of the picture that the coverage counts
+SURE = 2e-3  # relative deviation of the focal length above which a warning follows: it moves a tip at 0.5 m by 1 mm
+_CHECKED = 4  # least number of views for a jackknife and for leaving out bad views
+_ADVISED = 10  # number of views below which a warning follows
+_SAME_TILT = math.radians(10)  # least angle between boards: nearly parallel boards do not determine the focal length
+_WORST = 0.2  # relative deviation of the focal length above which the views do not determine it
+_GROUPS = 20  # most groups of views of the jackknife
+_CELLS = (6, 8)  # rows and columns of the parts of the picture that the coverage counts
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """How much of the picture and which tilts the views hold.
+    """Share of the picture and range of tilts that the views cover.
 
     Attributes:
-        cells: Share of 6 x 8 parts of the picture with at least one corner.
+        cells: Share of the 6 x 8 parts of the picture that contain at least one corner.
         radius: Largest distance of a corner from the middle, as a share of half the picture's diagonal.
         tilts: Smallest and largest angle between the boards' normals and the axis of the camera, in radians.
         between: Largest angle between two boards, in radians.
@@ -42,21 +42,21 @@ class Coverage:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A camera as its photographs show it.
+    """Result of a calibration.
 
     Attributes:
-        camera: The estimate.
-        size: (H, W) of the photographs in pixels; it holds for frames of this size.
-        deviations: Standard deviation of each of ``PARAMETERS``: the larger one of what the corners' scatter says by
-            linear propagation (OpenCV) and what leaving out views says (jackknife). The first takes the errors of
-            neighbouring corners as independent, which boards that bend and corner finders do not grant. Of fewer than
-            4 views: see ``holotorch.tracking.camera.few_views``.
-        formal: Those of independent corners, for comparison.
-        rms_px: Of all corners that were used.
-        views: rms in pixels of each view that was used, by name.
-        left_out: The same of those that were not: rms above 3 times the median and above 0.5 px.
-        coverage: Of the views that were used.
-        warnings: What to do better, one sentence each.
+        camera: Estimated camera.
+        size: (H, W) of the photographs in pixels; the camera is valid for frames of this size.
+        deviations: Standard deviation of each of ``PARAMETERS``: the larger one of that by linear propagation of the
+            scatter of the corners (OpenCV) and that by a jackknife over the views. The former assumes independent
+            errors of the corners, but bent boards and corner detectors cause correlated ones. For fewer than 4 views
+            see ``holotorch.tracking.camera.few_views``.
+        formal: Standard deviations for independent errors of the corners, for comparison.
+        rms_px: Root mean square reprojection error of all corners used, in pixels.
+        views: Root mean square error in pixels of each view used, by name.
+        left_out: The same for the views left out: those above 3 times the median and above 0.5 px.
+        coverage: Coverage of the views used.
+        warnings: Recommendations, one or two sentences each.
     """
 
     camera: Camera
@@ -71,24 +71,25 @@ class Calibration:
 
 
 def calibrate(views: Sequence[View], size: tuple[int, int]) -> Calibration:
-    """Estimate focal lengths, principal point and five terms of distortion from views of a board.
+    """Estimate focal lengths, principal point and five distortion coefficients from views of a board.
 
-    Views whose rms exceeds 3 times the median of all and 0.5 px are left out, the worst one first, as long as three
-    quarters and 4 remain. What fewer than 4 leave open is closed by what ordinary cameras are like (square pixels,
-    centred, moderate distortion: no fisheye), and is in the deviations: a start, not for measuring.
+    Views with an rms error above 3 times the median and above 0.5 px are left out, the worst one first, as long as
+    three quarters of the views and at least 4 remain. Fewer than 4 views are completed by a prior of ordinary cameras
+    (square pixels, central principal point, moderate distortion, no fisheye), whose uncertainty is part of the
+    deviations. Such a calibration is a start, but not accurate enough for measurements.
 
     Args:
-        views: 10 or more, of a flat board tilted differently; see ``holotorch.tracking.camera.boards``. Flat, because
-            a bend that is the same in all views is in no deviation: 1 mm over 200 mm of board makes the focal
-            length wrong by about 2 %.
+        views: 10 or more views of a flat board with different tilts; see ``holotorch.tracking.camera.boards``. A bend
+            of the board is the same in all views, so that no deviation includes it: a bend of 1 mm over 200 mm causes
+            an error of about 2 % in the focal length.
         size: (H, W) of the photographs in pixels.
 
     Raises:
-        ValueError: No views, all of them parallel, or others that leave the focal length open (deviation above 20 %),
-            corners outside the picture; with what to do.
+        ValueError: No views, parallel boards, views that do not determine the focal length (deviation above 20 %), or
+            corners outside the picture. The message says what to do.
 
-    Source: Zhang (2000) as in OpenCV's calibrateCameraExtended; Quenouille and Tukey for the jackknife, here over
-    up to 20 groups of views.
+    Source: Zhang (2000) as in OpenCV's calibrateCameraExtended; jackknife by Quenouille and Tukey, over up to 20 groups
+    of views.
     """
     height, width = size
     kept = list(views)
@@ -138,18 +139,18 @@ def calibrate(views: Sequence[View], size: tuple[int, int]) -> Calibration:
 
 
 def reprojection(camera: Camera, views: Sequence[View]) -> Tensor:
-    """Distance in pixels (rms), [n], between corners and where a known camera sees them, the boards' poses fitted.
+    """Root mean square reprojection errors [n] of views in pixels for a given camera, with fitted poses of the boards.
 
-    Whether an earlier calibration still holds, also from one photograph. A small value alone does not make a camera
-    right: boards hardly tilted look alike to many of them.
+    A large error shows that an earlier calibration no longer holds; one photograph suffices. A small error alone does
+    not prove the camera right: many cameras give the same image of a board with little tilt.
     """
     matrix, distortion = camera.matrix.detach().cpu().numpy(), camera.distortion.detach().cpu().numpy()
     errors = []
     for view in views:
         points, pixels = view.points.numpy(), view.pixels.numpy()
-        _, turned, at = cv2.solvePnP(points, pixels, matrix, distortion)
-        seen = cv2.projectPoints(points, turned, at, matrix, distortion)[0].reshape(-1, 2)
-        errors.append(math.sqrt(float(((seen - pixels) ** 2).sum(-1).mean())))
+        _, rotation, translation = cv2.solvePnP(points, pixels, matrix, distortion)
+        image = cv2.projectPoints(points, rotation, translation, matrix, distortion)[0].reshape(-1, 2)
+        errors.append(math.sqrt(float(((image - pixels) ** 2).sum(-1).mean())))
     return torch.tensor(errors, dtype=torch.float64)
 
 
@@ -175,7 +176,7 @@ def _fit(views: Sequence[View], size: tuple[int, int], start: _Fit | None = None
         matrix, distortion = start.camera.matrix.numpy(), start.values[4:].copy()
         flags = cv2.CALIB_USE_INTRINSIC_GUESS
     try:
-        _, matrix, distortion, turns, _, deviations, _, errors = cv2.calibrateCameraExtended(
+        _, matrix, distortion, rotations, _, deviations, _, errors = cv2.calibrateCameraExtended(
             points, pixels, size[::-1], matrix, distortion, flags=flags
         )
     except cv2.error:
@@ -184,7 +185,7 @@ def _fit(views: Sequence[View], size: tuple[int, int], start: _Fit | None = None
             "several sides"
         ) from None
     values = np.concatenate([matrix[[0, 1, 0, 1], [0, 1, 2, 2]], distortion.reshape(-1)[:5]])
-    normals = np.stack([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
+    normals = np.stack([cv2.Rodrigues(rotation)[0][:, 2] for rotation in rotations])
     if not (np.isfinite(values).all() and (values[:2] > 0).all() and np.isfinite(errors).all()):
         raise ValueError("the views do not determine a camera: tilt the board by 20 to 45 degrees to several sides")
     return _Fit(values, deviations.reshape(-1)[:9], normals, errors.reshape(-1))
@@ -192,14 +193,14 @@ def _fit(views: Sequence[View], size: tuple[int, int], start: _Fit | None = None
 
 def _jackknife(views: Sequence[View], size: tuple[int, int], whole: _Fit) -> np.ndarray:
     groups = min(len(views), _GROUPS)
-    found = []
+    values = []
     for group in range(groups):
         rest = [view for i, view in enumerate(views) if i % groups != group]
         try:
-            found.append(_fit(rest, size, whole).values)
-        except ValueError:  # all hangs on this group
+            values.append(_fit(rest, size, whole).values)
+        except ValueError:  # without this group, the views do not determine a camera
             return np.full(len(PARAMETERS), math.inf)
-    return np.sqrt((groups - 1) / groups * np.square(np.stack(found) - np.mean(found, 0)).sum(0))
+    return np.sqrt((groups - 1) / groups * np.square(np.stack(values) - np.mean(values, 0)).sum(0))
 
 
 def _coverage(views: Sequence[View], fit: _Fit, size: tuple[int, int]) -> Coverage:
@@ -226,35 +227,37 @@ def _check_tilts(coverage: Coverage) -> None:
 def _warnings(
     camera: Camera, size: tuple[int, int], count: int, relative: float, coverage: Coverage, errors: np.ndarray
 ) -> list[str]:
-    found = []
+    warnings = []
     if count < _CHECKED:
-        found.append(
+        warnings.append(
             f"Too few views to check one another ({count}): what is open is taken from ordinary cameras, which is a "
             f"start and no measurement. Take {_ADVISED} or more."
         )
     elif count < _ADVISED:
-        found.append(f"Only {count} views: take {_ADVISED} or more.")
+        warnings.append(f"Only {count} views: take {_ADVISED} or more.")
     if relative > SURE:
-        found.append(
+        warnings.append(
             f"The focal length is known to {100 * relative:.1f} % only: at 0.5 m that may move a tip by "
             f"{500 * relative:.1f} mm. Take more views, tilted by 20 to 45 degrees to several sides."
         )
     if coverage.cells < 0.6:
-        found.append(f"Corners in {100 * coverage.cells:.0f} % of the picture: move the board to all parts of it.")
+        warnings.append(f"Corners in {100 * coverage.cells:.0f} % of the picture: move the board to all parts of it.")
     if coverage.radius < 0.8:
-        found.append(
+        warnings.append(
             f"No corner beyond {100 * coverage.radius:.0f} % of the way to the picture's corners: the distortion there "
             "is a guess."
         )
     if count > 1 and coverage.between < math.radians(25):
-        found.append(
+        warnings.append(
             f"The boards differ by {math.degrees(coverage.between):.0f} degrees at most: tilt the board more, to "
             "several sides."
         )
     if float(np.median(errors)) > 1:
-        found.append(f"The corners scatter by {float(np.median(errors)):.1f} px: is the board flat, the picture sharp?")
+        warnings.append(
+            f"The corners scatter by {float(np.median(errors)):.1f} px: is the board flat, the picture sharp?"
+        )
     height, width = size
     corners = torch.tensor([[0.0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=torch.float64)
     if bool(camera.undistort(corners).isnan().any()):
-        found.append("The fitted distortion cannot be inverted in the picture's corners: no answers from there.")
-    return found
+        warnings.append("The fitted distortion cannot be inverted in the picture's corners: no answers from there.")
+    return warnings

@@ -10,22 +10,23 @@ from torch import Tensor
 
 from holotorch.core import checks
 
-_MISSED_PX = 1e-9  # an undistorted point that does not come back to within this has no answer
-_STEEP = 20.0  # tan of 87 degrees: beyond it a planar image says nothing
+_MISSED_PX = 1e-9  # pixels: largest error of an undistorted point after distorting it again
+_STEEP = 20.0  # largest distance from the axis on the plane z = 1: tan of 87 degrees
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Where a point in front of a camera falls on its image, and back.
+    """Projection of points in front of a camera to its image, and the inverse.
 
-    Frame: x right, y down, z forward, in metres. Pixels are (x, y) with (0, 0) the centre of the top left one.
+    The camera frame is x right, y down, z forward, in metres. Pixels are (x, y), and (0, 0) is the centre of the top
+    left pixel.
 
     Attributes:
         matrix: [3, 3] float64 with fx, fy, cx, cy in pixels; no skew. Differentiable, as ``distortion`` is.
         distortion: [5] float64: k1, k2, p1, p2, k3 in OpenCV's order.
-        tone: From light to levels: "srgb", "linear", or a rising table [256] of light 0 to 1 for each 8-bit level.
-        size: (H, W) of the frames that the parameters are for, or None: trackers refuse others, on which poses would be
-            wrong and plausible.
+        tone: Tone curve: "srgb", "linear", or an increasing table [256] of the light, 0 to 1, of each 8-bit level.
+        size: (H, W) of the frames for which the parameters are valid. Trackers refuse frames of another size, since
+            their poses would be wrong but plausible. None accepts every size.
 
     Raises:
         TypeError, ValueError: Impossible parameters.
@@ -61,7 +62,7 @@ class Camera:
             object.__setattr__(self, "tone", table)
 
     def need_size(self, frames: Tensor) -> None:
-        """ValueError for frames [..., H, W] of another size than the camera's."""
+        """Raise ValueError for frames [..., H, W] of another size than that of the camera."""
         if self.size is not None and tuple(frames.shape[-2:]) != self.size:
             (h, w), (height, width) = self.size, frames.shape[-2:]
             raise ValueError(
@@ -70,9 +71,9 @@ class Camera:
 
     @cached_property
     def valid_radius(self) -> float:
-        """Distance from the axis on the plane z = 1 to which the distortion can be inverted; 20 where it always can."""
+        """Largest distance from the axis on the plane z = 1 at which the distortion is invertible, 20 at most."""
         k1, k2, _, _, k3 = self.distortion.tolist()
-        # Where the distorted radius r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops rising.
+        # The distorted radius r (1 + k1 r^2 + k2 r^4 + k3 r^6) increases up to its first stationary point.
         roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1])
         turning = [root.real for root in roots if abs(root.imag) < 1e-12 and root.real > 0]
         return min(_STEEP, math.sqrt(min(turning, default=math.inf)))
@@ -84,7 +85,7 @@ class Camera:
         with torch.no_grad():
             plane = points[..., :2] / points[..., 2:]
             inside = (points[..., 2:] > 0) & (plane.square().sum(-1, keepdim=True) <= self.valid_radius**2)
-        # NaN comes last: on the way it would spoil the gradients of the others.
+        # Insert NaN last: in the computation it would make the gradients of all points NaN.
         kept = torch.where(inside, points, torch.tensor([0, 0, 1]).to(points))
         return torch.where(inside, self.distort(kept[..., :2] / kept[..., 2:]), torch.nan)
 
@@ -98,13 +99,13 @@ class Camera:
         radial = 1 + square * (k1 + square * (k2 + square * k3))
         u = x * radial + p1 * xy + p2 * (square + 2 * xx)
         v = y * radial + p2 * xy + p1 * (square + 2 * yy)
-        # All x in a row in memory, then all y: what follows is quicker.
+        # All x are contiguous in memory, then all y, which speeds up later operations.
         return torch.stack([u * matrix[0, 0] + matrix[0, 2], v * matrix[1, 1] + matrix[1, 2]]).movedim(0, -1)
 
     def undistort(self, pixels: Tensor) -> Tensor:
-        """Points [..., 2] on the plane z = 1 of pixels [..., 2], in float64; NaN where there is none.
+        """Points [..., 2] on the plane z = 1 of pixels [..., 2], in float64; NaN where the distortion has no inverse.
 
-        Differentiable to pixels and to the camera's parameters, as the inverse function is.
+        Differentiable with respect to the pixels and the parameters of the camera.
         """
         if pixels.shape[-1:] != (2,):
             raise ValueError(f"pixels must be of shape [..., 2], got {list(pixels.shape)}")
@@ -113,38 +114,40 @@ class Camera:
         given = pixels.reshape(1, -1, 2).to(torch.float64)
         matrix = self.matrix.to(given.device)
         with torch.no_grad():
-            # Newton's steps from where a pinhole would see it; what is no answer shows by not coming back.
+            # Newton steps from the undistorted pixel. Distorting the result again shows whether they converged.
             plane = ((given - matrix[:2, 2]) / matrix.diagonal()[:2]).nan_to_num(torch.inf).clamp(-_STEEP, _STEEP)
             plane, lost = self._settled(plane, given, 4)
-            if bool(lost.any()):  # they diverge where the distortion is strong, though it can be inverted there
+            if bool(lost.any()):  # the steps may diverge where the distortion is strong but invertible
                 plane, lost = self._settled(torch.where(lost, self._radial(given), plane), given, 8)
         if pixels.requires_grad or self.matrix.requires_grad or self.distortion.requires_grad:
-            plane = plane - self._newton(plane, given)  # at the answer: the inverse function's derivative
+            plane = plane - self._newton(
+                plane, given
+            )  # a step of zero length with the derivative of the inverse function
         return torch.where(lost, torch.nan, plane).reshape(pixels.shape)
 
     def _settled(self, plane: Tensor, pixels: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        """``plane`` [1, n, 2] after Newton's steps, and where [1, n, 1] it has no answer."""
+        """``plane`` [1, n, 2] after Newton steps, and which points [1, n, 1] did not converge."""
         for _ in range(steps):
             plane = (plane - self._newton(plane, pixels)).clamp(-_STEEP, _STEEP)
         missed = (self.distort(plane) - pixels).abs().amax(-1, keepdim=True)
         return plane, ~(missed <= _MISSED_PX) | (plane.square().sum(-1, keepdim=True) > self.valid_radius**2)
 
     def _radial(self, pixels: Tensor) -> Tensor:
-        """Points [1, n, 2] of ``pixels`` without the tangential distortion, by halving: radii rise to the valid one."""
+        """Points [1, n, 2] of ``pixels`` by bisection over the radius, without the tangential distortion."""
         k1, k2, _, _, k3 = self.distortion.to(pixels.device)
         matrix = self.matrix.to(pixels.device)
-        far = (pixels - matrix[:2, 2]) / matrix.diagonal()[:2]
-        reach = far.norm(dim=-1, keepdim=True)
-        low, high = torch.zeros_like(reach), torch.full_like(reach, self.valid_radius)
+        distorted = (pixels - matrix[:2, 2]) / matrix.diagonal()[:2]
+        radius = distorted.norm(dim=-1, keepdim=True)
+        low, high = torch.zeros_like(radius), torch.full_like(radius, self.valid_radius)
         for _ in range(50):
             middle = (low + high) / 2
             square = middle.square()
-            below = middle * (1 + square * (k1 + square * (k2 + square * k3))) < reach
+            below = middle * (1 + square * (k1 + square * (k2 + square * k3))) < radius
             low, high = torch.where(below, middle, low), torch.where(below, high, middle)
-        return (far / reach.clamp(min=1e-12) * low).nan_to_num(0.0)
+        return (distorted / radius.clamp(min=1e-12) * low).nan_to_num(0.0)
 
     def _newton(self, plane: Tensor, pixels: Tensor) -> Tensor:
-        """Step that Newton's rule takes off ``plane`` [1, n, 2]."""
+        """Newton step, to be subtracted from ``plane`` [1, n, 2]."""
         missed = self.distort(plane) - pixels
         (xx, xy), (yx, yy) = (row.unbind(-1) for row in self.slopes(plane).detach().unbind(-2))
         u, v = missed.unbind(-1)
@@ -154,7 +157,7 @@ class Camera:
         return torch.stack([yy * u - xy * v, xx * v - yx * u], -1).div(across[..., None]).nan_to_num(0.0)
 
     def slopes(self, plane: Tensor) -> Tensor:
-        """[..., 2, 2] pixels by which ``distort`` moves for a step on the plane z = 1, at ``plane`` [..., 2]."""
+        """[..., 2, 2] derivatives of ``distort`` in pixels by the point on the plane z = 1, at ``plane`` [..., 2]."""
         (k1, k2, p1, p2, k3), (x, y) = self.distortion.to(plane.device), plane.unbind(-1)
         square = x * x + y * y
         radial = 1 + square * (k1 + square * (k2 + square * k3))

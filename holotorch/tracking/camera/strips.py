@@ -14,13 +14,13 @@ from holotorch.tracking.camera.lens import Lens, Points
 
 @dataclass(frozen=True)
 class Line:
-    """A line on the plane z = 1, and places (t along, u across) in units of a pixel at the centre.
+    """A line on the plane z = 1, with coordinates t along it and u across, in units of a pixel at the principal point.
 
-    Points of the plane are complex numbers x + i y, and so is the line's own frame, t + i u.
+    Points of the plane are complex numbers x + i y. Coordinates of the line form complex numbers t + i u.
 
     Attributes:
-        origin: Where t = u = 0.
-        along: Unit vector.
+        origin: Point of the plane at t = u = 0.
+        along: Unit vector along the line.
         scale: Pixels per unit of the plane.
     """
 
@@ -29,65 +29,65 @@ class Line:
     scale: float
 
     def plane(self, t: np.ndarray | float, u: np.ndarray | float = 0.0) -> Points:
-        """Points on the plane z = 1 of places (t, u), which broadcast."""
+        """Points on the plane z = 1 at coordinates (t, u), which broadcast."""
         return self.origin + (t + 1j * np.asarray(u)) * (self.along / self.scale)
 
     def pixels(self, lens: Lens, t: np.ndarray, u: np.ndarray) -> Points:
-        """Pixels [T, U] of places t [T], u [U] some tens of pixels from the line.
+        """Pixels [T, U] at coordinates t [T], u [U], for u of up to some tens of pixels.
 
-        Three lines along are distorted, and a parabola across laid through them. What it misses is odd in u and rises
-        with its third power: a thousandth of a pixel at 30, of a lens with k1 = -0.12 and a focal length of 1400.
+        Three parallel lines are distorted exactly, and parabolas across interpolate between them. The error rises with
+        the third power of u: 0.001 pixels at u = 30, for a lens with k1 = -0.12 and a focal length of 1400 pixels.
         """
-        far, step = max(1.0, float(np.abs(u).max())), self.along / self.scale
-        half = u / (2 * far)
+        half_width, step = max(1.0, float(np.abs(u).max())), self.along / self.scale
+        half = u / (2 * half_width)
         square = 2 * half * half
         weight = np.array([square - half, 1 - 2 * square, square + half])
-        side = 1j * far * step
+        side = 1j * half_width * step
         three = np.array([self.origin - side, self.origin, self.origin + side])
         return lens.distort(t[:, None] * step + three) @ weight
 
     def place(self, plane: Points) -> tuple[np.ndarray, np.ndarray]:
-        """Places t and u of points on the plane z = 1."""
+        """Coordinates t and u of points on the plane z = 1."""
         offset = (plane - self.origin) * (self.along.conjugate() * self.scale)
         return offset.real, offset.imag
 
     def along_at(self, plane: complex) -> float:
-        """The place t of one point on the plane z = 1."""
+        """Coordinate t of one point on the plane z = 1."""
         return ((plane - self.origin) * self.along.conjugate()).real * self.scale
 
     def moved(self, offset: float, slope: float) -> "Line":
-        """The line u = offset + slope t, with t = 0 where it was."""
+        """The line u = offset + slope t of this line's coordinates, with its origin at t = 0."""
         turned = self.along * complex(1.0, slope)
         return Line(complex(self.plane(0.0, offset)), turned / abs(turned), self.scale)
 
     @staticmethod
     def between(lens: Lens, start: complex, end: complex) -> "Line":
-        """The line from one point of the plane z = 1 to another, t = 0 in their middle; NaN for NaN."""
+        """The line from one point of the plane z = 1 to another, with its origin in the middle; NaN for NaN."""
         gap = complex(end) - complex(start)
         return Line((complex(start) + complex(end)) / 2, gap / abs(gap) if gap else complex(cmath.nan), lens.scale)
 
 
-_LONGEST = 32767  # OpenCV's remap takes pictures and places in rows of fewer than these
+_LONGEST = 32767  # pixels: OpenCV's remap accepts only shorter rows of images and maps
 
 
 class Sampler:
-    """Reads one frame at pixels between pixels: levels, or light.
+    """Samples one frame at fractional pixels, as levels or as light.
 
     Args:
-        frame: uint8 [3, H, W], RGB, of any device and any strides; H and W are 4 or more.
-        light: float32 [256], of each level.
+        frame: uint8 [3, H, W], RGB, on any device and with any strides; H and W are 4 or more.
+        light: float32 [256] light of each level.
     """
 
     def __init__(self, frame: Tensor, light: np.ndarray):
         self.frame, self.light = frame, light
         self.height, self.width = frame.shape[-2:]
-        # One row of memory, whichever way colours lie in it: the quickest to pick from.
+        # A flat view of the memory of the frame in any layout, which is the fastest to index.
         strides = colour, self._down, self._right = frame.stride()
-        reach = sum((n - 1) * step for n, step in zip(frame.shape, strides, strict=True))
-        self._memory = frame.as_strided((reach + 1,), (1,))
+        extent = sum((n - 1) * step for n, step in zip(frame.shape, strides, strict=True))
+        self._memory = frame.as_strided((extent + 1,), (1,))
         self._host = self._memory.numpy() if frame.device.type == "cpu" else None
         self._colours, self._taps, self._around = _neighbours(*strides)
-        # OpenCV reads ten times as fast what lies as cameras deliver it.
+        # OpenCV is ten times as fast, but needs the interleaved memory layout of cameras.
         like = self._host is not None and strides[::2] == (1, 3) and max(self.height, self.width) < _LONGEST
         self._image = frame.numpy().transpose(1, 2, 0) if like else None
         self._last, self._before = _borders(self.width, self.height)
@@ -104,13 +104,13 @@ class Sampler:
         return self.frame[:, y : y + side, x : x + side].cpu().numpy()
 
     def _clipped(self, pixels: Points) -> np.ndarray:
-        """Real and imaginary parts [2, n], moved onto the frame."""
+        """Real and imaginary parts [2, n] of pixels, clipped to the frame."""
         place = np.empty((2, pixels.size))
         place[0], place[1] = pixels.real.ravel(), pixels.imag.ravel()
         return np.fmin(np.fmax(place, 0.0, out=place), self._last, out=place)
 
     def _index(self, taps: np.ndarray, whole: np.ndarray) -> np.ndarray:
-        """In memory, of ``taps`` [...] around pixels [2, n]: [..., n]."""
+        """Indices [..., n] in memory of neighbours ``taps`` [...] of pixels [2, n]."""
         return np.add.outer(taps, whole[1] * self._down + whole[0] * self._right)
 
     def _levels(self, index: np.ndarray) -> np.ndarray:
@@ -120,22 +120,22 @@ class Sampler:
         return self._memory.index_select(0, where).cpu().numpy().reshape(index.shape)
 
     def nearest(self, pixels: Points) -> np.ndarray:
-        """Levels uint8 [T, U, 3] of those nearest to pixels x + i y [T, U]; black where these leave the frame."""
+        """Levels uint8 [T, U, 3] of the pixels nearest to x + i y [T, U]; black outside the frame."""
         if self._image is not None:
-            # As one row: rows are shared out among threads, and to wake them takes longer than to do the work.
+            # As a single row, since OpenCV distributes rows over threads, whose start takes longer than the work.
             wide = pixels.size if pixels.size < _LONGEST else pixels.shape[-1]
-            places = pixels.astype(np.complex64).view(np.float32).reshape(-1, wide, 2)
-            found = cv2.remap(self._image, places, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
-            return found.reshape(*pixels.shape, 3)
+            positions = pixels.astype(np.complex64).view(np.float32).reshape(-1, wide, 2)
+            levels = cv2.remap(self._image, positions, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
+            return levels.reshape(*pixels.shape, 3)
         x, y = np.rint(pixels.real), np.rint(pixels.imag)
         inside = (x >= 0) & (y >= 0) & (x < self.width) & (y < self.height)
         index = np.where(inside, y * self._down + x * self._right, 0).astype(np.intp)
         return self._levels(index[..., None] + self._colours) * inside[..., None]
 
     def __call__(self, pixels: Points) -> np.ndarray:
-        """Light float32 [3, ...] at pixels x + i y, bilinear among four; the border's where they leave the frame.
+        """Light float32 [3, ...] at pixels x + i y by bilinear interpolation; outside the frame that of its border.
 
-        The four are turned into light before they are mixed, and only they are: no frame of floats is made.
+        Only the four neighbours of each pixel are converted to light, before they are interpolated.
         """
         place = self._clipped(pixels)
         whole = np.minimum(place.astype(np.intp), self._before)
@@ -146,7 +146,7 @@ class Sampler:
         return (mixed[:, 0] + share[1] * (mixed[:, 1] - mixed[:, 0])).reshape(3, *pixels.shape)
 
     def sharp(self, pixels: np.ndarray) -> np.ndarray:
-        """As a call, but cubic among sixteen (Keys 1981), which keeps more of what is as fine as a pixel."""
+        """As a call, but by cubic convolution (Keys 1981), which preserves fine detail better."""
         place = self._clipped(pixels)
         whole = place.astype(np.intp)
         np.minimum(np.maximum(whole, 1, out=whole), self._before - 1, out=whole)
@@ -161,21 +161,21 @@ class Sampler:
 
 @lru_cache(maxsize=16)
 def _borders(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Both [2, 1], x and y, of a frame's last pixel, and of that before it."""
+    """Coordinates (x, y) [2, 1] of the last pixel of a frame, and of the pixel before it in both directions."""
     last = np.array([[width - 1.0], [height - 1.0]])
     return last, last.astype(np.intp) - 1
 
 
 @lru_cache(maxsize=16)
 def _neighbours(colour: int, down: int, right: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Steps in memory from a pixel's first colour to all [3], of four pixels [3, 4], and of sixteen [3, 4, 4]."""
+    """Offsets in memory from the first colour of a pixel: its colours [3], 4 neighbours [3, 4] and 16 [3, 4, 4]."""
     colours, lines = colour * np.arange(3), np.arange(-1, 3)
     four = np.add.outer(colours, [0, right, down, down + right])
     return colours, four, np.add.outer(colours, np.add.outer(lines * down, lines * right))
 
 
 def _keys(share: np.ndarray) -> np.ndarray:
-    """Weights [4, ...] of the pixels at -1, 0, 1 and 2 for a place ``share`` after that at 0; Keys (1981), Eq. 4."""
+    """Weights [4, ...] of the samples at -1, 0, 1 and 2 for the position ``share``, 0 to 1; Keys (1981), Eq. 4."""
     square = share * share
     cube = square * share
     weights = np.empty((4, *share.shape), dtype=share.dtype)

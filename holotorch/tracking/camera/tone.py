@@ -1,14 +1,14 @@
-"""A camera's tone curve, from light to 8-bit levels, as several exposures of one still scene show it."""
+"""Estimation of a camera's tone curve, from light to 8-bit levels, from several exposures of one still scene."""
 
 import torch
 from torch import Tensor
 
 from holotorch.core import checks
 
-_CLIPPED = 3  # levels at both ends that may stand for less or more light than they say
-_SMOOTH = 1.0  # weight of the mean curvature beside the mean over pixels
-_NEEDED = 0.8  # share of the levels between the clipped ones that must occur
-_MISFIT = 0.1  # of ln(light); exposures by a step of 10 % wrong, or a scene that moved
+_CLIPPED = 3  # levels at both ends of the range that may be clipped
+_SMOOTH = 1.0  # weight of the mean squared curvature relative to the mean squared residual of the pixels
+_NEEDED = 0.8  # least share of the levels between the clipped ones that must occur
+_MISFIT = 0.1  # largest rms residual of ln(light): exposures that are wrong by 10 %, or a moving scene, exceed it
 
 
 def tone_curve(frames: Tensor, exposures: Tensor) -> Tensor:

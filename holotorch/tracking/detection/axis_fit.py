@@ -1,7 +1,7 @@
-"""Where the middle of a straight tube lies and how wide it is, to hundredths of a pixel, with deviations.
+"""Fit of the axis and the width of a straight tube's image, to hundredths of a pixel, with covariance.
 
-In linear light, with the levels beside the tube projected out, station by station: variable projection (Golub and
-Pereyra 1973). Samples weigh by their noise.
+The fit is made in linear light. The levels of the background beside the tube are linear parameters of each station and
+are projected out: variable projection (Golub and Pereyra 1973). Samples are weighted by their noise.
 """
 
 import math
@@ -14,27 +14,27 @@ from scipy.special import erf
 
 from holotorch.tracking.detection.fits import BLUNTEST, SHARPEST, median
 
-_STEPS = 8
-_SETTLED = 0.03  # pixels, of middle and blur: the step after is a third of it; gloss and shadow move a middle by more
-_WIDENED = 0.15  # pixels, of width and taper: the step after is a fifth of it, and moves the middle by next to nothing
-_FARTHEST = np.array([1.5, 1.5, 1.5, 1.5, 0.5])  # pixels in one step, of middle and width at both, and of blur
-_SLICES = 8
+_STEPS = 8  # most Gauss-Newton steps
+_SETTLED = 0.03  # pixels: step of middle and blur at which the fit ends; the next step would be a third of it
+_WIDENED = 0.15  # pixels: step of width and taper at which the fit ends; the next step would be a fifth of it
+_FARTHEST = np.array([1.5, 1.5, 1.5, 1.5, 0.5])  # pixels: largest step of middle (2), width (2) and blur
+_SLICES = 8  # slices across the tube with constant shading each
 _SHADINGS = (np.ones_like, lambda q: q, lambda q: np.sqrt(1 - q * q), lambda q: q**3)
-_MEANS = (1.0, 0.0, math.pi / 4, 0.0)  # of the shadings over the tube
-_SHARES = (1e3, 1.0, 1.0, 0.7)  # of a band's light: what each shading may amount to; the even one is free
+_MEANS = (1.0, 0.0, math.pi / 4, 0.0)  # mean of each shading over the width of the tube
+_SHARES = (1e3, 1.0, 1.0, 0.7)  # prior deviation of each shading, relative to the band's light; the first one is free
 
 
 @dataclass(frozen=True, eq=False)
 class AxisFit:
-    """Of a straight tube that is seen at stations along it.
+    """Fit to the image of a straight tube at stations along it.
 
     Attributes:
-        unknown: What was found: middle and width (each at t = 0 and what ``reach`` adds to it), blur, and shadings.
-        normal: Its inverse covariance, from the noise and from what is not known of the shading.
-        reach: Of the stations from t = 0, in samples.
-        contrast: Light of the tube less that on either side, over the larger of the two; medians.
-        weight: [S], how much each station counts; near 0 where something else is seen.
-        moving: Pixels by which the middle moved in the last step.
+        unknown: Fitted values: middle and width (each at t = 0, and its change up to t = reach), blur, and shadings.
+        normal: Inverse covariance of ``unknown``, from the noise and the priors.
+        reach: Largest distance of a station from t = 0, in samples.
+        contrast: Median contrasts of the tube to both sides, divided by the larger one.
+        weight: [S] weight of each station; near 0 where the tube is covered.
+        moving: Change of the middle in the last step, in pixels.
     """
 
     unknown: np.ndarray
@@ -46,12 +46,12 @@ class AxisFit:
 
     @property
     def sides(self) -> np.ndarray:
-        """[4] offset and slope of the middle, width and taper: u = offset + slope t, width + taper t."""
+        """[4] offset, slope, width and taper: the middle is offset + slope t, the width is width + taper t."""
         return self.unknown[:4] * self._scale
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """[4, 4] of the sides."""
+        """[4, 4] covariance of ``sides``."""
         covariance = _solved(self.normal, np.eye(len(self.normal), 4))[:4]
         return covariance * self._scale * self._scale[:, None]
 
@@ -60,9 +60,9 @@ class AxisFit:
         return np.array([1.0, 1.0 / self.reach, 1.0, 1.0 / self.reach])
 
     def given(self, width: tuple[float, float], known: float, before: float = math.inf) -> "AxisFit":
-        """The same where width and taper come to be known, to a share of the width; to first order.
+        """First-order update of the fit for another prior of width and taper, of relative deviation ``known``.
 
-        With ``before`` they were known to that share already, and are no more.
+        ``before`` is the relative deviation of the prior that this fit used, which is removed.
         """
         more, away = np.zeros(len(self.unknown)), np.zeros(len(self.unknown))
         more[2:4] = (known * width[0]) ** -2 - (before * width[0]) ** -2
@@ -83,36 +83,34 @@ def fit_axis(
     known: float = 0.35,
     start: np.ndarray | None = None,
 ) -> AxisFit:
-    """Blurred boxes whose two sides are straight lines along the tube, all stations at once.
+    """Fit the two straight sides of the tube to all stations at once.
 
-    Beside a box each station has two levels of its own; in it each band has a shading: even, and rising across, round
-    as Lambert's law gives, and cubic where part of the tube is in shadow. Their sizes are free within what light can
-    do (a prior of a share of the band's light), so that where pixels do not tell, the covariance does.
+    The model of a station is a blurred box. Each station has a free background level on either side of the tube. Each
+    band has four shadings across the tube: constant, linear, round (Lambert's law), and cubic (a partial shadow). Their
+    amplitudes have priors relative to the light of the band: the covariance includes what pixels cannot determine.
 
     Args:
-        light: [S, U] samples across, U odd; of one channel or a mix.
-        weight: Inverse variances of the same shape.
-        t: [S] places along, in samples.
-        band: [S] which band a station is on, from 0.
-        level: [bands] light of each band, as ``light``.
-        bright: [bands] the same without the cancelling of channels in a mix, which gloss and shadow need not follow.
-        width: Of the tube at t = 0 in samples, and its taper per sample, to begin with.
-        blur: Standard deviation to begin with, in samples.
-        known: Share of the width to which it and the taper are known beforehand. Shading and width are hard to tell
-            apart; whoever knows the width finds the middle better.
-        start: ``unknown`` of an earlier fit to the same stations, for all but width and taper.
+        light: [S, U] samples across the tube, U odd, of one channel or a linear combination of channels.
+        weight: [S, U] inverse variances.
+        t: [S] positions of the stations along the tube, in samples.
+        band: [S] index of the band of each station, from 0.
+        level: [bands] light of each band, in the units of ``light``.
+        bright: [bands] the same without cancellation between channels; it scales the priors of the shadings.
+        width: Expected width of the tube at t = 0 in samples, and its taper per sample.
+        blur: Standard deviation of the blur to begin with, in samples.
+        known: Relative deviation of the expected width and taper; a better known width gives a better middle.
+        start: ``unknown`` of an earlier fit to the same stations, to begin with, except for width and taper.
     """
     light, weight = light.astype(np.float64), weight.astype(np.float64)[..., None]
     stations, count, bands, kinds = *light.shape, len(level), len(_SHADINGS)
-    u, reach = np.arange(count) - (count - 1) / 2, max(1.0, float(np.abs(t).max()))
+    u = np.arange(count) - (count - 1) / 2
+    reach = max(1.0, float(np.abs(t).max()))
     member = (band[:, None] == np.arange(bands)).astype(np.float64)
-    parts = _parts(t / reach, member)
+    parts = _station_parts(t / reach, member)
     flat = parts[:, :-1, :-1].reshape(stations * (3 + kinds), -1)
-    expected = np.zeros(flat.shape[1])
-    expected[2:5] = width[0], width[1] * reach, blur
-    unknown = _first(expected, level, start)
-    shares = np.maximum(bright, 1e-9)[:, None] * np.array(_SHARES)
-    prior = np.concatenate([[0.0, 0.0, *2 * [(known * width[0]) ** -2], 0.0], shares.ravel() ** -2.0])
+    expected, unknown, prior = _expectation(level, bright, (width[0], width[1] * reach), blur, known)
+    if start is not None:
+        unknown[:2], unknown[4:] = start[:2], start[4:]
     moving, station, noise, normal, beside = 0.0, np.ones(stations), 1.0, prior, prior
     for k in range(_STEPS):
         seen = (flat @ unknown).reshape(stations, -1)
@@ -120,10 +118,10 @@ def fit_axis(
         columns, slopes_of = _strip_terms(u, seen[:, 0], half, float(seen[0, 2]))
         levels = seen[:, 1:]
         outer, inner = columns[..., :2], columns[..., 2:]
-        design = np.empty((stations, count, 4 + kinds))  # slopes, shadings and what is left without levels beside
+        design = np.empty((stations, count, 4 + kinds))  # derivatives, shadings, and residuals without background
         design[..., 3:-1] = inner
         design[..., -1] = light - (inner @ levels[:, 2:, None])[..., 0]
-        # Levels beside the tube are projected out, station by station.
+        # Project out the background levels of each station.
         weighted = (outer * weight).swapaxes(1, 2)
         inverse = _inverse(weighted @ outer)
         levels[:, :2] = beside = (inverse @ (weighted @ design[..., -1:]))[..., 0]
@@ -131,7 +129,10 @@ def fit_axis(
         both = weighted @ design
         gram = (design * weight).swapaxes(1, 2) @ design - both.swapaxes(1, 2) @ (inverse @ both)
         if k:
-            noise, station = _weighed(gram[:, -1, -1] / count, count)
+            chi = gram[:, -1, -1] / count
+            typical = max(median(chi), 1e-12)
+            noise = math.sqrt(typical * count / max(1, count - 3))
+            station = np.maximum(chi / (4 * typical), 1.0) ** -2
             gram = gram * station[:, None, None]
         both = flat.T @ (gram[:, :-1] @ parts).reshape(len(flat), -1)
         normal, slope = both[:, :-1], both[:, -1]
@@ -147,62 +148,65 @@ def fit_axis(
         moving = max(abs(middle), abs(turn))
         if k and max(moving, abs(soft)) < _SETTLED and max(abs(wide), abs(taper)) < _WIDENED:
             break
-    tube = member @ (unknown[5:].reshape(bands, kinds) @ np.array(_MEANS))
-    one, other = (median(np.abs(tube - side)) for side in beside.T)
+    contrast = _contrasts(member @ (unknown[5:].reshape(bands, kinds) @ np.array(_MEANS)), beside)
+    return AxisFit(unknown, normal / max(noise, 0.5) ** 2, reach, contrast, station, moving)
+
+
+def _contrasts(tube: np.ndarray, beside: np.ndarray) -> tuple[float, float]:
+    """Median contrasts of the tube [S] to the background on both sides [S, 2], divided by the larger one."""
+    one, other = median(np.abs(tube - beside[:, 0])), median(np.abs(tube - beside[:, 1]))
     most = max(one, other, 1e-300)
-    return AxisFit(unknown, normal / max(noise, 0.5) ** 2, reach, (one / most, other / most), station, moving)
+    return one / most, other / most
 
 
-def _weighed(chi: np.ndarray, count: int) -> tuple[float, np.ndarray]:
-    """Noise over what was assumed, and the weight [S] of each station: less than 1 where something else is seen.
+def _station_parts(share: np.ndarray, member: np.ndarray) -> np.ndarray:
+    """[S, 4 + K, 6 + bands K]: the parameters of each station as linear functions of the unknowns.
 
-    ``chi`` [S]: mean weighted square of what is left of a station's ``count`` samples.
-    """
-    typical = max(median(chi), 1e-12)
-    return math.sqrt(typical * count / max(1, count - 3)), np.maximum(chi / (4 * typical), 1.0) ** -2
-
-
-def _first(expected: np.ndarray, level: np.ndarray, start: np.ndarray | None) -> np.ndarray:
-    """Unknowns to begin with: what is expected, with the light of each band [bands] or the rest of an earlier fit."""
-    unknown = expected.copy()
-    if start is None:
-        unknown[5 :: len(_SHADINGS)] = level
-    else:
-        unknown[:2], unknown[4:] = start[:2], start[4:]
-    return unknown
-
-
-def _parts(t: np.ndarray, member: np.ndarray) -> np.ndarray:
-    """What each station sees of the unknowns, [S, 4 + K, 6 + bands K], K the number of shadings.
-
-    The unknowns are middle and width (each at t = 0 and what t = 1 adds), blur, and the shadings of each band. A
-    station sees middle, width, blur and the K shadings of its band; the last row is for what is left of the light.
+    The unknowns are middle and width (each at t = 0, and its change up to t = reach), the blur, and K shadings of each
+    band. Each station has the middle, width, blur and K shadings as parameters. The last row and column hold the
+    residual light.
 
     Args:
-        t: [S] positions of the stations over the farthest one.
-        member: [S, bands] 1 where a station is on a band, else 0.
+        share: [S] position of each station, -1 to 1.
+        member: [S, bands] 1 where the station lies on the band, else 0.
     """
-    (stations, bands), kinds = member.shape, len(_SHADINGS)
-    parts = np.zeros((stations, 4 + kinds, 6 + bands * kinds))
+    kinds = len(_SHADINGS)
+    parts = np.zeros((len(share), 4 + kinds, 6 + member.shape[1] * kinds))
     parts[:, 0, 0] = parts[:, 1, 2] = parts[:, 2, 4] = parts[:, -1, -1] = 1
-    parts[:, 0, 1] = parts[:, 1, 3] = t
+    parts[:, 0, 1] = parts[:, 1, 3] = share
     for kind in range(kinds):
         parts[:, 3 + kind, 5 + kind : -1 : kinds] = member
     return parts
 
 
-def _solved(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Of a positive matrix [N, N] and right sides [N] or [N, K]; NaN, which whoever asked refuses, where it is not.
+def _expectation(
+    level: np.ndarray, bright: np.ndarray, width: tuple[float, float], blur: float, known: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Expected unknowns, unknowns to start from, and inverse variances of the expected ones: [5 + bands K] each.
 
-    By Cholesky's factors from OpenCV: the call into NumPy's solver takes several times as long as the work. It gives up
-    on pivots below 2e-16, where nothing is seen; 3000 fits to frames of all conditions had none below 1e-3.
+    ``width`` is the expected width at t = 0 and its change up to t = reach, of relative deviation ``known``.
     """
-    known, found = cv2.solve(normal, right.reshape(len(right), -1), flags=cv2.DECOMP_CHOLESKY)
-    return found.reshape(right.shape) if known else np.full_like(right, np.nan)
+    expected = np.zeros(5 + len(level) * len(_SHADINGS))
+    expected[2:5] = *width, blur
+    unknown = expected.copy()
+    unknown[5 :: len(_SHADINGS)] = level
+    shares = np.maximum(bright, 1e-9)[:, None] * np.array(_SHARES)
+    prior = np.concatenate([[0.0, 0.0, *2 * [(known * width[0]) ** -2], 0.0], shares.ravel() ** -2.0])
+    return expected, unknown, prior
+
+
+def _solved(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solution for a positive definite matrix [N, N] and right sides [N] or [N, K]; NaN if it is not definite.
+
+    OpenCV's Cholesky solver has less overhead per call than NumPy's, which takes several times as long for such small
+    matrices. OpenCV fails for pivots below 2e-16; in 3000 fits to frames of all conditions none was below 1e-3.
+    """
+    solved, solution = cv2.solve(normal, right.reshape(len(right), -1), flags=cv2.DECOMP_CHOLESKY)
+    return solution.reshape(right.shape) if solved else np.full_like(right, np.nan)
 
 
 def _inverse(normal: np.ndarray) -> np.ndarray:
-    """Of matrices [S, 2, 2], positive but for rounding."""
+    """Inverses of matrices [S, 2, 2] that are positive definite up to rounding."""
     inverse = []
     for (a, b), (_, d) in normal.tolist():
         a, d = a * (1 + 1e-9) + 1e-300, d * (1 + 1e-9) + 1e-300
@@ -212,7 +216,7 @@ def _inverse(normal: np.ndarray) -> np.ndarray:
 
 
 def _slices() -> tuple[np.ndarray, np.ndarray]:
-    """Nodes [N] over the tube, -1 to 1, and what columns (left, right, shadings) take of a rise there [N, 2 + K]."""
+    """Nodes [N] across the tube, -1 to 1, and the jump of each column (left, right, shadings) there, [N, 2 + K]."""
     q = np.linspace(-1, 1, _SLICES + 1)
     middle = (q[1:] + q[:-1]) / 2
     shadings = np.pad(np.stack([f(middle) for f in _SHADINGS], -1), ((1, 1), (0, 0)))
@@ -223,30 +227,31 @@ def _slices() -> tuple[np.ndarray, np.ndarray]:
 
 _NODES, _TAKES = _slices()
 _HALVES = _TAKES / 2
-# Of levels of the columns, what a rise at each node adds to the slopes to the middle and, times the node, to the width.
+# From the levels of the columns to the derivatives of each jump by the middle of the tube and by half of its width.
 _RISES = -np.stack([_TAKES, _TAKES * _NODES[:, None]], 1).transpose(2, 0, 1).reshape(_TAKES.shape[1], -1)
 
 
 def _strip_terms(u: np.ndarray, at: np.ndarray, half: np.ndarray, blur: float):
-    """Columns [S, U, 2 + K]: light to the left of tubes at [S], to the right, and K shadings of the tube.
+    """Columns of the model [S, U, 2 + K], and a function that writes the derivatives of their sum.
 
-    And a function of levels [S, 2 + K], which writes the slopes of the columns' sum to middle, width and blur into the
-    first three of [S, U, 3 and more].
+    The columns are the background left and right of tubes at ``at`` [S], and the K shadings. The function takes their
+    levels [S, 2 + K] and an array [S, U, 3 or more], and writes the derivatives by middle, width and blur into the
+    first three entries of the latter.
     """
     scale = math.sqrt(2) * blur
     z = (u[:, None] - (at[:, None] + half[:, None] * _NODES)[:, None]) / scale  # [S, U, N]
-    # A rise is (1 + erf z) / 2; what the tube takes of the 1 cancels.
+    # A jump is (1 + erf z) / 2. The jumps of a shading add up to 0, so that only the sides need the constant 1 / 2.
     columns = erf(z) @ _HALVES
     columns[..., :2] += 0.5
     bell = np.exp(-z * z)
 
-    def slopes(levels: np.ndarray, found: np.ndarray) -> None:
+    def slopes(levels: np.ndarray, design: np.ndarray) -> None:
         steps = (levels @ _RISES).reshape(len(levels), -1, 2) / (math.sqrt(math.pi) * scale)
         both = bell @ steps
         middle, sides = both[..., 0], both[..., 1]
-        found[..., 0] = middle
-        np.multiply(sides, 0.5, out=found[..., 1])
-        np.subtract((u - at[:, None]) * middle, half[:, None] * sides, out=found[..., 2])
-        found[..., 2] /= blur
+        design[..., 0] = middle
+        np.multiply(sides, 0.5, out=design[..., 1])
+        np.subtract((u - at[:, None]) * middle, half[:, None] * sides, out=design[..., 2])
+        design[..., 2] /= blur
 
     return columns, slopes

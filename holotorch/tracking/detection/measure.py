@@ -1,8 +1,9 @@
-"""From a line on a frame to the places of the band edges on it: bands from labels, edges from whole windows."""
+"""Bands and their edges along a line on a frame: bands from colour labels, edges from fits to windows of samples."""
 
 import dataclasses
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,33 +19,63 @@ from holotorch.tracking.detection.luma import coarse_colours, fit_luma
 from holotorch.tracking.detection.stations import Axis, variance_of
 from holotorch.tracking.pose.status import Refusal, Status
 
-_COLUMNS = 40  # and more, along half a line: of every second to sixth pixel, whose colours say where it lies,
-_CERTAIN = 280  # or this many, where only coarse colours have said that it is there
-_WINDOW = 20  # pixels to either side of an edge, of which every second one is read,
-_CLOSE = 5  # but each as near as this, and two blurs farther
-_OUTSIDE = 10  # pixels beyond the outermost edges
-_ASIDE = 0.9  # pixels beyond the tube's sides, from which on a row tells nothing
-_HALFWAY, _SURE = 6, 3  # samples to either side of where labels change; the outermost of them that show one colour
-_AWAY = 2.0  # pixels from where it was expected at which an edge is looked at once more
-_MARGIN = 8.0  # pixels, and two blurs: what must be seen to either side of an edge
-_WHITE, _CUT = 252, 0.1  # a level that may be more light than it says, and the share of such in a row that spoils it
-_SMEARED = 4.0  # pixels of blur that no lens makes
-BLURRED = 0.6  # pixels from the blur that was expected, beyond which edges want another look
-_UNSURE, _LOST = 0.1, 3.0  # pixels: a clear edge is known to a few hundredths, and what may become one to a few
-_ALIKE = 0.2  # of the brightest channel: colours nearer than this are one
-_PALE = 0.5  # of the purity of what lies beside it
-_BESIDE = 14.0  # pixels from the mid-line, beside the widest catheters
-_SIGNS, _ROWS = np.repeat([-1.0, 1.0], 3), np.tile([2.0, 3.0, 4.0], 2)  # three rows to either side, pixels beyond it
-_SIDE_STEP = 0.25  # light that changes beside an edge, over what changes on it: something lies across the tube
-_SAME_STEP = 0.6  # the same, where the bands themselves go on there
-_CLEAR = 4.0  # standard deviations of that change
+
+@dataclass(frozen=True)
+class StripSearch:
+    """How the labels of a strip of the frame are searched for the tube and its bands."""
+
+    columns: int = 40  # least columns in half of the strip that are classified, of every second to sixth pixel
+    columns_cold: int = 280  # the same where no previous pose says that the tube is there
+    similar: float = 0.2  # difference up to which two colours are equal, as a share of the brightest channel
+    pale: float = 0.5  # purity of a colour, relative to that of the background, below which cloth shines through a tube
+    beside: float = 14.0  # distance from the axis at which the background is read, in pixels: beside the widest tubes
+    halfway: int = 6  # samples to either side of a change of labels
+    halfway_ends: int = 3  # outermost samples on either side that surely show one colour
+
+
+@dataclass(frozen=True)
+class EdgeWindow:
+    """Which pixels around an edge are sampled, and with which weight; in pixels unless said otherwise."""
+
+    half: int = 20  # half-width of the window along the tube; every second pixel is read
+    dense: int = 5  # distance up to which every pixel is read, plus two blurs
+    outside: int = 10  # distance beyond an outermost edge up to which samples count
+    aside: float = 0.9  # distance from the side of the tube beyond which a row of samples has no weight
+    white: int = 252  # highest level that is surely not saturated
+    saturated: float = 0.1  # share of saturated samples from which a row has no weight
+
+
+@dataclass(frozen=True)
+class EdgeLimits:
+    """When an edge is measured again or refused. In pixels unless said otherwise; determined on synthetic frames."""
+
+    far: float = 2.0  # distance from its expected position at which an edge is measured again
+    margin: float = 8.0  # distance to the border of the frame that an edge needs, plus two blurs
+    smeared: float = 4.0  # blur that only motion makes
+    unsure: float = 0.1  # deviation above which an edge is measured again in the middle rows alone
+    lost: float = 3.0  # deviation above which there is no edge
+    across: float = 0.25  # change of the background beside an edge over the change on it: something lies across
+    same: float = 0.6  # the same ratio, from which on the bands continue beside the tube
+    clear: float = 4.0  # least significance of a change of the background, in standard deviations
+
+
+_SEARCH, _WINDOW, _LIMITS = StripSearch(), EdgeWindow(), EdgeLimits()
+BLURRED = 0.6  # pixels: difference of a blur from the expected one above which edges are measured again
+_SIGNS, _ROWS = np.repeat([-1.0, 1.0], 3), np.tile([2.0, 3.0, 4.0], 2)  # three background rows on each side of the tube
 
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """Of the band edges [N] on a line, in pixels: t (NaN where not seen), its deviation, blur, bulge, and failures.
+    """Measured band edges [N] on a line, in pixels.
 
-    ``expected`` is the blur for which the windows were made; ``coarse`` says that colours have fewer pixels than luma.
+    Attributes:
+        t: [N] positions along the line; NaN where not measured.
+        deviation: [N] standard deviations of ``t``.
+        blur: Median blur of the edges.
+        expected: Blur for which the windows were chosen.
+        bulge: Largest bulge of a ring's front along the line.
+        coarse: Whether the colours have fewer pixels than the luma.
+        hidden, outside: Indices of the edges that are hidden, or too close to the border of the frame.
     """
 
     t: np.ndarray
@@ -68,32 +99,45 @@ def find_bands(
     *,
     onward: bool,
 ) -> tuple[Line, Stretches]:
-    """Line, and stretches on it, in a strip around a first line, ``half`` its length, ``aside`` half its width.
+    """Search a strip around a line for the tube, and the tube for its bands.
 
-    All in pixels; t rises from the tip to the rear, as on the first line where that is ``onward``. A Refusal (NO_AXIS,
-    BANDS_MISSING) where nothing thin has the bands' colours, or not in their order.
+    Args:
+        sampler: Reads the frame.
+        lens: Distortion of the camera.
+        line: Axis of the strip.
+        table: Labels of colours.
+        half: Half of the length of the strip, in pixels.
+        aside: Half of its width, in pixels.
+        reach: Largest slope of the tube relative to ``line``.
+        onward: Whether t on ``line`` is known to rise from the tip to the rear.
+
+    Returns:
+        Line along the tube, on which t rises from the tip to the rear, and the stretches of bands on it.
+
+    Raises:
+        Refusal: NO_AXIS where nothing thin has the bands' colours, BANDS_MISSING where these are not in their order.
     """
     end = math.ceil(half)
     t = np.arange(-end, end + 1.0)
     u = np.arange(-math.ceil(aside), aside + 1.0)
-    every = min(6, max(2, end // (_COLUMNS if onward else _CERTAIN)))
+    every = min(6, max(2, end // (_SEARCH.columns if onward else _SEARCH.columns_cold)))
     some = t[end % every :: every]
     found = find_axis(table.labels(sampler.nearest(line.pixels(lens, some, u))), some, u, reach)
     if found is None:
         raise Refusal(Status.NO_AXIS, "nothing thin and straight with the bands' colours")
     line = line.moved(*found)
-    rows = np.array([-1.0, 0.0, 1.0, -_BESIDE, _BESIDE])
+    rows = np.array([-1.0, 0.0, 1.0, -_SEARCH.beside, _SEARCH.beside])
     levels = sampler.nearest(line.pixels(lens, t, rows))
     near = table.labels(levels)
-    # What looks the same on both sides of the line is a drape, or cannot be told from one.
+    # Where the line and both of its sides have the same colour, it may lie on a drape in the colour of a band.
     shown = levels[:, [1, 3, 4]].transpose(2, 0, 1).astype(np.float32, order="C")
     most = shown.max(0)
     gap = np.abs(shown[..., 1:] - shown[..., :1]).max(0)
     alike = near[:, 3:] == near[:, 1:2]
-    drape = alike[:, 0] & alike[:, 1] & (np.maximum(gap[:, 0], gap[:, 1]) < _ALIKE * most[:, 0])
-    # A tube that lets cloth shine through has the cloth's hue, but is paler than any band on it.
+    drape = alike[:, 0] & alike[:, 1] & (np.maximum(gap[:, 0], gap[:, 1]) < _SEARCH.similar * most[:, 0])
+    # A transparent tube on cloth has the hue of the cloth, but is paler than any band.
     pure = 1 - shown.min(0) / np.maximum(most, 1.0)
-    through = alike[:, 0] & alike[:, 1] & (pure[:, 0] < _PALE * np.minimum(pure[:, 1], pure[:, 2]))
+    through = alike[:, 0] & alike[:, 1] & (pure[:, 0] < _SEARCH.pale * np.minimum(pure[:, 1], pure[:, 2]))
     stretches = find_stretches(near[:, :3], drape, through, table, float(end), onward=onward)
     if stretches is None:
         why = "no stretch of line shows the bands in their order, or it shows them both ways"
@@ -105,19 +149,22 @@ def find_bands(
 
 
 def halfway(sampler: Sampler, lens: Lens, line: Line, edges: np.ndarray) -> np.ndarray:
-    """Where light is halfway between that on both sides of ``edges`` [N], which a few pixels' labels gave.
+    """Refine ``edges`` [N] from labels to the positions where the light is halfway between that on both sides.
 
-    Of a step at x among samples k from -n to n, from 0 to 1, the sum of 1 - step is x + n + 1/2, however blurred. As
-    they were where that is not near.
+    For a step from 0 to 1 at x, sampled at -n to n, the sum of 1 - step is x + n + 1/2 for any symmetric blur. An edge
+    whose refined position is more than a few pixels away stays as it is.
     """
-    k = np.arange(-_HALFWAY, _HALFWAY + 1.0)
+    k = np.arange(-_SEARCH.halfway, _SEARCH.halfway + 1.0)
     around = lens.distort(line.plane((edges[:, None] + k)[..., None], np.array([-1.0, 0.0, 1.0])))
     light = sampler(around).sum(-1)  # [3, N, K]
-    before, after = (part.sum(-1, keepdims=True) / _SURE for part in (light[..., :_SURE], light[..., -_SURE:]))
+    before, after = (
+        part.sum(-1, keepdims=True) / _SEARCH.halfway_ends
+        for part in (light[..., : _SEARCH.halfway_ends], light[..., -_SEARCH.halfway_ends :])
+    )
     step = after - before
     share = ((light - before) * step).sum(0) / np.maximum((step * step).sum(0), 1e-9)
     found = (1 - share).sum(-1) - light.shape[-1] / 2
-    return edges + np.where(np.abs(found) < _SURE, found, 0.0)
+    return edges + np.where(np.abs(found) < _SEARCH.halfway_ends, found, 0.0)
 
 
 def measure_edges(
@@ -129,116 +176,162 @@ def measure_edges(
     blur: float,
     curve: np.ndarray,
 ) -> Edges:
-    """Places of the edges near ``guess`` [N] (NaN: not looked for); ``curve`` [N]: how far a ring's front bulges in t.
+    """Measure the positions of the band edges along the axis.
 
-    An edge fails that is hidden (the surroundings change where it does), unclear, or too near the frame's border. A
-    Refusal (INCONSISTENT) where all of them go on beside the tube.
+    An edge fails if it is hidden (the background changes there, too), unclear, or too close to the frame's border.
+
+    Args:
+        sampler: Reads the frame.
+        lens: Distortion of the camera.
+        axis: Axis and width of the tube's image.
+        guess: [N] expected positions in pixels; NaN for an edge that is not to be measured.
+        doubtful: Whether each edge may belong to an object that lies across the tube.
+        blur: Expected blur in pixels.
+        curve: [N] bulge of each ring's front along t, in pixels.
+
+    Raises:
+        Refusal: INCONSISTENT where all edges continue beside the tube.
     """
     line = axis.line
     chosen = np.isfinite(guess).nonzero()[0]
     t, deviation = np.full(len(guess), np.nan), np.full(len(guess), np.inf)
     if not len(chosen):
         return Edges(t, deviation, blur, blur, 0.0, False, (), ())
-    near, bulge = guess[chosen], curve[chosen]
-    window, along = _along(near, blur)
-    widths = axis.width_at(near)
-    half = math.ceil(float(widths.max()) / 2 + _ASIDE) - 1
+    near = guess[chosen]
+    along, window = _positions_along(near, blur)
+    widths, bulge = axis.width_at(near), curve[chosen]
+    half = math.ceil(float(widths.max()) / 2 + _WINDOW.aside) - 1
     u = np.arange(-half, half + 1.0)
     front = Front.of(u, widths, axis.blur)
-    # Rows on the tube, and three to either side of it, which tell whether something lies across.
-    rows = np.empty((len(near), len(u) + 6))
-    rows[:, : len(u)], rows[:, len(u) :] = u, _sides(widths, blur)
-    farther = np.zeros_like(rows)
-    farther[:, : len(u)] = bulge[:, None] * front.mean
-    # A row that is mostly surroundings tells little of the edge, and what it tells may be of something else.
-    row = np.minimum(np.maximum(widths[:, None] / 2 + _ASIDE - np.abs(u), 0), 1)
-    kept = _between(along, len(near), chosen[0] == 0, chosen[-1] == len(guess) - 1, blur)
+    rows, farther, row = _rows_across(u, widths, blur, bulge[:, None] * front.mean)
+    kept = _kept_along(along, blur, chosen, len(guess))
     looks = 2
     while True:
-        place = near[:, None, None] + along[:, None] + farther[:, None]
-        every = lens.distort(line.plane(place, rows[:, None]))
+        every = lens.distort(line.plane(near[:, None, None] + along[:, None] + farther[:, None], rows[:, None]))
         pixels = every[..., : len(u)]
         light = sampler.sharp(pixels).transpose(1, 2, 3, 0)  # [E, T, U, C]
         inside = sampler.inside(pixels)
         shown = kept[..., None] * row[:, None] * inside
-        weight = shown[..., None] / variance_of(light)
-        most = sampler.light[_WHITE]
-        if light.max() > most:  # where light is cut off on one side, halfway is no longer where the edge is
-            weight *= (light > most).mean(1, keepdims=True) < _CUT
+        weight = _weights(light, shown, sampler.light[_WINDOW.white])
         fit = fit_edges(light, weight, blur, t=along)
         known = np.isfinite(fit.deviation)
-        if np.count_nonzero(known) > 1 and median(fit.blur[known]) > _SMEARED > blur:
-            # It moved along itself, farther than what was looked at.
-            t[chosen] = near + fit.place
+        if np.count_nonzero(known) > 1 and median(fit.blur[known]) > _LIMITS.smeared > blur:
+            t[chosen] = near + fit.place  # the tube moved along itself: the window is too short for this blur
             return measure_edges(sampler, lens, axis, t, doubtful, median(fit.blur[known]), curve)
+        coarse = bool(np.any(coarse_colours(sampler, pixels[[0, -1], len(along) // 2, half])))
         shading, looks = fit, looks - 1
-        if coarse := bool(np.any(coarse_colours(sampler, pixels[[0, -1], len(along) // 2, half]))):
+        if coarse:
             fit, shading = fit_luma(fit, light, shown, sampler.light, along)
-        elif bool((fit.deviation > _UNSURE).any()) and not _astray(fit, looks):
-            # Surroundings that are not even leak into the outer rows; those in the middle may tell all the same.
-            core = (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)
-            fit = shading = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur, t=along))
+        elif bool((fit.deviation > _LIMITS.unsure).any()) and not _astray(fit, looks):
+            # An uneven background leaks into the outer rows, so that the middle rows alone may fit better.
+            core = weight * (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)[:, None, :, None]
+            fit = shading = fit.or_better(fit_edges(light, core, blur, t=along))
         near = near + fit.place
         if not _astray(fit, looks):
             break
     near = near - bulge * front.shift(shading.steps, shading.told, row)
-    blurs = fit.blur[np.isfinite(fit.deviation)]
-    soft = median(fit.blur)
     beside = sampler.light.take(sampler.nearest(every[..., len(u) :].reshape(-1, 6)))
     covered, beyond = _across(beside.reshape(*every.shape[:2], 6, 3), along - fit.place[:, None], fit)
-    if beyond and len(near) > 2 and soft < blur + BLURRED:
+    if beyond and len(near) > 2 and median(fit.blur) < blur + BLURRED:
         raise Refusal(Status.INCONSISTENT, "all bands go on beside the tube: this is thicker, seen in one part of it")
-    margin, moved = _MARGIN + 2 * soft, np.abs(fit.place)
-    within = np.ones(len(near), dtype=bool)
-    if not inside.all() or window < margin + moved.max():
-        within = np.all(sampler.inside(lens.distort(line.plane(near[:, None] + margin * np.array([-1, 1])))), -1)
-    clear = (fit.deviation < 0.6) & (moved < window / 2) & (fit.blur < 0.55 * window)
-    # An edge between two bands shows by its colours what it is; an outer one does not.
-    hides = covered & np.array(doubtful)[chosen]
-    outside, hidden = chosen[~within].tolist(), chosen[within & hides].tolist()
-    measured = within & ~hides & clear
-    t[chosen[measured]], deviation[chosen[measured]] = near[measured], fit.deviation[measured]
-    soft, most = median(blurs) if len(blurs) else blur, float(np.abs(bulge).max())
-    return Edges(t, deviation, soft, blur, most, coarse, tuple(hidden), tuple(outside))
+    within = _within_frame(sampler, lens, line, near, fit, window if inside.all() else 0)
+    clear = (fit.deviation < 0.6) & (np.abs(fit.place) < window / 2) & (fit.blur < 0.55 * window)
+    hidden, outside = list[int](), list[int]()
+    for j, index in enumerate(chosen.tolist()):
+        if not within[j]:
+            outside.append(index)
+        elif doubtful[index] and covered[j]:
+            hidden.append(index)  # an edge between two bands is not doubtful: their colours identify it
+        elif clear[j]:
+            t[index], deviation[index] = near[j], fit.deviation[j]
+    soft = median(fit.blur[known]) if (known := np.isfinite(fit.deviation)).any() else blur
+    return Edges(t, deviation, soft, blur, float(np.abs(bulge).max()), coarse, tuple(hidden), tuple(outside))
 
 
-def _along(near: np.ndarray, blur: float) -> tuple[int, np.ndarray]:
-    """Half the length of the windows around edges at ``near`` [E], in pixels, and the samples along a window [T]."""
-    gap = min((abs(b - a) for a, b in itertools.pairwise(near.tolist())), default=math.inf)
-    window = int(min(_WINDOW + 2 * blur, max(4.0, 0.45 * gap)))
-    along = np.arange(-window, window + 1.0)
-    return window, along[(np.abs(along) <= _CLOSE + 2 * blur) | (along % 2 == window % 2)]
+def _positions_along(near: np.ndarray, blur: float) -> tuple[np.ndarray, int]:
+    """Positions [T] of a window's samples relative to its edge, and its half-width, for edges at ``near``, in pixels.
 
-
-def _between(along: np.ndarray, edges: int, first: bool, last: bool, blur: float) -> np.ndarray:
-    """[E, T] 1 for samples that count, 0 far beyond the ``first`` and the ``last`` edge, where these are outermost.
-
-    There a table's grain shines through the tube, and light that drifts draws an edge to where it grows.
+    The windows of neighbouring edges do not overlap. Samples far from the edge are two pixels apart.
     """
-    outside = _OUTSIDE + 2 * blur
-    kept = np.ones((edges, len(along)), dtype=np.float32)
-    if first:
+    gap = min((abs(b - a) for a, b in itertools.pairwise(near.tolist())), default=math.inf)
+    window = int(min(_WINDOW.half + 2 * blur, max(4.0, 0.45 * gap)))
+    along = np.arange(-window, window + 1.0)
+    return along[(np.abs(along) <= _WINDOW.dense + 2 * blur) | (along % 2 == window % 2)], window
+
+
+def _rows_across(
+    u: np.ndarray, widths: np.ndarray, blur: float, bulge: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows across the tube: positions, shifts along by ``bulge`` [E, U], both [E, U + 6], and weights [E, U].
+
+    Besides the rows ``u`` [U] on the tube there are three background rows on each side, which show whether something
+    lies across the tube. A row that is mostly background has little weight: it carries little information on the edge,
+    and may show an edge of something else.
+    """
+    rows = np.empty((len(widths), len(u) + 6))
+    rows[:, : len(u)], rows[:, len(u) :] = u, _sides(widths, blur)
+    farther = np.zeros_like(rows)
+    farther[:, : len(u)] = bulge
+    return rows, farther, np.minimum(np.maximum(widths[:, None] / 2 + _WINDOW.aside - np.abs(u), 0), 1)
+
+
+def _weights(light: np.ndarray, shown: np.ndarray, most: float) -> np.ndarray:
+    """Weights [E, T, U, C] of samples, by their noise and by ``shown`` [E, T, U]; ``most`` is the largest exact light.
+
+    Saturated rows have no weight: where one side is saturated, the midpoint of the light is no longer at the edge.
+    """
+    weight = shown[..., None] / variance_of(light)
+    if light.max() > most:
+        weight *= (light > most).mean(1, keepdims=True) < _WINDOW.saturated
+    return weight
+
+
+def _kept_along(along: np.ndarray, blur: float, chosen: np.ndarray, edges: int) -> np.ndarray:
+    """[E, T] 1, or 0 for samples far outside the first and the last of all ``edges``.
+
+    There the texture of the background is visible through the tube, and its gradients would attract the fit.
+    """
+    outside = _WINDOW.outside + 2 * blur
+    kept = np.ones((len(chosen), len(along)), dtype=np.float32)
+    if chosen[0] == 0:
         kept[0] *= along >= -outside
-    if last:
+    if chosen[-1] == edges - 1:
         kept[-1] *= along <= outside
     return kept
 
 
+def _within_frame(
+    sampler: Sampler, lens: Lens, line: Line, near: np.ndarray, fit: EdgeFit, window: int
+) -> Sequence[bool] | np.ndarray:
+    """Whether the surroundings of each edge lie on the frame; ``window`` pixels around it are known to do so."""
+    margin = _LIMITS.margin + 2 * median(fit.blur)
+    if window >= margin + np.abs(fit.place).max():
+        return [True] * len(near)
+    return np.all(sampler.inside(lens.distort(line.plane(near[:, None] + margin * np.array([-1, 1])))), -1)
+
+
 def _astray(fit: EdgeFit, looks: int) -> bool:
-    """Whether an edge is 2 px and more from where it was looked for, with ``looks`` left and two edges to look at."""
-    far = float(np.abs(fit.place).max())
-    return looks > 0 and far >= _AWAY and int(np.count_nonzero(fit.deviation < _LOST)) >= 2
+    """Whether to measure again: an edge is far from its expected position, and ``looks`` measurements are left."""
+    distance = float(np.abs(fit.place).max())
+    return looks > 0 and distance >= _LIMITS.far and int(np.count_nonzero(fit.deviation < _LIMITS.lost)) >= 2
 
 
 def _sides(widths: np.ndarray, blur: float) -> np.ndarray:
-    """Three rows to either side of tubes so wide [E], beyond what blur makes of their sides: [E, 6] across."""
+    """Positions [E, 6] across of three rows on either side of tubes of ``widths`` [E], beyond their blurred sides."""
     return _SIGNS * (_ROWS + 2 * blur + widths[:, None] / 2)
 
 
 def _across(light: np.ndarray, along: np.ndarray, fit: EdgeFit) -> tuple[np.ndarray, bool]:
-    """Whether the surroundings change where the edges are: light [E, T, 6, C] at places [E, T] along from them.
+    """Whether the background changes where the edges are.
 
-    [E], on both sides of each: something lies across the tube there. And on one side of all, as much as on the tube.
+    Args:
+        light: [E, T, 6, C] light of the background rows.
+        along: [E, T] positions of these samples relative to the edges.
+        fit: Of the edges on the tube.
+
+    Returns:
+        [E] whether the background changes on both sides, so that something lies across the tube; and whether on one
+        side of all edges it changes about as much as the tube does.
     """
     count, samples, _, colours = light.shape
     light = light.reshape(count, samples, -1).astype(np.float64)
@@ -250,10 +343,10 @@ def _across(light: np.ndarray, along: np.ndarray, fit: EdgeFit) -> tuple[np.ndar
     middle = fit.steps.shape[1] // 2
     own = fit.steps[:, middle - 1 : middle + 2].sum(1)
     own = np.sqrt((own * own).sum(-1, keepdims=True)) / 3
-    large = size > _SIDE_STEP * own
-    if not large.any():  # as mostly: what noise may do need not be known
+    large = size > _LIMITS.across * own
+    if not large.any():  # the usual case, which needs no estimate of the noise
         return large[:, 0], False
     side = light.reshape(count, samples, 2, 3, colours).sum(3) / 3
     left = side - side.sum(1, keepdims=True) / samples - step[:, None] * up[:, :, None, None]
-    large &= size > _CLEAR * np.sqrt((left * left).sum((1, 3)) / (samples * power[..., 0]))
-    return large.all(1), bool((large & (size > _SAME_STEP * own)).all(0).any())
+    large &= size > _LIMITS.clear * np.sqrt((left * left).sum((1, 3)) / (samples * power[..., 0]))
+    return large.all(1), bool((large & (size > _LIMITS.same * own)).all(0).any())

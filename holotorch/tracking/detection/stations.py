@@ -1,4 +1,4 @@
-"""The mid-line of the tube's image and its width, from many stations across the bands."""
+"""Axis and width of the tube's image, from several cross-sections of the bands."""
 
 import math
 from collections.abc import Callable
@@ -13,32 +13,53 @@ from holotorch.tracking.detection.bands import Stretches
 from holotorch.tracking.detection.fits import median
 from holotorch.tracking.pose.status import Refusal, Status
 
-_LEVEL_SD = 2.5 / 255  # of a pixel's level; fits correct it by what they leave
-_ONE_SIDED = 0.15  # contrast to one side over that to the other
-_NARROWEST = 2.4  # pixels: below it no pixel shows one band alone
-_STATIONS, _FEWEST = 8, 6
-_SAMPLES = 16  # for each station: along the tube neighbours differ in nothing but noise
-_MOST = 700  # samples across, of all stations together: wide tubes take fewer stations
-THIRD = 0.35  # how well a width is known of which nothing is known, as a share of it
-_SLOW = 0.2  # of the width: a standard deviation that says that it may not have been reached yet
-_LINEAR = 0.1  # of a width: of what it is freed by one step of a fit, not by a new one, errs by the square of that
-_OTHER = 1.5  # pixels from its width at which a tube is surely wider or narrower
-_SHARP = 0.9  # pixels of blur, to begin with
-_SETTLED = 3.0  # pixels: a middle that moves farther in the last of a fit's steps is none
-_LINE_FLOOR = 0.002  # of the width: what gloss and shadow, which repeat along the tube, may move its middle
+
+@dataclass(frozen=True)
+class StationPlan:
+    """How many cross-sections of the tube, called stations, are sampled, and how densely."""
+
+    most: int = 8  # stations of a tube of ordinary width
+    fewest: int = 6  # stations of a wide tube
+    samples: int = 16  # lines averaged for each station: along the tube, neighbouring lines differ only in noise
+    most_across: int = 700  # samples across the tube, of all stations together; wide tubes take fewer stations
+
+
+@dataclass(frozen=True)
+class AxisLimits:
+    """When the fit of an axis is refused or its errors are raised. Determined on synthetic frames."""
+
+    one_sided: float = 0.15  # least ratio of the contrasts to both sides
+    narrowest: float = 2.4  # least width in pixels: below it no pixel shows the colour of one band alone
+    moving: float = 3.0  # largest move of the middle in the last step of a fit, in pixels: above it the fit diverges
+    floor: float = 0.002  # least deviation of the axis, in widths: gloss and shadow are constant along the tube
+
+
+@dataclass(frozen=True)
+class WidthFit:
+    """How the width of a tube is measured independently of a pose."""
+
+    slow: float = 0.2  # relative deviation of a width above which another fit follows: the fit may not have converged
+    linear: float = 0.1  # relative change of a width up to which one linear step replaces another fit
+    other_px: float = 1.5  # least difference in pixels at which the tube is surely wider or narrower than expected
+    blur_px: float = 0.9  # blur to begin with, standard deviation in pixels: that of a focused camera
+
+
+STATION_PLAN, _LIMITS, _WIDTH = StationPlan(), AxisLimits(), WidthFit()
+THIRD = 0.35  # relative deviation of a width that is unknown
+_LEVEL_SD = 2.5 / 255  # noise of a pixel's level, standard deviation; fits scale it by their residuals
 
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """Mid-line of the tube's image and its width.
+    """Axis of the tube's image, and the width of that image.
 
     Attributes:
-        line: On the plane z = 1; the bands lie around t = 0.
-        width, taper: Of the strip at t = 0 in pixels, and its change per pixel.
-        width_sd: Standard deviation of the width.
-        offset_sd, slope_sd: Of the line, in pixels and pixels per pixel, at ``centre``.
-        centre: Where the two are independent, t in pixels.
-        fit: What it was made of, on the line it was looked for along.
+        line: Axis on the plane z = 1; the bands lie around t = 0.
+        width, taper: Width at t = 0 in pixels, and its change per pixel.
+        width_sd: Standard deviation of the width in pixels.
+        offset_sd, slope_sd: Standard deviations of the axis at ``centre``, in pixels and pixels per pixel.
+        centre: Position t in pixels at which the errors of offset and slope are uncorrelated.
+        fit: Fit to the stations that gave this axis, relative to the line of the stations.
     """
 
     line: Line
@@ -52,17 +73,20 @@ class Axis:
 
     @property
     def blur(self) -> float:
-        """Of the sides, standard deviation in pixels."""
+        """Blur of the tube's sides, standard deviation in pixels."""
         return float(self.fit.unknown[4])
 
     def width_at(self, t: float | np.ndarray) -> np.ndarray:
-        """Pixels."""
+        """Width in pixels at positions ``t``."""
         return self.width + self.taper * np.asarray(t)
 
 
 @dataclass(frozen=True, eq=False)
 class Stations:
-    """What is seen across the bands at stations along ``line``, as :func:`fit_axis` takes it; ``extent`` in pixels."""
+    """Samples across the bands at stations along ``line``, as :func:`fit_axis` takes them.
+
+    ``extent`` is the distance in pixels from the first to the last sampled position.
+    """
 
     line: Line
     extent: float
@@ -74,21 +98,30 @@ class Stations:
     bright: np.ndarray
 
     def rough_width(self) -> float:
-        """Of the tube in pixels: where the signal is nearer to what it is at most than to what is beside."""
+        """Width of the tube in pixels: the samples that differ from the background by over half of the maximum."""
         left, right = self.signal[:, :2].mean(1), self.signal[:, -2:].mean(1)
         middle = self.signal.shape[1] // 2
         away = np.abs(self.signal - np.repeat(np.stack([left, right], 1), [middle, middle + 1], 1))
         return median((2 * away > away.max(1, keepdims=True)).sum(1))
 
     def show(self, width: float, blur: float) -> bool:
-        """Whether they reach beyond the sides of a tube so wide."""
+        """Whether the samples extend beyond the sides of a tube of this width and blur, in pixels."""
         return self.signal.shape[1] > 2 * (0.6 * width + 3 + 2 * blur)
 
 
-def look_across(sampler: Sampler, lens: Lens, line: Line, stretches: Stretches, width: float, blur: float) -> Stations:
-    """Stations within the bands that are seen, of a tube some ``width`` pixels wide.
+def look_across(
+    sampler: Sampler,
+    lens: Lens,
+    line: Line,
+    stretches: Stretches,
+    width: float,
+    blur: float,
+    plan: StationPlan = STATION_PLAN,
+) -> Stations:
+    """Sample stations within the visible bands of a tube of about ``width`` pixels.
 
-    A Refusal (BANDS_MISSING, TOO_NARROW) where no band is seen whole, or too little of them.
+    Raises:
+        Refusal: BANDS_MISSING where no band is visible from end to end, TOO_NARROW where the bands are too short.
     """
     edges = stretches.edges.tolist()
     spans = [
@@ -100,9 +133,9 @@ def look_across(sampler: Sampler, lens: Lens, line: Line, stretches: Stretches, 
         raise Refusal(Status.BANDS_MISSING, "no band is seen from one end to the other")
     half = math.ceil(0.6 * width + 4 + 2 * blur)
     u = np.arange(-half, half + 1.0)
-    wanted = min(_STATIONS, max(_FEWEST, _MOST // len(u)))
+    wanted = min(plan.most, max(plan.fewest, plan.most_across // len(u)))
     length = sum(b - a for a, b in spans)
-    samples = min(_SAMPLES, max(1, int(length / wanted)))
+    samples = min(plan.samples, max(1, int(length / wanted)))
     each = [max(1, round(wanted * (b - a) / length)) for a, b in spans]
     if samples < 2 and sum(each) > length:
         raise Refusal(Status.TOO_NARROW, "the bands are a few pixels long")
@@ -119,33 +152,50 @@ def look_across(sampler: Sampler, lens: Lens, line: Line, stretches: Stretches, 
 def measure_axis(
     stations: Stations, width: tuple[float, float], known: float, blur: float, before: Axis | None = None
 ) -> Axis:
-    """Mid-line and width; ``width`` and ``known`` as for ``fit_axis``, which begins at what was found ``before``.
+    """Axis and width from stations.
 
-    A Refusal (NO_AXIS, TOO_NARROW) where sides are unclear, one-sided or bent, or too near each other.
+    Args:
+        stations: Samples to fit.
+        width: Expected width at t = 0 in pixels, and taper per pixel.
+        known: Relative standard deviation of the expected width.
+        blur: Blur to begin with, in pixels.
+        before: Earlier axis of the same stations, whose fit is the start.
+
+    Raises:
+        Refusal: NO_AXIS where the sides are unclear, one-sided or bent; TOO_NARROW.
     """
     given = stations.signal, stations.weight, stations.t, stations.band, stations.level, stations.bright
     fit = fit_axis(*given, width, blur, known, before.fit.unknown if before else None)
     axis = _axis(stations, fit)
-    lost = not np.isfinite(fit.covariance).all() or fit.moving > _SETTLED
+    lost = not np.isfinite(fit.covariance).all() or fit.moving > _LIMITS.moving
     if lost or not 0 < axis.width < 2 * width[0] + 3:
         raise Refusal(Status.NO_AXIS, "the bands have no clear sides")
-    if min(fit.contrast) < _ONE_SIDED:
+    if min(fit.contrast) < _LIMITS.one_sided:
         raise Refusal(Status.NO_AXIS, "the bands' colours go on beside the line: too wide for the catheter")
     if 2 * np.count_nonzero(fit.weight > 0.2) < len(fit.weight):
         raise Refusal(Status.NO_AXIS, "the bands do not lie on one straight line: bent, or not a catheter")
-    if axis.width + axis.width_sd < _NARROWEST:
-        raise Refusal(Status.TOO_NARROW, f"the catheter is {axis.width:.1f} px wide; {_NARROWEST:g} px are needed")
+    if axis.width + axis.width_sd < _LIMITS.narrowest:
+        raise Refusal(
+            Status.TOO_NARROW, f"the catheter is {axis.width:.1f} px wide; {_LIMITS.narrowest:g} px are needed"
+        )
     return axis
 
 
 def measure_width(
     look: Callable[[float, float], Stations], stations: Stations, axis: Axis, wide: tuple[float, float], known: float
 ) -> tuple[Stations, Axis, Axis]:
-    """Stations, axis, and one more axis whose width is its own, to check with.
+    """Stations, axis with the expected width, and a second axis with an independently measured width, for checks.
 
-    ``axis`` is that of a tube ``wide`` (pixels at t = 0, and its taper per pixel, ``known`` to a share). Where the tube
-    reaches beyond the stations, ``look`` (at a width and a blur in pixels) sees it anew: by the axis before its width
-    is measured, and once more by that width. Refusals are those of :func:`look_across` and :func:`measure_axis`.
+    Args:
+        look: Samples stations for a width and a blur in pixels. Where the tube extends beyond the stations, they are
+            sampled again before its width is measured, and once more for the measured width.
+        stations: Stations that gave ``axis``.
+        axis: Axis with the expected width.
+        wide: Expected width at t = 0 in pixels, and taper per pixel.
+        known: Relative standard deviation of the expected width.
+
+    Raises:
+        Refusal: As of :func:`look_across` and :func:`measure_axis`.
     """
     narrow = not stations.show(axis.width, axis.blur)
     if narrow:
@@ -153,12 +203,12 @@ def measure_width(
     rough = stations.rough_width()
     if known >= THIRD:
         axis = width = measure_axis(stations, wide, known, axis.blur) if narrow else axis
-    elif abs(rough - wide[0]) >= max(_OTHER, 0.25 * wide[0]):
-        width = measure_axis(stations, (rough, 0.0), THIRD, _SHARP)
+    elif abs(rough - wide[0]) >= max(_WIDTH.other_px, 0.25 * wide[0]):
+        width = measure_axis(stations, (rough, 0.0), THIRD, _WIDTH.blur_px)
     else:
-        # Beginning with a width that is nearly right, gloss is not taken for it.
+        # Starting from a width that is nearly right avoids a fit to the width of a highlight.
         width = _axis(stations, axis.fit.given(wide, THIRD, known))
-        if narrow or abs(width.width - wide[0]) > _LINEAR * wide[0]:
+        if narrow or abs(width.width - wide[0]) > _WIDTH.linear * wide[0]:
             width = measure_axis(stations, wide, THIRD, axis.blur, axis)
     if stations.show(width.width, width.blur):
         axis = measure_axis(stations, wide, known, width.blur) if narrow and known < THIRD else axis
@@ -168,13 +218,13 @@ def measure_width(
     axis = measure_axis(stations, wide, known, width.blur)
     own = (width.width, width.taper) if other else wide
     width = measure_axis(stations, own, THIRD, width.blur, None if other else axis)
-    if width.width_sd > _SLOW * wide[0]:  # width against blur: a long valley, and steps are small
+    if width.width_sd > _WIDTH.slow * wide[0]:  # width and blur are nearly exchangeable, so that the fit is slow
         width = measure_axis(stations, (width.width, width.taper), THIRD, width.blur)
     return stations, axis, width
 
 
 def narrowed(stations: Stations, axis: Axis, width: tuple[float, float], known: float) -> Axis:
-    """The axis, where its width (pixels at t = 0, and taper per pixel) comes to be known, to a share of it."""
+    """Axis under a better known width (pixels at t = 0, taper per pixel) of relative deviation ``known``."""
     return _axis(stations, axis.fit.given(width, known))
 
 
@@ -182,7 +232,7 @@ def _axis(stations: Stations, fit: AxisFit) -> Axis:
     offset, slope, wide, taper = fit.sides.tolist()
     (variance, cross), (_, other) = fit.covariance[:2, :2].tolist()
     other = max(other, 1e-18)
-    floor = _LINE_FLOOR * wide
+    floor = _LIMITS.floor * wide
     return Axis(
         stations.line.moved(offset, slope),
         wide,
@@ -196,9 +246,14 @@ def _axis(stations: Stations, fit: AxisFit) -> Axis:
 
 
 def _contrast(light: np.ndarray, u: np.ndarray, width: float, band: np.ndarray, samples: int):
-    """Light [3, S, U] as one signal [S, U], its inverse variances, and each band's level in it [bands], and brightness.
+    """Reduce light [3, S, U] to one signal.
 
-    The signal is the mix of channels, one for each band, in which tube and surroundings differ most over the noise.
+    The signal of each band is the linear combination of the channels with the best ratio of contrast to noise between
+    tube and background.
+
+    Returns:
+        Signal [S, U], its inverse variance [S, U], level of the signal in each band [bands], and the level without
+        cancellation between channels [bands].
     """
     away = np.abs(u)
     where = np.empty((len(u), 2), dtype=np.float32)
@@ -216,6 +271,6 @@ def _contrast(light: np.ndarray, u: np.ndarray, width: float, band: np.ndarray, 
 
 
 def variance_of(light: np.ndarray) -> np.ndarray:
-    """Of light, from the noise of levels: the slope of the sRGB curve's inverse, which rises about as light^0.58."""
-    # By logarithms, which NumPy has for vectors of the processor; its powers take ten times as long.
+    """Variance of light from the noise of levels, through the slope of the inverse sRGB curve, about light^0.58."""
+    # NumPy vectorises logarithms and exponentials; its powers take ten times as long.
     return np.exp(np.log(np.maximum(light, 0.002)) * (2.8 / 2.4) + 2 * math.log(_LEVEL_SD * 2.4 / 1.055))

@@ -1,4 +1,4 @@
-"""How far a tracker lags a reference, from the distances that both saw the same tool travel, Sec. 3.5.4."""
+"""Latency of a tracker relative to a reference that tracks the same motion of a tool, Sec. 3.5.4."""
 
 import math
 from typing import NamedTuple
@@ -8,24 +8,24 @@ from torch import Tensor
 
 from holotorch.core import checks
 
-_LEAST = 0.8  # correlation below which two curves do not show the same motion
-_DROP = 0.05  # of the correlation, within the search, below which a peak is no peak
-_RIVAL = 0.02  # of the correlation: a second peak this near to the first is as good
-_SAMPLES = 20  # of the slower track; fewer do not make a curve
-_GAP = 2.5  # sampling intervals; across more nothing is interpolated
-_CLOCK = 4  # samples of the common clock in the shorter sampling interval
-_LONGEST_CLOCK = 1_000_000  # samples of the common clock; more is a forgotten unit
+_LEAST = 0.8  # least correlation of two curves that show the same motion
+_DROP = 0.05  # least range of the correlation within the search; with less, the peak is flat
+_RIVAL = 0.02  # difference of correlation up to which a second peak makes the lag ambiguous
+_SAMPLES = 20  # least number of samples of a track
+_GAP = 2.5  # longest gap, in sampling intervals, that is interpolated
+_CLOCK = 4  # samples of the common clock per sampling interval of the faster track
+_LONGEST_CLOCK = 1_000_000  # most samples of the common clock; more indicate times in another unit
 
 
 class Latency(NamedTuple):
     """Result of :func:`latency`.
 
     Attributes:
-        seconds: By which the track lags the reference; negative where it leads.
-        sd: Of ``seconds``, if what differs between the curves is white noise.
-        correlation: At the peak, at most 1.
-        width: Sharpness of the peak in seconds: the shift at which its parabola has lost half its height.
-        overlap: Seconds that both tracks cover.
+        seconds: Lag of the track behind the reference; negative where it leads.
+        sd: Standard deviation of ``seconds``, if the difference of the curves is white noise.
+        correlation: Correlation at the peak, at most 1.
+        width: Width of the peak in seconds: the shift at which its parabola has lost half of its height.
+        overlap: Duration in seconds that both tracks cover.
     """
 
     seconds: float
@@ -36,22 +36,22 @@ class Latency(NamedTuple):
 
 
 def latency(times: Tensor, tips: Tensor, reference_times: Tensor, reference: Tensor, longest: float = 0.5) -> Latency:
-    """Lag of a track behind a reference by the cross-correlation of their distances from where each began.
+    """Lag of a track behind a reference, by cross-correlation of the distances from their first positions.
 
-    Distances, since the two tracks may lie in different frames: hold the tool still at first, then move it fast and
-    not in a steady rhythm. The curves are brought to a common clock by linear interpolation, not across refusals, and
-    the peak of their normalised correlation is refined by a parabola.
+    Distances do not depend on the coordinate frames of the two tracks. Hold the tool still at first, then move it fast
+    and without a steady rhythm. Both curves are interpolated linearly to a common clock, except across refusals. A
+    parabola through the maximum of their normalised correlation gives the lag.
 
     Args:
-        times: Of the frames in seconds, [n], rising, on the clock of ``reference_times``.
+        times: [n] times of the frames in seconds, increasing, on the clock of ``reference_times``.
         tips: [n, 3] in metres; NaN where refused.
-        reference_times: [m], at any other sampling.
-        reference: Tips [m, 3] in metres, in any frame; NaN where there is none.
-        longest: Lag in seconds to search, both ways.
+        reference_times: [m] times of the reference in seconds, increasing.
+        reference: [m, 3] tips in metres, in any frame; NaN where there is none.
+        longest: Largest lag in seconds, of either sign, that is searched.
 
     Raises:
-        TypeError, ValueError: Shapes, times that do not rise, tracks that are too short or do not overlap, curves that
-            do not show the same motion, and a peak that is flat, at the end of the search, or has a rival.
+        TypeError, ValueError: Wrong shapes, times that do not increase, tracks that are too short or do not overlap,
+            curves that do not show the same motion, or a peak that is flat, at the end of the search, or ambiguous.
     """
     checks.positive("longest", longest, "seconds")
     own = _curve("track", times, tips)
@@ -70,18 +70,18 @@ def latency(times: Tensor, tips: Tensor, reference_times: Tensor, reference: Ten
     if count > _LONGEST_CLOCK:
         raise ValueError(f"{end - start:.3g} s at steps of {step:.3g} s are too many samples; are times in seconds?")
     clock = start + step * torch.arange(count, dtype=torch.float64)
-    reach = math.ceil(longest / step)
-    scores = _correlation(_resampled(own, clock), _resampled(other, clock), reach)
-    return _peak(scores, step, reach, fewest, end - start)
+    most = math.ceil(longest / step)
+    scores = _correlation(_resampled(own, clock), _resampled(other, clock), most)
+    return _peak(scores, step, most, fewest, end - start)
 
 
-def _peak(scores: Tensor, step: float, reach: int, samples: int, overlap: float) -> Latency:
+def _peak(scores: Tensor, step: float, most: int, samples: int, overlap: float) -> Latency:
     best = int(scores.nan_to_num(-2.0).argmax())
     top = float(scores[best])
     if not top >= _LEAST:
         raise ValueError(f"the curves do not show the same motion: correlation {top:.3g}, expected {_LEAST} or more")
-    if best in (0, 2 * reach) or not bool(scores[best - 1 : best + 2].isfinite().all()):
-        raise ValueError(f"the correlation still rises at {(best - reach) * step:.3g} s; search for a longer lag")
+    if best in (0, 2 * most) or not bool(scores[best - 1 : best + 2].isfinite().all()):
+        raise ValueError(f"the correlation still rises at {(best - most) * step:.3g} s; search for a longer lag")
     if top - float(scores[scores.isfinite()].min()) < _DROP:
         raise ValueError(f"the peak is flat: the correlation stays above {top - _DROP:.3g}; move faster, and stop")
     before, after = float(scores[best - 1]), float(scores[best + 1])
@@ -89,22 +89,22 @@ def _peak(scores: Tensor, step: float, reach: int, samples: int, overlap: float)
     width = step * math.sqrt(top / bend)
     inner = scores[1:-1]
     rivals = (inner > scores[:-2]) & (inner > scores[2:]) & (inner > top - _RIVAL)
-    lags = (torch.arange(1, 2 * reach) - best) * step
+    lags = (torch.arange(1, 2 * most) - best) * step
     rivals &= lags.abs() > width / 2  # nearer ones are noise on the peak itself
     if bool(rivals.any()):
-        rival = (int(rivals.nonzero()[0]) + 1 - reach) * step
+        rival = (int(rivals.nonzero()[0]) + 1 - most) * step
         raise ValueError(
-            f"lags of {(best - reach) * step:.3g} s and {rival:.3g} s fit alike: move without a steady rhythm, or "
+            f"lags of {(best - most) * step:.3g} s and {rival:.3g} s fit alike: move without a steady rhythm, or "
             "search for a shorter lag"
         )
     shift = (after - before) / (2 * bend)
     top += bend * shift * shift / 2
     sd = width * math.sqrt(max(0.0, 1 - top * top) / (top * top * samples))
-    return Latency((best - reach + shift) * step, sd, min(top, 1.0), width, overlap)
+    return Latency((best - most + shift) * step, sd, min(top, 1.0), width, overlap)
 
 
 def _curve(name: str, times: Tensor, tips: Tensor) -> tuple[Tensor, Tensor]:
-    """Times [n] and distances from the first tip [n], of the answered samples alone."""
+    """Times [n] and distances [n] from the first tip, of the samples with a pose."""
     for what, value in ((f"times of the {name}", times), (f"tips of the {name}", tips)):
         checks.real(what, value)
     if tips.ndim != 2 or tips.shape[1] != 3 or times.shape != tips.shape[:1]:
@@ -123,26 +123,26 @@ def _curve(name: str, times: Tensor, tips: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _resampled(curve: tuple[Tensor, Tensor], clock: Tensor) -> Tensor:
-    """The curve at the times of the clock by linear interpolation; NaN in its gaps."""
+    """The curve interpolated linearly to the times of the clock; NaN in its gaps."""
     times, values = curve
     after = torch.searchsorted(times, clock).clamp(1, len(times) - 1)
     interval = times[after] - times[after - 1]
     share = ((clock - times[after - 1]) / interval).clamp(0, 1)
-    found = values[after - 1] + share * (values[after] - values[after - 1])
-    return torch.where(interval > _GAP * times.diff().median(), torch.nan, found)
+    value = values[after - 1] + share * (values[after] - values[after - 1])
+    return torch.where(interval > _GAP * times.diff().median(), torch.nan, value)
 
 
-def _correlation(track: Tensor, reference: Tensor, reach: int) -> Tensor:
-    """Pearson's r of track(t + lag) and reference(t) for lags -reach to reach, over what both have at each."""
-    size = 1 << (len(track) + reach - 1).bit_length()
+def _correlation(track: Tensor, reference: Tensor, most: int) -> Tensor:
+    """Pearson's r of track(t + lag) and reference(t) for lags -most to most, over the times at which both exist."""
+    size = 1 << (len(track) + most - 1).bit_length()
 
     def sums(first: Tensor, second: Tensor) -> Tensor:  # over t of first(t + lag) second(t)
         product = torch.fft.rfft(first, size) * torch.fft.rfft(second, size).conj()
         whole = torch.fft.irfft(product, size)
-        return torch.cat([whole[size - reach :], whole[: reach + 1]])
+        return torch.cat([whole[size - most :], whole[: most + 1]])
 
     known = [value.isfinite().double() for value in (track, reference)]
-    # About the mean first, so that the variances below do not cancel.
+    # Subtract the means first, which avoids cancellation in the variances below.
     a, b = (
         torch.where(mask > 0, v - v[mask > 0].mean(), 0.0) for v, mask in zip((track, reference), known, strict=True)
     )

@@ -1,6 +1,6 @@
-"""How good a tracker is: stability, accuracy over grids, false poses, and whether its covariance tells the truth.
+"""Performance of a tracker: stability, accuracy over grids, false poses, and coverage of its covariances.
 
-Tips are float64 [n, 3] in metres, one row per frame in the order of time; a row of NaN is a frame that was refused.
+Tips are float64 [n, 3] in metres, one row per frame in the order of time. A row of NaN is a refused frame.
 """
 
 import math
@@ -10,6 +10,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import torch
+from scipy.special import chdtri
 from torch import Tensor
 
 from holotorch.core import checks
@@ -20,14 +21,14 @@ _UNKNOWN = (math.nan, math.nan, math.nan)
 
 
 class Stability(NamedTuple):
-    """How much the tip of a catheter that is held still moves.
+    """Stability of the tip of a catheter at rest.
 
     Attributes:
-        s_rms: Eq. 3.13 in metres: root mean square of the change from one frame to the next; blind to drift.
-        sd: Root mean square distance from the mean tip in metres, all three axes together, n - 1 degrees of freedom.
-            White noise has s_rms = sqrt(2) sd; a greater sd is drift, a greater s_rms a flicker.
-        differences: Pairs of neighbouring frames that were both answered.
-        answered: Frames that were answered.
+        s_rms: Eq. 3.13 in metres: root mean square change from one frame to the next; insensitive to drift.
+        sd: Root mean square distance from the mean tip in metres, over all three axes, with n - 1 degrees of freedom.
+            White noise gives s_rms = sqrt(2) sd; drift gives a larger sd, flicker a larger s_rms.
+        differences: Number of pairs of consecutive frames that both have a pose.
+        answered: Number of frames with a pose.
     """
 
     s_rms: float
@@ -37,14 +38,14 @@ class Stability(NamedTuple):
 
 
 class GridAccuracy(NamedTuple):
-    """Errors in metres at the points of a grid; NaN where a number cannot be had.
+    """Errors in metres at the points of a grid; NaN where an error is not defined.
 
     Attributes:
-        acc: Acc_f of Sec. 3.5.3: mean absolute difference between the distances to the reference point, found and
-            designed. It does not see a constant bias, nor an error across the direction to the reference.
-        absolute: Median, 95th percentile and maximum of the distance from the true tip; NaN without the truth.
-        rigid: The same after the rigid motion that fits the found points to the grid best.
-        answered, refused: Points.
+        acc: Acc_f of Sec. 3.5.3: mean absolute difference between measured and designed distances to the reference
+            point. It is insensitive to a constant bias and to errors perpendicular to the direction of the reference.
+        absolute: Median, 95th percentile and maximum of the distance from the true tip; NaN without ground truth.
+        rigid: The same statistics after the best rigid alignment of the measured points with the grid.
+        answered, refused: Numbers of points with and without a pose.
     """
 
     acc: float
@@ -58,9 +59,9 @@ class PlanarAccuracy(NamedTuple):
     """Mean errors in metres over a planar grid, relative to its reference point, Sec. 3.5.2.
 
     Attributes:
-        in_plane: Mean distance in the plane of the grid, as Fig. 3.10 draws it.
-        in_space: Mean distance with the error along the plane's normal.
-        answered, refused: Points, the reference not counted.
+        in_plane: Mean distance in the plane of the grid, as in Fig. 3.10.
+        in_space: Mean distance including the error along the normal of the plane.
+        answered, refused: Numbers of points with and without a pose, not counting the reference.
     """
 
     in_plane: float
@@ -70,12 +71,14 @@ class PlanarAccuracy(NamedTuple):
 
 
 class WrongPoses(NamedTuple):
-    """Answers that should not have been.
+    """Numbers of false and wrong poses.
 
     Attributes:
-        false: Answered frames without a catheter, of ``empty`` frames.
-        wrong: Answers further than the limit from the truth, of ``present`` frames with a catheter.
-        refused: Of the frames with a catheter.
+        false: Poses in frames without a catheter.
+        empty: Frames without a catheter.
+        wrong: Poses with an error above the limit, in frames with a catheter.
+        present: Frames with a catheter.
+        refused: Frames with a catheter but without a pose.
     """
 
     false: int
@@ -86,10 +89,10 @@ class WrongPoses(NamedTuple):
 
 
 def s_rms(tips: Tensor) -> Stability:
-    """Stability of tips [n, 3] of a catheter at rest, unfiltered; no difference is taken across a refusal.
+    """Stability of unfiltered tips [n, 3] of a catheter at rest. Differences across refused frames do not count.
 
     Raises:
-        TypeError, ValueError: No floating tensor [n, 3], or no two neighbouring frames that were answered.
+        TypeError, ValueError: ``tips`` is no floating tensor [n, 3], or no two consecutive frames have a pose.
 
     Source: Eq. 3.13. With no refusals there are n - 1 differences, as printed.
     """
@@ -107,16 +110,16 @@ def grid_accuracy(found: Tensor, grid: Tensor, reference: int, truth: Tensor | N
     """Accuracy of tips ``found`` [n, 3] at the points of a ``grid`` [n, 3], one face of Sec. 3.5.3.
 
     Args:
-        found: In metres, in the camera's frame; NaN where refused.
-        grid: As designed, in metres, in any frame.
+        found: Measured tips in metres, in the camera's frame; NaN where refused.
+        grid: Designed points in metres, in any frame.
         reference: Index of the reference point.
-        truth: True tips [n, 3] in the camera's frame, where they are known, as those of synthetic frames are.
+        truth: True tips [n, 3] in the camera's frame, where they are known, as for synthetic frames.
 
     Raises:
         TypeError, ValueError: Shapes that differ, a reference that is no point or was refused, or a grid with NaN.
 
-    Departs from the printed sum, which divides by all 64 points although that of the reference is zero by
-    construction: here by the answered points beside it, 63 of a full face.
+    Source: Sec. 3.5.3. The printed mean divides by all 64 points, although the error of the reference is zero by
+    construction. This function divides by the number of the other points with a pose, 63 for a full face.
     """
     found, grid = _rows("found", found), _rows("grid", grid, like=found)
     checks.all_finite("grid", grid)
@@ -140,14 +143,14 @@ def planar_accuracy(found: Tensor, grid: Tensor, right: Tensor, up: Tensor, refe
     """Distances of tips ``found`` [n, 3] from the intersections ``grid`` [n, 2] of a printed grid, Sec. 3.5.2.
 
     Args:
-        found: In metres, in the camera's frame; NaN where refused.
+        found: Measured tips in metres, in the camera's frame; NaN where refused.
         grid: Intersections in metres along ``right`` and ``up``.
         right: Direction [3] of the grid's first axis in the camera's frame, as a marker under the sheet gives it.
-        up: Direction [3] of its second axis, at right angles to the first to within a degree.
+        up: Direction [3] of its second axis, perpendicular to the first to within one degree.
         reference: Index of the intersection that all positions are relative to.
 
     Raises:
-        TypeError, ValueError: As :func:`grid_accuracy`, or directions that are no right angle.
+        TypeError, ValueError: As :func:`grid_accuracy`, or directions that are not perpendicular.
     """
     found, grid = _rows("found", found), _rows("grid", grid, axes=2)
     if len(found) != len(grid):
@@ -165,30 +168,20 @@ def planar_accuracy(found: Tensor, grid: Tensor, right: Tensor, up: Tensor, refe
 
 
 def chi_square_quantile(level: float) -> float:
-    """Value that chi-square with 3 degrees of freedom stays below with probability ``level``, 0 < level < 1."""
+    """Quantile ``level``, 0 < level < 1, of the chi-square distribution with 3 degrees of freedom."""
     if not 0 < checks.finite("level", level) < 1:
         raise ValueError(f"level must be between 0 and 1, got {level!r}")
-
-    def above(value: float) -> float:  # 1 - distribution, in closed form for 3 degrees
-        return math.erfc(math.sqrt(value / 2)) + math.sqrt(2 * value / math.pi) * math.exp(-value / 2)
-
-    low, high = 0.0, 100.0
-    while above(high) > 1 - level and high < 1e3:
-        high *= 2
-    for _ in range(80):
-        middle = (low + high) / 2
-        low, high = (middle, high) if above(middle) > 1 - level else (low, middle)
-    return (low + high) / 2
+    return float(chdtri(3, 1 - level))
 
 
 def coverage(tips: Tensor, covariance: Tensor, truth: Tensor, level: float = 0.95) -> tuple[float, int]:
-    """Share of answered frames whose truth lies in the ellipsoid of ``level``, and the number of those frames.
+    """Share of poses whose confidence ellipsoid of ``level`` contains the true tip, and the number of poses.
 
     Args:
         tips: [n, 3] in metres; NaN where refused.
-        covariance: Of the tips, [n, 3, 3] in m^2; a pose's first three rows and columns.
+        covariance: [n, 3, 3] covariances of the tips in m^2.
         truth: [n, 3] in metres.
-        level: A covariance that tells the truth covers this share.
+        level: Confidence level, which correct covariances reach as their share.
 
     Raises:
         TypeError, ValueError: Shapes that differ, no answered frame, NaN truth or a covariance that is not positive.
@@ -217,12 +210,12 @@ def counts(statuses: Iterable[IntEnum]) -> dict[str, int]:
 
 
 def wrong_poses(tips: Tensor, truth: Tensor, limit: float = 5e-3) -> WrongPoses:
-    """Count answers that should not have been.
+    """Count false and wrong poses.
 
     Args:
         tips: [n, 3] in metres; NaN where refused.
         truth: [n, 3] in metres; NaN where the frame shows no catheter.
-        limit: Greatest error in metres of an answer that is not wrong.
+        limit: Largest error in metres of a correct pose.
     """
     tips, truth = _rows("tips", tips), _rows("truth", truth, like=tips)
     checks.quantity(TOOL_DEVIATION, limit, "limit")
@@ -238,7 +231,7 @@ def wrong_poses(tips: Tensor, truth: Tensor, limit: float = 5e-3) -> WrongPoses:
 
 
 def _others(found: Tensor, reference: int) -> tuple[Tensor, Tensor]:
-    """Masks [n] of the answered points without the reference, and with it."""
+    """Masks [n] of the points with a pose, without and with the reference."""
     checks.whole("reference", reference, 0)
     if reference >= len(found):
         raise ValueError(f"reference must be one of {len(found)} points, got {reference}")

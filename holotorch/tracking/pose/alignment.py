@@ -1,4 +1,4 @@
-"""Where the camera sits on a headset, from poses of one tool that both have seen."""
+"""Pose of a camera on a headset, from poses of one tool that both have measured."""
 
 import math
 from dataclasses import dataclass
@@ -8,21 +8,21 @@ from torch import Tensor
 
 from holotorch.core import checks, quantities
 
-TOOL_LENGTH = 0.127  # metres: the thesis's alignment uses the tip and the middle of the bands, 127 mm behind it
-_FEWEST = 3
-_SAME_DIRECTION = math.radians(10)
-_LENGTHS_DIFFER = 0.02  # metres; more is no hand's tremor
+TOOL_LENGTH = 0.127  # metres: distance of the two points of an alignment in the thesis, tip and middle of the bands
+_FEWEST = 3  # least number of alignments
+_SAME_DIRECTION = math.radians(10)  # angle between tools below which they count as parallel
+_LENGTHS_DIFFER = 0.02  # metres: largest difference of the tool's length in both frames, by tremor of the hand
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """A rigid map between the frames of camera and headset, and how well it fits.
+    """A rigid map between the frames of camera and headset, and its residuals.
 
     Attributes:
         headset_from_camera: float64 [4, 4]: ``p_headset = headset_from_camera @ p_camera``, metres.
-        residuals: [n] rms distance in metres that the map leaves at the two points of each alignment.
-        leave_one_out: [n] the same under the map fitted without that alignment: what a new one would show. Infinite
-            where the others do not determine a map.
+        residuals: [n] root mean square distances in metres of the two points of each alignment after the map.
+        leave_one_out: [n] the same for the map fitted without that alignment, which predicts the error of a new one.
+            Infinite where the other alignments do not determine a map.
     """
 
     headset_from_camera: Tensor
@@ -45,21 +45,22 @@ def tool_points(tip: Tensor, direction: Tensor, length: float = TOOL_LENGTH) -> 
 
 
 def headset_from_camera(camera: Tensor, headset: Tensor) -> Alignment:
-    """Fit the rigid map that takes a tool's points in the camera's frame to those in the headset's.
+    """Fit the rigid map from points of a tool in the frame of the camera to those in the frame of the headset.
 
-    A straight tool shows nothing of its roll, so that one alignment, or several parallel ones, would leave a turn about
-    it open (the thesis's Eqs. 3.1 and 3.2 use one: 103 mm median error elsewhere); therefore a fit to three or more.
+    The roll of a straight tool is not observable, so that one alignment, or several parallel ones, do not determine the
+    rotation about it. Therefore the fit needs three or more. (Eqs. 3.1 and 3.2 of the thesis use one alignment, which
+    gives a median error of 103 mm elsewhere.)
 
     Args:
         camera: [n, 2, 3] two points of the tool in each alignment, in metres; :func:`tool_points` of its pose.
         headset: The same points in the headset's frame, which must be right-handed.
 
     Returns:
-        The map, differentiable to both arguments, with its residuals.
+        The map, differentiable with respect to both arguments, with its residuals.
 
     Raises:
-        ValueError: Fewer than 3 alignments, all parallel to within 10 degrees, tools of different length, or a headset
-            with a left-handed frame; with what to do.
+        ValueError: Fewer than 3 alignments, all parallel to within 10 degrees, tools of different lengths, or a headset
+            with a left-handed frame. The message says what to do.
 
     Source: Kabsch (1976) in float64, no scale; the sign of the determinant as in Umeyama (1991).
     """
@@ -120,17 +121,17 @@ def _spread(points: Tensor) -> float:
 
 
 def widest_angle(directions: Tensor) -> float:
-    """Largest angle in radians between two of the lines along unit vectors [n, 3]: at most a right angle."""
+    """Largest angle in radians between two of the lines along unit vectors [n, 3], at most pi / 2."""
     crossed = torch.linalg.cross(*torch.broadcast_tensors(directions[:, None], directions[None])).norm(dim=-1)
     return float(torch.atan2(crossed, (directions @ directions.mT).abs()).max())
 
 
 def rigid_map(source: Tensor, target: Tensor, sign: float = 1.0) -> Tensor:
-    """[4, 4] rigid map of points [..., 3] with least squares (Kabsch 1976); with ``sign`` -1 the best mirroring one."""
+    """[4, 4] least-squares rigid map of points [..., 3] (Kabsch 1976); ``sign`` -1 gives the best improper one."""
     a, b = source.reshape(-1, 3), target.reshape(-1, 3)
     u, _, vh = torch.linalg.svd((b - b.mean(0)).mT @ (a - a.mean(0)))
-    turned = sign * torch.linalg.det(u.detach() @ vh.detach()).sign()
-    rotation = u @ torch.diag(torch.stack([torch.ones_like(turned), torch.ones_like(turned), turned])) @ vh
+    handedness = sign * torch.linalg.det(u.detach() @ vh.detach()).sign()
+    rotation = u @ torch.diag(torch.stack([torch.ones_like(handedness), torch.ones_like(handedness), handedness])) @ vh
     shift = b.mean(0) - rotation @ a.mean(0)
     last = torch.tensor([[0.0, 0, 0, 1]], dtype=rotation.dtype, device=rotation.device)
     return torch.cat([torch.cat([rotation, shift[:, None]], 1), last])

@@ -1,4 +1,4 @@
-"""Where a catheter's band edges really are, from many frames of it: poses and positions fitted together."""
+"""Positions of a catheter's band edges from many frames: a joint fit of poses and positions."""
 
 import math
 from collections.abc import Sequence
@@ -12,23 +12,23 @@ from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.pose.alignment import widest_angle
 from holotorch.tracking.pose.pose import edge_weights, solve_pose
 
-_FEWEST = 5  # frames
-_SAME_DIRECTION = math.radians(10)
-_WORST = 5e-4  # metres: a ruler measures better
-_STEPS = 60
+_FEWEST = 5  # least number of frames
+_SAME_DIRECTION = math.radians(10)  # angle between directions below which they count as parallel
+_WORST = 5e-4  # metres: largest accepted deviation of a position; a ruler is more accurate
+_STEPS = 60  # most Levenberg-Marquardt steps
 
 
 @dataclass(frozen=True, eq=False)
 class BandEdges:
-    """Edges of the bands, as measured.
+    """Measured positions of the band edges.
 
     Attributes:
         positions: float64 [N] in metres from the tip.
-        covariance: [N, N] in m^2, zero for what was given; enlarged by chi_square / freedom where that exceeds 1. Of
-            the edges' noise alone: what moves an edge alike in all frames, such as a highlight, is not in it.
-        chi_square: Squared residuals over their variances.
-        freedom: Its degrees of freedom.
-        pivot: [3], the resting tip in the camera's frame; None where the tip moved.
+        covariance: [N, N] in m^2, zero for known distances; multiplied by chi_square / freedom where that exceeds 1. It
+            includes only random errors of the edges, and none that are the same in all frames, such as a highlight.
+        chi_square: Sum of the squared residuals, each divided by its variance.
+        freedom: Degrees of freedom of ``chi_square``.
+        pivot: [3] position of a resting tip in the camera's frame; None where the tip moved.
     """
 
     positions: Tensor
@@ -56,25 +56,26 @@ def fit_band_edges(
 ) -> BandEdges:
     """Fit the positions of the edges together with the pose of every frame.
 
-    Views of a free straight tool determine its positions only up to a shift, a scale and one projective stretch
-    s -> s / (1 + e s): to every such change there are poses that give the same images. So three distances must be
-    given, whatever the number of frames, and four edges leave one to be found. When the tip rests in one place
-    (``resting_tip``, a pivot) and the catheter is tilted around it, shift and stretch are determined too, and one
-    given distance sets the scale.
+    Views of a freely moving straight tool determine its positions only up to a shift, a scale and a projective stretch
+    s -> s / (1 + e s), since other poses compensate each of them in the images. Therefore three distances must be known
+    for any number of frames, and of four edges only one position is fitted. If the catheter is tilted about a tip that
+    rests in one place (``resting_tip``, a pivot), shift and stretch are determined too, and one known distance gives
+    the scale.
 
     Args:
-        edges_px: [F, N, 2] pixels (x, y) of the edges in F frames, all seen.
-        positions_m: [N] nominal distances from the tip in metres, rising.
-        camera: That took the frames.
-        known: Which nominal distances hold: an index i for edge i from the tip, a pair (i, j) for edge i to edge j.
+        edges_px: [F, N, 2] pixels (x, y) of the edges in F frames, all visible.
+        positions_m: [N] nominal distances from the tip in metres, increasing.
+        camera: Camera that took the frames.
+        known: Known nominal distances: an index i for that of edge i from the tip, a pair (i, j) for that between two
+            edges.
         resting_tip: Whether the tip was in the same place in all frames.
         along_px: Standard deviation of an edge along the tool's image, in pixels.
-        across_px: The same across it.
-        offset: How far in front of the axis, toward the camera, the edges are seen, in metres; as in ``solve_pose``.
+        across_px: Standard deviation of an edge across the tool's image, in pixels.
+        offset: Distance of the edges from the axis toward the camera, in metres; as in ``solve_pose``.
 
     Raises:
-        TypeError, ValueError: Bad input; too few distances known; fewer than 5 frames, or all parallel; edges that stay
-            open by more than 0.5 mm; with what to do.
+        TypeError, ValueError: Wrong input, too few known distances, fewer than 5 frames, parallel directions, or
+            positions with a deviation above 0.5 mm. The message says what to do.
 
     Source: joint least squares with the poses eliminated by their Schur complement, as in bundle adjustment (Triggs et
     al. 2000).
@@ -110,7 +111,10 @@ def fit_band_edges(
 
 
 class _Problem:
-    """Frames [F], each with a direction (two turns) and a tip, unless it rests; shared: positions and a resting tip."""
+    """Least squares over F frames: each has a direction (2 unknowns) and a tip (3, unless it rests) of its own.
+
+    Unknowns that all frames share are the free positions and a resting tip.
+    """
 
     def __init__(self, plane: Tensor, weights: Tensor, free: Tensor, resting: bool, offset: float):
         self.plane, self.weights, self.free = plane, weights, free
@@ -120,7 +124,7 @@ class _Problem:
         self.unknowns = len(plane) * self.own + self.shared
 
     def residuals(self, state: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-        """[F, 2 N], over their deviations."""
+        """Residuals [F, 2 N] in standard deviations."""
         tip, along, positions = state
         forward = (tip * along).sum(-1, keepdim=True)
         toward = torch.nn.functional.normalize(forward * along - tip, dim=-1)  # from the axis to the camera
@@ -140,7 +144,7 @@ class _Problem:
         return tip, torch.nn.functional.normalize(turned, dim=-1), positions
 
     def slopes(self, state: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        """[F, 2 N, own] and [F, 2 N, shared]: each unknown moved in all frames at once, by forward derivatives."""
+        """Jacobians [F, 2 N, own] and [F, 2 N, shared], by forward differentiation in all frames at once."""
         frames = len(self.plane)
         zeros = self.plane.new_zeros(self.own + self.shared)
 
@@ -152,7 +156,7 @@ class _Problem:
         return both[..., : self.own], both[..., self.own :]
 
     def solve(self, state: tuple[Tensor, Tensor, Tensor]) -> tuple[tuple[Tensor, Tensor, Tensor], float, Tensor]:
-        """Levenberg-Marquardt: the state, its chi-square, and the information [m, m] on what is shared."""
+        """Levenberg-Marquardt: the state, its chi-square, and the information [m, m] on the shared unknowns."""
         damping, cost = 1e-6, float(self.residuals(state).square().sum())
         own, shared = self.slopes(state)
         for _ in range(_STEPS):
@@ -204,7 +208,7 @@ def _checked(edges_px: Tensor, positions_m: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _constraints(known: Sequence[int | tuple[int, int]], positions: Tensor, resting: bool) -> Tensor:
-    """Basis [N, m] of the changes that leave the known distances as they are."""
+    """Basis [N, m] of the changes of the positions that keep the known distances."""
     count = len(positions)
     rows = positions.new_zeros(len(known), count)
     for row, entry in zip(rows, known, strict=True):
@@ -215,7 +219,7 @@ def _constraints(known: Sequence[int | tuple[int, int]], positions: Tensor, rest
         row[ends[-1]] = 1.0
         if len(ends) == 2:
             row[ends[0]] = -1.0
-    # What the images leave open: s -> s + c, c s, c s^2; of a resting tip the second only.
+    # Changes that the images do not determine: c, c s and c s^2; for a resting tip only c s.
     scaled = (2 * positions - positions[0] - positions[-1]) / (positions[-1] - positions[0])
     moving = torch.stack([torch.ones_like(scaled), scaled, scaled.square()], -1)
     open_ = positions[:, None] / positions[-1] if resting else moving

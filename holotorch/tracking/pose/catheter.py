@@ -12,17 +12,17 @@ from holotorch.core.quantities import TOOL_LENGTH, TOOL_POSITION, TOOL_RADIUS
 
 @dataclass(frozen=True)
 class Catheter:
-    """What the camera looks for.
+    """Geometry and colours of a catheter.
 
     Attributes:
-        edges: Where the bands begin and end, in metres from the tip, rising; at least 4, of any spacing. Neighbouring
-            bands touch: band i reaches from edge i to edge i + 1.
-        colours: Of the bands, 8-bit sRGB triples, ``len(edges) - 1`` of them; neighbours differ.
-        radius: In metres, outside.
-        length: From the tip to the rear end, in metres.
+        edges: Distances of the band edges from the tip in metres, increasing; at least 4, of any spacing. Neighbouring
+            bands touch: band i extends from edge i to edge i + 1.
+        colours: Colours of the ``len(edges) - 1`` bands, 8-bit sRGB triples; neighbours differ.
+        radius: Outer radius in metres.
+        length: Distance from the tip to the rear end in metres.
 
     Raises:
-        TypeError, ValueError: Impossible values, all edges and colours counted.
+        TypeError, ValueError: Impossible values.
 
     Source: Sec. 3.3.1 and Fig. 3.5 of the thesis: three bands of 38 mm that begin 70 mm from the tip.
     """
@@ -55,7 +55,7 @@ class Catheter:
 
     @property
     def positions(self) -> Tensor:
-        """Of the edges in metres from the tip, float64 [N]."""
+        """Distances of the edges from the tip in metres, float64 [N]."""
         return torch.tensor(self.edges, dtype=torch.float64)
 
 

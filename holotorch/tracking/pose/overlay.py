@@ -1,5 +1,6 @@
-"""What the tracker found, drawn on the frame: axis, band edges, the tip also where it is hidden, and how sure it is."""
+"""A pose drawn on its frame: axis, band edges, and the tip, visible or hidden, with its uncertainty."""
 
+import math
 import textwrap
 
 import cv2
@@ -11,29 +12,29 @@ from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.pose.catheter import Catheter
 from holotorch.tracking.pose.status import Pose, Status
 
-ELLIPSE = 5.991464547107979  # 95 % quantile of chi-square with 2 degrees of freedom: -2 ln 0.05
+ELLIPSE = -2 * math.log(0.05)  # 95 % quantile of chi-square with 2 degrees of freedom
 _FINE = 4  # fractional bits of OpenCV's drawing coordinates
 _TINY = 1e-6  # of the depth: step of the derivatives of the projection
 _GREEN, _ORANGE, _RED, _WHITE = (60, 230, 90), (255, 170, 30), (255, 70, 60), (255, 255, 255)
 
 
 def overlay(pixels: Tensor, pose: Pose, camera: Camera, catheter: Catheter) -> Tensor:
-    """A copy of the frame with the pose drawn on it, or with the reason for there being none.
+    """A copy of the frame with the pose drawn on it, or with the reason why there is none.
 
-    The line is the axis from tip to rear end, ticks across it are the band edges, the cross is the tip and the ellipse
-    around it the image of its covariance at 95 %.
+    The line is the axis from the tip to the rear end. Ticks across it are the band edges, the cross is the tip, and the
+    ellipse around the cross is the image of its 95 % confidence region.
 
     Args:
         pixels: uint8 [3, H, W], RGB.
-        pose: Of one catheter.
-        camera: That the frame is of.
-        catheter: That the pose is of.
+        pose: Pose of one catheter.
+        camera: Camera that took the frame.
+        catheter: Catheter with this pose.
 
     Returns:
         uint8 [3, H, W] on the device of ``pixels``.
 
     Raises:
-        TypeError, ValueError: No such frame, or a batch of poses.
+        TypeError, ValueError: The frame has another type or shape, or ``pose`` is a batch.
     """
     if pixels.dtype != torch.uint8:
         raise TypeError(f"pixels must be uint8, got {pixels.dtype}")
@@ -64,10 +65,10 @@ def _catheter(
 ) -> None:
     tip, direction = pose.tip.detach().cpu(), pose.direction.detach().cpu()
     along = torch.linspace(0, catheter.length, 65, dtype=torch.float64)
-    # Thin, so that the bands remain to be seen under it.
+    # A thin line, so that the bands remain visible.
     _line(canvas, camera.project(tip + along[:, None] * direction), colour, max(1, unit // 2))
     edges = tip + catheter.positions[:, None] * direction
-    across = torch.linalg.cross(direction.expand_as(edges), edges)  # at right angles to the axis and to the view
+    across = torch.linalg.cross(direction.expand_as(edges), edges)  # perpendicular to the axis and to the ray
     across = across / across.norm(dim=-1, keepdim=True).clamp(min=1e-12)
     for edge, side in zip(edges, 4 * catheter.radius * across, strict=True):
         _line(canvas, camera.project(torch.stack([edge - side, edge + side])), _WHITE, unit)
@@ -79,8 +80,8 @@ def _catheter(
         values, axes = torch.linalg.eigh(covariance)
         turn = torch.linspace(0, 2 * torch.pi, 73, dtype=torch.float64)
         circle = torch.stack([turn.cos(), turn.sin()], -1)
-        rim = circle * (ELLIPSE * values.clamp(min=0)).sqrt()
-        _line(canvas, spot + rim @ axes.T, colour, unit)
+        outline = circle * (ELLIPSE * values.clamp(min=0)).sqrt()
+        _line(canvas, spot + outline @ axes.T, colour, unit)
 
 
 def _line(canvas: np.ndarray, points: Tensor, colour: tuple[int, int, int], unit: int) -> None:
@@ -105,11 +106,11 @@ def _words(pose: Pose) -> list[str]:
 def _text(canvas: np.ndarray, lines: list[str], colour: tuple[int, int, int], unit: int) -> None:
     face, size, row = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * unit, 20 * unit
     for line in lines:
-        text = line.encode("ascii", "replace").decode()  # the font has no more
+        text = line.encode("ascii", "replace").decode()  # the font has only ASCII characters
         wide = cv2.getTextSize(text, face, size, unit)[0][0]
         room = max(8, int(len(text) * (canvas.shape[1] - 20 * unit) / max(wide, 1)))
         for part in textwrap.wrap(text, room):
-            for shift in (-unit, unit):  # a dark rim is legible on any ground
+            for shift in (-unit, unit):  # a dark outline makes it legible on any background
                 for place in ((10 * unit + shift, row), (10 * unit, row + shift)):
                     cv2.putText(canvas, part, place, face, size, (0, 0, 0), unit, cv2.LINE_AA)
             cv2.putText(canvas, part, (10 * unit, row), face, size, colour, unit, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""From the images of a catheter's band edges to its pose: five unknowns, exact, with covariance and gradients."""
+"""Pose of a catheter from the images of its band edges: five unknowns, with covariance and gradients."""
 
 import torch
 from torch import Tensor
@@ -8,8 +8,8 @@ from holotorch.core.quantities import EDGE_DEVIATION, TOOL_OFFSET, TOOL_POSITION
 from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.pose.status import Pose, Status
 
-_STEPS = 30
-_LEAST = 1e-9  # on the plane z = 1, or in radians: what lies nearer is one point
+_STEPS = 30  # most Levenberg-Marquardt steps; a pose takes about five
+_LEAST = 1e-9  # on the plane z = 1, or in radians: points that are closer to each other count as one point
 
 
 def solve_pose(
@@ -22,33 +22,39 @@ def solve_pose(
     seen: Tensor | None = None,
     offset: float | Tensor = 0.0,
 ) -> Pose:
-    """Pose of a straight tool of which points at known distances from its tip are seen.
+    """Pose of a straight tool from the images of points at known distances from its tip.
 
-    A linear start (the null vector of ``u_i x (A + s_i d) = 0``), then Levenberg-Marquardt steps on the reprojection in
-    five unknowns. Three points in view determine the pose, in front of the camera uniquely; they cannot check it, so
-    their pose is UNVERIFIED. Differentiable to all arguments by the implicit function theorem.
+    A linear solution (the null vector of ``u_i x (A + s_i d) = 0``) is the start of Levenberg-Marquardt steps that
+    minimise the reprojection error in five unknowns. Three visible points determine a pose, which is unique in front of
+    the camera, but leave no redundancy: its status is UNVERIFIED. The pose is differentiable with respect to all
+    arguments by the implicit function theorem.
 
     Args:
-        edges_px: [B, N, 2] pixels (x, y); NaN is "not seen".
-        positions_m: [N] distances from the tip in metres, all different, any order.
-        camera: Its distortion is undone first.
+        edges_px: [B, N, 2] pixels (x, y); NaN for an edge that is not visible.
+        positions_m: [N] distances from the tip in metres, all different, in any order.
+        camera: Camera whose distortion is removed from the pixels.
         along_px: Standard deviation of an edge along the tool's image, in pixels; a number or [B, N].
-        across_px: The same across it.
-        seen: [B, N] bool; false ones are left out.
-        offset: How far in front of the axis, toward the camera, the points lie, in metres; a number or [B].
+        across_px: Standard deviation of an edge across the tool's image, in pixels; a number or [B, N].
+        seen: [B, N] bool; False excludes an edge.
+        offset: Distance of the points from the axis toward the camera, in metres; a number or [B].
 
     Returns:
-        Poses [B] in float64. Those that cannot be found are NaN, with a status that says why.
+        Poses [B] in float64. A pose that cannot be computed is NaN, and its status gives the reason.
 
     Raises:
-        TypeError, ValueError: Wrong shapes or types, fewer than three positions, equal or in mm, deviations <= 0.
+        TypeError, ValueError: Wrong shapes or types, fewer than three positions, equal ones, deviations <= 0.
 
-    Source: Sec. 3.4.2 of the thesis asks for this; :func:`closed_form` is what its Eqs. 3.8 to 3.11 become.
+    Source: the problem of Sec. 3.4.2 of the thesis; :func:`closed_form` implements its Eqs. 3.8 to 3.11.
     """
     pixels, positions = _checked(edges_px, positions_m)
-    batch = len(pixels)
+    batch, count = pixels.shape[:2]
     plane = camera.undistort(pixels)
-    given = _visible(pixels, seen)
+    given = torch.isfinite(pixels.detach()).all(-1)
+    if seen is not None:
+        seen = torch.as_tensor(seen, device=given.device)
+        if seen.shape != given.shape or seen.dtype != torch.bool:
+            raise ValueError(f"seen must be bool of shape [{batch}, {count}], got {seen.dtype}, {list(seen.shape)}")
+        given = given & seen
     known = given & torch.isfinite(plane.detach()).all(-1)
     shift = _expanded("offset", TOOL_OFFSET, offset, pixels, 1)
     deviations = [
@@ -67,21 +73,15 @@ def solve_pose(
         _, slopes = _residuals(point, along, basis, plane, place, weights, shift)
     values = (plane, positions, weights, shift)
     if torch.is_grad_enabled() and any(value.requires_grad for value in values):
-        middle = (positions * known).sum(-1) / known.sum(-1).clamp(min=1)
+        middle = (positions * known).sum(-1) / known.sum(-1).clamp(min=1)  # again, now with gradient
         place = positions - middle[:, None]
         change = _implicit(point, along, basis, plane, place, weights, shift)
         point = point + change[:, :3]
         along = _turned(along, basis, change[:, 3:])
     residuals = _residuals(point, along, basis, plane, place, weights, shift)[0]
     tip = point - middle[:, None] * along
-    normal = slopes.mT @ slopes
-    inverse, singular = torch.linalg.inv_ex(normal)
-    lever = torch.zeros(batch, 6, 5, dtype=tip.dtype, device=tip.device)  # of tip and direction to the unknowns
-    lever[:, :3, :3] = torch.eye(3, dtype=tip.dtype)
-    lever[:, :3, 3:] = -middle[:, None, None] * basis
-    lever[:, 3:, 3:] = basis
-    covariance = lever @ inverse @ lever.mT
-    codes = _codes(given, known, flat | (singular != 0) | ~settled, point)
+    covariance, singular = _covariance(slopes, middle, basis)
+    codes = _codes(given, known, flat | singular | ~settled, point)
     lost = torch.tensor([not code.answered for code in codes], dtype=torch.bool, device=tip.device)
     return Pose(
         torch.where(lost[:, None], torch.nan, tip),
@@ -93,28 +93,25 @@ def solve_pose(
     )
 
 
-def _visible(pixels: Tensor, seen: Tensor | None) -> Tensor:
-    """Which edges [B, N] are finite, and among those ``seen`` where that is given."""
-    finite = torch.isfinite(pixels.detach()).all(-1)
-    if seen is None:
-        return finite
-    seen = torch.as_tensor(seen, device=finite.device)
-    if seen.shape != finite.shape or seen.dtype != torch.bool:
-        raise ValueError(f"seen must be bool of shape {list(finite.shape)}, got {seen.dtype}, {list(seen.shape)}")
-    return finite & seen
-
-
 def closed_form(edges_px: Tensor, positions_m: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Tip [B, 3] in metres and direction [B, 3] from two neighbouring bands by the sine rule, as the thesis has it.
+    """Pose from the three edges of two neighbouring bands by the sine rule, the method of the thesis.
 
-    With more than three edges it is the mean over all triples of neighbours. ``edges_px`` [B, N, 2], ``positions_m``
-    [N] in metres from the tip, rising. NaN where rays coincide or an edge is not seen.
+    For more than three edges, the result is the mean over all triples of neighbouring edges.
+
+    Args:
+        edges_px: [B, N, 2] pixels (x, y).
+        positions_m: [N] distances from the tip in metres, increasing.
+        camera: Camera whose distortion is removed from the pixels.
+
+    Returns:
+        Tip [B, 3] in metres and direction [B, 3]; NaN where rays coincide or an edge is NaN.
 
     Raises:
         ValueError: Wrong shapes or types, fewer than three positions, equal positions.
 
-    Source: Eqs. 3.3 to 3.12 of the thesis, with the angle by atan2, bands of any length, no quadratic (its double root
-    where the tool is parallel to the image costs half the digits), and |AT| / |AB| in 3.12, which is printed inverted.
+    Source: Eqs. 3.3 to 3.12 of the thesis, with these departures. Angles are computed by atan2. Bands may have any
+    length. There is no quadratic equation, whose double root for a tool parallel to the image loses half of the digits.
+    Eq. 3.12 uses |AT| / |AB|, which is printed inverted.
     """
     pixels, positions = _checked(edges_px, positions_m)
     plane = camera.undistort(pixels)
@@ -124,16 +121,30 @@ def closed_form(edges_px: Tensor, positions_m: Tensor, camera: Camera) -> tuple[
         a, b, c = rays[:, i], rays[:, i + 1], rays[:, i + 2]
         first, second = positions[i + 1] - positions[i], positions[i + 2] - positions[i + 1]
         p1, p2 = (torch.where(angle > _LEAST, angle, torch.nan) for angle in (_angle(a, b), _angle(b, c)))
-        both, whole = p1 + p2, first + second
+        both, length = p1 + p2, first + second
         delta = torch.atan2(
             first * torch.sin(p2) * torch.sin(both), second * torch.sin(p1) - first * torch.sin(p2) * torch.cos(both)
         )
-        near = (whole * torch.sin(delta) / torch.sin(both))[:, None] * a
-        far = (whole * torch.sin(both + delta) / torch.sin(both))[:, None] * c
-        direction = torch.nn.functional.normalize(far - near, dim=-1)
-        tips.append(near - positions[i] * direction)
+        front = (length * torch.sin(delta) / torch.sin(both))[:, None] * a
+        rear = (length * torch.sin(both + delta) / torch.sin(both))[:, None] * c
+        direction = torch.nn.functional.normalize(rear - front, dim=-1)
+        tips.append(front - positions[i] * direction)
         directions.append(direction)
     return torch.stack(tips).mean(0), torch.nn.functional.normalize(torch.stack(directions).mean(0), dim=-1)
+
+
+def _covariance(slopes: Tensor, middle: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
+    """[B, 6, 6] covariance of tip and direction, and which [B] are singular.
+
+    ``slopes`` [B, 2 N, 5] are derivatives by the middle point and two rotations about ``basis`` [B, 3, 2]; the middle
+    point lies ``middle`` [B] metres from the tip.
+    """
+    inverse, singular = torch.linalg.inv_ex(slopes.mT @ slopes)
+    lever = slopes.new_zeros(len(slopes), 6, 5)
+    lever[:, :3, :3] = torch.eye(3, dtype=slopes.dtype)
+    lever[:, :3, 3:] = -middle[:, None, None] * basis
+    lever[:, 3:, 3:] = basis
+    return lever @ inverse @ lever.mT, singular != 0
 
 
 def _checked(edges_px: Tensor, positions_m: Tensor) -> tuple[Tensor, Tensor]:
@@ -165,10 +176,10 @@ def _angle(a: Tensor, b: Tensor) -> Tensor:
 
 
 def edge_weights(pixels: Tensor, plane: Tensor, known: Tensor, deviations: Tensor, camera: Camera) -> Tensor:
-    """[B, N, 2, 2]: from differences on the plane z = 1 to pixels (along, across) over ``deviations`` [B, N, 2]."""
+    """[B, N, 2, 2] maps from residuals on the plane z = 1 to (along, across) in units of ``deviations`` [B, N, 2]."""
     share = known[..., None].to(pixels.dtype)
     x, y = ((pixels - pixels.sum(1, True) / share.sum(1, True).clamp(min=1)) * share).unbind(-1)
-    # The longest axis of the edges lies at half the angle of their moment about the middle.
+    # The principal axis of the edges lies at half the angle of their second moment.
     even, odd = (x * x - y * y).sum(-1), 2 * (x * y).sum(-1)
     angle = torch.atan2(odd, torch.where((even == 0) & (odd == 0), 1.0, even)) / 2
     cos, sin = angle.cos(), angle.sin()
@@ -177,7 +188,7 @@ def edge_weights(pixels: Tensor, plane: Tensor, known: Tensor, deviations: Tenso
 
 
 def _start(plane: Tensor, place: Tensor, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Middle point [B, 3], direction [B, 3], and which are no start: all edges in one point."""
+    """Linear start: middle point [B, 3], direction [B, 3], and which [B] have none because all edges coincide."""
     share = known.to(plane.dtype)
     count = share.sum(-1, keepdim=True).clamp(min=1)
     centre = (plane * share[..., None]).sum(1) / count
@@ -187,7 +198,7 @@ def _start(plane: Tensor, place: Tensor, known: Tensor) -> tuple[Tensor, Tensor,
     size = torch.where(flat, 1.0, extent)
     reach = (place * share).square().sum(-1).div(count[:, 0]).sqrt().clamp(min=1e-12)
     u, s = offsets / size[:, None, None], place * share / reach[:, None]
-    # Rows of u_z (A + s d)_xy - u_xy (A + s d)_z with coordinates centred and scaled.
+    # Rows of u_z (A + s d)_xy - u_xy (A + s d)_z, in coordinates that are centred and scaled.
     rows = torch.zeros(*plane.shape, 6, dtype=plane.dtype, device=plane.device)
     for axis in range(2):
         rows[..., axis, axis] = share
@@ -208,7 +219,7 @@ def _start(plane: Tensor, place: Tensor, known: Tensor) -> tuple[Tensor, Tensor,
 
 
 def _basis(along: Tensor) -> Tensor:
-    """[B, 3, 2]: two unit vectors at right angles to ``along``."""
+    """[B, 3, 2] two unit vectors perpendicular to ``along`` and to each other."""
     helper = torch.nn.functional.one_hot(along.abs().argmin(-1), 3).to(along.dtype)
     first = torch.nn.functional.normalize(torch.linalg.cross(along, helper), dim=-1)
     return torch.stack([first, torch.linalg.cross(along, first)], -1)
@@ -219,17 +230,17 @@ def _turned(along: Tensor, basis: Tensor, angles: Tensor) -> Tensor:
 
 
 def _residuals(point, along, basis, plane, place, weights, shift) -> tuple[Tensor, Tensor]:
-    """Weighted differences [B, 2 N], and their slopes [B, 2 N, 5] to the point and to two turns of the direction."""
+    """Weighted residuals [B, 2 N] and their derivatives [B, 2 N, 5] by the point and two rotations of the direction."""
     identity = torch.eye(3, dtype=point.dtype, device=point.device)
     forward = (point * along).sum(-1, keepdim=True)
-    toward = forward * along - point  # from the axis to the camera, at right angles
+    toward = forward * along - point  # from the axis to the camera, perpendicular to it
     distance = toward.norm(dim=-1, keepdim=True).clamp(min=1e-9)
     normal = toward / distance
     where = (point + shift[:, None] * normal)[:, None] + place[..., None] * along[:, None]
     depth = where[..., 2:].clamp(min=1e-9)
     image = where[..., :2] / depth
     residuals = (weights @ (image - plane)[..., None])[..., 0].flatten(1)
-    # Of the image to the point in space, then of that to the unknowns.
+    # Derivatives of the image by the point in space, then of this point by the unknowns.
     to_image = torch.cat([identity[:2, :2].expand(*image.shape, 2), -image[..., None]], -1) / depth[..., None]
     turn = (identity - normal[:, :, None] * normal[:, None]) * (shift[:, None] / distance)[..., None]
     moved = identity - turn @ (identity - along[:, :, None] * along[:, None])
@@ -245,14 +256,14 @@ def _residuals(point, along, basis, plane, place, weights, shift) -> tuple[Tenso
 
 
 def _refine(point, along, plane, place, weights, shift) -> tuple[Tensor, Tensor, Tensor]:
-    """Levenberg-Marquardt to rounding: point, direction, and whether it settled."""
+    """Levenberg-Marquardt to rounding error: point, direction, and which [B] converged."""
     damping = torch.full_like(point[:, 0], 1e-6)
     settled = torch.zeros_like(damping, dtype=torch.bool)
     basis = _basis(along)
     residuals, slopes = _residuals(point, along, basis, plane, place, weights, shift)
     cost = residuals.square().sum(-1)
-    rounding = 1e-14 * weights.abs().sum((1, 2, 3))  # of residuals
-    # Within 1e-9 of a standard deviation, or rounding; steps settle by squares, so the next one would be lost in it.
+    rounding = 1e-14 * weights.abs().sum((1, 2, 3))  # rounding error of the residuals
+    # Converged: a step below 1e-9 standard deviations or the rounding error. Convergence is quadratic.
     least = rounding.clamp(min=1e-9).square()
     for _ in range(_STEPS):
         normal = slopes.mT @ slopes
@@ -280,14 +291,14 @@ def _refine(point, along, plane, place, weights, shift) -> tuple[Tensor, Tensor,
 
 
 def _implicit(point, along, basis, plane, place, weights, shift) -> Tensor:
-    """A Newton step [B, 5] at the optimum: nought, with the optimum's derivative to what it was found from."""
+    """A Newton step [B, 5] at the optimum: its value is zero, its gradient that of the optimum by the inputs."""
     unknown = torch.zeros(len(point), 5, dtype=point.dtype, device=point.device, requires_grad=True)
     at = point + unknown[:, :3], _turned(along, basis, unknown[:, 3:])
     cost = 0.5 * _residuals(*at, basis, plane, place, weights, shift)[0].square().sum()
     slope = torch.autograd.grad(cost, unknown, create_graph=True)[0]
     rows = [torch.autograd.grad(slope[:, i].sum(), unknown, retain_graph=True)[0] for i in range(5)]
     inverse = torch.linalg.inv_ex(torch.stack(rows, 1)).inverse.detach()
-    # What cannot be found has no derivative, and must not spoil that of what all poses share.
+    # A pose that cannot be computed has no derivative, and must not make that of shared inputs NaN.
     inverse = torch.where(torch.isfinite(inverse).all(-1).all(-1)[:, None, None], inverse, 0.0)
     return -(inverse @ slope[..., None])[..., 0]
 
@@ -298,8 +309,8 @@ def _codes(given: Tensor, known: Tensor, failed: Tensor, point: Tensor) -> tuple
         given.sum(-1).tolist(), known.sum(-1).tolist(), failed.tolist(), point[:, 2].tolist(), strict=True
     ):
         if have >= 3:
-            found = not bad and depth > 0
-            codes.append(Status.INCONSISTENT if not found else Status.OK if have > 3 else Status.UNVERIFIED)
+            valid = not bad and depth > 0
+            codes.append(Status.INCONSISTENT if not valid else Status.OK if have > 3 else Status.UNVERIFIED)
         else:
             codes.append(Status.OUTSIDE_CAMERA if want >= 3 else Status.BANDS_MISSING)
     return tuple(codes)

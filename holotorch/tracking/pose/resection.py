@@ -1,4 +1,4 @@
-"""The pose of a straight tool from where known points of it lie along one line of the image: three unknowns."""
+"""Pose of a straight tool from the positions of known points along a known line of the image: three unknowns."""
 
 import math
 from collections.abc import Sequence
@@ -9,21 +9,20 @@ import numpy as np
 from holotorch.tracking.camera.strips import Line
 from holotorch.tracking.pose.status import Pose
 
-_STEPS = 2  # after a linear start that is right but for the noise, a thousandth or less; each squares what is left
-
+_STEPS = 2  # Gauss-Newton steps after the linear start, whose relative error is 1e-3 or less; each step squares it
 
 _Three = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class LinePose:
-    """A pose as :class:`holotorch.tracking.pose.status.Pose` has it, in NumPy.
+    """A pose as in :class:`holotorch.tracking.pose.status.Pose`, as NumPy arrays.
 
     Attributes:
         tip: [3] in metres.
-        direction: [3], unit vector.
-        covariance: [6, 6] of both.
-        chi_square: Of the points' places along the line.
+        direction: [3], unit vector from the tip to the rear.
+        covariance: [6, 6] of tip and direction.
+        chi_square: Chi-square of the positions along the line.
     """
 
     tip: np.ndarray
@@ -33,7 +32,7 @@ class LinePose:
 
     @property
     def tip_sd(self) -> float:
-        """In metres, over all three axes."""
+        """Standard deviation of the tip in metres, over all three axes."""
         return float(np.sqrt(self.covariance.diagonal()[:3].sum()))
 
 
@@ -48,32 +47,33 @@ def pose_on_line(
     *,
     rough: bool = False,
 ) -> LinePose | None:
-    """Pose of a tool whose image is ``line``; the part of :func:`solve_pose` that is left where the line is known.
+    """Pose of a tool whose image is ``line``: :func:`solve_pose` for a known line.
 
-    Tool and camera span a plane, whose image is the line. On it a point s from the tool's middle is seen at
-    t = (h0 + h1 s) / (1 + h2 s): weighted least squares for h, linear first, then Gauss-Newton. That the tool's length
-    is known gives the scale. The line's own deviations tilt the plane; both parts are independent.
+    The tool and the centre of the camera span a plane, whose image is the line. A point at s from the middle of the
+    tool has the image t = (h0 + h1 s) / (1 + h2 s). Weighted least squares determine h: a linear solution, then
+    Gauss-Newton steps. The known distances on the tool give the scale. The errors of the line tilt the plane, and are
+    independent of those of h.
 
     Args:
-        line: On the plane z = 1.
-        t: [N] places along it, in units of a pixel at the centre; N >= 3.
+        line: Line on the plane z = 1.
+        t: [N] positions along the line, in units of a pixel at the principal point; N >= 3.
         positions: [N] distances from the tip in metres.
         deviation: [N] standard deviations of t.
-        offset_sd: Of the line at the mean of t, in the same unit.
-        slope_sd: Of the line, in radians; independent of the offset.
-        shared_sd: Of what moves all points alike along the line, beside ``deviation``.
-        rough: Without the covariance, which costs as much as the rest: noughts in its place.
+        offset_sd: Standard deviation of the line's offset at the mean of t, in the unit of t.
+        slope_sd: Standard deviation of the line's slope in radians; independent of the offset.
+        shared_sd: Standard deviation of an error of t that all points share, in addition to ``deviation``.
+        rough: Whether to omit the covariance, which takes half of the time; it is then zero.
 
     Returns:
-        The pose, or None where none in front of the camera is near the points.
+        The pose, or None where no pose in front of the camera fits the points.
     """
-    # In plain numbers: of so few points, the calls into NumPy would cost several times as much.
+    # Python floats: for so few points, calls of NumPy would take several times as long.
     middle, mean = sum(t) / len(t), sum(positions) / len(t)
-    far, long = [value - middle for value in t], [value - mean for value in positions]
-    wide, length = max(map(abs, far)), max(map(abs, long))
+    offsets, levers = [value - middle for value in t], [value - mean for value in positions]
+    wide, length = max(map(abs, offsets)), max(map(abs, levers))
     if not wide > 0:
         return None
-    each = zip(far, long, deviation, strict=True)
+    each = zip(offsets, levers, deviation, strict=True)
     points = [(x / wide, s / length, wide / sd if sd else math.inf) for x, s, sd in each]
     h = (0.0, 0.0, 0.0)
     for _ in range(1 + _STEPS):
@@ -83,55 +83,48 @@ def pose_on_line(
     normal, _, chi_square, least = _terms(points, h)
     if not (least > 0 and math.isfinite(chi_square)):
         return None
-    (h0, h1, h2), unit, start = h, 1 / length, -mean / length
-    axes = _axes(line, middle, wide)
+    # Points in space are p e1 + q e2 up to one common scale, for both tip and direction. Errors of the line move them
+    # along e3.
+    (h0, h1, h2), step = h, line.along / line.scale
+    origin = line.origin + middle * step
+    unit, start = 1 / length, -mean / length
+    axes = np.array(
+        [[wide * step.real, wide * step.imag, 0.0], [origin.real, origin.imag, 1.0], [-step.imag, step.real, 0.0]]
+    )
     (p, q), (along, deep) = (h0 + h1 * start, 1 + h2 * start), (h1 * unit, h2 * unit)
     if rough:
         tip, direction = np.array([[p, q, 0.0], [along, deep, 0.0]]) @ axes
         size = math.sqrt(float(direction @ direction))
         return LinePose(tip / size, direction / size, np.zeros((6, 6)), chi_square) if size > 0 else None
-    # Tip and direction, how they move with h, and with the line's offset and slope.
+    # Tip and direction, and their derivatives by h (3), and by the offset and the slope of the line.
     tip = [[p, q, 0.0], [1.0, 0.0, 0.0], [start, 0.0, 0.0], [0.0, start, 0.0], [0.0, 0.0, q], [0.0, 0.0, p * wide]]
-    direction = [
-        [along, deep, 0.0],
-        [0.0, 0.0, 0.0],
-        [unit, 0.0, 0.0],
-        [0.0, unit, 0.0],
-        [0.0, 0.0, deep],
-        [0.0, 0.0, along * wide],
-    ]
+    rear = [[along, deep], [0.0, 0.0], [unit, 0.0], [0.0, unit]]
+    direction = [*([x, y, 0.0] for x, y in rear), [0.0, 0.0, deep], [0.0, 0.0, along * wide]]
     raw = np.array([tip, direction]) @ axes  # [2, 6, 3]
     raw /= np.sqrt(raw[1, 0] @ raw[1, 0])
     pose, moved = raw[:, 0], raw[:, 1:]
     moved = moved - (moved[1] @ pose[1])[:, None] * pose[:, None]
-    own = np.zeros((5, 5))  # covariance of h, and of the line's offset and slope
-    for column, right in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))):
-        own[:3, column] = _solved(normal, right)
-    shared = shared_sd / wide * np.array([1.0, h2, 0.0, 0.0, 0.0])
-    own += np.diag([0.0, 0.0, 0.0, offset_sd**2, slope_sd**2]) + shared * shared[:, None]
-    lever = moved.swapaxes(1, 2).reshape(6, 5)
-    covariance = lever @ own @ lever.T
+    covariance = _covariance(moved, normal, shared_sd / wide * np.array([1.0, h2, 0.0, 0.0, 0.0]), offset_sd, slope_sd)
     return LinePose(pose[0], pose[1], covariance, chi_square) if np.isfinite(covariance).all() else None
 
 
-def _axes(line: Line, middle: float, wide: float) -> np.ndarray:
-    """Axes e1, e2, e3 (rows) in which points of space are p e1 + q e2 up to one scale; e3 is across the line.
+def _covariance(
+    moved: np.ndarray, normal: list[float], shared: np.ndarray, offset_sd: float, slope_sd: float
+) -> np.ndarray:
+    """[6, 6] of tip and direction, from their derivatives ``moved`` [2, 5, 3] by h and by the line's offset and slope.
 
-    A line that is not quite where it was measured moves points along e3.
+    ``normal`` is the inverse covariance of h, ``shared`` [5] the standard deviation of the error common to all points.
     """
-    onward = line.along / line.scale
-    place = line.origin + middle * onward
-    return np.array(
-        [
-            [wide * onward.real, wide * onward.imag, 0.0],
-            [place.real, place.imag, 1.0],
-            [-onward.imag, onward.real, 0.0],
-        ]
-    )
+    own = np.zeros((5, 5))
+    for column, right in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))):
+        own[:3, column] = _solved(normal, right)
+    own += np.diag([0.0, 0.0, 0.0, offset_sd**2, slope_sd**2]) + shared * shared[:, None]
+    lever = moved.swapaxes(1, 2).reshape(6, 5)
+    return lever @ own @ lever.T
 
 
 def _terms(points: list[tuple[float, float, float]], h: _Three) -> tuple[list[float], _Three, float, float]:
-    """Normal matrix (its six entries), slope, sum of weighted squares, and the least depth; x where h is nought."""
+    """Normal matrix (six entries), gradient, chi-square and least depth at h; the linear problem where h is zero."""
     h0, h1, h2 = h
     started = h1 != 0
     a00 = a01 = a02 = a11 = a12 = a22 = b0 = b1 = b2 = chi = 0.0
@@ -157,7 +150,7 @@ def _terms(points: list[tuple[float, float, float]], h: _Three) -> tuple[list[fl
 
 
 def _solved(normal: list[float], right: _Three) -> _Three:
-    """Of a symmetric 3 x 3 system, by Cramer's rule; NaN where it has no one answer."""
+    """Solution of a symmetric 3 x 3 system by Cramer's rule; NaN where the matrix is not positive definite."""
     a, b, c, d, e, f = normal
     df, ce, be = d * f - e * e, c * e - b * f, b * e - c * d
     whole = a * df + b * ce + c * be
@@ -169,7 +162,7 @@ def _solved(normal: list[float], right: _Three) -> _Three:
 
 
 def on_host(pose: Pose) -> LinePose | None:
-    """Its tip and direction in NumPy, whatever device it is on; None where they are not finite."""
+    """Tip and direction of a pose on any device as NumPy arrays; None where they are not finite."""
     place, onward = (value.numpy(force=True).astype(np.float64) for value in (pose.tip, pose.direction))
     known = all(map(math.isfinite, (*place.tolist(), *onward.tolist())))
     return LinePose(place, onward, np.zeros((6, 6)), 0.0) if known else None

@@ -1,4 +1,4 @@
-"""Steadier and timelier poses: the One-Euro filter, and prediction to the time of display."""
+"""Smoothing of poses by the One-Euro filter, and prediction to the time of display."""
 
 import math
 from dataclasses import replace
@@ -14,25 +14,25 @@ from holotorch.tracking.pose.status import Pose, Status
 class OneEuro:
     """A low-pass whose cutoff rises with speed: steady at rest, quick in motion. One object follows one catheter.
 
-    With alpha = dt / (dt + tau), tau = 1 / (2 pi cutoff), the tip becomes x' + alpha (x - x'), and the direction moves
-    by the share alpha along the great circle to the new one. Both share a cutoff, hence a lag, or a moving catheter
-    would seem bent: ``min_cutoff + beta * speed``, speed the larger of the tip's and of the point ``arm`` behind it.
-    Departure from the paper: the speed is that of the measured poses, not from the last smoothed to the new one,
-    which would count the lag as speed.
+    With alpha = dt / (dt + tau) and tau = 1 / (2 pi cutoff), the smoothed tip x' becomes x' + alpha (x - x'), and the
+    direction moves by the fraction alpha along the great circle to the new one. Both use the same cutoff, and so have
+    the same lag: ``min_cutoff + beta * speed``, where the speed is the larger one of those of the tip and of the point
+    ``arm`` behind it. Departure from the paper: the speed is that of the measured poses. The difference between the new
+    pose and the last smoothed one would include the lag.
 
-    Lag: behind a steady motion the answer is :attr:`lag` seconds late. It follows lag' = (1 - alpha) (lag + dt), which
-    is exact for any steps and ends at tau: 1 / (2 pi cutoff), 80 ms at 2 Hz and 8 ms at 20 Hz. With the
-    defaults and 60 frames per second: a third of white jitter at rest, 13 ms late at 50 mm/s.
+    For a steady motion, the smoothed pose is :attr:`lag` seconds late. The lag follows lag' = (1 - alpha) (lag + dt),
+    which is exact for any time steps and converges to tau: 80 ms at 2 Hz and 8 ms at 20 Hz. With the defaults and 60
+    frames per second, white jitter at rest falls to a third, and the lag at 50 mm/s is 13 ms.
 
-    Nothing is carried across a refusal, a gap above ``longest_gap`` or a turn of 90 degrees or more from the smoothed
-    pose to the next, as when tip and rear are exchanged: the next pose passes unchanged, as the first.
+    The filter starts anew after a refusal, a gap above ``longest_gap``, or a rotation of 90 degrees or more from the
+    smoothed pose to the next, such as an exchange of tip and rear. The first pose passes unchanged.
 
     Args:
-        min_cutoff: In Hz, at rest.
-        beta: In Hz per m/s; 0 gives a plain low-pass.
-        derivative_cutoff: In Hz, of the speed.
-        longest_gap: In seconds.
-        arm: In metres from the tip, about that of the bands.
+        min_cutoff: Cutoff at rest, in Hz.
+        beta: Increase of the cutoff with speed, in Hz per m/s; 0 gives a low-pass filter with a fixed cutoff.
+        derivative_cutoff: Cutoff of the speed, in Hz.
+        longest_gap: Longest time between poses that the filter bridges, in seconds.
+        arm: Distance from the tip, in metres, of the second point whose speed counts; about that of the bands.
 
     Raises:
         TypeError, ValueError: A parameter that is not a finite number, not above 0, or a negative beta.
@@ -59,7 +59,7 @@ class OneEuro:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was seen."""
+        """Forget all poses."""
         self.lag = 0.0
         self._captured = -math.inf
         self._raw: Pose | None = None
@@ -68,14 +68,14 @@ class OneEuro:
         self._rate_covariance: Tensor | None = None
 
     def __call__(self, pose: Pose, captured: float) -> Pose:
-        """The smoothed pose for one that the camera took at ``captured`` seconds; a refusal comes back as it is.
+        """Smooth a pose whose frame was captured at ``captured`` seconds; a refusal is returned unchanged.
 
-        The covariance is the same mixture, (1 - alpha) C' + alpha C: no less than that of the mixed errors, however
-        they are correlated. Smoothing removes jitter, not bias, so it is not taken to make a pose more right.
+        The covariance becomes (1 - alpha) C' + alpha C. This is an upper bound for any correlation of the errors:
+        smoothing reduces jitter, but no bias.
 
         Raises:
             TypeError: A batch.
-            ValueError: NaN in an answered pose, or poses that do not come in the order of capture.
+            ValueError: NaN in a pose, or a capture time that is not later than the last one.
         """
         captured = checks.finite("captured", captured, "seconds")
         if not isinstance(pose.status, Status) or pose.tip.shape != (3,):
@@ -107,7 +107,7 @@ class OneEuro:
 
     @property
     def cutoff(self) -> float:
-        """In Hz, for the speed now known; 1 / (2 pi cutoff) is the lag at which a steady motion ends."""
+        """Cutoff in Hz at the current speed; the lag of a steady motion converges to 1 / (2 pi cutoff)."""
         if self._rate is None or self._smooth is None:
             return self.min_cutoff
         tip, turn = self._rate
@@ -115,21 +115,21 @@ class OneEuro:
         return self.min_cutoff + self.beta * max(float(tip.norm()), float(behind.norm()))
 
     def predict(self, when: float, *, longest: float = 0.1, acceleration: float = 0.3) -> Pose:
-        """The pose at ``when`` seconds, the time of display: the last one carried on at its filtered speed.
+        """Extrapolate the last pose to the time of display ``when`` at its filtered speed.
 
-        The lag is made up for too, so a steady motion is predicted without error. The covariance grows by that of the
-        speed times h^2, and by the way that an unknown acceleration leads in h = when - captured + lag while the speed
-        follows it 1 / (2 pi derivative_cutoff) late.
+        The prediction compensates the lag, so that it is exact for a steady motion. The covariance grows by that of the
+        speed times h^2, where h = when - captured + lag. It also grows by the displacement due to an unknown
+        acceleration during h, which the filtered speed follows with a delay of 1 / (2 pi derivative_cutoff).
 
         Args:
-            when: By the clock of ``captured``.
-            longest: In seconds from the capture; beyond, the answer is a refusal.
-            acceleration: Standard deviation in m/s^2, of the tip and of the point ``arm`` behind it: 0.3 for slow
-                careful work, 2 for a hand that swings 5 cm once a second.
+            when: Time in seconds on the clock of ``captured``.
+            longest: Longest prediction in seconds from the capture.
+            acceleration: Standard deviation of the acceleration of the tip and of the point ``arm`` behind it in m/s^2:
+                0.3 for slow careful work, 2 for a hand that swings by 5 cm once a second.
 
         Returns:
-            A pose, or a refusal (UNCERTAIN) after a refusal, after the first pose of a sequence, whose speed is not
-            known, and beyond ``longest``.
+            A pose, or a refusal (UNCERTAIN) beyond ``longest``, after a refusal, or after the first pose of a sequence,
+            when the speed is unknown.
         """
         when = checks.finite("when", when, "seconds")
         ahead = when - self._captured
@@ -154,12 +154,12 @@ class OneEuro:
             return
         alpha = dt / (dt + 1 / (2 * math.pi * self.derivative_cutoff))
         self._rate = self._rate + alpha * (rate - self._rate)
-        # Neighbouring differences share a pose with opposite signs: independent ones vary more.
+        # Consecutive differences share a pose with opposite signs; independent ones would have a larger variance.
         self._rate_covariance = (1 - alpha) ** 2 * self._rate_covariance + alpha**2 * covariance
 
 
 def _rotation(start: Tensor, end: Tensor) -> Tensor:
-    """Axis times angle [3] that turns one unit vector into the other by the shorter way."""
+    """Rotation vector [3] (axis times angle) of the smallest rotation from one unit vector to the other."""
     normal = torch.linalg.cross(start, end)
     sine = normal.norm()
     if sine < 1e-12:
@@ -168,7 +168,7 @@ def _rotation(start: Tensor, end: Tensor) -> Tensor:
 
 
 def _turned(vector: Tensor, rotation: Tensor) -> Tensor:
-    """A unit vector turned by axis times angle (Rodrigues), of length 1 again."""
+    """A unit vector rotated by a rotation vector (Rodrigues' formula), and normalised."""
     angle = rotation.norm()
     if angle < 1e-12:
         return vector

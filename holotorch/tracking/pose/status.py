@@ -1,4 +1,4 @@
-"""Pose of a catheter in front of a camera, how sure it is, and why there is none."""
+"""Pose of a catheter in front of a camera with its covariance, or the reason why there is none."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from torch import Tensor
 
 
 class Status(enum.IntEnum):
-    """What became of a frame, as trackers for surgery report it: a pose, or the first stage that could not go on."""
+    """Result of a frame, as trackers for surgery report it: a pose, or the first stage that failed."""
 
     OK = 0
-    UNVERIFIED = 1  # a pose from three edges: nothing is left to check it with
+    UNVERIFIED = 1  # a pose from three edges, without redundancy to check it
     BAD_FRAME = 2  # not an image: unreadable, wrong size, no contrast
-    NO_CATHETER = 3  # nothing of the bands' colours, thin and long
-    BANDS_MISSING = 4  # fewer than two neighbouring bands
-    NO_AXIS = 5  # bands that lie on no straight line
+    NO_CATHETER = 3  # nothing thin and long has the colours of the bands
+    BANDS_MISSING = 4  # fewer than two neighbouring bands are visible
+    NO_AXIS = 5  # the bands do not lie on a straight line
     TOO_NARROW = 6  # no pixel shows one colour alone
     EDGES_UNCLEAR = 7  # fewer than three edges between colours
     OUT_OF_FRAME = 8  # an edge lies at the border of the image
-    OUTSIDE_CAMERA = 9  # where the distortion cannot be inverted
-    INCONSISTENT = 10  # edges that no pose explains
-    UNCERTAIN = 11  # a pose, but too uncertain to be used
+    OUTSIDE_CAMERA = 9  # the catheter lies where the distortion is not invertible
+    INCONSISTENT = 10  # no pose explains the edges
+    UNCERTAIN = 11  # the pose is too uncertain to be used
 
     @property
     def answered(self) -> bool:
@@ -33,7 +33,7 @@ class Status(enum.IntEnum):
 
     @property
     def stage(self) -> str:
-        """Where it was decided: "frame", "colour", "axis", "edges", "camera" or "pose"."""
+        """Stage that decided the status: "frame", "colour", "axis", "edges", "camera" or "pose"."""
         return _STAGES.get(self, "pose")
 
 
@@ -50,10 +50,11 @@ _STAGES = {
 
 
 class Refusal(Exception):
-    """A stage that could not go on.
+    """Raised by a stage that fails.
 
     Attributes:
-        turned: Whether the bands may lie there in the other direction.
+        status, reason: Status and reason of the refused pose.
+        turned: Whether the bands may be visible in the reversed order.
     """
 
     def __init__(self, status: Status, reason: str, *, turned: bool = False):
@@ -63,20 +64,20 @@ class Refusal(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Of one catheter or of many ([...]: leading axes, alike for all), in the camera's frame.
+    """Pose of one catheter or a batch of poses, with leading axes [...], in the frame of the camera.
 
-    x points right, y down, z forward.
+    In this frame x points right, y down, z forward.
 
     Attributes:
-        tip: [..., 3] in metres; NaN where there is no pose, as in all that follows.
+        tip: [..., 3] in metres; NaN where there is no pose, as all attributes below.
         direction: [..., 3], unit vector from the tip to the rear: ``tip + s * direction`` lies s metres from the tip.
-        covariance: [..., 6, 6] of (tip, direction) in m^2, m and 1; of rank 5. It holds what the frame leaves open, and
-            not what is unknown of the camera (its calibration) or of where the catheter's edges are: those shift the
-            poses of all frames alike, and with a good calibration (rms 0.04 px) by more than is stated here.
-        chi_square: [...] squared deviations of the edges from the pose, each over its variance.
+        covariance: [..., 6, 6] of (tip, direction) in m^2, m and 1; of rank 5. It includes the errors of the frame, but
+            not those of the calibration or of the positions of the edges on the catheter. The latter shift the poses of
+            all frames in the same way, and even for a good calibration (rms 0.04 px) by more than this covariance.
+        chi_square: [...] sum of the squared residuals of the edges, each divided by its variance.
         freedom: [...] degrees of freedom of ``chi_square``.
-        status: One, or a tuple of them for a batch.
-        reason: A sentence; empty where all is well.
+        status: Status of the pose, or a tuple of them for a batch.
+        reason: Reason for a refusal or a warning, one sentence; else empty.
     """
 
     tip: Tensor
@@ -89,7 +90,7 @@ class Pose:
 
     @staticmethod
     def refused(status: Status, reason: str) -> Pose:
-        """No pose, and why."""
+        """A refusal: no pose, with its status and reason."""
         if status.answered:
             raise ValueError(f"{status.name} is no refusal")
         nowhere = torch.full((3,), torch.nan, dtype=torch.float64)
@@ -106,16 +107,16 @@ class Pose:
 
     @property
     def tip_sd(self) -> Tensor:
-        """Standard deviation of the tip in metres [...], over all three axes: the root of the variances' sum."""
+        """[...] standard deviation of the tip in metres: the root of the sum of the variances of all three axes."""
         return self.covariance[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
 
     @property
     def camera_from_tool(self) -> Tensor:
-        """[..., 4, 4]: the tool's z axis onto ``direction`` by the smallest rotation, its origin at the tip."""
+        """[..., 4, 4] rigid map that takes the origin to the tip and, by the smallest rotation, z to ``direction``."""
         x, y, z = self.direction.unbind(-1)
         square = x * x + y * y
-        back = (z < 0) & (square < 1e-30)  # half a turn about x
-        # 1 / (1 + z), without the digits that cancel where the tool points back.
+        back = (z < 0) & (square < 1e-30)  # rotation by 180 degrees about x
+        # 1 / (1 + z), without cancellation for z near -1.
         share = torch.where(z < 0, (1 - z) / torch.where(back | (z >= 0), 1.0, square), 1 / (1 + z.clamp(min=0)))
         zero, one = torch.zeros_like(z), torch.ones_like(z)
         columns = [
@@ -140,7 +141,7 @@ class Pose:
         return iter((self,)) if isinstance(self.status, Status) else map(self.__getitem__, range(len(self)))
 
     def __getitem__(self, index: int) -> Pose:
-        """One of a batch."""
+        """One pose of a batch."""
         if isinstance(self.status, Status):
             raise IndexError("this is one pose, not a batch")
         tip, direction, covariance = self.tip[index], self.direction[index], self.covariance[index]

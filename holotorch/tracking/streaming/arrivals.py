@@ -1,10 +1,10 @@
-"""What a receiver counts of the packets that reach it, and which of them it does not believe.
+"""Statistics of the packets that reach a receiver, and checks of which of them continue the stream.
 
-Packets are not signed, so whoever can send to the port, or sees the stream's number on the network, can forge poses
-that no check here tells from genuine ones. What the checks do: one damaged or forged packet, or a sender with a wrong
-clock, neither keeps an old pose alive nor locks the genuine sender out. A number or a time of sending that does not
-continue the stream is set aside; only when several such packets in a row continue each other does the receiver follow
-them. A genuine sender therefore comes back after as many packets, unless forged ones keep coming.
+Packets are not signed. Anyone who can send to the port, or can read the number of the stream on the network, can forge
+poses that no check here distinguishes from genuine ones. The checks ensure that a single damaged or forged packet, or a
+sender with a wrong clock, neither keeps an old pose valid nor locks out the genuine sender. The receiver does not use a
+packet whose number or time of sending does not continue the stream, until several such packets in a row continue each
+other. A genuine sender is therefore accepted again after that many packets, unless forged ones keep coming.
 """
 
 import itertools
@@ -17,23 +17,23 @@ import numpy as np
 
 from holotorch.tracking.streaming.packet import PosePacket
 
-_WINDOW = 1024  # sequence numbers remembered to tell a late packet from a repeated one
-_KEPT = 4096  # delays remembered for the median
-_RECENT = 256  # packets after which the fastest is sought anew, so that neither a wrong stamp nor drift lasts
-_RATE = 1000.0  # poses per second that no tracker exceeds: how far the sequence may run on while nothing arrives
-_STEP = 1.0  # seconds by which the time of sending may run ahead of the arrivals: the longest hold-up of one packet
-_AGREE = 3  # packets in a row, each continuing the one before, after which a receiver follows them
+_WINDOW = 1024  # sequence numbers that are stored to distinguish late packets from repeated ones
+_KEPT = 4096  # delays that are stored for the median
+_RECENT = 256  # packets between updates of the fastest transit, which limit the effect of wrong stamps and clock drift
+_RATE = 1000.0  # poses per second: largest rate at which the sequence may advance while no packet arrives
+_STEP = 1.0  # seconds: longest delay of one packet, by which times of sending may advance faster than arrivals
+_AGREE = 3  # packets in a row that continue each other, after which a receiver follows them
 
 
 class _Mark(NamedTuple):
-    """Where a packet stands in its stream: its number, the sender's time of sending and the receiver's of arrival."""
+    """Number of a packet in its stream, time of sending (sender's clock) and time of arrival (receiver's clock)."""
 
     sequence: int
     sent: float
     arrived: float
 
     def continued_by(self, later: "_Mark") -> bool:
-        """Whether ``later`` may be a newer packet of the same stream, as far as its number and time of sending say."""
+        """Whether ``later`` may be a newer packet of the same stream by its number and time of sending."""
         passed = later.arrived - self.arrived
         step = later.sequence - self.sequence
         return 0 < step <= _WINDOW + _RATE * max(passed, 0.0) and 0 <= later.sent - self.sent <= passed + _STEP
@@ -41,19 +41,19 @@ class _Mark(NamedTuple):
 
 @dataclass
 class Statistics:
-    """What happened to one stream on its way; times in seconds.
+    """Statistics of one stream; times in seconds.
 
     Attributes:
-        received: Packets, each counted once.
-        reordered: Came after a newer one, and were not used.
-        duplicated: Came again.
-        late: Older than the receiver's ``late`` when they came.
-        refused: Carried no pose.
-        future: Captured in the future, by more than the receiver's ``ahead``; not used, and not among ``received``.
-        jumped: Did not continue the stream in number and time of sending; not used, and not among ``received``.
-        foreign: Of another stream while this one was alive, and were not used.
-        invalid: Not readable, ``last_error`` why.
-        restarts: Streams before this one.
+        received: Number of packets received, each counted once.
+        reordered: Packets that arrived after a newer one; not used.
+        duplicated: Packets that arrived again.
+        late: Packets that were older than the receiver's ``late`` when they arrived.
+        refused: Packets without a pose.
+        future: Packets captured more than the receiver's ``ahead`` in the future; not used or counted as ``received``.
+        jumped: Packets whose number or time of sending did not continue the stream; not used, not ``received``.
+        foreign: Packets of another stream while this one was active; not used.
+        invalid: Unreadable packets; ``last_error`` is the reason of the last one.
+        restarts: Number of streams before this one.
         jitter: Smoothed difference of the transit of neighbouring packets (RFC 3550, Sec. 6.4.1).
         offset: The sender's clock minus the receiver's, by the clock request of the shortest round trip among the last
             eight; None as long as none was answered. Then a transit is counted from that of the fastest packet.
@@ -86,7 +86,7 @@ class Statistics:
     _raw: deque = field(default_factory=lambda: deque(maxlen=_KEPT), repr=False)  # transit by two clocks, time before
 
     def heard(self, packet: PosePacket, arrived: float, late: float, ahead: float) -> bool:
-        """Count a packet that ``arrived`` by the receiver's clock; whether it is to be used as the newest so far."""
+        """Count a packet that arrived at ``arrived`` (receiver's clock); returns whether it is the newest so far."""
         raw, waited = arrived - packet.sent, packet.sent - packet.captured
         if self._in_future(raw, waited, ahead):
             self.future += 1
@@ -97,7 +97,7 @@ class Statistics:
             return False
         behind = self._highest - packet.sequence if self._highest >= 0 else -1
         if behind >= _WINDOW or (behind >= 0 and self._seen >> behind & 1):
-            # Beyond the window a late packet cannot be told from a repeated one, and is used no more than it.
+            # Beyond the window, late and repeated packets are indistinguishable, and neither is used.
             self.duplicated += 1
             return False
         self.received, self._counted = self.received + 1, self._counted + 1
@@ -121,7 +121,7 @@ class Statistics:
         return True
 
     def _in_future(self, raw: float, waited: float, ahead: float) -> bool:
-        """Captured after it was sent, or, where the clocks have been compared, after it arrived."""
+        """Whether a packet was captured after it was sent or, if the clocks have been compared, after it arrived."""
         if -waited > ahead:
             return True
         if self.offset is None or self.round_trip is None:
@@ -129,7 +129,7 @@ class Statistics:
         return -(raw + self.offset + waited) > ahead + self.round_trip / 2
 
     def _believed(self, mark: "_Mark") -> bool:
-        """Whether a packet continues the stream, or the packets that were set aside now suffice to follow them."""
+        """Whether a packet continues the stream, or completes a row of packets that continue each other."""
         if self._newest is None or (
             mark.sent <= self._newest.sent  # overtaken by the newest, or a copy of it
             if mark.sequence <= self._newest.sequence
@@ -141,23 +141,23 @@ class Statistics:
         self._apart.append(mark)
         if len(self._apart) < _AGREE:
             return False
-        # The numbers begin anew here; what was counted before stays.
+        # Sequence numbers start anew here, while the counts continue.
         self._missed, self._counted, self._first, self._highest, self._seen = self.lost, 0, -1, -1, 0
         self._fastest, self._previous = math.inf, None
         return True
 
     @property
     def lost(self) -> int:
-        """Packets missing between the first and the newest."""
+        """Number of packets that are missing between the first and the newest."""
         return self._missed + (self._highest - self._first + 1 - self._counted if self._counted else 0)
 
     def transit(self, raw: Any) -> Any:
-        """Seconds on the way, from arrivals by one clock minus the sending by the other."""
+        """Transit time in seconds, from ``raw``: arrival (receiver's clock) minus sending (sender's clock)."""
         return raw + self.offset if self.offset is not None else raw - self._fastest
 
     def latency(self) -> dict[str, float]:
-        """Median and 95th percentile, of the transit and of the whole time since capture; NaN before a packet came."""
+        """Median and 95th percentile of transit and of the time since capture; NaN before the first packet."""
         raw = np.array(self._raw or [(math.nan, math.nan)], dtype=float)
-        way = self.transit(raw[:, 0])
-        found = [*np.quantile(way, (0.5, 0.95)).tolist(), *np.quantile(way + raw[:, 1], (0.5, 0.95)).tolist()]
-        return dict(zip(("transit_median", "transit_p95", "latency_median", "latency_p95"), found, strict=True))
+        transit = self.transit(raw[:, 0])
+        values = [*np.quantile(transit, (0.5, 0.95)).tolist(), *np.quantile(transit + raw[:, 1], (0.5, 0.95)).tolist()]
+        return dict(zip(("transit_median", "transit_p95", "latency_median", "latency_p95"), values, strict=True))

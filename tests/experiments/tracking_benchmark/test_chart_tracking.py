@@ -18,6 +18,7 @@ from holotorch.experiments.tracking_benchmark.methods import BASE, COLD, FEWER, 
 from holotorch.experiments.tracking_benchmark.timing import KORNIA
 from holotorch.io.images import encode_png
 from holotorch.tracking.camera.camera import Camera
+from holotorch.tracking.detection.stations import StationPlan
 from holotorch.tracking.pose.pose import solve_pose
 from holotorch.tracking.pose.status import Pose, Status
 from holotorch.tracking.simulation.render import Look
@@ -34,7 +35,7 @@ def small(**changes) -> World:
 
 
 def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(chart_tracking, "scene", small)
+    monkeypatch.setattr(chart_tracking, "scene", lambda _: small())
     monkeypatch.setattr(chart_tracking, "AMOUNT", Amount(2, 1, 1, 10, 1, 0.06))
     for module in (chart_tracking, tracking_bench, tracking_picture):
         monkeypatch.setattr(module, "STILL", {(520, 20): 0.2, (520, 5): None})
@@ -141,15 +142,16 @@ def test_refusals_are_given_their_reason():
     assert 0 in fits.values() and 1 in fits.values()
 
 
-def test_photographs_are_those_beside_the_checkout_or_bundled(tmp_path, monkeypatch):
-    monkeypatch.setattr(tracking_methods, "PHOTOGRAPHS", tmp_path / "none")
+def test_photographs_come_from_a_folder_or_from_scikit_image(tmp_path):
     bundled = tracking_methods.photographs()
     assert len(bundled) == 3 and all(image.dtype == torch.uint8 and image.shape[0] == 3 for image in bundled)
     picture = torch.rand(3, 16, 20, dtype=torch.float64)
-    (tmp_path / "one.png").write_bytes(encode_png(picture))
     (tmp_path / "grey.png").write_bytes(encode_png(picture[:1]))
-    monkeypatch.setattr(tracking_methods, "PHOTOGRAPHS", tmp_path)
-    found = tracking_methods.photographs()
+    with pytest.raises(ValueError, match="must hold colour photographs"):
+        tracking_methods.photographs(tmp_path)
+    (tmp_path / "one.png").write_bytes(encode_png(picture))
+    found = tracking_methods.photographs(tmp_path)
+    assert len(found) == 1
     assert (found[-1] - 255 * picture).abs().max() <= 0.5 + 1e-6
 
 
@@ -159,7 +161,7 @@ def test_fewer_stations_are_fewer():
     some = methods(world, (COLD, FEWER))
     many, few = (track(case.frame(), case) for track in some.values())
     assert many.answered and few.answered and float((many.tip - few.tip).norm()) > 0
-    assert tracking_methods.stations._STATIONS > tracking_methods.STATIONS
+    assert StationPlan().most > tracking_methods.FEWER_STATIONS.most
 
 
 def test_the_bounds_are_those_of_pixels_and_edges():
