@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.deprecation import renamed
 from holotorch.core.precision import at_least_single
 
 _LUMINANCE = (0.2126390058715103, 0.7151686787677559, 0.0721923153607337)  # of linear sRGB, IEC 61966-2-1
@@ -14,7 +15,7 @@ def linear_srgb(intensity: Tensor, matrix: Tensor) -> Tensor:
     """One matrix product: linear sRGB [..., 3, H, W] of ``intensity`` [..., K, H, W], with ``matrix`` [3, K].
 
     ``io.colour_tables.srgb_matrix`` makes the matrix from wavelengths. Differentiable. Pure colours lie outside sRGB
-    and come out with negative components, to be brought in by :func:`desaturated`; nothing is clipped here.
+    and come out with negative components, to be brought in by :func:`gamut_map`; nothing is clipped here.
 
     Raises:
         ValueError: Shapes that do not match.
@@ -28,7 +29,7 @@ def linear_srgb(intensity: Tensor, matrix: Tensor) -> Tensor:
     return torch.einsum("ck,...khw->...chw", matrix.to(intensity), intensity)
 
 
-def desaturated(colour: Tensor) -> Tensor:
+def gamut_map(colour: Tensor) -> Tensor:
     """Bring linear sRGB [..., 3, H, W] into its gamut: mixed with the grey of its own luminance until none is negative.
 
     The gamut rule of the library. It keeps luminance, and the hue in the chromaticity diagram, where clipping changes
@@ -64,7 +65,7 @@ def equal_power(intensity: Tensor, reference: Tensor) -> Tensor:
     return intensity * torch.where(black, 0.0, wanted / torch.where(black, 1.0, ours)).to(intensity.dtype)
 
 
-def exposed(intensity: Tensor, *, peak: Tensor | None = None, gamma: float = GAMMA) -> Tensor:
+def tone_map(intensity: Tensor, *, peak: Tensor | None = None, gamma: float = GAMMA) -> Tensor:
     """Picture (intensity / peak)^gamma in 0..1, Eq. 5.16; what exceeds the peak is cut to 1, an empty one is black.
 
     Args:
@@ -86,3 +87,6 @@ def exposed(intensity: Tensor, *, peak: Tensor | None = None, gamma: float = GAM
     lit = (intensity > 0) & (peak > 0)
     part = torch.where(lit, intensity, 1.0) / torch.where(peak > 0, peak, 1.0)
     return torch.where(lit, part.clamp(max=1).pow(gamma), 0.0)
+
+
+__getattr__ = renamed(__name__, {"exposed": "tone_map", "desaturated": "gamut_map"})

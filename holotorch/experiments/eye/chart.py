@@ -24,8 +24,8 @@ from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.io.bundled import find_config
 from holotorch.optics.light.spectral import spectral_image
 from holotorch.optics.light.wavelength_sampling import followed, neighbour_error, seen_light
-from holotorch.optics.viewing.elementwise import ElementSampling, least_oversampling, through_elements
-from holotorch.optics.viewing.imaging import imaged
+from holotorch.optics.viewing.elementwise import ElementSampling, least_oversampling, propagate_elements
+from holotorch.optics.viewing.imaging import propagate_collapsed
 from holotorch.optics.viewing.retina import plan_retina
 
 SIDE, DISTANCES = 512, (10e-3, 20e-3, 30e-3)
@@ -71,17 +71,19 @@ def _ways(eye: Observer) -> list[dict]:
     field, looking, display = hologram[1].conj()[None], eye.eye(depth), eye.display
     least = least_oversampling(grid, [wave], display, looking, plane=depth)
     wanted = intensity(
-        through_elements(field, grid, [wave], display, looking, plane=depth, sampling=_finer(least, 1.3), paraxial=True)
+        propagate_elements(
+            field, grid, [wave], display, looking, plane=depth, sampling=_finer(least, 1.3), paraxial=True
+        )
     )
     plan = plan_retina(grid, [wave], display, looking, plane=depth, paraxial=True)
     needed = max(least.oversampling)
     calls: dict[str, Any] = {
-        "collapse": lambda: imaged(field, grid, [wave], display, looking, plane=depth, paraxial=True)
+        "collapse": lambda: propagate_collapsed(field, grid, [wave], display, looking, plane=depth, paraxial=True)
     }
     for factor in (*(f for f in FACTORS if f < 0.95 * needed), needed):
         sampling = _finer(least, factor / needed)
         name = f"elements, {factor:.2g} x" + (", the thesis's sampling" if factor == 1 else "")
-        calls[name] = lambda sampling=sampling: through_elements(
+        calls[name] = lambda sampling=sampling: propagate_elements(
             field, grid, [wave], display, looking, plane=depth, sampling=sampling, paraxial=True
         )
     rows = []

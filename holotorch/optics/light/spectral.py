@@ -28,9 +28,9 @@ from holotorch.optics.free_space.kernels import turns_phasor
 from holotorch.optics.light.incoherent import incoherent_sum
 from holotorch.optics.light.wavelength_sampling import flawless, followed, least_followed, unseparated
 from holotorch.optics.viewing.display import Display, number
-from holotorch.optics.viewing.elementwise import through_elements
+from holotorch.optics.viewing.elementwise import propagate_elements
 from holotorch.optics.viewing.eye import Eye
-from holotorch.optics.viewing.imaging import imaged
+from holotorch.optics.viewing.imaging import propagate_collapsed
 
 
 def neighbours(
@@ -46,13 +46,14 @@ def neighbours(
     """Fields on the retina at wavelengths near the one that was followed there.
 
     Args:
-        image: What :func:`imaged` or :func:`through_elements` gave for the plane in focus, complex [..., H, W].
+        image: Field on the retina, complex [..., H, W], from :func:`propagate_collapsed` or
+            :func:`propagate_elements` for the plane in focus.
         grid: Its sampling.
         wavelength: In metres, of ``image``.
         others: In metres.
         display: As it was for ``image``.
         eye: Likewise. Its aberrations and its colour error are those of each wavelength.
-        elements: ``image`` comes from :func:`through_elements`, which keeps the retina's curvature.
+        elements: ``image`` comes from :func:`propagate_elements`, which keeps the retina's curvature.
 
     Yields:
         Complex [..., H, W] for each of ``others``, one in memory at a time. Near the edges light is missing that was
@@ -124,7 +125,7 @@ def spectral_image(
         tolerance: In place of ``count``: error of the picture that may come of following few
             (:func:`neighbour_error`), relative to the mean picture.
         reach: Half width in metres of the scene, for ``tolerance``.
-        elements: Follow by :func:`through_elements` instead of :func:`imaged`.
+        elements: Follow by :func:`propagate_elements` instead of :func:`propagate_collapsed`.
         paraxial: As there.
         recompute: As in :func:`incoherent_sum`, per wavelength followed.
 
@@ -151,7 +152,7 @@ def spectral_image(
     if tolerance is not None:
         count = least_followed(lengths, power, tolerance, grid, display, eye, reach=reach)
     nodes, owners = followed(lengths, power, count or 0)
-    way = through_elements if elements else imaged
+    way = propagate_elements if elements else propagate_collapsed
     room = _room(grid, lengths, nodes, owners, display, eye)
     wide = Grid((grid.shape[0] + 2 * room[0], grid.shape[1] + 2 * room[1]), grid.pitch)
     padded = torch.nn.functional.pad(field, (room[1], room[1], room[0], room[0]))

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
+from holotorch.core.deprecation import renamed
 from holotorch.core.fourier import fft2, filter_spectrum, good_length
 from holotorch.core.grid import Grid
 from holotorch.optics.elements.lens import pupil
@@ -70,7 +71,7 @@ def least_oversampling(
     return ElementSampling(oversampling, padded, fine)
 
 
-def through_elements(
+def propagate_elements(
     field: Tensor,
     grid: Grid,
     wavelengths: float | Sequence[float],
@@ -81,7 +82,7 @@ def through_elements(
     sampling: ElementSampling | None = None,
     paraxial: bool = False,
 ) -> Tensor:
-    """Field on the retina element by element (thesis Algorithm 6), at the same points and scale as ``imaged``.
+    """Propagate a hologram to the retina element by element (thesis Algorithm 6), scaled as ``propagate_collapsed``.
 
     Args:
         field: Of the hologram, complex [..., C, H, W].
@@ -120,9 +121,9 @@ def through_elements(
     batch = field.numel() // max(1, math.prod(field.shape[-3:]))
     checks.affordable(
         sizes.memory_bytes(field.dtype.itemsize, batch) + field.dtype.itemsize * field.numel(),
-        f"through_elements() on {sizes.fine[0]} x {sizes.fine[1]} samples, {max(sizes.oversampling):.3g} times as fine "
-        f"as the hologram's {grid.shape[0]} x {grid.shape[1]},",
-        "use imaged(), crop the hologram, pass fewer fields at once, or use smaller lenses",
+        f"propagate_elements() on {sizes.fine[0]} x {sizes.fine[1]} samples, {max(sizes.oversampling):.3g} times as "
+        f"fine as the hologram's {grid.shape[0]} x {grid.shape[1]},",
+        "use propagate_collapsed(), crop the hologram, pass fewer fields at once, or use smaller lenses",
         field.device,
     )
     scale = retinal_scale(display, eye, plane)
@@ -220,3 +221,6 @@ def _read(spectrum: Tensor, fine: Grid, grid: Grid, scale: Length) -> Tensor:
         lines = zoom(spectrum.transpose(dim, -1), (before, kernel, after)).transpose(dim, -1)
         spectrum = lines * (abs(scale) ** 0.5)
     return spectrum
+
+
+__getattr__ = renamed(__name__, {"through_elements": "propagate_elements"})

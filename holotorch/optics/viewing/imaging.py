@@ -32,6 +32,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
+from holotorch.core.deprecation import renamed
 from holotorch.core.fourier import centred_fft2, centred_ifft2, good_length
 from holotorch.core.grid import Grid
 from holotorch.optics.free_space.kernels import (
@@ -90,7 +91,7 @@ class CollapseSampling:
         return math.ceil(max(kernel, lines, (88 + 1.5 * itemsize * batch) * passed))
 
 
-def imaged(
+def propagate_collapsed(
     field: Tensor,
     grid: Grid,
     wavelengths: float | Sequence[float],
@@ -150,7 +151,7 @@ def imaged(
     size, batch = field.dtype.itemsize, field.numel() // max(1, math.prod(field.shape[-3:]))
     checks.affordable(
         sizes.memory_bytes(passed, size, batch) + size * field.numel(),
-        f"imaged() on an object plane of {sizes.fine[0]} x {sizes.fine[1]} samples, "
+        f"propagate_collapsed() on an object plane of {sizes.fine[0]} x {sizes.fine[1]} samples, "
         f"{max(sizes.oversampling):.3g} times as fine as the hologram's {grid.shape[0]} x {grid.shape[1]},",
         "crop the hologram, pass fewer fields at once, use a smaller pupil, or put the plane farther from the pupil",
         field.device,
@@ -283,3 +284,6 @@ def _centred(values: Tensor, shape: Sequence[int]) -> Tensor:
 
 def _fft(count: int) -> float:
     return 5 * count * math.log2(max(count, 2))
+
+
+__getattr__ = renamed(__name__, {"imaged": "propagate_collapsed"})

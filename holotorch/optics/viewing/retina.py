@@ -14,9 +14,15 @@ from holotorch.core.complex import intensity
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import WIDTH
 from holotorch.optics.viewing.display import Display, Length, inverse, number
-from holotorch.optics.viewing.elementwise import ElementSampling, least_oversampling, through_elements
+from holotorch.optics.viewing.elementwise import ElementSampling, least_oversampling, propagate_elements
 from holotorch.optics.viewing.eye import Eye
-from holotorch.optics.viewing.imaging import CollapseSampling, collapse_sampling, imaged, pupil_bands, retinal_scale
+from holotorch.optics.viewing.imaging import (
+    CollapseSampling,
+    collapse_sampling,
+    propagate_collapsed,
+    pupil_bands,
+    retinal_scale,
+)
 
 # Error of a pupil with a hard rim, times its samples across. Measured: 1.1 to 3.2 for the collapse of points with 1360
 # samples, 0.6 to 3.4 for noise with 42 to 55, 0.4 to 1.3 for elements with 3800.
@@ -31,7 +37,7 @@ class RetinaPlan:
 
     Attributes:
         method: "collapse" or "elements".
-        sampling: Sizes of that way, for :func:`imaged` or :func:`through_elements`.
+        sampling: Sizes of that way, for :func:`propagate_collapsed` or :func:`propagate_elements`.
         predicted_error: Expected relative L2 error of the intensity, over points of light within the scene.
         memory_bytes: Largest extra memory of one image of one wavelength.
         flops: Arithmetic of one image of one wavelength.
@@ -64,7 +70,7 @@ def plan_retina(
     dtype: torch.dtype = torch.complex64,
     memory_limit: int | None = None,
 ) -> RetinaPlan:
-    """Choose between :func:`imaged` and :func:`through_elements`.
+    """Choose between :func:`propagate_collapsed` and :func:`propagate_elements`.
 
     Args:
         grid: Sampling of the hologram.
@@ -244,8 +250,8 @@ class Retina(nn.Module):
         return retinal_scale(self.display, self.eye, self.plane)
 
     def field(self, field: Tensor) -> Tensor:
-        """Complex field on the retina, [..., C, H, W], as :func:`imaged` gives it."""
-        way = imaged if self.plan.method == "collapse" else through_elements
+        """Complex field on the retina, [..., C, H, W], as :func:`propagate_collapsed` gives it."""
+        way = propagate_collapsed if self.plan.method == "collapse" else propagate_elements
         return way(
             field, self.grid, self.wavelengths, self.display, self.eye, plane=self.plane, paraxial=self.paraxial,
             sampling=self.plan.sampling,  # type: ignore[arg-type]
