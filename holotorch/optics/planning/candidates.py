@@ -59,12 +59,16 @@ Axes = tuple[AxisContent, AxisContent]
 
 
 def candidates(
-    planes: PlanePair, waves: Sequence[float], distances: Sequence[float], content: FieldContent, dtype: torch.dtype
+    planes: PlanePair,
+    wavelengths: Sequence[float],
+    distances: Sequence[float],
+    content: FieldContent,
+    dtype: torch.dtype = torch.complex64,
 ) -> list[Candidate]:
-    """Every way for ``planes``; for several wavelengths and distances with the worst of their errors."""
+    """Every method for ``planes``; its error is the largest one over the wavelengths and distances."""
     if dtype not in (torch.complex64, torch.complex128):
         raise TypeError(f"dtype must be complex64 or complex128, got {dtype}")
-    longest, far = max(waves), max(distances, key=abs)
+    longest, far = max(wavelengths), max(distances, key=abs)
     scenes = [_axes(planes, longest, distance, content) for distance in _extremes(planes, distances)]
     ways = [_identity(scenes)] if planes.straight else []
     if far == 0 and planes.straight:
