@@ -1,4 +1,4 @@
-"""From intensities at several wavelengths to a picture: linear sRGB, its gamut, equal power, the curve of Eq. 5.16."""
+"""Pictures from intensities at several wavelengths: linear sRGB, gamut mapping, equal power, tone curve of Eq. 5.16."""
 
 import torch
 from torch import Tensor
@@ -7,8 +7,9 @@ from holotorch.core import checks
 from holotorch.core.deprecation import renamed
 from holotorch.core.precision import at_least_single
 
-_LUMINANCE = (0.2126390058715103, 0.7151686787677559, 0.0721923153607337)  # of linear sRGB, IEC 61966-2-1
-GAMMA = 0.5  # of Eq. 5.16
+# Luminance of the primaries of linear sRGB (IEC 61966-2-1): the Y row of the matrix to CIE XYZ.
+_LUMINANCE = (0.2126390058715103, 0.7151686787677559, 0.0721923153607337)
+GAMMA = 0.5  # exponent of Eq. 5.16
 
 
 def linear_srgb(intensity: Tensor, matrix: Tensor) -> Tensor:
@@ -30,9 +31,9 @@ def linear_srgb(intensity: Tensor, matrix: Tensor) -> Tensor:
 
 
 def gamut_map(colour: Tensor) -> Tensor:
-    """Bring linear sRGB [..., 3, H, W] into its gamut: mixed with the grey of its own luminance until none is negative.
+    """Map linear sRGB [..., 3, H, W] into its gamut: mix it with grey of equal luminance until nothing is negative.
 
-    The gamut rule of the library. It keeps luminance, and the hue in the chromaticity diagram, where clipping changes
+    It keeps luminance, and the hue in the chromaticity diagram, where clipping changes
     both: pure 455 nm would turn 3.2 times as bright. Values above 1 are left for the exposure. Black where the
     luminance is not positive. Differentiable but on the gamut's border.
     """
@@ -71,8 +72,8 @@ def tone_map(intensity: Tensor, *, peak: Tensor | None = None, gamma: float = GA
     Args:
         intensity: [..., C, H, W], not negative; a tiny negative from rounding counts as 0.
         peak: Intensity that becomes 1, which broadcasts against ``intensity``; to compare sources, that of one of them.
-            By default the largest value of each picture over C, H and W: Eq. 5.16 is printed for one channel, and a
-            peak of its own for each would change the colours.
+            By default the largest value of each picture over C, H and W: Eq. 5.16 is printed for one channel, and one
+            peak per channel would change the colours.
         gamma: Exponent, above 0.
 
     Returns:
