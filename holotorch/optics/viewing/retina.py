@@ -91,45 +91,36 @@ def plan_retina(
     Raises:
         ValueError: Impossible numbers, more memory than the limit, or an expected error beyond 0.5.
     """
-    channel_wavelengths = checks.wavelengths(wavelengths)
+    wavelengths = checks.wavelengths(wavelengths)
     tolerance = checks.positive("tolerance", tolerance)
     plane = display.object_plane(plane, eye.accommodation)
     if reach is None:
         reach = max(n * p for n, p in zip(grid.shape, grid.pitch, strict=True) if n > 1) / 2
-    checks.quantity(WIDTH, reach, "reach")
     options: list[tuple[float, str, CollapseSampling | ElementSampling, float, int]] = []
-    heights = [reach * i / (_HEIGHTS - 1) for i in range(_HEIGHTS)]
+    heights = [checks.quantity(WIDTH, reach, "reach") * i / (_HEIGHTS - 1) for i in range(_HEIGHTS)]
     size, refused = 8 if dtype == torch.complex64 else 16, ""
     try:
-        collapse = collapse_sampling(grid, channel_wavelengths, display, eye, plane)
+        collapse = collapse_sampling(grid, wavelengths, display, eye, plane)
         error = max(
             collapse_error(grid, w, display, eye, plane, heights, paraxial=paraxial, registered=registered)
-            for w in channel_wavelengths
+            for w in wavelengths
         )
-        across = abs(number(display.matrix(plane)[1])) / (2 * number(eye.pupil_radius))  # spot per wavelength
-        edge = _EDGE_ERROR * max(
-            max(channel_wavelengths) * across / (n * p)
-            for n, p in zip(collapse.window, grid.pitch, strict=True)
-            if n > 1
-        )
-        passed = max(math.prod(pupil_bands(grid, w, display, eye, plane)) for w in channel_wavelengths) * math.prod(
-            collapse.window
-        )
-        options.append(
-            (collapse.flops, "collapse", collapse, math.hypot(error, edge), collapse.memory_bytes(passed, size))
-        )
+        spot = max(wavelengths) * (abs(number(display.matrix(plane)[1])) / (2 * number(eye.pupil_radius)))
+        across = max(spot / (n * p) for n, p in zip(collapse.window, grid.pitch, strict=True) if n > 1)
+        passed = max(math.prod(pupil_bands(grid, w, display, eye, plane)) for w in wavelengths)
+        memory = collapse.memory_bytes(passed * math.prod(collapse.window), size)
+        options.append((collapse.flops, "collapse", collapse, math.hypot(error, _EDGE_ERROR * across), memory))
     except ValueError as reason:
         refused = f"collapse is impossible here: {reason}"
-    elements = least_oversampling(grid, channel_wavelengths, display, eye, plane=plane)
+    elements = least_oversampling(grid, wavelengths, display, eye, plane=plane)
     step = max(p / m for n, p, m in zip(grid.shape, grid.pitch, elements.oversampling, strict=True) if n > 1)
     edge = min(1.0, _EDGE_ERROR * step / (2 * number(eye.pupil_radius)))
     options.append((elements.flops, "elements", elements, edge, elements.memory_bytes(size)))
     limit = math.inf if memory_limit is None else memory_limit
     fitting = [option for option in options if option[4] <= limit]
     if not fitting:
-        least = min(option[4] for option in options)
-        raise ValueError(f"no way to the retina fits into {limit:.3g} bytes, the smallest takes {least:.3g}; crop the "
-                         "hologram or raise memory_limit")  # fmt: skip
+        raise ValueError(f"no way to the retina fits into {limit:.3g} bytes, the smallest takes "
+                         f"{min(o[4] for o in options):.3g}; crop the hologram or raise memory_limit")  # fmt: skip
     within = [option for option in fitting if option[3] <= tolerance]
     best = min(within) if within else min(fitting, key=lambda option: option[3])
     flops, method, sampling, error, memory = best
