@@ -1,4 +1,4 @@
-"""Argument checks in one voice: what was expected, what came, what to change."""
+"""Argument checks with uniform messages: the expected value, the given value, and what to change."""
 
 import contextlib
 import math
@@ -13,16 +13,16 @@ from torch import Tensor
 from holotorch.core import memory
 from holotorch.core.quantities import WAVELENGTH, Quantity
 
-_UNASKED = 64 << 20  # bytes that are taken without reading how much memory is available, which takes 0.1 ms
-_TURNED = 0.01  # rad: 1 % of a field
+_UNASKED = 64 << 20  # bytes up to which the available memory is not read, which takes 0.1 ms
+_TURNED = 0.01  # rad: phase error above which rounding is reported, 1 % of a field
 
 
 class SamplingWarning(UserWarning):
-    """A grid is too coarse or too small for what it is asked to carry; the message says what would do."""
+    """A grid is too coarse or too small for its light; the message names a sufficient sampling."""
 
 
 class PrecisionWarning(UserWarning):
-    """A number was given with fewer digits than the phase of light needs; the message says which type would do."""
+    """A number has fewer digits than the phase of light needs; the message names a sufficient type."""
 
 
 def positive(name: str, value: float, unit: str = "") -> float:

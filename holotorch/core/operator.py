@@ -1,4 +1,4 @@
-"""What the rest of the library calls a linear operator."""
+"""LinearOperator: the protocol of linear operators, and a function with a given adjoint as derivative."""
 
 from collections.abc import Callable
 from typing import Protocol

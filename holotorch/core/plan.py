@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Plan:
-    """The cheapest adequate way found, and the one that came next.
+    """The cheapest adequate method of an operation, and the runner-up.
 
     Attributes:
         method: Name of the method.
@@ -16,9 +16,9 @@ class Plan:
         predicted_error: Expected relative L2 error of the result for the described content.
         memory_bytes: Largest extra memory of one call with its kernel, for one channel.
         flops: Arithmetic of one call with the kernel at hand, for one channel.
-        reason: One sentence that says why this one.
-        runner_up: One sentence that says which came next and why it lost.
-        adequate: Whether ``predicted_error`` is within the tolerance; False is only returned where nothing is.
+        reason: One sentence that says why this method was chosen.
+        runner_up: One sentence that says which method came next and why it was not chosen.
+        adequate: Whether ``predicted_error`` is within the tolerance; False only if that of no method is.
     """
 
     method: str

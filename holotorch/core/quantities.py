@@ -1,4 +1,4 @@
-"""Physical quantities: their units, the ranges that can be meant, and the words for a value outside its range.
+"""Physical quantities: their units, plausible ranges, and the message for a value outside its range.
 
 A range is as wide as the physics that this package is used for, and no wider, so that a length in nanometres,
 micrometres or millimetres that stands where metres belong is refused. Used by ``checks.quantity`` and by the fields of

@@ -1,5 +1,6 @@
-"""Propagation of light, lenses and eyes, and what a display shows."""
+"""Propagation of light, lenses and eyes, and the picture that a display shows."""
 
+from holotorch.core.deprecation import renamed
 from holotorch.optics.elements.converging import ConvergingFresnel, converging_fresnel
 from holotorch.optics.elements.lens import Aperture, Lens, lens_limit, lens_phase, pupil
 from holotorch.optics.elements.path import OpticalPath
@@ -24,7 +25,7 @@ from holotorch.optics.light.incoherent import disc_source, incoherent_sum, tilte
 from holotorch.optics.light.spectral import neighbours, spectral_image
 from holotorch.optics.light.spectrum import Spectrum
 from holotorch.optics.light.wavelength_sampling import least_followed, neighbour_error, seen_light
-from holotorch.optics.picture import desaturated, equal_power, exposed, linear_srgb
+from holotorch.optics.picture import equal_power, gamut_map, linear_srgb, tone_map
 from holotorch.optics.planning.plan import plan_propagation
 from holotorch.optics.planning.propagate import Propagator, propagate
 from holotorch.optics.viewing.display import Display
@@ -48,9 +49,9 @@ from holotorch.optics.viewing.display_geometry import (
     visible_half_width,
     volume_size,
 )
-from holotorch.optics.viewing.elementwise import least_oversampling, through_elements
+from holotorch.optics.viewing.elementwise import least_oversampling, propagate_elements
 from holotorch.optics.viewing.eye import Eye, EyeLens, chromatic_refraction, zernike
-from holotorch.optics.viewing.imaging import imaged, retinal_scale
+from holotorch.optics.viewing.imaging import propagate_collapsed, retinal_scale
 from holotorch.optics.viewing.retina import Retina, plan_retina, retinal_image
 
 __all__ = [
@@ -81,18 +82,16 @@ __all__ = [
     "chromatic_refraction",
     "converging_fresnel",
     "depth_of_focus",
-    "desaturated",
     "diffraction_angle",
     "disc_source",
     "equal_power",
-    "exposed",
     "eye_box",
     "eyepiece_distance",
     "fresnel_distance",
     "fresnel_kernel",
     "fresnel_number",
+    "gamut_map",
     "image_distance",
-    "imaged",
     "incoherent_sum",
     "least_followed",
     "least_oversampling",
@@ -113,6 +112,8 @@ __all__ = [
     "planar_fov",
     "predicted_contrast",
     "propagate",
+    "propagate_collapsed",
+    "propagate_elements",
     "pupil",
     "region",
     "region_apex",
@@ -124,11 +125,21 @@ __all__ = [
     "seen_light",
     "smallest_spot",
     "spectral_image",
-    "through_elements",
     "tilted_wave",
+    "tone_map",
     "unaliased_distance",
     "vignetting",
     "visible_half_width",
     "volume_size",
     "zernike",
 ]
+
+__getattr__ = renamed(
+    __name__,
+    {
+        "imaged": "propagate_collapsed",
+        "through_elements": "propagate_elements",
+        "exposed": "tone_map",
+        "desaturated": "gamut_map",
+    },
+)

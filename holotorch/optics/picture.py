@@ -1,20 +1,22 @@
-"""From intensities at several wavelengths to a picture: linear sRGB, its gamut, equal power, the curve of Eq. 5.16."""
+"""Pictures from intensities at several wavelengths: linear sRGB, gamut mapping, equal power, tone curve of Eq. 5.16."""
 
 import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.deprecation import renamed
 from holotorch.core.precision import at_least_single
 
-_LUMINANCE = (0.2126390058715103, 0.7151686787677559, 0.0721923153607337)  # of linear sRGB, IEC 61966-2-1
-GAMMA = 0.5  # of Eq. 5.16
+# Luminance of the primaries of linear sRGB (IEC 61966-2-1): the Y row of the matrix to CIE XYZ.
+_LUMINANCE = (0.2126390058715103, 0.7151686787677559, 0.0721923153607337)
+GAMMA = 0.5  # exponent of Eq. 5.16
 
 
 def linear_srgb(intensity: Tensor, matrix: Tensor) -> Tensor:
     """One matrix product: linear sRGB [..., 3, H, W] of ``intensity`` [..., K, H, W], with ``matrix`` [3, K].
 
     ``io.colour_tables.srgb_matrix`` makes the matrix from wavelengths. Differentiable. Pure colours lie outside sRGB
-    and come out with negative components, to be brought in by :func:`desaturated`; nothing is clipped here.
+    and come out with negative components, to be brought in by :func:`gamut_map`; nothing is clipped here.
 
     Raises:
         ValueError: Shapes that do not match.
@@ -28,10 +30,10 @@ def linear_srgb(intensity: Tensor, matrix: Tensor) -> Tensor:
     return torch.einsum("ck,...khw->...chw", matrix.to(intensity), intensity)
 
 
-def desaturated(colour: Tensor) -> Tensor:
-    """Bring linear sRGB [..., 3, H, W] into its gamut: mixed with the grey of its own luminance until none is negative.
+def gamut_map(colour: Tensor) -> Tensor:
+    """Map linear sRGB [..., 3, H, W] into its gamut: mix it with grey of equal luminance until nothing is negative.
 
-    The gamut rule of the library. It keeps luminance, and the hue in the chromaticity diagram, where clipping changes
+    It keeps luminance, and the hue in the chromaticity diagram, where clipping changes
     both: pure 455 nm would turn 3.2 times as bright. Values above 1 are left for the exposure. Black where the
     luminance is not positive. Differentiable but on the gamut's border.
     """
@@ -64,14 +66,14 @@ def equal_power(intensity: Tensor, reference: Tensor) -> Tensor:
     return intensity * torch.where(black, 0.0, wanted / torch.where(black, 1.0, ours)).to(intensity.dtype)
 
 
-def exposed(intensity: Tensor, *, peak: Tensor | None = None, gamma: float = GAMMA) -> Tensor:
+def tone_map(intensity: Tensor, *, peak: Tensor | None = None, gamma: float = GAMMA) -> Tensor:
     """Picture (intensity / peak)^gamma in 0..1, Eq. 5.16; what exceeds the peak is cut to 1, an empty one is black.
 
     Args:
         intensity: [..., C, H, W], not negative; a tiny negative from rounding counts as 0.
         peak: Intensity that becomes 1, which broadcasts against ``intensity``; to compare sources, that of one of them.
-            By default the largest value of each picture over C, H and W: Eq. 5.16 is printed for one channel, and a
-            peak of its own for each would change the colours.
+            By default the largest value of each picture over C, H and W: Eq. 5.16 is printed for one channel, and one
+            peak per channel would change the colours.
         gamma: Exponent, above 0.
 
     Returns:
@@ -86,3 +88,6 @@ def exposed(intensity: Tensor, *, peak: Tensor | None = None, gamma: float = GAM
     lit = (intensity > 0) & (peak > 0)
     part = torch.where(lit, intensity, 1.0) / torch.where(peak > 0, peak, 1.0)
     return torch.where(lit, part.clamp(max=1).pow(gamma), 0.0)
+
+
+__getattr__ = renamed(__name__, {"exposed": "tone_map", "desaturated": "gamut_map"})

@@ -22,11 +22,11 @@ from holotorch.optics import (
     Lens,
     PixelShape,
     Retina,
-    imaged,
     plan_retina,
+    propagate_collapsed,
+    propagate_elements,
     retinal_image,
     spectral_image,
-    through_elements,
 )
 from holotorch.optics.viewing.elementwise import ElementSampling
 from holotorch.optics.viewing.imaging import CollapseSampling, collapse_sampling, pupil_bands
@@ -93,10 +93,10 @@ REFUSED = {
     "PixelShape with orders=10 on 672 x 672 samples needs ab": lambda: PixelShape(Grid(32, 8e-6), orders=10)(
         NOTHING.expand(10**8, 1, 32, 32)
     ),
-    "imaged() on an object plane of 1000000 x 1000000 sample": lambda: imaged(
+    "propagate_collapsed() on an object plane of 1000000 x 1000000 sample": lambda: propagate_collapsed(
         FIELD, GRID, WAVE, *LOOK, sampling=COLLAPSE
     ),
-    "through_elements() on 1000000 x 1000000 samples, 64 tim": lambda: through_elements(
+    "propagate_elements() on 1000000 x 1000000 samples, 64 tim": lambda: propagate_elements(
         FIELD, GRID, WAVE, *LOOK, sampling=ELEMENTS
     ),
 }
@@ -122,11 +122,11 @@ def test_the_observer_is_refused_what_a_wide_pupil_takes(available):
     for call in (
         lambda: retina(FIELD),
         lambda: retinal_image(FIELD, GRID, WAVE, *LOOK),
-        lambda: imaged(FIELD, GRID, WAVE, *LOOK),
-        lambda: through_elements(FIELD, GRID, WAVE, *LOOK),
+        lambda: propagate_collapsed(FIELD, GRID, WAVE, *LOOK),
+        lambda: propagate_elements(FIELD, GRID, WAVE, *LOOK),
         lambda: spectral_image(FIELD[0], GRID, [WAVE], [1.0], *LOOK, count=1),
     ):
-        with pytest.raises(MemoryError, match="GB are available; (crop|use imaged)"):
+        with pytest.raises(MemoryError, match="GB are available; (crop|use propagate_collapsed)"):
             call()
 
 
@@ -135,7 +135,7 @@ def test_more_fields_at_once_need_more():
     plan = plan_retina(GRID, WAVE, display, eye)
     many = NOTHING.expand(10**7, 1, *GRID.shape)
     with pytest.raises(MemoryError) as caught:
-        imaged(many, GRID, WAVE, display, eye)
+        propagate_collapsed(many, GRID, WAVE, display, eye)
     needed = float(re.findall(r"about (\S+) GB", str(caught.value))[0]) * 1e9
     assert needed > 1e5 * plan.memory_bytes and math.isfinite(needed)
 

@@ -8,7 +8,7 @@ import torch
 
 from holotorch.io.colour_tables import srgb_matrix, tristimulus, white_balance
 from holotorch.optics.light.spectrum import Spectrum
-from holotorch.optics.picture import desaturated, linear_srgb
+from holotorch.optics.picture import gamut_map, linear_srgb
 
 COLOURS = (636e-9, 520e-9, 455e-9)
 
@@ -32,7 +32,7 @@ def test_balanced_sources_show_grey_and_green_is_out_of_gamut():
     torch.testing.assert_close(white, torch.ones_like(white), rtol=2e-3, atol=0)
     green = linear_srgb(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)[:, None, None], matrix)
     assert green.min() < -0.1  # a pure 520 nm lies far outside sRGB
-    assert desaturated(green).min() >= 0
+    assert gamut_map(green).min() >= 0
     # Equal energy of the three is another white: strong in blue.
     equal = linear_srgb(torch.ones(3, 1, 1, dtype=torch.float64), srgb_matrix(COLOURS))
     assert (equal.flatten() @ torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)).item() == pytest.approx(

@@ -23,8 +23,8 @@ from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.io.bundled import find_config
 from holotorch.optics.light.spectral import spectral_image
 from holotorch.optics.light.wavelength_sampling import followed, neighbour_error, seen_light
-from holotorch.optics.viewing.elementwise import ElementSampling, least_oversampling, through_elements
-from holotorch.optics.viewing.imaging import imaged
+from holotorch.optics.viewing.elementwise import ElementSampling, least_oversampling, propagate_elements
+from holotorch.optics.viewing.imaging import propagate_collapsed
 from holotorch.optics.viewing.retina import plan_retina
 
 SIDE, DISTANCES = 512, (10e-3, 20e-3, 30e-3)  # pixels of the hologram; distances of the scene in metres
@@ -79,13 +79,15 @@ def _methods(observer: Observer) -> list[dict]:
 
     def by_elements(factor: float) -> Tensor:
         sampling = _scaled(least, factor)
-        return through_elements(field, grid, [wavelength], display, eye, plane=depth, sampling=sampling, paraxial=True)
+        return propagate_elements(
+            field, grid, [wavelength], display, eye, plane=depth, sampling=sampling, paraxial=True
+        )
 
     reference = intensity(by_elements(1.3))
     plan = plan_retina(grid, [wavelength], display, eye, plane=depth, paraxial=True)
     needed = max(least.oversampling)
     calls: dict[str, Any] = {
-        "collapse": lambda: imaged(field, grid, [wavelength], display, eye, plane=depth, paraxial=True)
+        "collapse": lambda: propagate_collapsed(field, grid, [wavelength], display, eye, plane=depth, paraxial=True)
     }
     for factor in (*(f for f in FACTORS if f < 0.95 * needed), needed):
         name = f"elements, {factor:.2g} x" + (", the thesis's sampling" if factor == 1 else "")

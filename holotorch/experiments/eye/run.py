@@ -30,7 +30,7 @@ from holotorch.io.bundled import find_config
 from holotorch.io.colour_tables import srgb_matrix, white_balance
 from holotorch.io.files import save_array, write_bytes
 from holotorch.io.images import encode_png
-from holotorch.optics.picture import desaturated, equal_power, exposed, linear_srgb
+from holotorch.optics.picture import equal_power, gamut_map, linear_srgb, tone_map
 
 _SAVE_EVERY = 30.0  # seconds between two checkpoints
 _WHITE = 0.995  # quantile of the reference's brightness that is shown white
@@ -208,10 +208,10 @@ def _write(out: Path, eye: Observer, views: _Views, values: dict[str, Any], file
     reference = equal_power(reference, rendering.expand_as(reference))
     shown, captions = [], []
     for f, depth in enumerate(focus):
-        peak = desaturated(linear_srgb(reference[f], matrix)).flatten().quantile(_WHITE)
+        peak = gamut_map(linear_srgb(reference[f], matrix)).flatten().quantile(_WHITE)
         for s, source in enumerate(("reference", *sources)):
             light = reference[f] if s == 0 else equal_power(images[0, s - 1, f], reference[f])
-            picture = exposed(desaturated(linear_srgb(light, matrix)), peak=peak)
+            picture = tone_map(gamut_map(linear_srgb(light, matrix)), peak=peak)
             files.write(write_bytes, out / "images" / f"{source}_{f}.png", encode_png(picture))
             shown.append(picture)
             kind = ", synthetic" if values["synthetic"] else ""

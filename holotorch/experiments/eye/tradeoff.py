@@ -18,8 +18,8 @@ from holotorch.metrics import seed_statistics, sharpness, speckle_contrast, ssim
 from holotorch.optics.light.coherence import optimum_fwhm, path_difference, predicted_contrast
 from holotorch.optics.light.spectral import spectral_image
 from holotorch.optics.light.spectrum import Spectrum
-from holotorch.optics.picture import equal_power, exposed
-from holotorch.optics.viewing.imaging import imaged
+from holotorch.optics.picture import equal_power, tone_map
+from holotorch.optics.viewing.imaging import propagate_collapsed
 
 # FWHM in metres of the spectra that are compared.
 WIDTHS = tuple(1e-9 * width for width in (1.4, 2.5, 4, 6, 9, 13, 19, 28, 40, 56))
@@ -114,7 +114,9 @@ def tradeoff(
 
 def _image(eye: Observer, field: Tensor, wavelength: float) -> Tensor:
     depth = eye.focus[0]
-    image = imaged(field.conj()[None], eye.scene.grid, [wavelength], eye.display, eye.eye(depth), plane=depth)
+    image = propagate_collapsed(
+        field.conj()[None], eye.scene.grid, [wavelength], eye.display, eye.eye(depth), plane=depth
+    )
     return pooled(intensity(image[0]), eye.scene.stride)
 
 
@@ -136,7 +138,7 @@ def _case(eye: Observer, colour: int, wavelength: float, holograms: list[Tensor]
         shown.append(torch.stack([pooled(image, eye.scene.stride) for image in images]))
     pictures = equal_power(torch.stack(shown), reference.expand(len(holograms), len(WIDTHS), *reference.shape))
     peak = reference.flatten().quantile(_BRIGHTEST)
-    tone = exposed(pictures[..., None, :, :], peak=peak), exposed(reference[None], peak=peak)
+    tone = tone_map(pictures[..., None, :, :], peak=peak), tone_map(reference[None], peak=peak)
     quality = ssim(tone[0], tone[1].expand_as(tone[0]).contiguous(), data_range=1.0)[..., 0].mean(0)
     contrast = speckle_contrast(pictures, reference=reference, mask=reference > _LIT * reference.max()).mean(0)
     best, inside = _peak(np.log(np.array(WIDTHS)), quality.numpy())

@@ -22,7 +22,8 @@ from holotorch.experiments.runs.pictures import figure_png
 from holotorch.experiments.timing import interleaved
 from holotorch.optics import AngularSpectrum, CroppedKernel, Fresnel, Propagator, unaliased_distance
 from holotorch.optics.free_space.plane_pair import PlanePair
-from holotorch.optics.planning.plan import find
+from holotorch.optics.planning.candidates import candidates
+from holotorch.optics.planning.content import FieldContent
 from holotorch.optics.planning.propagate import kernel_of
 
 WAVELENGTH = 530e-9  # metres
@@ -150,7 +151,8 @@ def _predictions() -> list[dict[str, Any]]:
         large = torch.nn.functional.pad(field, (0, 3 * grid.shape[1], 0, 3 * grid.shape[0]))
         exact = CroppedKernel(wide, wavelength, distance)(large[None])[0, : grid.shape[0], : grid.shape[1]]
         path = PlanePair(grid, grid)
-        for method in find(path, [wavelength], [distance], band=(share / 2 / pitch, share / 2 / pitch)):
+        content = FieldContent((share / 2 / pitch, share / 2 / pitch))
+        for method in candidates(path, [wavelength], [distance], content):
             values = [torch.tensor(value, dtype=torch.float64) for value in (wavelength, distance)]
             kernel = kernel_of(path, method, values[0], values[1], torch.complex64)
             out = filter_spectrum(field.to(torch.complex64), kernel).to(torch.complex128)

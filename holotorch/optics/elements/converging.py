@@ -59,12 +59,15 @@ def converging_fresnel(
     y, x = checks.pair("offset", offset, "metres")
     offset = checks.quantity(OFFSET, y), checks.quantity(OFFSET, x)
     checks.precise(wavelength, distance)
-    waves, far, lens = (
+    wavelength_tensor, distance_tensor, focus_tensor = (
         torch.as_tensor(value, dtype=torch.float64, device=field.device) for value in (wavelength, distance, focus)
     )
-    if not torch.compiler.is_compiling() and (far == 0).any():
+    if not torch.compiler.is_compiling() and (distance_tensor == 0).any():
         raise ValueError("distance must be other than zero in metres")
-    columns, rows = (matrix.to(field.dtype) for matrix in lens_matrices(grid, waves, far, lens, out_grid, offset))
+    columns, rows = (
+        matrix.to(field.dtype)
+        for matrix in lens_matrices(grid, wavelength_tensor, distance_tensor, focus_tensor, out_grid, offset)
+    )
     return columns @ field @ rows.transpose(-1, -2)
 
 
@@ -134,25 +137,29 @@ class ConvergingFresnel(nn.Module):
         self.magnification = 1.0 if unbent else (self.focus - self.distance) / self.focus
         self.out_grid = out_grid or self._default_grid()
         self.scaled = self._is_scaled()
-        waves = torch.tensor(self.wavelengths, dtype=torch.float64)
-        far, lens = (torch.tensor(value, dtype=torch.float64) for value in (self.distance, self.focus))
+        wavelength_tensor = torch.tensor(self.wavelengths, dtype=torch.float64)
+        distance_tensor, focus_tensor = (
+            torch.tensor(value, dtype=torch.float64) for value in (self.distance, self.focus)
+        )
         if self.scaled:
-            columns, rows = (self._spectrum(axis, waves) for axis in (0, 1))
+            columns, rows = (self._spectrum(axis, wavelength_tensor) for axis in (0, 1))
         else:
-            weights = sum(n * m for n, m in zip(grid.shape, self.out_grid.shape, strict=True)) * len(waves)
+            weights = sum(n * m for n, m in zip(grid.shape, self.out_grid.shape, strict=True)) * len(wavelength_tensor)
             checks.affordable(
                 35 * weights,  # measured
                 f"ConvergingFresnel from {grid.shape[0]} x {grid.shape[1]} to {self.out_grid.shape[0]} x "
                 f"{self.out_grid.shape[1]} samples, by dense matrices,",
                 "use a smaller grid or out_grid",
             )
-            columns, rows = lens_matrices(grid, waves, far, lens, self.out_grid, self.offset)
+            columns, rows = lens_matrices(
+                grid, wavelength_tensor, distance_tensor, focus_tensor, self.out_grid, self.offset
+            )
         self._keep("columns", columns)
         self._keep("rows", rows)
         if self.scaled:
-            share = carrier(waves, far)[:, None] / self.magnification
-            self._keep("column_curvature", self._curvature(0, waves) * share)
-            self._keep("row_curvature", self._curvature(1, waves))
+            share = carrier(wavelength_tensor, distance_tensor)[:, None] / self.magnification
+            self._keep("column_curvature", self._curvature(0, wavelength_tensor) * share)
+            self._keep("row_curvature", self._curvature(1, wavelength_tensor))
         self.beyond_fresnel = self._left_out()
         if self.beyond_fresnel > _TRUSTED:
             warnings.warn(
@@ -171,7 +178,7 @@ class ConvergingFresnel(nn.Module):
         if not self.scaled:
             return columns @ field @ rows.transpose(-1, -2)
         picture = filter_spectrum(field, columns[..., :, None] * rows[..., None, :])
-        return self._turned(picture) * self._curvatures(field)
+        return self._oriented(picture) * self._curvatures(field)
 
     def adjoint(self, field: Tensor) -> Tensor:
         """Apply the conjugate transpose to ``field`` [..., C, H', W'] of the output grid."""
@@ -179,7 +186,7 @@ class ConvergingFresnel(nn.Module):
         columns, rows = self._read("columns", field), self._read("rows", field)
         if not self.scaled:
             return columns.transpose(-1, -2).conj() @ field @ rows.conj()
-        picture = self._turned(field * self._curvatures(field).conj())
+        picture = self._oriented(field * self._curvatures(field).conj())
         return filter_spectrum(picture, (columns[..., :, None] * rows[..., None, :]).conj())
 
     def extra_repr(self) -> str:
@@ -199,7 +206,7 @@ class ConvergingFresnel(nn.Module):
     def _apply(self, fn, recurse=True):
         return super()._apply(lambda tensor: tensor.to(fn(tensor).device), recurse)
 
-    def _turned(self, picture: Tensor) -> Tensor:
+    def _oriented(self, picture: Tensor) -> Tensor:
         return picture.flip((-2, -1)) if self.magnification < 0 else picture
 
     def _curvatures(self, field: Tensor) -> Tensor:
@@ -232,37 +239,37 @@ class ConvergingFresnel(nn.Module):
         )
         return same and self.out_grid.shape == self.grid.shape and not self._near_focus()
 
-    def _spectrum(self, axis: int, waves: Tensor) -> Tensor:
+    def _spectrum(self, axis: int, wavelength_tensor: Tensor) -> Tensor:
         """Transform of the taps over distance / m, complex128 [C, padded]."""
         size, pitch = self.grid.shape[axis], self.grid.pitch[axis]
         shift = self.offset[axis] / (self.magnification * pitch)
         if self.magnification < 0 and size % 2 == 0:
             # Reversing an even axis moves its origin from sample n/2 to n/2 - 1.
             shift += 1
-        place = tap_indices(good_length(2 * size - 1), size, size) + shift
-        far = torch.tensor(self.distance / self.magnification, dtype=torch.float64)
-        return torch.fft.fft(fresnel_taps(place, pitch, waves, far))
+        position = tap_indices(good_length(2 * size - 1), size, size) + shift
+        distance_tensor = torch.tensor(self.distance / self.magnification, dtype=torch.float64)
+        return torch.fft.fft(fresnel_taps(position, pitch, wavelength_tensor, distance_tensor))
 
-    def _curvature(self, axis: int, waves: Tensor) -> Tensor:
+    def _curvature(self, axis: int, wavelength_tensor: Tensor) -> Tensor:
         """exp(-i pi x^2 / (wavelength (focus - distance))) on the output's samples, complex128 [C, n']."""
-        place = self.out_grid.coordinates()[axis].reshape(-1) + self.offset[axis]
-        return turns_phasor(-place.square() / (2 * waves[:, None] * (self.focus - self.distance)))
+        position = self.out_grid.coordinates()[axis].reshape(-1) + self.offset[axis]
+        return turns_phasor(-position.square() / (2 * wavelength_tensor[:, None] * (self.focus - self.distance)))
 
     def _left_out(self) -> float:
         phases = [0.0]
-        for wave in self.wavelengths:
-            y, x = (self._steepest(axis, wave) for axis in (0, 1))
+        for wavelength in self.wavelengths:
+            y, x = (self._steepest(axis, wavelength) for axis in (0, 1))
             if y is not None and x is not None:
-                phases.append(math.pi * abs(self.distance) * (y * y + x * x) ** 2 / (4 * wave))
+                phases.append(math.pi * abs(self.distance) * (y * y + x * x) ** 2 / (4 * wavelength))
         return max(phases)
 
-    def _steepest(self, axis: int, wave: float) -> float | None:
+    def _steepest(self, axis: int, wavelength: float) -> float | None:
         """Largest slope |x - q| / |z| of a ray from q in the field to x in the result, None where there is none.
 
         Such rays have |x - m q| <= wavelength |z| B. The largest slope lies on a corner of this polygon in (q, x), and
         every corner has q or x at the end of its window.
         """
-        m, reach = self.magnification, wave * abs(self.distance) * 0.5 / self.grid.pitch[axis]
+        m, reach = self.magnification, wavelength * abs(self.distance) * 0.5 / self.grid.pitch[axis]
         half, half_out = self.grid.extent[axis] / 2, self.out_grid.extent[axis] / 2
         low, high = self.offset[axis] - half_out, self.offset[axis] + half_out
         slopes = []

@@ -24,7 +24,7 @@ def lens_phase(
         wavelength: In metres, shape [...]; broadcasts against ``focal_length``.
         focal_length: In metres, positive converges, negative diverges, infinite is no lens; not 0.
         paraxial: The parabola -k r^2 / (2 f) of Goodman, Eq. 5-10, and of the thesis (after Voelz). Otherwise the
-            spherical wave -k (sqrt(r^2 + f^2) - |f|) with the sign of f, which focuses a plane wave without spherical
+            spherical phase -k (sqrt(r^2 + f^2) - |f|) with the sign of f, which focuses a plane wave without spherical
             aberration; the two differ by k r^4 / (8 f^3).
 
     Returns:
@@ -35,7 +35,7 @@ def lens_phase(
     """
     checks.meant(WAVELENGTH, wavelength)
     checks.meant(FOCAL_LENGTH, focal_length)
-    return 2 * math.pi * _turns(grid, wavelength, focal_length, paraxial)
+    return 2 * math.pi * _phase_cycles(grid, wavelength, focal_length, paraxial)
 
 
 def pupil(grid: Grid, radius: Tensor | float, *, softness: float = 0.0) -> Tensor:
@@ -83,7 +83,7 @@ def lens_limit(pitch: float, wavelength: float, focal_length: float, *, paraxial
 
 
 class Transmission(nn.Module):
-    """A thin element: complex fields [..., C, H, W] times complex numbers, one per sample.
+    """A thin element, which multiplies complex fields [..., C, H, W] by one complex number per sample.
 
     Args:
         grid: Sampling of the field, also that of the result.
@@ -120,14 +120,14 @@ class Transmission(nn.Module):
 
 
 class Lens(Transmission):
-    """Thin lens with a circular rim: :func:`lens_phase` inside ``radius``, nothing outside.
+    """Thin lens with a circular edge: :func:`lens_phase` inside ``radius``, opaque outside.
 
     Args:
         grid: Sampling of the field.
         wavelengths: In metres, one per channel.
         focal_length: In metres, not 0; positive converges. One for all channels (a refractive or achromatic lens) or
             one per channel (a holographic optical element, whose focal length goes as 1 / wavelength).
-        radius: Of the rim in metres; None lets the whole window through.
+        radius: Radius of the clear aperture in metres; None for a lens that covers the whole window.
         paraxial: Parabola, or the spherical wave.
 
     Raises:
@@ -135,9 +135,9 @@ class Lens(Transmission):
         MemoryError: The grid has more samples than memory is available for.
 
     Warns:
-        SamplingWarning: The grid is too coarse for the phase at the rim, or at the end of the window where there is
-            none; the message names the limit (:func:`lens_limit`) and the pitch that would do. Light that is not flat
-            asks for a finer one still.
+        SamplingWarning: The grid is too coarse for the phase at the edge of the lens, or of a window that it
+            covers; the message names the limit (:func:`lens_limit`) and a sufficient pitch. Light that is not flat
+            needs a finer one.
 
     Source: Goodman, Sec. 5.1; thesis Algorithm 6.
     """
@@ -151,19 +151,21 @@ class Lens(Transmission):
         radius: float | None = None,
         paraxial: bool = True,
     ):
-        waves = checks.wavelengths(wavelengths)
-        given = list(focal_length) if isinstance(focal_length, Sequence) else [focal_length] * len(waves)
-        if len(given) != len(waves):
-            raise ValueError(f"focal_length must be one number or one per wavelength ({len(waves)}), got {len(given)}")
+        wavelength_values = checks.wavelengths(wavelengths)
+        given = list(focal_length) if isinstance(focal_length, Sequence) else [focal_length] * len(wavelength_values)
+        if len(given) != len(wavelength_values):
+            raise ValueError(
+                f"focal_length must be one number or one per wavelength ({len(wavelength_values)}), got {len(given)}"
+            )
         lengths = [checks.quantity(FOCAL_LENGTH, each) for each in given]
-        rim = None if radius is None else checks.quantity(APERTURE_RADIUS, radius, "radius")
-        affordable("a lens", grid, len(waves))
-        values = turns_phasor(_turns(grid, _doubles(waves), _doubles(lengths), paraxial))
-        if rim is not None:
-            values = values * pupil(grid, rim)
-        super().__init__(grid, waves, values)
-        self.focal_length, self.radius, self.paraxial = tuple(lengths), rim, paraxial
-        warn_if_coarse(grid, waves, lengths, rim, paraxial=paraxial)
+        edge = None if radius is None else checks.quantity(APERTURE_RADIUS, radius, "radius")
+        affordable("a lens", grid, len(wavelength_values))
+        values = turns_phasor(_phase_cycles(grid, _doubles(wavelength_values), _doubles(lengths), paraxial))
+        if edge is not None:
+            values = values * pupil(grid, edge)
+        super().__init__(grid, wavelength_values, values)
+        self.focal_length, self.radius, self.paraxial = tuple(lengths), edge, paraxial
+        warn_if_coarse(grid, wavelength_values, lengths, edge, paraxial=paraxial)
 
     def extra_repr(self) -> str:
         """Sampling, wavelengths and lens, for ``print(module)``."""
@@ -206,14 +208,16 @@ def affordable(what: str, grid: Grid, channels: int) -> None:
     )
 
 
-def _turns(grid: Grid, wavelength: Tensor | float, focal_length: Tensor | float, paraxial: bool) -> Tensor:
-    waves, length = (torch.as_tensor(v, dtype=torch.float64)[..., None, None] for v in (wavelength, focal_length))
+def _phase_cycles(grid: Grid, wavelength: Tensor | float, focal_length: Tensor | float, paraxial: bool) -> Tensor:
+    wavelength_values, length = (
+        torch.as_tensor(v, dtype=torch.float64)[..., None, None] for v in (wavelength, focal_length)
+    )
     y, x = grid.coordinates(length.device)
     square = y.square() + x.square()
     if paraxial:
-        return -square / (2 * waves * length)
+        return -square / (2 * wavelength_values * length)
     # sqrt(r^2 + f^2) - |f| without cancelling, and finite for an infinite f.
-    return -square / (waves * length * (1 + torch.sqrt(1 + square / length.square())))
+    return -square / (wavelength_values * length * (1 + torch.sqrt(1 + square / length.square())))
 
 
 def _doubles(values: Sequence[float]) -> Tensor:
@@ -228,15 +232,15 @@ def warn_if_coarse(
         if math.isinf(length):
             continue
         for size, pitch in zip(grid.shape, grid.pitch, strict=True):
-            reach = min(size // 2 * pitch, radius or math.inf)
+            outermost = min(size // 2 * pitch, radius or math.inf)
             limit = lens_limit(pitch, wavelength, length, paraxial=paraxial)
-            if reach <= limit * (1 + 1e-9):
+            if outermost <= limit * (1 + 1e-9):
                 continue
-            slope = reach / (abs(length) if paraxial else math.hypot(reach, length))
+            slope = outermost / (abs(length) if paraxial else math.hypot(outermost, length))
             warnings.warn(
                 f"Lens of focal length {length:g} m at {wavelength:g} m wavelength: samples {pitch:g} m apart hold its "
-                f"phase only up to {limit * 1e3:.3g} mm from the axis, but it reaches {reach * 1e3:.3g} mm; a pitch of "
-                f"{wavelength / 2 / slope:.3g} m or less would do for flat light, a smaller radius too",
+                f"phase only up to {limit * 1e3:.3g} mm from the axis, but it reaches {outermost * 1e3:.3g} mm; a "
+                f"pitch of {wavelength / 2 / slope:.3g} m or less would do for flat light, a smaller radius too",
                 SamplingWarning,
                 stacklevel=3,
             )

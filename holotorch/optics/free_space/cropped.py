@@ -30,8 +30,8 @@ class CroppedKernel(SpectralFilter):
         wavelengths: In metres, one per channel.
         distance: In metres, negative to travel back.
         paraxial: Leave out the correction beyond the Fresnel approximation.
-        offset: Where (y, x) in metres the axis of the result lies beside that of the field: a window off the axis, or
-            one between the samples, at the same cost.
+        offset: Position (y, x) in metres of the axis of the result relative to the axis of the field: a
+            window off the axis, or one between the samples, at the same cost.
 
     Raises:
         ValueError: A wavelength that is not positive, a distance that is not finite, or a pitch below 0.9 wavelengths,
@@ -48,21 +48,25 @@ class CroppedKernel(SpectralFilter):
         offset: tuple[float, float] = (0.0, 0.0),
     ):
         distance = checks.quantity(DISTANCE, distance)
-        waves = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
-        longest = waves.max().item()
-        planes = plane_pair(grid, None, offset, (0.0, 0.0), waves.tolist())
+        channel_wavelengths = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
+        longest = channel_wavelengths.max().item()
+        planes = plane_pair(grid, None, offset, (0.0, 0.0), channel_wavelengths.tolist())
         if min(grid.pitch) < FINEST * longest and not paraxial:
             raise ValueError(
                 f"CroppedKernel needs a pitch of at least {FINEST} wavelengths, got {min(grid.pitch):g} m at "
                 f"{longest:g} m; use AngularSpectrum"
             )
-        far = torch.tensor(distance, dtype=torch.float64)
-        places = [place.item() for place in shifts(planes, far, torch.zeros(2, dtype=torch.float64))]
+        distance_tensor = torch.tensor(distance, dtype=torch.float64)
+        positions = [
+            position.item() for position in shifts(planes, distance_tensor, torch.zeros(2, dtype=torch.float64))
+        ]
         height, width = (
-            good_length(2 * size - 1 if paraxial else crop_length(size, size, pitch, longest, abs(distance), place))
-            for size, pitch, place in zip(grid.shape, grid.pitch, places, strict=True)
+            good_length(2 * size - 1 if paraxial else crop_length(size, size, pitch, longest, abs(distance), position))
+            for size, pitch, position in zip(grid.shape, grid.pitch, positions, strict=True)
         )
         padded = Grid((height, width), grid.pitch)
-        kernel = transfer_function(planes, padded, waves, far, sampled=(False, False), paraxial=paraxial)
+        kernel = transfer_function(
+            planes, padded, channel_wavelengths, distance_tensor, sampled=(False, False), paraxial=paraxial
+        )
         super().__init__(grid, wavelengths, kernel)
         self.distance, self.offset = distance, planes.offset

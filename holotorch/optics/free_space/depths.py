@@ -44,9 +44,9 @@ class DepthStack(nn.Module):
 
     def adjoint(self, field: Tensor) -> Tensor:
         """Apply the conjugate transpose to ``field`` [..., C, D, H, W]."""
-        wanted = len(self.wavelengths), len(self.filters), *self.grid.shape
-        if tuple(field.shape[-4:]) != wanted:
-            raise ValueError(f"field must end in (C, D, H, W) = {wanted}, got {tuple(field.shape)}")
+        expected = len(self.wavelengths), len(self.filters), *self.grid.shape
+        if tuple(field.shape[-4:]) != expected:
+            raise ValueError(f"field must end in (C, D, H, W) = {expected}, got {tuple(field.shape)}")
         parts = zip(self._each(), field.unbind(-3), strict=True)
         return torch.stack([each.adjoint(part) for each, part in parts]).sum(0)
 

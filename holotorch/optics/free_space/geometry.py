@@ -43,7 +43,7 @@ def least_padding(grid: Grid, wavelength: float, distance: float, *, paraxial: b
     """
     spread = lateral_spread(grid, wavelength, distance, paraxial=paraxial)
     edge = 3 * math.sqrt(wavelength * abs(distance))
-    y, x = (1 + (reach + edge) / extent for reach, extent in zip(spread, grid.extent, strict=True))
+    y, x = (1 + (sideways + edge) / extent for sideways, extent in zip(spread, grid.extent, strict=True))
     return y, x
 
 

@@ -1,6 +1,6 @@
 """Transfer functions of free space: pure functions, float64 inside, differentiable in wavelength and distance.
 
-Numbers and tensors that cannot be meant are refused; tensors that are compiled or mapped over are taken as they are.
+Numbers and tensors outside the range of their quantity are refused; values are not checked under compile and vmap.
 """
 
 import math
@@ -16,12 +16,12 @@ from holotorch.core.quantities import DISTANCE, WAVELENGTH
 def carrier(wavelength: Tensor | float, distance: Tensor | float) -> Tensor:
     """exp(i k z), complex128 of the broadcast shape.
 
-    k z reaches 1e6 rad and more, where float32 steps by 0.1 rad; whole turns are taken off in float64 first. A tensor
-    of float32 is rounded already: PrecisionWarning where that turns the phase by 0.01 rad or more.
+    k z reaches 1e6 rad and more, where float32 steps by 0.1 rad; whole cycles are subtracted in float64 first. A tensor
+    of float32 is already rounded: PrecisionWarning if that changes the phase by 0.01 rad or more.
     """
-    turns = _distance(distance) / _wavelength(wavelength)
+    cycles = _distance(distance) / _wavelength(wavelength)
     checks.precise(wavelength, distance)
-    return turns_phasor(turns)
+    return turns_phasor(cycles)
 
 
 def angular_spectrum_kernel(
@@ -39,7 +39,7 @@ def angular_spectrum_kernel(
 
     Returns:
         complex128 of shape [..., H, W], frequencies in FFT order. Evanescent waves decay with abs(distance), so that
-        travelling back does not blow them up; distance 0 gives ones.
+        propagation backward does not amplify them; distance 0 gives ones.
 
     k_z - k is written -k s^2 / (1 + cos), s the sine of the angle, which does not cancel. Source: Goodman, Sec. 3.10.
     """
@@ -47,12 +47,12 @@ def angular_spectrum_kernel(
     fy, fx = grid.frequencies(distance.device)
     sine2 = (wavelength * fy).square() + (wavelength * fx).square()
     travels, decays = sine2 < 1, sine2 > 1
-    # Masked before the root, so that the branch not taken has a finite gradient.
+    # Masked before the root, so that the unused branch has a finite gradient.
     cosine = torch.where(travels, torch.sqrt(torch.where(travels, 1 - sine2, 1)), 0)
     imaginary = torch.where(decays, torch.sqrt(torch.where(decays, sine2 - 1, 1)), 0)
 
-    turns = -distance / wavelength * torch.where(travels, sine2 / (1 + cosine), 1)
-    kernel = torch.exp(-2 * math.pi * distance.abs() / wavelength * imaginary) * turns_phasor(turns)
+    cycles = -distance / wavelength * torch.where(travels, sine2 / (1 + cosine), 1)
+    kernel = torch.exp(-2 * math.pi * distance.abs() / wavelength * imaginary) * turns_phasor(cycles)
     if not band_limit:
         return kernel
     # tan(angle) = wavelength f / cos. The same limit on the evanescent side drops the slow decays next to the cut-off,
@@ -79,19 +79,19 @@ def fresnel_kernel(grid: Grid, wavelength: Tensor | float, distance: Tensor | fl
 def window_taper(
     grid: Grid, wavelength: float, distance: float, reach: tuple[float, float], *, paraxial: bool = False
 ) -> Tensor:
-    """Weights, float64 [H, W] in FFT order, that drop light which would wrap round into a window.
+    """Weights, float64 [H, W] in FFT order, that remove light which would wrap around into a window.
 
-    From within ``reach`` metres (y, x) of all of the window's points, light moves sideways by at most that, and keeps
-    weight 1. What moves by the padded extent less ``reach`` comes back into the window and gets 0; between them the
-    weight falls as cos^2. A step there would be an edge, whose diffraction spreads over the window: 10 % of the
-    intensity for a hologram of random phase, where a fall over two sqrt(wavelength distance) leaves 1e-4.
+    Light that moves sideways by at most ``reach`` metres (y, x) keeps weight 1. Light that moves by the padded extent
+    minus ``reach`` or more re-enters the window and gets weight 0; between the two the weight falls as cos^2. A step
+    instead would diffract light over the window: 10 % of the intensity for a hologram of random phase, of which a fall
+    over two sqrt(wavelength distance) leaves 1e-4.
 
     Args:
         grid: Sampling of the padded field.
         wavelength: In metres.
         distance: In metres.
         reach: Half of the window and half of the field, per axis.
-        paraxial: Sideways by the angle's sine, as Fresnel's model has it, or else by its tangent.
+        paraxial: Light moves sideways by the sine of its angle, as in the Fresnel model, instead of the tangent.
 
     Raises:
         ValueError: A padded extent below twice ``reach``.
@@ -102,7 +102,7 @@ def window_taper(
         if size == 1:
             continue
         sine, aside = sines[axis], sines[1 - axis].square()
-        # One line for all, half a percent short at most, unless the other axis tilts the light much.
+        # The other axis changes the angle by at most half a percent unless its light is steep.
         aside = aside if float(aside.max()) > 0.01 else 0.0
         cosine = 1.0 if paraxial else (1 - sine.square() - aside).clamp_min(1e-12).sqrt()
         if extent < 2 * start * (1 - 1e-9):
@@ -114,9 +114,9 @@ def window_taper(
     return weights
 
 
-def turns_phasor(turns: Tensor) -> Tensor:
-    """exp(2 pi i turns), with whole turns taken off in float64; the gradient is that of the unreduced phase."""
-    phase = 2 * math.pi * (turns - turns.detach().round())
+def turns_phasor(cycles: Tensor) -> Tensor:
+    """exp(2 pi i cycles), with whole cycles subtracted in float64; the gradient is that of the unreduced phase."""
+    phase = 2 * math.pi * (cycles - cycles.detach().round())
     return torch.complex(torch.cos(phase), torch.sin(phase))
 
 

@@ -1,4 +1,4 @@
-"""PlanePair: from which samples to which, and along which direction, light is propagated."""
+"""PlanePair: the samples of source and result of a propagation, and the direction of its carrier wave."""
 
 import math
 from collections.abc import Sequence
@@ -14,12 +14,12 @@ from holotorch.core.quantities import OFFSET
 
 @dataclass(frozen=True)
 class PlanePair:
-    """Source grid, grid of the result, and the carrier that is taken out of both fields.
+    """Source grid, grid of the result, and the carrier wave by which both fields are divided.
 
     Attributes:
         grid: Sampling of the source.
         out: Sampling of the result.
-        offset: Where (y, x) in metres the axis of the result lies beside that of the source.
+        offset: Position (y, x) in metres of the axis of the result relative to the axis of the source.
         tilt: Sines (y, x) of the carrier's direction.
     """
 
@@ -30,12 +30,12 @@ class PlanePair:
 
     @property
     def straight(self) -> bool:
-        """Whether the result has the source's own samples and there is no tilt."""
+        """Whether source and result have the same samples and the carrier is not tilted."""
         return self.out == self.grid and not any(self.offset) and not any(self.tilt)
 
     @property
     def same_pitch(self) -> bool:
-        """Whether the result is a window of the source's own sampling."""
+        """Whether source and result have the same pitch."""
         return self.out.pitch == self.grid.pitch
 
 
@@ -46,9 +46,9 @@ def plane_pair(
     tilt: Sequence[float] | Tensor,
     wavelengths: Sequence[float],
 ) -> PlanePair:
-    """A checked pair of planes.
+    """PlanePair from checked arguments.
 
-    TypeError for arguments of another kind; ValueError for a tilt at which part of the grid's band would not travel.
+    Raises TypeError for arguments of a wrong type, and ValueError for a tilt at which part of the band is evanescent.
     """
     if out is not None and not isinstance(out, Grid):
         raise TypeError(f"out_grid must be a Grid, such as Grid((256, 256), pitch=8e-6), got {out!r}")
@@ -66,9 +66,9 @@ def plane_pair(
 
 
 def shifts(planes: PlanePair, distance: Tensor, tilt: Tensor) -> list[Tensor]:
-    """Per axis: where sample 0 of the result lies beside sample 0 of the source, in samples, seen along the light.
+    """Per axis, the position of sample 0 of the result relative to sample 0 of the source, along the carrier.
 
-    float64 of the distance's shape; differentiable in distance and tilt.
+    In samples, float64 of the shape of ``distance``; differentiable in distance and tilt.
     """
     tangents = tilt / torch.sqrt(1 - tilt.square().sum())
     return [

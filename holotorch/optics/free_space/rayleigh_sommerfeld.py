@@ -90,14 +90,16 @@ class RayleighSommerfeld(nn.Module):
         y, x = self.grid.coordinates(device)
         rows, columns = self.out_grid.coordinates(device)
         points = torch.cartesian_prod(rows[:, 0] + self.offset[0], columns[0] + self.offset[1])
-        waves = torch.tensor(self.wavelengths, dtype=torch.float64, device=device)[:, None, None]
+        wavelengths = torch.tensor(self.wavelengths, dtype=torch.float64, device=device)[:, None, None]
         area, z = math.prod(self.grid.pitch), abs(self.distance)
         for chunk in points.split(max(1, _CHUNK // math.prod(self.grid.shape) // len(self.wavelengths))):
             dy, dx = chunk[:, 0, None, None] - y, chunk[:, 1, None, None] - x
             r = torch.sqrt(dy.square() + dx.square() + z * z).flatten(1)
             weight = area * z / (2 * math.pi * r.square())
-            turns = r / waves
-            phase = 2 * math.pi * (turns - turns.round())
-            wave = torch.polar(torch.ones_like(phase), phase)
-            kernel = weight * torch.complex(1 / r.expand_as(phase), -2 * math.pi / waves.expand_as(phase)) * wave
+            cycles = r / wavelengths
+            phase = 2 * math.pi * (cycles - cycles.round())
+            phasor = torch.polar(torch.ones_like(phase), phase)
+            kernel = (
+                weight * torch.complex(1 / r.expand_as(phase), -2 * math.pi / wavelengths.expand_as(phase)) * phasor
+            )
             yield kernel if self.distance > 0 else kernel.conj()

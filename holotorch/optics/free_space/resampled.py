@@ -36,48 +36,48 @@ def resampling_factors(
     if tilt is None:
         tilt = torch.tensor(planes.tilt, dtype=torch.float64, device=distance.device)
     cosine2 = 1 - tilt.square().sum()
-    rims = [(room - size) // 2 for room, size in zip(padded or planes.grid.shape, planes.grid.shape, strict=True)]
+    extra = [(room - size) // 2 for room, size in zip(padded or planes.grid.shape, planes.grid.shape, strict=True)]
     # What the taps take over from the factor beyond Fresnel.
     top = 0.5 / planes.grid.pitch[0], 0.5 / planes.grid.pitch[1]
     levels = [torch.zeros_like(distance)] * 2
     if padded is not None and any(planes.tilt):
         levels = [levelling_shift(top, wavelength, distance, tilt, axis) for axis in (0, 1)]
     matrices = []
-    for axis, rim in enumerate(rims):
+    for axis, margin in enumerate(extra):
         pitch, size = planes.grid.pitch[axis], planes.grid.shape[axis]
-        source = torch.arange(-rim, size + rim, dtype=torch.float64, device=distance.device) - size // 2
-        reached = planes.out.coordinates(distance.device)[axis].reshape(-1) + planes.offset[axis]
+        source = torch.arange(-margin, size + margin, dtype=torch.float64, device=distance.device) - size // 2
+        targets = planes.out.coordinates(distance.device)[axis].reshape(-1) + planes.offset[axis]
         aside = distance * tilt[axis] / torch.sqrt(cosine2) - levels[axis]
-        place = (reached[:, None] - aside[..., None, None]) / pitch - source
-        bent = distance * (1 - tilt[1 - axis].square()) / cosine2**1.5
-        weights = fresnel_taps(place.flatten(-2), pitch, wavelength, bent)
-        matrices.append(weights.unflatten(-1, place.shape[-2:]))
+        position = (targets[:, None] - aside[..., None, None]) / pitch - source
+        curvature_distance = distance * (1 - tilt[1 - axis].square()) / cosine2**1.5
+        weights = fresnel_taps(position.flatten(-2), pitch, wavelength, curvature_distance)
+        matrices.append(weights.unflatten(-1, position.shape[-2:]))
     columns = matrices[0] * carrier(wavelength, distance * torch.sqrt(cosine2))[..., None, None]
-    beyond = None
+    remainder = None
     if padded is not None:
         fy, fx = Grid(padded, planes.grid.pitch).frequencies(distance.device)
-        wave, far = wavelength[..., None, None], distance[..., None, None]
+        wavelength, distance = wavelength[..., None, None], distance[..., None, None]
         if any(planes.tilt):
-            turns = tilted_turns(fy, fx, wave, far, tilt, squares=False)
-            turns = turns - fy * levels[0][..., None, None] - fx * levels[1][..., None, None]
-            beyond = turns_phasor(turns).to(dtype)
+            cycles = tilted_turns(fy, fx, wavelength, distance, tilt, squares=False)
+            cycles = cycles - fy * levels[0][..., None, None] - fx * levels[1][..., None, None]
+            remainder = turns_phasor(cycles).to(dtype)
         else:
-            beyond = remainder_kernel(fy, fx, wave, far).to(dtype)
-    return columns.to(dtype), matrices[1].to(dtype), beyond
+            remainder = remainder_kernel(fy, fx, wavelength, distance).to(dtype)
+    return columns.to(dtype), matrices[1].to(dtype), remainder
 
 
 def resample(field: Tensor, factors: Factors) -> Tensor:
     """Apply :func:`resampling_factors` to a field [..., H, W]."""
-    columns, rows, beyond = factors
-    if beyond is not None:
-        top, left = _rims(columns, rows, field.shape)
+    columns, rows, remainder = factors
+    if remainder is not None:
+        top, left = _margins(columns, rows, field.shape)
         height, width = field.shape[-2] + 2 * top, field.shape[-1] + 2 * left
         field = nn.functional.pad(field, (left, left, top, top))
-        field = ifft2(multiplied(fft2(field, (beyond.shape[-2], beyond.shape[-1])), beyond), (height, width))
+        field = ifft2(multiplied(fft2(field, (remainder.shape[-2], remainder.shape[-1])), remainder), (height, width))
     return columns @ field @ rows.transpose(-1, -2)
 
 
-def _rims(columns: Tensor, rows: Tensor, shape: Sequence[int]) -> tuple[int, int]:
+def _margins(columns: Tensor, rows: Tensor, shape: Sequence[int]) -> tuple[int, int]:
     return (columns.shape[-1] - shape[-2]) // 2, (rows.shape[-1] - shape[-1]) // 2
 
 
@@ -94,7 +94,7 @@ class ResampledKernel(nn.Module):
         wavelengths: In metres, one per channel.
         distance: In metres, not 0, negative to travel back.
         out_grid: Sampling of the result.
-        offset: Where (y, x) in metres the axis of the result lies beside that of the field.
+        offset: Position (y, x) in metres of the axis of the result relative to the axis of the field.
         tilt: Sines (y, x) of the direction of a carrier that is taken out, as in ``propagate``.
         paraxial: Leave out the correction beyond the Fresnel approximation.
         padded: Samples of the transforms that apply that correction; by default the window, an eighth on each side and
@@ -132,10 +132,10 @@ class ResampledKernel(nn.Module):
         if min(grid.pitch) < FINEST * longest:
             raise ValueError(f"pitch must be at least {FINEST} wavelengths of {longest:g} m, got {min(grid.pitch):g} m")
         waves = torch.tensor(self.wavelengths, dtype=torch.float64)
-        far = torch.tensor(self.distance, dtype=torch.float64)
+        distance_tensor = torch.tensor(self.distance, dtype=torch.float64)
         if padded is None and not paraxial:
             padded = resampled_padding(planes, longest, abs(self.distance))
-        factors = resampling_factors(planes, waves, far, padded=None if paraxial else padded)
+        factors = resampling_factors(planes, waves, distance_tensor, padded=None if paraxial else padded)
         for name, values in zip(("columns", "rows", "beyond"), factors, strict=True):
             pair = None if values is None else torch.view_as_real(values).contiguous()
             self.register_buffer(name, pair, persistent=False)
@@ -148,12 +148,12 @@ class ResampledKernel(nn.Module):
     def adjoint(self, field: Tensor) -> Tensor:
         """Apply the conjugate transpose to ``field`` [..., C, H', W'] of the output grid."""
         checks.field("field", field, (len(self.wavelengths), *self.out_grid.shape))
-        columns, rows, beyond = self._buffers_for(field)
-        (height, width), (top, left) = self.grid.shape, _rims(columns, rows, self.grid.shape)
+        columns, rows, remainder = self._buffers_for(field)
+        (height, width), (top, left) = self.grid.shape, _margins(columns, rows, self.grid.shape)
         spread = columns.transpose(-1, -2).conj() @ field @ rows.conj()
-        if beyond is None:
+        if remainder is None:
             return spread
-        back = ifft2(fft2(spread, (beyond.shape[-2], beyond.shape[-1])) * beyond.conj())
+        back = ifft2(fft2(spread, (remainder.shape[-2], remainder.shape[-1])) * remainder.conj())
         return back[..., top : top + height, left : left + width]
 
     def extra_repr(self) -> str:

@@ -1,4 +1,4 @@
-"""Transfer functions in two factors: one exponential or set of taps per axis, and what lies beyond Fresnel."""
+"""Transfer functions as products of a paraxial factor per axis and the factor beyond Fresnel."""
 
 import torch
 from torch import Tensor
@@ -30,7 +30,7 @@ def transfer_function(
     """Kernel of a linear convolution on the padded grid, carrier included, differentiable in all tensors.
 
     Args:
-        planes: From which samples to which; of equal pitch.
+        planes: Samples of source and result, of equal pitch.
         padded: Grid of the transforms. The first samples of the result are those of ``planes.out``.
         wavelength: In metres, float64, shape [...].
         distance: In metres, float64, shape [...] that broadcasts; zeros give the identity.
@@ -47,32 +47,39 @@ def transfer_function(
     tilted = any(planes.tilt)
     if tilt is None:
         tilt = torch.tensor(planes.tilt, dtype=torch.float64, device=distance.device)
-    places = shifts(planes, distance, tilt)
+    positions = shifts(planes, distance, tilt)
     cosine2 = 1 - tilt.square().sum()
-    wave = carrier(wavelength, distance * torch.sqrt(cosine2)).to(dtype)
+    carrier_factor = carrier(wavelength, distance * torch.sqrt(cosine2)).to(dtype)
     if tilted and all(sampled):
-        return _sampled_tilted(padded, wavelength, distance, tilt, places).to(dtype) * wave[..., None, None]
+        return (
+            _sampled_tilted(padded, wavelength, distance, tilt, positions).to(dtype) * carrier_factor[..., None, None]
+        )
     if tilted:
-        places = [place + _level(axis, padded, wavelength, distance, tilt) for axis, place in enumerate(places)]
+        positions = [
+            position + _levelling_samples(axis, padded, wavelength, distance, tilt)
+            for axis, position in enumerate(positions)
+        ]
     factors = []
     for axis in (0, 1):
-        bent = distance * (1 - tilt[1 - axis].square()) / cosine2**1.5
-        factors.append(_axis_factor(planes, axis, padded, wavelength, bent, places[axis], sampled=sampled[axis]))
-        if planes.straight and _alike(planes.grid) and _alike(padded) and sampled[0] == sampled[1]:
+        curvature_distance = distance * (1 - tilt[1 - axis].square()) / cosine2**1.5
+        factors.append(
+            _axis_factor(planes, axis, padded, wavelength, curvature_distance, positions[axis], sampled=sampled[axis])
+        )
+        if planes.straight and _equal_axes(planes.grid) and _equal_axes(padded) and sampled[0] == sampled[1]:
             factors *= 2  # one computation serves both axes
             break
     columns, rows = (factor.to(dtype) for factor in factors)
-    kernel = columns[..., :, None] * (rows * wave[..., None])[..., None, :]
+    kernel = columns[..., :, None] * (rows * carrier_factor[..., None])[..., None, :]
     if paraxial:
         return kernel
     wavelength, distance = wavelength[..., None, None], distance[..., None, None]
     if tilted:
         fy, fx = padded.frequencies(distance.device)
-        turns = tilted_turns(fy, fx, wavelength, distance, tilt, squares=False)
+        cycles = tilted_turns(fy, fx, wavelength, distance, tilt, squares=False)
         for axis, frequency in ((0, fy), (1, fx)):
-            level = _level(axis, padded, wavelength[..., 0, 0], distance[..., 0, 0], tilt)
-            turns = turns - frequency * padded.pitch[axis] * level[..., None, None]
-        return kernel * turns_phasor(turns).to(dtype)
+            shift = _levelling_samples(axis, padded, wavelength[..., 0, 0], distance[..., 0, 0], tilt)
+            cycles = cycles - frequency * padded.pitch[axis] * shift[..., None, None]
+        return kernel * turns_phasor(cycles).to(dtype)
     # The factor beyond Fresnel is even in both frequencies: one quadrant is computed and mirrored.
     (height, width), (py, px) = padded.shape, padded.pitch
     fy = torch.arange(height // 2 + 1, dtype=torch.float64, device=distance.device)[:, None] / (height * py)
@@ -91,43 +98,45 @@ def wide_transfer_function(
     kernel = angular_spectrum_kernel(padded, wavelength, distance)
     kernel = kernel * carrier(wavelength, distance)[..., None, None]
     straight = torch.zeros(2, dtype=torch.float64, device=distance.device)
-    for frequency, pitch, place in zip(
+    for frequency, pitch, position in zip(
         padded.frequencies(distance.device), padded.pitch, shifts(planes, distance, straight), strict=True
     ):
-        if bool((place != 0).any()):
-            kernel = kernel * turns_phasor(frequency * pitch * place[..., None, None])
+        if bool((position != 0).any()):
+            kernel = kernel * turns_phasor(frequency * pitch * position[..., None, None])
     return kernel.to(dtype)
 
 
-def _alike(grid: Grid) -> bool:
+def _equal_axes(grid: Grid) -> bool:
     return grid.shape[0] == grid.shape[1] and grid.pitch[0] == grid.pitch[1]
 
 
-def _sampled_tilted(padded: Grid, wavelength: Tensor, distance: Tensor, tilt: Tensor, places: list[Tensor]) -> Tensor:
+def _sampled_tilted(
+    padded: Grid, wavelength: Tensor, distance: Tensor, tilt: Tensor, positions: list[Tensor]
+) -> Tensor:
     fy, fx = padded.frequencies(distance.device)
-    turns = tilted_turns(fy, fx, wavelength[..., None, None], distance[..., None, None], tilt)
-    for frequency, pitch, place in zip((fy, fx), padded.pitch, places, strict=True):
-        turns = turns + frequency * pitch * place[..., None, None]
-    return turns_phasor(turns)
+    cycles = tilted_turns(fy, fx, wavelength[..., None, None], distance[..., None, None], tilt)
+    for frequency, pitch, position in zip((fy, fx), padded.pitch, positions, strict=True):
+        cycles = cycles + frequency * pitch * position[..., None, None]
+    return turns_phasor(cycles)
 
 
-def _level(axis: int, padded: Grid, wavelength: Tensor, distance: Tensor, tilt: Tensor) -> Tensor:
+def _levelling_samples(axis: int, padded: Grid, wavelength: Tensor, distance: Tensor, tilt: Tensor) -> Tensor:
     """:func:`levelling_shift` in samples."""
     top = 0.5 / padded.pitch[0], 0.5 / padded.pitch[1]
     return levelling_shift(top, wavelength, distance, tilt, axis) / padded.pitch[axis]
 
 
 def _axis_factor(
-    planes: PlanePair, axis: int, padded: Grid, wavelength: Tensor, distance: Tensor, place: Tensor, *, sampled: bool
+    planes: PlanePair, axis: int, padded: Grid, wavelength: Tensor, distance: Tensor, position: Tensor, *, sampled: bool
 ) -> Tensor:
     """Paraxial factor of one axis in frequency, complex128 [..., size]; ``place`` as from :func:`shifts`."""
     size, pitch = padded.shape[axis], padded.pitch[axis]
     if sampled:
         frequency = torch.fft.fftfreq(size, pitch, dtype=torch.float64, device=distance.device)
-        turns = -(wavelength * distance)[..., None] / 2 * frequency.square()
-        return turns_phasor(turns + frequency * pitch * place[..., None])
+        cycles = -(wavelength * distance)[..., None] / 2 * frequency.square()
+        return turns_phasor(cycles + frequency * pitch * position[..., None])
     index = tap_indices(size, planes.grid.shape[axis], planes.out.shape[axis]).to(distance.device)
-    places = index + place[..., None]
-    here = (distance == 0)[..., None]
-    taps = fresnel_taps(places, pitch, wavelength, torch.where(distance == 0, pitch, distance))
-    return torch.fft.fft(torch.where(here, torch.sinc(places).to(taps.dtype), taps))
+    positions = index + position[..., None]
+    at_zero = (distance == 0)[..., None]
+    taps = fresnel_taps(positions, pitch, wavelength, torch.where(distance == 0, pitch, distance))
+    return torch.fft.fft(torch.where(at_zero, torch.sinc(positions).to(taps.dtype), taps))

@@ -1,4 +1,4 @@
-"""ZoomedFilter: a spectral filter whose result is read at the points of another grid, by the chirp-z transform."""
+"""ZoomedFilter: a spectral filter whose result is computed at the points of another grid by the chirp-z transform."""
 
 import math
 from collections.abc import Sequence
@@ -22,46 +22,46 @@ def chirp(size: int, step: float, start: float, count: int, device: torch.device
     """
     index = torch.arange(size, dtype=torch.float64, device=device)
     index = torch.where(index >= (size + 1) // 2, index - size, index)
-    reached = torch.arange(count, dtype=torch.float64, device=device)
+    target = torch.arange(count, dtype=torch.float64, device=device)
     length = good_length(size + count - 1)
     between = torch.arange(length, dtype=torch.float64, device=device)
-    # From 0 to the largest j - k, which belongs to the most negative frequency, and then from the smallest.
+    # In FFT order: from 0 to the largest j - k, and then from the smallest, negative one.
     between = torch.where(between >= count + size // 2, between - length, between)
     rate = step / size
-    before = turns_phasor(rate / 2 * index.square() + index * (start / size))
-    after = turns_phasor(rate / 2 * reached.square()) / size
-    return before, torch.fft.fft(turns_phasor(-rate / 2 * between.square())) / length, after
+    pre_chirp = turns_phasor(rate / 2 * index.square() + index * (start / size))
+    post_chirp = turns_phasor(rate / 2 * target.square()) / size
+    return pre_chirp, torch.fft.fft(turns_phasor(-rate / 2 * between.square())) / length, post_chirp
 
 
 def zoom(spectrum: Tensor, factors: Chirp) -> Tensor:
     """Inverse DFT over the last axis, [..., P] in FFT order, read at the points of :func:`chirp`: [..., count]."""
-    before, kernel, after = factors
-    size, half = len(before), (len(before) + 1) // 2
-    lines = spectrum * before
+    pre_chirp, kernel, post_chirp = factors
+    size, half = len(pre_chirp), (len(pre_chirp) + 1) // 2
+    lines = spectrum * pre_chirp
     gap = lines.new_zeros(*lines.shape[:-1], len(kernel) - size)
     lines = fft(torch.cat([lines[..., :half], gap, lines[..., half:]], -1))
-    return ifft_unscaled(multiplied(lines, kernel))[..., : len(after)] * after
+    return ifft_unscaled(multiplied(lines, kernel))[..., : len(post_chirp)] * post_chirp
 
 
 def zoom_adjoint(values: Tensor, factors: Chirp) -> Tensor:
     """Conjugate transpose of :func:`zoom`."""
-    before, kernel, after = factors
-    size, half = len(before), (len(before) + 1) // 2
-    lines = fft(values * after.conj(), len(kernel))
+    pre_chirp, kernel, post_chirp = factors
+    size, half = len(pre_chirp), (len(pre_chirp) + 1) // 2
+    lines = fft(values * post_chirp.conj(), len(kernel))
     lines = ifft_unscaled(multiplied(lines, kernel.conj()))
-    return torch.cat([lines[..., :half], lines[..., len(kernel) - size + half :]], -1) * before.conj()
+    return torch.cat([lines[..., :half], lines[..., len(kernel) - size + half :]], -1) * pre_chirp.conj()
 
 
 def chirps(
     grid: Grid, padded: Grid, out: Grid, offset: Sequence[float], device: torch.device | None = None
 ) -> list[Chirp]:
     """Factors per axis (y, x) to read a field of ``grid``, padded, on ``out`` whose axis lies at ``offset`` metres."""
-    found = []
+    factors = []
     for axis in (0, 1):
         pitch, step, count = grid.pitch[axis], out.pitch[axis], out.shape[axis]
         start = (offset[axis] - count // 2 * step) / pitch + grid.shape[axis] // 2
-        found.append(chirp(padded.shape[axis], step / pitch, start, count, device))
-    return found
+        factors.append(chirp(padded.shape[axis], step / pitch, start, count, device))
+    return factors
 
 
 def zoomed(field: Tensor, kernel: Tensor, factors: Sequence[Chirp]) -> Tensor:
@@ -75,16 +75,16 @@ def zoomed(field: Tensor, kernel: Tensor, factors: Sequence[Chirp]) -> Tensor:
 class ZoomedFilter(nn.Module):
     """A filter that is diagonal in frequency, read on a grid of any pitch: complex [..., C, H, W] to [..., C, H', W'].
 
-    The padded result is taken as what its samples are, a band-limited periodic field, and summed from its spectrum at
-    the asked points; exact as long as the kernel does not wrap light round into them. Twice to four times a
-    :class:`SpectralFilter`, where ``ResampledKernel`` grows with the cube of the size.
+    The padded result is a band-limited periodic field, which is summed from its spectrum at the points of ``out_grid``;
+    exact as long as the kernel does not wrap light around into them. It takes two to four times as long as a
+    :class:`SpectralFilter`, whereas the cost of ``ResampledKernel`` grows with the cube of the size.
 
     Args:
         grid: Sampling of the field.
         wavelengths: In metres, one per channel.
         kernel: complex128, shape [C, P, Q], FFT order.
         out_grid: Sampling of the result.
-        offset: Where (y, x) in metres the axis of the result lies beside that of the field.
+        offset: Position (y, x) in metres of the axis of the result relative to the axis of the field.
     """
 
     def __init__(

@@ -1,1 +1,1 @@
-"""Light sources: spectra, coherence, and what of them is followed through the optics."""
+"""Light sources: spectra, coherence, and the wavelengths that are propagated through the optics."""

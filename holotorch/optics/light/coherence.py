@@ -1,4 +1,4 @@
-"""What a spectrum does to a holographic picture, in closed form: speckle contrast, defocus, the best width."""
+"""Effects of a spectrum on a holographic picture in closed form: speckle contrast, defocus, optimum width."""
 
 import math
 
@@ -7,7 +7,7 @@ from holotorch.core.quantities import DEPTH, DISTANCE, WAVELENGTH_CHANGE
 from holotorch.optics.light.quadrature import correlation
 from holotorch.optics.light.spectrum import Spectrum
 
-DEFOCUS = 2.3  # depths of focus, fitted over three colours of one volume
+DEFOCUS = 2.3  # in depths of focus: shift of the focus at the optimum width, fitted over three colours of one volume
 
 
 def path_difference(distance: float, aperture: float, *, tilt: float = 0.0) -> float:
@@ -15,7 +15,7 @@ def path_difference(distance: float, aperture: float, *, tilt: float = 0.0) -> f
 
     A fixed hologram sends spatial frequency f to the sine f lambda. Followed to ``distance``, its phase is
     -pi distance lambda f^2, so light of another wavelength is out of phase with the pupil's centre by
-    2 pi (distance aperture^2 / 2) (lambda - lambda') / lambda^2 at its rim. The depth of the sources themselves
+    2 pi (distance aperture^2 / 2) (lambda - lambda') / lambda^2 at its edge. The depth of the sources themselves
     does not enter: the hologram's own phase is fixed.
 
     Args:
@@ -25,7 +25,7 @@ def path_difference(distance: float, aperture: float, *, tilt: float = 0.0) -> f
         tilt: Sine of the pupil's centre as seen from there: points off the axis have more, 2 distance tilt aperture.
 
     Raises:
-        ValueError: An aperture that is not above 0, or a rim beyond 1.
+        ValueError: An aperture that is not above 0, or an edge beyond 1.
 
     Paraxial to the order of lambda f; at a sine of 0.1 it is short by 1 %.
     """
@@ -77,7 +77,7 @@ def chromatic_defocus(distance: float, wavelength: float, change: float) -> floa
 
 
 def depth_of_focus(wavelength: float, aperture: float) -> float:
-    """Range of depths in focus in metres, wavelength / aperture^2: a quarter wave at the rim to either side."""
+    """Range of depths in focus in metres, wavelength / aperture^2: a quarter wave at the edge to either side."""
     return checks.wavelengths(wavelength)[0] / checks.positive("aperture", aperture) ** 2
 
 

@@ -1,4 +1,4 @@
-"""Sums of intensities over what does not interfere: wavelengths, and points of an extended source."""
+"""Sums of intensities over light that does not interfere: wavelengths, and points of an extended source."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -26,10 +26,10 @@ def incoherent_sum(
 
     Args:
         intensity_of: Intensity [...] of one wavelength in metres, or of one tilt of the illumination.
-        places: Wavelengths [K], given on as floats, or a sequence of anything else.
+        places: Wavelengths [K], passed on as floats, or any sequence of arguments of ``intensity_of``.
         weights: [K], such as those of ``Spectrum.samples``; a tensor may carry gradients.
-        recompute: When gradients are wanted, compute each intensity a second time on the way back instead of keeping
-            what it was made of: memory of one, for a third more time.
+        recompute: When gradients are wanted, compute each intensity again in the backward pass instead of keeping its
+            intermediate results: memory of one intensity, for a third more time.
 
     Raises:
         TypeError: An intensity that is complex: a field was given.
@@ -73,9 +73,9 @@ def disc_source(radius: float, rings: int = 2) -> tuple[list[tuple[float, float]
     nodes, weights = np.polynomial.legendre.leggauss(rings)
     around = 4 * rings
     points = [
-        (radius * math.sqrt((1 + node) / 2) * math.sin(turn), radius * math.sqrt((1 + node) / 2) * math.cos(turn))
+        (radius * math.sqrt((1 + node) / 2) * math.sin(angle), radius * math.sqrt((1 + node) / 2) * math.cos(angle))
         for node in nodes.tolist()
-        for turn in (2 * math.pi * (k + 0.5) / around for k in range(around))
+        for angle in (2 * math.pi * (k + 0.5) / around for k in range(around))
     ]
     return points, torch.from_numpy(np.repeat(weights / (2 * around), around))
 
@@ -86,19 +86,19 @@ def tilted_wave(grid: Grid, wavelength: float, direction: tuple[float, float]) -
     Args:
         grid: Of the hologram, whose field is multiplied by this.
         wavelength: In metres.
-        direction: Sines (y, x) of where the wave goes.
+        direction: Sines (y, x) of the direction of the wave.
 
     Raises:
         ValueError: A direction that the grid cannot sample.
     """
-    wave = checks.wavelengths(wavelength)[0]
+    wavelength = checks.wavelengths(wavelength)[0]
     sines = checks.pair("direction", direction, "sines")
     for sine, pitch in zip(sines, grid.pitch, strict=True):
-        if abs(sine) > wave / (2 * pitch):
+        if abs(sine) > wavelength / (2 * pitch):
             raise ValueError(
-                f"direction {sine:g} is beyond what a pitch of {pitch:g} m samples at {wave:g} m, "
-                f"{wave / (2 * pitch):.3g}; use a smaller source or a finer grid"
+                f"direction {sine:g} is beyond what a pitch of {pitch:g} m samples at {wavelength:g} m, "
+                f"{wavelength / (2 * pitch):.3g}; use a smaller source or a finer grid"
             )
     y, x = grid.coordinates()
-    turns = y * (sines[0] / wave) + x * (sines[1] / wave)
-    return torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
+    cycles = y * (sines[0] / wavelength) + x * (sines[1] / wavelength)
+    return torch.polar(torch.ones_like(cycles), 2 * math.pi * cycles)

@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor
 
-_MOST = 512  # nodes; a spectrum that needs more is asked for too much
+_MOST = 512  # largest number of nodes; a tolerance that needs more is refused
 _JITTER = 1e-10  # keeps the equations of the weights solvable; costs 1e-5 of error at most
-_EXACT = 1e-5  # error below which nothing is improved upon
-_STARTS = (0.85, 0.95)  # outermost nodes of the even starts, as a part of the half band
+_EXACT = 1e-5  # error at which the search for better nodes stops
+_STARTS = (0.85, 0.95)  # outermost nodes of evenly spaced initial nodes, as fractions of the half band
 
 
 def gauss_rule(nodes: Tensor, weights: Tensor, count: int) -> tuple[Tensor, Tensor]:

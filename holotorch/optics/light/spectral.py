@@ -28,9 +28,9 @@ from holotorch.optics.free_space.kernels import turns_phasor
 from holotorch.optics.light.incoherent import incoherent_sum
 from holotorch.optics.light.wavelength_sampling import flawless, followed, least_followed, unseparated
 from holotorch.optics.viewing.display import Display, number
-from holotorch.optics.viewing.elementwise import through_elements
+from holotorch.optics.viewing.elementwise import propagate_elements
 from holotorch.optics.viewing.eye import Eye
-from holotorch.optics.viewing.imaging import imaged
+from holotorch.optics.viewing.imaging import propagate_collapsed
 
 
 def neighbours(
@@ -46,13 +46,14 @@ def neighbours(
     """Fields on the retina at wavelengths near the one that was followed there.
 
     Args:
-        image: What :func:`imaged` or :func:`through_elements` gave for the plane in focus, complex [..., H, W].
+        image: Field on the retina, complex [..., H, W], from :func:`propagate_collapsed` or
+            :func:`propagate_elements` for the plane in focus.
         grid: Its sampling.
         wavelength: In metres, of ``image``.
         others: In metres.
         display: As it was for ``image``.
         eye: Likewise. Its aberrations and its colour error are those of each wavelength.
-        elements: ``image`` comes from :func:`through_elements`, which keeps the retina's curvature.
+        elements: ``image`` comes from :func:`propagate_elements`, which keeps the retina's curvature.
 
     Yields:
         Complex [..., H, W] for each of ``others``, one in memory at a time. Near the edges light is missing that was
@@ -61,8 +62,8 @@ def neighbours(
     Raises:
         ValueError: An eye with aberrations or colour error whose pupil takes more than the band of ``grid``.
     """
-    wave = checks.wavelengths(wavelength)[0]
-    if unseparated(grid, wave, display, eye):
+    centre = checks.wavelengths(wavelength)[0]
+    if unseparated(grid, centre, display, eye):
         raise ValueError(
             "the errors of this eye cannot be set anew for another wavelength, since its pupil takes more than the "
             "band of the grid; follow every wavelength, or use a smaller pupil or a finer grid"
@@ -80,20 +81,20 @@ def neighbours(
         by_row, by_column = turns_phasor(rate * rows.square()), turns_phasor(rate * columns.square())
         return values * by_row.to(values.dtype) * by_column.to(values.dtype)
 
-    def flawed(values: Tensor, length: float, sign: int) -> Tensor:
-        # On the pupil, where the eye's errors are; at -1 they are taken off again.
+    def with_errors(values: Tensor, length: float, sign: int) -> Tensor:
+        # The errors of the eye are applied in its pupil; a sign of -1 removes them.
         path = eye.path(fy * (length * second), fx * (length * second), length)
         return centred_ifft2(centred_fft2(values) * turns_phasor(path * (sign / length)).to(values.dtype))
 
     rate = first / second / 2
     if flawless(eye):
-        spectrum = centred_fft2(parabola(image, -curvature / (2 * wave), y, x))
+        spectrum = centred_fft2(parabola(image, -curvature / (2 * centre), y, x))
     else:
-        lit = parabola(image, (rate - curvature / 2) / wave, y, x)
-        spectrum = centred_fft2(parabola(flawed(lit, wave, -1), -rate / wave, y, x))
+        lit = parabola(image, (rate - curvature / 2) / centre, y, x)
+        spectrum = centred_fft2(parabola(with_errors(lit, centre, -1), -rate / centre, y, x))
     for other in checks.wavelengths(list(others)):
-        field = centred_ifft2(parabola(spectrum, -plane * (other - wave) / 2, fy, fx))
-        yield field if flawless(eye) else flawed(parabola(field, rate / other, y, x), other, 1)
+        field = centred_ifft2(parabola(spectrum, -plane * (other - centre) / 2, fy, fx))
+        yield field if flawless(eye) else with_errors(parabola(field, rate / other, y, x), other, 1)
 
 
 def spectral_image(
@@ -118,13 +119,13 @@ def spectral_image(
         grid: Its sampling.
         places: Wavelengths [K] in metres, increasing, as ``Spectrum.every`` or ``Spectrum.samples`` gives them.
         weights: [K], at least 0; a tensor may carry gradients. [S, K] for S spectra at once.
-        display: Where everything stands.
+        display: Positions of hologram, eyepiece and eye.
         eye: Pupil, retina, accommodation; the picture is of the plane in focus.
-        count: How many wavelengths to follow, with equal shares of the power; the others are :func:`neighbours`.
-        tolerance: In place of ``count``: error of the picture that may come of following few
-            (:func:`neighbour_error`), relative to the mean picture.
+        count: Number of wavelengths to propagate, with equal shares of the power; the others are :func:`neighbours`.
+        tolerance: In place of ``count``: accepted error of the picture from propagating few
+            wavelengths (:func:`neighbour_error`), relative to the mean picture.
         reach: Half width in metres of the scene, for ``tolerance``.
-        elements: Follow by :func:`through_elements` instead of :func:`imaged`.
+        elements: Use :func:`propagate_elements` instead of :func:`propagate_collapsed`.
         paraxial: As there.
         recompute: As in :func:`incoherent_sum`, per wavelength followed.
 
@@ -133,7 +134,7 @@ def spectral_image(
 
     Raises:
         ValueError: Neither or both of count and tolerance, places that do not increase, impossible weights, or what
-            :func:`neighbours` and the way to the retina raise.
+            :func:`neighbours` and the propagation to the retina raise.
     """
     checks.field("field", field, grid.shape)
     if (count is None) == (tolerance is None):
@@ -150,36 +151,38 @@ def spectral_image(
     power = shares.detach().reshape(-1, len(lengths)).sum(0)
     if tolerance is not None:
         count = least_followed(lengths, power, tolerance, grid, display, eye, reach=reach)
-    nodes, owners = followed(lengths, power, count or 0)
-    way = through_elements if elements else imaged
-    room = _room(grid, lengths, nodes, owners, display, eye)
-    wide = Grid((grid.shape[0] + 2 * room[0], grid.shape[1] + 2 * room[1]), grid.pitch)
-    padded = torch.nn.functional.pad(field, (room[1], room[1], room[0], room[0]))
+    nodes, nearest = followed(lengths, power, count or 0)
+    propagate = propagate_elements if elements else propagate_collapsed
+    margin = _margin(grid, lengths, nodes, nearest, display, eye)
+    wide = Grid((grid.shape[0] + 2 * margin[0], grid.shape[1] + 2 * margin[1]), grid.pitch)
+    padded = torch.nn.functional.pad(field, (margin[1], margin[1], margin[0], margin[0]))
 
-    def weighed(image: Tensor, k: int) -> Tensor:
+    def weighted(image: Tensor, k: int) -> Tensor:
         weight = shares[..., k].to(image.device, image.real.dtype)
         return intensity(image) * weight.reshape(*weight.shape, *(1,) * image.ndim)
 
-    def around(node: int) -> Tensor:
-        wave = lengths[nodes[node]].item()
-        image = way(padded[..., None, :, :], wide, [wave], display, eye, paraxial=paraxial)[..., 0, :, :]
-        total = weighed(image, nodes[node])
-        others = [k for k, owner in enumerate(owners) if owner == node and k != nodes[node]]
+    def image_near(node: int) -> Tensor:
+        centre = lengths[nodes[node]].item()
+        image = propagate(padded[..., None, :, :], wide, [centre], display, eye, paraxial=paraxial)[..., 0, :, :]
+        total = weighted(image, nodes[node])
+        others = [k for k, owner in enumerate(nearest) if owner == node and k != nodes[node]]
         if others:
-            made = neighbours(image, wide, wave, lengths[others].tolist(), display, eye, elements=elements)
-            for k, other in zip(others, made, strict=True):
-                total = total + weighed(other, k)
+            images = neighbours(image, wide, centre, lengths[others].tolist(), display, eye, elements=elements)
+            for k, other in zip(others, images, strict=True):
+                total = total + weighted(other, k)
         return total
 
-    total = incoherent_sum(around, list(range(len(nodes))), [1.0] * len(nodes), recompute=recompute)
-    return total[..., room[0] : room[0] + grid.shape[0], room[1] : room[1] + grid.shape[1]]
+    total = incoherent_sum(image_near, list(range(len(nodes))), [1.0] * len(nodes), recompute=recompute)
+    return total[..., margin[0] : margin[0] + grid.shape[0], margin[1] : margin[1] + grid.shape[1]]
 
 
-def _room(
-    grid: Grid, places: Tensor, nodes: list[int], owners: list[int], display: Display, eye: Eye
+def _margin(
+    grid: Grid, places: Tensor, nodes: list[int], nearest: list[int], display: Display, eye: Eye
 ) -> tuple[int, int]:
     """Samples (y, x) by which the steepest light of the farthest neighbour moves sideways."""
-    away = max(abs((places[k] - places[nodes[owner]]).item()) for k, owner in enumerate(owners))
+    largest = max(abs((places[k] - places[nodes[owner]]).item()) for k, owner in enumerate(nearest))
     plane = abs(number(display.focus_plane(eye.accommodation)))
-    rooms = [math.ceil(plane * away / (2 * p**2)) if n > 1 else 0 for n, p in zip(grid.shape, grid.pitch, strict=True)]
-    return rooms[0], rooms[1]
+    margins = [
+        math.ceil(plane * largest / (2 * p**2)) if n > 1 else 0 for n, p in zip(grid.shape, grid.pitch, strict=True)
+    ]
+    return margins[0], margins[1]

@@ -12,16 +12,17 @@ from holotorch.core import checks
 from holotorch.core.quantities import BANDWIDTH
 from holotorch.optics.light.quadrature import gauss_rule, least_rule, speckle_rule
 
-CUTOFF = 0.1  # of the peak: the thesis drops what is weaker (Sec. 5.5.2.2)
-_NODES = 256  # of the measure that rules are made from; resolves 200 rad of phase over the band to rounding
+CUTOFF = 0.1  # fraction of the peak below which the thesis drops the power (Sec. 5.5.2.2)
+# Nodes of the integral over the band from which rules are derived; they resolve 200 rad of phase to rounding.
+_NODES = 256
 
 
 @dataclass(frozen=True)
 class _Lorentzian:
     half_width: float
 
-    def __call__(self, away: Tensor) -> Tensor:
-        return 1 / (1 + (away / self.half_width).square())
+    def __call__(self, offsets: Tensor) -> Tensor:
+        return 1 / (1 + (offsets / self.half_width).square())
 
     def reach(self, level: float) -> float:
         return self.half_width * math.sqrt(1 / level - 1)
@@ -31,8 +32,8 @@ class _Lorentzian:
 class _Gaussian:
     half_width: float
 
-    def __call__(self, away: Tensor) -> Tensor:
-        return torch.exp2(-(away / self.half_width).square())
+    def __call__(self, offsets: Tensor) -> Tensor:
+        return torch.exp2(-(offsets / self.half_width).square())
 
     def reach(self, level: float) -> float:
         return self.half_width * math.sqrt(-math.log2(level))
@@ -207,17 +208,17 @@ class Spectrum:
         places, weights = self.measure() if step is None else self.every(step)
         low, high = self.band()
         middle = (low + high) / 2
-        away = places - middle
+        offsets = places - middle
         if path_difference is None:
             if count is None:
                 raise ValueError("a tolerance needs path_difference, in metres, of the light that interferes")
-            nodes, weights = gauss_rule(away, weights, checks.whole("count", count, 1))
+            nodes, weights = gauss_rule(offsets, weights, checks.whole("count", count, 1))
             return middle + nodes, weights
         beat, rim = checks.positive("path_difference", path_difference, "metres") / middle**2, iris / middle
         if tolerance is not None:
-            nodes, weights = least_rule(away, weights, beat, checks.positive("tolerance", tolerance), rim)
+            nodes, weights = least_rule(offsets, weights, beat, checks.positive("tolerance", tolerance), rim)
         else:
-            nodes, weights = speckle_rule(away, weights, beat, checks.whole("count", count or 0, 1), rim)
+            nodes, weights = speckle_rule(offsets, weights, beat, checks.whole("count", count or 0, 1), rim)
         return middle + nodes, weights
 
     def measure(self) -> tuple[Tensor, Tensor]:
@@ -240,10 +241,10 @@ class Spectrum:
         """Corners of a table; with a low cutoff, far wings are apart from the peak, which they would undersample."""
         if isinstance(self.profile, _Table):
             return list(self.profile.wavelengths)
-        away, joints = 4 * self.profile.half_width, []
-        while away < self.centre:
-            joints = [self.centre - away, *joints, self.centre + away]
-            away *= 4
+        offsets, joints = 4 * self.profile.half_width, []
+        while offsets < self.centre:
+            joints = [self.centre - offsets, *joints, self.centre + offsets]
+            offsets *= 4
         return joints
 
     def _shape(self, places: Tensor) -> Tensor:

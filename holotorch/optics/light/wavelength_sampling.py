@@ -1,4 +1,4 @@
-"""Which wavelengths of a spectrum to follow through the optics, for the error that making the others may cost."""
+"""Selection of the wavelengths of a spectrum that are propagated, from the error of deriving the others."""
 
 import math
 from dataclasses import dataclass
@@ -11,19 +11,19 @@ from holotorch.core.grid import Grid
 from holotorch.optics.viewing.display import Display, number
 from holotorch.optics.viewing.eye import Eye
 
-_POINTS, _RINGS, _SPOKES = 9, 16, 64
+_POINTS, _RINGS, _SPOKES = 9, 16, 64  # points per axis of the scene; rings of the pupil; rays per ring
 
 
 @dataclass(frozen=True)
 class SeenLight:
-    """What of a hologram's light an eye takes in, by rays.
+    """Light of a hologram that enters an eye, from geometrical optics.
 
     Attributes:
-        rim: Share of the pupil's rim that the light reaches, 0 to 1: 0 where the hologram's window or band limits it.
+        rim: Fraction of the pupil's edge that the light reaches, 0 to 1; 0 if the window or band limits it.
         path_difference: Greatest difference in metres between paths from the hologram to one point of the scene, as
             ``coherence.path_difference`` has it, points off the axis included.
-        bend: What Fresnel's model leaves out of these paths, z (slope)^4 / 8: its rms in metres over the light of a
-            point, its mean taken off.
+        bend: Rms in metres, over the light of a point and without its mean, of the part z (slope)^4 / 8 of these paths
+            that the Fresnel model leaves out.
     """
 
     rim: float
@@ -32,37 +32,39 @@ class SeenLight:
 
 
 def seen_light(grid: Grid, wavelength: float, display: Display, eye: Eye, *, reach: float | None = None) -> SeenLight:
-    """Follow rays from points of the plane in focus forward to the pupil and back to the hologram.
+    """Trace rays from points of the plane in focus forward to the pupil and back to the hologram.
 
     Args:
         grid: Sampling of the hologram: its extent is the window, its pitch the band.
         wavelength: In metres.
-        display: Where everything stands.
+        display: Positions of hologram, eyepiece and eye.
         eye: Pupil and accommodation.
         reach: Half width in metres of the scene, by default the hologram's, per axis.
     """
-    wave, plane = checks.wavelengths(wavelength)[0], number(display.focus_plane(eye.accommodation))
+    centre, plane = checks.wavelengths(wavelength)[0], number(display.focus_plane(eye.accommodation))
     first, second, _, _ = (number(value) for value in display.matrix(plane))
     sides = [n * p / 2 if n > 1 else 0.0 for n, p in zip(grid.shape, grid.pitch, strict=True)]
     ends = sides if reach is None else [checks.positive("reach", reach, "metres") * (side > 0) for side in sides]
-    # Rings lie where light may arrive: of a pupil far wider than that, rings of its own would all be dark.
+    # Rings cover the part of the pupil that light may reach; in a much wider pupil rings would all be dark.
     steepest = [
-        min(wave / (2 * p), (s + e) / max(abs(plane), 1e-30)) for p, s, e in zip(grid.pitch, sides, ends, strict=True)
+        min(centre / (2 * p), (s + e) / max(abs(plane), 1e-30)) for p, s, e in zip(grid.pitch, sides, ends, strict=True)
     ]
-    lit = math.hypot(*(abs(first) * end + abs(second) * slope for end, slope in zip(ends, steepest, strict=True)))
+    illuminated = math.hypot(
+        *(abs(first) * end + abs(second) * slope for end, slope in zip(ends, steepest, strict=True))
+    )
     radius = number(eye.pupil_radius)
-    radii = torch.linspace(0, 1, _RINGS + 1, dtype=torch.float64)[1:] * min(radius, lit)
-    turn = torch.arange(_SPOKES, dtype=torch.float64) * (2 * math.pi / _SPOKES)
+    radii = torch.linspace(0, 1, _RINGS + 1, dtype=torch.float64)[1:] * min(radius, illuminated)
+    angle = torch.arange(_SPOKES, dtype=torch.float64) * (2 * math.pi / _SPOKES)
     along = torch.linspace(-1, 1, _POINTS, dtype=torch.float64)
     inside = torch.ones(_POINTS, _POINTS, _RINGS, _SPOKES, dtype=torch.bool)
     path = torch.zeros(inside.shape, dtype=torch.float64)
-    for axis, spoke in enumerate((torch.sin(turn), torch.cos(turn))):
+    for axis, spoke in enumerate((torch.sin(angle), torch.cos(angle))):
         if sides[axis] == 0:
             continue
         shape = (-1, 1, 1, 1) if axis == 0 else (1, -1, 1, 1)
         point = (ends[axis] * along).reshape(shape)
         slope = (radii[:, None] * spoke - first * point) / second
-        inside = inside & (slope.abs() <= wave / (2 * grid.pitch[axis]))
+        inside = inside & (slope.abs() <= centre / (2 * grid.pitch[axis]))
         inside = inside & ((point - plane * slope).abs() <= sides[axis])
         path = path + abs(plane) / 2 * slope.square()
     spread = (path.where(inside, -math.inf).amax((-2, -1)) - path.where(inside, math.inf).amin((-2, -1))).clamp_min(0)
@@ -71,12 +73,12 @@ def seen_light(grid: Grid, wavelength: float, display: Display, eye: Eye, *, rea
     left_out = path.square() / max(2 * abs(plane), 1e-30)
     mean = (shares * left_out).sum((-2, -1), keepdim=True) / shares.sum((-2, -1), keepdim=True).clamp_min(1e-30)
     bend = ((shares * (left_out - mean).square()).sum() / shares.sum().clamp_min(1e-30)).sqrt().item()
-    rim = inside[..., -1, :].double().mean().item() if radius <= lit else 0.0
+    rim = inside[..., -1, :].double().mean().item() if radius <= illuminated else 0.0
     return SeenLight(rim, spread.max().item(), bend)
 
 
 def followed(places: Tensor, weights: Tensor, count: int) -> tuple[list[int], list[int]]:
-    """Which wavelengths to follow, ``count`` with equal shares of the power, and whose neighbour each of all is.
+    """Select ``count`` wavelengths with equal shares of the power, and the nearest of these for every wavelength.
 
     Args:
         places: Wavelengths [K] in metres, increasing.
@@ -84,38 +86,39 @@ def followed(places: Tensor, weights: Tensor, count: int) -> tuple[list[int], li
         count: Between 1 and K.
 
     Returns:
-        Indices into ``places`` of those followed (fewer where the power is in few wavelengths), and for each of
-        ``places`` the number of the nearest among them.
+        Indices into ``places`` of the selected wavelengths (fewer if the power is in few wavelengths), and for each of
+        ``places`` the number of the nearest selected one.
     """
     if not 1 <= checks.whole("count", count, 1) <= len(places):
         raise ValueError(f"count must be at most {len(places)}, the number of wavelengths given, got {count}")
-    below = weights.cumsum(0) / weights.sum()
-    wanted = (torch.arange(count, dtype=below.dtype) + 0.5) / count
-    nodes = list(range(count)) if count == len(places) else torch.searchsorted(below, wanted).unique().tolist()
+    cumulative = weights.cumsum(0) / weights.sum()
+    targets = (torch.arange(count, dtype=cumulative.dtype) + 0.5) / count
+    nodes = list(range(count)) if count == len(places) else torch.searchsorted(cumulative, targets).unique().tolist()
     return nodes, (places - places[nodes][:, None]).abs().argmin(0).tolist()
 
 
 def neighbour_error(places: Tensor, weights: Tensor, count: int, light: SeenLight) -> float:
-    """Error to expect of ``spectral_image`` when it follows ``count`` of ``places``, relative to the mean picture.
+    """Expected error of ``spectral_image`` that propagates ``count`` of ``places``, relative to the mean picture.
 
-    Light at the rim comes and goes with wavelength as a random walk, 2 rim / wavelength of its power per metre. Every
-    step of the walk matters with the power of the wavelengths beyond it that are made from the same one. To it is added
-    the fourth order of the slopes, which Fresnel's model leaves out between neighbours. Measured against every
-    wavelength followed: a half to a tenth of this, for a rim that light reaches in few places.
+    Light at the edge of the pupil changes with wavelength like a random walk, 2 rim / wavelength of its power per metre
+    (``rim`` is that of ``light``). Every step of the walk is weighted with the power of the wavelengths beyond it that
+    are derived from the same one. The fourth order of the slopes, which the Fresnel model leaves out between
+    neighbours, is added. The measured error, against propagation of every wavelength, is a half to a tenth of this
+    if light reaches only small parts of the edge.
     """
-    nodes, owners = followed(places, weights, count)
+    nodes, nearest = followed(places, weights, count)
     share = weights / weights.sum()
-    away = places - places[nodes][owners]
+    offsets = places - places[nodes][nearest]
     walk = 0.0
     for node in range(len(nodes)):
-        own = torch.tensor(owners) == node
-        for side in (own & (away >= 0), own & (away <= 0)):
-            far, order = away[side].abs().sort()
+        own = torch.tensor(nearest) == node
+        for side in (own & (offsets >= 0), own & (offsets <= 0)):
+            distances, order = offsets[side].abs().sort()
             beyond = share[side][order].flip(0).cumsum(0).flip(0)
-            walk += (beyond[1:].square() * far.diff()).sum().item()
+            walk += (beyond[1:].square() * distances.diff()).sum().item()
     middle = places.mean().item()
-    # The fourth order is 3 times as fast a function of wavelength as a path of its own would be.
-    bent = math.sqrt(2) * 2 * math.pi * 3 * light.bend / middle * (share * away.abs()).sum().item() / middle
+    # The fourth order is 3 times as fast a function of wavelength as that of the path itself.
+    bent = math.sqrt(2) * 2 * math.pi * 3 * light.bend / middle * (share * offsets.abs()).sum().item() / middle
     return math.hypot(math.sqrt(4 * light.rim * walk / middle), bent)
 
 
@@ -147,14 +150,14 @@ def least_followed(
 
 
 def flawless(eye: Eye) -> bool:
-    """Whether an eye has no errors beside those of its rim."""
+    """Whether an eye has neither aberrations nor colour error."""
     return not eye.aberrations and eye.chromatic_reference is None
 
 
-def unseparated(grid: Grid, wave: float, display: Display, eye: Eye) -> bool:
+def unseparated(grid: Grid, centre: float, display: Display, eye: Eye) -> bool:
     """Whether the eye's errors, a function of directions, cannot be told from samples of the picture."""
     if flawless(eye):
         return False
     second = number(display.matrix(number(display.focus_plane(eye.accommodation)))[1])
-    taken = (number(eye.pupil_radius) + 8 * eye.softness) / (wave * abs(second))
+    taken = (number(eye.pupil_radius) + 8 * eye.softness) / (centre * abs(second))
     return any(taken > 1 / (2 * p) for n, p in zip(grid.shape, grid.pitch, strict=True) if n > 1)

@@ -1,4 +1,4 @@
-"""Every way to propagate, with its predicted error and its cost."""
+"""Every method of propagation, with its predicted error and its cost."""
 
 import itertools
 import math
@@ -15,28 +15,29 @@ from holotorch.optics.free_space.plane_pair import PlanePair, shifts
 from holotorch.optics.planning.content import FieldContent
 from holotorch.optics.planning.predict import AxisContent, rms_beyond_fresnel
 
+# Padding factors of a sampled transfer function that are tried, and those tried for steep, tilted or displaced light.
 _PADS = (1.0, 1.03125, 1.0625, 1.125, 1.25, 1.5)
 _WIDE_PADS = (2.0, 3.0, 4.0, 6.0, 8.0)
-_CROP_PADS = (2.0, CROP_PAD)
-_TAILS = (0.125, 0.5, 1.5)  # of resampled_padding
-_PRODUCT_SPEED = 4.0  # arithmetic of a dense product that takes the time of 1 in an FFT
+_CROP_PADS = (2.0, CROP_PAD)  # values of ``pad`` in crop_length
+_TAILS = (0.125, 0.5, 1.5)  # values of ``tails`` in resampled_padding
+_PRODUCT_SPEED = 4.0  # operations of a dense product in the time of one operation of an FFT
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One way to propagate; its error is computed when first asked for.
+    """One method of propagation; its error is computed at the first access.
 
     Attributes:
-        method: Name.
-        sampled: Per axis (y, x), whether its transfer function is sampled, or its taps cropped.
+        method: Name of the method.
+        sampled: Per axis (y, x), whether the transfer function is sampled; otherwise the taps are cropped.
         padded: Samples of the transforms.
         paraxial: Whether the factor beyond Fresnel is left out.
-        predict: Gives the expected relative L2 error.
-        captured: Gives the share of the energy of the content that is expected to land in the window, of several
-            wavelengths and distances the least.
-        flops: Arithmetic of one call.
-        memory: Bytes.
-        cost: What candidates are ranked by: ``flops``, those of dense products counted at their speed.
+        predict: Computes the expected relative L2 error.
+        captured: Computes the fraction of the energy that is expected to arrive in the window; the smallest one of
+            several wavelengths and distances.
+        flops: Floating-point operations of one call.
+        memory: Largest extra memory of one call, in bytes.
+        cost: Rank of the candidate: ``flops``, with dense products weighted by their speed.
     """
 
     method: str
@@ -59,59 +60,67 @@ Axes = tuple[AxisContent, AxisContent]
 
 
 def candidates(
-    planes: PlanePair, waves: Sequence[float], distances: Sequence[float], content: FieldContent, dtype: torch.dtype
+    planes: PlanePair,
+    wavelengths: Sequence[float],
+    distances: Sequence[float],
+    content: FieldContent,
+    dtype: torch.dtype = torch.complex64,
 ) -> list[Candidate]:
-    """Every way for ``planes``; for several wavelengths and distances with the worst of their errors."""
+    """Every method for ``planes``; its error is the largest one over the wavelengths and distances."""
     if dtype not in (torch.complex64, torch.complex128):
         raise TypeError(f"dtype must be complex64 or complex128, got {dtype}")
-    longest, far = max(waves), max(distances, key=abs)
+    longest, farthest = max(wavelengths), max(distances, key=abs)
     scenes = [_axes(planes, longest, distance, content) for distance in _extremes(planes, distances)]
-    ways = [_identity(scenes)] if planes.straight else []
-    if far == 0 and planes.straight:
-        return ways
+    options = [_identity(scenes)] if planes.straight else []
+    if farthest == 0 and planes.straight:
+        return options
     wide = min(planes.grid.pitch) < FINEST * longest
     if not planes.same_pitch:
         dense = [] if wide else [_resampled(planes, scenes, dtype, tails) for tails in (None, *_TAILS)]
         pairs = zip(*(_lengths(axis, _PADS + _WIDE_PADS) for axis in scenes[0]), strict=False)
         return dense + [_zoomed(planes, scenes, pair, dtype) for pair in pairs]
-    alike = scenes[0][0] is scenes[0][1]
+    symmetric = scenes[0][0] is scenes[0][1]
     tilted = any(planes.tilt)
     pads = _PADS + (_WIDE_PADS if wide or tilted or planes.out != planes.grid else ())
     lengths = [_lengths(axis, pads) for axis in scenes[0]]
-    pairs = zip(*lengths, strict=False) if alike or wide or tilted else itertools.product(*lengths)
-    ways += [_sampled(scenes, pair, dtype) for pair in pairs]
+    pairs = zip(*lengths, strict=False) if symmetric or wide or tilted else itertools.product(*lengths)
+    options += [_sampled(scenes, pair, dtype) for pair in pairs]
     if wide:
-        return ways
-    masks = (
+        return options
+    sampled_axes = (
         [(False, False)]
-        if alike or tilted or planes.out != planes.grid
+        if symmetric or tilted or planes.out != planes.grid
         else [(False, False), (True, False), (False, True)]
     )
-    rooms = [*_CROP_PADS, 3.0, 4.0] if tilted else [None, *_CROP_PADS]
-    return ways + [_cropped(scenes, mask, room, dtype) for mask in masks for room in rooms]
+    crop_pads = [*_CROP_PADS, 3.0, 4.0] if tilted else [None, *_CROP_PADS]
+    return options + [
+        _cropped(scenes, sampled_axis, crop_pad, dtype) for sampled_axis in sampled_axes for crop_pad in crop_pads
+    ]
 
 
 def _extremes(planes: PlanePair, distances: Sequence[float]) -> list[float]:
-    """Distances that stand for all: the farthest, and where the result is aside both ends of their range."""
+    """Distances that bound the error: the longest one, or both ends of the range if the result is displaced."""
     if planes.straight:
         return [max(map(abs, distances)) or 1e-12]
     return list(dict.fromkeys(z or 1e-12 for z in (min(distances), max(distances))))
 
 
 def _axes(planes: PlanePair, wavelength: float, distance: float, content: FieldContent) -> Axes:
-    asked = planes
+    requested = planes
     if not planes.same_pitch:
-        # The window of the result in samples of the source, a sample more on each side, and between them: the tails of
-        # the content vanish on samples, and the ends of its band half-way cancel.
+        # The window of the result in samples of the source, with one sample more on each side. Its samples lie a
+        # quarter between those of the source: tails of the content vanish on them, and band ends cancel half-way.
         height, width = (
             math.ceil(extent / pitch) + 2 for extent, pitch in zip(planes.out.extent, planes.grid.pitch, strict=True)
         )
         planes = PlanePair(planes.grid, Grid((height, width), planes.grid.pitch), planes.offset, planes.tilt)
-    places = shifts(planes, torch.tensor(distance, dtype=torch.float64), torch.tensor(planes.tilt, dtype=torch.float64))
-    # Light that travels back is the conjugate of light that travels on in the mirrored direction.
-    back = distance < 0
-    signals = [each.conj() if back else each for each in content.signals or ()]
-    sines = [-sine if back else sine for sine in planes.tilt]
+    positions = shifts(
+        planes, torch.tensor(distance, dtype=torch.float64), torch.tensor(planes.tilt, dtype=torch.float64)
+    )
+    # Light that travels backward is the conjugate of light that travels forward in the mirrored direction.
+    backward = distance < 0
+    signals = [each.conj() if backward else each for each in content.signals or ()]
+    sines = [-sine if backward else sine for sine in planes.tilt]
     y, x = (
         AxisContent(
             planes.grid.shape[axis],
@@ -121,13 +130,13 @@ def _axes(planes: PlanePair, wavelength: float, distance: float, content: FieldC
             abs(distance),
             content.margin[axis],
             planes.out.shape[axis],
-            places[axis].item() if planes == asked else round(places[axis].item()) + 0.25,
+            positions[axis].item() if planes == requested else round(positions[axis].item()) + 0.25,
             (sines[axis], sines[1 - axis]),
             signals[axis] if signals else None,
         )
         for axis in (0, 1)
     )
-    # What one axis has computed serves an equal other one.
+    # Equal axes share one object, and with it all cached results.
     return (y, y) if y == x and content.signals is None else (y, x)
 
 
@@ -138,16 +147,16 @@ def _lengths(axis: AxisContent, pads: tuple[float, ...]) -> list[int]:
 
 
 def _identity(scenes: list[Axes]) -> Candidate:
-    """The field as it is, times the carrier."""
+    """The unchanged field, times the carrier."""
     axes = y, x = max(scenes, key=lambda axes: axes[0].distance)
 
     def predict() -> float:
         if y.distance <= 1e-12:
             return 0.0
-        # rms over the content of the phase pi lambda z f^2, which is the whole effect inside the window.
+        # Rms over the content of the phase pi lambda z f^2, the only change inside the window.
         square = y.moment(4) + x.moment(4) + 2 * y.moment(2) * x.moment(2)
         phase = min(math.pi * y.wavelength * y.distance * math.sqrt(square), 2.0)
-        if phase > 0.1:  # much too far to stand still, whatever the edges do
+        if phase > 0.1:  # large enough to exclude this method without looking at the edges
             return phase
         return max(phase, sum(math.sqrt(axis.standing()) for axis in axes))
 
@@ -168,58 +177,63 @@ def _sampled(scenes: list[Axes], padded: tuple[int, ...], dtype: torch.dtype) ->
         ]
         return math.hypot(math.sqrt(sum(energies)), _rounding(axes, (True, True), dtype))
 
-    return _way("angular spectrum", (True, True), (padded[0], padded[1]), False, scenes, predict, dtype)
+    return _fft_candidate("angular spectrum", (True, True), (padded[0], padded[1]), False, scenes, predict, dtype)
 
 
-def _cropped(scenes: list[Axes], mask: tuple[bool, bool], room: float | None, dtype: torch.dtype) -> Candidate:
-    """Cropped taps where ``mask`` is False, elsewhere a transfer function sampled at the largest padding below 2.
+def _cropped(
+    scenes: list[Axes], sampled_axis: tuple[bool, bool], crop_pad: float | None, dtype: torch.dtype
+) -> Candidate:
+    """Cropped taps on one or both axes; on the other axis a transfer function sampled at the largest padding below 2.
 
-    ``room`` None is paraxial; a number is the padding in which the factor beyond Fresnel finds its room.
+    ``sampled_axis`` marks the axes of the latter kind. ``crop_pad`` is the padding for the taps and the factor beyond
+    Fresnel; None leaves this factor out.
     """
 
     def length(axis: int) -> int:
-        own = [axes[axis] for axes in scenes]
-        if mask[axis]:
-            return _lengths(own[0], _PADS)[-1]
+        along = [axes[axis] for axes in scenes]
+        if sampled_axis[axis]:
+            return _lengths(along[0], _PADS)[-1]
         return good_length(
-            own[0].size + own[0].window - 1 if room is None else max(_crop_length(each, room) for each in own),
-            odd=any(own[0].tilt),
+            along[0].size + along[0].window - 1
+            if crop_pad is None
+            else max(_crop_length(each, crop_pad) for each in along),
+            odd=any(along[0].tilt),
         )
 
     lengths = length(0), length(1)
 
     def predict(axes: Axes) -> float:
         if any(axes[0].tilt):
-            # A measured field has its light in few places, where what both axes crop together may weigh more.
+            # The light of a measured field may be concentrated where both axes crop it, which counts more.
             mixing = 1 if axes[0].measured is None else 1 + sum(sine != 0 for sine in axes[0].tilt)
             taps = mixing * math.sqrt(_tilted_taps(axes, lengths, paraxial=False))
-            return math.hypot(_rounding(axes, mask, dtype), taps)
-        energies = [_rounding(axes, mask, dtype) ** 2, 0.0]
-        if room is None:
+            return math.hypot(_rounding(axes, sampled_axis, dtype), taps)
+        energies = [_rounding(axes, sampled_axis, dtype) ** 2, 0.0]
+        if crop_pad is None:
             energies[1] = max(rms_beyond_fresnel(list(axes)) ** 2, sum(axis.paraxial() for axis in axes))
-        for axis, other, padded, keep in zip(axes, axes[::-1], lengths, mask, strict=True):
+        for axis, other, padded, keep in zip(axes, axes[::-1], lengths, sampled_axis, strict=True):
             if keep:
                 energies.append(axis.wrapped(padded))
-            elif room is not None and other is axis and len(energies) > 2:
+            elif crop_pad is not None and other is axis and len(energies) > 2:
                 energies.append(energies[-1])
-            elif room is not None:
-                # The cross frequency of rms size stands for the whole of the other axis.
+            elif crop_pad is not None:
+                # The rms frequency of the other axis represents all of its content.
                 energies.append(axis.cropped(padded, math.sqrt(other.moment(2))))
         return math.sqrt(sum(energies))
 
-    method = ("Fresnel" if room is None else "cropped kernel") + (", one axis sampled" if any(mask) else "")
-    return _way(method, mask, lengths, room is None, scenes, predict, dtype)
+    method = ("Fresnel" if crop_pad is None else "cropped kernel") + (", one axis sampled" if any(sampled_axis) else "")
+    return _fft_candidate(method, sampled_axis, lengths, crop_pad is None, scenes, predict, dtype)
 
 
 def _resampled(planes: PlanePair, scenes: list[Axes], dtype: torch.dtype, tails: float | None) -> Candidate:
-    """Dense taps between any two grids; the factor beyond Fresnel applied first, with room for its ``tails``.
+    """Dense taps between any two grids, after the factor beyond Fresnel with room for its ``tails``.
 
-    None leaves that factor out.
+    Without ``tails`` that factor is left out.
     """
     height, width = planes.grid.shape
-    wavelength, far = scenes[0][0].wavelength, max(axes[0].distance for axes in scenes)
-    padded = planes.grid.shape if tails is None else resampled_padding(planes, wavelength, far, tails)
-    rims = (padded[0] - height) // 2, (padded[1] - width) // 2
+    wavelength, farthest = scenes[0][0].wavelength, max(axes[0].distance for axes in scenes)
+    padded = planes.grid.shape if tails is None else resampled_padding(planes, wavelength, farthest, tails)
+    edges = (padded[0] - height) // 2, (padded[1] - width) // 2
     paraxial, tilted = tails is None, any(planes.tilt)
 
     def predict(axes: Axes) -> float:
@@ -235,12 +249,12 @@ def _resampled(planes: PlanePair, scenes: list[Axes], dtype: torch.dtype, tails:
             error += axis.resampled(length, math.sqrt(other.moment(2)))
         return math.sqrt(error)
 
-    tall, broad = height + 2 * rims[0], width + 2 * rims[1]
-    products = 8.0 * planes.out.shape[0] * broad * (tall + planes.out.shape[1])
+    padded_height, padded_width = height + 2 * edges[0], width + 2 * edges[1]
+    products = 8.0 * planes.out.shape[0] * padded_width * (padded_height + planes.out.shape[1])
     transforms = 0.0 if paraxial else _transforms(math.prod(padded))
     memory = dtype.itemsize * (
-        planes.out.shape[0] * (tall + broad)
-        + planes.out.shape[1] * broad
+        planes.out.shape[0] * (padded_height + padded_width)
+        + planes.out.shape[1] * padded_width
         + 3 * math.prod(padded)
         + math.prod(planes.out.shape)
     )
@@ -259,25 +273,28 @@ def _resampled(planes: PlanePair, scenes: list[Axes], dtype: torch.dtype, tails:
 
 
 def _zoomed(planes: PlanePair, scenes: list[Axes], padded: tuple[int, ...], dtype: torch.dtype) -> Candidate:
-    """The sampled transfer function, and the result summed from its spectrum at the points of the other grid."""
-    way = _sampled(scenes, padded, dtype)
+    """The sampled transfer function, whose result is summed from its spectrum at the points of the other grid."""
+    candidate = _sampled(scenes, padded, dtype)
     lines = 0.0
     for size, count, number in zip(padded, planes.out.shape, (planes.out.shape[1], padded[0]), strict=True):
         length = good_length(size + count - 1)
         lines += 10 * number * length * math.log2(length)
-    flops = way.flops / 2 + lines
-    memory = way.memory + 2 * dtype.itemsize * max(padded[0], planes.out.shape[0]) * (padded[1] + planes.out.shape[1])
-    return replace(way, method="angular spectrum, zoomed", flops=flops, cost=flops, memory=memory)
+    flops = candidate.flops / 2 + lines
+    memory = candidate.memory + 2 * dtype.itemsize * max(padded[0], planes.out.shape[0]) * (
+        padded[1] + planes.out.shape[1]
+    )
+    return replace(candidate, method="angular spectrum, zoomed", flops=flops, cost=flops, memory=memory)
 
 
-def _crop_length(axis: AxisContent, room: float) -> int:
-    return crop_length(axis.size, axis.window, axis.pitch, axis.wavelength, axis.distance, axis.shift, room)
+def _crop_length(axis: AxisContent, crop_pad: float) -> int:
+    return crop_length(axis.size, axis.window, axis.pitch, axis.wavelength, axis.distance, axis.shift, crop_pad)
 
 
 def _rounding(axes: Axes, sampled: tuple[bool, bool], dtype: torch.dtype) -> float:
-    """Rounding of the transforms, relative to what is left of the light in the window.
+    """Rounding error of the transforms, relative to the light that arrives in the window.
 
-    A sampled transfer function keeps all light on the padded grid, and rounds against it; cropped taps keep what lands.
+    A sampled transfer function keeps all light on the padded grid, and its rounding is relative to all of it; cropped
+    taps keep only the light that arrives.
     """
     left = math.prod(axis.captured for axis, keep in zip(axes, sampled, strict=True) if keep)
     return 3 * torch.finfo(dtype).eps / math.sqrt(max(left, 1e-12))
@@ -287,7 +304,7 @@ def _transforms(samples: int) -> float:
     return 10 * samples * math.log2(max(2, samples)) + 6 * samples
 
 
-def _way(
+def _fft_candidate(
     method: str,
     sampled: tuple[bool, bool],
     padded: tuple[int, int],

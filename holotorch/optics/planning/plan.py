@@ -1,4 +1,4 @@
-"""Which propagator, with how much padding: the cheapest whose predicted error is within the tolerance."""
+"""plan_propagation: choose the cheapest method and padding whose predicted error is within the tolerance."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from holotorch.core.plan import Plan
 from holotorch.core.quantities import DISTANCE
 from holotorch.optics.free_space.plane_pair import PlanePair, plane_pair
 from holotorch.optics.planning.candidates import Candidate, candidates
-from holotorch.optics.planning.content import described, measured
+from holotorch.optics.planning.content import field_content
 
 
 def plan_propagation(
@@ -34,67 +34,43 @@ def plan_propagation(
 
     Args:
         grid: Sampling of the field.
-        wavelength: In metres; of several, the plan serves all.
-        distance: In metres, of either sign; likewise.
-        tolerance: Largest relative L2 error of the result that is wanted.
-        band: Highest frequencies (y, x) of the content in cycles per metre; up to the grid's own by default. The
-            prediction is the expectation for noise that fills this band and the window; smoother content does better.
-        spread: The same said as how far (y, x) in metres the content travels sideways over the distance.
-        margin: Widths (y, x) in metres over which the content fades smoothly to nothing at both ends of each axis. By
-            default it is cut hard by the window, and the edges diffract.
-        field: An example of the content, complex [..., H, W], to measure instead of a description.
+        wavelength: In metres. A plan for several wavelengths serves all of them.
+        distance: In metres, of either sign. A plan for several distances serves all of them.
+        tolerance: Largest accepted relative L2 error of the result.
+        band: Highest frequencies (y, x) of the content in cycles per metre; up to the grid's highest frequency by
+            default. The prediction is the expectation for noise that fills this band and the window; smoother content
+            has a smaller error.
+        spread: Alternative to ``band``: distance (y, x) in metres that the content travels sideways on its path.
+        margin: Widths (y, x) in metres over which the content fades smoothly to zero at both ends of each axis. By
+            default the window cuts the content off, and the edges diffract.
+        field: An example of the content, complex [..., H, W], which is measured and replaces the description.
         out_grid: Sampling of the result; that of the field by default.
-        offset: Where (y, x) in metres the axis of the result lies beside that of the field.
-        tilt: Sines (y, x) of the direction of a carrier that is taken out of the field and of the result.
+        offset: Position (y, x) in metres of the axis of the result relative to the axis of the field.
+        tilt: Sines (y, x) of the direction of a carrier wave by which the field and the result are divided.
         dtype: complex64 or complex128, of the field.
         memory_limit: Refuse a plan that needs more bytes than this per channel.
 
     Raises:
-        ValueError: Impossible numbers, or more memory than ``memory_limit``; the message says how to tile.
+        ValueError: An argument outside its range, or a plan that needs more than ``memory_limit``; the message says
+            how to propagate in tiles.
     """
     waves = checks.wavelengths(wavelength)
     planes = plane_pair(grid, out_grid, offset, tilt, waves)
-    found = find(
-        planes,
-        waves,
-        [checks.quantity(DISTANCE, z) for z in _listed(distance)],
-        band=band,
-        spread=spread,
-        margin=margin,
-        field=field,
-        dtype=dtype,
-    )
-    return plan_from(found, planes, tolerance, memory_limit, dtype)
-
-
-def find(
-    planes: PlanePair,
-    waves: Sequence[float],
-    distances: Sequence[float],
-    *,
-    band: tuple[float, float] | None = None,
-    spread: tuple[float, float] | None = None,
-    margin: tuple[float, float] = (0.0, 0.0),
-    field: Tensor | None = None,
-    dtype: torch.dtype = torch.complex64,
-) -> list[Candidate]:
-    """Every way for the described or measured content; arguments as of :func:`plan_propagation`."""
-    content = described(planes.grid, max(waves), max(map(abs, distances)), band=band, spread=spread, margin=margin)
-    if field is not None:
-        checks.field("field", field, planes.grid.shape)
-        content = measured(field, planes.grid)
-    return candidates(planes, waves, distances, content, dtype)
+    distances = list(distance) if isinstance(distance, Sequence) else [distance]
+    distances = [checks.quantity(DISTANCE, each) for each in distances]
+    content = field_content(grid, waves, distances, band=band, spread=spread, margin=margin, field=field)
+    return plan_from(candidates(planes, waves, distances, content, dtype), planes, tolerance, memory_limit, dtype)
 
 
 def plan_from(
-    found: list[Candidate],
+    options: list[Candidate],
     planes: PlanePair,
     tolerance: float,
     memory_limit: int | None = None,
     dtype: torch.dtype = torch.complex64,
 ) -> Plan:
-    """The plan for the best of ``found``."""
-    best, second = choose(found, checks.positive("tolerance", tolerance))
+    """The plan for the best of the candidates ``options``."""
+    best, second = choose(options, checks.positive("tolerance", tolerance))
     adequate = best.error <= tolerance
     size = f"{best.padded[0]} x {best.padded[1]} samples"
     if memory_limit is not None and best.memory > memory_limit:
@@ -105,8 +81,8 @@ def plan_from(
         )
     verdict = "the cheapest adequate" if adequate else "the most accurate, though not adequate,"
     reason = (
-        f"{best.method} on {size} is {verdict} of {len(found)} ways: predicted error {best.error:.1e} for a tolerance "
-        f"of {tolerance:.1e}"
+        f"{best.method} on {size} is {verdict} of {len(options)} ways: predicted error {best.error:.1e} for a "
+        f"tolerance of {tolerance:.1e}"
     )
     pad = best.padded[0] / planes.grid.shape[0], best.padded[1] / planes.grid.shape[1]
     precision, window = str(dtype).removeprefix("torch."), (planes.out.shape, planes.out.pitch, planes.offset)
@@ -120,30 +96,26 @@ def plan_from(
         best.memory,
         best.flops,
         reason,
-        _lost(best, second),
+        _rejection(best, second),
         adequate,
     )
 
 
-def choose(found: list[Candidate], tolerance: float) -> tuple[Candidate, Candidate | None]:
-    """The cheapest adequate candidate, or the most accurate if none is, and the one that came next.
+def choose(options: list[Candidate], tolerance: float) -> tuple[Candidate, Candidate | None]:
+    """The cheapest adequate candidate, or else the most accurate one, and the runner-up.
 
-    Cheap ones are asked for their error first, and none after the first that is adequate.
+    Errors are computed in the order of cost, and only up to the first adequate candidate.
     """
-    ranked = sorted(found, key=lambda way: (way.cost, not way.paraxial))
-    for i, way in enumerate(ranked):
-        if way.error <= tolerance:
-            rival = ranked[i - 1] if i else ranked[1] if len(ranked) > 1 else None
-            return way, rival
-    ranked.sort(key=lambda way: way.error)
+    ranked = sorted(options, key=lambda candidate: (candidate.cost, not candidate.paraxial))
+    for i, candidate in enumerate(ranked):
+        if candidate.error <= tolerance:
+            return candidate, ranked[i - 1] if i else ranked[1] if len(ranked) > 1 else None
+    ranked.sort(key=lambda candidate: candidate.error)
     return ranked[0], ranked[1] if len(ranked) > 1 else None
 
 
-def _listed(values: float | Sequence[float]) -> list[float]:
-    return list(values) if isinstance(values, Sequence) else [values]
-
-
-def _lost(best: Candidate, second: Candidate | None) -> str:
+def _rejection(best: Candidate, second: Candidate | None) -> str:
+    """One sentence on why the runner-up was not chosen."""
     if second is None:
         return "no other way was considered"
     name = f"{second.method} on {second.padded[0]} x {second.padded[1]} samples"

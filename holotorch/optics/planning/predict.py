@@ -1,4 +1,4 @@
-"""What a kernel on a transform of finite length gets wrong, computed on one axis before any field is propagated."""
+"""Errors of kernels on transforms of finite length, predicted on one axis before any field is propagated."""
 
 import math
 from collections.abc import Callable
@@ -18,20 +18,20 @@ from holotorch.optics.free_space.impulse_response import (
 )
 from holotorch.optics.free_space.kernels import turns_phasor
 
-_TONES = 17
-_SLICES = 9  # frequencies of the other axis that stand for all, where its light changes this axis' kernel
-_QUANTILES = (0.02, 0.1, 0.25, 0.4, 0.6, 0.75, 0.9, 0.98)  # of a measured axis' energy, where there are more of them
-_LONGER = 4  # times source and window: a transform whose own wrapping is small beside that of the padding
-_LONGEST = 1 << 18  # samples of such a transform; light that is spread farther is taken as lost
+_TONES = 17  # tones that represent the band of one axis
+_SLICES = 9  # frequencies of the other axis at which a kernel that mixes the axes is evaluated
+_QUANTILES = (0.02, 0.1, 0.25, 0.4, 0.6, 0.75, 0.9, 0.98)  # of the energy of a measured axis: further such frequencies
+_LONGER = 4  # length of the reference transform in units of source plus window, so that its own wrapping is negligible
+_LONGEST = 1 << 18  # samples of the longest reference transform; light that needs a longer one counts as lost
 
 
 @dataclass(frozen=True)
 class AxisContent:
-    """Light of one axis: its band, and how the exact kernel and others treat tones of that band.
+    """Light of one axis, and the errors of approximate kernels for it.
 
-    All errors are energies relative to what the exact kernel keeps in the window of the result. They are means over
-    tones exp(2 pi i f x) of the band, cut by the window of the source or faded out over its rim, which is the
-    expectation for noise that fills both; or over measured signals, where there are any.
+    All errors are energies relative to the energy that the exact kernel keeps in the window of the result. They are
+    means over tones exp(2 pi i f x) of the band, cut off by the window of the source or faded out over its margin,
+    which is the expectation for noise that fills band and window. Measured signals, if given, replace the tones.
 
     Attributes:
         size: Samples n of the source.
@@ -39,11 +39,11 @@ class AxisContent:
         band: Highest frequency present, in cycles per metre, at most 1 / (2 pitch).
         wavelength: In metres.
         distance: In metres, > 0.
-        margin: Width in metres of the rim over which the content fades to nothing at both ends; 0 for a hard edge.
+        margin: Width in metres over which the content fades to zero at both ends; 0 for a hard edge.
         out: Samples of the result; ``size`` if 0.
-        shift: Where sample 0 of the result lies beside sample 0 of the source, in samples, seen along the light.
+        shift: Position of sample 0 of the result relative to sample 0 of the source, in samples, along the carrier.
         tilt: Sines (this axis, the other) of the carrier's direction.
-        measured: Signals [K, size] to take instead of tones: random mixtures of the lines of a field.
+        measured: Signals [K, size] that replace the tones: random mixtures of the lines of a field.
     """
 
     size: int
@@ -70,20 +70,20 @@ class AxisContent:
 
     @property
     def bent(self) -> float:
-        """Distance over which untilted light of the same wavelength would get this axis' curvature of phase."""
-        own, other = self.tilt
-        return self.distance * (1 - other**2) / (1 - own**2 - other**2) ** 1.5
+        """Distance over which untilted light of the same wavelength acquires the phase curvature of this axis."""
+        along, other = self.tilt
+        return self.distance * (1 - other**2) / (1 - along**2 - other**2) ** 1.5
 
     @cached_property
     def captured(self) -> float:
-        """Share of the energy of the content that stays in the window."""
+        """Fraction of the energy of the content that arrives in the window."""
         return max(self._energy(self._taps), 1e-300)
 
     def moment(self, power: int, limit: float = math.inf) -> float:
         """Mean of min(f, limit)^power over the content, f in cycles per metre.
 
-        Measured content has the window's edges in it, of a band without measurement only :meth:`standing` and
-        :meth:`paraxial` know them.
+        Measured content includes the edges of the window. For described content only :meth:`standing` and
+        :meth:`paraxial` take the edges into account.
         """
         if self.measured is None:
             top = min(self.band, limit)
@@ -93,29 +93,29 @@ class AxisContent:
         return ((weight * frequency**power).sum() / weight.sum().clamp(min=1e-300)).item()
 
     def standing(self) -> float:
-        """Error of leaving the field as it is, what its edges diffract included."""
+        """Error of leaving the field unchanged, including diffraction at its edges."""
         still = (self._shifts == 0).to(torch.complex128)
         return self._energy(still - self._taps) / self.captured
 
     def wrapped(self, padded: int) -> float:
         """Error of a transfer function sampled on ``padded`` points.
 
-        It repeats the kernel every ``padded`` samples; the repetitions among the window's displacements are the error.
-        Where the rays alone say that more than 5 % of the light wraps, that share is returned as it is.
+        It repeats the kernel every ``padded`` samples; the repetitions within the window are the error. If more than
+        5 % of the light wraps according to geometrical optics, that fraction is returned.
         """
         if self.measured is None and not self.shift and self.window == self.size:
             share = self._wrapped_rays(padded)
             if share > 0.05:
                 return share
         frequency = torch.fft.fftfreq(padded, self.pitch, dtype=torch.float64)
-        turns = -self.wavelength * self.bent / 2 * frequency.square() + frequency * self.shift * self.pitch
-        repeated = torch.fft.ifft(turns_phasor(turns))
+        cycles = -self.wavelength * self.bent / 2 * frequency.square() + frequency * self.shift * self.pitch
+        repeated = torch.fft.ifft(turns_phasor(cycles))
         return self._energy(repeated[self._shifts % padded] - self._taps) / self.captured
 
     def wrapped_slices(self, padded: int, other: "AxisContent", *, limited: bool) -> float:
         """:meth:`wrapped` with the exact kernel, for light steep enough that the other axis changes it.
 
-        Slices of the transfer function at frequencies of the ``other`` axis stand for all of it. ``limited`` drops the
+        Slices of the transfer function at frequencies of the ``other`` axis represent all of it. ``limited`` drops the
         frequencies that :func:`angular_spectrum_kernel` drops on ``padded`` points.
         """
         if any(self.tilt) and self._spread(other) > 2 * padded:
@@ -133,7 +133,7 @@ class AxisContent:
         shift = levelling_shift((self.nyquist, other.nyquist), wavelength, distance, tilt, 0)
         return self._from_exact(self._levelled(padded, other, shift.expand(len(other.slices), 1)), other)
 
-    def _from_exact(self, given: Tensor, other: "AxisContent") -> float:
+    def _from_exact(self, approximate: Tensor, other: "AxisContent") -> float:
         """Error of taps [K, n + m - 1] at the slices of the other axis."""
         exact = self._exact_slices(other)
         if exact is None:
@@ -141,7 +141,7 @@ class AxisContent:
         weights = other.shares
         lost, whole = (
             sum(w * self._energy(each) for w, each in zip(weights, taps, strict=True))
-            for taps in (given - exact, exact)
+            for taps in (approximate - exact, exact)
         )
         return lost / max(whole, 1e-300)
 
@@ -161,27 +161,27 @@ class AxisContent:
         # Each slice is levelled exactly: nothing jumps where the band closes upon itself.
         wavelength, distance, tilt = self._scene
         ends = torch.tensor((self.nyquist, -self.nyquist), dtype=torch.float64)
-        turns = tilted_turns(ends, other.slices, wavelength, distance, tilt, squares=False)
-        return self._levelled(padded, other, (turns[:, :1] - turns[:, 1:]) / (2 * self.nyquist))
+        cycles = tilted_turns(ends, other.slices, wavelength, distance, tilt, squares=False)
+        return self._levelled(padded, other, (cycles[:, :1] - cycles[:, 1:]) / (2 * self.nyquist))
 
     def _levelled(self, padded: int, other: "AxisContent", shift: Tensor) -> Tensor:
-        """Taps [K, n + m - 1]: Fresnel's, moved by ``shift`` [K, 1] metres, times what is beyond them less that."""
+        """Taps [K, n + m - 1]: Fresnel taps moved by ``shift`` [K, 1] metres, times the factor beyond Fresnel."""
         index = tap_indices(padded, self.size, self.window)
         taps = torch.stack([self._fresnel(index + each / self.pitch) for each in shift[:, 0]])
         factor = self._levelled_factor(padded, other, shift)
         return torch.fft.ifft(torch.fft.fft(taps) * factor)[:, self._shifts % padded]
 
     def _levelled_factor(self, padded: int, other: "AxisContent", shift: Tensor) -> Tensor:
-        """What is beyond Fresnel less a shift in metres, at the slices of the other axis: [K, padded]."""
+        """Factor beyond Fresnel without a shift in metres, at the slices of the other axis: [K, padded]."""
         wavelength, distance, tilt = self._scene
         frequency = torch.fft.fftfreq(padded, self.pitch, dtype=torch.float64)
-        turns = tilted_turns(frequency, other.slices, wavelength, distance, tilt, squares=False)
-        return turns_phasor(turns - frequency * shift) * self._across(other)
+        cycles = tilted_turns(frequency, other.slices, wavelength, distance, tilt, squares=False)
+        return turns_phasor(cycles - frequency * shift) * self._across(other)
 
     def _across(self, other: "AxisContent") -> Tensor:
-        """What the other axis does to its own frequencies [K, 1], the same for all of this one."""
-        own, across = self.tilt
-        bent = self.distance * (1 - own**2) / (1 - own**2 - across**2) ** 1.5
+        """Paraxial phase factor of the other axis at its slices [K, 1], which does not depend on this axis."""
+        along, across = self.tilt
+        bent = self.distance * (1 - along**2) / (1 - along**2 - across**2) ** 1.5
         return turns_phasor(-self.wavelength * bent / 2 * other.slices.square())
 
     @property
@@ -192,9 +192,9 @@ class AxisContent:
 
     @cached_property
     def slices(self) -> Tensor:
-        """Frequencies [K, 1] of this axis, in cycles per metre, that stand for its content where it changes the other.
+        """Frequencies [K, 1] of this axis, in cycles per metre, that represent it in the kernel of the other axis.
 
-        From end to end of the band; if the content was measured, also where most of its energy is.
+        They cover the band evenly; for measured content, quantiles of its energy are added.
         """
         even = torch.linspace(-1, 1, _SLICES, dtype=torch.float64) * self.band
         if self.measured is None:
@@ -209,25 +209,25 @@ class AxisContent:
     def _power(self) -> tuple[Tensor, Tensor]:
         """Frequencies of measured content and its energy at them.
 
-        Twice the window: on the window alone the field would repeat, and a uniform one would have no edges.
+        The transform has twice the length of the window: on the window alone the field would repeat without edges.
         """
         assert self.measured is not None
         frequency = torch.fft.fftfreq(2 * self.size, self.pitch, dtype=torch.float64)
         return frequency, torch.fft.fft(self.measured, 2 * self.size).abs().square().sum(0)
 
     def _spread(self, other: "AxisContent") -> int:
-        """Samples over which a tilted axis spreads the light of one point, what the other axis does to it included."""
-        own, across = (
+        """Samples over which a tilted axis spreads the light of one point, including the effect of the other axis."""
+        along, across = (
             self.wavelength * torch.tensor((-axis.nyquist, 0.0, axis.nyquist), dtype=torch.float64) + sine
             for axis, sine in zip((self, other), self.tilt, strict=True)
         )
-        tangents = own[:, None] / torch.sqrt((1 - own[:, None].square() - across.square()).clamp(min=1e-3))
-        places = self.distance * tangents / self.pitch
-        return math.ceil((places.max() - places.min()).item()) + self.size + self.window
+        tangents = along[:, None] / torch.sqrt((1 - along[:, None].square() - across.square()).clamp(min=1e-3))
+        positions = self.distance * tangents / self.pitch
+        return math.ceil((positions.max() - positions.min()).item()) + self.size + self.window
 
     @cached_property
     def shares(self) -> list[float]:
-        """Shares of the energy of the content that each of :attr:`slices` stands for."""
+        """Fractions of the energy of the content that :attr:`slices` represent."""
         if self.measured is None:
             parts = torch.ones(_SLICES, dtype=torch.float64)
             parts[[0, -1]] = 0.5
@@ -253,7 +253,7 @@ class AxisContent:
         return torch.fft.ifft(kernel)[:, self._shifts % padded]
 
     def _wrapped_rays(self, padded: int) -> float:
-        """Share of the light that travels sideways past the padding but not past the window behind it."""
+        """Fraction of the light that crosses the padding sideways and ends in the repeated window behind it."""
         steepest = self.wavelength * self.bent * self.band / self.pitch  # samples
         room = padded - self.size
         if steepest <= room:
@@ -262,14 +262,14 @@ class AxisContent:
         return (farthest - room) ** 2 / (2 * self.size * steepest) + max(0.0, steepest - farthest) / steepest
 
     def cropped(self, padded: int, cross: float) -> float:
-        """Error of the factor beyond Fresnel on cropped taps, against the same on a much longer transform.
+        """Error of the factor beyond Fresnel on cropped taps, against the same factor on a longer transform.
 
-        ``cross`` is the frequency on the other axis, in cycles per metre, which takes part in that factor.
+        ``cross`` is the frequency of the other axis, in cycles per metre, on which that factor depends too.
         """
         if self._moved > padded / 4:
-            return self._rim()
-        far = self._beyond_fresnel(good_length(2 * (self.size + self.window)), cross)
-        return self._energy(self._beyond_fresnel(padded, cross) - far) / self.captured
+            return self._band_edge_energy()
+        longer = self._beyond_fresnel(good_length(2 * (self.size + self.window)), cross)
+        return self._energy(self._beyond_fresnel(padded, cross) - longer) / self.captured
 
     def resampled(self, padded: int, cross: float) -> float:
         """Error of the factor beyond Fresnel applied first, on ``padded`` samples around the window.
@@ -277,10 +277,10 @@ class AxisContent:
         ``cross`` as in :meth:`cropped`.
         """
         if self._moved > padded / 4:
-            return self._rim()
-        given = self._filtered_first(self._remainder(padded, cross), self._fresnel)
-        far = self._beyond_fresnel(good_length(max(2 * (self.size + self.window), 4 * padded)), cross)
-        return ((given - self._arriving(far)).abs().square().sum() / self.size).item() / self.captured
+            return self._band_edge_energy()
+        approximate = self._filtered_first(self._remainder(padded, cross), self._fresnel)
+        longer = self._beyond_fresnel(good_length(max(2 * (self.size + self.window), 4 * padded)), cross)
+        return ((approximate - self._arriving(longer)).abs().square().sum() / self.size).item() / self.captured
 
     def resampled_slices(self, padded: int, other: "AxisContent") -> float:
         """:meth:`resampled` about a tilted carrier, as in :meth:`tilted_taps`."""
@@ -291,28 +291,28 @@ class AxisContent:
         shift = levelling_shift((self.nyquist, other.nyquist), wavelength, distance, tilt, 0)
         lost = whole = 0.0
         for factor, taps, weight in zip(self._levelled_factor(padded, other, shift), exact, other.shares, strict=True):
-            given = self._filtered_first(factor, lambda index: self._fresnel(index + shift / self.pitch))
+            approximate = self._filtered_first(factor, lambda index: self._fresnel(index + shift / self.pitch))
             wanted = self._arriving(taps)
-            lost += weight * (given - wanted).abs().square().sum().item()
+            lost += weight * (approximate - wanted).abs().square().sum().item()
             whole += weight * wanted.abs().square().sum().item()
         return lost / max(whole, 1e-300)
 
     def _filtered_first(self, factor: Tensor, taps: Callable[[Tensor], Tensor]) -> Tensor:
-        """The content times ``factor`` [P], its middle P samples convolved with the ``taps`` at given places."""
+        """The content times ``factor`` [P], whose middle P samples are convolved with ``taps`` of the displacements."""
         padded = len(factor)
-        rim = (padded - self.size) // 2
-        kept = self.size + 2 * rim
-        near = torch.fft.ifft(torch.fft.fft(self._signals, padded) * factor)
-        near = near[:, torch.arange(-rim, self.size + rim) % padded]
-        weights = taps(torch.arange(-(self.size + rim - 1), self.window + rim))
+        extra = (padded - self.size) // 2
+        kept = self.size + 2 * extra
+        filtered = torch.fft.ifft(torch.fft.fft(self._signals, padded) * factor)
+        filtered = filtered[:, torch.arange(-extra, self.size + extra) % padded]
+        weights = taps(torch.arange(-(self.size + extra - 1), self.window + extra))
         length = good_length(kept + len(weights) - 1)
-        given = torch.fft.ifft(torch.fft.fft(near, length) * torch.fft.fft(weights, length))
-        return given[:, kept - 1 : kept - 1 + self.window]
+        approximate = torch.fft.ifft(torch.fft.fft(filtered, length) * torch.fft.fft(weights, length))
+        return approximate[:, kept - 1 : kept - 1 + self.window]
 
     def paraxial(self) -> float:
         """Error of leaving out the factor beyond Fresnel, for light that travels along this axis only."""
         if self._moved > (self.size + self.window) / 4:
-            return self._rim()
+            return self._band_edge_energy()
         exact = self._beyond_fresnel(good_length((3 * self.size + 3 * self.window) // 2), 0.0)
         return self._energy(exact - self._taps) / self.captured
 
@@ -321,10 +321,10 @@ class AxisContent:
         """Samples by which the factor beyond Fresnel moves the steepest light of the grid: z s^3 / 2."""
         return self.distance * (self.wavelength * self.nyquist) ** 3 / (2 * self.pitch)
 
-    def _rim(self) -> float:
-        """Energy of the kernel's part that comes from the ends of the band, where its phase is not to be trusted.
+    def _band_edge_energy(self) -> float:
+        """Energy of the part of the kernel that comes from the ends of the band, whose phase is not reliable.
 
-        So far away the steepest light has long left the window; what remains of it are the two terms
+        At such distances the steepest light has left the window; what remains are the two terms
         f(u) ~ 1 / (pi u) of the taps beside the point source's 1 / sqrt(2), in random phase.
         """
         product = self.wavelength * self.bent
@@ -376,9 +376,9 @@ class AxisContent:
         """1 inside, infinitely smooth to 0 over the margin at both ends."""
         if self.margin == 0:
             return torch.ones_like(n)
-        place = (torch.minimum(n, self.size - 1 - n) + 0.5) * self.pitch / self.margin
-        t = place.clamp(2e-3, 1 - 2e-3)
-        return torch.where(place < 1, 1 / (1 + torch.exp(1 / t - 1 / (1 - t))), 1.0)
+        position = (torch.minimum(n, self.size - 1 - n) + 0.5) * self.pitch / self.margin
+        t = position.clamp(2e-3, 1 - 2e-3)
+        return torch.where(position < 1, 1 / (1 + torch.exp(1 / t - 1 / (1 - t))), 1.0)
 
     def _energy(self, taps: Tensor) -> float:
         """Energy per sample of the source that a convolution with ``taps`` [n + m - 1] gives of the content."""
@@ -391,9 +391,10 @@ class AxisContent:
 
 
 def rms_beyond_fresnel(axes: list[AxisContent]) -> float:
-    """Rms over the content of the phase that Fresnel leaves out, pi z s^4 / (4 lambda), for light that lands inside.
+    """Rms of the phase pi z s^4 / (4 lambda) that Fresnel leaves out, over the content that arrives in the window.
 
-    Both axes together, but without what hard edges put beyond the band; :meth:`AxisContent.paraxial` has that.
+    It includes both axes but not the light that hard edges diffract beyond the band, for which see
+    :meth:`AxisContent.paraxial`.
     """
     moments = []
     for axis in axes:

@@ -30,9 +30,9 @@ def planar_fov(pitch: float, wavelength: float) -> float:
 def magnified_fov(width: float, focal_length: float) -> float:
     """Field of view in radians, 2 atan(w / 2f), with the eye at the focal point of a lens.
 
-    For spherical illumination (the lens close to the hologram) and for the volume-magnifying display alike. Its limit:
-    light that leaves the hologram. What of the scene fills it is :func:`scene_fov`, what passes the iris
-    :func:`vignetting`.
+    For spherical illumination (the lens close to the hologram) and for the volume-magnifying display. It is limited
+    by the light that leaves the hologram; :func:`scene_fov` gives the angle that the scene fills, :func:`vignetting`
+    the light that passes the iris.
     """
     return 2 * math.atan(checks.quantity(WIDTH, width) / (2 * _positive_focal_length(focal_length)))
 
@@ -105,8 +105,8 @@ def accommodation_range(
         checks.quantity(PLANE, plane, name)
     checks.quantity(SPACING, eyepiece_distance, "eyepiece_distance")
     checks.quantity(SPACING, eye_distance, "eye_distance")
-    seen = [image_distance(eyepiece_distance - z, focal_length) + eye_distance for z in (near, far)]
-    return min(seen), max(seen)
+    distances = [image_distance(eyepiece_distance - z, focal_length) + eye_distance for z in (near, far)]
+    return min(distances), max(distances)
 
 
 def region_apex(width: float, pitch: float, wavelength: float) -> float:
@@ -170,15 +170,15 @@ def vignetting(height: float, first: float, second: float, pupil_radius: float, 
     """
     checks.quantity(OFFSET, height, "height")
     checks.finite("first", first)
-    half = _light_reach(second, sine)
+    half = _light_half_width(second, sine)
     low, high = max(-pupil_radius, first * height - half), min(pupil_radius, first * height + half)
     return max(0.0, high - low) / (2 * checks.quantity(PUPIL_RADIUS, pupil_radius))
 
 
 def visible_half_width(first: float, second: float, pupil_radius: float, sine: float) -> float:
     """Height in metres from which no light reaches the pupil: (r + B sine) / A, infinite for A = 0."""
-    reach = checks.quantity(PUPIL_RADIUS, pupil_radius) + _light_reach(second, sine)
-    return reach / abs(first) if checks.finite("first", first) else math.inf
+    half_width = checks.quantity(PUPIL_RADIUS, pupil_radius) + _light_half_width(second, sine)
+    return half_width / abs(first) if checks.finite("first", first) else math.inf
 
 
 def eye_box(size: float, first: float, second: float, sine: float) -> float:
@@ -223,7 +223,7 @@ def _cone(height: float, distance: float, width: float, pitch: float, wavelength
     return abs(checks.quantity(DISTANCE, distance)) * _tangent(pitch, wavelength)
 
 
-def _light_reach(second: float, sine: float) -> float:
+def _light_half_width(second: float, sine: float) -> float:
     """Half width in metres, B sine, of the light of a point on the pupil's plane, both numbers checked."""
     if checks.nonnegative("sine", sine) > 1:
         raise ValueError(f"sine must be at most 1, got {sine!r}")

@@ -1,4 +1,4 @@
-"""The long way to the retina: free space, eyepiece, free space, eye, free space, on samples fine enough for each."""
+"""Propagation to the retina element by element, with the sampling that each element needs."""
 
 import math
 import warnings
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
+from holotorch.core.deprecation import renamed
 from holotorch.core.fourier import fft2, filter_spectrum, good_length
 from holotorch.core.grid import Grid
 from holotorch.optics.elements.lens import pupil
@@ -20,12 +21,12 @@ from holotorch.optics.viewing.eye import Eye
 from holotorch.optics.viewing.imaging import retinal_scale
 from holotorch.optics.viewing.rays import Region, band, clipped, fringe, reach, refracted, steepest, travelled
 
-_ROOM = 1.05  # of the steepest ray, for what edges diffract beyond it
+_ROOM = 1.05  # times the slope of the steepest ray, for the light that edges diffract beyond it
 
 
 @dataclass(frozen=True)
 class ElementSampling:
-    """Sizes (y, x) of the long way on one grid.
+    """Sizes (y, x) of the element-by-element propagation from one grid.
 
     Attributes:
         oversampling: How much finer than the hologram everything is sampled.
@@ -62,15 +63,15 @@ def least_oversampling(
     """Least sampling that holds every lens phase, and the light behind every lens, unaliased.
 
     The rays of the hologram, a window times the slopes that its pitch carries, are followed as a polygon per axis
-    through the display; the steepest slope s of a ray, or of a lens where there are rays, asks for a pitch of
-    wavelength / (2 s), and the widest place for the window. 5 % and Fresnel fringes are added.
+    through the display; the steepest slope s of a ray, or of a lens within the rays, requires a pitch of
+    wavelength / (2 s), and the largest extent of the rays determines the window. 5 % and Fresnel fringes are added.
     """
-    found = [_axis(grid, axis, wavelengths, display, eye, plane) for axis in (0, 1)]
-    oversampling, padded, fine = zip(*found, strict=True)
+    axes = [_axis(grid, axis, wavelengths, display, eye, plane) for axis in (0, 1)]
+    oversampling, padded, fine = zip(*axes, strict=True)
     return ElementSampling(oversampling, padded, fine)
 
 
-def through_elements(
+def propagate_elements(
     field: Tensor,
     grid: Grid,
     wavelengths: float | Sequence[float],
@@ -81,13 +82,13 @@ def through_elements(
     sampling: ElementSampling | None = None,
     paraxial: bool = False,
 ) -> Tensor:
-    """Field on the retina element by element (thesis Algorithm 6), at the same points and scale as ``imaged``.
+    """Propagate a hologram to the retina element by element (thesis Algorithm 6), scaled as ``propagate_collapsed``.
 
     Args:
         field: Of the hologram, complex [..., C, H, W].
         grid: Its sampling.
         wavelengths: In metres, one per channel.
-        display: Where everything stands, lens rim included.
+        display: Positions of hologram, eyepiece and eye, and the radius of the eyepiece.
         eye: Pupil, retina, accommodation.
         plane: Object plane in metres from the hologram that sets the scale only; by default the one in focus.
         sampling: By default :func:`least_oversampling`.
@@ -106,11 +107,14 @@ def through_elements(
 
     Departs from Algorithm 6 in sampling only: there every step has the pitch of the hologram.
     """
-    waves = checks.wavelengths(wavelengths)
-    checks.field("field", field, (len(waves), *grid.shape))
-    least = least_oversampling(grid, waves, display, eye, plane=plane)
+    channel_wavelengths = checks.wavelengths(wavelengths)
+    checks.field("field", field, (len(channel_wavelengths), *grid.shape))
+    least = least_oversampling(grid, channel_wavelengths, display, eye, plane=plane)
     sizes = sampling or least
-    if any(have < want * (1 - 1e-9) for have, want in zip(sizes.oversampling, least.oversampling, strict=True)):
+    if any(
+        given < least_factor * (1 - 1e-9)
+        for given, least_factor in zip(sizes.oversampling, least.oversampling, strict=True)
+    ):
         warnings.warn(
             f"elements sampled {max(sizes.oversampling):.3g} times as fine as the hologram alias in a lens; "
             f"{max(least.oversampling):.3g} times would do",
@@ -120,14 +124,15 @@ def through_elements(
     batch = field.numel() // max(1, math.prod(field.shape[-3:]))
     checks.affordable(
         sizes.memory_bytes(field.dtype.itemsize, batch) + field.dtype.itemsize * field.numel(),
-        f"through_elements() on {sizes.fine[0]} x {sizes.fine[1]} samples, {max(sizes.oversampling):.3g} times as fine "
-        f"as the hologram's {grid.shape[0]} x {grid.shape[1]},",
-        "use imaged(), crop the hologram, pass fewer fields at once, or use smaller lenses",
+        f"propagate_elements() on {sizes.fine[0]} x {sizes.fine[1]} samples, {max(sizes.oversampling):.3g} times as "
+        f"fine as the hologram's {grid.shape[0]} x {grid.shape[1]},",
+        "use propagate_collapsed(), crop the hologram, pass fewer fields at once, or use smaller lenses",
         field.device,
     )
     scale = retinal_scale(display, eye, plane)
     images = [
-        _passed(field[..., c, :, :], grid, wave, display, eye, scale, sizes, paraxial) for c, wave in enumerate(waves)
+        _passed(field[..., c, :, :], grid, wavelength, display, eye, scale, sizes, paraxial)
+        for c, wavelength in enumerate(channel_wavelengths)
     ]
     return torch.stack(images, -3)
 
@@ -141,39 +146,39 @@ def _axis(
     scale = abs(number(retinal_scale(display, eye, plane)))
     d_el, d_eye, d_r = (number(v) for v in (display.lens_distance, display.eye_distance, eye.axial_length))
     powers = number(inverse(display.focal_length)), number(inverse(eye.focal_length))
-    rims = math.inf if display.lens_radius is None else number(display.lens_radius), number(eye.pupil_radius)
+    radii = math.inf if display.lens_radius is None else number(display.lens_radius), number(eye.pupil_radius)
     slope, width = 0.0, scale * size * pitch
-    for wave in wavelengths:
-        rays: Region = band(size * pitch / 2, wave / (2 * pitch))
-        steep = wave / (2 * pitch)
-        for distance, power, rim in zip((d_el, d_eye), powers, rims, strict=True):
+    for wavelength in wavelengths:
+        rays: Region = band(size * pitch / 2, wavelength / (2 * pitch))
+        steep = wavelength / (2 * pitch)
+        for distance, power, radius in zip((d_el, d_eye), powers, radii, strict=True):
             start = reach(rays)
             rays = travelled(rays, distance)
             # Wrapped light must miss the opening; all that passes must lie within the window.
-            arrives, kept = reach(rays), min(reach(rays), rim + 8 * eye.softness)
-            width = max(width, start + kept, arrives + kept, 2 * kept) + 2 * fringe(wave, distance)
+            arrives, kept = reach(rays), min(reach(rays), radius + 8 * eye.softness)
+            width = max(width, start + kept, arrives + kept, 2 * kept) + 2 * fringe(wavelength, distance)
             rays = clipped(rays, kept)
             steep = max(steep, abs(power) * reach(rays))
             rays = refracted(rays, power)
             steep = max(steep, steepest(rays))
         end = reach(travelled(rays, d_r))
-        width = max(width, end + scale * size * pitch / 2 + fringe(wave, d_r))
-        slope = max(slope, _ROOM * steep / wave)
+        width = max(width, end + scale * size * pitch / 2 + fringe(wavelength, d_r))
+        slope = max(slope, _ROOM * steep / wavelength)
     factor = max(1.0, 2 * pitch * slope)
     fine = good_length(math.ceil(factor * width / pitch))
     wide = fine / factor
-    need = 0.0
-    for wave in wavelengths:
-        sine = wave / (2 * pitch)
+    needed = 0.0
+    for wavelength in wavelengths:
+        sine = wavelength / (2 * pitch)
         spread = d_el * sine / math.sqrt(1 - sine**2) if sine < 1 else math.inf
-        need = max(need, min((size + wide) / 2 + (spread + fringe(wave, d_el)) / pitch, size + wide))
-    return factor, good_length(max(math.ceil(need), size)), fine
+        needed = max(needed, min((size + wide) / 2 + (spread + fringe(wavelength, d_el)) / pitch, size + wide))
+    return factor, good_length(max(math.ceil(needed), size)), fine
 
 
 def _passed(
     field: Tensor,
     grid: Grid,
-    wave: float,
+    wavelength: float,
     display: Display,
     eye: Eye,
     scale: Length,
@@ -186,24 +191,24 @@ def _passed(
     def space(where: Grid, distance: Length) -> Tensor:
         # No band limit: the windows leave room for all light that matters.
         kernel = (
-            fresnel_kernel(where, wave, distance)
+            fresnel_kernel(where, wavelength, distance)
             if paraxial
-            else angular_spectrum_kernel(where, wave, distance, band_limit=False)
+            else angular_spectrum_kernel(where, wavelength, distance, band_limit=False)
         )
-        return (kernel * carrier(wave, distance)).to(field.device, field.dtype)
+        return (kernel * carrier(wavelength, distance)).to(field.device, field.dtype)
 
     light = zoomed(field, space(padded, display.lens_distance), chirps(grid, padded, fine, (0.0, 0.0), field.device))
     y, x = fine.coordinates(field.device)
     square = y.square() + x.square()
 
     def lens(power: Length) -> Tensor:
-        return turns_phasor(-power / (2 * wave) * square)
+        return turns_phasor(-power / (2 * wavelength) * square)
 
     eyepiece = lens(torch.as_tensor(inverse(display.focal_length), dtype=torch.float64))
     if display.lens_radius is not None:
         eyepiece = eyepiece * pupil(fine, display.lens_radius, softness=eye.softness).to(field.device)
     light = filter_spectrum(light * eyepiece.to(field.dtype), space(fine, display.eye_distance))
-    iris = lens(torch.as_tensor(inverse(eye.focal_length), dtype=torch.float64)) * eye.pupil_function(y, x, wave)
+    iris = lens(torch.as_tensor(inverse(eye.focal_length), dtype=torch.float64)) * eye.pupil_function(y, x, wavelength)
     spectrum = fft2(light * iris.to(field.dtype))
     return _read(spectrum * space(fine, eye.axial_length), fine, grid, scale)
 
@@ -220,3 +225,6 @@ def _read(spectrum: Tensor, fine: Grid, grid: Grid, scale: Length) -> Tensor:
         lines = zoom(spectrum.transpose(dim, -1), (before, kernel, after)).transpose(dim, -1)
         spectrum = lines * (abs(scale) ** 0.5)
     return spectrum
+
+
+__getattr__ = renamed(__name__, {"through_elements": "propagate_elements"})

@@ -64,7 +64,7 @@ class Eye:
         return 1 / (inverse(self.accommodation) + inverse(self.axial_length))
 
     def pupil_function(self, y: Tensor, x: Tensor, wavelength: Length) -> Tensor:
-        """What the pupil does beside the ideal lens: amplitude, aberrations and colour error.
+        """Complex transmission of the pupil without the ideal lens: amplitude, aberrations and colour error.
 
         Args:
             y: Positions in metres on the pupil's plane, float64, broadcasting with ``x``.
@@ -86,7 +86,7 @@ class Eye:
         for index, coefficient in self.aberrations.items():
             path = path + coefficient * zernike(index, y / radius, x / radius)
         if self.chromatic_reference is not None:
-            # A myopic refraction (below zero) is power in excess, and a path shorter towards the rim by P r^2 / 2.
+            # A myopic refraction (below zero) is power in excess, and a path shorter towards the edge by P r^2 / 2.
             excess = chromatic_refraction(self.chromatic_reference) - chromatic_refraction(wavelength)
             path = path - excess * square / 2
         return path

@@ -1,4 +1,4 @@
-"""The short way to the retina: eyepiece, eye and all the space between collapsed into one filtered image.
+"""Collapsed propagation to the retina: eyepiece, eye and the space between them as one filter of the image.
 
 Derivation. Let (A, B, C, D) be the paraxial ray matrix from an object plane, field U(x), to the pupil of the eye, as in
 ``Display.matrix``. By Collins's integral the field on the pupil is
@@ -32,6 +32,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
+from holotorch.core.deprecation import renamed
 from holotorch.core.fourier import centred_fft2, centred_ifft2, good_length
 from holotorch.core.grid import Grid
 from holotorch.optics.free_space.kernels import (
@@ -90,7 +91,7 @@ class CollapseSampling:
         return math.ceil(max(kernel, lines, (88 + 1.5 * itemsize * batch) * passed))
 
 
-def imaged(
+def propagate_collapsed(
     field: Tensor,
     grid: Grid,
     wavelengths: float | Sequence[float],
@@ -107,15 +108,16 @@ def imaged(
         field: Of the hologram, complex [..., C, H, W].
         grid: Its sampling.
         wavelengths: In metres, one per channel.
-        display: Where everything stands.
+        display: Positions of hologram, eyepiece and eye.
         eye: Pupil, retina, accommodation. Its radius, accommodation and axial length and the display's lengths may
             carry gradients.
         plane: Distance in metres from the hologram of the object plane, to which light is propagated first; by default
             the one in focus. It sets the scale of the result.
         sampling: Of the object plane; by default :func:`collapse_sampling`.
-        paraxial: Fresnel's model throughout. Otherwise the way to the eyepiece is exact, and the pupil gets what
-            Fresnel leaves out behind it for points on the axis, -k / 8 sum d_i u_i^4 over the slopes u_i of the ray
-            through xi: spherical aberration. What depends on the point beside the axis (mostly a shift) stays out.
+        paraxial: Fresnel's model throughout. Otherwise propagation to the eyepiece is exact, and the pupil takes over
+            the phase that Fresnel leaves out behind it for points on the axis, -k / 8 sum d_i u_i^4 over the slopes u_i
+            of the ray through xi: spherical aberration. The part that depends on the position beside the axis (mostly
+            a shift) is left out.
 
     Returns:
         Complex [..., C, H, W] on ``grid``, upright: the retina shows it :func:`retinal_scale` times as large, turned
@@ -129,15 +131,15 @@ def imaged(
     Warns:
         SamplingWarning: ``sampling`` is coarser than :func:`collapse_sampling`.
 
-    What it leaves out: the rim of the eyepiece (``plan_retina`` says whether it cuts light that the pupil would take),
-    what Fresnel leaves out behind the eyepiece for points beside the axis, and light that leaves the window of ``grid``
-    before the object plane.
+    It leaves out the edge of the eyepiece (``plan_retina`` says whether it blocks light that the pupil would accept),
+    the phase that Fresnel leaves out behind the eyepiece for points beside the axis, and light that leaves the window
+    of ``grid`` before the object plane.
     Departs from Algorithm 6, which samples every lens phase at the pitch of the hologram, where they alias.
     """
-    waves = checks.wavelengths(wavelengths)
-    checks.field("field", field, (len(waves), *grid.shape))
+    channel_wavelengths = checks.wavelengths(wavelengths)
+    checks.field("field", field, (len(channel_wavelengths), *grid.shape))
     plane = display.object_plane(plane, eye.accommodation)
-    least = collapse_sampling(grid, waves, display, eye, plane)
+    least = collapse_sampling(grid, channel_wavelengths, display, eye, plane)
     sizes = sampling or least
     if any(have < want * (1 - 1e-9) for have, want in zip(sizes.oversampling, least.oversampling, strict=True)):
         warnings.warn(
@@ -146,17 +148,20 @@ def imaged(
             SamplingWarning,
             stacklevel=2,
         )
-    passed = max(math.prod(pupil_bands(grid, wave, display, eye, plane)) for wave in waves) * math.prod(sizes.window)
+    passed = max(
+        math.prod(pupil_bands(grid, wavelength, display, eye, plane)) for wavelength in channel_wavelengths
+    ) * math.prod(sizes.window)
     size, batch = field.dtype.itemsize, field.numel() // max(1, math.prod(field.shape[-3:]))
     checks.affordable(
         sizes.memory_bytes(passed, size, batch) + size * field.numel(),
-        f"imaged() on an object plane of {sizes.fine[0]} x {sizes.fine[1]} samples, "
+        f"propagate_collapsed() on an object plane of {sizes.fine[0]} x {sizes.fine[1]} samples, "
         f"{max(sizes.oversampling):.3g} times as fine as the hologram's {grid.shape[0]} x {grid.shape[1]},",
         "crop the hologram, pass fewer fields at once, use a smaller pupil, or put the plane farther from the pupil",
         field.device,
     )
     images = [
-        _image(field[..., c, :, :], grid, wave, display, eye, plane, sizes, paraxial) for c, wave in enumerate(waves)
+        _image(field[..., c, :, :], grid, wavelength, display, eye, plane, sizes, paraxial)
+        for c, wavelength in enumerate(channel_wavelengths)
     ]
     return torch.stack(images, -3)
 
@@ -184,7 +189,7 @@ def collapse_sampling(
     as long as they do not come back into the pupil's, f <= r / (lambda |B|): 1 / fine pitch >= F + f suffices.
     """
     first, second, _, back = (number(value) for value in display.matrix(plane))
-    radius, far = number(eye.pupil_radius) + 8 * eye.softness, number(plane)
+    radius, distance = number(eye.pupil_radius) + 8 * eye.softness, number(plane)
     blur = abs(back - second * number(inverse(eye.accommodation))) * radius
     factors, padded, window, fine = [], [], [], []
     for size, pitch in zip(grid.shape, grid.pitch, strict=True):
@@ -196,37 +201,40 @@ def collapse_sampling(
         spot = max(wavelengths) * abs(second) / (2 * radius)
         wide = size + 2 * math.ceil((blur + _SPOTS * spot) / pitch)
         factor = 1.0
-        for wave in wavelengths:
-            if abs(second) <= 1e-9 * (abs(far) + number(display.eye_distance)):
+        for wavelength in wavelengths:
+            if abs(second) <= 1e-9 * (abs(distance) + number(display.eye_distance)):
                 raise ValueError("the pupil is an image of this object plane (B = 0); give another plane")
-            taken = radius / (wave * abs(second))
+            taken = radius / (wavelength * abs(second))
             if taken > _ROOM / (2 * pitch):
                 # Light of the object beyond the pitch's band, which the hologram does not hold on the axis.
                 factor = max(factor, 2 * pitch * taken)
-            highest = 1 / (2 * pitch) + abs(first) * wide * pitch / 2 / (wave * abs(second))
+            highest = 1 / (2 * pitch) + abs(first) * wide * pitch / 2 / (wavelength * abs(second))
             factor = max(factor, _ROOM * pitch * (highest + taken))
         if factor > _FINEST:
             raise ValueError(f"the collapse would need {factor:.3g} times the hologram's sampling; give another plane")
         factors.append(factor)
         window.append(wide)
         fine.append(good_length(math.ceil(factor * wide)))
-        padded.append(max(_padding(size, wide, pitch, wave, far) for wave in wavelengths))
+        padded.append(max(_padding(size, wide, pitch, wavelength, distance) for wavelength in wavelengths))
     pairs = [(each[0], each[1]) for each in (factors, padded, window, fine)]
     return CollapseSampling(pairs[0], pairs[1], pairs[2], pairs[3])  # type: ignore[arg-type]
 
 
-def _padding(size: int, wide: int, pitch: float, wave: float, far: float) -> int:
-    """Length of a transform that wraps no light into the window: all of it stays, or is tapered off beyond reach."""
-    sine = wave / (2 * pitch)
-    spread = abs(far) * sine / math.sqrt(1 - sine**2) if sine < 1 else math.inf
-    need = min((size + wide) / 2 + (spread + fringe(wave, far)) / pitch, size + wide + fringe(wave, far) / pitch)
+def _padding(size: int, wide: int, pitch: float, wavelength: float, distance: float) -> int:
+    """Length of a transform that wraps no light into the window: it holds all light, or is used with a taper."""
+    sine = wavelength / (2 * pitch)
+    spread = abs(distance) * sine / math.sqrt(1 - sine**2) if sine < 1 else math.inf
+    need = min(
+        (size + wide) / 2 + (spread + fringe(wavelength, distance)) / pitch,
+        size + wide + fringe(wavelength, distance) / pitch,
+    )
     return good_length(max(math.ceil(need), size))
 
 
 def _image(
     field: Tensor,
     grid: Grid,
-    wave: float,
+    wavelength: float,
     display: Display,
     eye: Eye,
     plane: Length,
@@ -240,33 +248,33 @@ def _image(
     fine = Grid(sizes.fine, (fy, fx))
     whole = all(p >= n + w or n == 1 for p, n, w in zip(sizes.padded, grid.shape, sizes.window, strict=True))
     if paraxial:
-        kernel = fresnel_kernel(padded, wave, plane)
+        kernel = fresnel_kernel(padded, wavelength, plane)
     else:
         # On to the eyepiece exactly, and back to the plane as the ray matrix has it.
-        kernel = angular_spectrum_kernel(padded, wave, display.lens_distance, band_limit=False)
-        kernel = kernel * fresnel_kernel(padded, wave, display.lens_distance - plane).conj()
+        kernel = angular_spectrum_kernel(padded, wavelength, display.lens_distance, band_limit=False)
+        kernel = kernel * fresnel_kernel(padded, wavelength, display.lens_distance - plane).conj()
     if whole:
         reach = [(n + w) / 2 * p for n, w, p in zip(grid.shape, sizes.window, grid.pitch, strict=True)]
-        kernel = kernel * window_taper(padded, wave, number(plane), (reach[0], reach[1]), paraxial=paraxial)
-    kernel = (kernel * carrier(wave, plane)).to(field.device, field.dtype)
+        kernel = kernel * window_taper(padded, wavelength, number(plane), (reach[0], reach[1]), paraxial=paraxial)
+    kernel = (kernel * carrier(wavelength, plane)).to(field.device, field.dtype)
     light = zoomed(field, kernel, chirps(grid, padded, fine, (0.0, 0.0), field.device))
     y, x = fine.coordinates(field.device)
-    rate = torch.as_tensor(first / second, dtype=torch.float64, device=field.device) / (2 * wave)
+    rate = torch.as_tensor(first / second, dtype=torch.float64, device=field.device) / (2 * wavelength)
     light = light * (turns_phasor(rate * y.square()) * turns_phasor(rate * x.square())).to(field.dtype)
-    bands = pupil_bands(grid, wave, display, eye, plane)
+    bands = pupil_bands(grid, wavelength, display, eye, plane)
     spectrum = _centred(centred_fft2(light), [n * m for n, m in zip(window.shape, bands, strict=True)])
     # The same window, so the same frequencies: those of its centred spectrum, and on.
     eta, xi = (
-        (torch.arange(n * m, dtype=torch.float64, device=field.device) - n * m // 2) / (n * p) * (wave * second)
+        (torch.arange(n * m, dtype=torch.float64, device=field.device) - n * m // 2) / (n * p) * (wavelength * second)
         for n, m, p in zip(window.shape, bands, window.pitch, strict=True)
     )
     eta, xi = eta[:, None], xi[None, :]
     square = eta.square() + xi.square()
-    turns = (back / second - inverse(eye.accommodation)) / (2 * wave) * square
+    cycles = (back / second - inverse(eye.accommodation)) / (2 * wavelength) * square
     if not paraxial:
         legs = display.eye_distance * (back / second) ** 4 + 1 / eye.axial_length**3
-        turns = turns - legs / (8 * wave) * square.square()
-    passed = eye.pupil_function(eta, xi, wave) * turns_phasor(turns)
+        cycles = cycles - legs / (8 * wavelength) * square.square()
+    passed = eye.pupil_function(eta, xi, wavelength) * turns_phasor(cycles)
     share = math.sqrt(math.prod(window.shape) / math.prod(fine.shape))
     image = spectrum * (passed * share).to(field.dtype)
     # Samples at the hologram's pitch have the sum of all bands for their spectrum.
@@ -283,3 +291,6 @@ def _centred(values: Tensor, shape: Sequence[int]) -> Tensor:
 
 def _fft(count: int) -> float:
     return 5 * count * math.log2(max(count, 2))
+
+
+__getattr__ = renamed(__name__, {"imaged": "propagate_collapsed"})

@@ -1,8 +1,8 @@
-"""Rays of a hologram through a display, on one axis: what they ask of windows and pitches. Plain numbers."""
+"""Rays of a hologram through a display, on one axis, which determine windows and pitches. Plain numbers."""
 
 import math
 
-Region = list[tuple[float, float]]  # corners (place in metres, slope) of a convex region of rays
+Region = list[tuple[float, float]]  # corners (position in metres, slope) of a convex region of rays
 
 
 def band(half: float, slope: float) -> Region:
@@ -12,33 +12,33 @@ def band(half: float, slope: float) -> Region:
 
 def travelled(region: Region, distance: float) -> Region:
     """The rays after free space."""
-    return [(place + distance * slope, slope) for place, slope in region]
+    return [(position + distance * slope, slope) for position, slope in region]
 
 
 def refracted(region: Region, power: float) -> Region:
     """The rays behind a thin lens of ``power`` = 1 / focal length."""
-    return [(place, slope - power * place) for place, slope in region]
+    return [(position, slope - power * position) for position, slope in region]
 
 
 def clipped(region: Region, radius: float) -> Region:
     """The rays within ``radius`` of the axis; none at all if the region misses it."""
     for sign in (1, -1):
         kept: Region = []
-        for i, (place, slope) in enumerate(region):
-            before, steep = region[i - 1]
-            inside, was = sign * place <= radius, sign * before <= radius
-            if inside != was:
-                share = (sign * radius - before) / (place - before)
-                kept.append((sign * radius, steep + share * (slope - steep)))
+        for i, (position, slope) in enumerate(region):
+            previous, previous_slope = region[i - 1]
+            inside, was_inside = sign * position <= radius, sign * previous <= radius
+            if inside != was_inside:
+                share = (sign * radius - previous) / (position - previous)
+                kept.append((sign * radius, previous_slope + share * (slope - previous_slope)))
             if inside:
-                kept.append((place, slope))
+                kept.append((position, slope))
         region = kept
     return region
 
 
 def reach(region: Region) -> float:
     """Largest distance from the axis."""
-    return max((abs(place) for place, _ in region), default=0.0)
+    return max((abs(position) for position, _ in region), default=0.0)
 
 
 def steepest(region: Region) -> float:
@@ -47,5 +47,5 @@ def steepest(region: Region) -> float:
 
 
 def fringe(wavelength: float, distance: float) -> float:
-    """Room in metres for what diffraction at edges spreads beyond the rays: 3 sqrt(wavelength z)."""
+    """Margin in metres for light that edges diffract beyond the rays: 3 sqrt(wavelength z)."""
     return 3 * math.sqrt(wavelength * abs(distance))

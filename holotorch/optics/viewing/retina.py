@@ -1,4 +1,4 @@
-"""What arrives on the retina: one call, by the cheaper of two ways that is accurate enough."""
+"""Retina: the image on the retina, by the cheaper of two methods that is accurate enough."""
 
 import math
 import warnings
@@ -14,29 +14,35 @@ from holotorch.core.complex import intensity
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import WIDTH
 from holotorch.optics.viewing.display import Display, Length, inverse, number
-from holotorch.optics.viewing.elementwise import ElementSampling, least_oversampling, through_elements
+from holotorch.optics.viewing.elementwise import ElementSampling, least_oversampling, propagate_elements
 from holotorch.optics.viewing.eye import Eye
-from holotorch.optics.viewing.imaging import CollapseSampling, collapse_sampling, imaged, pupil_bands, retinal_scale
+from holotorch.optics.viewing.imaging import (
+    CollapseSampling,
+    collapse_sampling,
+    propagate_collapsed,
+    pupil_bands,
+    retinal_scale,
+)
 
-# Error of a pupil with a hard rim, times its samples across. Measured: 1.1 to 3.2 for the collapse of points with 1360
-# samples, 0.6 to 3.4 for noise with 42 to 55, 0.4 to 1.3 for elements with 3800.
-_RIM = 3.0
-_RAYS, _HEIGHTS = 512, 9
-_UNUSABLE = 0.5
+# Error of a pupil with a hard edge, times the samples across its diameter. Measured: 1.1 to 3.2 for the collapse of
+# points with 1360 samples, 0.6 to 3.4 for noise with 42 to 55, 0.4 to 1.3 for elements with 3800.
+_EDGE_ERROR = 3.0
+_RAYS, _HEIGHTS = 512, 9  # rays across the pupil, and points of the scene, that predict the error of the collapse
+_UNUSABLE = 0.5  # expected relative error above which an image is refused
 
 
 @dataclass(frozen=True)
 class RetinaPlan:
-    """Which way to the retina, and why.
+    """Method of propagation to the retina, and the reason for it.
 
     Attributes:
         method: "collapse" or "elements".
-        sampling: Sizes of that way, for :func:`imaged` or :func:`through_elements`.
+        sampling: Sizes of that method, for :func:`propagate_collapsed` or :func:`propagate_elements`.
         predicted_error: Expected relative L2 error of the intensity, over points of light within the scene.
         memory_bytes: Largest extra memory of one image of one wavelength.
         flops: Arithmetic of one image of one wavelength.
-        reason: One sentence that says why this one.
-        runner_up: One sentence on the other.
+        reason: One sentence that says why this method was chosen.
+        runner_up: One sentence on the other method.
         adequate: Whether ``predicted_error`` is within the tolerance.
     """
 
@@ -64,65 +70,66 @@ def plan_retina(
     dtype: torch.dtype = torch.complex64,
     memory_limit: int | None = None,
 ) -> RetinaPlan:
-    """Choose between :func:`imaged` and :func:`through_elements`.
+    """Choose between :func:`propagate_collapsed` and :func:`propagate_elements`.
 
     Args:
         grid: Sampling of the hologram.
         wavelengths: In metres, one per channel.
-        display: Where everything stands.
+        display: Positions of hologram, eyepiece and eye.
         eye: Pupil, retina, accommodation.
         tolerance: Largest relative L2 error of the intensity that is wanted.
         plane: Object plane in metres from the hologram, the one in focus by default.
         reach: Half width in metres of the scene in that plane, the hologram's by default.
-        paraxial: Judge by Fresnel's model, in which the collapse has no error but its sampling.
+        paraxial: Predict errors in the Fresnel model, in which the collapse has no error other than its sampling.
         registered: Do not count as an error that parts of the image move by a fraction of a spot.
         dtype: complex64 or complex128, of the field.
-        memory_limit: Refuse a way that needs more bytes than this.
+        memory_limit: Refuse a method that needs more bytes than this.
 
     Returns:
-        The cheapest way within the tolerance; if none is, the most accurate, not adequate.
+        The cheapest method within the tolerance, or else the most accurate one, marked as not adequate.
 
     Raises:
         ValueError: Impossible numbers, more memory than the limit, or an expected error beyond 0.5.
     """
-    waves = checks.wavelengths(wavelengths)
+    wavelengths = checks.wavelengths(wavelengths)
     tolerance = checks.positive("tolerance", tolerance)
     plane = display.object_plane(plane, eye.accommodation)
     if reach is None:
         reach = max(n * p for n, p in zip(grid.shape, grid.pitch, strict=True) if n > 1) / 2
-    checks.quantity(WIDTH, reach, "reach")
-    found: list[tuple[float, str, CollapseSampling | ElementSampling, float, int]] = []
-    heights = [reach * i / (_HEIGHTS - 1) for i in range(_HEIGHTS)]
+    options: list[tuple[float, str, CollapseSampling | ElementSampling, float, int]] = []
+    heights = [checks.quantity(WIDTH, reach, "reach") * i / (_HEIGHTS - 1) for i in range(_HEIGHTS)]
     size, refused = 8 if dtype == torch.complex64 else 16, ""
     try:
-        short = collapse_sampling(grid, waves, display, eye, plane)
+        collapse = collapse_sampling(grid, wavelengths, display, eye, plane)
         error = max(
             collapse_error(grid, w, display, eye, plane, heights, paraxial=paraxial, registered=registered)
-            for w in waves
+            for w in wavelengths
         )
-        across = abs(number(display.matrix(plane)[1])) / (2 * number(eye.pupil_radius))  # spot per wavelength
-        rim = _RIM * max(max(waves) * across / (n * p) for n, p in zip(short.window, grid.pitch, strict=True) if n > 1)
-        passed = max(math.prod(pupil_bands(grid, w, display, eye, plane)) for w in waves) * math.prod(short.window)
-        found.append((short.flops, "collapse", short, math.hypot(error, rim), short.memory_bytes(passed, size)))
+        spot = max(wavelengths) * (abs(number(display.matrix(plane)[1])) / (2 * number(eye.pupil_radius)))
+        across = max(spot / (n * p) for n, p in zip(collapse.window, grid.pitch, strict=True) if n > 1)
+        passed = max(math.prod(pupil_bands(grid, w, display, eye, plane)) for w in wavelengths)
+        memory = collapse.memory_bytes(passed * math.prod(collapse.window), size)
+        options.append((collapse.flops, "collapse", collapse, math.hypot(error, _EDGE_ERROR * across), memory))
     except ValueError as reason:
         refused = f"collapse is impossible here: {reason}"
-    long = least_oversampling(grid, waves, display, eye, plane=plane)
-    step = max(p / m for n, p, m in zip(grid.shape, grid.pitch, long.oversampling, strict=True) if n > 1)
-    rim = min(1.0, _RIM * step / (2 * number(eye.pupil_radius)))
-    found.append((long.flops, "elements", long, rim, long.memory_bytes(size)))
+    elements = least_oversampling(grid, wavelengths, display, eye, plane=plane)
+    step = max(p / m for n, p, m in zip(grid.shape, grid.pitch, elements.oversampling, strict=True) if n > 1)
+    edge = min(1.0, _EDGE_ERROR * step / (2 * number(eye.pupil_radius)))
+    options.append((elements.flops, "elements", elements, edge, elements.memory_bytes(size)))
     limit = math.inf if memory_limit is None else memory_limit
-    fitting = [way for way in found if way[4] <= limit]
+    fitting = [option for option in options if option[4] <= limit]
     if not fitting:
-        least = min(way[4] for way in found)
-        raise ValueError(f"no way to the retina fits into {limit:.3g} bytes, the smallest takes {least:.3g}; crop the "
-                         "hologram or raise memory_limit")  # fmt: skip
-    within = [way for way in fitting if way[3] <= tolerance]
-    best = min(within) if within else min(fitting, key=lambda way: way[3])
+        raise ValueError(f"no way to the retina fits into {limit:.3g} bytes, the smallest takes "
+                         f"{min(o[4] for o in options):.3g}; crop the hologram or raise memory_limit")  # fmt: skip
+    within = [option for option in fitting if option[3] <= tolerance]
+    best = min(within) if within else min(fitting, key=lambda option: option[3])
     flops, method, sampling, error, memory = best
     if error > _UNUSABLE:
         raise ValueError(f"the only way that fits, {method}, has an expected error of {error:.2g}; raise memory_limit, "
                          "or make the scene smaller (reach)")  # fmt: skip
-    others = [f"{way[1]}: error {way[3]:.2g}, {way[0]:.2g} operations, {way[4]:.2g} bytes" for way in found]
+    others = [
+        f"{option[1]}: error {option[3]:.2g}, {option[0]:.2g} operations, {option[4]:.2g} bytes" for option in options
+    ]
     reason = (
         f"{method} at {max(sampling.oversampling):.2f} times the hologram's sampling: error {error:.2g} "
         f"{'within' if within else 'beyond'} the tolerance {tolerance:g}, {flops:.2g} operations, {memory:.2g} bytes"
@@ -146,12 +153,16 @@ def collapse_error(
 
     For points y in the object plane, on one axis: the ray through xi on the pupil has slopes u0 = (xi - A y) / B, u1
     behind the eyepiece and u2 behind the eye. Fresnel leaves out -k / 8 sum d u^4 along the last two, of which the
-    collapse has the part of y = 0; and it lacks the rim of the eyepiece. Spots with and without these are compared and
+    collapse has the part of y = 0; and it lacks the edge of the eyepiece. Spots with and without these are compared and
     the errors averaged over y, weighted with energy. Most of the error is a shift of the spot by a part of its width,
     which an observer does not see; ``registered`` compares after undoing it.
     """
     first, second, _, back = (number(value) for value in display.matrix(plane))
-    s0, far, d_r = number(display.lens_distance) - number(plane), number(display.eye_distance), number(eye.axial_length)
+    s0, eye_distance, d_r = (
+        number(display.lens_distance) - number(plane),
+        number(display.eye_distance),
+        number(eye.axial_length),
+    )
     power, radius = number(inverse(display.focal_length)), number(eye.pupil_radius)
     sine = max(wavelength / (2 * p) for n, p in zip(grid.shape, grid.pitch, strict=True) if n > 1)
     y = torch.tensor(heights, dtype=torch.float64)[:, None]
@@ -161,13 +172,13 @@ def collapse_error(
         u0 = (xi - first * y) / second
         lens = y + s0 * u0
         u1, u2 = u0 - power * lens, -(xi + d_r / second * y) / d_r
-        return far * u1**4 + d_r * u2**4, u0, lens
+        return eye_distance * u1**4 + d_r * u2**4, u0, lens
 
     path, slope, lens = left_out(y)
     lit = (slope.abs() <= sine).double()
-    rim = lit if display.lens_radius is None else lit * (lens.abs() <= number(display.lens_radius))
+    edge = lit if display.lens_radius is None else lit * (lens.abs() <= number(display.lens_radius))
     phase = torch.zeros_like(path) if paraxial else -math.pi / (4 * wavelength) * (path - left_out(0 * y)[0])
-    # What all rays of a spot share does not show.
+    # A phase that all rays of a spot share is not visible.
     phase = phase - (phase * lit).sum(-1, keepdim=True) / lit.sum(-1, keepdim=True).clamp(min=1)
     if registered:
         # A phase linear in xi moves the spot and nothing else.
@@ -175,19 +186,19 @@ def collapse_error(
         phase = (
             phase - (phase * ramp).sum(-1, keepdim=True) / ramp.square().sum(-1, keepdim=True).clamp(min=1e-30) * ramp
         )
-    truth, made = (torch.fft.fft(torch.polar(a, b), 4 * _RAYS) for a, b in ((rim, phase), (lit, 0 * phase)))
+    truth, made = (torch.fft.fft(torch.polar(a, b), 4 * _RAYS) for a, b in ((edge, phase), (lit, 0 * phase)))
     wanted, got = intensity(truth), intensity(made)
     total = got.square().sum()
     return math.sqrt(((got - wanted).square().sum() / total).item()) if total > 0 else 0.0
 
 
 class Retina(nn.Module):
-    """The planned way from hologram to retina: fields complex [..., C, H, W] to the light on the retina.
+    """Planned propagation from hologram to retina: fields complex [..., C, H, W] to the light on the retina.
 
     Args:
         grid: Sampling of the hologram, also of the result, which is referred back to the object plane (upright).
         wavelengths: In metres, one per channel.
-        display: Where everything stands.
+        display: Positions of hologram, eyepiece and eye.
         eye: Pupil, retina, accommodation.
         tolerance: Largest relative L2 error of the intensity.
         plane: Object plane in metres from the hologram, by default the one in focus.
@@ -206,7 +217,7 @@ class Retina(nn.Module):
         MemoryError: In a call, before anything is allocated: the field needs more memory than is available.
 
     Warns:
-        SamplingWarning: No way meets the tolerance; the most accurate one that fits is used.
+        SamplingWarning: No method meets the tolerance; the most accurate one that fits is used.
 
     Lengths given as tensors keep their gradients; the plan stands for the values they have when it is made.
     """
@@ -244,9 +255,9 @@ class Retina(nn.Module):
         return retinal_scale(self.display, self.eye, self.plane)
 
     def field(self, field: Tensor) -> Tensor:
-        """Complex field on the retina, [..., C, H, W], as :func:`imaged` gives it."""
-        way = imaged if self.plan.method == "collapse" else through_elements
-        return way(
+        """Complex field on the retina, [..., C, H, W], as :func:`propagate_collapsed` gives it."""
+        propagate = propagate_collapsed if self.plan.method == "collapse" else propagate_elements
+        return propagate(
             field, self.grid, self.wavelengths, self.display, self.eye, plane=self.plane, paraxial=self.paraxial,
             sampling=self.plan.sampling,  # type: ignore[arg-type]
         )  # fmt: skip

@@ -145,8 +145,8 @@ def test_the_plan_names_what_it_does_not_count(capsys):
 @pytest.mark.parametrize(("tolerance", "method"), [(0.05, "collapse"), (0.03, "elements")])
 def test_the_run_goes_the_way_that_its_plan_says(tolerance, method, tmp_path, monkeypatch):
     called = []
-    collapse = spectral.imaged
-    for name, way in (("collapse", "imaged"), ("elements", "through_elements")):
+    collapse = spectral.propagate_collapsed
+    for name, way in (("collapse", "propagate_collapsed"), ("elements", "propagate_elements")):
         # Elements in fact are tried below; here it counts which way is called.
         monkeypatch.setattr(
             spectral, way, lambda *words, name=name, **more: called.append(name) or collapse(*words, **more)

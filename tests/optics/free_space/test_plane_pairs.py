@@ -16,7 +16,8 @@ from holotorch.optics import CroppedKernel, Propagator, plan_propagation, propag
 from holotorch.optics.free_space.plane_pair import PlanePair, plane_pair
 from holotorch.optics.free_space.resampled import resample, resampling_factors
 from holotorch.optics.free_space.zoomed import chirps, zoomed
-from holotorch.optics.planning.plan import find
+from holotorch.optics.planning.candidates import candidates
+from holotorch.optics.planning.content import field_content
 from holotorch.optics.planning.propagate import kernel_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:no method reaches:holotorch.core.checks.SamplingWarning")
@@ -57,6 +58,11 @@ def follow(tilt: tuple, distance: float) -> tuple[float, float]:
     return distance * tilt[0] / cosine, distance * tilt[1] / cosine
 
 
+def every_method(planes, distance, field=None):
+    content = field_content(planes.grid, [WAVE], [distance], field=field)
+    return candidates(planes, [WAVE], [distance], content, torch.complex128)
+
+
 @pytest.mark.parametrize("crossovers", [0.05, 0.8, 1.2, -1.0, 3.0])
 @pytest.mark.parametrize("window", WINDOWS)
 def test_white_phases_arrive_right_in_any_window(window, crossovers):
@@ -79,7 +85,7 @@ def test_every_way_into_a_window_errs_as_predicted(window, crossovers):
     path = plane_pair(GRID, out, offset, (0.0, 0.0), [WAVE])
     waves, far = (torch.tensor(value, dtype=torch.float64) for value in (WAVE, distance))
     checked = 0
-    for way in find(path, [WAVE], [distance], dtype=torch.complex128):
+    for way in every_method(path, distance):
         if not 1e-6 < way.error < 0.1:
             continue
         if path.same_pitch:
@@ -103,7 +109,7 @@ def test_tilted_light_arrives_as_predicted(tilt, crossovers):
     wanted = exact(field, GRID, offset, distance, sines)
     path = plane_pair(GRID, None, offset, sines, [WAVE])
     waves, far = (torch.tensor(value, dtype=torch.float64) for value in (WAVE, distance))
-    ways = [way for way in find(path, [WAVE], [distance], dtype=torch.complex128) if way.error < 0.1]
+    ways = [way for way in every_method(path, distance) if way.error < 0.1]
     assert ways
     for way in ways:
         got = filter_spectrum(field, kernel_of(path, way, waves, far, torch.complex128))
@@ -185,7 +191,7 @@ def test_measured_content_predicts_the_error_of_the_very_field(kind):
         large = torch.nn.functional.pad(field, (0, 3 * shape[1], 0, 3 * shape[0]))
         wanted = CroppedKernel(wide, WAVE, distance)(large[None])[0, : shape[0], : shape[1]]
         waves, far = (torch.tensor(value, dtype=torch.float64) for value in (WAVE, distance))
-        for way in find(PlanePair(grid, grid), [WAVE], [distance], field=field, dtype=torch.complex128):
+        for way in every_method(PlanePair(grid, grid), distance, field):
             if not 1e-5 < way.error < 0.05:
                 continue
             out = filter_spectrum(field, kernel_of(PlanePair(grid, grid), way, waves, far, torch.complex128))

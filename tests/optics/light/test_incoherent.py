@@ -9,7 +9,7 @@ from holotorch import Grid
 from holotorch.optics.light.coherence import path_difference
 from holotorch.optics.light.incoherent import disc_source, incoherent_sum, tilted_wave
 from holotorch.optics.light.spectrum import Spectrum
-from holotorch.optics.picture import desaturated, equal_power, exposed, linear_srgb
+from holotorch.optics.picture import equal_power, gamut_map, linear_srgb, tone_map
 from holotorch.optics.planning.propagate import propagate
 
 
@@ -75,23 +75,23 @@ def test_equal_power_and_exposure():
     wanted[0, 1] = 0
     torch.testing.assert_close(scaled.sum((-2, -1)), wanted, rtol=1e-12, atol=0)
     peak = sled.amax((-3, -2, -1), keepdim=True)
-    picture = exposed(sled)
+    picture = tone_map(sled)
     torch.testing.assert_close(picture, (sled / peak).sqrt())
     assert picture.amax((-3, -2, -1)).tolist() == [1, 1]
-    over = exposed(scaled, peak=peak)
+    over = tone_map(scaled, peak=peak)
     assert over.max() == 1 and (scaled > peak).any()
-    torch.testing.assert_close(exposed(sled, gamma=1.0), sled / peak)
+    torch.testing.assert_close(tone_map(sled, gamma=1.0), sled / peak)
 
 
 def test_an_empty_picture_is_black_with_finite_gradients():
     image = torch.zeros(3, 4, 5, requires_grad=True)
-    picture = exposed(equal_power(image, torch.ones(3, 4, 5)))
+    picture = tone_map(equal_power(image, torch.ones(3, 4, 5)))
     picture.sum().backward()
     assert torch.equal(picture, torch.zeros(3, 4, 5)) and image.grad is not None
     assert torch.isfinite(image.grad).all()
     half = torch.rand(1, 4, 5, dtype=torch.float64) + 0.1
     peak = torch.tensor(2.0, dtype=torch.float64)
-    assert torch.autograd.gradcheck(lambda x: exposed(x, peak=peak), (half.requires_grad_(),))
+    assert torch.autograd.gradcheck(lambda x: tone_map(x, peak=peak), (half.requires_grad_(),))
 
 
 def test_colours_are_one_product_and_fit_the_gamut():
@@ -99,7 +99,7 @@ def test_colours_are_one_product_and_fit_the_gamut():
     light = torch.rand(2, 3, 4, 5, dtype=torch.float64, requires_grad=True)
     colour = linear_srgb(light, matrix)
     torch.testing.assert_close(colour[1, :, 2, 3], matrix @ light[1, :, 2, 3])
-    shown = desaturated(colour)
+    shown = gamut_map(colour)
     luminance = torch.tensor([0.2126390059, 0.7151686788, 0.0721923153], dtype=torch.float64)
     inside = (colour >= 0).all(-3)
     assert inside.any() and not inside.all() and (shown >= 0).all()
@@ -111,9 +111,9 @@ def test_colours_are_one_product_and_fit_the_gamut():
     torch.testing.assert_close(
         torch.linalg.cross(shown - grey, colour - grey, dim=-3), torch.zeros_like(colour), rtol=0, atol=1e-9
     )
-    assert torch.autograd.gradcheck(lambda x: desaturated(linear_srgb(x, matrix)), (light,), fast_mode=True)
-    assert torch.equal(desaturated(torch.zeros(3, 2, 2)), torch.zeros(3, 2, 2))
-    assert torch.equal(desaturated(-torch.ones(3, 2, 2)), torch.zeros(3, 2, 2))
+    assert torch.autograd.gradcheck(lambda x: gamut_map(linear_srgb(x, matrix)), (light,), fast_mode=True)
+    assert torch.equal(gamut_map(torch.zeros(3, 2, 2)), torch.zeros(3, 2, 2))
+    assert torch.equal(gamut_map(-torch.ones(3, 2, 2)), torch.zeros(3, 2, 2))
 
 
 def test_refusals():
@@ -131,9 +131,9 @@ def test_refusals():
     with pytest.raises(ValueError, match="channels must match"):
         equal_power(image, torch.rand(2, 4, 5))
     with pytest.raises(ValueError, match="gamma must be above zero"):
-        exposed(image, gamma=0.0)
+        tone_map(image, gamma=0.0)
     with pytest.raises(ValueError, match=r"needs a matrix \[3, K\]"):
         linear_srgb(image, torch.rand(3, 4))
     with pytest.raises(ValueError, match="red, green, blue"):
-        desaturated(torch.rand(4, 4, 5))
+        gamut_map(torch.rand(4, 4, 5))
     assert path_difference(0.0, 0.1) == 0

@@ -10,13 +10,13 @@ from holotorch.optics import (
     Display,
     Eye,
     Spectrum,
-    imaged,
     least_followed,
     neighbour_error,
     neighbours,
+    propagate_collapsed,
+    propagate_elements,
     seen_light,
     spectral_image,
-    through_elements,
 )
 from holotorch.optics.light.quadrature import gauss_rule
 from holotorch.optics.light.wavelength_sampling import followed
@@ -99,7 +99,7 @@ def test_a_neighbour_equals_the_wavelength_itself(elements, paraxial):
     """Away from the edges, through a soft pupil: 4 nm beside the green, where no speckle is left as it was."""
     grid, eye = Grid((72, 64), 8e-6), Eye(1e-3, 24e-3, 60e-3, softness=60e-6)
     display, other = Display.planar(80e-3), GREEN + 4e-9
-    field, way = random_phase(grid, torch.complex64)[None], through_elements if elements else imaged
+    field, way = random_phase(grid, torch.complex64)[None], propagate_elements if elements else propagate_collapsed
     image, wanted = (way(field, grid, wave, display, eye, paraxial=paraxial)[0] for wave in (GREEN, other))
     (got,) = neighbours(image, grid, GREEN, [other], display, eye, elements=elements)
     got, before, wanted = (each[12:-12, 12:-12].abs().square() for each in (got, image, wanted))
@@ -115,7 +115,7 @@ def test_the_errors_of_the_eye_are_those_of_each_wavelength(elements):
     eye = Eye(1e-3, 24e-3, 60e-3, {4: 0.2e-6, 8: 0.1e-6}, chromatic_reference=GREEN, softness=60e-6)
     field, way, other = (
         random_phase(grid, torch.complex64)[None],
-        through_elements if elements else imaged,
+        propagate_elements if elements else propagate_collapsed,
         GREEN + 4e-9,
     )
     image, wanted = (way(field, grid, wave, display, eye, paraxial=True)[0] for wave in (GREEN, other))
@@ -151,7 +151,9 @@ def test_the_hologram_in_focus_shows_no_difference_of_paths():
     at, behind = (Eye(1e-3, 24e-3, far, softness=60e-6) for far in (80e-3, 100e-3))
     grid, other = Grid((96, 80), 8e-6), GREEN + 4e-9
     for eye in (at, behind):
-        image, wanted = (imaged(random_phase(grid)[None], grid, wave, display, eye)[0] for wave in (GREEN, other))
+        image, wanted = (
+            propagate_collapsed(random_phase(grid)[None], grid, wave, display, eye)[0] for wave in (GREEN, other)
+        )
         (got,) = neighbours(image, grid, GREEN, [other], display, eye)
         inside = slice(12, -12), slice(12, -12)
         assert relative(got[inside].abs().square(), wanted[inside].abs().square()) < 0.035

@@ -13,7 +13,8 @@ from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import phasor
 from holotorch.optics import CroppedKernel, Propagator, plan_propagation, propagate
 from holotorch.optics.free_space.plane_pair import PlanePair
-from holotorch.optics.planning.plan import find
+from holotorch.optics.planning.candidates import candidates
+from holotorch.optics.planning.content import FieldContent
 from holotorch.optics.planning.propagate import kernel_of
 
 pytestmark = [
@@ -133,7 +134,7 @@ def test_prediction_is_within_a_factor_of_ten_and_never_below_a_third_over_rando
         exact = CroppedKernel(wide, wavelength, distance)(padded[None])[0, : grid.shape[0], : grid.shape[1]]
         band = (share / (2 * pitch), share / (2 * pitch))
         path = PlanePair(grid, grid)
-        found = find(path, [wavelength], [distance], band=band)
+        found = candidates(path, [wavelength], [distance], FieldContent(band))
         truths = {}
         for way in found:
             waves, far = torch.tensor(wavelength, dtype=torch.float64), torch.tensor(distance, dtype=torch.float64)

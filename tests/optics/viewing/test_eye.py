@@ -6,7 +6,7 @@ import torch
 
 from holotorch import Grid
 from holotorch.core.checks import SamplingWarning
-from holotorch.optics import Display, Eye, EyeLens, chromatic_refraction, imaged, zernike
+from holotorch.optics import Display, Eye, EyeLens, chromatic_refraction, propagate_collapsed, zernike
 
 GRID = Grid((48, 40), (8e-6, 9e-6))
 RED = 636e-9
@@ -54,7 +54,7 @@ def test_defocus_by_zernike_is_defocus_by_accommodation():
     other = Eye(radius, 24e-3, 22e-3, softness=20e-6)
     same = Eye(radius, 24e-3, 25e-3, aberrations={4: -shift * radius**2 / (4 * math.sqrt(3))}, softness=20e-6)
     wanted, got, sharp = (
-        imaged(light, GRID, RED, NEAR, eye, plane=-5e-3, paraxial=True).abs()
+        propagate_collapsed(light, GRID, RED, NEAR, eye, plane=-5e-3, paraxial=True).abs()
         for eye in (other, same, Eye(radius, 24e-3, 25e-3, softness=20e-6))
     )
     # Up to a phase on all of the pupil; windows differ in the room for the blur, which wraps 1e-3 of the light.
