@@ -11,6 +11,7 @@ from holotorch.experiments.config.errors import ConfigError, short
 Key = tuple[str | int, ...]
 _LARGEST = 1 << 17  # largest file in bytes; it takes up to 4 s to parse
 _MOST = 100_000  # largest number of values; a file of that size can only have more through aliases
+_DEEPEST = 50  # levels of keys in keys; configurations have fewer than ten
 MOST_MISTAKES = 50  # largest number of mistakes that are listed
 
 
@@ -123,6 +124,8 @@ class _Expanded(Exception):
 
 
 def _construct(loader, node: yaml.Node, name: str, positions: dict[Key, str], key: Key, mistakes: list[str]) -> Any:
+    if len(key) > _DEEPEST:
+        raise RecursionError
     positions.setdefault(key, f"{name}:{node.start_mark.line + 1}:{node.start_mark.column + 1}")
     if len(positions) > _MOST:  # every value has a position
         raise _Expanded(positions[key])
