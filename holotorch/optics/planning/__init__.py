@@ -1,1 +1,1 @@
-"""Which way to propagate: the content, the error of each way, and the plan."""
+"""Choice of a propagation method: field content, predicted errors, candidates, and the plan."""

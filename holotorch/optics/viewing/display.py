@@ -1,4 +1,4 @@
-"""Display: where hologram, eyepiece and eye stand, and the ray matrices between them."""
+"""Display: positions of hologram, eyepiece and eye, and the ray matrices between them."""
 
 import math
 from dataclasses import dataclass
@@ -15,18 +15,18 @@ Matrix = tuple[Length, Length, Length, Length]
 
 @dataclass(frozen=True)
 class Display:
-    """Hologram, eyepiece, eye on one axis: the thesis's volume-magnifying display (Fig. 5.5), or one of its relatives.
+    """Hologram, eyepiece and eye on one axis, such as the volume-magnifying display of the thesis (Fig. 5.5).
 
-    All in metres; each may be a tensor that carries a gradient.
+    All lengths are in metres; each may be a tensor that carries a gradient.
 
     Attributes:
         lens_distance: d_el from hologram to eyepiece, at least 0; beyond ``focal_length`` it magnifies the volume.
-        focal_length: f_el of the eyepiece, infinite for none.
+        focal_length: f_el of the eyepiece, infinite without an eyepiece.
         eye_distance: d_eye from eyepiece to the lens of the eye, at least 0.
-        lens_radius: r_el, half the clear width of the eyepiece; None does not limit the light.
+        lens_radius: r_el, half the clear width of the eyepiece; None for an unlimited width.
 
     Raises:
-        ValueError: A length that cannot be meant: a distance below 0, a focal length of 0, millimetres for metres.
+        ValueError: A length is implausible: a distance below 0, a focal length of 0, or a value in millimetres.
     """
 
     lens_distance: Length
@@ -61,7 +61,7 @@ class Display:
         return 1 - self.eye_distance * power, s0 + self.eye_distance * back, -power, back
 
     def object_plane(self, plane: Length | None, accommodation: Length) -> Length:
-        """``plane`` in metres from the hologram, or without one that in focus; ValueError if it cannot be meant."""
+        """``plane`` in metres from the hologram, by default the plane in focus; ValueError if it is implausible."""
         if plane is None:
             return self.focus_plane(accommodation)
         checks.quantity(PLANE, number(plane), "plane")
@@ -73,7 +73,7 @@ class Display:
         d_el - s0 with 1 / s0 = 1 / (accommodation - d_eye) + 1 / f; negative lies behind the hologram.
 
         Raises:
-            ValueError: That plane is at infinity.
+            ValueError: The plane is at infinity.
         """
         ahead = accommodation - self.eye_distance
         if math.isinf(number(ahead)):
@@ -88,7 +88,7 @@ class Display:
 
 
 def number(value: Length) -> float:
-    """A plain number, of a tensor without its gradient."""
+    """The value as a float, without gradient."""
     return float(value.detach()) if isinstance(value, Tensor) else float(value)
 
 

@@ -1,4 +1,4 @@
-"""Whether the tube shows where a pose puts it, or where the same bands read from the other end would put it."""
+"""Test whether the tube extends beyond the bands as a pose says, or as the pose with reversed bands would."""
 
 from dataclasses import dataclass
 
@@ -12,21 +12,21 @@ from holotorch.tracking.pose.resection import LinePose
 
 @dataclass(frozen=True)
 class EndCheck:
-    """How the tube is looked for beyond its bands.
+    """Parameters of the search for the tube beyond its bands.
 
-    On the 70 right poses and 63 reversed ones of ``trials.conditions``, ``trials.occlusions`` and 30 random poses, the
-    share of stations that show a tube was 0.82 or more where there is one and 0.23 or less where there is none.
+    On the 70 correct and 63 reversed poses of ``trials.conditions``, ``trials.occlusions`` and 30 random poses, the
+    share of stations that show a tube was at least 0.82 with a tube and at most 0.23 without one.
     """
 
-    stations: int = 40  # along a part of the tube
-    fewest: int = 8  # of them on the frame, for a part to count
-    margin: float = 4e-3  # metres left out at either end of a part: the deviation of a tip, and a tip that tapers
-    shown: float = 0.6  # share of stations from which on a part shows a tube
-    missing: float = 0.4  # share up to which it shows none
-    contrast: float = 4.0  # 8-bit levels by which a tube is brighter, or darker, than both its sides
+    stations: int = 40  # stations along a part of the tube
+    fewest: int = 8  # least number of stations on the frame for a part to be evaluated
+    margin: float = 4e-3  # metres left out at each end of a part, for the error of the tip and its taper
+    shown: float = 0.6  # share of stations at and above which a part shows a tube
+    missing: float = 0.4  # share of stations up to which a part shows no tube
+    contrast: float = 4.0  # least difference of the tube from both of its sides, in 8-bit levels
 
 
-_INSIDE = np.array([-0.3, -0.15, 0.0, 0.15, 0.3])  # widths from the axis
+_INSIDE = np.array([-0.3, -0.15, 0.0, 0.15, 0.3])  # rows on the tube, in widths from the axis
 _BESIDE = np.array([0.9, 1.2, 1.5, 1.8])
 _ACROSS = np.concatenate([-_BESIDE[::-1], _INSIDE, _BESIDE])
 _SIZES = len(_BESIDE), len(_INSIDE), len(_BESIDE)
@@ -38,12 +38,12 @@ _MEANS = np.repeat(
 def shows_reversed(
     sampler: Sampler, lens: Lens, found: LinePose, catheter: Catheter, check: EndCheck | None = None
 ) -> bool:
-    """Whether the tube goes on beyond the tip, or the rear, of a pose and is missing where the pose says that it is.
+    """Whether the tube is visible where only the reversed bands would put it, and missing where the pose puts it.
 
-    So does a frame whose red and blue are exchanged, where the bands' colours are the same from both ends: read from
-    the other end, the catheter lies along the same line, but for the lengths of tube beyond its bands. Both signs are
-    needed, so that neither a hand that holds the rear, nor a thing in line with the tip, says it alone. False where the
-    tube is as long on both sides of the bands, or these parts leave the frame.
+    This happens on a frame with exchanged red and blue if the exchange reverses the order of the bands' colours. The
+    reversed catheter lies on the same line, but has other lengths of tube beyond its bands. Both signs are required,
+    because a hand may hide the rear, and another object may lie in line with the tip. The result is False if the tube
+    is equally long on both sides of the bands, or if these parts are outside the frame.
     """
     check = check or EndCheck()
     reach = catheter.edges[0] + catheter.edges[-1]  # where the tip lies if the bands are read from the other end
@@ -54,7 +54,7 @@ def shows_reversed(
     if long - short < 4 * check.margin:
         return False
     beyond = _share(sampler, lens, found, catheter.radius, ahead, check)
-    if beyond is None or beyond < check.shown:  # as on most frames
+    if beyond is None or beyond < check.shown:  # the usual case
         return False
     due = _share(sampler, lens, found, catheter.radius, behind, check)
     return due is not None and due <= check.missing
@@ -63,9 +63,9 @@ def shows_reversed(
 def _share(
     sampler: Sampler, lens: Lens, found: LinePose, radius: float, part: tuple[float, float], check: EndCheck
 ) -> float | None:
-    """Share of the stations along ``part``, metres from the tip, at which something shows that is as wide as the tube.
+    """Share of the stations along ``part``, in metres from the tip, at which an object of the tube's width is visible.
 
-    None where fewer than ``check.fewest`` lie on the frame.
+    None if fewer than ``check.fewest`` lie on the frame.
     """
     begin, end = part[0] + check.margin, part[1] - check.margin
     places = begin + (end - begin) / (check.stations - 1) * np.arange(check.stations)
@@ -82,10 +82,10 @@ def _share(
     sideways = 1j * along / abs(along) * (2 * radius / depth)
     pixels = lens.distort(axis[:, None] + sideways[:, None] * _ACROSS)
     inside = sampler.inside(pixels[:, [0, -1]]).all(-1)
-    if (seen := int(inside.sum())) < check.fewest:
+    if (count := int(inside.sum())) < check.fewest:
         return None
-    # Means over one side, the tube and the other side, of all three colours.
-    levels = sampler.nearest(pixels if seen == len(pixels) else pixels[inside])
-    one, tube, other = _MEANS @ levels.reshape(seen, -1).astype(np.float32).T
+    # Mean levels of all three channels over one side, the tube and the other side.
+    levels = sampler.nearest(pixels if count == len(pixels) else pixels[inside])
+    one, tube, other = _MEANS @ levels.reshape(count, -1).astype(np.float32).T
     brighter, darker = tube - np.maximum(one, other), np.minimum(one, other) - tube
-    return max(int((brighter > check.contrast).sum()), int((darker > check.contrast).sum())) / seen
+    return max(int((brighter > check.contrast).sum()), int((darker > check.contrast).sum())) / count

@@ -1,7 +1,7 @@
-"""Where an edge lies between two colours, to hundredths of a pixel, with deviations.
+"""Position of an edge between two colours to hundredths of a pixel, with its standard deviation.
 
-In linear light, and what need not be known (levels of each row and channel) is projected out: variable projection
-(Golub and Pereyra 1973). Rows and channels weigh by their noise.
+The fit works in linear light and weights samples by their inverse variances. The light levels of each row and channel
+are eliminated by variable projection (Golub and Pereyra 1973).
 """
 
 import math
@@ -12,37 +12,39 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-_STEPS = 8
-_ENDS = 0.06, 0.16  # of a blur, or samples, of place and blur: the steps after are a twentieth,
-_NEAR = 0.03  # and of places two more follow, the last of them so small
-_SHARED = 1.2  # neighbours share pixels: how much larger deviations are than of samples that do not, measured
-_STRANGE = 1.5  # what is left, over its white part: above it the model misses something, and averaging does not help
-_OWN = 1.4  # of the same: how far apart shading and gloss put the places of channels, in what noise does, measured
-_OTHER = 4.0  # standard deviations of an edge's own blur
-SHARPEST, BLUNTEST = 0.35, 10.0  # pixels, standard deviation of an edge
+_STEPS = 8  # most Gauss-Newton steps
+# Largest last step of position and of blur at convergence, in samples or relative to the blur; the next steps would be
+# a twentieth of them.
+_ENDS = 0.06, 0.16
+_NEAR = 0.03  # the same for the last of the two further steps of the position alone
+_SHARED = 1.2  # measured ratio of a position's deviation to that without pixels shared by adjacent samples
+_STRANGE = 1.5  # ratio of the residual to its white part above which the model is incomplete
+_OWN = 1.4  # measured ratio of the channels' scatter, which shading and gloss increase, to that from noise
+_OTHER = 4.0  # standard deviations by which an edge's blur may differ from the shared one
+SHARPEST, BLUNTEST = 0.35, 10.0  # pixels: least and largest standard deviation of an edge's blur
 
-# Of an edge: (t [T], place [E], blur [E]), all in samples, to what it is there and its slopes to both, [E, 3, T].
+# Model of an edge: maps t [T], position [E] and blur [E], in samples, to its values and both derivatives, [E, 3, T].
 Shape = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 def median(values: np.ndarray) -> float:
-    """Of [n], n > 0; of an even number the one above the middle. NumPy's own is ten times as slow for a few."""
+    """Upper median of values [n], n > 0; NumPy's median takes ten times as long for a few values."""
     return float(np.sort(values)[len(values) // 2])
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeFit:
-    """Of edges [E].
+    """Fit of edges [E].
 
     Attributes:
-        place: In samples from the window's middle.
-        blur: Standard deviation of the edge in samples.
-        deviation: Standard deviation of ``place`` from the noise; infinite where there is no edge.
-        noise: Standard deviation of what the fit leaves, over that of the weights: 1 where those are right.
-        steps: [E, U, C], light after the edge less light before, of each row and channel.
-        levels: [E, U, C], light before.
-        told: [E, U, C], what a step of 1 would tell of the place in each row and channel: an inverse variance.
-        apart: [E], how much farther apart the channels put edges than noise does; 1 or more, alike for all.
+        place: [E] positions in samples from the middle of the window.
+        blur: [E] standard deviations of the blur in samples.
+        deviation: [E] standard deviations of ``place`` from the noise; infinite where there is no edge.
+        noise: Standard deviation of the residuals over that of the weights; 1 if the weights are correct.
+        steps: [E, U, C] light after the edge minus light before it, in each row and channel.
+        levels: [E, U, C] light before the edge.
+        told: [E, U, C] inverse variance of the position from a unit step in each row and channel.
+        apart: [E] scatter of the channels' positions relative to that from noise; at least 1, equal for all edges.
     """
 
     place: np.ndarray
@@ -55,14 +57,14 @@ class EdgeFit:
     apart: np.ndarray
 
     def or_better(self, other: "EdgeFit") -> "EdgeFit":
-        """Of each edge the fit with the smaller deviation."""
+        """For each edge, the one of the two fits that has the smaller deviation."""
         better = other.deviation < self.deviation
         pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
         return EdgeFit(*(np.where(better.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in pairs))
 
 
 def normal_step(t: np.ndarray, place: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """A step from 0 to 1 at ``place`` [E], blurred by ``sigma`` [E], at t [T]; and its slopes to both: [E, 3, T]."""
+    """Step from 0 to 1 at ``place`` [E], blurred by ``sigma`` [E], at t [T], and both derivatives: [E, 3, T]."""
     z = (t - place[:, None]) / sigma[:, None]
     found = np.empty((len(z), 3, len(t)))
     found[:, 0] = ndtr(z)
@@ -78,14 +80,14 @@ def fit_edges(
     shape: Shape = normal_step,
     t: np.ndarray | None = None,
 ) -> EdgeFit:
-    """Error functions of a place for each edge and one blur, with levels of their own in each row and channel.
+    """Fit a position to each edge and one blur to all, with separate light levels in each row and channel.
 
     Args:
-        light: [E, T, U, C] samples; T odd, the edge near the middle.
-        weight: Inverse variances, of the same shape; 0 leaves a sample out.
-        blur: To begin with, in samples.
-        shape: Of an edge: a step in light, unless something else is told of it.
-        t: [T], where the samples lie, rising, as far to one side of the middle as to the other; one apart by itself.
+        light: [E, T, U, C] samples of E edges at T positions in U rows and C channels; T odd, the edge near the middle.
+        weight: [E, T, U, C] inverse variances; 0 leaves a sample out.
+        blur: Initial standard deviation of the blur in samples.
+        shape: Model of an edge, by default a blurred step.
+        t: [T] positions of the samples, increasing and symmetric about 0; by default one apart.
     """
     rows, flat = light.shape[2:], (*light.shape[:2], -1)  # [E, T, U C]
     light, weight = (np.ascontiguousarray(given, dtype=np.float64).reshape(flat) for given in (light, weight))

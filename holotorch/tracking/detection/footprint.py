@@ -1,4 +1,4 @@
-"""What a pose makes of the catheter on a line of its image: how wide it is there, and how its rings bulge."""
+"""Image of a catheter at a given pose: the width of the tube along its image line, and the bulge of its rings."""
 
 import math
 from collections.abc import Sequence
@@ -10,8 +10,8 @@ from holotorch.tracking.camera.strips import Line
 from holotorch.tracking.detection.fits import SHARPEST
 from holotorch.tracking.pose.resection import LinePose
 
-_INTERPOLATED = 1 / 6  # pixels^2 that bilinear samples add to a blur, whatever their direction
-_NODES = (np.arange(16) + 0.5) / 8 - 1  # across a tube, from one side to the other
+_INTERPOLATED = 1 / 6  # variance in pixels^2 that bilinear interpolation adds to a blur in any direction
+_NODES = (np.arange(16) + 0.5) / 8 - 1  # midpoints of 16 slices across a tube, whose sides lie at -1 and 1
 _ROUND = np.sqrt(1 - _NODES**2)
 _LIT = np.stack([np.ones_like(_NODES), _NODES, _ROUND], -1)
 _BOTH = np.concatenate([_LIT, _LIT * _ROUND[:, None]], -1)
@@ -19,12 +19,12 @@ _RIDGE = 1e-4 * np.eye(_LIT.shape[1])
 
 
 def width_px(found: LinePose, positions: Sequence[float], radius: float, line: Line) -> tuple[float, float]:
-    """Of the tube's image at t = 0 in pixels across the line, and its change per pixel.
+    """Width of the tube's image at t = 0 in pixels across the line, and its change per pixel.
 
-    2 r / (z sqrt(1 - n_z^2)) on the plane z = 1, n the unit normal of the plane through axis and camera: what is
-    seen aside of the image's middle is seen at a slant.
+    On the plane z = 1 the width is 2 r / (z sqrt(1 - n_z^2)), where n is the unit normal of the plane through the axis
+    and the camera centre. The root accounts for oblique rays away from the image centre.
     """
-    # In plain numbers, as all of this: of so few rings, the calls into NumPy would cost several times as much.
+    # Plain Python numbers, here and below: for so few rings, NumPy calls cost several times as much.
     (x, y, z), (a, b, c) = found.tip.tolist(), found.direction.tolist()
     nx, ny, nz = y * c - z * b, z * a - x * c, x * b - y * a
     slant = math.sqrt(1 + nz * nz / (nx * nx + ny * ny)) if nx or ny else math.inf
@@ -35,7 +35,7 @@ def width_px(found: LinePose, positions: Sequence[float], radius: float, line: L
 
 
 def bulge_px(found: LinePose, positions: Sequence[float], radius: float, line: Line) -> np.ndarray:
-    """How far along the line [N], in pixels, the front of each ring's image lies from that of its centre."""
+    """Distance [N] along the line, in pixels, from the image of each ring's centre to that of its front."""
     (x, y, z), (a, b, c) = found.tip.tolist(), found.direction.tolist()
     onward = x * a + y * b + z * c
     fx, fy, fz = onward * a - x, onward * b - y, onward * c - z
@@ -48,21 +48,21 @@ def bulge_px(found: LinePose, positions: Sequence[float], radius: float, line: L
 
 
 def axis_on_plane(found: LinePose, position: float) -> complex:
-    """The tool's point ``position`` metres from its tip, seen on the plane z = 1; NaN in the camera's own plane."""
+    """Image on the plane z = 1 of the axis point ``position`` metres from the tip; NaN in the plane z = 0."""
     (x, y, z), (a, b, c) = found.tip.tolist(), found.direction.tolist()
     return complex(x + position * a, y + position * b) / (z + position * c or math.nan)
 
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """How far rings' fronts bulge in rows [U] across the images of tubes [E], as shares of the bulge in their middles.
+    """Bulge of the rings' fronts in rows [U] across the images of tubes [E], relative to the bulge at the mid-line.
 
-    A row sees its neighbours through the blur: what it shows is the mean of their shares, weighed by how much each of
-    them changes at the edge. Light on a tube changes across it, and what shines through clear tube not in the same way.
+    The blur mixes adjacent rows: the observed bulge is their mean, weighted by the step of light at the edge in each.
+    These steps vary across the tube, in K shapes.
 
     Attributes:
-        mean: [E, U], where the change is the same all across.
-        change, bulge: [E, U, K], of changes of K shapes across: what a row sees of each, and that times the share.
+        mean: [E, U] bulge if the step of light is constant across the tube.
+        change, bulge: [E, U, K] blurred step of each shape, and the same weighted by the bulge.
     """
 
     mean: np.ndarray
@@ -71,7 +71,7 @@ class Front:
 
     @staticmethod
     def of(u: np.ndarray, widths: np.ndarray, blur: float) -> "Front":
-        """In rows ``u`` from the mid-line of tubes so wide [E], all in pixels; ``blur`` of bilinear samples' sides."""
+        """Bulge in rows ``u`` [U] of tubes of ``widths`` [E] with sides of standard deviation ``blur``; pixels."""
         sigma = math.sqrt(max(blur**2 - _INTERPOLATED, SHARPEST**2))
         z = (u[:, None] - widths[:, None, None] / 2 * _NODES) * (math.sqrt(0.5) / sigma)
         both = (np.exp(-z * z) + 1e-30) @ _BOTH
@@ -79,12 +79,12 @@ class Front:
         return Front(bulge[..., 0] / change[..., 0], change, bulge)
 
     def shift(self, steps: np.ndarray, told: np.ndarray, row: np.ndarray) -> np.ndarray:
-        """[E], by how much more than ``mean`` the edges bulge on average, as light changes at them.
+        """Average bulge of the edges [E] in excess of ``mean``, from the steps of light at them.
 
         Args:
-            steps: [E, U, C], change of light at the edges.
-            told: [E, U, C], what a step of 1 tells of the place: an inverse variance.
-            row: [E, U], weights of the rows.
+            steps: [E, U, C] steps of light at the edges.
+            told: [E, U, C] inverse variance of the position from a unit step.
+            row: [E, U] weights of the rows.
         """
         known = (row[:, None] * (told > 0).swapaxes(1, 2))[..., None]
         weighed = (self.change[:, None] * known).swapaxes(2, 3)  # [E, C, K, U]

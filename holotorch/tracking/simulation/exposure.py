@@ -1,4 +1,4 @@
-"""What a sensor and a codec do to levels: noise, rounding, colours at half resolution, JPEG."""
+"""Effects of a sensor and a codec on levels: noise, rounding, chroma at half resolution, JPEG."""
 
 from functools import lru_cache
 
@@ -6,19 +6,20 @@ import cv2
 import numpy as np
 import torch
 
-_NOISE = 1 << 21  # normal deviates drawn once; each row of a frame begins anywhere among them
-_ROWS = 64  # at a time: in the processor's cache, and no large holes in the memory when they are done
+_NOISE = 1 << 21  # number of normal deviates, drawn once; each row of a frame starts at a random one
+_ROWS = 64  # rows processed at a time, so that they fit the processor's cache
 
 
 @lru_cache(maxsize=1)
 def _deviates() -> np.ndarray:
+    """Normal deviates that all frames share."""
     return torch.randn(_NOISE, generator=torch.Generator().manual_seed(20)).numpy()
 
 
 def sensed(
     levels: np.ndarray, noise: float, video: bool, jpeg_quality: int | None, generator: torch.Generator | None
 ) -> np.ndarray:
-    """Frame uint8 [3, H, W] that sensor and codec make of levels float32 of the same shape; ``noise`` in levels."""
+    """Frame uint8 [3, H, W] that sensor and codec produce from levels float32 [3, H, W]; ``noise`` in levels."""
     frame = expose(levels, noise, generator)
     if video:
         frame = halve_colours(frame)
@@ -26,7 +27,7 @@ def sensed(
 
 
 def expose(frame: np.ndarray, noise: float, generator: torch.Generator | None) -> np.ndarray:
-    """Levels uint8 [3, H, W] of levels float32 of the same shape, with white noise of so many levels."""
+    """Levels uint8 [3, H, W]: rounded levels float32 [3, H, W] with white noise of standard deviation ``noise``."""
     flat = frame.reshape(-1, frame.shape[-1])
     rows = np.lib.stride_tricks.sliding_window_view(_deviates(), frame.shape[-1])
     start = torch.randint(len(rows), (len(flat),), generator=generator).numpy()
@@ -38,7 +39,7 @@ def expose(frame: np.ndarray, noise: float, generator: torch.Generator | None) -
 
 
 def halve_colours(levels: np.ndarray) -> np.ndarray:
-    """Levels [3, H, W] whose every 2 x 2 pixels keep their luma and share the chroma of the upper left one."""
+    """Levels [3, H, W] with full luma, where each 2 x 2 pixels share the chroma of the upper left one."""
     height, width = levels.shape[1:]
     even = np.pad(levels, ((0, 0), (0, height % 2), (0, width % 2)), "edge").transpose(1, 2, 0)
     planes = cv2.cvtColor(np.ascontiguousarray(even), cv2.COLOR_RGB2YUV_I420)
@@ -47,7 +48,7 @@ def halve_colours(levels: np.ndarray) -> np.ndarray:
 
 
 def compress(levels: np.ndarray, quality: int) -> np.ndarray:
-    """Levels [3, H, W] through a JPEG of ``quality`` 1 to 100, its chroma at half resolution."""
+    """Levels [3, H, W] after JPEG compression with ``quality`` 1 to 100 and chroma at half resolution."""
     options = [cv2.IMWRITE_JPEG_QUALITY, quality]
     options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(levels[::-1].transpose(1, 2, 0)), options)

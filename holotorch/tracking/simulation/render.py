@@ -1,4 +1,4 @@
-"""Synthetic frames of a catheter: rays through the camera model, light, blur, tone curve, noise; the truth is exact."""
+"""Renders synthetic frames of a catheter with exact truth: camera rays, light, blur, tone curve and noise."""
 
 import math
 from collections.abc import Iterator
@@ -17,14 +17,14 @@ from holotorch.tracking.simulation.cast import Rays, Tube, cast, light_of, tube_
 from holotorch.tracking.simulation.exposure import sensed
 
 Colour = tuple[int, int, int]
-_FINE = 4  # samples along a pixel's side while it is blurred; on an edge each has 8 rays
-_TILE = 96  # pixels along the side of what is cast and blurred at a time
-_LARGEST = 8192  # pixels along a side
+_FINE = 4  # samples along a pixel's side before the blur; a sample on an edge has 8 rays
+_TILE = 96  # side of a tile, which is ray-cast and blurred at a time, in pixels
+_LARGEST = 8192  # largest side of a frame in pixels
 
 
 @dataclass(frozen=True)
 class Occluder:
-    """A flat thing before the catheter: corners (x, y) in pixels (painted up to 0.2 larger) and its sRGB colour."""
+    """Flat polygon in front of the catheter: corners (x, y) in pixels (drawn up to 0.2 larger) and sRGB colour."""
 
     corners: tuple[tuple[float, float], ...]
     colour: Colour
@@ -38,38 +38,37 @@ class Occluder:
 
     @staticmethod
     def capsule(start: tuple[float, float], end: tuple[float, float], radius: float, colour: Colour) -> "Occluder":
-        """A stroke with round ends, such as a finger; ``start``, ``end`` and ``radius`` in pixels."""
+        """Line segment with round ends, such as a finger; ``start``, ``end`` and ``radius`` in pixels."""
         checks.positive("radius", radius, "pixels")
         along = math.atan2(end[1] - start[1], end[0] - start[0])
-        turns = [along + math.pi * (0.5 + i / 16) for i in range(17)]
-        first = [(start[0] + radius * math.cos(a), start[1] + radius * math.sin(a)) for a in turns]
-        last = [(end[0] - radius * math.cos(a), end[1] - radius * math.sin(a)) for a in turns]
+        angles = [along + math.pi * (0.5 + i / 16) for i in range(17)]
+        first = [(start[0] + radius * math.cos(a), start[1] + radius * math.sin(a)) for a in angles]
+        last = [(end[0] - radius * math.cos(a), end[1] - radius * math.sin(a)) for a in angles]
         return Occluder((*first, *last), colour)
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """All that a frame shows and suffers, apart from where the catheter is.
+    """Appearance of a frame and its image errors; everything except the catheter's pose.
 
     Attributes:
-        background: uint8 [3, H, W] as the camera shows it without the catheter (its lens has blurred it already), or
-            one colour.
-        gain: Factor on all light: the exposure.
-        light: Towards the light, in the camera's frame; any length. It is as strong as it takes to show a surface that
-            faces the camera in its own colour, up to four times: the background is such a surface.
-        ambient: Share of the light that comes from everywhere, 0 to 1.
+        background: Image uint8 [3, H, W] of the scene without the catheter, already blurred by the lens, or one colour.
+        gain: Factor on all light, as from the exposure.
+        light: Direction towards the light in the camera's coordinates; its length does not matter. Its strength shows a
+            surface that faces the camera, such as the background, in its own colour, with a factor of at most four.
+        ambient: Share of the light that comes equally from all directions, 0 to 1.
         ramp: Relative change of all light from the centre of the frame to its right and to its lower border.
-        highlight: Light that shines back from the tube's gloss, 1 as bright as white paper.
-        highlight_width: Of its lobe, standard deviation in radians.
-        tube: Colour outside the bands.
-        opacity: Of the tube outside the bands, looking straight at it, 0 to 1; more where it is seen at a slant.
-        blur_px: Standard deviation of the lens's point spread, Gaussian.
-        motion_px: (x, y) path of catheter and occluders over the background while the shutter is open, at constant
-            speed. The truth is the middle.
-        noise_dn: Standard deviation of white Gaussian noise, in 8-bit levels, after the tone curve.
-        video: Whether each 2 x 2 pixels share one's chroma (4:2:0), as webcams' and videos' decoders give it.
-        jpeg_quality: 1 to 100, chroma at half resolution (4:2:0), smoothed; None does not compress.
-        occluders: In front of the catheter, later ones in front of earlier ones; not shaded.
+        highlight: Brightness of the specular reflection of the tube; 1 is that of white paper.
+        highlight_width: Standard deviation of the specular lobe in radians.
+        tube: Colour of the tube outside the bands.
+        opacity: Opacity of the tube outside the bands at normal incidence, 0 to 1; it is higher at oblique incidence.
+        blur_px: Standard deviation of the lens's Gaussian point spread function in pixels.
+        motion_px: Path (x, y) of catheter and occluders over the background during the exposure, in pixels, at constant
+            speed. The true pose is that in the middle.
+        noise_dn: Standard deviation of white Gaussian noise in 8-bit levels, added after the tone curve.
+        video: Whether each 2 x 2 pixels share the chroma of one of them (4:2:0), as decoders of webcams give it.
+        jpeg_quality: JPEG quality, 1 to 100, with smoothed chroma at half resolution (4:2:0); None for no compression.
+        occluders: Polygons in front of the catheter, each in front of the previous ones; they are not shaded.
 
     Raises:
         TypeError, ValueError: Values outside these ranges.

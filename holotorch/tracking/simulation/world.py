@@ -1,4 +1,4 @@
-"""Synthetic scenes with exact truth: what a catheter tracker must answer, and what it must refuse."""
+"""Synthetic scenes with exact truth, some of which a catheter tracker must answer and others refuse."""
 
 import itertools
 import math
@@ -20,21 +20,22 @@ from holotorch.tracking.simulation import scenery
 from holotorch.tracking.simulation.exposure import sensed
 from holotorch.tracking.simulation.render import Look, mean_levels, render
 
-_GRID, _SPACING = 0.0816, 0.010  # metres: side of the sheet of Sec. 3.5.2, distance of the holes of Sec. 3.5.3
-_ROLL = math.radians(25)  # of the catheter in the frame where nothing says otherwise
+# Side of the sheet of Sec. 3.5.2 and distance of the holes of Sec. 3.5.3 of the thesis, in metres.
+_GRID, _SPACING = 0.0816, 0.010
+_ROLL = math.radians(25)  # default angle of the catheter within the frame
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A frame, made when it is asked for, and what is true of it.
+    """A frame that is rendered on demand, and the truth about it.
 
     Attributes:
-        name: Says what is shown; unique in its list.
-        frame: Makes the frame, uint8 [3, H, W]; the same one at each call.
-        tip: [3] in metres, camera frame; None where the catheter is not in the frame.
+        name: Description of the frame, unique in its list.
+        frame: Renders the frame, uint8 [3, H, W]; each call gives the same one.
+        tip: [3] in metres, in the camera's coordinates; None if the catheter is not in the frame.
         direction: Unit vector [3] from the tip to the rear, or None.
-        answerable: Whether a pose can be told from this frame.
-        why: The reason, in a few words.
+        answerable: Whether the frame determines a pose.
+        why: The reason for ``answerable``, in a few words.
     """
 
     name: str
@@ -46,9 +47,9 @@ class Case:
 
 
 def synthetic_camera(size: tuple[int, int] = (1080, 1920), tone: str = "srgb") -> Camera:
-    """Camera of the synthetic frames: 1400 pixels of focal length at a width of 1920, a little distortion.
+    """Camera of the synthetic frames: focal length 1400 pixels at a width of 1920, weak distortion.
 
-    Its axis meets the frame at (W / 2, H / 2): half a pixel right of and below the middle, ((W - 1) / 2, (H - 1) / 2).
+    Its principal point is (W / 2, H / 2), half a pixel right of and below the frame's centre.
     """
     height, width = size
     focal = 1400 * width / 1920
@@ -57,22 +58,22 @@ def synthetic_camera(size: tuple[int, int] = (1080, 1920), tone: str = "srgb") -
 
 
 def aimed(tilt: float, roll: float = _ROLL) -> Tensor:
-    """Direction [3] of a catheter that lies at ``roll`` in the frame, its rear ``tilt`` towards the camera; radians."""
+    """Direction [3] of a catheter at the angle ``roll`` in the frame, its rear tilted to the camera; in radians."""
     flat = math.cos(tilt)
     return torch.tensor([flat * math.cos(roll), flat * math.sin(roll), -math.sin(tilt)], dtype=torch.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Scenes of one catheter before one camera. Each method gives its cases as a list; frames are made when asked for.
+    """Scenes of one catheter in front of one camera. Each method returns cases, whose frames are rendered on demand.
 
     Attributes:
         size: (H, W) in pixels.
-        camera: None for :func:`synthetic_camera`.
-        catheter: What is right; look-alikes differ from it.
-        look: Blur, noise and light of all frames; cases change what they are about. Its background is not used.
-        photographs: uint8 [3, h, w] of any size, for backgrounds; without them, procedural ones.
-        seed: Of all that is random: backgrounds, poses, noise.
+        camera: By default :func:`synthetic_camera`.
+        catheter: The catheter to be tracked; similar objects in negative cases differ from it.
+        look: Blur, noise and light of all frames, which a case may change. Its background is not used.
+        photographs: Images uint8 [3, h, w] of any size for backgrounds, in addition to procedural ones.
+        seed: Seed of backgrounds, poses and noise.
     """
 
     size: tuple[int, int] = (1080, 1920)
@@ -98,10 +99,10 @@ class World:
         shown: Catheter | None = None,
         **changes: Any,
     ) -> Case:
-        """A case of the catheter (or of ``shown``, which is not it) at a pose (tip, direction), or of none.
+        """A case of the catheter, or of another one ``shown``, at a pose (tip, direction); without a pose, of none.
 
-        Without a background, on the desk. ``changes`` are those of the look. The noise follows from the world's seed
-        and the name.
+        The default background is the desk. ``changes`` replace fields of the look. The noise depends on the world's
+        seed and the name.
         """
 
         def frame() -> Tensor:

@@ -41,8 +41,8 @@ def _unit_if_unusual(value: Any) -> Any:
     low, high = SCREEN.usual
     if isinstance(value, int | float) and not isinstance(value, bool) and high < value <= SCREEN.high:
         words = f"a distance in metres, usually {shown(low, 'm')} to {shown(high, 'm')}"
-        cure = f"write {value:g} cm, or {value:g} m if metres are meant"
-        raise PydanticCustomError("quantity", "expected {words}", {"words": words, "cure": f"; {cure}"})
+        hint = f"write {value:g} cm, or {value:g} m if metres are meant"
+        raise PydanticCustomError("quantity", "expected {words}", {"words": words, "hint": f"; {hint}"})
     return value
 
 

@@ -301,7 +301,7 @@ def test_the_study_of_the_thesis():
         (["screen.distance=21 m"], "screen.distance: expected an eye inside the cylinder"),
         (
             ["screen.radius=236"],
-            "screen.radius: expected a length .*, got 236; 236 looks like millimetres",
+            "screen.radius: expected a length .*, got 236; 236 means metres: did you mean '236 mm'",
         ),
         (["screen.size=[2, 20]"], "expected an arc of at most one turn"),
         (["screen={kind: flat, shape: [1080, 1920], size: [0.3, 0.53], distance: 0.5, cut: true}"], "even the middle"),
