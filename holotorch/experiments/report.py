@@ -5,8 +5,7 @@ from pathlib import Path
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.registry import KINDS, find_kind
-from holotorch.experiments.runs.markup import plain
-from holotorch.experiments.runs.page import page, render
+from holotorch.experiments.runs.page import page, plain, render
 from holotorch.experiments.runs.record import RunRecord
 from holotorch.io.files import write_text
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 from stand_in import CAMERA, SIZE, StandIn
 
-from holotorch.experiments.runs import pictures
+from holotorch.experiments.runs import figures
 from holotorch.experiments.tracking import source as track_source
 from holotorch.experiments.tracking.devices import save_camera, save_catheter
 from holotorch.tracking import THESIS
@@ -15,7 +15,7 @@ def tiny():
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
         for name in ("comparison", "channel_maps", "convergence", "visual_field"):
-            patch.setattr(pictures, name, lambda *_, **__: b"")
+            patch.setattr(figures, name, lambda *_, **__: b"")
         yield
     torch.set_num_threads(threads)
 

@@ -34,7 +34,7 @@ def without_figures() -> Iterator[None]:
     """Runs within draw no figures, which take longer than they do."""
     with contextlib.ExitStack() as stack:
         for name in ("comparison", "channel_maps", "convergence", "visual_field"):
-            stack.enter_context(patch(f"holotorch.experiments.runs.pictures.{name}", lambda *_, **__: b""))
+            stack.enter_context(patch(f"holotorch.experiments.runs.figures.{name}", lambda *_, **__: b""))
         yield
 
 

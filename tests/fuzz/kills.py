@@ -32,7 +32,7 @@ from tiny_runs import RUNS, command, results
 from holotorch.cli import main
 from holotorch.experiments.eye import run as eye_run
 from holotorch.experiments.pec import progress
-from holotorch.experiments.runs import pictures
+from holotorch.experiments.runs import figures
 from holotorch.experiments.tracking import source as track_source
 from holotorch.experiments.tracking.devices import save_camera, save_catheter
 from holotorch.io.images import encode_png
@@ -216,7 +216,7 @@ def _quick() -> Iterator[None]:
     dot = encode_png(torch.zeros(1, 2, 2))
     with contextlib.ExitStack() as stack:
         for name in ("comparison", "channel_maps", "convergence", "visual_field"):
-            stack.enter_context(patch.object(pictures, name, lambda *_, **__: dot))
+            stack.enter_context(patch.object(figures, name, lambda *_, **__: dot))
         for module in (progress, eye_run):
             stack.enter_context(patch.object(module, "_SAVE_EVERY", 0.02))
         stack.enter_context(patch.object(track_source, "make_tracker", lambda *_: StandIn()))

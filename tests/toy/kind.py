@@ -9,7 +9,7 @@ from holotorch.experiments.config.source import Key
 from holotorch.experiments.kind import ExperimentKind
 from holotorch.experiments.runs.fingerprint import fingerprint
 from holotorch.experiments.runs.folder import RunFolder, conclude
-from holotorch.experiments.runs.markup import element, heading
+from holotorch.experiments.runs.page import element, heading
 from holotorch.experiments.runs.plan import RunPlan
 from holotorch.experiments.runs.record import RunRecord
 from holotorch.experiments.runs.saving import Checkpoint, Results

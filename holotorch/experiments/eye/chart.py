@@ -17,7 +17,7 @@ from holotorch.experiments.eye.config import ObserverSettings
 from holotorch.experiments.eye.experiment import PRESETS, Observer, observer
 from holotorch.experiments.eye.tradeoff import WIDTHS, Case, fitted_prefactor, in_words, tradeoff
 from holotorch.experiments.registry import load_config
-from holotorch.experiments.runs.pictures import figure_png
+from holotorch.experiments.runs.figures import figure_png
 from holotorch.experiments.timing import timed
 from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.io.bundled import find_config

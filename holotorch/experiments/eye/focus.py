@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from holotorch.experiments.eye.config import SweepSettings
 from holotorch.experiments.eye.experiment import Observer
-from holotorch.experiments.runs.pictures import figure_png
+from holotorch.experiments.runs.figures import figure_png
 
 _BLUR = 6.0  # rays: standard deviation of the Gaussian that is subtracted, so that only fine detail is compared
 _OPAQUE = 0.5  # opacity above which a ray shows a surface

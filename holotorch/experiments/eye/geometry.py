@@ -9,7 +9,7 @@ from matplotlib.patches import Rectangle
 
 from holotorch.experiments.eye.config import MagnifyingSettings
 from holotorch.experiments.eye.experiment import PRESETS, Observer
-from holotorch.experiments.runs.pictures import figure_png
+from holotorch.experiments.runs.figures import figure_png
 from holotorch.optics.viewing import display_geometry as viewing
 
 _COLOURS = ("tab:red", "tab:green", "tab:blue")  # colours of the curves of the three wavelengths

@@ -5,8 +5,8 @@ from typing import Any
 
 from holotorch.experiments.eye import geometry as eye_geometry
 from holotorch.experiments.eye.experiment import Observer
-from holotorch.experiments.runs.markup import plain
 from holotorch.experiments.runs.memory import shortage
+from holotorch.experiments.runs.page import plain
 from holotorch.experiments.volume import plan as volume_plan
 from holotorch.optics.viewing.imaging import retinal_scale
 

@@ -16,11 +16,12 @@ from holotorch.experiments.eye.experiment import Observer, observer, realisation
 from holotorch.experiments.eye.report import by_wavelength
 from holotorch.experiments.eye.tradeoff import fitted_prefactor, in_words, tradeoff
 from holotorch.experiments.registry import load_config
-from holotorch.experiments.runs import pictures
+from holotorch.experiments.runs import figures
 from holotorch.experiments.runs.fingerprint import Fingerprint, fingerprint
 from holotorch.experiments.runs.folder import RunFolder, conclude
-from holotorch.experiments.runs.markup import plain
 from holotorch.experiments.runs.memory import peak_memory
+from holotorch.experiments.runs.page import plain
+from holotorch.experiments.runs.pictures import save_picture
 from holotorch.experiments.runs.saving import Checkpoint, Results
 from holotorch.experiments.runs.signals import deferred
 from holotorch.experiments.runs.tables import write_table
@@ -29,7 +30,6 @@ from holotorch.experiments.volume.run import fingerprint_inputs
 from holotorch.io.bundled import find_config
 from holotorch.io.colour_tables import srgb_matrix, white_balance
 from holotorch.io.files import save_array, write_bytes
-from holotorch.io.images import encode_png
 from holotorch.optics.picture import equal_power, gamut_map, linear_srgb, tone_map
 
 _SAVE_EVERY = 30.0  # seconds between two checkpoints
@@ -212,13 +212,13 @@ def _write(out: Path, eye: Observer, views: _Views, values: dict[str, Any], file
         for s, source in enumerate(("reference", *sources)):
             light = reference[f] if s == 0 else equal_power(images[0, s - 1, f], reference[f])
             picture = tone_map(gamut_map(linear_srgb(light, matrix)), peak=peak)
-            files.write(write_bytes, out / "images" / f"{source}_{f}.png", encode_png(picture))
+            files.write(save_picture, out / "images" / f"{source}_{f}", picture)
             shown.append(picture)
             kind = ", synthetic" if values["synthetic"] else ""
             captions.append(f"{source.replace('_', ' ')}, focus {depth * 1e3:.4g} mm{kind}")
     columns = len(sources) + 1
     rows = [
-        pictures.comparison(shown[k : k + columns], captions[k : k + columns]) for k in range(0, len(shown), columns)
+        figures.comparison(shown[k : k + columns], captions[k : k + columns]) for k in range(0, len(shown), columns)
     ]
     for f, data in enumerate(rows):
         files.write(write_bytes, out / "images" / f"comparison_{f}.png", data)

@@ -15,14 +15,14 @@ from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.progress import Log
 from holotorch.experiments.pec.report import METHOD_NAMES
 from holotorch.experiments.pec.weight import ZONES, eccentricities, weight_map
-from holotorch.experiments.runs import pictures
+from holotorch.experiments.runs import figures
 from holotorch.experiments.runs.fingerprint import Fingerprint, fingerprint
 from holotorch.experiments.runs.folder import RunFolder, conclude
 from holotorch.experiments.runs.memory import peak_memory
+from holotorch.experiments.runs.pictures import save_picture
 from holotorch.experiments.runs.saving import Checkpoint, Results
 from holotorch.experiments.runs.signals import deferred
 from holotorch.io.files import save_array, write_bytes, write_text
-from holotorch.io.images import encode_png
 
 
 def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
@@ -112,23 +112,23 @@ def _write_results(
         shown["isolated"] = corrected.isolated
         captions.append("Corrected, on a chip that stands alone" + _score(corrected.numbers["isolated"]))
     for name, picture in shown.items():
-        files.write(write_bytes, out / "images" / f"{name}.png", encode_png(picture))
+        files.write(save_picture, out / "images" / name, picture)
     names = [f"{wavelength * 1e9:.0f} nm" for wavelength in experiment.wavelengths]
     frames = len(corrected.phase)
     maps = [f"{name}, frame 1 of {frames}" for name in names] if frames > 1 else names
     phase = corrected.phase[0][experiment.lit].to(experiment.device)
     warm = experiment.array.temperature(experiment.array.crosstalk(phase)).cpu()
-    figures = {
-        "comparison": pictures.comparison(list(shown.values()), captions),
-        "phase": pictures.channel_maps(phase.cpu(), maps, "heater phase (rad)", "viridis"),
-        "temperature": pictures.channel_maps(warm, maps, "temperature rise (degC)", "inferno", (0, None)),
-        "convergence": pictures.convergence(_per_colour(solution.losses, len(names)), names, log.checked, log.metric),
+    drawn = {
+        "comparison": figures.comparison(list(shown.values()), captions),
+        "phase": figures.channel_maps(phase.cpu(), maps, "heater phase (rad)", "viridis"),
+        "temperature": figures.channel_maps(warm, maps, "temperature rise (degC)", "inferno", (0, None)),
+        "convergence": figures.convergence(_per_colour(solution.losses, len(names)), names, log.checked, log.metric),
     }
     if weight := experiment.settings.target.weight:
         shape, rings = experiment.grid.shape, [zone[0] for zone in ZONES[1:]]
         angles = eccentricities(weight, shape)
-        figures["weight"] = pictures.visual_field(weight_map(weight, shape), angles, weight.field_deg, rings, "weight")
-    for name, data in figures.items():
+        drawn["weight"] = figures.visual_field(weight_map(weight, shape), angles, weight.field_deg, rings, "weight")
+    for name, data in drawn.items():
         files.write(write_bytes, out / "images" / f"{name}.png", data)
 
 

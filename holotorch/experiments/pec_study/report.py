@@ -2,7 +2,7 @@
 
 from holotorch.experiments.pec.config import SIGMA_MEANING
 from holotorch.experiments.pec_study.config import METHODS
-from holotorch.experiments.runs.markup import element, figure, heading
+from holotorch.experiments.runs.page import element, figure, heading
 from holotorch.experiments.runs.record import RunRecord
 
 

@@ -8,10 +8,10 @@ from holotorch.experiments.pec_study.bench import Bench
 from holotorch.experiments.pec_study.cases import Cases
 from holotorch.experiments.pec_study.config import StudySettings
 from holotorch.experiments.pec_study.studies import STUDIES
+from holotorch.experiments.runs.figures import curves
 from holotorch.experiments.runs.fingerprint import fingerprint
 from holotorch.experiments.runs.folder import RunFolder, conclude
 from holotorch.experiments.runs.memory import peak_memory
-from holotorch.experiments.runs.pictures import curves
 from holotorch.experiments.runs.saving import Checkpoint, Results
 from holotorch.experiments.runs.tables import write_table
 from holotorch.io.files import write_bytes, write_text

@@ -18,7 +18,7 @@ from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import phasor
 from holotorch.core.fourier import fft2, filter_spectrum, ifft2
 from holotorch.core.grid import Grid
-from holotorch.experiments.runs.pictures import figure_png
+from holotorch.experiments.runs.figures import figure_png
 from holotorch.experiments.timing import interleaved
 from holotorch.optics import AngularSpectrum, CroppedKernel, Fresnel, Propagator, unaliased_distance
 from holotorch.optics.free_space.plane_pair import PlanePair

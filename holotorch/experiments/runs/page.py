@@ -1,5 +1,6 @@
-"""The page of a report: one static HTML file without scripts, which works from disk."""
+"""The page of a report, one static HTML file without scripts, and the elements of its body."""
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,11 +19,41 @@ def _template() -> "Template":
     return environment.get_template("report.html.jinja")
 
 
+def page(title: str, body: str) -> str:
+    """The page around a body of HTML; characters that UTF-8 cannot encode, such as lone surrogates, become "?"."""
+    return _template().render(title=title, body=body).encode("utf-8", "replace").decode("utf-8")
+
+
 def render(macro: str, *values: Any) -> str:
     """HTML of a macro of the template; the template escapes every value."""
     return str(getattr(_template().module, macro)(*values))
 
 
-def page(title: str, body: str) -> str:
-    """The page around a body of HTML; characters that UTF-8 cannot encode, such as lone surrogates, become "?"."""
-    return _template().render(title=title, body=body).encode("utf-8", "replace").decode("utf-8")
+def element(tag: str, text: Any, kind: str = "") -> str:
+    """An element with text in it; ``kind`` is its CSS class."""
+    return render("element", tag, text, kind)
+
+
+def heading(title: str, status: Any) -> str:
+    """The title of a run, followed by its status unless that is "complete"."""
+    return render("heading", title, status)
+
+
+def figure(source: str, caption: str, kind: str) -> str:
+    """A picture with its caption; ``source`` is a data URL or an address relative to the page."""
+    return render("figure", source, caption, kind)
+
+
+def table(names: Sequence[str], rows: Sequence[Sequence[str]], *, head: bool = True) -> str:
+    """A table of text without the columns that are empty in every row; ``head`` False leaves out the names."""
+    kept = [i for i in range(len(names)) if any(row[i] for row in rows)]
+    return render("table", [names[i] for i in kept] if head else [], [[row[i] for i in kept] for row in rows])
+
+
+def plain(value: Any) -> str:
+    """A JSON value as text."""
+    if isinstance(value, dict):
+        return "; ".join(f"{k.replace('_', ' ')}: {plain(v)}" for k, v in value.items())
+    if isinstance(value, list):
+        return ", ".join(plain(item) for item in value)
+    return f"{value:.5g}" if isinstance(value, float) else str(value)

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from holotorch.experiments.runs.markup import element, figure, heading, plain, table
 from holotorch.experiments.runs.memory import peak_memory
+from holotorch.experiments.runs.page import element, figure, heading, plain, table
+from holotorch.experiments.runs.pictures import save_picture
 from holotorch.experiments.runs.record import RunRecord
 from holotorch.io.files import write_bytes
-from holotorch.io.images import encode_png
 from holotorch.io.video import Frame, Frames
 from holotorch.tracking import Pose, Status
 from holotorch.tracking.evaluation.protocols import counts, s_rms
@@ -93,7 +93,7 @@ class Log:
         """Add a frame."""
         pose = item.pose
         if drawn is not None and self.wants(item):
-            write_bytes(self.images / f"{item.status.name}.png", encode_png(_smaller(drawn)))
+            save_picture(self.images / item.status.name, _smaller(drawn))
             reason = f": {pose.reason}" if pose.reason else ""
             self.pictures[item.status.name] = f"frame {item.number}, {item.status.name}{reason}"
         self.statuses.append(item.status)

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from holotorch.core.fourier import fft2, good_length, ifft2
 from holotorch.core.grid import Grid
-from holotorch.experiments.runs.pictures import figure_png
+from holotorch.experiments.runs.figures import figure_png
 from holotorch.experiments.timing import interleaved, timed
 from holotorch.hologram import AxialHologram, ConvolutionHologram, DirectHologram
 from holotorch.hologram.cone import cone_samples, spherical_wave

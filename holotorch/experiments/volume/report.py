@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from holotorch.experiments.runs.markup import element, figure, heading, plain, table
+from holotorch.experiments.runs.page import element, figure, heading, plain, table
 
 _FIGURES = {
     "rendering": "Direct volume rendering",

@@ -9,10 +9,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from holotorch.experiments.config.errors import ConfigError
-from holotorch.experiments.runs import pictures
+from holotorch.experiments.runs import figures
 from holotorch.experiments.runs.fingerprint import fingerprint
 from holotorch.experiments.runs.folder import RunFolder, conclude
 from holotorch.experiments.runs.memory import peak_memory
+from holotorch.experiments.runs.pictures import save_picture
 from holotorch.experiments.runs.processes import from_first, process_count
 from holotorch.experiments.runs.saving import Checkpoint, Results
 from holotorch.experiments.runs.signals import deferred
@@ -21,7 +22,6 @@ from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.experiments.volume.evaluation import VolumeEvaluation
 from holotorch.experiments.volume.experiment import Part, VolumeExperiment
 from holotorch.io.files import save_array, write_bytes, write_json
-from holotorch.io.images import encode_png
 
 
 def run_volume(experiment: VolumeExperiment, opened: RunFolder) -> bool:
@@ -131,16 +131,16 @@ def _write(opened: RunFolder, experiment: VolumeExperiment, evaluation: VolumeEv
     images = {"rendering": evaluation.rendering, "in_focus": evaluation.sharpest(shown)}
     images |= {f"focus_{f}": picture for f, picture in enumerate(shown)}
     for name, picture in images.items():
-        files.write(write_bytes, out / "images" / f"{name}.png", encode_png(picture.clamp(0, 1)))
+        files.write(save_picture, out / "images" / name, picture)
     captions = ["Direct volume rendering", "Hologram, every ray at its depth"]
     captions += [f"Hologram refocused at {depth * 1e3:.4g} mm" for depth in evaluation.depths]
     captions = [caption + (", synthetic" if experiment.synthetic else "") for caption in captions]
-    files.write(write_bytes, out / "images" / "comparison.png", pictures.comparison([*images.values()], captions))
+    files.write(write_bytes, out / "images" / "comparison.png", figures.comparison([*images.values()], captions))
     depth = torch.where(evaluation.visible, evaluation.depth * 1e3, torch.nan)
     files.write(
         write_bytes,
         out / "images" / "depth.png",
-        pictures.channel_maps(depth[None], ["depth of each ray"], "mean depth behind the hologram (mm)", "viridis"),
+        figures.channel_maps(depth[None], ["depth of each ray"], "mean depth behind the hologram (mm)", "viridis"),
     )
     seconds = ("seconds", "rendering_seconds", "refocus_seconds")
     summary = {

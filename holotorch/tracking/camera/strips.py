@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from holotorch.tracking.camera.lens import Lens, Points
+from holotorch.tracking.camera.numpy_lens import Lens, Points
 
 
 @dataclass(frozen=True)

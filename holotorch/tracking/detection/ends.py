@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from holotorch.tracking.camera.lens import Lens
+from holotorch.tracking.camera.numpy_lens import Lens
 from holotorch.tracking.camera.strips import Sampler
 from holotorch.tracking.pose.catheter import Catheter
 from holotorch.tracking.pose.resection import LinePose

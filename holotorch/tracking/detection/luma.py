@@ -8,7 +8,7 @@ import dataclasses
 
 import numpy as np
 
-from holotorch.tracking.camera.lens import Points
+from holotorch.tracking.camera.numpy_lens import Points
 from holotorch.tracking.camera.strips import Sampler
 from holotorch.tracking.detection.fits import EdgeFit, fit_edges, normal_step
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from holotorch.tracking.camera.lens import Lens
+from holotorch.tracking.camera.numpy_lens import Lens
 from holotorch.tracking.camera.strips import Line, Sampler
 from holotorch.tracking.detection.bands import Stretches, find_axis, find_stretches
 from holotorch.tracking.detection.colours import ColourTable

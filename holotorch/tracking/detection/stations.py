@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from holotorch.tracking.camera.lens import Lens
+from holotorch.tracking.camera.numpy_lens import Lens
 from holotorch.tracking.camera.strips import Line, Sampler
 from holotorch.tracking.detection.axis_fit import AxisFit, fit_axis
 from holotorch.tracking.detection.bands import Stretches

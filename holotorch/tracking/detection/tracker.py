@@ -16,7 +16,7 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.core.quantities import TOOL_DEVIATION
 from holotorch.tracking.camera.camera import Camera
-from holotorch.tracking.camera.lens import Lens
+from holotorch.tracking.camera.numpy_lens import Lens
 from holotorch.tracking.camera.strips import Line, Sampler
 from holotorch.tracking.detection.bands import Stretches
 from holotorch.tracking.detection.channels import ChannelOrder, need_frames, stated_order

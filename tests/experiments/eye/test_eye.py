@@ -21,7 +21,7 @@ from holotorch.experiments.eye.experiment import observer
 from holotorch.experiments.eye.plan import plan_text, plan_values
 from holotorch.experiments.eye.run import scene_settings
 from holotorch.experiments.registry import load_config
-from holotorch.experiments.runs import pictures
+from holotorch.experiments.runs import figures
 from holotorch.optics.light import spectral
 
 CONFIG = CONFIGS / "eye" / "teapot.yaml"
@@ -47,7 +47,7 @@ def settings(*overrides: str):
 
 def test_a_run_shows_less_speckle_under_wider_sources(tmp_path, monkeypatch):
     captions = []
-    monkeypatch.setattr(pictures, "comparison", lambda images, words: captions.extend(words) or b"")
+    monkeypatch.setattr(figures, "comparison", lambda images, words: captions.extend(words) or b"")
     folder, complete = execute(settings(), tmp_path / "a", "a")
     names = {path.name for path in folder.iterdir()}
     assert complete and names == {

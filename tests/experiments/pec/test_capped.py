@@ -165,7 +165,7 @@ def test_a_report_says_which_methods_show_fewer_frames(tmp_path):
 @pytest.mark.parametrize("frames", [1, 3])
 def test_maps_name_the_frame_that_they_show(tmp_path, monkeypatch, frames):
     titles = []
-    monkeypatch.setattr(run_module.pictures, "channel_maps", lambda values, names, *_: titles.append(names) or b"")
+    monkeypatch.setattr(run_module.figures, "channel_maps", lambda values, names, *_: titles.append(names) or b"")
     execute(load_config(CONFIG, [*SMALL, f"frames={frames}"]), tmp_path / "a")
     wavelengths = ["630 nm", "530 nm", "445 nm"]
     assert titles == 2 * [wavelengths if frames == 1 else [f"{each}, frame 1 of 3" for each in wavelengths]]

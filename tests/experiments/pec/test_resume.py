@@ -126,7 +126,7 @@ def test_stopped_twice_and_resumed_twice_is_still_the_same(monkeypatch, tmp_path
     assert_same(folder, tmp_path / "whole")
 
 
-@pytest.mark.parametrize("moment", ["evaluate", "baseline", "encode_png"])
+@pytest.mark.parametrize("moment", ["evaluate", "baseline", "save_picture"])
 def test_stopped_after_the_solver_is_the_same(monkeypatch, tmp_path, moment):
     words = [LBFGS, "report.baselines=[none]"]
     execute(settings(*words), tmp_path / "whole")

@@ -187,7 +187,7 @@ def test_a_pose_whose_picture_cannot_be_written_is_kept(tmp_path, tracker, monke
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("holotorch.experiments.tracking.report.write_bytes", full)
+    monkeypatch.setattr("holotorch.experiments.runs.pictures.write_bytes", full)
     with pytest.raises(OSError, match="No space left"):
         tracked(tmp_path, pictures(tmp_path / "in", [9, 12]))
     assert [row["status"] for row in read(tmp_path / "out")] == ["OK"]

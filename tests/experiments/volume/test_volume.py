@@ -17,7 +17,7 @@ from holotorch.cli import main
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.execute import execute
 from holotorch.experiments.registry import load_config
-from holotorch.experiments.runs import pictures
+from holotorch.experiments.runs import figures
 from holotorch.experiments.volume import run as volume_run
 from holotorch.experiments.volume.evaluation import pooled
 from holotorch.experiments.volume.experiment import Part, build
@@ -68,7 +68,7 @@ def test_a_run_is_what_its_parts_give(tmp_path):
 
 def test_the_map_of_depths_says_what_it_is_of(tmp_path, monkeypatch, tiny):
     labels = []
-    monkeypatch.setattr(pictures, "channel_maps", lambda values, names, label, colours: labels.append(label) or b"")
+    monkeypatch.setattr(figures, "channel_maps", lambda values, names, label, colours: labels.append(label) or b"")
     execute(settings(), tmp_path / "a", "a")
     assert labels == ["mean depth behind the hologram (mm)"]
 

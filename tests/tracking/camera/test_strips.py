@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from holotorch.tracking.camera.camera import Camera
-from holotorch.tracking.camera.lens import Lens
+from holotorch.tracking.camera.numpy_lens import Lens
 from holotorch.tracking.camera.strips import Line, Sampler
 from holotorch.tracking.simulation.world import synthetic_camera
 

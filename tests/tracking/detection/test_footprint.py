@@ -8,7 +8,7 @@ import torch
 from oracles.strips import on_plane
 
 from holotorch.tracking.camera.camera import Camera
-from holotorch.tracking.camera.lens import Lens
+from holotorch.tracking.camera.numpy_lens import Lens
 from holotorch.tracking.camera.strips import Line
 from holotorch.tracking.detection.footprint import Front, bulge_px, width_px
 from holotorch.tracking.pose.catheter import THESIS

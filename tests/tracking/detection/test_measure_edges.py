@@ -10,7 +10,7 @@ import torch
 from oracles.strips import on_plane
 from tracked import NEAR, SIZE, WORLD, at
 
-from holotorch.tracking.camera.lens import Lens
+from holotorch.tracking.camera.numpy_lens import Lens
 from holotorch.tracking.camera.strips import Line, Sampler
 from holotorch.tracking.detection.bands import Stretches
 from holotorch.tracking.detection.fits import EdgeFit

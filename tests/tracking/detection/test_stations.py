@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from holotorch.tracking.camera.camera import Camera
-from holotorch.tracking.camera.lens import Lens
+from holotorch.tracking.camera.numpy_lens import Lens
 from holotorch.tracking.camera.strips import Line
 from holotorch.tracking.detection import stations as module
 from holotorch.tracking.detection.axis_fit import AxisFit

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from oracles.strips import on_plane
 
 from holotorch.tracking import THESIS, Camera, solve_pose
-from holotorch.tracking.camera.lens import Lens
+from holotorch.tracking.camera.numpy_lens import Lens
 from holotorch.tracking.camera.strips import Line
 from holotorch.tracking.pose.resection import LinePose, pose_on_line
 

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from holotorch.experiments.runs.markup import element, figure, heading, table
+from holotorch.experiments.runs.page import element, figure, heading, table
 from holotorch.experiments.runs.record import RunRecord
 
 _CAPTIONS = {

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from holotorch.experiments.runs.markup import element, figure, heading, table
+from holotorch.experiments.runs.page import element, figure, heading, table
 from holotorch.experiments.runs.record import RunRecord
 
 

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from holotorch.tracking.camera.camera import Camera
-from holotorch.tracking.camera.lens import Lens
+from holotorch.tracking.camera.numpy_lens import Lens
 
 NONE, MILD = [0.0] * 5, [-0.05, 0.02, 1e-3, -5e-4, 0.0]
 STRONG, BARREL, PINCUSHION = [-0.35, 0.15, 2e-3, -1e-3, -0.02], [-0.6, 0.0, 0.0, 0.0, 0.0], [0.25, 0.1, -2e-3, 2e-3, 0]

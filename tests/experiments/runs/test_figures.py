@@ -10,7 +10,7 @@ from holotorch import Grid
 from holotorch.correction import LBFGS, PECProblem, penalty_schedule, run_stages
 from holotorch.experiments.pec.weight import eccentricities, weight_map
 from holotorch.experiments.registry import load_config
-from holotorch.experiments.runs import pictures
+from holotorch.experiments.runs import figures
 from holotorch.modulator import ThermalCrosstalk
 from holotorch.optics import Fraunhofer
 
@@ -20,15 +20,15 @@ PERIPHERAL = CONFIGS / "pec" / "peripheral.yaml"
 @pytest.fixture
 def drawn(monkeypatch):
     """The figures that were drawn, laid out."""
-    figures = []
+    kept = []
 
     def keep(figure):
         FigureCanvasAgg(figure).draw()
-        figures.append(figure)
+        kept.append(figure)
         return b""
 
-    monkeypatch.setattr(pictures, "figure_png", keep)
-    return figures
+    monkeypatch.setattr(figures, "figure_png", keep)
+    return kept
 
 
 @pytest.mark.parametrize(("height", "width"), [(96, 192), (64, 64), (40, 20)])
@@ -38,7 +38,7 @@ def test_captions_stay_inside_and_scores_stay_whole(height, width, drawn):
         "Corrected, all errors alike, SSIM 0.548",
         "Corrected, on a chip that stands alone, SSIM 0.467",
     ]
-    pictures.comparison([torch.rand(3, height, width)] * 3, captions)
+    figures.comparison([torch.rand(3, height, width)] * 3, captions)
     (figure,) = drawn
     for axes, caption in zip(figure.axes, captions, strict=True):
         place = axes.title.get_window_extent()
@@ -56,9 +56,9 @@ def test_a_second_stage_is_named_and_the_legend_covers_no_curve(drawn):
     make = lambda **more: PECProblem(crosstalk, propagator, target, **more)  # noqa: E731
     solver = LBFGS(max_steps=60, tolerance=0.0)
     found = run_stages(penalty_schedule(make, solver, crosstalk.total, None), 6 * torch.rand(3, 24, 24))
-    pictures.convergence(found.losses, ["a", "b", "c"], [(10, 0.3), (60, 0.5)], "ssim")
+    figures.convergence(found.losses, ["a", "b", "c"], [(10, 0.3), (60, 0.5)], "ssim")
     plain = LBFGS(max_steps=20, tolerance=0.0)(make(), 6 * torch.rand(3, 24, 24))
-    pictures.convergence(plain.losses, ["a", "b", "c"], [], "ssim")
+    figures.convergence(plain.losses, ["a", "b", "c"], [], "ssim")
     both, one = drawn
     assert "up to step 10 (dotted)" in both.axes[0].get_title() and not one.axes[0].get_title()
     # No line leads from one loss to the other.
@@ -69,13 +69,13 @@ def test_a_second_stage_is_named_and_the_legend_covers_no_curve(drawn):
 
 def test_losses_that_only_waver_are_one_stage():
     wavering = torch.tensor([[1, 1], [2.3, 0.8], [0.3, 2], [0.9, 3.5], [0.2, 0.1]]).double().numpy()
-    assert pictures._next_stage(wavering) is None
+    assert figures._next_stage(wavering) is None
 
 
 def test_a_weight_is_drawn_in_degrees_with_the_rings_of_the_zones(drawn):
     weight = load_config(PERIPHERAL, ["target.weight.gaze_deg=[10,-20]"]).target.weight
     away = eccentricities(weight, (96, 192))
-    pictures.visual_field(weight_map(weight, (96, 192)), away, weight.field_deg, [8, 30, 60, 170], "weight")
+    figures.visual_field(weight_map(weight, (96, 192)), away, weight.field_deg, [8, 30, 60, 170], "weight")
     (figure,) = drawn
     axes = figure.axes[0]
     assert (axes.get_xlim(), axes.get_ylim()) == ((-70, 70), (-35, 35))

@@ -1,0 +1,144 @@
+"""Figures of a run, drawn without any global state of matplotlib."""
+
+import io
+import textwrap
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from torch import Tensor
+
+
+def channel_maps(values: Tensor, names: Sequence[str], label: str, colormap: str, limits=(None, None)) -> bytes:
+    """PNG of maps [C, H, W] side by side with one colour bar each, ``label`` giving the unit."""
+    figure = Figure(figsize=(3.6 * len(names), 3.2), layout="constrained")
+    for i, (name, panel) in enumerate(zip(names, values.numpy(), strict=True)):
+        axes = figure.add_subplot(1, len(names), i + 1)
+        drawn = axes.imshow(panel, cmap=colormap, vmin=limits[0], vmax=limits[1], interpolation="nearest")
+        axes.set_title(name, fontsize=10)
+        axes.set_xticks([])
+        axes.set_yticks([])
+        figure.colorbar(drawn, ax=axes, label=label, shrink=0.85)
+    return figure_png(figure)
+
+
+def visual_field(values: Tensor, eccentricity: Tensor, field_deg: float, rings: Sequence[float], label: str) -> bytes:
+    """PNG of a map [H, W] that is ``field_deg`` wide, with rings of equal eccentricity (deg)."""
+    height, width = values.shape
+    x, y = field_deg / 2, field_deg / 2 * height / width
+    figure = Figure(figsize=(7.2, 1.0 + 6.0 * height / width), layout="constrained")
+    axes = figure.add_subplot()
+    drawn = axes.imshow(values.numpy(), cmap="magma", extent=(-x, x, -y, y), interpolation="nearest")
+    inside = [ring for ring in rings if eccentricity.min() < ring < eccentricity.max()]
+    if inside:
+        # Coordinates of pixel centres.
+        across, up = ((np.arange(n) + 0.5) / n * 2 - 1 for n in (width, height))
+        lines = axes.contour(
+            x * across, -y * up, eccentricity.numpy(), inside, colors="white", linewidths=1, linestyles=":"
+        )
+        axes.clabel(lines, fmt=lambda ring: f"{ring:g} deg", fontsize=8)
+    axes.set_xlabel("right of the middle (deg)")
+    axes.set_ylabel("above the middle (deg)")
+    axes.set_title("Dotted: eccentricities between which the report's zones lie", fontsize=9)
+    figure.colorbar(drawn, ax=axes, label=label, shrink=0.85)
+    return figure_png(figure)
+
+
+def comparison(images: Sequence[Tensor], captions: Sequence[str]) -> bytes:
+    """PNG of pictures [C, H, W] in [0, 1] side by side with captions; a score stands on a separate line."""
+    height, width = images[0].shape[-2:]
+    titles = [_title(caption) for caption in captions]
+    wide, gap, top = 3.1, 0.1, 0.14 + 0.18 * max(title.count("\n") + 1 for title in titles)  # inches
+    tall = wide * height / width
+    whole = (wide + gap) * len(images) + gap, tall + gap + top
+    figure = Figure(figsize=whole, dpi=120)
+    for i, (image, title) in enumerate(zip(images, titles, strict=True)):
+        left = gap + i * (wide + gap)
+        axes = figure.add_axes((left / whole[0], gap / whole[1], wide / whole[0], tall / whole[1]))
+        shown = image.clamp(0, 1).permute(1, 2, 0).squeeze(-1).numpy()
+        axes.imshow(shown, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        axes.set_title(title, fontsize=10)
+        axes.set_axis_off()
+    return figure_png(figure)
+
+
+def _title(caption: str) -> str:
+    what, _, score = caption.partition(", SSIM ")
+    return textwrap.fill(what, 38) + (f"\nSSIM {score}" if score else "")
+
+
+def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[int, float]], metric: str) -> bytes:
+    """PNG of the loss per colour [steps + 1, C] (left axis, relative to the start) and of a metric (right axis)."""
+    figure = Figure(figsize=(7.2, 3.4), layout="constrained")
+    axes = figure.add_subplot()
+    relative = np.maximum((losses / losses[0].clamp(min=1e-30)).cpu().numpy(), 1e-16)
+    stage, steps = _next_stage(relative), np.arange(len(relative))
+    for i, name in enumerate(names):
+        style = {"linewidth": 1.2, "color": _COLOURS[i % len(_COLOURS)]}
+        axes.semilogy(steps[:stage], relative[:stage, i], label=name, **style)
+        if stage:
+            axes.semilogy(steps[stage:], relative[stage:, i], **style)
+    if stage:
+        axes.axvline(stage - 0.5, color="0.4", linewidth=1, linestyle=":")
+        words = "the error of the amplitude; from there on that of the intensity, and what a limit adds"
+        axes.set_title(f"The loss up to step {stage - 1} (dotted) is {words}", fontsize=8)
+    axes.set_xlabel("step")
+    axes.set_ylabel("loss / loss at the start")
+    axes.grid(alpha=0.3)
+    if checked:
+        right = axes.twinx()
+        right.plot(*zip(*checked, strict=True), "k--", linewidth=1.2, label=metric.upper())
+        right.set_ylabel(f"mean {metric.upper()}")
+        if metric == "ssim":
+            right.set_ylim(0, 1.02)
+    figure.legend(loc="outside upper center", ncols=len(names) + 1, fontsize=8, frameon=False)
+    return figure_png(figure)
+
+
+def _next_stage(losses: np.ndarray) -> int | None:
+    """First step whose losses [steps + 1, C] belong to a second objective, or None.
+
+    L-BFGS minimises the error of the amplitude first and that of the intensity then: at the change, the losses of all
+    colours, which only fell before, rise at once. The momentum of Adam lets single colours rise from the start.
+    """
+    change = losses[1:] / losses[:-1]
+    jumps = np.flatnonzero((change > 1.5).all(1))
+    fell = len(jumps) > 0 and jumps[0] > 4 and bool((change[: jumps[0]] < 1.01).all())
+    return int(jumps[0]) + 1 if fell else None
+
+
+def curves(rows: Sequence[dict[str, Any]], title: str) -> bytes:
+    """PNG of SSIM against the swept setting of a study: a line per method, a panel per kind of propagation."""
+    scored = [row for row in rows if row["ssim"] != ""]
+    kinds = list(dict.fromkeys(row["kind"] for row in scored))
+    figure = Figure(figsize=(7.5 * len(kinds), 4.2), layout="constrained")
+    for i, kind in enumerate(kinds):
+        axes = figure.add_subplot(1, len(kinds), i + 1)
+        selected = [row for row in scored if row["kind"] == kind]
+        # The study sweeps a setting if it has one, otherwise sigma.
+        positions = list(dict.fromkeys((row["setting"], row["sigma_px"]) for row in selected))
+        for k, method in enumerate(dict.fromkeys(row["method"] for row in selected)):
+            rows_of = [row for row in selected if row["method"] == method]
+            points = [(positions.index((row["setting"], row["sigma_px"])), row["ssim"]) for row in rows_of]
+            axes.plot(*zip(*points, strict=True), "os^vD*PhX"[k % 9] + "-", label=method, markersize=5)
+        step = max(1, len(positions) // 12)
+        words = [f"{setting}\n{sigma:g} px" if setting else f"{sigma:g} px" for setting, sigma in positions]
+        axes.set_xticks(range(0, len(positions), step), words[::step], fontsize=7, rotation=30 if step > 1 else 0)
+        axes.set_ylim(0, 1.02)
+        axes.set_ylabel("mean SSIM")
+        axes.set_title(f"{title}, {kind}", fontsize=9)
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=7)
+    return figure_png(figure)
+
+
+_COLOURS = ("#c0392b", "#27864a", "#2867b2")
+
+
+def figure_png(figure: Figure) -> bytes:
+    """PNG of a figure, drawn without any global state of matplotlib."""
+    buffer = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(buffer)
+    return buffer.getvalue()
