@@ -182,7 +182,7 @@ def test_ctrl_c_saves_what_was_found(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("moment", ["evaluate", "save_array", "encode_png", "write_report", "baseline"])
+@pytest.mark.parametrize("moment", ["evaluate", "save_array", "save_picture", "write_report", "baseline"])
 def test_ctrl_c_after_the_solver_loses_nothing(monkeypatch, tmp_path, moment, number):
     where = execute_module if moment == "write_report" else run_module
     original = getattr(where, moment)
