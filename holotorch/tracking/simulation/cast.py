@@ -205,12 +205,12 @@ class Rays:
         return Rays(index, plane[0], 2 * (plane[1] - plane[0]), 2 * (plane[2] - plane[0]))
 
     def at(self, row: np.ndarray, offset: np.ndarray) -> np.ndarray:
-        """Rays [..., 2] at ``offset`` [..., 2] (x, y) in pixels from the centres of the pixels with index ``row`` [...]."""
+        """Rays [..., 2] at ``offset`` [..., 2] (x, y) in pixels from the centres of pixels ``row`` [...]."""
         return self.centre[row] + self.right[row] * offset[..., :1] + self.down[row] * offset[..., 1:]
 
 
 def cast(tube: Tube, rays: Rays, window: tuple[slice, slice], fine: int) -> np.ndarray:
-    """Light and cover, float32 [h fine, w fine, 4], of a window of the padded frame, fine x fine samples a pixel.
+    """Light and cover, float32 [h fine, w fine, 4], of a window of the padded frame, fine^2 samples a pixel.
 
     Each sample is one ray, or the mean of 8 rays where a neighbouring sample shows another part of the tube.
     """

@@ -43,10 +43,8 @@ MEDIAN = 3
 LEAST_GRADIENT = 25.0  # least difference in levels between the two sides of an edge
 MARGIN_PX = 16  # margin around the bands' pixels, for the kernel and the ends removed by the erosion
 OFF_AXIS_PX = 3.0
-OFF_BORDER_PX, OFF_BORDER_SHARE = (
-    6.0,
-    0.1,
-)  # largest distance of an edge from the change of colour: pixels plus share of a band
+# Largest distance of an edge from the change of colour: pixels plus share of a band.
+OFF_BORDER_PX, OFF_BORDER_SHARE = 6.0, 0.1
 DEVIATION_PX = 0.3  # assumed standard deviation of an endpoint in x and y
 NUDGE_PX = 1e-4  # step of an endpoint for the numerical derivatives of the pose
 NO_POSE = "the endpoints are not the image of the bands in front of the camera"
@@ -61,7 +59,7 @@ Endpoints = list[tuple[float, float] | None]
 
 @dataclass(frozen=True)
 class Windows:
-    """Thresholds derived from a catheter's colours: hue (degrees, one per band), its tolerance, saturation and value."""
+    """Thresholds from a catheter's colours: hues (degrees, one per band), tolerance, saturation and value."""
 
     hues: tuple[float, ...]
     reach: float
@@ -144,7 +142,7 @@ def need_pixels(count: int) -> None:
 
 
 def need_line(count: int, kept: int, rms_px: float) -> None:
-    """Raise a Refusal if the pixels form no line: ``kept`` of ``count`` are near the axis, with rms distance ``rms_px``."""
+    """Raise a Refusal if the pixels form no line: ``kept`` of ``count`` are near the axis, ``rms_px`` from it."""
     if kept < max(LEAST_PIXELS, AXIS_SHARE * count) or not rms_px <= AXIS_RMS_PX:
         raise Refusal(
             Status.NO_AXIS,
@@ -204,14 +202,14 @@ def box(first: Sequence[int], last: Sequence[int], size: tuple[int, int]) -> Box
 
 
 def nudged(found: Endpoints) -> np.ndarray:
-    """Endpoints float64 [1 + 2 n, n, 2], NaN for None: unchanged, then with one coordinate changed by ``NUDGE_PX`` each."""
+    """Endpoints float64 [1 + 2 n, n, 2], NaN for None: unchanged, then with each number changed by ``NUDGE_PX``."""
     edges = np.array([spot or (np.nan, np.nan) for spot in found])
     nudges = np.concatenate([np.zeros((1, edges.size)), NUDGE_PX * np.eye(edges.size)])
     return edges + nudges.reshape(-1, *edges.shape)
 
 
 def answer(found: Endpoints, tip: np.ndarray, direction: np.ndarray, device: torch.device | None = None) -> Pose:
-    """Pose from the tips and directions [1 + 2 n, 3] of the :func:`nudged` endpoints; raises a Refusal if it is invalid."""
+    """Pose from the tips and directions [1 + 2 n, 3] of :func:`nudged` endpoints; raises a Refusal if invalid."""
     both = np.concatenate([tip, direction], -1)
     slopes = (both[1:] - both[0]).T / NUDGE_PX
     covariance = DEVIATION_PX**2 * slopes @ slopes.T

@@ -103,7 +103,7 @@ class ThesisTracker:
         return [pose for pose in poses if pose is not None]
 
     def _undistorted(self, frames: Tensor) -> Tensor:
-        """Frames float32, 0 to 1, as of a camera with the same matrix without distortion; black beyond its valid radius."""
+        """Frames float32, 0 to 1, of the same camera without distortion; black beyond its valid radius."""
         height, width = frames.shape[-2:]
         if self._map.shape[:2] != (height, width) or self._map.device != frames.device:
             y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
@@ -127,7 +127,7 @@ class ThesisTracker:
         return bands
 
     def _axis(self, solid: Tensor, bands: Tensor) -> tuple[Axis, Box]:
-        """Line through the pixels [H, W] left by the erosion, except those far from it; and the box around these pixels."""
+        """Line through the pixels [H, W] left by the erosion, except those far from it; and their box."""
         rows, columns = torch.nonzero(solid, as_tuple=True)
         stages.need_pixels(len(rows))
         points, numbers = torch.stack([columns, rows], -1).to(torch.float64), bands[rows, columns]
