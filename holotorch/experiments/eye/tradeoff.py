@@ -23,14 +23,14 @@ from holotorch.optics.viewing.imaging import propagate_collapsed
 
 # FWHM in metres of the spectra that are compared.
 WIDTHS = tuple(1e-9 * width for width in (1.4, 2.5, 4, 6, 9, 13, 19, 28, 40, 56))
-# Offsets in metres from the central wavelength at which pictures are computed, on both sides. Up to 10 nm, the step is
-# half the period of the beat at the corner of a scene.
+# Offsets in metres from the central wavelength at which pictures are computed, on both sides. Up to 10 nm the step is
+# 0.5 nm, half the period of the beat at the corner of a scene; from there to 84 nm it is 1 nm.
 _OFFSETS = 1e-9 * np.concatenate([np.arange(0, 10, 0.5), np.arange(10, 85.0)])
 # Number of wavelengths of a colour that are propagated; the others are derived from them. Propagating only 1 of 60
 # wavelengths causes an error of only 0.4 % (``holotorch chart eye``).
 _PROPAGATED = 16
 _REFERENCE_SEED = 1000  # first seed of the realisations of the reference
-_BRIGHTEST = 0.995  # quantile of the reference that is shown white
+_BRIGHTEST = 0.995  # quantile of the reference that is shown as white
 _LIT = 0.05  # speckle is measured on pixels brighter than this fraction of the brightest pixel of the reference
 
 
@@ -96,7 +96,7 @@ class Case:
 def tradeoff(
     settings: ObserverSettings, scene: VolumeSettings, distances: tuple[float, ...], *, seeds: int = 2, others: int = 12
 ) -> list[Case]:
-    """A case for every distance and colour, with the eye focused on the middle of the scene.
+    """Compute a case for every distance and colour, with the eye focused on the middle of the scene.
 
     All pictures are computed with ``propagate_collapsed`` (one filter for eyepiece and eye), because each hologram
     needs 189 wavelengths per colour.
