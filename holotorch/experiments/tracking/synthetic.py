@@ -87,7 +87,7 @@ def _render(folder: Path, frames: int, world: World) -> None:
         (folder / "images").rmdir()
     size, tool = world.size, world.catheter
     cloth = drape(size, 0, (70, 120, 130))
-    scale = float(world.camera.matrix[0, 0]) / 1400  # scale of the finger, whose size fits fx = 1400 px
+    scale = float(world.camera.matrix[0, 0]) / 1400  # the finger's sizes below are for fx = 1400 px
     across = (tool.edges[0] + tool.edges[-1]) / 2
     table = io.StringIO()
     rows = csv.writer(table, lineterminator="\n")

@@ -20,7 +20,7 @@ from holotorch.tracking.simulation.world import World
 Row = dict[str, Any]
 
 # Goals for S_RMS (Eq. 3.13, change of a resting tip from frame to frame) in mm, for poses given by distance in mm and
-# tilt in degrees. None marks poses whose goal is one for the efficiency instead.
+# tilt in degrees. None marks poses that have a goal for the efficiency instead.
 STILL: dict[tuple[int, int], float | None] = {
     (450, 20): 0.05,
     (520, 5): 0.12,
