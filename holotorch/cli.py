@@ -22,17 +22,18 @@ def main(arguments: list[str] | None = None) -> int:
     from holotorch.experiments.config.errors import ConfigError
 
     try:
-        # Servers and streams have ends of their own.
+        # Servers and streams handle interruptions themselves.
         with interruptible() if options.action in (_run, _resume, _demo, _chart, _export_slm) else nullcontext():
             return options.action(options)
     except ConfigError as error:
         print(error, file=sys.stderr)
         return BAD_INPUT
     except (MemoryError, RuntimeError) as error:
-        # torch raises RuntimeError or a subclass of it, on the CPU and on CUDA.
+        # When memory runs out, torch raises RuntimeError or a subclass of it, on the CPU and on CUDA.
         if isinstance(error, RuntimeError) and not re.search(r"(?i)can.t allocate memory|out of memory", str(error)):
             raise
-        refused = str(error) if isinstance(error, MemoryError) else ""  # by an operation that knows its own needs
+        # An operation that estimates its memory in advance raises MemoryError with an explanation.
+        refused = str(error) if isinstance(error, MemoryError) else ""
         print(refused or "out of memory; use a smaller grid", file=sys.stderr)
         return FAILED
     except OSError as error:
@@ -44,7 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _before(options: argparse.Namespace) -> str:
-    """What to say of an interruption that came before the work; what a run before it has saved is untouched."""
+    """Message for an interruption before this command computed anything; it changed no results of an earlier run."""
     folder = options.folder if options.action is _resume else getattr(options, "out", None)
     if folder is not None and (folder / "config.yaml").is_file() and not (folder / "summary.json").is_file():
         return f"interrupted before it went on; start it again with: holotorch resume {folder}"

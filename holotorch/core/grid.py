@@ -14,13 +14,13 @@ from holotorch.core.quantities import PITCH
 
 @dataclass(frozen=True)
 class Grid:
-    """Samples of a plane, ``shape`` = (H, W) of them, ``pitch`` = (y, x) metres apart; one number means both axes.
+    """Samples of a plane: ``shape`` = (H, W) samples, ``pitch`` = (y, x) metres apart; one number means both axes.
 
-    The optical axis lies on sample ``n // 2`` of each axis, so an even grid reaches one sample further to the
-    negative side.
+    The optical axis lies on sample ``n // 2`` of each axis, so a grid of even size has one sample more on the negative
+    side than on the positive one.
 
     Raises:
-        TypeError: A size is no integer or a pitch no number.
+        TypeError: A size is not an integer, or a pitch is not a number.
         ValueError: A size below 1, or a pitch outside 1 nm to 2 mm, such as one in micrometres.
     """
 
@@ -37,7 +37,7 @@ class Grid:
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Height and width in metres, a whole pitch per sample."""
+        """Height and width in metres: number of samples times pitch."""
         return self.shape[0] * self.pitch[0], self.shape[1] * self.pitch[1]
 
     def coordinates(self, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
@@ -57,9 +57,9 @@ class Grid:
         return fy[:, None], fx[None, :]
 
     def padded(self, factor: float | tuple[float, float]) -> "Grid":
-        """The same pitch on at least ``factor`` (per axis, >= 1) times the samples, a length that FFTs like.
+        """Grid of the same pitch with at least ``factor`` (>= 1, per axis) times as many samples.
 
-        A factor of exactly 1 leaves that axis as it is.
+        The number of samples is rounded up to a length with a fast FFT. A factor of exactly 1 keeps the size.
         """
         factors = (factor, factor) if isinstance(factor, int | float) else tuple(factor)
         for value in factors:

@@ -32,8 +32,9 @@ def gerchberg_saxton(
 
     Without ``crosstalk`` this is the classical algorithm; its result on an array with crosstalk is the case "no
     correction". With ``crosstalk``, each pass spreads the phase before it propagates the field. This is the basic
-    iterative PEC of Persson et al. and Gemayel et al., which has no deconvolution (thesis Sec. 4.4.3.3,
-    B = S exp(i P(phs(A)))). With a ``deconvolution`` as well it is the thesis's Algorithm 1, :func:`iterative_pec`.
+    iterative PEC of Persson et al. and Gemayel et al., without deconvolution (thesis Sec. 4.4.3.3): the emitted field
+    is S exp(i P(phase of A)), with A the field propagated back from the image, S the amplitude of the source (1 here)
+    and P the crosstalk. With a ``deconvolution`` as well it is the thesis's Algorithm 1, :func:`iterative_pec`.
 
     Args:
         propagator: Operator on fields [..., C, H, W] with ``adjoint``.
@@ -42,7 +43,7 @@ def gerchberg_saxton(
         max_steps: Passes through the loop.
         crosstalk: Operator on phases, or None.
         deconvolution: Function of the phase wanted after spreading, in [0, 2 pi), and of the heater phases of the last
-            pass (None in the first pass), that returns the new heater phases. None takes the wanted phase itself.
+            pass (None in the first pass), that returns the new heater phases. If None, the wanted phase is used.
         mask: 1 in the signal region, 0 in the background, where the field is not constrained (Eqs. 4.7, 4.8).
         callback: Called with the solution so far after every pass.
 
@@ -101,7 +102,8 @@ def iterative_pec(
     With a Fresnel propagator it is the thesis's iterative Fresnel PEC (IFPEC).
 
     Arguments and result are those of :func:`gerchberg_saxton`. The deconvolution takes ``inner_steps`` of
-    :func:`deconvolve`, beginning at the wanted phase; each costs one application of P and one of its transpose.
+    :func:`deconvolve`, beginning at the wanted phase. Each step costs one application of the crosstalk and one of its
+    transpose.
     """
     return gerchberg_saxton(
         propagator,

@@ -42,7 +42,7 @@ _ACCEPTED = {
 
 
 def _loosened(value: Any) -> Any:
-    """A schema with the standard names of limits, and with all types that the validators of settings accept."""
+    """Rename pydantic's limits to those of JSON Schema, and allow all types that the validators of settings accept."""
     if isinstance(value, list):
         return [_loosened(each) for each in value]
     if not isinstance(value, dict):

@@ -16,7 +16,7 @@ def demo(out: Path | None) -> tuple[Path, bool]:
     image, scene, tracking, layout = (load_config(path, words) for path, words in paths if path is not None)
     folder = claim(out, "demo")
     if (folder / "images").is_dir():
-        (folder / "images").rmdir()  # made by ``claim``; the runs have their own folders
+        (folder / "images").rmdir()  # created by ``claim``; each run has a folder of its own inside
     parts, complete = [], True
     for settings, name in ((image, "correction"), (scene, "volume")):
         if complete:

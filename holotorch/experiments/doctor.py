@@ -19,7 +19,7 @@ def diagnose() -> bool:
     for name, check in _CHECKS.items():
         try:
             lines = list(check())
-        except Exception as error:  # whatever fails is reported
+        except Exception as error:  # any failure is reported as a failed check
             lines = [(False, f"{type(error).__name__}: {error}")]
         for passed, text in lines:
             sound &= passed

@@ -1,4 +1,4 @@
-"""What the commands ``check``, ``run`` and ``resume`` do with an experiment of any kind."""
+"""Implementation of the commands ``check``, ``run`` and ``resume`` for an experiment of any kind."""
 
 from pathlib import Path
 from typing import Any
@@ -15,17 +15,17 @@ from holotorch.io.files import write_json
 
 
 def execute(settings: Any, out: Path | None, name: str = "run") -> tuple[Path, bool]:
-    """Carry a run out and fill a folder: ``out``, or the next free ``runs/NAME-001``.
+    """Carry out a run and fill its folder: ``out``, or the next free ``runs/NAME-001``.
 
-    An ``out`` that holds an unfinished run of the same settings is gone on with.
+    If ``out`` holds an unfinished run of the same settings, that run is continued.
 
     Args:
-        settings: Of any kind, as from :func:`~holotorch.experiments.registry.load_config`.
+        settings: Settings of any kind, as from :func:`~holotorch.experiments.registry.load_config`.
         out: Folder of the run.
-        name: Of the run, where there is no ``out``.
+        name: Name of the run; without ``out`` it also names the folder.
 
     Returns:
-        The folder, and whether the run is complete; if it was interrupted, what it had found is in the folder.
+        The folder, and whether the run is complete. The folder of an interrupted run holds the results so far.
 
     Raises:
         ConfigError: The folder holds files already or cannot be written, an input cannot be used, the run does not fit
@@ -35,7 +35,7 @@ def execute(settings: Any, out: Path | None, name: str = "run") -> tuple[Path, b
     experiment = kind.build(settings)
     plan = kind.plan(experiment)
     with joined_processes(kind.parallel) as rank:
-        if rank > 0:  # the first process has the folder
+        if rank > 0:  # only the first process writes to the folder
             with interruptible() as pressed:
                 return Path(), kind.run(experiment, RunFolder(Path(), name, plan, pressed))
         if kind.announces:
@@ -56,17 +56,17 @@ def execute(settings: Any, out: Path | None, name: str = "run") -> tuple[Path, b
 
 
 def check(settings: Any) -> RunPlan:
-    """Plan a run, compute nothing."""
+    """Plan a run without computing anything."""
     kind = find_kind(settings.experiment)
     return kind.plan(kind.build(settings))
 
 
 def resume(folder: Path) -> tuple[Path, bool]:
-    """Go on with an interrupted run in its folder, as if it had never stopped; returns as :func:`execute`.
+    """Continue an interrupted run in its folder, as if it had never stopped; returns the same as :func:`execute`.
 
     Raises:
-        ConfigError: The folder holds no run of this program, or its configuration no longer works, or is no longer that
-            of its checkpoint.
+        ConfigError: The folder holds no run of this program, or its configuration is no longer valid or no longer
+            matches its checkpoint.
     """
     config = folder / "config.yaml"
     if not config.is_file() or not (folder / "env.json").is_file():

@@ -1,4 +1,4 @@
-"""ExperimentKind: what the command line needs to know of one kind of experiment."""
+"""ExperimentKind: the interface between the command line and one kind of experiment."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from holotorch.experiments.config.settings import Settings
 from holotorch.experiments.config.source import Key
 from holotorch.experiments.runs.plan import RunPlan
 
-if TYPE_CHECKING:  # torch and matplotlib are loaded by what runs, not by what checks a configuration
+if TYPE_CHECKING:  # importing these loads torch and matplotlib, which checking a configuration does not need
     from holotorch.experiments.runs.folder import RunFolder
     from holotorch.experiments.runs.record import RunRecord
 
@@ -20,16 +20,17 @@ Experiment = TypeVar("Experiment")
 
 
 class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
-    """One kind of experiment: a folder with a module ``kind`` whose ``KIND`` is an instance, a line in the registry.
+    """One kind of experiment.
 
-    ``check``, ``run``, ``resume`` and ``report`` of the command line do the rest. Methods import what they need when
-    they are called, so that a configuration is checked before torch is loaded.
+    To add a kind, write a folder whose module ``kind`` defines an instance ``KIND``, and add a line to the registry;
+    the commands ``check``, ``run``, ``resume`` and ``report`` then work for it. Methods import heavy modules when they
+    are called, so that a configuration is checked before torch is loaded.
 
     Attributes:
-        settings: Model of its configuration.
+        settings: Pydantic model of the configuration.
         parallel: Whether several processes, started by ``torchrun``, share one run.
         announces: Whether the plan is printed before the run begins.
-        example: Configuration that comes with the package, to begin with.
+        example: Path of the bundled configuration that ``holotorch new`` copies.
     """
 
     settings: type[SettingsT]
@@ -38,41 +39,41 @@ class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
     example: ClassVar[str]
 
     def contradictions(self, settings: SettingsT) -> list[tuple[Key, str]]:
-        """Settings that are fine one by one and not together: their keys, and what to change."""
+        """Settings that are valid one by one but contradict each other: the key and the message for each."""
         return []
 
     @abstractmethod
     def build(self, settings: SettingsT) -> Experiment:
-        """Load the inputs and resolve what the configuration leaves open. ConfigError for inputs that do not fit."""
+        """Load the inputs and choose the settings that the configuration leaves open. ConfigError for bad inputs."""
 
     @abstractmethod
     def plan(self, experiment: Experiment) -> RunPlan:
-        """What a run will do and cost; computes nothing."""
+        """The methods and the cost of a run; computes nothing."""
 
     def prepare(self, experiment: Experiment) -> None:
-        """Find what would stop the run, before it claims a folder. ConfigError for that."""
+        """Raise ConfigError if the run cannot start; called before its folder is created."""
 
     @abstractmethod
     def run(self, experiment: Experiment, folder: RunFolder) -> bool:
-        """Compute, fill the folder and conclude it; whether the run is complete."""
+        """Compute the results and write all files of the folder; returns whether the run is complete."""
 
     def restart(self, folder: Path, config: Mapping[str, Any]) -> str | None:
-        """What to do instead of continuing an interrupted run; None for the kinds whose runs can be continued.
+        """Advice if an interrupted run cannot be continued; None for the kinds whose runs can be continued.
 
         Args:
-            folder: Of the run.
-            config: Its configuration, as it stands in the folder.
+            folder: Folder of the run.
+            config: Configuration of the run, as read from the folder.
         """
         return None
 
     def device(self, experiment: Experiment) -> str:
-        """Where the run computes."""
+        """Device of the computation, as torch names it."""
         return "cpu"
 
     @abstractmethod
     def section(self, record: RunRecord) -> list[str]:
-        """The run's part of a report page, as HTML, from the files of its folder alone."""
+        """The section of a report page for a run, as HTML, from the files of its folder alone."""
 
     def comparison(self, records: Sequence[RunRecord]) -> list[str]:
-        """What a page of several runs of this kind begins with."""
+        """HTML that compares several runs of this kind, placed before their sections on a page."""
         return []

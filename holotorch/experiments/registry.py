@@ -1,4 +1,4 @@
-"""The kinds of experiments by their names in YAML, and the configuration of any of them."""
+"""The registry of the kinds of experiments by their names in YAML, and the reader of their configurations."""
 
 from importlib import import_module
 from pathlib import Path
@@ -9,7 +9,7 @@ from holotorch.experiments.config.messages import nearest, validated
 from holotorch.experiments.config.source import read_source
 from holotorch.experiments.kind import ExperimentKind
 
-# Where the module ``kind`` of each is; loaded when it is asked for.
+# Package that holds the module ``kind`` of each; loaded on demand.
 KINDS = {
     "pec": "holotorch.experiments.pec",
     "pec_study": "holotorch.experiments.pec_study",
@@ -30,7 +30,7 @@ def load_config(path: Path | str, overrides: list[str] | None = None) -> Any:
     """Read, override and check a configuration; returns the settings of its kind.
 
     Raises:
-        ConfigError: Everything that is wrong with it, one line per mistake with its file, line and column.
+        ConfigError: All mistakes, one line each with file, line and column.
     """
     source = read_source(Path(path), overrides or [])
     name = source.data.get("experiment")

@@ -19,7 +19,7 @@ def write_report(folders: Sequence[Path], path: Path, more: Mapping[str, str] | 
         more: Further pages to link to: the text of each link, and its address relative to ``path``.
 
     Raises:
-        ConfigError: A folder holds no run, or one that cannot be read.
+        ConfigError: A folder holds no run, or a run that cannot be read.
     """
     runs = [_read(folder) for folder in folders]
     parts = []

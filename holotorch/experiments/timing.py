@@ -1,4 +1,4 @@
-"""How long calls take: one call, or several in alternation, so that all of them meet the same state of the machine."""
+"""Timing of one call, or of several calls in alternation, so that the load of the machine affects all of them alike."""
 
 import statistics
 import time

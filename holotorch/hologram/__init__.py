@@ -1,4 +1,4 @@
-"""Holograms of point sources on planes: the exact sum, faster methods, reconstruction, and phase-only encodings."""
+"""Holograms of point sources on planes: exact sum, faster methods, reconstruction and phase-only encodings."""
 
 from holotorch.hologram.axial import AxialHologram
 from holotorch.hologram.convolution import ConvolutionHologram

@@ -20,24 +20,24 @@ from holotorch.hologram.raster import Raster, has_light
 from holotorch.hologram.transfer import AxialDesign, TransferFactors
 from holotorch.optics.free_space.padding import FINEST
 
-_GROUP = 16  # planes spread onto the nodes in one matrix product, which reads the block of open nodes once
+_GROUP = 16  # number of planes spread onto the nodes by one matrix product
 
 
 class AxialHologram(LayerHologram):
     """Sum over planes of band-limited spherical waves exp(i k r) / r, with one small transform per node, not per plane.
 
-    Planes are spread onto evenly spaced nodes along the axis (:class:`Nodes`). Each node takes one transform at the
+    Planes are spread onto evenly spaced nodes along the axis (:class:`Nodes`). Each node needs one FFT at the
     resolution of the sources. The spectra are summed by Horner's rule: the partial sum is multiplied by the same
     factor from each node to the next. Finally the sum is multiplied by the spectrum of the spherical wave and
-    transformed back. Evenly spaced planes serve as nodes themselves where they are fewer.
+    transformed back. If the planes are evenly spaced and need no more FFTs than nodes would, they serve as nodes.
 
     Args:
         grid: Pixels of the hologram.
         wavelength: In metres.
         depths: Distances of the planes from the hologram in metres, above 0; any order and spacing.
-        cone: "taper", "band" or "full", see ``holotorch.hologram.cone``. "full" is allowed only where every pixel lies
+        cone: "taper", "band" or "full", see ``holotorch.hologram.cone``. "full" is allowed only if every pixel lies
             within the cone of every source, since steeper light is left out.
-        stride: Pixels between neighbouring sources of a plane.
+        stride: Distance between neighbouring sources of a plane in pixels.
         tolerance: Largest relative L2 error for layers of random noise; complex64 reaches 1e-6 at best.
 
     Raises:
@@ -45,7 +45,7 @@ class AxialHologram(LayerHologram):
             that "full" is not allowed.
 
     Warns:
-        SamplingWarning: In a call, where the predicted error exceeds the tolerance.
+        SamplingWarning: In a call, if the predicted error exceeds the tolerance.
 
     Source: Sec. 5.3.2 of the thesis for the sum; Weyl's expansion exp(ikr)/r = i int exp(2 pi i (f x + z w)) / w df.
     """
@@ -90,7 +90,7 @@ class AxialHologram(LayerHologram):
         return self._designs[shape]
 
     def transfer_factors(self, shape: tuple[int, int], dtype: torch.dtype, device: torch.device) -> TransferFactors:
-        """Transfer factors for layers of ``shape`` (h, w); warns where the predicted error exceeds the tolerance."""
+        """Transfer factors for layers of ``shape`` (h, w); warns if the predicted error exceeds the tolerance."""
         design = self.design(shape)
         if not design.adequate:
             warnings.warn(
@@ -113,8 +113,8 @@ class AxialHologram(LayerHologram):
     def accumulate(self, planes: Iterable[Tensor], phase: Tensor | None = None) -> Tensor:
         """Field [H, W] of planes [h, w], real or complex, in the order of ``depths``, which must rise or fall.
 
-        The planes are read one after another and not kept. ``phase`` [h, w] in rad is common to all planes; it is
-        applied once per node.
+        The planes are read one after another and not all kept in memory. ``phase`` [h, w] in rad is common to all
+        planes; it is applied once per node.
         """
         if isinstance(planes, Tensor) and len(planes):
             total = self.accumulator((planes.shape[-2], planes.shape[-1]), phase)
@@ -160,10 +160,10 @@ class AxialHologram(LayerHologram):
 
 
 class Accumulator:
-    """Running sum of an :class:`AxialHologram` over planes that arrive in rising or falling depth.
+    """Running sum of an :class:`AxialHologram` over planes that are added in rising or falling depth.
 
-    A node is open while planes that touch it may still arrive. The open nodes lie in one block of memory, node m in
-    row m modulo the number of rows, so that a group of planes is added in place by one matrix product.
+    A node is open while planes that contribute to it may still be added. The open nodes share one block of memory, node
+    m in row m modulo the number of rows, so that a group of planes is added in place by one matrix product.
     """
 
     def __init__(self, operator: AxialHologram, shape: tuple[int, int], phase: Tensor | None = None):
@@ -171,7 +171,7 @@ class Accumulator:
         self.phasor = None if phase is None else phasor(phase)
         self.nodes = operator.design(shape).nodes
         self.begins, self.weights = self.nodes.weights(operator.depths)
-        # Rows beyond the width of the window, so that a group holds several planes where they are far apart.
+        # Additional rows beyond the width of the window, so that a group holds several planes even if they are sparse.
         spare = round(_GROUP / 2 * self.nodes.count / len(operator.depths))
         self.rows = self.nodes.width + min(spare, self.nodes.width)
         self.factors: TransferFactors | None = None
@@ -208,7 +208,7 @@ class Accumulator:
         self.pending.append((j, plane))
 
     def finish(self) -> Tensor:
-        """The field [H, W]; zeros where no plane emits light."""
+        """The field [H, W]; zeros if no plane emits light."""
         self._spread()
         self._close(self.open)
         if self.total is None or self.factors is None:
@@ -235,7 +235,7 @@ class Accumulator:
             end = start + 1
             while end < len(flat) and abs(self.begins[end] - self.begins[start]) <= spare:
                 end += 1
-            # Groups of equal size, where many planes touch the same nodes.
+            # Planes that contribute to the same nodes are divided into groups of about equal size.
             end = start + math.ceil((end - start) / math.ceil((end - start) / _GROUP))
             self._gather(flat[start:end], list(range(start, end)))
             start = end
@@ -263,13 +263,13 @@ class Accumulator:
         if not self.block.is_complex():
             # Real planes: rows hold real and imaginary parts alternately.
             matrix = torch.view_as_real(matrix).movedim(-1, 1).flatten(0, 1)
-        # One product for each line of the picture takes a third less time than one for the whole picture, which
-        # would first be copied into another memory order.
+        # A batch of products, one per picture row, takes a third less time than one product for the whole picture,
+        # which would first be copied into another memory order.
         lines = stack.to(self.block.dtype).view(len(order), height, width).transpose(0, 1)
         self.block.baddbmm_(matrix.to(self.block).expand(height, -1, -1), lines)
 
     def _close(self, nodes: set[int]) -> None:
-        """Add ``nodes``, which no later plane touches, to the sum and free their rows."""
+        """Add ``nodes``, to which no later plane contributes, to the sum and free their rows."""
         for index in sorted(nodes, reverse=self.rising is False):
             assert self.block is not None
             k = index % self.rows
@@ -279,7 +279,7 @@ class Accumulator:
         self.open = self.open - nodes
 
     def _add_node(self, index: int, node: Tensor) -> None:
-        """Horner's rule: propagate the sum to node ``index`` and add the node."""
+        """Apply Horner's rule: propagate the sum to node ``index`` and add the spectrum of the node."""
         node = node.reshape(self.shape)
         if self.phasor is not None:
             node *= self.phasor
@@ -302,7 +302,7 @@ class Accumulator:
 
 
 def _side_by_side(planes: list[Tensor]) -> Tensor:
-    """Planes [h, w] as [J, h w]; a view where they are adjacent in memory, as the slices of one tensor are."""
+    """Planes [h, w] as [J, h w]; a view if they are adjacent in memory, like the slices of one tensor."""
     first = planes[0]
     size, store = first.numel(), first.untyped_storage().data_ptr()
     begin, step = first.data_ptr(), size * first.element_size()

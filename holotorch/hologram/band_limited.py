@@ -2,7 +2,7 @@
 
 Weyl's expansion writes a spherical wave as a sum of plane waves, exp(ikr) / r = i int exp(2 pi i (f x + z w)) / w df
 with w = sqrt(1 / wavelength^2 - fx^2 - fy^2). The cones ``taper`` and ``band`` weight the integrand in frequency. The
-result has no closed form in space; it is integrated numerically, which is slow and exact to rounding.
+result has no closed form in space; it is integrated numerically, which is slow but exact to rounding.
 """
 
 import math
@@ -43,7 +43,7 @@ def band_limited_wave(
         pitch: (y, x) in metres, at least 0.9 wavelengths.
         wavelength: In metres.
         depth: In metres, above 0.
-        soft: Whether the band ends with the taper of ``cone.taper`` or sharply.
+        soft: True: the band ends with the taper of ``cone.taper``; False: it ends sharply.
 
     Raises:
         ValueError: The depth is so large that the quadrature needs too many nodes.

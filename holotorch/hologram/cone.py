@@ -1,17 +1,18 @@
 """Spherical wave of a point source on a sampled hologram, and the cone of directions that the pixels can carry.
 
 The wave of a point source is exp(+i k r) / r (thesis Eqs. 5.1, 5.13). A pitch p carries directions with sines up to
-wavelength / (2 p) per axis; steeper light aliases. All holograms share these definitions of the part that is kept:
+wavelength / (2 p) per axis; steeper light aliases. All holograms share these definitions of the part of the wave that
+is kept, with sin(theta) = wavelength / (2 p):
 
 - ``full``: the whole wave. It aliases where the cone is narrower than the hologram (Algorithm 4 as printed).
-- ``box``: a sharp pyramid in space, |x| <= z tan(theta) and |y| <= z tan(theta): the thesis's K_z of Sec. 5.6.1.
+- ``box``: a sharp pyramid in space, |x| <= z tan(theta) and |y| <= z tan(theta), the thesis's K_z of Sec. 5.6.1.
 - ``disc``: a sharp cone in space, of the same half angle.
 - ``band``: the wave whose spectrum ends sharply at the highest frequency, all that a display with square pixels emits.
 - ``taper``: the wave whose spectrum falls to 0 over the last 30 % of the band of each axis, to suppress ringing.
 
-Where every pixel lies well inside the cone of every source, ``full``, ``box``, ``disc`` and ``taper`` agree:
-:func:`is_plain` gives the criterion. ``band`` rings farther into the cone: on the axis, by 0.6 / sqrt(K) of the wave,
-where the cone covers K samples.
+If every pixel lies well inside the cone of every source, ``full``, ``box``, ``disc`` and ``taper`` agree;
+:func:`is_plain` is the criterion. The ringing of ``band`` extends farther into the cone: on the axis its amplitude is
+0.6 / sqrt(K) of the wave, where the cone covers K samples.
 """
 
 import math
@@ -40,16 +41,19 @@ def taper(fraction: Tensor) -> Tensor:
 
 
 def taper_margin(cone: float, error: float) -> float:
-    """Distance in samples from an end of the taper beyond which it changes the wave by less than ``error`` of it.
+    """Distance in samples from an end of the taper beyond which the relative change of the wave is below ``error``.
 
     The second derivative of the taper is discontinuous at its ends. At n samples from the geometric image of an end
-    this adds a relative amplitude of sqrt(K) / n^3, where the whole cone covers K = 2 ``cone`` samples.
+    this adds a relative amplitude of about 2 sqrt(K) / n^3, where the whole cone covers K = 2 ``cone`` samples.
     """
     return (_TAPER_RINGING * math.sqrt(2 * cone) / error) ** (1 / 3)
 
 
 def is_plain(grid: Grid, wavelength: float, depth: float, apart: tuple[int, int], error: float) -> bool:
-    """Whether the taper changes the wave by less than ``error`` of it at all displacements up to ``apart`` samples."""
+    """Whether the taper's relative change of the wave is below ``error`` at all displacements up to ``apart`` samples.
+
+    ``apart`` is (y, x).
+    """
     return all(
         math.isinf(cone) or TAPER_BEGIN * cone - distance >= taper_margin(cone, error / 2)
         for cone, distance in zip(cone_samples(grid, wavelength, depth), apart, strict=True)
@@ -66,9 +70,9 @@ def spherical_wave(dy: Tensor, dx: Tensor, pitch: tuple[float, float], wavelengt
     """exp(i k r) / r within the cone, at displacements in metres.
 
     Args:
-        dy: Float64, broadcasting against ``dx``.
-        dx: Float64.
-        pitch: (y, x) of the hologram in metres, from which the cone follows.
+        dy: Displacements along y, float64, broadcast with ``dx``.
+        dx: Displacements along x, float64.
+        pitch: Pitch (y, x) of the hologram in metres, which defines the cone.
         wavelength: In metres.
         depth: z > 0 in metres; r^2 = z^2 + dy^2 + dx^2.
         cone: "full", "box" or "disc"; the others have no closed form in space, see ``band_limited_wave``.
@@ -102,10 +106,10 @@ def check_cone(cone: Cone, pitch: tuple[float, float], wavelength: float) -> Non
 
 
 def check_scene(grid: Grid, wavelength: float, depths, stride: int) -> tuple[float, tuple[float, ...], int]:
-    """Checked wavelength, depths and stride of a hologram's sources.
+    """Check and return wavelength (m), depths (m) and stride (pixels) of a hologram's sources.
 
     Raises:
-        TypeError: Not numbers.
+        TypeError: Arguments that are not numbers.
         ValueError: Several wavelengths; no depth, or a depth that is not above zero or exceeds 100 m.
     """
     first, *others = checks.wavelengths(wavelength)
@@ -122,7 +126,7 @@ def check_scene(grid: Grid, wavelength: float, depths, stride: int) -> tuple[flo
 
 
 def check_layers(layers: Tensor, count: int) -> None:
-    """TypeError or ValueError unless ``layers`` is complex [..., D, h, w] with D = ``count``."""
+    """Raise TypeError or ValueError unless ``layers`` is complex [..., D, h, w] with D = ``count``."""
     if not isinstance(layers, Tensor) or not layers.is_complex():
         raise TypeError(f"layers must be a complex tensor (..., D, h, w), got {getattr(layers, 'dtype', type(layers))}")
     if layers.ndim < 3 or layers.shape[-3] != count or 0 in layers.shape[-2:]:

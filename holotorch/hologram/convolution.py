@@ -1,4 +1,4 @@
-"""ConvolutionHologram: one convolution per plane of sources, exact."""
+"""ConvolutionHologram: exact holograms by one convolution per plane of sources."""
 
 import math
 from collections.abc import Sequence
@@ -16,18 +16,18 @@ from holotorch.hologram.raster import Raster, has_light, span, strided_length
 from holotorch.optics.free_space.plane_pair import plane_pair
 from holotorch.optics.free_space.transfer import transfer_function
 
-# Relative amplitude, of the spherical wave, of the light that may wrap around the padded array, and of the difference
-# between a tapered and an unlimited wave where the closed form replaces the tapered one.
+# Amplitude, relative to the spherical wave, up to which light may wrap around the padded array. It is also the
+# largest difference at which the closed form of the unlimited wave replaces the tapered one.
 TAPER_ERROR = 2e-7
 
 
 class ConvolutionHologram(LayerHologram):
     """The sum of ``DirectHologram`` by FFT: thesis Eqs. 5.8 to 5.14 and Algorithm 5, exact to rounding.
 
-    Phases are computed in float64 and cast last. A plane takes one transform of its sources, which are ``stride``
-    apart, and half a transform of its kernel, of which a quadrant is computed. Planes are summed in frequency and
-    transformed back together. The padded length max(V, H, (V + H + K) / 2) keeps light from wrapping around, where
-    sources cover V samples, pixels H and the cone of light K; Sec. 5.6.1 takes H + K.
+    Phases are computed in float64 and cast last. Each plane needs an FFT of its sources, at their own spacing of
+    ``stride`` pixels, and half an FFT for its kernel, which is even, so that a quadrant suffices. Planes are summed in
+    frequency and transformed back together. The padded length max(V, H, (V + H + K) / 2) keeps light from wrapping
+    around, where sources cover V samples, pixels H and the cone of light K; Sec. 5.6.1 uses H + K.
 
     Args:
         grid: Pixels of the hologram.
@@ -35,8 +35,9 @@ class ConvolutionHologram(LayerHologram):
         depths: Distances of the planes from the hologram in metres, above 0; any order and spacing.
         cone: The part of each spherical wave that is kept, see ``holotorch.hologram.cone``. ``taper`` is applied in
             frequency, on arrays so long that at most 2e-7 of a wave wraps around. ``band`` uses the kernel of
-            ``CroppedKernel``, with a relative error of about 2 s^2 / sqrt(N), s the sine of the steepest light.
-        stride: Pixels between neighbouring sources of a plane.
+            ``CroppedKernel``, with a relative error of about 2 s^2 / sqrt(N / 2), where s is the sine of the steepest
+            light and N the padded length in samples.
+        stride: Distance between neighbouring sources of a plane in pixels.
 
     Raises:
         TypeError, ValueError: Invalid arguments; in a call: layers that are not complex [..., D, h, w].
@@ -49,7 +50,7 @@ class ConvolutionHologram(LayerHologram):
         """Size of the transforms in samples for layers of ``shape`` (h, w)."""
         apart, least = span(self.grid, shape, self.stride)
         extents = [self._extent(depth, apart) for depth in self.depths]
-        # One sample longer than the largest displacement of a pair plus that of a kernel: no wave wraps onto a pixel.
+        # No wave wraps onto a pixel if the length exceeds the largest displacement of a pair plus the kernel's extent.
         y, x = (
             strided_length(max(length, distance + max(extent) + 1), self.stride)
             for length, distance, extent in zip(least, apart, zip(*extents, strict=True), strict=True)
@@ -57,10 +58,10 @@ class ConvolutionHologram(LayerHologram):
         return y, x
 
     def _extent(self, depth: float, apart: tuple[int, int]) -> tuple[int, int]:
-        """Largest displacement (y, x) at which the kernel of a depth is not zero, in samples."""
+        """Largest displacement (y, x) in samples at which the kernel of a depth is not negligible."""
         if self._in_frequency(depth, apart):
             sines = [self.wavelength / (2 * pitch) for pitch in self.grid.pitch]
-            path = depth / math.sqrt(1 - sines[0] ** 2 - sines[1] ** 2)  # of the steepest light, in metres
+            path = depth / math.sqrt(1 - sines[0] ** 2 - sines[1] ** 2)  # path of the steepest light in metres
             y, x = (
                 math.ceil(path * sine / pitch + taper_margin(path * sine / pitch, TAPER_ERROR))
                 for sine, pitch in zip(sines, self.grid.pitch, strict=True)
@@ -85,7 +86,7 @@ class ConvolutionHologram(LayerHologram):
         return self.cone == "taper" and not is_plain(self.grid, self.wavelength, depth, apart, TAPER_ERROR)
 
     def _kernel(self, depth: float, raster: Raster, layers: Tensor) -> Tensor:
-        """A quadrant of the transform of the spherical wave from a plane."""
+        """A quadrant of the spectrum of the spherical wave from ``depth``."""
         apart, _ = span(self.grid, raster.shape, self.stride)
         if self.cone == "band":
             return self._band_kernel(depth, raster, apart).to(layers.device, layers.dtype)
@@ -151,7 +152,7 @@ class ConvolutionHologram(LayerHologram):
 
 
 class ConvolutionSum:
-    """Running sum of a :class:`ConvolutionHologram` over planes that arrive in any order."""
+    """Running sum of a :class:`ConvolutionHologram` over planes that are added in any order."""
 
     def __init__(self, operator: ConvolutionHologram, shape: tuple[int, int], phase: Tensor | None):
         self.operator, self.raster, self.phase = operator, operator._raster(shape), phase
@@ -169,7 +170,7 @@ class ConvolutionSum:
         self.total = spectrum if self.total is None else self.total.add_(spectrum)
 
     def finish(self) -> Tensor:
-        """The field [H, W]; zeros where no plane emits light."""
+        """The field [H, W]; zeros if no plane emits light."""
         if self.total is None:
             return torch.zeros(self.operator.grid.shape, dtype=torch.complex64)
         return self.raster.pixels(self.total)

@@ -1,4 +1,4 @@
-"""Encodings of complex holograms for phase-only modulators, and their loss."""
+"""Encodings of complex holograms as phases for phase-only modulators, and the error that they cause."""
 
 import math
 from collections.abc import Callable
@@ -22,7 +22,7 @@ def kinoform(field: Tensor) -> Tensor:
 def double_phase(field: Tensor) -> Tensor:
     """Double-phase encoding: two phases in a checkerboard whose phasors average to the field, real [..., H, W] in rad.
 
-    The field is scaled to a largest amplitude of 1. The difference between neighbours goes to the highest frequencies,
+    The field is scaled to a largest amplitude of 1. The difference between neighbours lies at the highest frequencies,
     which an aperture in the Fourier plane removes. A black hologram gives two phases that cancel. Source: Hsueh and
     Sawchuk (1978), as used by Maimone et al. (2017).
 
@@ -112,7 +112,7 @@ def iterated(
 
 
 def encoding_loss(field: Tensor, phase: Tensor, view: Callable[[Tensor], Tensor]) -> Tensor:
-    """Relative squared error [...] of the image |view(.)|^2 of a phase against that of the field, at the best scale.
+    """Relative squared error [...] of the image |view(.)|^2 of a phase against that of the field, optimally scaled.
 
     ``view`` maps holograms [..., H, W] to the image plane, including any aperture.
     """
@@ -123,7 +123,7 @@ def encoding_loss(field: Tensor, phase: Tensor, view: Callable[[Tensor], Tensor]
 
 
 def _checked(field: Tensor) -> Tensor:
-    """Check a field, see the callers, and set subnormal values, whose derivatives overflow, to zero."""
+    """The checked field, with subnormal values, whose derivatives overflow, set to zero."""
     if not isinstance(field, Tensor) or not field.is_complex():
         raise TypeError(f"field must be a complex tensor (..., H, W), got {getattr(field, 'dtype', type(field))}")
     if field.ndim < 2 or 0 in field.shape[-2:]:
@@ -133,9 +133,9 @@ def _checked(field: Tensor) -> Tensor:
 
 
 def _phase(field: Tensor) -> Tensor:
-    """Phase in rad, 0 where dark.
+    """Phase in rad, 0 where the field is 0.
 
-    It is taken of the unit phasor, since the derivative of torch.angle squares the amplitude, which may underflow.
+    It is computed from the unit phasor, since the derivative of torch.angle squares the amplitude, which may underflow.
     """
     amplitude = field.abs()
     return torch.angle(field / torch.where(amplitude > 0, amplitude, 1))

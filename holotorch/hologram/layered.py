@@ -14,15 +14,15 @@ from holotorch.hologram.cone import Cone, check_cone, check_layers, check_scene
 class LayerHologram(nn.Module):
     """A linear map from layers of point sources to the field on a hologram, with its conjugate transpose.
 
-    A subclass implements ``_forward`` and ``_adjoint`` for one batch axis B; gradients of any order and ``vmap`` follow
-    from the two.
+    A subclass implements ``_forward`` and ``_adjoint`` for one batch axis B; this class derives gradients of any order
+    and ``vmap`` from the two.
 
     Args:
         grid: Pixels of the hologram.
         wavelength: In metres.
         depths: Distances of the planes from the hologram in metres, above 0; any order and spacing.
         cone: The part of each spherical wave that is kept, see ``holotorch.hologram.cone``.
-        stride: Pixels between neighbouring sources of a plane.
+        stride: Distance between neighbouring sources of a plane in pixels.
 
     Raises:
         TypeError, ValueError: Invalid arguments; in a call: layers that are not complex [..., D, h, w].
@@ -45,9 +45,9 @@ class LayerHologram(nn.Module):
         """Apply the conjugate transpose to a field [..., H, W].
 
         Args:
-            field: Complex, on the grid of the hologram.
-            shape: Sources (h, w) of a layer; by default as many as the hologram has pixels, divided by ``stride``
-                and rounded up.
+            field: Complex field on the grid of the hologram.
+            shape: Number of sources (h, w) of a layer; by default the number of pixels along each axis divided by
+                ``stride`` and rounded up.
 
         Returns:
             Layers [..., D, h, w].
@@ -74,7 +74,7 @@ class LayerHologram(nn.Module):
 
 
 def _flattened(function: Callable[[Tensor], Tensor], x: Tensor, axes: int) -> Tensor:
-    """Apply a function of one batch axis to ``x``, all of whose axes but the last ``axes`` are batch axes."""
+    """Apply ``function``, which expects one batch axis, to ``x`` with any number of batch axes before ``axes`` axes."""
     batch = x.shape[:-axes]
     out = function(x.reshape(math.prod(batch), *x.shape[-axes:]))
     return out.reshape(*batch, *out.shape[1:])

@@ -21,7 +21,7 @@ from holotorch.core.grid import Grid
 def axial_range(grid: Grid, wavelength: float, steepest: tuple[float, float] = (math.inf, math.inf)):
     """Smallest and largest axial frequency w of the grid's band, in cycles per metre.
 
-    ``steepest`` limits the tangents |fy| / w and |fx| / w further.
+    ``steepest`` is an additional limit of the tangents |fy| / w and |fx| / w.
     """
     tangents = []
     for pitch, limit in zip(grid.pitch, steepest, strict=True):
@@ -40,7 +40,7 @@ class Nodes:
         first: Depth of node 0 in metres, the smallest.
         spacing: Distance between neighbouring nodes in metres.
         count: Number of nodes.
-        width: Number of nodes that a plane is spread onto; 1 where the planes lie on the nodes.
+        width: Number of nodes that a plane is spread onto; 1 if the planes lie on the nodes.
         oversampling: Ratio of the sampling rate 1 / ``spacing`` to the width of the axial band, above 1.
         centre: Axial frequency in cycles per metre that is removed from the phases of the nodes.
     """
@@ -97,9 +97,10 @@ class Nodes:
 
 
 def choose_nodes(depths: tuple[float, ...], low: float, high: float, tolerance: float) -> Nodes:
-    """Cheapest nodes within ``tolerance`` for planes at ``depths`` and axial frequencies from ``low`` to ``high``.
+    """Cheapest nodes with an error within ``tolerance`` for planes at ``depths``.
 
-    Evenly spaced planes serve as nodes themselves where they are not more numerous.
+    ``low`` and ``high`` are the limits of the axial frequency in cycles per metre. Evenly spaced planes serve as nodes
+    themselves if that is not more expensive.
     """
     nearest, farthest, centre = min(depths), max(depths), (low + high) / 2
     best = None
@@ -123,7 +124,7 @@ def choose_nodes(depths: tuple[float, ...], low: float, high: float, tolerance: 
 
 
 def _evenly_spaced(depths: tuple[float, ...]) -> float | None:
-    """Spacing of the sorted depths, or None where they are not even to 1e-12 of the largest depth."""
+    """Spacing of the sorted depths in metres, or None if they are uneven by more than 1e-12 of the largest depth."""
     ordered = sorted(depths)
     if len(ordered) == 1:
         return 1e-3  # arbitrary for a single plane

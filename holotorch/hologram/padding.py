@@ -30,7 +30,7 @@ class Axis:
     Attributes:
         sources: Extent of the sources in samples.
         pixels: Number of pixels of the hologram.
-        stride: Pixels between neighbouring sources.
+        stride: Distance between neighbouring sources in pixels.
         pitch: Pixel pitch in metres.
         wavelength: In metres.
         nearest: Smallest depth of a plane in metres.
@@ -59,10 +59,10 @@ class Axis:
         return sine / math.sqrt(1 - sine**2)
 
     def fade(self, length: int) -> tuple[float, float]:
-        """Tangents between which the attenuation rises from none to complete, for transforms of ``length``.
+        """Tangents of direction between which the attenuation rises from none to complete, for FFTs of ``length``.
 
-        Light below the first reaches a pixel from the nearest plane; light above the second wraps onto a pixel from
-        the farthest.
+        Light less steep than the first can reach a pixel from the nearest plane. Light steeper than the second can wrap
+        onto a pixel from the farthest plane.
         """
         begin = self.apart * self.pitch / self.nearest
         end = (length - self.apart) * self.pitch / self.farthest
@@ -80,7 +80,7 @@ class Axis:
         return strided_length(math.ceil(self.apart + extent) + 1, self.stride)
 
     def error(self, length: int) -> float:
-        """Relative L2 error of the field of random sources, the larger of those at the nearest and farthest depth."""
+        """Relative L2 error of the field of random sources: the larger error of the nearest and the farthest depth."""
         return max(self._error(length, depth) for depth in {self.nearest, self.farthest})
 
     def _error(self, length: int, depth: float) -> float:
@@ -93,7 +93,7 @@ class Axis:
         return math.sqrt((pairs * np.abs(taps - exact) ** 2).sum() / (pairs * np.abs(exact) ** 2).sum())
 
     def _reference_length(self, length: int, depth: float) -> int:
-        """Length of the array for the reference kernel, which has at most a quarter of the wrap-around."""
+        """Length of the array for the reference kernel, on which at most a quarter as much light wraps around."""
         return good_length(math.ceil(4 * max(length, self.apart + self.steepest * depth / self.pitch)))
 
     def _sines(self, length: int) -> np.ndarray:
@@ -136,9 +136,9 @@ def faded_out(values: Tensor, begin: float, end: float) -> Tensor:
 
 
 def choose_length(axis: Axis, tolerance: float) -> tuple[int, float]:
-    """Shortest fast length whose error is within ``tolerance``, with that error; else the best length tried.
+    """Shortest fast FFT length whose error is within ``tolerance``, and its error; else the best length tried.
 
-    Lengths are tried up to three times sources and pixels together, plus twelve times the width sqrt(wavelength z) of
+    Lengths are tried up to three times the sum of sources and pixels, plus twelve times the width sqrt(wavelength z) of
     edge diffraction.
     """
     spread = 4 * (axis.apart + axis.steepest * axis.farthest / axis.pitch)

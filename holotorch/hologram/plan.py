@@ -15,7 +15,7 @@ from holotorch.hologram.convolution import TAPER_ERROR, ConvolutionHologram
 from holotorch.hologram.raster import span
 from holotorch.optics.free_space.padding import FINEST
 
-_ROUNDING = {torch.complex64: 5e-7, torch.complex128: 1e-12}  # relative error of the sums
+_ROUNDING = {torch.complex64: 5e-7, torch.complex128: 1e-12}  # relative rounding error of the sums
 _WAVE = 150.0  # operations per sample of a spherical wave in float64; measured against the time of an FFT
 _PASS = 12.0  # operations per sample of one pass over an array; measured likewise
 _FEW_SAMPLES = 4  # pixels; a narrower cone is not sampled well enough to act as a spherical wave
@@ -28,15 +28,15 @@ class HologramPlan:
     Attributes:
         method: "convolution" or "axial nodes".
         cone: Definition of the waves, see ``holotorch.hologram.cone``.
-        near: Whether some pixel lies so near the edge of the cone of some source, or beyond it, that the definitions of
-            the cone may differ by more than the tolerance.
-        transforms: Number of transforms of sources, one per plane or per node.
+        near: Whether some pixel lies so near the edge of the cone of some source, or beyond it, that the choice of
+            ``cone`` may change the field by more than the tolerance.
+        transforms: Number of FFTs of sources, one per plane or per node.
         size: Size (y, x) of the whole spectrum in samples.
         predicted_error: Expected relative L2 error for random sources, against the wave that ``cone`` defines.
-        memory_bytes: Largest extra memory for one wavelength.
-        flops: Floating-point operations for one wavelength, for transforms and passes over arrays.
-        reason: One sentence that explains the choice.
-        runner_up: One sentence about the other method.
+        memory_bytes: Peak of the extra memory for one wavelength, in bytes.
+        flops: Floating-point operations for one wavelength, for FFTs and passes over arrays.
+        reason: Short text that explains the choice.
+        runner_up: Short text about the other method.
         notes: Warnings where the scene is near a limit of validity.
         adequate: Whether ``predicted_error`` is within the tolerance.
         operator: The module that computes the hologram.
@@ -69,20 +69,20 @@ def plan_hologram(
     dtype: torch.dtype = torch.complex64,
     memory_limit: int | None = None,
 ) -> HologramPlan:
-    """Choose the method for the hologram of layers of ``shape`` (h, w), the lit part of the scene.
+    """Choose the method for a hologram of planes with h x w sources each.
 
     Args:
         grid: Pixels of the hologram.
         wavelength: In metres.
         depths: Distances of the planes from the hologram in metres, above 0.
-        shape: Sources (h, w) of a plane; a dark margin need not be counted.
-        stride: Pixels between neighbouring sources.
-        tolerance: Largest relative L2 error.
-        cone: Definition of the waves, which every method keeps. The default is "taper", which is the cheapest and rings
-            least, or "box" at pitches below 0.9 wavelengths. For distant planes, where ``near`` is False, all
-            definitions but "band" agree.
-        dtype: complex64 or complex128.
-        memory_limit: In bytes.
+        shape: Number of sources (h, w) of a plane. It need only cover the part of the scene that is not dark.
+        stride: Distance between neighbouring sources in pixels.
+        tolerance: Largest permitted relative L2 error.
+        cone: Definition of the waves; only methods that compute this wave are considered. The default is "taper", which
+            is the cheapest and rings least, or "box" at pitches below 0.9 wavelengths. For distant planes, where
+            ``near`` is False, all definitions but "band" give the same field within the tolerance.
+        dtype: Type of the field, complex64 or complex128.
+        memory_limit: Largest permitted extra memory in bytes; None for no limit.
 
     Raises:
         ValueError: Invalid arguments, no method within the tolerance, or none within the memory limit.
@@ -129,12 +129,12 @@ def plan_hologram(
 
 
 def _in_frequency(grid: Grid, wavelength: float, nearest: float, apart: tuple[int, int], asked: Cone) -> Cone | None:
-    """Cone with which an axial hologram computes the wave that ``asked`` defines, or None where it cannot."""
+    """Cone with which an axial hologram computes the wave that ``asked`` defines, or None if it cannot."""
     if min(grid.pitch) < FINEST * wavelength:
         return None
     if asked in ("taper", "band"):
         return asked
-    # Where the sharp cone contains every pair of a source and a pixel, its wave is the unlimited one.
+    # If every pixel lies inside the sharp cone of every source, the cone cuts nothing off: the wave is that of "full".
     y, x = (distance / half for distance, half in zip(apart, cone_samples(grid, wavelength, nearest), strict=True))
     return "full" if max(y, x) < 1 and (asked != "disc" or math.hypot(y, x) < 1) else None
 
@@ -162,7 +162,7 @@ def _convolution(operator: ConvolutionHologram, shape: tuple[int, int], dtype: t
 
 
 def _convolution_error(operator: ConvolutionHologram, size: tuple[int, int], dtype: torch.dtype) -> float:
-    if operator.cone == "band":  # of the band's own wave, as ``CroppedKernel`` derives it, for noise
+    if operator.cone == "band":  # relative to the band-limited wave, for random sources; derived in ``CroppedKernel``
         sine = operator.wavelength / (2 * min(operator.grid.pitch))
         return 2 * sine**2 / math.sqrt(min(size) / 2)
     return math.hypot(_ROUNDING[dtype], TAPER_ERROR if operator.cone == "taper" else 0)

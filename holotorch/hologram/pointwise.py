@@ -10,7 +10,7 @@ from holotorch.hologram.band_limited import band_limited_wave
 from holotorch.hologram.cone import Cone, cone_samples, is_plain, spherical_wave
 from holotorch.hologram.layered import LayerHologram
 
-# Largest relative change of the wave by the taper at which the closed form of the unlimited wave replaces it.
+# The closed form of the unlimited wave replaces the tapered one if their relative difference is below this.
 _EXACT = 1e-8
 
 
@@ -28,7 +28,7 @@ class DirectHologram(LayerHologram):
         depths: Distances of the planes from the hologram in metres, above 0; any order and spacing.
         cone: The part of each spherical wave that is kept, see ``holotorch.hologram.cone``. ``taper`` and ``band`` are
             integrated over frequencies, exact to 1e-8.
-        stride: Pixels between neighbouring sources of a plane.
+        stride: Distance between neighbouring sources of a plane in pixels.
 
     Raises:
         TypeError, ValueError: Invalid arguments; in a call: layers that are not complex [..., D, h, w].
@@ -85,7 +85,7 @@ class DirectHologram(LayerHologram):
         return out.to(field.dtype)
 
     def _pixel_rows(self, rows: Tensor, height: int) -> Tensor:
-        """Pixel row of each source row, counted from the first row of the hologram; may lie outside the hologram."""
+        """Pixel row at the position of each source row, from the first row of the hologram; may lie outside it."""
         return (rows - height // 2) * self.stride + self.grid.shape[0] // 2
 
     def _rows_at_distance(self, positions: Tensor, aside: int) -> tuple[Tensor, Tensor]:
@@ -97,7 +97,7 @@ class DirectHologram(LayerHologram):
     def _row_matrices(
         self, depth: float, shape: Sequence[int], columns: tuple[int, int], positions: Tensor
     ) -> Iterator[tuple[int, Tensor]]:
-        """For each row distance: the waves from the columns of a source row, last to first, to all pixels [w', W]."""
+        """Yield each row distance and the matrix [w', W] of waves from w' columns, last to first, to all W pixels."""
         (height, width), stride = self.grid.shape, self.stride
         low, high = columns
         farthest = max(height - 1 - int(positions.min()), int(positions.max()))

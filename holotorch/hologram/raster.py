@@ -14,13 +14,13 @@ _PROBE_STEP = 251  # distance between the elements that ``has_light`` tests befo
 class Raster:
     """A periodic array of ``size`` samples (N_y, N_x) that holds the pixels and the sources, ``stride`` samples apart.
 
-    The sources begin at sample 0. Their spectrum has the period N / stride: a transform of that length, repeated.
+    The sources begin at sample 0. Their spectrum has the period N / stride, so an FFT of that length is repeated.
 
     Args:
         grid: Pixels of the hologram.
-        shape: Sources (h, w) of a layer.
-        stride: Pixels between neighbouring sources.
-        size: Samples, multiples of ``stride``.
+        shape: Number of sources (h, w) of a layer.
+        stride: Distance between neighbouring sources in pixels.
+        size: Size of the array in samples (N_y, N_x), multiples of ``stride``.
     """
 
     def __init__(self, grid: Grid, shape: tuple[int, int], stride: int, size: tuple[int, int]):
@@ -41,7 +41,7 @@ class Raster:
         return period.repeat(self.stride, self.stride)
 
     def tiles(self, spectrum: Tensor) -> Tensor:
-        """View of a whole spectrum [..., N_y, N_x] by periods, [..., s, N_y / s, s, N_x / s], s the stride."""
+        """View of a whole spectrum [..., N_y, N_x] divided into periods, [..., s, N_y / s, s, N_x / s], s = stride."""
         y, x = self.period
         return spectrum.view(*spectrum.shape[:-2], self.stride, y, self.stride, x)
 
@@ -66,7 +66,7 @@ class Raster:
 
 
 def span(grid: Grid, shape: tuple[int, int], stride: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Largest distance between a source and a pixel, and the extent of both together, in samples, each (y, x)."""
+    """Largest distance between a source and a pixel, and the larger extent of the two, each (y, x) in samples."""
     apart, least = [], []
     for count, pixels in zip(shape, grid.shape, strict=True):
         low, high = -(count // 2) * stride, (count - 1 - count // 2) * stride

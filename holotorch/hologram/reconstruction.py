@@ -26,7 +26,7 @@ def refocused(hologram: Tensor, grid: Grid, wavelength: float, depth: float, *, 
 def focal_stack(
     hologram: Tensor, grid: Grid, wavelength: float, depths: Iterable[float], *, tolerance: float = 1e-3
 ) -> Iterator[Tensor]:
-    """Intensity [..., H, W] at each depth, one after another."""
+    """Yield the intensity [..., H, W] at each depth in metres."""
     for depth in depths:
         yield intensity(refocused(hologram, grid, wavelength, depth, tolerance=tolerance))
 
@@ -37,10 +37,10 @@ def perspective(
     """The part of a hologram [..., H, W] within a cone of directions, which reaches a distant pupil.
 
     Args:
-        hologram: Complex.
-        grid: Its pixels.
+        hologram: Complex field of the hologram.
+        grid: Pixels of the hologram.
         wavelength: In metres.
-        direction: Sines (y, x) of the pupil's centre as seen from the hologram.
+        direction: Sines (y, x) of the direction from the hologram to the centre of the pupil.
         aperture: Sine of the half angle of the pupil, above 0; its edge is tapered over the last 30 %.
 
     Raises:

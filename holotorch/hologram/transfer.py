@@ -68,7 +68,10 @@ class TransferFactors:
         return multiply_even(whole, turns_phasor(cycles).to(self.dtype))
 
     def last(self, node: int) -> Tensor:
-        """Factor of the sum at ``node``, a quadrant: spectrum of the wave, cone and attenuation, over the window's."""
+        """Quadrant of the factor for the sum at ``node``.
+
+        It is the spectrum of the spherical wave times cone and attenuation, divided by the spectrum of the window.
+        """
         nodes, axial, offset = self.design.nodes, self._axial(), self._axial_offset()
         strength = 1 / (axial * math.prod(self.grid.pitch) * nodes.response(offset))
         strength = torch.where(axial > 0.07 / self.wavelength, strength, 0)

@@ -1,1 +1,1 @@
-"""Files: the only part that opens them. Import from its modules; the package itself loads nothing."""
+"""Reading and writing of files; other packages open none. Import from the modules: the package itself loads nothing."""

@@ -3,12 +3,12 @@
 import difflib
 from pathlib import Path
 
-# Photographs that scikit-image carries inside its package, so that no network is needed.
+# Photographs that are part of the scikit-image package, so that no network is needed.
 BUNDLED_IMAGES = ("astronaut", "brick", "camera", "chelsea", "coffee", "coins", "grass", "moon", "page", "text")
 
 
 def no_such_picture(source: str) -> str:
-    """Message for a picture that is neither bundled nor a file, with the nearest name."""
+    """Error message for a picture that is neither bundled nor a file; it suggests the most similar bundled name."""
     near = difflib.get_close_matches(source, BUNDLED_IMAGES, 1)
     hint = f"did you mean {near[0]!r}? " if near else ""
     shown = repr(source) if len(source) < 200 else f"{source[:200]!r}... ({len(source)} characters)"

@@ -1,4 +1,4 @@
-"""Download of published volumes: those of Table 5.2 of the thesis whose checksum is known."""
+"""Download of published volumes: the volumes of Table 5.2 of the thesis whose checksum is known."""
 
 import difflib
 from dataclasses import dataclass
@@ -12,14 +12,14 @@ _ORIGIN = "http://klacansky.com/open-scivis-datasets"
 
 @dataclass(frozen=True)
 class Published:
-    """A volume of the Open SciVis Datasets: raw voxels, x fastest, in cubes of no stated size.
+    """A volume of the Open SciVis Datasets: raw cubic voxels of unknown size, x fastest.
 
     Attributes:
-        url: Of the raw file; its name says size (x, y, z) and type.
-        shape: Voxels (D, H, W).
+        url: Address of the raw file; its name contains the size (x, y, z) and the type.
+        shape: Number of voxels (D, H, W).
         dtype: Type of a voxel.
-        sha512: Of the raw file, as the catalogue publishes it.
-        acknowledgement: Whom the catalogue asks to name. It states no licence: do not pass the data on.
+        sha512: Checksum of the raw file, as the catalogue publishes it.
+        acknowledgement: Sources to be credited, by the catalogue. It states no licence: do not redistribute the data.
     """
 
     url: str
@@ -58,19 +58,19 @@ PUBLISHED = {
 
 
 def fetch_volume(name: str, directory: str | Path | None = None) -> Volume:
-    """Fetch a volume of the thesis once, check it, and load it; later calls need no network.
+    """Download a volume of the thesis, verify its checksum and load it; later calls use the downloaded file.
 
     Args:
-        name: One of :data:`PUBLISHED`. Engine, C60 and hand of Table 5.2 are not among them: no checksum of theirs is
+        name: One of :data:`PUBLISHED`. Engine, C60 and hand of Table 5.2 are missing, because their checksums are not
             known. Download them and use :func:`load_volume`; ``scene.c60`` computes a molecule.
-        directory: Where the file is kept; by default the user's cache.
+        directory: Folder in which the file is kept; the user's cache by default.
 
     Returns:
-        uint8, in cubes of relative size 1.
+        The volume, uint8, with a relative spacing of 1 along all axes.
 
     Raises:
-        ValueError: No such name, or what was fetched does not have the published checksum.
-        OSError: The file could not be fetched; the message says where to put it by hand.
+        ValueError: Unknown name, or a downloaded file without the published checksum.
+        OSError: The download failed; the message says where to put the file by hand.
     """
     if name not in PUBLISHED:
         near = difflib.get_close_matches(str(name), PUBLISHED, 1)
@@ -85,6 +85,6 @@ def fetch_volume(name: str, directory: str | Path | None = None) -> Volume:
     file = folder / entry.url.rsplit("/", 1)[1]
     try:
         pooch.retrieve(entry.url, known_hash=f"sha512:{entry.sha512}", fname=file.name, path=folder)
-    except OSError as error:  # those of requests are OSErrors as well
+    except OSError as error:  # errors of the requests library are OSErrors, too
         raise OSError(f"could not fetch {entry.url}: {error}; download it and put it at {file}") from error
     return load_volume(file, spacing=1, unit="relative", shape=entry.shape, dtype=entry.dtype)

@@ -12,12 +12,12 @@ _OBSERVER = "CIE 1931 2 Degree Standard Observer"
 
 
 def tristimulus(wavelengths: float | Sequence[float]) -> Tensor:
-    """CIE 1931 colour-matching functions (2 degrees) X, Y, Z at wavelengths in metres, float64 [3, K].
+    """CIE 1931 colour-matching functions (2 degrees) for X, Y and Z at wavelengths in metres, float64 [3, K].
 
-    Values between the whole nanometres of the table are interpolated by Sprague's method, as CIE 167 recommends.
+    The table has steps of 1 nm; values in between are interpolated by Sprague's method, as CIE 167 recommends.
 
     Raises:
-        ValueError: A wavelength outside the table, 360 to 830 nm.
+        ValueError: A wavelength outside the range of the table, 360 to 830 nm.
     """
     from colour import MSDS_CMFS, SpragueInterpolator
 
@@ -36,16 +36,16 @@ def tristimulus(wavelengths: float | Sequence[float]) -> Tensor:
 def srgb_matrix(
     wavelengths: Sequence[float], weights: Sequence[float] | Tensor | None = None, *, white: Tensor | None = None
 ) -> Tensor:
-    """Matrix [3, K] from intensities at ``wavelengths`` to linear sRGB, float64; a column per wavelength.
-
-    Args:
-        wavelengths: In metres.
-        weights: Power of each, 1 by default, such as the weights of the rules of
-            :class:`~holotorch.optics.light.spectrum.Spectrum`.
-        white: Intensities [K] of the white of a picture, which gets a luminance of 1; all ones by default.
+    """Matrix [3, K] from intensities at ``wavelengths`` to linear sRGB, float64, with one column per wavelength.
 
     The colours are not adapted to a white point: equal intensities of three sources give the colour of their sum, which
-    is not D65. :func:`white_balance` gives weights for which they give D65.
+    is not D65. With weights from :func:`white_balance` they give D65.
+
+    Args:
+        wavelengths: K wavelengths in metres.
+        weights: Power of each wavelength, 1 by default; for example the weights of the quadrature rules of
+            :class:`~holotorch.optics.light.spectrum.Spectrum`.
+        white: Intensities [K] of the white of a picture, which gets a luminance of 1; all ones by default.
 
     Raises:
         ValueError: Wavelengths outside the table, weights that do not match or are negative, or a white without light.
@@ -67,9 +67,9 @@ def srgb_matrix(
 
 
 def white_balance(wavelengths: Sequence[float]) -> Tensor:
-    """Powers [3] of three sources whose sum is the white of sRGB, D65, relative to the strongest one, float64.
+    """Powers of three sources whose sum is D65, the white of sRGB, relative to the strongest source, float64 [3].
 
-    A display that is balanced this way shows equal values as neutral grey.
+    A display with these powers shows equal values of its three channels as neutral grey.
 
     Raises:
         ValueError: Not three wavelengths, or three that cannot mix D65.

@@ -10,8 +10,8 @@ from holotorch.core import checks
 from holotorch.io.bundled import BUNDLED_IMAGES, no_such_picture
 from holotorch.io.formats.decoding import check_exr, decode
 
-_MEMORY = 56  # bytes per pixel in load_image: three values of 8 bytes, a copy of them, and the decoded pixel
-SMALLEST_SIDE = 11  # pixels; the size of the window of ssim
+_MEMORY = 56  # bytes per pixel in load_image: three float64 values, a copy of them, and the decoded pixel
+SMALLEST_SIDE = 11  # pixels; side of the window of ssim
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of red, green and blue, ITU-R BT.709
 
 
@@ -24,8 +24,9 @@ def load_image(source: str | Path) -> Tensor:
         their maximum if it exceeds 1. Transparent pixels are composited over black.
 
     Raises:
-        ValueError: No such picture, not decodable, beyond the memory limit of :mod:`holotorch.io.formats.limits`,
-            smaller than 11 px on a side, NaN, negative, or black throughout.
+        ValueError: The picture does not exist, cannot be decoded, exceeds the memory limit of
+            :mod:`holotorch.io.formats.limits`, has a side of less than 11 px, contains NaN, infinity or negative
+            values, or is black throughout.
     """
     path = Path(source)
     if str(source) in BUNDLED_IMAGES:
@@ -46,7 +47,7 @@ def load_image(source: str | Path) -> Tensor:
 def fit_image(image: Tensor, shape: tuple[int, int], fit: str = "crop") -> Tensor:
     """Resize ``image`` [C, h, w] to ``shape`` (H, W); a picture of that size is returned unchanged.
 
-    The aspect ratio is changed by :func:`frame_image`, then the picture is resampled bilinearly with antialiasing,
+    The picture gets the new aspect ratio by :func:`frame_image` and is then resampled bilinearly with antialiasing,
     which does not overshoot and therefore creates no negative values.
     """
     if tuple(image.shape[-2:]) == tuple(shape):
@@ -72,7 +73,7 @@ def frame_image(image: Tensor, aspect: float, fit: str = "crop") -> Tensor:
 
 
 def with_channels(image: Tensor, channels: int) -> Tensor:
-    """Match ``image`` [C, H, W] to 1 or 3 channels: colour becomes BT.709 luminance, grey is repeated."""
+    """Convert ``image`` [C, H, W] to 1 or 3 channels: colour becomes BT.709 luminance, grey is repeated."""
     if image.shape[0] == channels:
         return image
     if channels == 1:
@@ -83,7 +84,7 @@ def with_channels(image: Tensor, channels: int) -> Tensor:
 
 
 def encode_png(image: Tensor) -> bytes:
-    """8-bit PNG of ``image`` [C, H, W] in [0, 1], C = 1 or 3; values are rounded, those outside clipped."""
+    """8-bit PNG of ``image`` [C, H, W], C = 1 or 3; values are clipped to [0, 1] and rounded."""
     import cv2
 
     checks.all_finite("image", image)

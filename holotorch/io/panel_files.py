@@ -20,14 +20,14 @@ _KEY = "holotorch"  # key of the PNG text chunk and of the EXR attribute that co
 
 
 def write_levels(path: Path, levels: Tensor, metadata: Mapping[str, Any]) -> None:
-    """Write a frame of grey levels, uint8 or uint16 [H, W], as ``.png`` or (uint8 only) ``.bmp``, whole or not at all.
+    """Write a frame of grey levels, uint8 or uint16 [H, W], as ``.png`` or (uint8 only) ``.bmp``, atomically.
 
-    Levels are stored without scaling: those of a 10-bit panel are 0 to 1023 in a 16-bit file. The metadata, any JSON
-    value, are stored in a text chunk of a PNG, or in ``NAME.bmp.json`` beside a BMP, which has no text chunks.
+    Levels are stored without scaling: levels of a 10-bit panel are 0 to 1023 in a 16-bit file. The metadata, a mapping
+    to JSON values, are stored in a text chunk of a PNG, or in ``NAME.bmp.json`` beside a BMP, which has no text chunks.
 
     Raises:
-        TypeError: Levels of another kind, or metadata that JSON does not hold.
-        ValueError: Another shape, another ending, 16 bits in a BMP, or NaN in the metadata.
+        TypeError: Levels of another dtype, or metadata that cannot be written as JSON.
+        ValueError: Another shape, another file extension, 16 bits in a BMP, or NaN in the metadata.
     """
     import cv2
 
@@ -51,10 +51,10 @@ def write_levels(path: Path, levels: Tensor, metadata: Mapping[str, Any]) -> Non
 
 
 def read_levels(path: Path) -> tuple[Tensor, dict[str, Any]]:
-    """Read a frame of grey levels, uint8 or uint16 [H, W], and its metadata; empty where the file has none.
+    """Read a frame of grey levels, uint8 or uint16 [H, W], and its metadata, which are empty if the file has none.
 
     Raises:
-        ValueError: Not a grey PNG or BMP, or damaged.
+        ValueError: The file is missing, damaged, or no grey picture of 8 or 16 bits.
     """
     import cv2
 
@@ -71,11 +71,11 @@ def read_levels(path: Path) -> tuple[Tensor, dict[str, Any]]:
 
 
 def write_phases(path: Path, phase: Tensor, metadata: Mapping[str, Any]) -> None:
-    """Write phases in rad, float32 [H, W], as the channel Y of an ``.exr``, to the bit, whole or not at all.
+    """Write phases in rad, float32 [H, W], as the channel Y of an ``.exr``, bit-exactly and atomically.
 
     Raises:
-        TypeError: Not float32, which is what the file keeps, or metadata that JSON does not hold.
-        ValueError: Another shape or ending, NaN or infinity, in the phases or the metadata.
+        TypeError: Phases that are not float32, the type of the channel, or metadata that cannot be written as JSON.
+        ValueError: Another shape or file extension, or NaN or infinity in the phases or the metadata.
     """
     import OpenEXR
 
@@ -85,7 +85,7 @@ def write_phases(path: Path, phase: Tensor, metadata: Mapping[str, Any]) -> None
     checks.all_finite("phase", phase)
     if path.suffix.lower() != ".exr":
         raise ValueError(f"{path}: phases are written as .exr, got {path.suffix or 'no ending'}")
-    # A contiguous copy: the library ignores the strides of its arrays.
+    # OpenEXR ignores the strides of its arrays, so it needs a contiguous copy.
     pixels = np.array(phase.detach().cpu().numpy(), dtype=np.float32, order="C", copy=True)
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, _KEY: _json(metadata)}
     with tempfile.TemporaryDirectory() as folder:  # the library writes only to a path
@@ -99,7 +99,7 @@ def read_phases(path: Path) -> tuple[Tensor, dict[str, Any]]:
     """Read phases in rad, float32 [H, W], and their metadata from an EXR file with a channel Y.
 
     Raises:
-        ValueError: Not an EXR file of that kind, or damaged.
+        ValueError: The file is missing, damaged, or has no float32 channel Y.
     """
     import OpenEXR
 
@@ -115,7 +115,7 @@ def read_phases(path: Path) -> tuple[Tensor, dict[str, Any]]:
 
 
 def _with_text(png: bytes, text: str) -> bytes:
-    """A PNG with an international text chunk (UTF-8, not compressed) after its header."""
+    """The PNG with ``text`` in an international text chunk (UTF-8, not compressed) after its header."""
     end = len(PNG) + 12 + struct.unpack(">I", png[8:12])[0]
     body = b"iTXt" + _KEY.encode() + b"\0\0\0\0\0" + text.encode()
     return png[:end] + struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body)) + png[end:]
@@ -141,7 +141,7 @@ def _metadata(path: Path, text: str | None) -> dict[str, Any]:
         return {}
     try:
         found = json.loads(text)
-    except (ValueError, TypeError, RecursionError):  # of an attribute that is no text; of lists without end
+    except (ValueError, TypeError, RecursionError):  # TypeError: no text; RecursionError: nested too deeply
         raise ValueError(f"{path}: its metadata are damaged: not JSON") from None
     if not isinstance(found, dict):
         raise ValueError(f"{path}: its metadata are damaged: expected settings, got {found!r}")

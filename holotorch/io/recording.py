@@ -2,16 +2,16 @@
 
 A recording is a folder::
 
-    recording.json   format, frame size, rate, source, order of channels, files beside; written first
-    camera.yaml ...  copies of the files that the recording was made with, byte for byte
-    frames.rgb       the frames one after another, 8-bit, H rows of W pixels of red, green, blue; nothing between them
+    recording.json   format, frame size, rate, source, order of channels, names of the copied files; written first
+    camera.yaml ...  exact copies of the files that the recording was made with
+    frames.rgb       the frames without any bytes between them, each with H rows of W pixels of 8-bit red, green, blue
     times.csv        frame,seconds,crc32,problem: a line per frame, written after the frame; a frame that could not be
-                     read has a problem and no checksum, and no bytes in frames.rgb
+                     read has a problem, but no checksum and no bytes in frames.rgb
 
-Both files are only appended to, so that frames recorded before a crash of the program can be replayed. When the disk is
-full, an incomplete frame is removed. The pixels are not compressed, since encoding a 1080p frame as PNG takes longer
-than the frame period of a camera. ``ffplay -f rawvideo -pixel_format rgb24 -video_size WxH frames.rgb``
-shows them.
+``frames.rgb`` and ``times.csv`` are only appended to, so that frames recorded before a crash of the program can be
+replayed. If the disk is full, an incomplete frame is removed. The pixels are not compressed, since encoding a 1080p
+frame as PNG takes longer than the frame period of a camera.
+``ffplay -f rawvideo -pixel_format rgb24 -video_size WxH frames.rgb`` plays the frames.
 """
 
 import csv
@@ -47,7 +47,7 @@ def is_recording(path: Path) -> bool:
 
 
 class Recorder:
-    """Appends frames to a new recording; a context manager that closes it."""
+    """Writer of a new recording, to which frames are appended; also a context manager that closes the recording."""
 
     def __init__(
         self, folder: Path, shape: tuple[int, int], rate: float, source: str, copies: Mapping[str, Path] | None = None
@@ -55,15 +55,15 @@ class Recorder:
         """Start a recording.
 
         Args:
-            folder: New or empty.
-            shape: (H, W) of every frame.
+            folder: Folder of the recording, new or empty.
+            shape: Size (H, W) of every frame in pixels.
             rate: Frames per second that the source states.
             source: Name of the source.
-            copies: Files to keep beside the frames, by the name they get there, such as ``camera.yaml``.
+            copies: Files to copy into the folder; the keys are the names of the copies, such as ``camera.yaml``.
 
         Raises:
-            ValueError: A folder with something in it, or an impossible shape or rate.
-            OSError: It cannot be written, or a copy not read.
+            ValueError: The folder is not empty, or the shape or rate is impossible.
+            OSError: The folder cannot be written, or a file to copy cannot be read.
         """
         for side in shape:
             checks.whole("side of a frame", side, 1)
@@ -89,16 +89,16 @@ class Recorder:
         self._row(_COLUMNS)
 
     def write(self, frame: Frame) -> None:
-        """Append a frame: its pixels first, then its line.
+        """Append a frame: first its pixels to ``frames.rgb``, then its line to ``times.csv``.
 
         Raises:
-            ValueError: Pixels of another shape or kind.
-            OSError: The disk takes no more; the recording is as it was before.
+            ValueError: Pixels of another shape or dtype.
+            OSError: The disk is full; the recording is unchanged.
         """
         checks.finite("time of a frame", frame.seconds, "seconds")
-        # repr of a float is read back to the same bits.
+        # The text that repr gives for a float is read back as exactly the same float.
         if frame.pixels is None:
-            problem = " ".join(frame.problem.split())  # without line breaks
+            problem = " ".join(frame.problem.split())  # removes line breaks
             self._row((str(self.frames), repr(float(frame.seconds)), "", problem or "not readable"))
         else:
             if frame.pixels.dtype != torch.uint8 or tuple(frame.pixels.shape) != (3, *self.shape):
@@ -135,13 +135,14 @@ class Recorder:
 
 
 def open_recording(folder: Path) -> Frames:
-    """Recorded frames with their times.
+    """Open a recording to replay its frames with their times.
 
     A truncated recording yields all complete frames and a remark in ``notes``. A frame whose checksum does not match
     has a problem instead of pixels.
 
     Raises:
-        ValueError: No recording, of a later format, damaged, or without a whole frame.
+        ValueError: The folder holds no recording, one of a later format, a damaged one, or one without a complete
+            frame.
     """
     if not is_recording(folder):
         raise ValueError(f"{folder} holds no recording: recording.json and times.csv are not both there")
@@ -150,7 +151,7 @@ def open_recording(folder: Path) -> Frames:
     size = recording_bytes(shape, 1)
     rows = _rows(folder)
     present = (folder / "frames.rgb").stat().st_size if (folder / "frames.rgb").is_file() else 0
-    # A line is written after its frame, so that an interruption leaves at most pixels without a line.
+    # The line of a frame is written after its pixels: an interruption can leave pixels without a line, not the reverse.
     kept, place = [], 0
     for seconds, crc, problem in rows:
         if crc is not None and place + size > present:
@@ -183,7 +184,7 @@ def open_recording(folder: Path) -> Frames:
 
 
 def free_bytes(folder: Path) -> int:
-    """Free bytes on the disk of ``folder``, or of its nearest parent that exists."""
+    """Free bytes on the disk of ``folder``; if it does not exist, on the disk of its nearest existing parent."""
     folder = folder.resolve()
     while not folder.exists():
         folder = folder.parent
@@ -208,13 +209,13 @@ def _facts(folder: Path) -> dict[str, Any]:
 
 
 def _rows(folder: Path) -> list[tuple[float, int | None, str]]:
-    """Time, checksum and problem of each line; a last line without its end was being written when it was cut off."""
+    """Time, checksum and problem of each line. A last line without a line break is incomplete and is ignored."""
     path = folder / "times.csv"
     text = path.read_bytes().decode("utf-8", "replace")
     reader = csv.reader(text[: text.rfind("\n") + 1].split("\n")[:-1])
     try:
         lines = list(reader)
-    except csv.Error as error:  # a carriage return within a line, a cell longer than csv takes
+    except csv.Error as error:  # a carriage return within a line, or a cell too long for csv
         raise ValueError(f"{path}:{reader.line_num} is damaged: {error}") from None
     if not lines or tuple(lines[0]) != _COLUMNS:
         raise ValueError(

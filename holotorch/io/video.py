@@ -22,7 +22,7 @@ _ASSUMED_RATE = 30.0  # Hz; frame rate of sources that state none
 
 
 class Frame(NamedTuple):
-    """One frame: time in ``seconds`` and ``pixels``, uint8 [3, H, W] RGB, or None with a ``problem``."""
+    """One frame: its time in seconds, and RGB pixels, uint8 [3, H, W], or None and the reason in ``problem``."""
 
     seconds: float
     pixels: Tensor | None
@@ -30,12 +30,12 @@ class Frame(NamedTuple):
 
 
 class Frames:
-    """Iterator over the frames of a source, for one pass; a context manager that closes the source.
+    """The frames of a source, which can be iterated over once; also a context manager that closes the source.
 
     Attributes:
         name: Name of the source.
-        shape: (H, W) of the frames.
-        total: Number of frames that the source states, or None where it states none, such as a camera.
+        shape: Size (H, W) of the frames in pixels.
+        total: Number of frames that the source states, or None if it states none, like a camera.
         rate: Frames per second that the source states, or an assumed rate.
         live: Whether the source is a camera, which does not end.
         notes: Remarks about the source for the user, such as an assumed rate; complete after the last frame.
@@ -67,17 +67,18 @@ class Frames:
         if close is not None:
             close()
         if self._close is not None:
-            self._close()  # closing a generator that has not started does not run its cleanup
+            self._close()  # needed because closing a generator that has not started runs none of its cleanup
 
 
 def open_frames(source: str | Path, rate: float | None = None) -> Frames:
-    """Frames of a video file, of the pictures in a folder in natural order, or of the camera with a number as name.
+    """Open a video file, a folder of pictures (ordered by the numbers in their names), or a camera (by its number).
 
-    Times are those of the file, or of the camera's driver; where there are none, as for pictures, frames count at
-    ``rate`` per second, 30 by default, and ``notes`` says so. A frame that cannot be read is a frame with a problem.
+    Times are taken from the file or from the camera's driver. If there are none, as for pictures, the frames are spaced
+    by 1 / ``rate`` seconds (30 per second by default), and ``notes`` says so. A frame that cannot be read has a problem
+    instead of pixels.
 
     Raises:
-        ValueError: No such file, folder or camera, nothing in it that can be decoded, or a rate that is no rate.
+        ValueError: No such file, folder or camera, no frame that can be decoded, or a rate that is not positive.
     """
     if rate is not None:
         checks.positive("rate", rate, "frames per second")
@@ -92,12 +93,12 @@ def open_frames(source: str | Path, rate: float | None = None) -> Frames:
 
 
 def no_such_source(source: str | Path) -> str:
-    """Message for a source that does not exist and is not the number of a camera."""
+    """Error message for a source that does not exist and is not the number of a camera."""
     return f"no such video, folder or camera: {source}; a camera is given by its number, such as 0"
 
 
 def is_camera(source: str | Path) -> bool:
-    """Whether a source is the number of a camera, and no file or folder of that name."""
+    """Whether a source is the number of a camera; a file or folder of that name takes precedence."""
     return str(source).isdecimal() and not Path(source).exists()
 
 
@@ -128,7 +129,7 @@ def _video(path: Path, rate: float | None) -> Frames:
         picture, seconds, count, guessed = first, 0.0, 0, 0
         while True:
             now = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
-            if count and not now > seconds:  # the stream has no time for this frame
+            if count and not now > seconds:  # the stream states no time for this frame
                 now, guessed = seconds + 1 / stated, guessed + 1
             seconds, count = now, count + 1
             yield Frame(seconds, _rgb(picture)) if picture is not None else Frame(seconds, None, "not decodable")
@@ -146,7 +147,7 @@ def _video(path: Path, rate: float | None) -> Frames:
 
 
 def _taken(take: Callable[[], tuple[bool, Any]]) -> tuple[bool, Any]:
-    """Result of ``take``, or (False, None) where OpenCV raises an error for a damaged file."""
+    """Result of ``take``, or (False, None) if OpenCV raises an error, as for a damaged file."""
     import cv2
 
     try:
@@ -215,7 +216,7 @@ def _camera(index: int, rate: float | None) -> Frames:
 
 
 class VideoWriter:
-    """Frames one by one into an ``.mp4`` (MPEG-4) or ``.avi`` (motion JPEG); see :func:`replacing_video`."""
+    """Writer of an ``.mp4`` (MPEG-4) or ``.avi`` (motion JPEG) video, frame by frame; see :func:`replacing_video`."""
 
     def __init__(self, path: Path, shape: tuple[int, int], rate: float):
         import cv2
@@ -227,7 +228,7 @@ class VideoWriter:
             raise OSError(0, f"OpenCV cannot write a video of {shape[1]} x {shape[0]} px at {rate:g} Hz", str(path))
 
     def write(self, pixels: Tensor) -> None:
-        """Append one frame, uint8 [3, H, W] RGB. OSError where the disk takes no more."""
+        """Append one RGB frame, uint8 [3, H, W]; OSError if it cannot be written, as on a full disk."""
         import cv2
 
         if pixels.dtype != torch.uint8 or tuple(pixels.shape) != (3, *self.shape):
@@ -239,21 +240,21 @@ class VideoWriter:
             raise OSError(0, "OpenCV could not write a frame; is the disk full?", str(self.path))
 
     def close(self) -> None:
-        """Write what the file needs at its end."""
+        """Finish the file and close it."""
         self._writer.release()
 
 
 @contextmanager
 def replacing_video(path: Path, shape: tuple[int, int], rate: float) -> Iterator[VideoWriter]:
-    """Open a video under a temporary name that becomes ``path`` when the block ends without an error.
+    """Context manager that writes a video under a temporary name and renames it to ``path`` if the block succeeds.
 
     Args:
-        path: Ends in ``.mp4`` or ``.avi``.
-        shape: (H, W) of the frames; an odd side loses its last line, as the codecs want.
-        rate: Frames per second; a video has one rate, also where frames came irregularly.
+        path: File to write; its name ends in ``.mp4`` or ``.avi``.
+        shape: Size (H, W) of the frames in pixels; the codecs drop the last row or column of an odd size.
+        rate: Frames per second, constant over the video even if frames were captured irregularly.
 
     Raises:
-        ValueError: Another ending, or an impossible rate or shape.
+        ValueError: Another file extension, or an impossible rate or shape.
         OSError: The file cannot be written.
     """
     if path.suffix.lower() not in _CODECS:
@@ -261,7 +262,7 @@ def replacing_video(path: Path, shape: tuple[int, int], rate: float) -> Iterator
     checks.positive("rate", rate, "frames per second")
     for side in shape:
         checks.whole("side of a frame", side, 2)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")  # the ending chooses the container
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")  # its extension sets the container
     try:
         try:
             writer = VideoWriter(partial, shape, rate)
@@ -277,7 +278,7 @@ def replacing_video(path: Path, shape: tuple[int, int], rate: float) -> Iterator
 
 
 def _picture(path: Path) -> np.ndarray | None:
-    """BGR [H, W, 3] with the orientation tag applied; None where the picture cannot be decoded."""
+    """BGR pixels [H, W, 3] with the orientation tag applied, or None if the picture cannot be decoded."""
     import cv2
 
     try:
@@ -295,5 +296,5 @@ def _rgb(pixels: np.ndarray) -> Tensor:
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """Key that puts frame2 before frame10."""
+    """Sort key by which frame2 comes before frame10."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]

@@ -42,29 +42,30 @@ def load_volume(
     dtype: DTypeLike | None = None,
     unit: str | None = None,
 ) -> Volume:
-    """Read a volume, in the number type of the file, with its spacing in metres or marked as relative.
+    """Read a volume with the dtype of the file; its spacing is in metres or marked as relative.
 
     Args:
         path: A file: raw (.raw, .raw.gz), MetaImage (.mhd, .mha), NRRD (.nrrd, .nhdr), TIFF stack, picture tiled with
             slices (.png), NumPy (.npy, .npz), VTK (.vti), NIfTI (.nii, .nii.gz), HDF5 (.h5::dataset); or a folder:
             numbered pictures, a DICOM series, Zarr (.zarr::array).
-        spacing: Between voxels along (z, y, x), or one number for cubes. Needed where the file states none; replaces
-            what it states.
-        shape: (D, H, W). Needed for a tiled picture and for raw files whose name does not say; checked for all others.
-        dtype: Type of raw voxels, such as "uint8", or ">i2" for big-endian. Checked for all others.
+        spacing: Distance between voxels along (z, y, x), or one number for cubic voxels. Required if the file states no
+            spacing; otherwise it replaces the spacing of the file.
+        shape: Number of voxels (D, H, W). Required for a tiled picture and for raw files whose names do not contain it;
+            compared with the content of all other files.
+        dtype: Type of raw voxels, such as "uint8", or ">i2" for big-endian; compared with the content of other files.
         unit: Unit of ``spacing``: "m" (default), or "relative" for a volume that has proportions but no size.
 
     Returns:
-        Voxels [D, H, W]. Where they take over 1 GiB and over half of the free memory, they are mapped if the file holds
-        them in native byte order without compression: such a file is read as it is used and never written, and must
-        not be cut short meanwhile, as the system then ends the program.
-        Floating-point values are not searched for NaN here, which would read it all: see :meth:`Volume.check_finite`.
+        Voxels [D, H, W]. If they take over 1 GiB and over half of the free memory, and the file holds them in native
+        byte order without compression, they are memory-mapped: the file is read on access and never written. It must
+        not be truncated while in use, because the system then ends the program.
+        Floating-point values are not checked for NaN, which would read the whole file: see :meth:`Volume.check_finite`.
 
     Raises:
-        ValueError: No such file, a format or geometry that is not known or not stated, a file that does not have the
-            size its header says, more than one number per voxel, compressed voxels beyond the memory limit of
+        ValueError: No such file, an unknown format, geometry that is unknown or not stated, a file whose size differs
+            from its header, more than one number per voxel, or compressed voxels beyond the memory limit of
             :mod:`holotorch.io.formats.limits`.
-        ImportError: The library for the format is not installed; the message has the line that installs it.
+        ImportError: The library for the format is not installed; the message states the command that installs it.
     """
     file, member = split_member(path)
     if shape is not None:

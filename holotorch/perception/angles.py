@@ -35,7 +35,7 @@ def as_tensor(name: str, value: Any, unit: str = "degrees") -> Tensor:
 
 
 def eccentricity(value: Any, name: str = "eccentricity_deg") -> Tensor:
-    """Convert eccentricities to a tensor. ValueError outside 0 to 180 deg; left and right have no sign here."""
+    """Convert eccentricities to a tensor. ValueError outside 0 to 180 deg; they have no sign for left or right."""
     tensor = as_tensor(name, value)
     bad = (tensor < 0) | (tensor > 180)
     if bad.any():

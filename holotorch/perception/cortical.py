@@ -22,8 +22,8 @@ class LinearMagnification:
     """1 / M = (1 + E / E2) / M0, thesis Eqs. 2.1 and 2.2 with a = 1 / E2.
 
     Attributes:
-        m0: Cortex per visual angle in the fovea, mm/deg.
-        e2_deg: Eccentricity at which a size has doubled.
+        m0: Magnification in the fovea: length of cortex per visual angle, mm/deg.
+        e2_deg: Eccentricity in degrees at which sizes are twice those at the fixation point.
     """
 
     m0: float

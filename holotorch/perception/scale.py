@@ -86,7 +86,7 @@ class EqualEfficiencyScale:
 
     @classmethod
     def from_time(cls, seconds: float | Tensor, times: PerceptionTime, eccentricity_deg: Any) -> "EqualEfficiencyScale":
-        """The line of the sizes with the time ``seconds``, from laws ``times`` [N] at eccentricities [N] in degrees.
+        """The line of sizes whose time is ``seconds``, from laws ``times`` [N] at eccentricities [N] in degrees.
 
         As in the thesis, only laws within 40 .. 70 deg are used. ValueError if one of them has a >= 0.
         """

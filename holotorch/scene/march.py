@@ -17,7 +17,7 @@ from holotorch.scene.volume import Volume
 
 @dataclass(frozen=True)
 class Step:
-    """Contribution of one plane: ``weight`` T alpha [n] and ``colour`` [3, n] of ``rays`` [n], flat window indices."""
+    """Contribution of a plane: ``weight`` T alpha [n] and ``colour`` [3, n] of ``rays`` [n] (flat window indices)."""
 
     plane: int
     rays: Tensor
@@ -26,9 +26,10 @@ class Step:
 
 
 class March:
-    """Composites ``volume`` along ``rays``, slab by slab, only for rays that may cross visible voxels.
+    """Front-to-back compositing of ``volume`` along ``rays``, slab by slab, for rays that may cross visible voxels.
 
-    The attribute ``visible`` is the range of depths with any opacity, to the size of a brick, or None.
+    The attribute ``visible`` is the range of depths that contains visible voxels, rounded outwards to whole bricks;
+    None if there are none.
 
     Args:
         volume: Scalar field.
@@ -38,7 +39,7 @@ class March:
         rays: Geometry of the rays.
         depths: Depths of the planes, front to back.
         spans: Smallest and largest depth of the slab of each plane.
-        early: Transmittance below which rays end.
+        early: Transmittance below which a ray ends.
 
     Raises:
         ValueError: A voxel is NaN or infinite.
@@ -66,7 +67,7 @@ class March:
         self.unit = transfer.unit_distance * max(place.half) * 2
         self.steps_of_slope = flat_steps(volume) if lighting is not None else None
         low, high = volume.bricks(BRICK)
-        # Voxels that are optimised have a gradient even while they are transparent, so none may be skipped.
+        # If the voxels are optimised, transparent ones have a gradient, too, so none may be skipped.
         self.learned = volume.values.requires_grad
         self.occupied = torch.ones_like(low, dtype=torch.bool) if self.learned else transfer.visible(low, high)
         box = occupied_box(self.occupied, volume.shape)
@@ -76,9 +77,9 @@ class March:
         self.window = Window.of(place, rays, rows, columns, like)
 
     def steps(self, wanted: Tensor | None = None) -> Iterator[Step]:
-        """Contributions of the planes, front to back; planes without any are left out.
+        """Yield the contributions of the planes, front to back; planes without a contribution are left out.
 
-        Only the rays of ``wanted``, bool [h, w], are followed; None means all.
+        Only rays where ``wanted``, bool [h, w], is true are followed; None means all.
         """
         if not self.window.size:
             return
@@ -105,7 +106,10 @@ class March:
             yield Step(plane, sampled.rays, weight, colour)
 
     def planes(self, after: Callable[[Tensor], Tensor]) -> Iterator[Tensor]:
-        """``after`` of the radiance of every plane on the grid, [3, h, w]; the function maps zero to zero."""
+        """Yield ``after(radiance)``, [3, h, w], for every plane.
+
+        ``after`` must map zero to zero, since it is applied only where a plane has light.
+        """
         done = 0
         for step in self.steps():
             yield from (self.empty() for _ in range(done, step.plane))
@@ -127,7 +131,7 @@ class March:
         return torch.zeros((), dtype=self.dtype, device=self.device).expand(3, *self.rays.grid.shape)
 
     def whole(self, values: Tensor) -> Tensor:
-        """Values [c, rays of the window] on the grid, [c, h, w]; zero outside the window."""
+        """Place values [c, rays of the window] on the grid, [c, h, w], which is zero outside the window."""
         (height, width), rows, columns = self.rays.grid.shape, self.window.rows, self.window.columns
         if not self.window.size:
             return values.new_zeros(len(values), height, width)
@@ -136,7 +140,7 @@ class March:
         return torch.nn.functional.pad(framed, margins)
 
     def whole_of(self, rays: Tensor, values: Tensor) -> Tensor:
-        """Values [3, n] of ``rays`` [n], flat window indices, on the grid, [3, h, w]; zero elsewhere."""
+        """Place values [3, n] of ``rays`` [n] (flat window indices) on the grid, [3, h, w], which is zero elsewhere."""
         (height, width), rows, columns = self.rays.grid.shape, self.window.rows, self.window.columns
         if len(columns) < width:
             rays = rays + torch.div(rays, len(columns), rounding_mode="floor") * (width - len(columns))
@@ -158,7 +162,7 @@ class March:
         return torch.cat([values[None], slopes(values, self.steps_of_slope)])
 
     def _slice_fields(self) -> Callable[[int], Tensor]:
-        # unbind has one gradient for all slices; indexing would make a volume of zeros for each slice.
+        # The backward pass of unbind makes one gradient for all slices; indexing would make a whole volume per slice.
         slices = self.volume.values.unbind(0)
         steps = self.steps_of_slope
         if steps is None:

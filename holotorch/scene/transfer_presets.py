@@ -1,4 +1,4 @@
-"""Transfer functions for common materials, and import of those that ParaView and 3D Slicer save as JSON."""
+"""Transfer functions for common materials, and import of transfer functions that ParaView or 3D Slicer saved as JSON."""
 
 import json
 import sys
@@ -70,7 +70,7 @@ def transfer_from_json(text: str, *, unit_distance: float = UNIT_DISTANCE) -> Tr
     ParaView: the first map of the list, ``RGBPoints`` [x, r, g, b, ...] and ``Points`` [x, opacity, midpoint,
     sharpness, ...]. 3D Slicer (volume property, schema 1): the first component's ``rgbTransferFunction`` and
     ``scalarOpacity``. The positions of colours and opacities are merged; both are piecewise linear between them. A jump
-    becomes a slope over a millionth of the range. Lighting is ignored.
+    becomes a steep slope over a millionth of the range of positions. Lighting is ignored.
 
     Args:
         text: Content of the file.
@@ -83,7 +83,7 @@ def transfer_from_json(text: str, *, unit_distance: float = UNIT_DISTANCE) -> Tr
     """
     try:
         content = json.loads(text)
-    except (ValueError, RecursionError) as error:  # of brackets without end
+    except (ValueError, RecursionError) as error:  # RecursionError: brackets nested too deeply
         raise ValueError(f"a transfer function must be JSON text, got {text[:40]!r}: {error}") from None
     first = content[0] if isinstance(content, list) and content else content
     if isinstance(first, dict) and "RGBPoints" in first:
@@ -204,7 +204,8 @@ def _objects(name: str, value: Any) -> list[dict[str, Any]]:
 
 
 def _number(name: str, value: Any) -> float:
-    # An integer beyond all floats compares exactly; NaN compares as not within.
+    # Python compares integers too large for a float exactly, and every comparison with NaN is False, so this test
+    # rejects both, and infinity.
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
         raise ValueError(f"{name} must be a number, got {value!r}")
     return float(value)

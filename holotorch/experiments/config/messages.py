@@ -24,7 +24,7 @@ _EXPECTED = {
 
 
 def validated(source: Source, model: type[Model]) -> Model:
-    """The settings in a file.
+    """Validate the data of a file and return its settings.
 
     Raises:
         ConfigError: All mistakes, one line each, in the order of the file.
@@ -41,14 +41,14 @@ def validated(source: Source, model: type[Model]) -> Model:
 
 
 def _follows(entry: Any, others: list[Any]) -> bool:
-    """Whether "too short" is only a consequence of other errors: pydantic does not count entries that are invalid."""
+    """Whether an error "too short" only follows from other errors, since pydantic does not count invalid entries."""
     location = entry["loc"]
     inside = (len(other["loc"]) > len(location) and other["loc"][: len(location)] == location for other in others)
     return entry["type"] == "too_short" and any(inside)
 
 
 def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
-    """One line for an entry of ``ValidationError.errors()``: position, key, what was expected and given, a hint."""
+    """One line for an entry of ``ValidationError.errors()``: position, key, expected and given value, and a hint."""
     key = _written_key(source, entry["loc"])
     kind, given = entry["type"], entry["input"]
     if kind == "extra_forbidden":
@@ -71,7 +71,7 @@ def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
     wanted = next((text for start, text in _EXPECTED.items() if kind.startswith(start)), None)
     wanted = wanted or entry["msg"].replace("Input should be ", "").removeprefix("expected ")
     near = difflib.get_close_matches(str(given)[:100].lower(), re.findall(r"'([^']+)'", wanted), 1)
-    # Only a number without a unit may lack one.
+    # Only numbers get the hint that a unit is missing; texts have a unit already.
     hint = entry["ctx"]["hint"] if kind == "quantity" and not isinstance(given, str) else ""
     shown = "nothing" if given is None else "NaN" if isinstance(given, float) and math.isnan(given) else short(given)
     return source.mistake(key, f"expected {wanted}, got {shown}" + (f"; did you mean {near[0]!r}?" if near else hint))
@@ -133,6 +133,6 @@ def _tags(option: type[BaseModel]) -> tuple[str, ...]:
 
 
 def nearest(word: str, options: list[str]) -> str:
-    """A hint: the option most similar to ``word``, or all options; upper case does not matter."""
+    """A hint: the option most similar to ``word`` (ignoring case), or all options."""
     near = difflib.get_close_matches(word, options, 1) or difflib.get_close_matches(word.lower(), options, 1)
     return f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(options)}" if options else ""

@@ -14,7 +14,7 @@ from holotorch.core.quantities import PITCH, PLANE, WAVELENGTH, Quantity
 from holotorch.experiments.config.errors import short
 
 _POWERS = {"m": 0, "cm": -2, "mm": -3, "um": -6, "µm": -6, "μm": -6, "nm": -9}  # powers of ten, in metres
-_UNITS = ("nm", "um", "mm", "cm")  # that a number without a unit may have been meant in
+_UNITS = ("nm", "um", "mm", "cm")  # units that are suggested for a number without a unit
 # No two parts of the pattern match the same characters, so that a text without a match takes linear time.
 _LENGTH = re.compile(r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-zµμ]*)")
 
@@ -79,7 +79,7 @@ def pair(value: Any) -> Any:
 
 
 def several(value: Any) -> Any:
-    """One value as a list."""
+    """A single value as a sequence of one."""
     return value if isinstance(value, list | tuple) else (value,)
 
 
@@ -87,7 +87,7 @@ def existing(there: Callable[[str], object], missing: Callable[[str], str]) -> B
     """A validator of paths that exist.
 
     Args:
-        there: Whether, or where, a path exists.
+        there: Function whose result is true if a path exists.
         missing: The message for a path that does not exist or cannot exist, such as a name that is too long.
     """
 
@@ -113,7 +113,7 @@ Number = Annotated[float, BeforeValidator(number), Field(allow_inf_nan=False)]
 Count = Annotated[int, BeforeValidator(number), Field(ge=1)]
 Length = Annotated[float, BeforeValidator(metres), Field(allow_inf_nan=False)]
 Wavelength = Annotated[Length, plausible(WAVELENGTH)]
-Distance = Annotated[Length, plausible(PLANE)]  # of an image or a plane, on either side of the hologram
+Distance = Annotated[Length, plausible(PLANE)]  # distance of an image or a plane on either side of the hologram
 Pitch = Annotated[Length, plausible(PITCH)]
 ExistingPath = Annotated[str, existing(lambda value: Path(value).exists(), _no_path)]
 ExistingArray = Annotated[str, existing(lambda value: Path(value.split("::")[0]).exists(), _no_path)]

@@ -10,8 +10,8 @@ from holotorch.experiments.config.errors import ConfigError, short
 
 Key = tuple[str | int, ...]
 _LARGEST = 1 << 17  # largest file in bytes; it takes up to 4 s to parse
-_MOST = 100_000  # largest number of values; a file of that size can only have more through aliases
-_DEEPEST = 50  # levels of keys in keys; configurations have fewer than ten
+_MOST = 100_000  # largest number of values; a file within the size limit can only have more through YAML aliases
+_DEEPEST = 50  # largest depth of nested keys; configurations have fewer than ten levels
 MOST_MISTAKES = 50  # largest number of mistakes that are listed
 
 

@@ -104,7 +104,7 @@ def _methods(observer: Observer) -> list[dict]:
 
 
 def _scaled(least: ElementSampling, factor: float) -> ElementSampling:
-    """``least`` with ``factor`` times its samples."""
+    """The sampling ``least`` with ``factor`` times as many samples."""
     fine = tuple(good_length(math.ceil(size * factor / 2) * 2) for size in least.fine)
     times = tuple(m * now / size for m, now, size in zip(least.oversampling, fine, least.fine, strict=True))
     return replace(least, oversampling=times, fine=fine)  # type: ignore[arg-type]
@@ -132,7 +132,7 @@ def _counts(observer: Observer) -> list[dict]:
         reference, seconds = timed(partial(image, wavelengths, weights, total))
         rows.append(_row(source, f"{total} of {total} nm steps", seconds, "0"))
         most = total // 4
-        # Fewer are propagated than asked for where most of the power is in few wavelengths.
+        # Fewer wavelengths than requested are propagated if few of them carry most of the power.
         asked = [count for count in (1, 2, 3, 7, 15, most) if count <= max(3, most)]
         for count in sorted({len(followed(wavelengths, weights, count)[0]) for count in asked}):
             picture, seconds = timed(partial(image, wavelengths, weights, count))

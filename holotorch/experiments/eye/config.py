@@ -27,7 +27,7 @@ Positive = Annotated[Length, AfterValidator(_above_zero)]
 
 
 class SceneSettings(Settings):
-    """The hologram to look at: the configuration of a volume, and ``change``s to it as on the command line."""
+    """The hologram to look at: the configuration of a volume, and changes to it, written as on the command line."""
 
     config: Annotated[str, existing(find_config, _no_scene)]
     change: Annotated[tuple[str, ...], BeforeValidator(several)] = ()
@@ -65,9 +65,9 @@ class EyeSettings(Settings):
 class LightSettings(Settings):
     """Sources to compare, with FWHM of 1.4, 5, 10 and 20 nm.
 
-    ``tolerance`` bounds the error of the sum over wavelengths, of which few are propagated, relative to the rms
-    brightness of a picture. ``extent`` is the sine of the half angle of the sources, which are discs, seen from the
-    hologram; 0 for points.
+    ``tolerance`` bounds the error of the sum over wavelengths relative to the rms brightness of a picture; only a few
+    wavelengths are propagated. The sources are discs: ``extent`` is the sine of the half angle that they subtend at the
+    hologram, 0 for point sources.
     """
 
     sources: Annotated[tuple[Source, ...], BeforeValidator(several), Field(min_length=1)] = (
@@ -91,8 +91,9 @@ class SweepSettings(Settings):
 class ObserverSettings(Settings):
     """An observer's view of the hologram of a volume, for several light sources and depths of focus.
 
-    ``focus``: depths of the scene at which the eye is focused; by default, the depths of 10, 50 and 90 % of the rays.
-    ``seeds``: realisations of the random phases; they are compared with the mean of eight times as many others.
+    ``focus``: depths of the scene at which the eye is focused; by default, the 10, 50 and 90 % quantiles of the depths
+    of the rays. ``seeds``: number of realisations of the random phases; the reference that they are compared with is
+    the mean of eight times as many other realisations.
     ``tolerance``: relative L2 error of the intensity on the retina. If collapsed propagation exceeds it, light is
     propagated element by element, which takes 10 to 300 times as long and much memory.
     ``sweep``: also sweep the focus over the scene, to find the focus at which each part looks sharpest.

@@ -35,8 +35,8 @@ PRESETS: dict[str, Callable[[float], Spectrum]] = {
 # (C60: 0.8).
 BEST = 0.46
 _REFERENCE_SEED = 100_000  # first seed of the realisations that only form the reference
-_MAX_RINGS = 16  # of directions of an extended source, which take a thousand times as long as a point source
-_LIT = 0.05  # of the brightest pixel of the reference: speckle is measured on brighter pixels
+_MAX_RINGS = 16  # rings of directions of an extended source; 16 take a thousand times as long as a point source
+_LIT = 0.05  # speckle is measured on pixels brighter than this fraction of the brightest pixel of the reference
 
 
 @dataclass(frozen=True)
@@ -96,10 +96,10 @@ class Observer:
         return min(self.aperture(depth), wavelength / (2 * max(self.scene.rays.pitch)))
 
     def samples(self, source: str, wavelength: float, depth: float) -> tuple[Tensor, Tensor, int]:
-        """Wavelengths and weights that represent a source within the tolerance, and the number of them to propagate."""
+        """Wavelengths (metres) and weights that represent a source within the tolerance, and how many to propagate."""
         key = (source, wavelength, depth)
         if key not in self._samples:
-            # Two independent errors: of the sum over wavelengths, and of deriving most pictures from a few.
+            # Two independent errors: that of the sum over wavelengths, and that of deriving most pictures from a few.
             eye, tolerance = self.eye(depth), self.settings.light.tolerance / math.sqrt(2)
             half_width = self.scene.width / 2
             light = seen_light(self.scene.grid, wavelength, self.display, eye, reach=half_width)
@@ -124,8 +124,8 @@ class Observer:
     def points(self, wavelength: float, depth: float) -> tuple[list[tuple[float, float]], list[float]]:
         """Directions (sines y, x) and weights of the points that represent an extended source.
 
-        A tilt by a direction shifts the picture by the depth times its sine; rings of directions are at most half a
-        spot apart in the picture.
+        Light from a direction shifts the picture by the depth times the sine of its angle. The rings of directions are
+        so dense that neighbouring rings are at most half a diffraction spot apart in the picture.
 
         Raises:
             ConfigError: More than 16 rings (1024 directions) are needed.
@@ -141,10 +141,10 @@ class Observer:
         return tilts, weights.tolist()
 
     def retina(self, depth: float) -> RetinaPlan:
-        """The method of propagation to the retina of an eye that is focused at a depth.
+        """Choose the method of propagation to the retina of an eye that is focused at a depth.
 
-        All sources use the same one, since their pictures are compared. It is planned for the shortest and the longest
-        wavelength of all sources; error and sampling are smaller between these.
+        All sources use the same method, since their pictures are compared. It is planned for the shortest and the
+        longest wavelength of all sources; wavelengths between them have smaller errors and need fewer samples.
 
         Raises:
             ConfigError: No method can be used.
@@ -178,7 +178,7 @@ class Observer:
         Args:
             hologram: Complex [3, H, W].
             source: Name of a source; None for a single wavelength per colour.
-            depth: At which the eye is focused; it chooses the method, see :meth:`retina`.
+            depth: Depth in metres at which the eye is focused; the method depends on it, see :meth:`retina`.
         """
         eye, grid, pictures = self.eye(depth), self.scene.grid, []
         elements = self.retina(depth).method == "elements"
@@ -197,13 +197,13 @@ class Observer:
         return torch.stack(pictures).cpu()
 
     def row(self, source: str, depth: float, pictures: Tensor, reference: Tensor) -> dict[str, Any]:
-        """Measurements of a source at a focus: a list by colour of means over realisations.
+        """Measurements of a source at a focus: for each quantity, a list with the mean over realisations per colour.
 
         Args:
             source: Name of the source.
             depth: Focus in metres.
             pictures: [S, 3, h, w], one for each realisation.
-            reference: [3, h, w], free of speckle.
+            reference: Picture free of speckle, [3, h, w].
         """
         peak = reference.amax((-2, -1), keepdim=True)
         shown = equal_power(pictures, reference.expand_as(pictures))

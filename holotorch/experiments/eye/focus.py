@@ -13,9 +13,9 @@ from holotorch.experiments.eye.config import SweepSettings
 from holotorch.experiments.eye.experiment import Observer
 from holotorch.experiments.runs.figures import figure_png
 
-_BLUR = 6.0  # rays: standard deviation of the Gaussian that is subtracted, so that only fine detail is compared
+_BLUR = 6.0  # standard deviation, in rays, of the blurred picture that is subtracted to compare only fine detail
 _OPAQUE = 0.5  # opacity above which a ray shows a surface
-_LEAST = 100  # rays that a band needs
+_LEAST = 100  # least number of rays in a band
 _ENDS = (0.02, 0.98)  # quantiles of the depths of the surface at which the first band begins and the last one ends
 
 
@@ -24,10 +24,10 @@ class Band:
     """The part of a scene within a range of depths, and its similarity to the rendering at each focus.
 
     Attributes:
-        depth: Mean, in metres from the hologram.
+        depth: Mean depth in metres from the hologram.
         spread: Standard deviation of the depths, in metres.
-        rays: Number of rays that show it.
-        correlation: Of its fine detail with that of the rendering, one for each focus of the sweep.
+        rays: Number of rays that show the band.
+        correlation: Correlation of its fine detail with that of the rendering, one value for each focus of the sweep.
         sharpest: Focus in metres with the largest correlation, interpolated between the steps; NaN if it is at an end
             of the sweep.
         depth_of_focus: wavelength / aperture^2 of the middle colour, in metres.
@@ -58,9 +58,9 @@ class FocusSweep:
     """The result of a sweep.
 
     Attributes:
-        depths: Of the focus, in metres from the hologram.
-        pictures: Mean over realisations [F, 3, h, w] on the rays.
-        bands: Of depth, near ones first.
+        depths: Depths of the focus in metres from the hologram.
+        pictures: Mean pictures over realisations [F, 3, h, w] on the rays.
+        bands: Bands of depth, nearest first.
     """
 
     depths: tuple[float, ...]
@@ -73,10 +73,10 @@ class Surface:
     """The visible surface of a scene.
 
     Attributes:
-        rendering: [3, h, w].
+        rendering: Rendering of the scene, [3, h, w].
         opaque: Whether a ray shows the surface, [h, w].
-        depth: Of the surface along each ray, in metres from the hologram, [h, w].
-        ends: Depths at which the surface begins and ends, without outliers.
+        depth: Depth of the surface along each ray in metres from the hologram, [h, w].
+        ends: Depths in metres at which the surface begins and ends, without outliers.
     """
 
     rendering: Tensor
@@ -114,7 +114,7 @@ def focus_sweep(eye: Observer, settings: SweepSettings, surface: Surface | None 
         surface: Result of :func:`visible_surface`; computed if it is not given.
 
     Raises:
-        ValueError: As by :func:`visible_surface`.
+        ValueError: For the same scenes as :func:`visible_surface`.
     """
     scene, surface = eye.scene, surface or visible_surface(eye)
     depth, (low, high) = surface.depth, surface.ends

@@ -20,7 +20,7 @@ _REGIONS = {
     3: "the cone of light covers the whole hologram, so spots grow with distance",
 }
 _ROMAN = {0: "none", 1: "I", 2: "II", 3: "III"}
-_INVISIBLE = 0.005  # share of its light that enters the pupil, below which the edge of the scene counts as lost
+_INVISIBLE = 0.005  # the edge of the scene counts as lost if a smaller share of its light enters the pupil
 
 
 def geometry(eye: Observer) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def in_words(values: dict[str, Any]) -> list[str]:
 
 
 def _accommodation_mm(eye: Observer, depth: float) -> float | None:
-    """Distance in mm at which a depth appears; None beyond the focal length of the eyepiece, where no eye focuses."""
+    """Distance in mm at which a depth appears; None beyond the eyepiece's focal length, where no eye can focus."""
     try:
         return 1e3 * eye.accommodation(depth)
     except ValueError:
@@ -147,7 +147,7 @@ def _draw_display(axes: Any, eye: Observer) -> None:
     for sign in (-1, 1):
         axes.plot([end, end], [sign * pupil, sign * max(2.5 * pupil, half)], "k", linewidth=2)
     axes.plot([end + retina] * 2, [-retina / 6, retina / 6], color="0.4", linewidth=3)
-    share = axes.get_xaxis_transform()  # heights as a share of the axes
+    share = axes.get_xaxis_transform()  # heights are fractions of the height of the axes
     axes.text(end + retina, 0.97, "eye  ", ha="right", va="top", fontsize=8, transform=share)
     axes.set_xlabel("along the axis (mm from the hologram)")
     axes.set_ylabel("height (mm)")

@@ -12,9 +12,9 @@ from holotorch.optics.viewing.imaging import retinal_scale
 
 # Cost on two CPU cores, as measured.
 _FLOP_SECONDS = {"collapse": 2e-10, "elements": 4e-10}  # seconds per operation of a RetinaPlan
-_DERIVED_SECONDS = 1e-9  # seconds for a wavelength derived from another, divided by n log2(n) for n samples
+_DERIVED_SECONDS = 1e-9  # seconds to derive the picture of one wavelength from another, per n log2(n) of n samples
 _BASE_BYTES = 600e6  # libraries, holograms of 512 px, and pictures of the report
-_MARGIN = 1.1  # memory of a propagation with the margin that derived wavelengths need, relative to that without
+_MARGIN = 1.1  # factor on the memory of a propagation for the margin that derived wavelengths need
 _DERIVED_BYTES = 96.0  # bytes per sample of the fields from which wavelengths are derived
 
 

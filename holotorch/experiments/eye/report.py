@@ -12,7 +12,7 @@ _PREDICTED = (
 
 
 def by_wavelength(row: dict[str, Any], wavelengths: list[float]) -> dict[str, Any]:
-    """A row of a table with a column for each wavelength (nm) of a list, such as ``contrast_636nm``."""
+    """Replace each list in a table row by one column per wavelength (nm), such as ``contrast_636nm``; keep the rest."""
     flat = {}
     for key, value in row.items():
         columns = [f"{key}_{wavelength:.0f}nm" for wavelength in wavelengths] if isinstance(value, list) else [key]

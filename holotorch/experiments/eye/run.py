@@ -33,7 +33,7 @@ from holotorch.io.files import save_array, write_bytes
 from holotorch.optics.picture import equal_power, gamut_map, linear_srgb, tone_map
 
 _SAVE_EVERY = 30.0  # seconds between two checkpoints
-_WHITE = 0.995  # quantile of the reference's brightness that is shown white
+_WHITE = 0.995  # quantile of the reference's brightness that is shown as white
 
 
 def scene_settings(settings: ObserverSettings) -> VolumeSettings:
@@ -92,7 +92,7 @@ def run_observer(eye: Observer, opened: RunFolder) -> bool:
 
 
 def _fingerprint(eye: Observer) -> Fingerprint:
-    """Without the number of realisations and the sweeps after them, which may change before a run is resumed."""
+    """Fingerprint without the number of realisations and the sweeps, which may change before a run is resumed."""
     settings, inputs, free = fingerprint_inputs(eye.scene)
     scene = fingerprint(settings, inputs, {*free, "report"})
     own = fingerprint(eye.settings, {}, {"seeds", "sweep", "tradeoff", "scene"})

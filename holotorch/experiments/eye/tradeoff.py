@@ -23,15 +23,15 @@ from holotorch.optics.viewing.imaging import propagate_collapsed
 
 # FWHM in metres of the spectra that are compared.
 WIDTHS = tuple(1e-9 * width for width in (1.4, 2.5, 4, 6, 9, 13, 19, 28, 40, 56))
-# Distances in metres from the central wavelength at which pictures are computed, to either side: up to 10 nm in steps
-# of half a beat at the corner of a scene.
+# Offsets in metres from the central wavelength at which pictures are computed, on both sides. Up to 10 nm the step is
+# 0.5 nm, half the period of the beat at the corner of a scene; from there to 84 nm it is 1 nm.
 _OFFSETS = 1e-9 * np.concatenate([np.arange(0, 10, 0.5), np.arange(10, 85.0)])
-# Wavelengths of a colour that are propagated; the others are derived from them. Even 1 of 60 errs by 0.4 % only
-# (``holotorch chart eye``).
+# Number of wavelengths of a colour that are propagated; the others are derived from them. Propagating only 1 of 60
+# wavelengths causes an error of only 0.4 % (``holotorch chart eye``).
 _PROPAGATED = 16
 _REFERENCE_SEED = 1000  # first seed of the realisations of the reference
-_BRIGHTEST = 0.995  # quantile of the reference that is shown white
-_LIT = 0.05  # of the brightest pixel of the reference: speckle is measured on brighter pixels
+_BRIGHTEST = 0.995  # quantile of the reference that is shown as white
+_LIT = 0.05  # speckle is measured on pixels brighter than this fraction of the brightest pixel of the reference
 
 
 @dataclass(frozen=True)
@@ -39,14 +39,14 @@ class Case:
     """Measurements of one colour at one distance.
 
     Attributes:
-        distance: Of the scene from the hologram, in metres.
-        wavelength: In metres.
+        distance: Distance of the scene from the hologram in metres.
+        wavelength: Central wavelength in metres.
         aperture: Sine of the half angle of the light that carries detail; limited by the eye, the hologram or the
             pitch of the rays.
-        ssim: For each of ``WIDTHS``, relative to the mean of other realisations.
+        ssim: SSIM for each of ``WIDTHS``, relative to the mean of other realisations.
         contrast: Speckle contrast for each of ``WIDTHS``.
-        sharpness: For each of ``WIDTHS``.
-        best: FWHM in metres with the highest SSIM, by a parabola through it and its neighbours.
+        sharpness: Sharpness for each of ``WIDTHS``.
+        best: FWHM in metres with the highest SSIM, by a parabola through the largest value and its neighbours.
         inside: Whether ``best`` lies inside the range of ``WIDTHS``.
     """
 
@@ -96,9 +96,10 @@ class Case:
 def tradeoff(
     settings: ObserverSettings, scene: VolumeSettings, distances: tuple[float, ...], *, seeds: int = 2, others: int = 12
 ) -> list[Case]:
-    """A case for every distance and colour, with the eye focused on the middle of the scene.
+    """Compute a case for every distance and colour, with the eye focused on the middle of the scene.
 
-    Every picture is propagated collapsed, since each hologram is seen in 189 wavelengths per colour.
+    All pictures are computed with ``propagate_collapsed`` (one filter for eyepiece and eye), because each hologram
+    needs 189 wavelengths per colour.
     """
     cases = []
     for distance in tqdm(distances, desc="speckle against sharpness", unit="distance"):

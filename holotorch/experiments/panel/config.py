@@ -17,7 +17,7 @@ from holotorch.io.files import read_bytes
 from holotorch.modulator.dispersion import Birefringence, BirefringenceTable, Cauchy, phase_scale
 from holotorch.modulator.panel import PhaseModulator, checked_lut, even_lut
 
-# Relative difference up to which a wavelength is that of a calibration: lasers differ from their nominal wavelength.
+# Largest relative difference at which a wavelength uses a calibration as it is: lasers deviate from nominal wavelengths.
 _SAME = 1e-3
 
 
@@ -46,7 +46,7 @@ class CalibrationSettings(Settings):
 
 
 class DispersionSettings(Settings):
-    """Birefringence a + b / wavelength^2, b in m^2; or a measured ``table`` of [wavelength, birefringence]."""
+    """Birefringence a + b / wavelength^2 with b in m^2, or a measured ``table`` of [wavelength, birefringence]."""
 
     a: Number | None = None
     b: Number | None = None
@@ -101,13 +101,13 @@ def load_panel(path: Path | str, overrides: Sequence[str] = ()) -> PanelSettings
 
 
 def build_panel(settings: PanelSettings, wavelengths: Sequence[float]) -> PhaseModulator:
-    """The panel under light of ``wavelengths`` in metres, one per channel.
+    """Build the panel for light of ``wavelengths`` in metres, one per channel.
 
-    The table of each channel is that of the calibration at its wavelength (to 0.1 %), or that of the nearest
+    The phase table of each channel is that of the calibration at its wavelength (to 0.1 %), or that of the nearest
     calibration, scaled by the dispersion of the crystal.
 
     Raises:
-        ConfigError: A wavelength without a table in a panel without dispersion, or outside the dispersion's table.
+        ConfigError: A wavelength has no calibration and the panel no dispersion, or it is outside the dispersion table.
     """
     law = _law(settings.dispersion) if settings.dispersion is not None else None
     rows = []

@@ -40,16 +40,16 @@ def export_slm(
 ) -> tuple[Path, dict[str, Any]]:
     """Write one file for each frame and colour of a run, read the files back and simulate their picture.
 
-    A hologram smaller than the panel is centred on the optical axis, with phase 0 around it; the simulation takes the
-    pixels around it as covered. The files of a run of kind ``pec`` hold the phases after spreading, modulo 2 pi: for a
-    liquid crystal, which has no thermal crosstalk, not for a thermal chip. Those of a run of kind ``volume`` hold the
-    encoded field of its first realisation.
+    A hologram smaller than the panel is centred on the optical axis, with phase 0 around it; the simulation assumes
+    that no light comes from the pixels around it. The files of a run of kind ``pec`` hold the phases after the heat has
+    spread, modulo 2 pi: they suit a liquid crystal, which has no thermal crosstalk, but not a thermal chip. Those of a
+    run of kind ``volume`` hold the encoded field of its first realisation.
 
     Args:
         folder: Folder of the run.
         description: YAML file of the panel.
         out: Folder for the files, new or empty; by default ``slm`` in the folder of the run.
-        encoding: One of ``source.ENCODINGS``, for a volume; double phase by default.
+        encoding: For a volume, one of ``source.ENCODINGS``; double phase by default.
         form: ``png`` (16 bits for a panel of more than 8 bits), ``bmp``, or ``exr`` for the phases in rad.
         overrides: ``key=value`` words for the description of the panel.
 
@@ -57,7 +57,8 @@ def export_slm(
         The folder of the files, and the content of its ``export.json``.
 
     Raises:
-        ConfigError: No such run, NaN in it, a panel of another pitch or too few pixels, or a folder in use.
+        ConfigError: There is no such run, it contains NaN, the panel has another pitch or too few pixels, or the folder
+            for the files is not empty.
     """
     if form not in FORMATS:
         raise ConfigError([f"expected one of {', '.join(FORMATS)} as the format, got {form!r}"])
@@ -83,7 +84,7 @@ def export_slm(
         }
         write_json(place / "export.json", report)
     except BaseException:
-        shutil.rmtree(place)  # it was empty before: it holds only files of this export
+        shutil.rmtree(place)  # it was empty before, so it holds only files of this export
         raise
     return place, report
 
@@ -93,9 +94,9 @@ def resimulate(
 ) -> dict[str, Any]:
     """Errors of the written files, computed from the files and the panel alone, one value per colour.
 
-    The rms error in rad of the phases of the levels, beside its expected value for uniform phases; and the relative L2
-    change and the correlation of the picture at its best scale, due to the levels alone, and due to the whole panel
-    with fringing fields and gaps.
+    The errors are the rms error in rad of the phases of the levels, with its expected value for uniformly distributed
+    phases, and the relative L2 change and the correlation of the picture at its best scale: once due to the levels
+    alone, and once due to the whole panel with fringing fields and gaps.
     """
     square = torch.zeros(len(source.wavelengths), dtype=torch.float64)
     fields: dict[str, list[Tensor]] = {"levels": [], "panel": []}

@@ -116,7 +116,7 @@ def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> Panel
 
 
 def _check_axes(folder: Path, experiment: "PECExperiment", heaters: Tensor) -> None:
-    """ValueError for a phase.npy whose first two axes a user has exchanged, also where F = C.
+    """Raise ValueError for a phase.npy whose first two axes were exchanged; with F = C its shape does not show this.
 
     The heating power of each colour in the run's summary identifies the order [F, C, H, W].
     """
@@ -141,7 +141,7 @@ def _check_axes(folder: Path, experiment: "PECExperiment", heaters: Tensor) -> N
 
 
 def _depth(folder: Path, settings: VolumeSettings) -> float:
-    """The middle one of the depths in the report of the run."""
+    """The middle one of the depths in metres at which the run was refocused."""
     try:
         depths = _summary(folder).get("refocused_m") or [settings.hologram.distance / settings.scale]
         return checks.finite("refocused_m", depths[len(depths) // 2], "metres")

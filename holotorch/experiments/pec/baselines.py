@@ -22,8 +22,8 @@ def baseline(experiment: PECExperiment, name: str, callback: Callback | None = N
     phases deconvolved by non-negative least squares. "basic_ipec": Gerchberg-Saxton with the crosstalk in its loop.
     "ipec": iterative proximity effect correction, which also deconvolves in the loop (Algorithm 1).
 
-    All begin with the image that the start of the solver forms, so that as much light is in the window.
-    ValueError for a crosstalk that has no inverse.
+    All methods begin with the image that the solver's start phases form, so that the same share of light is in the
+    window. ValueError for a crosstalk that has no inverse.
     """
     propagator, crosstalk = experiment.propagator, experiment.array.crosstalk
     assert not isinstance(propagator, DepthStack)

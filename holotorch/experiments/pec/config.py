@@ -54,7 +54,7 @@ class PeripheralWeightSettings(Settings):
     kind: Literal["peripheral"]
     field_deg: Annotated[Number, Field(gt=0, le=360)]
     gaze_deg: tuple[Annotated[Number, Field(ge=-90, le=90)], Annotated[Number, Field(ge=-180, le=180)]] = (0.0, 0.0)
-    e2_deg: Annotated[Number, Field(gt=0, le=180)] = 1.746  # Cowey and Rolls
+    e2_deg: Annotated[Number, Field(gt=0, le=180)] = 1.746  # value of Cowey and Rolls
     least: Annotated[Number, Field(ge=0, le=1)] = 0.0
 
 
@@ -63,7 +63,7 @@ class TargetSettings(Settings):
 
     ``region``: size in pixels of the middle part of the image that shows the picture; the rest of the image is free
     (thesis Eqs. 4.7, 4.8). ``depths``: with several distances, ``bands`` divides the picture into as many vertical
-    bands, each of which is wanted at one distance only; ``full`` wants the whole picture at every distance.
+    bands, each of which is the target at one distance only; with ``full`` the whole picture is the target at each.
     ``weight``: weight of the squared error over the picture.
     """
 
@@ -97,7 +97,7 @@ class FraunhoferSettings(Settings):
 
 
 class NearFieldSettings(Settings):
-    """An image at one or more distances, of a single array (``isolated``) or of its periodic repetition (thesis)."""
+    """An image at one or more distances, from a single array (``isolated``) or its periodic repetition (thesis)."""
 
     kind: Literal["fresnel", "angular_spectrum"]
     distance: Annotated[
@@ -132,7 +132,7 @@ class AdamSettings(Settings):
 
 
 class LBFGSSettings(Settings):
-    """Preconditioned L-BFGS in stages: first the loss of the amplitude, then that of the intensity and of a limit."""
+    """Preconditioned L-BFGS in stages: first the loss of the amplitude, then that of the intensity with any limit."""
 
     kind: Literal["lbfgs"]
     memory: Annotated[Count, Field(le=100)] = 3

@@ -35,7 +35,7 @@ class Result:
 
 
 def quality(experiment: PECExperiment, phase: Tensor) -> float:
-    """Mean of the first metric over the lit colours, for phases [F, C, H, W] of them; cheap, for progress bars."""
+    """Mean of the first metric over the lit colours for their phases [F, C, H, W]; fast enough for progress bars."""
     name = experiment.settings.report.metrics[0]
     formed = experiment.picture_in(experiment.intensity(phase.double())).cpu()
     picture = _as_picture(experiment, formed, at_best_scale=experiment.scale_free)
@@ -86,7 +86,7 @@ def _isolated(experiment: PECExperiment, phase: Tensor) -> tuple[Tensor, dict[st
     shape = (len(experiment.wavelengths), len(experiment.distances), *experiment.grid.shape)
     formed, between = (torch.zeros(shape, dtype=torch.float64) for _ in range(2))
     half = experiment.grid.pitch[0] / 2, experiment.grid.pitch[1] / 2
-    for i, wavelength in enumerate(experiment.wavelengths):  # one kernel at a time: in float64 they are large
+    for i, wavelength in enumerate(experiment.wavelengths):  # one kernel at a time, since float64 kernels are large
         for j, distance in enumerate(experiment.distances):
             for offset, total in (((0.0, 0.0), formed), (half, between)):
                 exact = CroppedKernel(experiment.grid, wavelength, distance, offset=offset).to(experiment.device)

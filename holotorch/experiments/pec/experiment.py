@@ -43,13 +43,13 @@ Progress = Callable[[Solution], None]
 class PECExperiment:
     """The operators, the target and the solver of a configuration.
 
-    Colours in which the picture is black are not lit and not solved for; C below counts the lit ones if not said
-    otherwise.
+    Colours in which the picture is black are not lit, and no phases are computed for them. In the shapes below, C is
+    the number of lit colours unless stated otherwise.
 
     Attributes:
         settings: The configuration.
         source: The picture as loaded, float64 [C', h, w].
-        lit: Which of all colours are not black.
+        lit: Indices or mask of the colours that are not black, among all colours.
         array: The phased array, over the lit colours.
         start: Kind of the phases at the start, as in ``solver.start``.
         device: Device of the solver.
@@ -234,7 +234,7 @@ class PECExperiment:
         limit, bits = self.settings.modulator.max_phase, self.settings.modulator.bits
         if bits is not None:
             phase = quantised(phase, bits)
-        # After the rounding to levels, which may exceed the limit. A common scale keeps the number of levels.
+        # The limit is applied after rounding to levels, which may exceed it. A common scale keeps the number of levels.
         return phase if limit is None else limit_peak_phase(limit, phase, self.array.crosstalk)
 
     def stages(self) -> list[Stage]:

@@ -83,7 +83,7 @@ class Log:
             "checked": self.checked,
             "seconds": self.seconds,
         }
-        self.saved = time.perf_counter()  # also if it fails, so that the next attempt is 30 seconds later
+        self.saved = time.perf_counter()  # set even after a failure, so that the next attempt is 30 seconds later
         return self.checkpoint.save(content)
 
     @contextmanager

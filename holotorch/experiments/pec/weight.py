@@ -43,7 +43,7 @@ def zone_scores(
     where = eccentricities(settings, (image.shape[-2], image.shape[-1]))
     square = (picture - image).double().square().mean(0)
     edge = SSIM_WINDOW // 2
-    centres = where[edge:-edge, edge:-edge]  # of the windows
+    centres = where[edge:-edge, edge:-edge]  # eccentricities of the centres of the windows
     windows = square[:0]
     if min(where.shape) >= SSIM_WINDOW:
         windows = ssim_map(picture, image, data_range=1.0).mean(0)

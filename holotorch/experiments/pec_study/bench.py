@@ -177,7 +177,7 @@ class Bench:
         return solution if limit is None else replace(solution, x=limit_peak_phase(limit, solution.x, self.crosstalk))
 
     def algorithm2(self, start: Tensor, *, steps: int = 400, callback: Callback | None = None) -> Solution:
-        """The thesis's solver, proximal proximity effect correction (PPEC)."""
+        """Algorithm 2 of the thesis, proximal proximity effect correction (PPEC)."""
         return APG(max_steps=steps)(self.problem(), start, callback=callback)
 
     def retrieved(self, kind: str, *, passes: int = 100, inner: int = 30, seed: int = 7) -> Solution:
@@ -237,7 +237,7 @@ class Bench:
 
 
 class Track:
-    """Callback that scores a solver on its way; the time of the scoring is subtracted."""
+    """Callback that scores the intermediate phases of a solver; the recorded times exclude the scoring."""
 
     def __init__(self, bench: Bench, every: int = 5):
         self.bench, self.every = bench, every

@@ -1,4 +1,4 @@
-"""Studies of proximity effect correction: the thesis's comparisons, and what goes beyond them, as tables.
+"""Studies of proximity effect correction as tables: the comparisons of the thesis, and further ones.
 
 Every study returns rows with the same keys. The chart ``pec`` compares the committed tables with the thesis.
 """
@@ -195,7 +195,7 @@ _ALL = ("none", "basic IPEC", "IPEC", "PPEC", "ours")
 
 
 def _methods(bench: Bench, steps: int, names: Sequence[str]) -> Iterator[tuple[str, Tensor, float]]:
-    """Heater phases and seconds of each method; the solvers begin at the thesis's hot start if not said otherwise."""
+    """Heater phases and seconds of each method; solvers use the thesis's hot start unless their name states another."""
     work: dict[str, Callable[[], Solution]] = {
         "none": lambda: bench.retrieved("none"),
         "basic IPEC": lambda: bench.retrieved("basic"),
@@ -221,7 +221,7 @@ def _corrected(bench: Bench, steps: int, setting: str) -> list[Row]:
 
 
 def _slices(bench: Bench, steps: int) -> tuple[Tensor, Tensor]:
-    """The thesis's stack: one hologram per depth of its slice alone, [D, C, H, W], and the light of each, [D, C]."""
+    """The thesis's stack: one hologram per depth for that slice alone, [D, C, H, W], and the light of each, [D, C]."""
     phases, weights = [], []
     for i, distance in enumerate(bench.distances):
         mask = bench.mask

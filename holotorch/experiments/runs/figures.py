@@ -100,8 +100,9 @@ def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[in
 def _next_stage(losses: np.ndarray) -> int | None:
     """First step whose losses [steps + 1, C] belong to a second objective, or None.
 
-    L-BFGS minimises the error of the amplitude first and that of the intensity then: at the change, the losses of all
-    colours, which only fell before, rise at once. The momentum of Adam lets single colours rise from the start.
+    L-BFGS first minimises the error of the amplitude and then that of the intensity. At the change, the losses of all
+    colours rise in the same step, after falling in every step before. With Adam, the losses of single colours rise from
+    the start because of its momentum.
     """
     change = losses[1:] / losses[:-1]
     jumps = np.flatnonzero((change > 1.5).all(1))
@@ -138,7 +139,7 @@ _COLOURS = ("#c0392b", "#27864a", "#2867b2")
 
 
 def figure_png(figure: Figure) -> bytes:
-    """PNG of a figure, drawn without any global state of matplotlib."""
+    """Render a figure as PNG, without any global state of matplotlib."""
     buffer = io.BytesIO()
     FigureCanvasAgg(figure).print_png(buffer)
     return buffer.getvalue()

@@ -22,8 +22,8 @@ def fingerprint(
 
     Args:
         settings: The resolved configuration.
-        inputs: Contents of input files by the key of their settings; these settings are left out, since the content
-            of a file counts and not its path.
+        inputs: Contents of input files by the key of the setting that names the file. These settings themselves are
+            left out, since the content of a file matters and not its path.
         free: Keys that may change before a run is resumed.
     """
     excluded = {*inputs, *free}
@@ -44,7 +44,7 @@ def differences(before: Fingerprint, now: Fingerprint) -> list[str]:
 
 
 def _digest(parts: tuple[Tensor | bytes | str, ...]) -> str:
-    """Digest of inputs; of a tensor of more than 64 MiB, only evenly spaced slices along the first axis count."""
+    """Digest of inputs; of a tensor of more than 64 MiB, only evenly spaced slices along the first axis are hashed."""
     total = hashlib.blake2b(digest_size=16)
     for part in parts:
         if isinstance(part, Tensor):

@@ -1,4 +1,4 @@
-"""The folder of a run: used by one run at a time; results in it are kept whatever fails."""
+"""The folder of a run. Only one run can use it at a time, and a failure does not delete results in it."""
 
 import os
 import re
@@ -81,11 +81,12 @@ class RunFolder:
 def open_run(
     out: Path | None, name: str, settings: BaseModel, plan: RunPlan, device: str, *, resumes: bool = True
 ) -> Iterator[RunFolder]:
-    """Fill a folder within this block: a new one, or ``out`` if it holds an unfinished run of the same settings.
+    """Context manager that provides the folder of a run.
 
-    A run that cannot be continued (not ``resumes``) always takes a new folder.
+    The folder is new, or is ``out`` if that holds an unfinished run of the same settings. A run that cannot be
+    continued (``resumes`` False) always needs a new folder.
 
-    The folder is locked against other runs, where the system can do that; config.yaml and env.json are written at once.
+    The folder is locked against other runs if the system supports this; config.yaml and env.json are written at once.
     Within the block, the first signal raises KeyboardInterrupt. If the block fails, the folder keeps all results; a new
     folder without results is removed, so that a corrected run can use it.
 
@@ -194,7 +195,7 @@ def _keep_results(folder: Path, new: bool, resumes: bool) -> Iterator[None]:
 
 
 def _remove_setup(folder: Path) -> bool:
-    """Remove a folder if it holds only the files that are written before the work begins; whether it was removed."""
+    """Remove a folder if it holds only the files written before the computation starts; returns whether it did."""
     files = [path for path in folder.rglob("*") if not path.is_dir()]
     if not {path.name for path in files} <= _SETUP:
         return False
@@ -222,14 +223,14 @@ def conclude(
         summary: Numbers; ``status`` is set here.
         results: The files written so far.
         done: Whether everything was computed.
-        checkpoint: Of the run; an error in writing it counts as an error of an unfinished run. A complete run's
-            checkpoint is removed.
+        checkpoint: Checkpoint of the run. If the run is not done, an error in writing it is raised like that of any
+            other file. If the run is complete, such an error is ignored and the file is removed.
 
     Returns:
         Whether the run is complete.
 
     Raises:
-        OSError: A file could not be written; all others have been written.
+        OSError: A file could not be written; writing of all other files was attempted before.
     """
     with deferred(run.pressed):
         if not done and checkpoint is not None:
@@ -244,7 +245,7 @@ def conclude(
                 run.pressed.settled = True
                 for path in (run.path / "checkpoint.pt", run.path / "interrupted.json"):
                     path.unlink(missing_ok=True)
-            if run.write_page is not None:  # after all other files, which it shows
+            if run.write_page is not None:  # written last, since it shows the other files
                 results.write(run.write_page, run.path / "report.html")
         if results.failure is not None:
             raise results.failure

@@ -1,4 +1,4 @@
-"""How the pictures of a run are written."""
+"""Writing of the pictures of a run."""
 
 from pathlib import Path
 

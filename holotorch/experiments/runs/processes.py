@@ -32,6 +32,6 @@ def process_count() -> tuple[int, int]:
 
 
 def from_first(value: Tensor) -> Tensor:
-    """The value of the first process, in all processes."""
+    """Broadcast the value of the first process to all processes."""
     torch.distributed.broadcast(value, 0)
     return value

@@ -1,4 +1,4 @@
-"""Checkpoints and results on a disk that may be full: errors are reported, and all other files are written."""
+"""Checkpoints and results on a disk that may be full: errors are reported, and the other files are still written."""
 
 import hashlib
 import math
@@ -22,7 +22,7 @@ class Checkpoint:
 
     Attributes:
         path: The file; it is replaced only when a new checkpoint is complete.
-        fingerprint: Of the configuration and inputs of the run; a checkpoint with another fingerprint is refused.
+        fingerprint: Fingerprint of the configuration and inputs; a checkpoint with another fingerprint is refused.
         failure: The error of the last :meth:`save`, or None.
     """
 
@@ -71,7 +71,7 @@ class Checkpoint:
                 try:
                     content = content | {"fingerprint": self.fingerprint}
                     torch.save(content | {"checksum": checksum(content)}, stream)
-                except RuntimeError as error:  # torch raises it while it handles the error of the disk
+                except RuntimeError as error:  # torch raises it while it handles the OSError of a failed write
                     raise error.__context__ if isinstance(error.__context__, OSError) else error from None
         except (OSError, RuntimeError) as error:
             is_disk = isinstance(error, OSError)
@@ -84,7 +84,7 @@ class Checkpoint:
 
 
 class Results:
-    """Files of results. An error in writing one is reported once, and the others are written all the same.
+    """Writer of result files. An error in writing one is reported once, and the other files are still written.
 
     Attributes:
         failure: The first error, or None.
@@ -95,7 +95,7 @@ class Results:
         self._reported: set[int | None] = set()
 
     def fail(self, error: OSError | None) -> None:
-        """Record an error that has been reported already."""
+        """Record an error that has already been reported; the first recorded error is kept."""
         self.failure = self.failure or error
 
     def write(self, write: Callable[..., Any], *words: Any) -> bool:

@@ -64,8 +64,8 @@ def handling(handler: Callable[[int, Any], object]) -> Iterator[None]:
         yield
         return
     numbers = [signal.SIGINT, signal.SIGTERM]
-    hangup = getattr(signal, "SIGHUP", None)  # not on Windows
-    if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:  # under nohup a run goes on
+    hangup = getattr(signal, "SIGHUP", None)  # does not exist on Windows
+    if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:  # nohup ignores it, so the run continues
         numbers.append(hangup)
     before = [signal.signal(number, handler) for number in numbers]
     try:

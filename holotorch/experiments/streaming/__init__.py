@@ -1,1 +1,1 @@
-"""Poses over the network."""
+"""Sending and receiving of poses over the network."""

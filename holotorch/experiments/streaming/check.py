@@ -1,4 +1,4 @@
-"""``holotorch stream --check``: a test of streaming on this computer, and its address for senders."""
+"""``holotorch stream --check``: a test of streaming on this computer, which also prints its address for senders."""
 
 import asyncio
 import importlib.util
@@ -14,14 +14,14 @@ from holotorch.tracking.pose.status import Pose, Status
 from holotorch.tracking.streaming.packet import now
 from holotorch.tracking.streaming.stream import PORT, PoseReceiver, PoseSender
 
-_EVERY = 50  # packets per refusal
+_EVERY = 50  # one of this many packets is a refusal
 _FAST = 1e-3  # seconds: largest accepted median transit on the loopback
 
 
 def check(port: int = PORT, *, packets: int = 1000, show: Callable[[str], None] = print) -> bool:
-    """Send ``packets`` over the loopback to two receivers and through a lossy relay to a third.
+    """Send ``packets`` packets over the loopback to two receivers, and through a lossy relay to a third one.
 
-    Prints the results by ``show``, and returns whether all of them are good.
+    Prints the results with ``show``. Returns whether all of them are good.
     """
     sound = True
     for fine, text in asyncio.run(_rows(port, packets)):
@@ -108,17 +108,18 @@ def _lossy(receiver: PoseReceiver, relay: "Relay") -> tuple[bool, str]:
 
 
 class Relay(asyncio.DatagramProtocol):
-    """A simulated bad network: it loses 20 % of the packets, reorders 10 % by up to three, and repeats 2 %.
+    """A simulated bad network: it loses 20 % of the packets, delays 10 % by up to three packets, and repeats 2 %.
 
     Attributes:
-        came, dropped, overtaken, repeated: Numbers of packets; ``overtaken`` ones were sent on after a later packet.
-        newest: Largest number, in the order of arrival, of a packet that was sent on.
+        came, dropped, overtaken, repeated: Numbers of received, lost, delayed and repeated packets. A packet counts as
+            overtaken if it was sent on after a later one.
+        newest: Largest number, counted in the order of arrival, of a packet that was sent on.
     """
 
     def __init__(self, port: int, seed: int = 7):
         self._to, self._dice = ("127.0.0.1", port), random.Random(seed)
         self.came, self.dropped, self.overtaken, self.repeated, self.newest = 0, 0, 0, 0, -1
-        self._held: deque[tuple[int, int, bytes]] = deque()  # due, number, packet
+        self._held: deque[tuple[int, int, bytes]] = deque()  # (number at which it is due, number, content)
         self._transport: Any = None
 
     async def __aenter__(self) -> "Relay":

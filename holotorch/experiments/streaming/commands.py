@@ -1,4 +1,4 @@
-"""The command ``stream``: its arguments and what it calls. Modules load when the command runs."""
+"""The command ``stream``: its arguments and action. Other modules are imported when it runs."""
 
 import argparse
 import sys
@@ -57,12 +57,12 @@ def _stream(options: argparse.Namespace) -> int:
     if not found.delivered:
         print("nothing could be delivered: does a receiver run there? holotorch stream --view is one", file=sys.stderr)
         return FAILED
-    # Of a camera, which never ends, Ctrl-C is the ordinary end.
+    # A camera never ends, so that Ctrl-C is the normal end of its stream.
     return OK if found.complete or is_camera(options.sources[0]) else INTERRUPTED
 
 
 def _listens(options: argparse.Namespace) -> None:
-    """ConfigError for what the two ways of ``stream`` that send no poses of the user's would leave unused."""
+    """Raise ConfigError for arguments that ``--check`` and ``--view``, which send no poses of the user, do not use."""
     from holotorch.experiments.config.errors import ConfigError
 
     chosen = "--check" if options.check else "--view"

@@ -1,4 +1,4 @@
-"""``holotorch stream``: sends recorded or tracked poses, and prints statistics of received ones."""
+"""``holotorch stream``: sends recorded or tracked poses, or prints statistics of received poses."""
 
 import asyncio
 import csv
@@ -28,8 +28,8 @@ class Streamed(NamedTuple):
 
     Attributes:
         frames: Number of poses and refusals sent.
-        complete: Whether all poses were sent; False where the user interrupted.
-        delivered: False where every packet to every receiver failed, and there was no OpenIGTLink server.
+        complete: Whether all poses were sent; False if the user interrupted the stream.
+        delivered: False if all packets to all receivers failed and there was no OpenIGTLink server.
     """
 
     frames: int
@@ -38,12 +38,13 @@ class Streamed(NamedTuple):
 
 
 def read_poses(path: Path) -> list[tuple[float, Pose]]:
-    """Capture times and poses from a poses.csv of ``holotorch track``.
+    """Read capture times in seconds and poses from a poses.csv of ``holotorch track``.
 
-    The table has no covariance of the direction. A variance of 1 along each axis stands for an unknown unit vector.
+    The table has no covariance of the direction. It is set to a variance of 1 along each axis, which stands
+    for an unknown unit vector.
 
     Raises:
-        ConfigError: Not such a file, a line that cannot be read or sent, or times that do not rise.
+        ConfigError: The file is not a poses.csv, a line cannot be read or sent, or the times do not increase.
     """
     try:
         with open(path, newline="", encoding="utf-8") as stream:
@@ -87,7 +88,7 @@ def _pose(row: dict[str, str]) -> tuple[float, Pose]:
 
 
 def replay(poses: Sequence[tuple[float, Pose]], rate: float | None = None) -> Iterator[tuple[float, Pose]]:
-    """Give recorded poses with capture times moved to now, when they are due; ``rate`` in Hz replaces their pace."""
+    """Yield recorded poses with capture times moved to the present. ``rate`` in Hz replaces the recorded pace."""
     start, first = now(), poses[0][0]
     for i, (captured, pose) in enumerate(poses):
         yield start + (captured - first if rate is None else i / rate), pose
@@ -103,20 +104,20 @@ def stream(
     track: Callable[[Sequence[str]], Iterable[tuple[float, Pose]]] | None = None,
     show: Callable[[str], None] = print,
 ) -> Streamed:
-    """Send poses until they end or the user interrupts.
+    """Send poses until the sources end or the user interrupts the stream.
 
     Args:
-        sources: One poses.csv, or what ``track`` understands: videos, folders, a camera's index.
+        sources: One poses.csv, or sources of ``track``: videos, folders, the index of a camera.
         to: Receivers, each ``HOST`` or ``HOST:PORT``.
         igtl: Port of an OpenIGTLink server, to which Slicer connects; None for no server.
         rate: Poses per second of a poses.csv, instead of the recorded pace.
         smooth: Whether to smooth the poses by :class:`OneEuro`; the packets then state its lag.
         track: Yields capture times (by ``packet.now``) and poses for the sources, as frames arrive. A pose with a
             future time is sent at that time.
-        show: Takes the lines to print.
+        show: Function that prints a line.
 
     Raises:
-        ConfigError: Nothing to send or nobody to send to, an address or a file that cannot be read, no pyigtl.
+        ConfigError: There is no source or no receiver, an address or file cannot be read, or pyigtl is missing.
     """
     receivers = [address(text) for text in to]
     if not receivers and igtl is None:
@@ -144,7 +145,7 @@ def stream(
 
 
 def _said(error: OSError) -> Exception:
-    """A mistake of the user's if it is about an address or port; one about a file names the file as it is."""
+    """Convert an error about an address or port to ConfigError; an error about a file stays unchanged."""
     return ConfigError([error.strerror or str(error)]) if error.filename is None else error
 
 
@@ -165,10 +166,10 @@ async def _send(
         if server:
             show(f"Slicer     connects to {own_address()}, port {server.port}")
         try:
-            # In a thread: a frame takes its time, and clock requests must not wait for it.
+            # Tracking runs in a thread, so that clock requests are answered in the meantime.
             while (item := await asyncio.to_thread(next, poses, None)) is not None:
                 captured, pose = item
-                await asyncio.sleep(max(0.0, captured - now()))  # here Ctrl-C ends it; a thread would be waited for
+                await asyncio.sleep(max(0.0, captured - now()))  # unlike sleep in a thread, Ctrl-C ends it at once
                 pose = smoother(pose, captured) if smoother else pose
                 if sender:
                     sender.send(pose, captured, lag=smoother.lag if smoother else 0.0)
@@ -185,7 +186,7 @@ async def _send(
 
 
 def view(port: int = PORT, *, seconds: float = math.inf, show: Callable[[str], None] = print) -> None:
-    """Print once a second what arrives at ``port``, at the end the statistics; ConfigError if the port is in use."""
+    """Print the newest packet at ``port`` once a second, and finally statistics. ConfigError if the port is in use."""
     state: list[PoseReceiver] = []
     try:
         with suppress(KeyboardInterrupt):
@@ -225,7 +226,7 @@ def _line(receiver: PoseReceiver) -> str:
 
 
 def statistics_text(receiver: PoseReceiver) -> list[str]:
-    """A receiver's statistics in a few lines."""
+    """Statistics of a receiver as a few lines of text."""
     counts = receiver.statistics
     if not counts.received:
         text = f"Received   nothing; {counts.invalid} unreadable packets {counts.last_error}".rstrip()
@@ -247,7 +248,7 @@ def statistics_text(receiver: PoseReceiver) -> list[str]:
 
 
 def address(text: str) -> tuple[str, int]:
-    """Host and port of ``HOST``, ``HOST:PORT`` or ``[IPv6]:PORT``; ConfigError otherwise."""
+    """Read host and port from ``HOST``, ``HOST:PORT`` or ``[IPv6]:PORT``. ConfigError for other text."""
     host, colon, port = text.rpartition(":") if not text.endswith("]") and text.count(":") else (text, "", "")
     host = host.removeprefix("[").removesuffix("]")
     number = int(port) if port.isascii() and port.isdigit() else 0
@@ -259,10 +260,10 @@ def address(text: str) -> tuple[str, int]:
 
 
 def own_address() -> str:
-    """IPv4 address by which others may reach this computer; 127.0.0.1, for itself only, if there is no network."""
+    """IPv4 address of this computer for other computers, or 127.0.0.1 if there is no network."""
     with socket.socket(type=socket.SOCK_DGRAM) as probe:
         try:
-            # Sends nothing: it asks which way a packet to elsewhere would leave (RFC 5737 keeps this address unused).
+            # This sends nothing, but selects the interface for foreign addresses. RFC 5737 reserves this address.
             probe.connect(("192.0.2.1", 9))
             return probe.getsockname()[0]
         except OSError:

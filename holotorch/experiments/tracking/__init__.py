@@ -1,1 +1,1 @@
-"""Catheter tracking: recordings, cameras, runs."""
+"""Catheter tracking: configurations, inputs, runs and their reports."""

@@ -28,13 +28,13 @@ def calibrate_photographs(
     Args:
         files: Photographs, or folders of them, all of one size.
         out: YAML file for the camera; must not exist yet.
-        board: Description of the board, as :func:`parse_board` takes it.
+        board: Description of the board, in the form that :func:`parse_board` reads.
 
     Returns:
-        The calibration, and the photographs in which no board was found, with the reason.
+        The calibration, and the reason for each photograph in which no board was found.
 
     Raises:
-        ConfigError: Photographs that cannot be read, differ in size, show no board, or do not determine a camera.
+        ConfigError: The photographs cannot be read, differ in size, show no board, or do not determine a camera.
     """
     wanted = parse_board(board)
     if out.exists():
@@ -80,7 +80,7 @@ def calibrate_photographs(
 
 
 def parse_board(words: Sequence[str]) -> Chessboard | Charuco:
-    """The board that the words after ``--board`` describe. ConfigError says what is expected instead."""
+    """Create the board that the words after ``--board`` describe. ConfigError for words that describe no board."""
     kind, *rest = " ".join(words).split() or ("",)
     sides = re.fullmatch(r"(\d{1,3})x(\d{1,3})", rest[0]) if rest else None
     wanted = {"chessboard": 1, "charuco": 2}.get(kind, -1)
@@ -125,7 +125,7 @@ def calibration_text(calibration: Calibration, missing: dict[str, str], board: S
 
 
 def _rounded(value: float, deviation: float) -> str:
-    """Value and deviation, both to the second digit of the deviation."""
+    """Value and deviation as text, both rounded to the second significant digit of the deviation."""
     digits = max(0, 1 - math.floor(math.log10(deviation))) if deviation > 0 else 6
     return f"{value:.{digits}f} +- {deviation:.{digits}f}"
 
@@ -145,6 +145,6 @@ def _listed(files: Sequence[Path]) -> list[Path]:
     resolved = [path.resolve() for path in paths]
     twice = {str(path) for path, place in zip(paths, resolved, strict=True) if resolved.count(place) > 1}
     if twice:
-        # A view that is counted twice lowers the stated deviations although it adds no information.
+        # Counting a view twice would lower the stated deviations without adding information.
         raise ConfigError([f"{path}: given twice" for path in sorted(twice)])
     return paths

@@ -1,11 +1,11 @@
-"""The commands ``track`` and ``calibrate``: their arguments and what they call. Modules load when a command runs."""
+"""The commands ``track`` and ``calibrate``: their arguments and actions. Other modules are imported when they run."""
 
 import argparse
 import re
 from pathlib import Path
 
 OK, INTERRUPTED = 0, 130
-# Options for the two files that track and stream need.
+# Options of ``track`` and ``stream`` for the files that both need.
 FILES = {
     "--camera": "its intrinsics: a YAML file, as calibrate writes it",
     "--catheter": "YAML file, such as configs/tracking/catheter.yaml",
@@ -29,7 +29,7 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     calibrate.add_argument("files", nargs="+", type=Path, metavar="FILE", help="photographs, or folders of them")
     board = "chessboard 9x6 25mm (default; inner corners, square) or charuco 5x7 40mm 20mm DICT_6X6_250"
     calibrate.add_argument("--board", nargs="+", metavar="WORD", help=board)
-    # argparse takes -25mm for an option unless told that it is a (wrong) number.
+    # Without this pattern, argparse would read -25mm as an option instead of an (invalid) length.
     calibrate._negative_number_matcher = re.compile(r"-\.?\d")
     calibrate.add_argument("--out", type=Path, default=Path("camera.yaml"), help="file (default: camera.yaml)")
     calibrate.set_defaults(action=_calibrate)

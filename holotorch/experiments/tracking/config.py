@@ -1,4 +1,4 @@
-"""What the configuration of a tracking run may say."""
+"""Settings of a tracking run."""
 
 from typing import Annotated, Any, Literal
 
@@ -10,18 +10,18 @@ SYNTHETIC = "synthetic"
 
 
 def _camera_number(value: Any) -> Any:
-    """The number of a camera, which YAML reads as a number, as text."""
+    """Convert the index of a camera, which YAML reads as a number, to text."""
     return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
 class TrackSettings(Settings):
-    """A catheter tracked through a video, a folder of pictures, a recording, or what a camera sees.
+    """Tracking of a catheter in a video, a folder of pictures, a recording, or the frames of a live camera.
 
-    ``source``: a path, the number of a camera, or ``synthetic``, which renders a recording of ``frames`` with its truth
-    first. ``camera``, ``catheter``: YAML files; by default those beside a recording, or a synthetic camera and the
-    dissertation's catheter. ``record``: keep every frame, losslessly, so that it can be tracked again. ``video``: write
-    the overlay video. ``still``: the catheter is at rest, so measure its stability. ``rate_hz``: frames per second of a
-    source that has no times.
+    ``source``: a path, the index of a camera, or ``synthetic``, which first renders a recording of ``frames`` frames
+    with the true poses. ``camera``, ``catheter``: YAML files; by default those beside a recording, or a synthetic
+    camera and the dissertation's catheter. ``record``: save every frame without loss, so that it can be tracked again.
+    ``video``: write the overlay video. ``still``: measure the stability of the tip, for a catheter at rest.
+    ``rate_hz``: frames per second of a source without time stamps.
     """
 
     experiment: Literal["track"]

@@ -1,4 +1,4 @@
-"""YAML files of cameras, of catheters, and of where a camera sits on a headset."""
+"""YAML files of cameras, of catheters, and of a camera's position on a headset."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,10 +39,11 @@ Row = tuple[Number, Number, Number, Number]
 
 
 class EvidenceSettings(Settings):
-    """How good a calibration is, for the reader and for warnings while tracking. Angles in radians.
+    """Quality of a calibration, for users and for warnings while tracking. Angles are in radians.
 
-    ``deviations``: standard deviation of each parameter. ``views`` and ``left_out``: rms in pixels by
-    photograph. ``cells``, ``radius``, ``tilts``, ``between``: see ``Coverage``.
+    ``deviations``: standard deviation of each parameter. ``views`` and ``left_out``: rms reprojection error
+    in pixels of each photograph that was used or left out. ``cells``, ``radius``, ``tilts`` and ``between``: see
+    ``Coverage``.
     """
 
     deviations: dict[str, Number]
@@ -60,7 +61,7 @@ class CameraSettings(Settings):
     """A camera; see ``Camera``.
 
     ``distortion``: k1, k2, p1, p2, k3 in OpenCV's order. ``size``: rows and columns of its frames.
-    ``tone``: srgb, linear, or the light of each of the 256 levels.
+    ``tone``: srgb, linear, or a list of the light of each of the 256 levels.
     """
 
     fx: Positive
@@ -83,10 +84,10 @@ class CatheterSettings(Settings):
 
 
 class HeadsetSettings(Settings):
-    """Where a camera sits on a headset: rows of the 4 x 4 matrix from camera to headset, in metres.
+    """Position of a camera on a headset: rows of the 4 x 4 matrix from camera to headset coordinates, in metres.
 
-    ``residuals`` and ``leave_one_out``: errors of the alignments that it was computed from, in metres; see
-    ``Alignment``. Null where an alignment could not be left out.
+    ``residuals`` and ``leave_one_out``: errors in metres of the alignments from which the matrix was computed; see
+    ``Alignment``. An error is null if its alignment could not be left out.
     """
 
     headset_from_camera: tuple[Row, Row, Row, Row]
@@ -99,14 +100,14 @@ AnySettings = TypeVar("AnySettings", bound=Settings)
 
 
 def load_camera(path: Path | str, overrides: Sequence[str] = ()) -> CameraSettings:
-    """Read, override and check a camera; ConfigError names each mistake with its file, line and column."""
+    """Read a camera's file, apply overrides and check it. ConfigError gives file, line and column of mistakes."""
     source, settings = _read(CameraSettings, path, overrides)
     _tried(source, build_camera, settings)
     return settings
 
 
 def build_camera(settings: CameraSettings) -> Camera:
-    """The camera that the settings describe."""
+    """Create the camera that the settings describe."""
     matrix = [[settings.fx, 0.0, settings.cx], [0.0, settings.fy, settings.cy], [0.0, 0.0, 1.0]]
     tone = settings.tone if isinstance(settings.tone, str) else torch.tensor(settings.tone, dtype=torch.float64)
     distortion = torch.tensor(settings.distortion, dtype=torch.float64)
@@ -114,7 +115,7 @@ def build_camera(settings: CameraSettings) -> Camera:
 
 
 def save_camera(path: Path, camera: Camera | Calibration, size: tuple[int, int] | None = None) -> None:
-    """Write a camera, or a calibration with its evidence. ``size`` (H, W): of the frames, for a camera without one."""
+    """Write a camera, or a calibration with its quality. ``size`` (H, W) is the frame size of a plain camera."""
     values: dict[str, Any] = {}
     if isinstance(camera, Calibration):
         calibration, camera, size = camera, camera.camera, camera.size
@@ -144,19 +145,19 @@ def save_camera(path: Path, camera: Camera | Calibration, size: tuple[int, int] 
 
 
 def load_catheter(path: Path | str, overrides: Sequence[str] = ()) -> CatheterSettings:
-    """Read, override and check a catheter; ConfigError names each mistake with its file, line and column."""
+    """Read a catheter's file, apply overrides and check it. ConfigError gives file, line and column of mistakes."""
     source, settings = _read(CatheterSettings, path, overrides)
     _tried(source, build_catheter, settings)
     return settings
 
 
 def build_catheter(settings: CatheterSettings) -> Catheter:
-    """The catheter that the settings describe."""
+    """Create the catheter that the settings describe."""
     return Catheter(settings.edges, settings.colours, settings.radius, settings.length)
 
 
 def misfit(path: Path, error: ValueError) -> ConfigError:
-    """A tracker's refusal of a catheter, at the place of its colours, which are always the reason."""
+    """Error for a catheter that a tracker refused. It points to the colours, which are the only reason for this."""
     return ConfigError([read_source(path, []).mistake(("colours",), str(error))])
 
 
@@ -169,14 +170,14 @@ def save_catheter(path: Path, catheter: Catheter) -> None:
 
 
 def load_headset(path: Path | str, overrides: Sequence[str] = ()) -> HeadsetSettings:
-    """Read, override and check where a camera sits; ConfigError names each mistake with its file, line and column."""
+    """Read a camera's position, apply overrides and check it. ConfigError gives file, line and column of mistakes."""
     source, settings = _read(HeadsetSettings, path, overrides)
     _tried(source, build_headset, settings)
     return settings
 
 
 def build_headset(settings: HeadsetSettings) -> torch.Tensor:
-    """[4, 4] float64, headset_from_camera; ValueError unless it is rigid."""
+    """The matrix headset_from_camera, float64 [4, 4]. ValueError unless it is rigid."""
     matrix = torch.tensor(settings.headset_from_camera, dtype=torch.float64)
     rotation, last = matrix[:3, :3], torch.tensor([0.0, 0, 0, 1], dtype=torch.float64)
     missed = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().max()
@@ -188,7 +189,7 @@ def build_headset(settings: HeadsetSettings) -> torch.Tensor:
 
 
 def save_headset(path: Path, alignment: Alignment) -> None:
-    """Write where the camera sits on a headset, with the residuals of the alignment."""
+    """Write the position of a camera on a headset, with the residuals of the alignment."""
     left_out = [value if value != float("inf") else None for value in alignment.leave_one_out.tolist()]
     rows = [(a, b, c, d) for a, b, c, d in alignment.headset_from_camera.detach().tolist()]
     settings = HeadsetSettings(
@@ -208,7 +209,7 @@ def _read(model: type[AnySettings], path: Path | str, overrides: Sequence[str]) 
 
 
 def _tried(source: Source, build: Any, settings: Settings) -> None:
-    """Build what the settings describe; an error that begins with the name of a key is reported at its place."""
+    """Call ``build`` with the settings; an error that begins with the name of a key is reported at this key's line."""
     try:
         build(settings)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""The kind ``track``: a catheter's tip on every frame of a source."""
+"""The kind ``track``: tracks a catheter's tip through all frames of a source."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a tracking run reports: counts by status, time per stage, stability, and its section of a page."""
+"""Report of a tracking run: counts by status, time per stage, stability, and the section of the report page."""
 
 import io
 import math
@@ -17,10 +17,10 @@ from holotorch.io.video import Frame, Frames
 from holotorch.tracking import Pose, Status
 from holotorch.tracking.evaluation.protocols import counts, s_rms
 
-# Columns of poses.csv, which has a line per frame. Lengths are in metres in the camera's frame (x right, y down, z
-# forward), directions point from the tip to the rear, the covariance of the tip is given by its upper triangle, and
-# ``milliseconds`` is the tracker's own time. Floats are exact to the bit. A refused frame has empty cells instead of a
-# pose, and ``stage`` names the stage that refused it.
+# Columns of poses.csv, which has a line per frame. Lengths are in metres in the camera's coordinates (x right, y down,
+# z forward), directions point from the tip to the rear, the covariance of the tip is given by its upper triangle, and
+# ``milliseconds`` is the time of the tracker alone. Floats are written exactly. A refused frame has empty cells instead
+# of a pose, and ``stage`` names the stage that refused it.
 COLUMNS = (
     *("frame", "time_s", "status", "stage", "reason"),
     *("tip_x_m", "tip_y_m", "tip_z_m", "direction_x", "direction_y", "direction_z"),
@@ -30,7 +30,7 @@ COLUMNS = (
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 _STATED = "what the frames leave open; not what is unknown of the camera (its calibration) and of the catheter's edges"
-_MOVED = 3.0  # a catheter is called at rest if its tips spread by at most so many times their stated deviation
+_MOVED = 3.0  # a catheter counts as resting if its tips spread by at most this many stated deviations
 _SHOWN = 4  # number of statuses whose first frame the page shows
 
 
@@ -38,8 +38,8 @@ class Tracked(NamedTuple):
     """One frame and its pose.
 
     Attributes:
-        number: Of the frame, from 0.
-        frame: As it came.
+        number: Number of the frame, from 0.
+        frame: The frame as it was read.
         pose: The pose or a refusal, BAD_FRAME for a frame that could not be read.
         seconds: Time that the tracker took; 0 for a frame that could not be read.
         stages: Seconds of each stage of the tracker, if it measures them.
@@ -53,13 +53,13 @@ class Tracked(NamedTuple):
 
     @property
     def status(self) -> Status:
-        """Status of the pose, which is a single one."""
+        """Status of the pose, which is not a batch."""
         assert isinstance(self.pose.status, Status)
         return self.pose.status
 
 
 def row(item: Tracked) -> list[str]:
-    """The frame as cells of ``COLUMNS``; floats exact to the bit, cells that a refusal does not have empty."""
+    """The frame as cells of ``COLUMNS``. Floats are exact; a refused frame has empty cells instead of a pose."""
     pose = item.pose
     cells = [str(item.number), repr(item.frame.seconds), item.status.name]
     cells += ["" if pose.answered else item.status.stage, " ".join(pose.reason.split())]
@@ -72,7 +72,7 @@ def row(item: Tracked) -> list[str]:
 
 
 class Log:
-    """Numbers of all frames of a run, and the first overlay of each status."""
+    """Results of all frames of a run, and the first overlay of each status."""
 
     def __init__(self, images: Path):
         self.images = images
@@ -104,7 +104,7 @@ class Log:
             self.seconds.append(item.seconds)
         if item.stages:
             if self.timed == 1 and not self.warm:
-                self.warm = True  # the first call also builds tables; it is left out if there are others
+                self.warm = True  # the first call also builds tables; it only counts if it is the only one
                 self.timed, self.stages = 0, {}
             self.timed += 1
             for name, value in item.stages.items():
@@ -160,7 +160,7 @@ def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, A
 
 
 def _moved(log: Log, spread: float) -> list[str]:
-    """A note if the tips spread (root mean square about their mean, in metres) far beyond their stated deviation."""
+    """A note if ``spread`` (rms distance of the tips from their mean, metres) far exceeds the stated deviation."""
     stated = torch.tensor([value for value in log.deviations if math.isfinite(value)], dtype=torch.float64)
     allowed = float(stated.square().mean().sqrt()) if len(stated) else math.inf
     if spread <= _MOVED * allowed:
@@ -189,7 +189,7 @@ def save_figure(folder: Path, log: Log) -> None:
 
 
 def track_section(record: RunRecord) -> list[str]:
-    """HTML of a tracking run: how many frames have a pose, how well, how fast, and a frame of each status."""
+    """HTML of a tracking run: share of frames with a pose, their precision, the time, and a frame of each status."""
     summary = record.summary
     parts = [heading(f"{record.title}: {summary['source']}", summary["status"])]
     if "failure" in summary:
@@ -214,7 +214,7 @@ def track_section(record: RunRecord) -> list[str]:
 
 
 def _truth(truth: dict[str, float]) -> str:
-    """HTML of the tips' distances from the truth of a synthetic recording."""
+    """HTML of the distances between the tips and the truth of a synthetic recording."""
     text = f"The recording is synthetic, and where the tip truly is is known. Of {truth['frames']} frames with a pose "
     text = element("p", text + f"{truth.get('wrong', 0)} are wrong by more than 5 mm.")
     shares = [
@@ -228,7 +228,7 @@ def _truth(truth: dict[str, float]) -> str:
 
 
 def _smaller(drawn: Tensor) -> Tensor:
-    """A frame [3, H, W] of levels as values from 0 to 1, reduced to a size for a page."""
+    """Convert the levels of a frame [3, H, W] to values from 0 to 1, and reduce its size for the page."""
     factor = max(1, min(drawn.shape[-2:]) // 400)
     return torch.nn.functional.avg_pool2d(drawn.double() / 255, factor)
 
@@ -240,7 +240,7 @@ def _at(values: Tensor, share: float) -> float:
 
 
 def drawn_track(log: Log) -> Any:
-    """Figure of the tip and its stated deviation over time, with the words "no pose" where there is none."""
+    """Figure of the tip and its stated deviation over time, or with the words "no pose" if there is none."""
     from matplotlib.figure import Figure
 
     drawn = Figure(figsize=(9, 4.5), layout="constrained")
@@ -252,7 +252,7 @@ def drawn_track(log: Log) -> Any:
     if len(seconds) == 1:
         upper.set_xticks([0])
     if poses == 1:
-        upper.set_yticks([0])  # it is its own median
+        upper.set_yticks([0])  # the offset of a single tip from the median is 0
     if not poses:
         upper.set_xlim(0, seconds[-1] or None)
         for axes in (upper, lower):

@@ -1,4 +1,4 @@
-"""Tracking a catheter through a video, pictures or a camera: poses, overlay, timing, and a recording to replay."""
+"""Tracking runs on a video, pictures or a camera: they write poses, an overlay, times, and a recording to replay."""
 
 import csv
 import io
@@ -36,9 +36,9 @@ Entered = TypeVar("Entered")
 
 
 def follow(frames: Iterable[Frame], tracker: Tracker) -> Iterator[Tracked]:
-    """Track frame by frame, each with the pose of the frame before; with none after a refusal.
+    """Track frame by frame. The tracker gets the previous frame's pose, or None if that frame was refused.
 
-    ``tracker`` is called as ``tracker(frames [1, 3, H, W], previous)``. A dict ``times`` of the tracker is taken as the
+    ``tracker`` is called as ``tracker(frames [1, 3, H, W], previous)``. If it has a dict ``times``, this gives the
     seconds of each stage of its last call.
     """
     previous: list[Pose] | None = None
@@ -57,10 +57,10 @@ def follow(frames: Iterable[Frame], tracker: Tracker) -> Iterator[Tracked]:
 def live(
     sources: Sequence[str], camera: Path | None, catheter: Path | None, rate: float | None = None
 ) -> Iterator[tuple[float, Pose]]:
-    """Times on the packets' clock and poses of one source, as its frames come.
+    """Yield the capture time and the pose of each frame of one source; times are on the clock of ``packet.now``.
 
-    Frames of a file come at the pace of its times: those of their poses are when each is due, and may be still to come.
-    The source and its files are opened, and refused, when this is called; frames are read as poses are asked for.
+    For a file, a capture time is the time at which the frame is due at the pace of its time stamps, which may be in the
+    future. The source and its files are opened and checked by the call; frames are read when the poses are requested.
     """
     if len(sources) != 1:
         raise ConfigError([f"expected one source to track and stream, got {len(sources)}"])
@@ -74,7 +74,7 @@ def _live(inputs: TrackingInputs) -> Iterator[tuple[float, Pose]]:
         printed, start = len(frames.notes), None
         for item in follow(frames, inputs.tracker):
             start = now() - item.frame.seconds if start is None else start
-            # The camera took the frame before the tracker's time.
+            # The camera captured the frame before the tracker began.
             yield (now() - item.seconds if frames.live else start + item.frame.seconds), item.pose
         for note in frames.notes[printed:]:
             print(note, flush=True)
@@ -87,7 +87,7 @@ class TrackingExperiment:
     Attributes:
         settings: The configuration.
         inputs: Source, camera, catheter and tracker; None for a synthetic source, which the run renders first.
-        truth: True tips in metres by the number of their frame; empty where nobody knows them.
+        truth: True tips in metres by frame number; empty if they are unknown.
     """
 
     settings: TrackSettings
@@ -99,7 +99,7 @@ def build_tracking(settings: TrackSettings) -> TrackingExperiment:
     """Open the source of a configuration and the files that it needs.
 
     Raises:
-        ConfigError: A source or file that cannot be used, or a truth.csv of a recording that cannot be read.
+        ConfigError: A source or file cannot be used, or the truth.csv of a recording cannot be read.
     """
     if settings.source == SYNTHETIC:
         return TrackingExperiment(settings, None, {})
@@ -113,7 +113,7 @@ def _opened(settings: TrackSettings, source: str | Path) -> TrackingInputs:
 
 
 def plan_tracking(experiment: TrackingExperiment) -> RunPlan:
-    """What will be tracked, and the room that a recording of it takes."""
+    """Describe the source, and the disk space that a recording of it needs."""
     settings = experiment.settings
     if experiment.inputs is None:
         height, width = frame_size(_path(settings.camera))
@@ -137,17 +137,17 @@ def _path(name: str | None) -> Path | None:
 
 
 def run_tracking(experiment: TrackingExperiment, folder: RunFolder) -> bool:
-    """Track a source and fill its folder; whether the source was tracked to its end.
+    """Track a source and fill the run folder. Returns whether the run is complete.
 
-    The folder gets ``poses.csv`` (a line per frame, ``COLUMNS``), ``overlay.mp4``, copies of the two YAML files,
-    ``recording`` if asked for, and ``summary.json`` and the page last. Ctrl-C, as SIGTERM and a closed terminal, saves
-    what there is, and is the ordinary end of a camera. A killed process (``kill -9``) leaves what it had written
-    under hidden names: ``.poses.csv.PID.partial``, whole but for its last line, and an overlay that no player may open;
-    its recording can be tracked.
+    The run writes ``poses.csv`` (a line per frame, ``COLUMNS``), ``overlay.mp4``, copies of the two YAML files,
+    ``recording`` if requested, and finally ``summary.json`` and the page. Ctrl-C, SIGTERM and closing the terminal end
+    the run and save the results so far; for a camera, this is the normal end. A killed process (``kill -9``) leaves
+    files with hidden names: ``.poses.csv.PID.partial``, complete except for its last line, and an overlay that players
+    may refuse. Its recording can be tracked.
 
     Raises:
-        ConfigError: No room for the recording.
-        Exception: Whatever the tracker or the disk raised, once all poses before it are saved.
+        ConfigError: The disk has no room for the recording.
+        Exception: The tracker or the disk failed; all poses before the error are saved first.
     """
     if experiment.inputs is not None:
         return _tracked(experiment, experiment.inputs, folder)
@@ -164,14 +164,14 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
     printed = len(frames.notes)
     if settings.record:
         _check_room(folder, frames)
-    parts: list[ExitStack] = []  # each to be closed, whatever happens to the others
+    parts: list[ExitStack] = []  # each part is closed even if closing another one fails
     parts.append(ExitStack())
     parts[0].enter_context(frames)
     try:
         _track_all(inputs, settings, run, log, parts)
     except KeyboardInterrupt:
         pass
-    except Exception as error:  # the poses before it are kept
+    except Exception as error:  # it is raised again after the poses before it are saved
         failure = error
     with deferred(run.pressed):
         for part in reversed(parts):
@@ -181,7 +181,7 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
                 failure = failure or error
         if not log.statuses:
             if not _holds_frames(folder):
-                shutil.rmtree(folder)  # of this run alone, and without a frame or a pose
+                shutil.rmtree(folder)  # it belongs to this run alone and contains no frame or pose
                 raise failure or KeyboardInterrupt
             print(f"no frame was tracked to its end; what there is of the first is in {folder}", file=sys.stderr)
             if failure is not None:
@@ -198,7 +198,7 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
             save_figure(folder, log)
         else:
             results.write(save_figure, folder, log)
-            results.failure = None  # the first failure is the one to tell
+            results.failure = None  # only the first failure is reported
         done = failure is None and (not run.pressed or frames.live)
         complete = conclude(run, _without_nan(summary), results, done=done)
     if failure is not None:
@@ -209,7 +209,7 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
 def _track_all(
     inputs: TrackingInputs, settings: TrackSettings, run: RunFolder, log: Log, parts: list[ExitStack]
 ) -> None:
-    """Track every frame and write what it gives, until a signal comes; ``parts`` close the files."""
+    """Track all frames and write the results until a signal arrives. Opened files are appended to ``parts``."""
     folder, frames = run.path, inputs.frames
     for name, path in inputs.paths.items():
         write_bytes(folder / name, path.read_bytes())
@@ -236,20 +236,20 @@ def _track_all(
 
 
 def _check_room(folder: Path, frames: Frames) -> None:
-    """ConfigError where the disk cannot hold a recording of all frames."""
+    """Raise ConfigError if the disk has too little space for a recording of all frames."""
     size, free = recording_bytes(frames.shape, frames.total or 0), free_bytes(folder)
     if size > free:
         raise ConfigError([f"the recording takes {size / 1e9:.2f} GB and {free / 1e9:.2f} GB are free; choose --out"])
 
 
 def _entered(parts: list[ExitStack], context: AbstractContextManager[Entered]) -> Entered:
-    """Enter a context of its own, to be closed with ``parts``."""
+    """Enter a context manager and append it to ``parts``, which closes each entry separately."""
     parts.append(ExitStack())
     return parts[-1].enter_context(context)
 
 
 def _recorded(frames: Iterator[Frame], recorder: Recorder, pressed: list[int]) -> Iterator[Frame]:
-    """The frames, each kept before anything is done with it."""
+    """Record each frame and then yield it."""
     for frame in frames:
         with deferred(pressed):
             recorder.write(frame)
@@ -270,13 +270,13 @@ def _append(table: IO[bytes], cells: Sequence[str]) -> None:
 
 
 def _holds_frames(folder: Path) -> bool:
-    """Whether a pose, the refusal of one, or a recorded frame is in the folder."""
+    """Whether the folder contains a pose, a refusal, or a recorded frame."""
     tables = (folder / "poses.csv", folder / "recording" / "times.csv")
     return any(path.is_file() and path.read_bytes().count(b"\n") > 1 for path in tables)
 
 
 def _without_nan(value: Any) -> Any:
-    """JSON values with null for NaN and infinity: one number must not cost a run its summary."""
+    """Replace NaN and infinity by None, since JSON cannot represent them and the summary could not be written."""
     if isinstance(value, dict):
         return {key: _without_nan(item) for key, item in value.items()}
     if isinstance(value, list):

@@ -22,16 +22,16 @@ from holotorch.tracking import Camera, Catheter, Pose
 from holotorch.tracking.camera.calibration import SURE
 from holotorch.tracking.detection.channels import ChannelOrder, ambiguities, ambiguity_text
 
-# Share of a side by which a principal point may lie off the centre. Intrinsics of 1080 lines used for 720, or the
-# other way round, are off by a sixth and more.
+# Largest distance of a principal point from the centre, as a share of the side. Intrinsics for 1080 rows that are used
+# for 720 rows, or vice versa, lead to a sixth or more.
 _OFF_CENTRE = 0.15
 Tracker = Callable[[Tensor, Sequence[Pose] | None], list[Pose]]
 
 
 class TrackingInputs(NamedTuple):
-    """The inputs of a run. Whoever opened them closes ``frames``.
+    """The inputs of a run. The caller that opened them must close ``frames``.
 
-    ``paths`` holds the two YAML files under the names of their copies in the run folder.
+    ``paths`` maps the names of the copies in the run folder to the two YAML files.
     """
 
     frames: Frames
@@ -44,17 +44,17 @@ class TrackingInputs(NamedTuple):
 def open_inputs(
     source: str | Path, camera: Path | None, catheter: Path | None, method: str, rate: float | None
 ) -> TrackingInputs:
-    """Open a source with its files, and make a tracker for it.
+    """Open a source and its YAML files, and create a tracker for it.
 
     Args:
-        source: A video, a folder of pictures, a folder of a recording, or the number of a camera.
+        source: A video, a folder of pictures, a folder of a recording, or the index of a camera.
         camera: YAML file; by default the one beside the recording.
-        catheter: Likewise.
-        method: ours or thesis.
-        rate: Frames per second of a source without times.
+        catheter: YAML file; by default the one beside the recording.
+        method: "ours" or "thesis".
+        rate: Frames per second of a source without time stamps.
 
     Raises:
-        ConfigError: One of them cannot be used, or they do not fit together.
+        ConfigError: An input cannot be used, or the inputs do not fit together.
     """
     replayed = _is_replay(source)
     files = {"camera.yaml": camera, "catheter.yaml": catheter}
@@ -100,7 +100,7 @@ def _is_replay(source: str | Path) -> bool:
 
 
 def _loaded(paths: dict[str, Path]) -> tuple[CameraSettings, Catheter]:
-    """Camera and catheter from their files. ConfigError with the mistakes of both files."""
+    """Load the camera and the catheter. ConfigError lists the mistakes of both files."""
     mistakes: list[str] = []
     loaded: list[Any] = []
     for load, name in ((load_camera, "camera.yaml"), (load_catheter, "catheter.yaml")):
@@ -114,18 +114,18 @@ def _loaded(paths: dict[str, Path]) -> tuple[CameraSettings, Catheter]:
 
 
 def make_tracker(method: str, camera: Camera, catheter: Catheter) -> Tracker:
-    """The tracker for a method. ValueError for a catheter whose colours it cannot tell apart."""
+    """Create the tracker for a method. ValueError for a catheter whose colours it cannot distinguish."""
     if method == "thesis":
         from holotorch.tracking.thesis.tracker import ThesisTracker
 
         return _Cold(ThesisTracker(camera, catheter))
     from holotorch.tracking.detection.tracker import CatheterTracker
 
-    return CatheterTracker(camera, catheter, channels=ChannelOrder.RGB)  # every source gives RGB
+    return CatheterTracker(camera, catheter, channels=ChannelOrder.RGB)  # all sources deliver RGB
 
 
 class _Cold:
-    """Adapter for a tracker that takes no previous poses."""
+    """Adapter for a tracker that does not use previous poses."""
 
     def __init__(self, tracker: Callable[[Tensor], list[Pose]]):
         self._tracker = tracker
@@ -141,8 +141,8 @@ class _Cold:
 def _check_intrinsics(lens: CameraSettings, frames: Frames) -> None:
     """Check that the intrinsics belong to these frames.
 
-    ConfigError for another frame size; a note for a principal point far from the centre or a vague focal length. Such
-    intrinsics give wrong poses that look plausible.
+    Raises ConfigError for another frame size, and adds a note for a principal point far from the centre or an uncertain
+    focal length. Such intrinsics give wrong poses that look plausible.
     """
     height, width = frames.shape
     if lens.size is not None and tuple(lens.size) != frames.shape:

@@ -31,11 +31,11 @@ from holotorch.tracking.simulation.scenery import SKIN, drape, finger
 from holotorch.tracking.simulation.world import World, synthetic_camera
 
 RATE = 30.0  # frames per second
-_SIZE = (1080, 1920)  # (H, W) of a camera that states none
+_SIZE = (1080, 1920)  # (H, W) for a camera without a frame size
 _TIP = ("tip_x_m", "tip_y_m", "tip_z_m")
 _COVARIANCE = ("cov_xx_m2", "cov_xy_m2", "cov_xz_m2", "cov_yy_m2", "cov_yz_m2", "cov_zz_m2")
 _SHARES = {"median": 0.5, "p95": 0.95, "worst": 1.0}
-_WRONG = 5.0  # mm
+_WRONG = 5.0  # mm: error above which a pose counts as wrong
 _COLUMNS = ("frame", "time_s", *_TIP, "direction_x", "direction_y", "direction_z")
 
 
@@ -46,21 +46,20 @@ def write_synthetic(
     camera: Path | None = None,
     catheter: Path | None = None,
 ) -> Path:
-    """Render a recording, and ``truth.csv`` beside its frames; the folder ``out``.
+    """Render a recording with its true poses in ``truth.csv``. Returns the folder.
 
-    A catheter swings over a surgical drape and skin-coloured fingers pass over its bands. ``holotorch track`` takes
-    the folder as it is, with the camera and the catheter that were rendered. Whatever ends the rendering early leaves
-    no folder.
+    A catheter swings over a surgical drape, and skin-coloured fingers pass over its bands. ``holotorch track`` can read
+    the folder, which also contains the rendered camera and catheter. If rendering ends early, the folder is removed.
 
     Args:
         out: New or empty folder.
-        frames: To render.
-        size: (H, W) of a camera that states none.
-        camera: YAML file; :func:`synthetic_camera` by default.
-        catheter: The same; the thesis's.
+        frames: Number of frames to render.
+        size: (H, W) in pixels, for a camera without a frame size.
+        camera: YAML file; by default :func:`synthetic_camera` is used.
+        catheter: YAML file; by default the catheter of the thesis is used.
 
     Raises:
-        ConfigError: A file that cannot be used, a folder in use, or a catheter that is nowhere before the camera.
+        ConfigError: A file cannot be used, the folder is in use, or the catheter would not be in front of the camera.
     """
     lens = None if camera is None else load_camera(find_config(camera) or camera)
     tool = THESIS if catheter is None else build_catheter(load_catheter(find_config(catheter) or catheter))
@@ -73,13 +72,13 @@ def write_synthetic(
         shutil.rmtree(folder)
         raise ConfigError([f"this catheter cannot be rendered with this camera: {error}"]) from None
     except BaseException:
-        shutil.rmtree(folder)  # claimed empty a moment ago
+        shutil.rmtree(folder)  # it was empty when this function began
         raise
     return folder
 
 
 def frame_size(camera: Path | None) -> tuple[int, int]:
-    """(H, W) of the frames that :func:`write_synthetic` renders for a camera. ConfigError for a file that is none."""
+    """(H, W) of the frames that :func:`write_synthetic` renders for a camera. ConfigError for an invalid file."""
     return (None if camera is None else load_camera(find_config(camera) or camera).size) or _SIZE
 
 
@@ -88,7 +87,7 @@ def _render(folder: Path, frames: int, world: World) -> None:
         (folder / "images").rmdir()
     size, tool = world.size, world.catheter
     cloth = drape(size, 0, (70, 120, 130))
-    scale = float(world.camera.matrix[0, 0]) / 1400  # of a finger in pixels
+    scale = float(world.camera.matrix[0, 0]) / 1400  # the finger's sizes below are for fx = 1400 px
     across = (tool.edges[0] + tool.edges[-1]) / 2
     table = io.StringIO()
     rows = csv.writer(table, lineterminator="\n")
@@ -105,7 +104,7 @@ def _render(folder: Path, frames: int, world: World) -> None:
                 at = (0.05 * math.sin(turn), 0.03 * math.cos(turn))
                 tip, along = world.pose(0.5 + 0.03 * math.sin(turn), math.radians(15 + 8 * math.cos(turn)), 0.4, at)
                 middle = world.camera.project((tip + across * along)[None])[0]
-                # A finger passes over the middle of the bands for a while.
+                # A finger covers the middle of the bands in 10 of 45 frames.
                 covers = 20 <= i % 45 < 30
                 start = (float(middle[0]), float(middle[1]) - 260 * scale)
                 end = (float(middle[0]), float(middle[1]) + 14 * scale)
@@ -123,10 +122,10 @@ def _render(folder: Path, frames: int, world: World) -> None:
 def read_truth(folder: Path) -> dict[str, list[float]]:
     """True tips in metres by frame number, from truth.csv in a folder; empty without such a table.
 
-    A table of that name without the columns of a truth is ignored among pictures, and an error in a recording.
+    A table of this name with other columns is ignored in a folder of pictures, and is an error in a recording.
 
     Raises:
-        ConfigError: A table that cannot be read as the truth, with the first line that is wrong.
+        ConfigError: The table is not valid. The message names the first wrong line.
     """
     path = folder / "truth.csv"
     if not path.is_file():
@@ -156,10 +155,11 @@ def read_truth(folder: Path) -> dict[str, list[float]]:
 
 
 def errors(poses: Path, true: Mapping[str, Sequence[float]]) -> dict[str, float]:
-    """Distances between the tips of a poses.csv and the truth, as plain JSON values in mm; empty without a truth.
+    """Statistics of the distances from the tips in a poses.csv to the truth, as JSON values; empty without a truth.
 
-    ``true``: as :func:`read_truth` gives it. ``coverage``: share of the answered frames whose truth lies in the 95 %
-    ellipsoid of the stated covariance. ``wrong``: frames off by more than 5 mm.
+    ``true`` is a result of :func:`read_truth`. Keys ending in ``_mm`` are quantiles of the distances in millimetres,
+    ``coverage`` is the share of poses whose 95 % ellipsoid contains the truth, and ``wrong`` the number of poses with
+    an error above 5 mm.
     """
     with open(poses, newline="") as stream:
         known = [row for row in csv.DictReader(stream) if row["frame"] in true]
@@ -187,7 +187,7 @@ def errors(poses: Path, true: Mapping[str, Sequence[float]]) -> dict[str, float]
 
 
 def compared(statistics: Mapping[str, float]) -> str:
-    """The result of :func:`errors` in words."""
+    """The result of :func:`errors` as a sentence."""
     if not statistics["frames"]:
         return f"Truth      no frame answered of {statistics['refused']} (synthetic)"
     return (

@@ -19,7 +19,8 @@ from holotorch.tracking.simulation.world import World
 
 Row = dict[str, Any]
 
-# Goals of S_RMS in mm for poses by distance in mm and tilt in degrees; None for poses whose efficiency is measured.
+# Goals for S_RMS (Eq. 3.13, change of a resting tip from frame to frame) in mm, for poses given by distance in mm and
+# tilt in degrees. None marks poses that have a goal for the efficiency instead.
 STILL: dict[tuple[int, int], float | None] = {
     (450, 20): 0.05,
     (520, 5): 0.12,
@@ -28,8 +29,9 @@ STILL: dict[tuple[int, int], float | None] = {
     (520, 0): None,
     (520, 20): None,
 }
-# Point of the catheter at that distance, in metres from the tip; None for the middle of the bands. The goals refer to
-# the tip. Tilt brings the bands nearer to the camera than the tip, so that the choice changes S_RMS by up to a half.
+# Point of the catheter that lies at the distance given in ``STILL``, in metres from the tip; None is the middle of the
+# bands. The goals refer to the tip. Tilt brings the bands nearer to the camera than the tip, so that the choice changes
+# S_RMS by up to a half.
 TIP, MIDDLE = "tip", "middle of the bands"
 POINTS: dict[str, float | None] = {TIP: 0.0, MIDDLE: None}
 _CODECS: dict[str, dict[str, Any]] = {
@@ -46,7 +48,7 @@ _LIGHTS: dict[str, dict[str, Any]] = {
     "a quarter of it": {"gain": 0.25},
 }
 _PLACES = 5  # positions of a catheter at rest, less than a pixel apart
-# Fitting reasons for the refusal of unanswerable scenes, by the beginnings of their names.
+# Statuses that count as correct reasons for refusing a scene that cannot be answered, by the beginning of its name.
 _UNSEEN = frozenset({Status.NO_CATHETER, Status.BANDS_MISSING, Status.NO_AXIS})
 _SAYS: dict[str, frozenset[Status]] = {
     "motion across": _UNSEEN | {Status.TOO_NARROW, Status.EDGES_UNCLEAR, Status.INCONSISTENT},
@@ -106,7 +108,10 @@ def still(world: World, trackers: dict[str, Method], count: int) -> tuple[list[R
 
 
 def grids(world: World, trackers: dict[str, Method], share: float = 1.0) -> tuple[list[Row], list[Answer]]:
-    """Errors over the sheet of Sec. 3.5.2 and the faces of Sec. 3.5.3: absolute, after a rigid fit, and Acc."""
+    """Errors of the tip on the 2-D grid of Sec. 3.5.2 and the faces of the 3-D grid of Sec. 3.5.3.
+
+    The rows contain absolute errors, errors after a rigid fit, and Acc; see :class:`protocols.GridAccuracy`.
+    """
     parts = {"2D": world.grid_2d()} | {f"3D {face}": cases for face, cases in world.grid_3d().items()}
     every = max(1, round(1 / share))
     said = {part: list(answers(cases[::every], trackers, f"grid {part}")) for part, cases in parts.items()}
@@ -122,7 +127,7 @@ def grids(world: World, trackers: dict[str, Method], share: float = 1.0) -> tupl
 
 
 def codecs(world: World, trackers: dict[str, Method], share: float = 1.0) -> tuple[list[Row], list[Answer]]:
-    """Errors over every fourth point of the sheet, for frames without compression and with several codecs."""
+    """Errors on every fourth point of the 2-D grid, for frames without compression and with several codecs."""
     every = max(1, round(4 / share))
     rows, said = [], []
     for codec, changes in _CODECS.items():
@@ -137,7 +142,7 @@ def codecs(world: World, trackers: dict[str, Method], share: float = 1.0) -> tup
 
 
 def lights(world: World, tracker: Method, count: int, share: float = 1.0) -> list[Row]:
-    """Influence of light on S_RMS (``count`` frames per pose) and on errors over every second point of the sheet."""
+    """Influence of light on S_RMS (``count`` frames per pose) and on errors on every second point of the 2-D grid."""
     rows = []
     for light, changes in _LIGHTS.items():
         lit = replace(world, look=replace(world.look, **changes))
@@ -200,7 +205,10 @@ def scenes(
 
 
 def empty(world: World, trackers: dict[str, Method], count: int) -> tuple[list[Row], list[Answer]]:
-    """Outcomes of ``count`` frames without the catheter, one row for each kind and method, with the false poses."""
+    """Outcomes of ``count`` frames without the catheter, one row for each kind and method.
+
+    ``numbers_of_false`` lists the numbers of the frames in which the method found a pose.
+    """
     found = list(answers(negatives(world, count), trackers, "negatives"))
     rows = []
     for (kind, method), own in _by(found, lambda answer: (_kind(answer.name), answer.method)).items():

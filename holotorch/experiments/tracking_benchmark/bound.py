@@ -53,7 +53,7 @@ def tip_bounds(world: World, pose: tuple[Tensor, Tensor], frames: int = 2) -> Bo
     look = replace(world.look, background=background, noise_dn=_DITHER, jpeg_quality=None)
     near = _near(camera, catheter, pose, size)
     axes = _axes(*pose)
-    # In steps that move the ends and the middle of the bands by one pixel, the information is well conditioned.
+    # Steps that move the ends and the middle of the bands by one pixel make the information well conditioned.
     slopes = torch.linalg.inv(_image_slopes(camera, catheter, pose, axes))
     generator = torch.Generator().manual_seed(world.seed)
     zero, count = torch.zeros(5, dtype=torch.float64), len(catheter.edges)
@@ -84,7 +84,7 @@ def tip_bounds(world: World, pose: tuple[Tensor, Tensor], frames: int = 2) -> Bo
     information = (product + product.T) / 2
     moves = _STEP * slopes[:3]
     whole = torch.linalg.inv(information[:7, :7])[:5, :5]
-    # Covariance of the edges along and the ends across, in steps; then of the pose that moves them.
+    # Covariance, in units of these steps, of the edges along the tube and of its two ends across it; then of the pose.
     some = torch.linalg.inv(information[3:, 3:])
     seen = torch.cat([torch.arange(4, 4 + count), torch.arange(2)])
     lever = torch.zeros(count + 2, 5, dtype=torch.float64)
@@ -113,7 +113,7 @@ def _axes(tip: Tensor, direction: Tensor) -> Tensor:
 
 
 def _image_slopes(camera: Camera, catheter: Catheter, pose: tuple[Tensor, Tensor], axes: Tensor) -> Tensor:
-    """[5, 5] derivatives of the image: both ends (along, across) and middle (along), by the tip and two rotations."""
+    """[5, 5] derivatives of the image of both ends (along, across) and the middle (along), by tip and two rotations."""
     marks = _marks(camera, catheter, *pose)
     along = (marks[2] - marks[0]) / (marks[2] - marks[0]).norm()
     across = torch.stack([-along[1], along[0]])
@@ -131,7 +131,11 @@ def _image_slopes(camera: Camera, catheter: Catheter, pose: tuple[Tensor, Tensor
 def _edge_slopes(
     camera: Camera, catheter: Catheter, pose: tuple[Tensor, Tensor], axes: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Derivatives of the edges along the image: [N, 5] as :func:`_image_slopes`, [N] by positions on the tube."""
+    """Derivatives of the edges' positions along the tube in the image, in pixels.
+
+    They are [N, 5] with respect to the tip and two rotations, as in :func:`_image_slopes`, and [N] with respect to the
+    edges' positions on the tube in metres.
+    """
     first, _, last = _marks(camera, catheter, *pose)
     along = (last - first) / (last - first).norm()
 
@@ -146,7 +150,7 @@ def _edge_slopes(
 
 
 def _window(world: World, pose: tuple[Tensor, Tensor]) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Corner (x, y) and size (h, w) of the part of the frame that holds the bands."""
+    """Corner (x, y) and size (h, w) of the part of the frame that contains the bands."""
     marks = _marks(world.camera, world.catheter, *pose)
     limits = torch.tensor(world.size[::-1], dtype=torch.float64) - 1
     if not bool(((marks >= 0) & (marks <= limits)).all()):  # also false for NaN
@@ -159,7 +163,7 @@ def _window(world: World, pose: tuple[Tensor, Tensor]) -> tuple[tuple[int, int],
 
 
 def _near(camera: Camera, catheter: Catheter, pose: tuple[Tensor, Tensor], size: tuple[int, int]) -> Tensor:
-    """Which pixels [H, W] lie within the margin of the bands."""
+    """Whether pixels [H, W] lie on the bands or within ``_MARGIN`` of them."""
     first, _, last = _marks(camera, catheter, *pose)
     along = (last - first) / (last - first).norm()
     y, x = torch.meshgrid(torch.arange(size[0]), torch.arange(size[1]), indexing="ij")

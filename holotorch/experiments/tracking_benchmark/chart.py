@@ -64,7 +64,8 @@ def tracking(
         photographs_folder: Folder with photographs for backgrounds; without it, those of scikit-image.
 
     Returns:
-        Rows of the methods, further tables by name, pictures by name, and the lines of the verdict.
+        Rows of the methods, further tables by name, pictures by name, and lines of text that compare the results with
+        the goals.
     """
     world, amount = scene(photographs_folder), AMOUNT
     trackers = methods(world, (BASE, COLD, PRIOR, FEWER))
@@ -94,7 +95,7 @@ def tracking(
 
 
 def _share(kind: str, name: str, own: list[Answer]) -> Row:
-    """Outcomes of one method on one kind of frames; a frame without a catheter is to be refused."""
+    """Outcomes of one method on one kind of frames; a frame without a catheter should be refused."""
     refused = [answer for answer in own if not answer.answered]
     answerable = sum(answer.answerable for answer in own)
     lost = sum(answer.answerable for answer in refused)
@@ -129,7 +130,7 @@ def _methods(tables: dict[str, list[Row]], said: dict[str, list[Answer]]) -> lis
         for depth, tilt in STILL:
             found = one(tables["still"], depth_mm=depth, tilt_deg=tilt, point=TIP, method=name)
             row[f"s_rms_mm_{depth}_{tilt}"] = found["s_rms_mm"]
-        # Separately, since the frames of catheters at rest repeat a few errors.
+        # Both kinds are counted separately, since frames of catheters at rest repeat only a few errors.
         for kind in ("grids", "still"):
             row[f"coverage_{kind}"] = covered([answer for answer in said[kind] if answer.method == name])
         rows.append(row)
@@ -148,7 +149,7 @@ def _verdict(world: World, rows: list[Row], tables: dict[str, list[Row]]) -> lis
     lines += [f"synthetic {line}" for name in (COLD, PRIOR) for line in _accuracy(name, rows, tables)]
     for row in tables["reliability"]:
         if row["frames_of"] in ("still", "grids", "codecs"):
-            continue  # their errors are above, and the sum over all kinds includes them
+            continue  # their errors are listed separately, and the sum over all kinds includes the grids and codecs
         lines += [f"synthetic {line}" for line in _reliability(row)]
     for row in tables["codecs"]:
         error = f"median {row['median_mm']} mm, worst {row['worst_mm']} mm, {row['refused']} of {row['points']} refused"

@@ -1,4 +1,4 @@
-"""Trackers compared on synthetic frames with exact ground truth: the answer of each to each frame, and its time."""
+"""The trackers to compare, and their answers to synthetic frames with exact ground truth, with the time of each."""
 
 import math
 import time
@@ -55,7 +55,7 @@ class Answer(NamedTuple):
 
     @staticmethod
     def of(method: str, case: Case, pose: Pose, seconds: float) -> "Answer":
-        """Answer that a single pose, not a batch, stands for."""
+        """Create the answer from a single pose (not a batch)."""
         assert isinstance(pose.status, Status) and isinstance(pose.reason, str)
         truth = None if case.tip is None else case.tip.tolist()
         tip, covariance = pose.tip.tolist(), pose.covariance[:3, :3].tolist()
@@ -83,7 +83,7 @@ class Answer(NamedTuple):
 
 
 def photographs(folder: Path | None = None) -> tuple[Tensor, ...]:
-    """Colour photographs uint8 [3, h, w] for backgrounds: PNG and JPEG files of ``folder``, or scikit-image's own.
+    """Colour photographs uint8 [3, h, w] for backgrounds: PNG and JPEG files of ``folder``, or those of scikit-image.
 
     Raises:
         ValueError: ``folder`` holds no colour photograph.

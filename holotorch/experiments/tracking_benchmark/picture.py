@@ -15,7 +15,7 @@ _STYLE = {BASE: ("tab:gray", "s"), COLD: ("tab:blue", "o"), PRIOR: ("tab:green",
 
 
 def draw(rows: list[Row], tables: dict[str, list[Row]]) -> bytes:
-    """PNG of the chart: error against time, spread at rest against its bounds, and what is refused."""
+    """PNG of the chart: error over time, spread at rest with its bounds, and shares of right, refused and wrong."""
     figure = Figure(figsize=(14, 4.6), layout="constrained")
     first, second, third = (figure.add_subplot(1, 3, k + 1) for k in range(3))
     _errors(first, rows)

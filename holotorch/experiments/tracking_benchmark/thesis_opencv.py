@@ -1,4 +1,4 @@
-"""The thesis's tracking pipeline (Sec. 3.4) in OpenCV on the CPU: what every time of the tracking charts is held to."""
+"""The thesis's tracking pipeline (Sec. 3.4) in OpenCV on the CPU, the baseline of all times in the tracking charts."""
 
 from collections.abc import Sequence
 
@@ -16,21 +16,22 @@ from holotorch.tracking.thesis.stages import Axis, Box, Endpoints, Stopwatch
 class ThesisOpenCV:
     """The stages of ``holotorch.tracking.thesis.tracker.ThesisTracker``, with the same decisions, on 8-bit images.
 
-    Written to be a fair baseline: undistortion maps in fixed point, made once; 8-bit images throughout; filters within
-    the box of the bands only. Frames whose memory is [H, W, 3], as cameras deliver them, are not copied.
+    It is written to be a fair baseline: the undistortion maps are in fixed point and are computed once, all images have
+    8 bits, and filters run only within the box around the bands. Frames with the memory layout [H, W, 3], as cameras
+    deliver them, are not copied.
 
     Args:
-        camera: Whose frames come.
-        catheter: Its bands.
-        literal: Undistort each frame by ``cv2.undistort``, the function of that name, which makes its maps anew.
+        camera: Camera of the frames.
+        catheter: Catheter to track.
+        literal: Undistort each frame by ``cv2.undistort``, which computes its maps again on every call.
 
     Attributes:
-        times: Seconds of each stage of the last call, by the names of Table 3.1; all frames of the batch together.
-        endpoints: Of each frame of the last call, the bands' edges (x, y) in pixels of the undistorted frame, in the
-            catheter's order, None where not found; an empty list where the frame was refused before.
+        times: Seconds of each stage in the last call, summed over the frames of the batch, by the names of Table 3.1.
+        endpoints: For each frame of the last call, the edges of the bands (x, y) in pixels of the undistorted frame, in
+            the catheter's order. An edge that was not found is None; the list is empty if the frame was refused before.
 
     Raises:
-        ValueError: Colours that thresholds in hue cannot tell apart.
+        ValueError: Hue thresholds cannot distinguish the colours of the catheter.
 
     Source: Sec. 3.4 and Table 3.1 of the thesis, with its equations 3.5 to 3.12 corrected.
     """
@@ -52,10 +53,10 @@ class ThesisOpenCV:
         self._size = (0, 0)
 
     def __call__(self, frames: Tensor) -> list[Pose]:
-        """Pose in metres, or refusal, of each frame of uint8 [B, 3, H, W], RGB, in the CPU's memory.
+        """Pose in metres, or refusal, for each RGB frame of a uint8 tensor [B, 3, H, W] on the CPU.
 
         Raises:
-            TypeError, ValueError: Not such a tensor.
+            TypeError, ValueError: ``frames`` is not such a tensor.
         """
         stages.need_frames(frames)
         if frames.device.type != "cpu":
@@ -74,7 +75,7 @@ class ThesisOpenCV:
         return poses
 
     def _prepare(self, size: tuple[int, int]) -> None:
-        """Maps of the undistortion for frames of this (width, height), black beyond the valid radius."""
+        """Compute the undistortion maps for frames of this (width, height), black beyond the valid radius."""
         if size == self._size and self._maps is not None:
             return
         x, y = cv2.initUndistortRectifyMap(self._matrix, self._distortion, np.eye(3), self._matrix, size, cv2.CV_32FC1)
@@ -99,7 +100,7 @@ class ThesisOpenCV:
         hsv = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)
         coloured = cv2.inRange(hsv, self._low, (180.0, 255.0, 255.0))  # type: ignore[call-overload]
         bands = cv2.LUT(cv2.extractChannel(hsv, 0), self._bands)
-        cv2.bitwise_and(bands, coloured, bands)  # the band's number where the threshold is 255
+        cv2.bitwise_and(bands, coloured, bands)  # the number of the band where ``coloured`` is 255, and 0 elsewhere
         watch.lap("Color segmentation")
         solid = cv2.erode(bands, _SQUARE)
         watch.lap("Erosion")
@@ -122,7 +123,7 @@ class ThesisOpenCV:
         return pose
 
     def _axis(self, solid: np.ndarray, bands: np.ndarray) -> tuple[Axis, Box]:
-        """Line through the pixels that the erosion left, without those far from it, and the box around them."""
+        """Fit a line to the pixels that the erosion left, without outliers. Returns the line and the pixels' box."""
         places = cv2.findNonZero(solid)
         stages.need_pixels(0 if places is None else len(places))
         points = np.asarray(places, dtype=np.int32).reshape(-1, 2)
@@ -150,7 +151,7 @@ class ThesisOpenCV:
         return axis, stages.box(kept.min(0).tolist(), kept.max(0).tolist(), (solid.shape[1], solid.shape[0]))
 
     def _pose(self, found: Endpoints) -> Pose:
-        """Mean of the closed-form poses of each pair of neighbouring bands whose three endpoints were found."""
+        """Mean of the closed-form poses from all pairs of neighbouring bands whose three endpoints were found."""
         edges = stages.nudged(found)
         rays = np.ones((*edges.shape[:2], 3))
         rays[..., :2] = (edges - self._matrix[:2, 2]) / self._matrix.diagonal()[:2]
@@ -162,7 +163,7 @@ _SQUARE = np.ones((3, 3), dtype=np.uint8)
 
 
 def _line(points: np.ndarray) -> tuple[float, float, float, float]:
-    """Point (x, y) and unit direction of the line with the least squares across it."""
+    """Point (x, y) and unit direction of the line with the least sum of squared perpendicular distances."""
     dx, dy, x, y = cv2.fitLine(points, cv2.DIST_L2, 0, 0.01, 0.01).ravel().tolist()
     return x, y, dx, dy
 
@@ -181,8 +182,9 @@ def _centroids(gradient: np.ndarray, labels: np.ndarray, count: int, left: int, 
 def _closed_form(rays: np.ndarray, positions: np.ndarray, first: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Mean tip and direction [B, 3] over the triples of edges that begin at ``first``, from unit rays [B, N, 3].
 
-    The sine rule in the triangles of the camera and each band, Eqs. 3.5 to 3.12 as corrected; bands of any length.
-    That is :func:`holotorch.tracking.pose.pose.closed_form` once more, in numpy: other times are held to this one's.
+    Applies the sine rule to the triangles formed by the camera and each band (corrected Eqs. 3.5 to 3.12); bands may
+    have any length. This repeats :func:`holotorch.tracking.pose.pose.closed_form` in NumPy, since it belongs to the
+    baseline of the times.
     """
     tips, directions = [], []
     for i in first:

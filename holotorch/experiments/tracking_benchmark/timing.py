@@ -21,9 +21,9 @@ from holotorch.tracking.simulation.world import Case, World
 from holotorch.tracking.thesis.tracker import ThesisTracker
 
 KORNIA = "thesis, kornia"
-# Names of the conditions that are timed, by kind of frame.
+# Names of the conditions whose frames are timed, by kind of frame.
 _FRAMES = {"plain desk": ("plain",), "clutter": ("heavy clutter",), "drape": ("cloth as band 3",)}
-_PHOTOGRAPH = ("photograph 0", "texture")  # a texture where the world has no photograph
+_PHOTOGRAPH = ("photograph 0", "texture")  # the texture is used if the world has no photographs
 _STREAM = 6  # different frames of each kind, 6 MB each: more than the caches of a processor hold
 _REPEATS = 9  # repetitions of a call, whose median is not affected by single stalls of the machine
 

@@ -78,9 +78,10 @@ class Scene:
 class ThesisConvolution:
     """Algorithm 5 of the thesis: for each plane, transforms of sources and spherical wave, and an inverse transform.
 
-    Each plane takes transforms of H + K samples, where H + K is at most H + 2 V, and a new evaluation of the spherical
-    wave, unless ``ready`` computes its transform in advance. Phases are float64 (the thesis does not specify this);
-    waves are clipped to the sharp cone of its Sec. 5.6.1.
+    For H pixels along an axis and a spherical wave of K samples, the transforms have H + K samples. K is at most 2 V
+    for a volume of V samples; here V = H. The wave is evaluated anew for each plane; with ``ready``, one wave is
+    transformed in advance and used for all planes. Phases are float64 (the thesis does not specify this); waves are
+    clipped to the sharp cone of its Sec. 5.6.1.
     """
 
     def __init__(self, scene: Scene, wavelength: float, *, ready: bool = False):
@@ -116,7 +117,7 @@ def volume() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
 
 
 def _calls(scene: Scene, wavelength: float) -> dict[str, Callable[[], Any]]:
-    """Calls that compute the hologram of a colour with operators that are built in advance, as for a sequence."""
+    """Calls that compute the hologram of a colour; the operators are built in advance, as for a sequence of frames."""
     layers, planes, phase = scene.layers(), torch.stack([*scene.amplitudes()]), scene.phase
     exact = ConvolutionHologram(scene.grid, wavelength, scene.depths, stride=2)
     soft, fine = (AxialHologram(scene.grid, wavelength, scene.depths, stride=2, tolerance=t) for t in (3e-3, 1e-4))
@@ -165,7 +166,7 @@ def _methods() -> list[dict]:
 
 
 def _errors(scene: Scene, wavelength: float) -> dict[str, float]:
-    """Relative L2 error of each method, relative to the same cone of light computed in complex128."""
+    """Relative L2 error of each method with respect to the same cone of light computed in complex128."""
     layers = scene.layers(torch.complex128)
     box = ConvolutionHologram(scene.grid, wavelength, scene.depths, stride=2)(layers)
     soft = AxialHologram(scene.grid, wavelength, scene.depths, stride=2, tolerance=1e-6)(layers)

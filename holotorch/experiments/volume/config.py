@@ -43,18 +43,18 @@ Depth = Annotated[Distance, AfterValidator(_in_front)]
 
 
 class VolumeSource(Settings):
-    """A file, a scene of the public catalogue, or a synthetic phantom: the first of these that is given.
+    """A file, a scene of the public catalogue, or a synthetic phantom, in this order of precedence.
 
-    A phantom that is given with a scene replaces it if the scene cannot be fetched.
+    If both a scene and a phantom are given, the phantom is used only if the scene cannot be fetched.
 
-    ``spacing`` (z, y, x), ``shape`` (D, H, W), ``dtype`` and ``unit`` add what a file does not state, see
+    ``spacing`` (z, y, x), ``shape`` (D, H, W), ``dtype`` and ``unit`` supply values that a file does not state, see
     ``load_volume``. ``directory``: cache of fetched scenes.
     """
 
     path: ExistingArray | None = None
     scene: Scene | None = None
     phantom: Phantom | None = None
-    samples: Annotated[Count, Field(ge=4, le=512)] = 128  # of a phantom, per axis; 512 take some seconds
+    samples: Annotated[Count, Field(ge=4, le=512)] = 128  # samples of a phantom per axis; 512 take some seconds
     directory: str | None = None
     spacing: Annotated[tuple[Number, ...], BeforeValidator(several)] | None = None
     shape: tuple[Count, Count, Count] | None = None
@@ -65,8 +65,8 @@ class VolumeSource(Settings):
 class TransferSettings(Settings):
     """Colour and opacity: a preset between two values of the volume, a JSON file, or a list of points.
 
-    ``points``: [value, red, green, blue, opacity] each, all but the value in 0..1. The opacity is that of a path of
-    ``unit_distance``, relative to the longest side of the volume.
+    ``points``: each is [value, red, green, blue, opacity]; all but the value are in 0..1. The opacity is that of a path
+    of length ``unit_distance``, in units of the longest side of the volume.
     """
 
     preset: Literal["bone", "soft_tissue", "vessels", "industrial"] | None = None
@@ -81,7 +81,7 @@ class ViewSettings(Settings):
     """Orientation and size of the volume: rotations in degrees about the vertical axis (y), then the horizontal (x).
 
     ``width``: length of its longest side in metres; by default that of the hologram. ``front``: the end of the volume
-    that faces the observer. ``lighting``: shade by the gradient; otherwise all points emit evenly.
+    that faces the observer. ``lighting``: shade points by the gradient of the volume; otherwise they are not shaded.
     """
 
     azimuth_deg: Number = 0.0
@@ -94,8 +94,8 @@ class ViewSettings(Settings):
 class HologramSettings(GridSettings):
     """Pixels, distance of the volume's middle, number (or distances) of the planes, and rays along each side.
 
-    ``cone``: how the cone of light of a point ends, see ``holotorch.hologram.cone``; by default the soft edge that
-    costs least.
+    ``cone``: type of the edge of a point's cone of light, see ``holotorch.hologram.cone``; by default the cheapest soft
+    edge.
     """
 
     distance: Depth

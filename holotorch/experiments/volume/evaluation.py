@@ -12,8 +12,8 @@ from holotorch.experiments.volume.experiment import VolumeExperiment
 from holotorch.hologram import refocused
 from holotorch.metrics import SSIM_WINDOW, ssim
 
-_TOLERANCE = 3e-3  # relative L2 error of the propagation that refocuses
-_BRIGHT = 0.25  # of the brightest pixel of the rendering: speckle is measured on brighter pixels
+_TOLERANCE = 3e-3  # relative L2 error of the propagation to the refocused pictures
+_BRIGHT = 0.25  # speckle is measured on pixels brighter than this fraction of the brightest pixel of the rendering
 VISIBLE = 0.05  # opacity above which a ray shows part of the volume
 
 
@@ -21,9 +21,9 @@ class VolumeEvaluation:
     """Refocused pictures, averaged over realisations, and the rendering that they are compared with.
 
     Attributes:
-        depths: At which the hologram is refocused, in metres.
+        depths: Depths in metres at which the hologram is refocused.
         rendering: Direct volume rendering along the rays, red, green, blue [3, h, w].
-        opacity: Of each ray, [h, w].
+        opacity: Opacity of each ray, [h, w].
         depth: Mean depth of the light of each ray, in metres, [h, w].
         visible: Rays that show part of the volume, [h, w].
         sums: Sum of refocused intensities over realisations, averaged over the pixels of each ray, [F, 3, h, w].
@@ -57,7 +57,7 @@ class VolumeEvaluation:
         return mean * best_scale(self.sharpest(mean), self.rendering)[:, None, None]
 
     def sharpest(self, pictures: Tensor) -> Tensor:
-        """A picture [3, h, w] that takes each ray from the picture refocused nearest to its depth."""
+        """Compose a picture [3, h, w]: each ray is taken from the picture refocused nearest to the depth of the ray."""
         chosen = self._nearest()[None, None].expand(1, *pictures.shape[1:])
         return pictures.gather(0, chosen)[0]
 
@@ -107,7 +107,7 @@ class VolumeEvaluation:
 
 
 def pooled(image: Tensor, stride: int) -> Tensor:
-    """Mean over the pixels around each ray, [H / stride, W / stride]; ray i lies on pixel ``stride * i``."""
+    """Mean of the pixels around each ray, [H / stride, W / stride]; ray i is at pixel ``stride * i`` of an axis."""
     if stride == 1:
         return image
     height, width = image.shape

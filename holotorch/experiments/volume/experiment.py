@@ -25,7 +25,7 @@ from holotorch.scene.transfer import TransferFunction
 from holotorch.scene.volume import Volume
 
 _CATALOGUE = {"teapot": "boston_teapot"}  # names of the thesis that differ from those of the catalogue
-_SMOOTH = 8  # rays: correlation length of smooth phases
+_SMOOTH = 8  # correlation length of smooth phases, in rays
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ class VolumeExperiment:
                 advance()
                 started = time.perf_counter()
         fields = []
-        while sums:  # one at a time, so that the memory of a spectrum is free before the next is transformed
+        while sums:  # one at a time, so that the memory of a spectrum is freed before the next is transformed
             fields.append(sums.pop(0).finish().to(self.device))
         return torch.stack(fields), rendering
 
@@ -180,7 +180,7 @@ class VolumeExperiment:
 
 @dataclass(frozen=True)
 class Part:
-    """The share of one of several processes: colours are divided first, then blocks of planes.
+    """The work of one of several processes: the colours are divided first, then blocks of planes.
 
     Attributes:
         rank: Index of this process.

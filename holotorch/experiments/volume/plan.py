@@ -16,7 +16,7 @@ _FLOP_SECONDS = 4.2e-11  # seconds per operation of a HologramPlan
 _RAY_SECONDS = 1.5e-8  # seconds of rendering per ray and plane
 _BASE_BYTES = 500e6  # libraries
 _RAY_BYTES = 120  # bytes per ray of the renderer
-_SLAB = 42  # rendered planes that wait to be spread onto the nodes of an axial hologram
+_SLAB = 42  # rendered planes held in memory before they are spread onto the nodes of an axial hologram
 _COARSE = 64  # rays along each side of the rendering that estimates how much light is cut off
 
 
@@ -129,7 +129,7 @@ def _notes(experiment: VolumeExperiment) -> list[str]:
 
 
 def _lost_light(experiment: VolumeExperiment) -> float:
-    """Share of the volume's light that lies beside the rays, from a coarse rendering of the whole volume."""
+    """Share of the volume's light outside the area of the rays, from a coarse rendering of the whole volume."""
     extent = torch.tensor(experiment.volume.extent, dtype=torch.float64)
     sides = (experiment.rotation.abs() @ extent / extent.max() * experiment.width).tolist()
     if all(size >= side for size, side in zip(experiment.rays.extent, sides[1:], strict=True)):

@@ -67,7 +67,7 @@ def run_volume(experiment: VolumeExperiment, opened: RunFolder) -> bool:
 
 
 def fingerprint_inputs(experiment: VolumeExperiment) -> tuple[VolumeSettings, dict[str, tuple[Any, ...]], set[str]]:
-    """Arguments of :func:`fingerprint`: the number of realisations and the device may change in a resumed run."""
+    """Arguments for :func:`fingerprint`; the number of realisations and the device may change in a resumed run."""
     volume, file = experiment.volume, experiment.settings.transfer.file
     inputs: dict[str, tuple[Any, ...]] = {"volume": (volume.values, repr((volume.spacing, volume.unit)))}
     if file:

@@ -1,4 +1,4 @@
-"""General array files without a spacing: NumPy, HDF5 and Zarr, axes (z, y, x)."""
+"""General array files, which state no spacing: NumPy, HDF5 and Zarr, with axes (z, y, x)."""
 
 import math
 from pathlib import Path
@@ -11,7 +11,7 @@ from holotorch.io.formats.scan import Scan, chosen, extra, readable, three_axes,
 
 
 def read_npy(path: Path) -> Scan:
-    """NumPy array, mapped if large."""
+    """Read a NumPy array; a large one is memory-mapped."""
     with readable(path, ".npy array"):
         stored = np.load(path, mmap_mode="r", allow_pickle=False)
     if stored.flags.c_contiguous:
@@ -20,7 +20,7 @@ def read_npy(path: Path) -> Scan:
 
 
 def read_npz(path: Path, member: str | None = None) -> Scan:
-    """The only array of an .npz archive, or ``member``."""
+    """Read the array ``member`` of an .npz archive, or its only array."""
     with readable(path, ".npz archive"):
         archive = np.load(path, allow_pickle=False)
     with archive:
@@ -32,7 +32,7 @@ def read_npz(path: Path, member: str | None = None) -> Scan:
 
 
 def _check_member(path: Path, archive: Any, name: str) -> None:
-    """Raise ValueError for an array whose stated size differs from its data, before numpy allocates the stated size."""
+    """Raise ValueError if the stated size of an array differs from that of its data, before numpy allocates memory."""
     entry = next(item for item in archive.zip.infolist() if item.filename in (name, f"{name}.npy"))
     with archive.zip.open(entry) as stream:
         version = np.lib.format.read_magic(stream)
@@ -45,7 +45,7 @@ def _check_member(path: Path, archive: Any, name: str) -> None:
 
 
 def read_hdf5(path: Path, member: str | None = None) -> Scan:
-    """A dataset of an HDF5 file, ``path::dataset``; the name is needed where several have three axes."""
+    """Read a dataset of an HDF5 file, ``path::dataset``; the name is required if several datasets have three axes."""
     h5py = extra("h5py", "reading HDF5")
     found: dict[str, int] = {}
     with readable(path, "HDF5 file"):
@@ -62,7 +62,7 @@ def read_hdf5(path: Path, member: str | None = None) -> Scan:
 
 
 def read_zarr(path: Path, member: str | None = None) -> Scan:
-    """An array of a Zarr folder, ``path::array``, or the folder itself where it is an array."""
+    """Read an array of a Zarr folder, ``path::array``, or the folder itself if it is an array."""
     zarr = extra("zarr", "reading Zarr")
     with readable(path, "Zarr folder"):
         node = zarr.open(str(path), mode="r")

@@ -1,4 +1,4 @@
-"""Decoding of pictures by OpenCV, after a check of the memory that their header asks for."""
+"""Decoding of pictures by OpenCV, after a check of the memory that the size in their header requires."""
 
 import io
 import math
@@ -13,23 +13,24 @@ from holotorch.io.formats.limits import affordable
 
 PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
-_MOST_SCANS = 100  # of a progressive JPEG; a scan of a few bytes may stand for all of a picture
+_MOST_SCANS = 100  # in a progressive JPEG; decoding a scan of a few bytes can take as long as a whole picture
 _MARKER = re.compile(rb"\xff+([^\x00\xff])")
-_BARE = frozenset((0x01, *range(0xD0, 0xD9)))  # markers without a segment: restarts, the beginning
-_DECODED = 8  # bytes of a pixel, four channels of 16 bits
+_BARE = frozenset((0x01, *range(0xD0, 0xD9)))  # markers without a segment, such as restarts and the start of the image
+_DECODED = 8  # bytes per decoded pixel: four channels of 16 bits
 
 
 def decode(path: Path, flags: int, *, data: bytes | None = None, memory: int = _DECODED) -> np.ndarray:
     """Pixels [H, W] or [H, W, C] of a PNG, JPEG, BMP, TIFF or WebP file, as ``cv2.imdecode`` gives them.
 
     Args:
-        path: Of the file.
-        flags: Of ``cv2.imdecode``.
-        data: Content of the file, where it has been read already.
-        memory: Bytes per pixel that decoding and what the caller does with the pixels take.
+        path: Path of the file.
+        flags: Flags of ``cv2.imdecode``.
+        data: Content of the file, if it has been read already.
+        memory: Bytes per pixel needed for decoding and for the further processing by the caller.
 
     Raises:
-        ValueError: No picture, a damaged one, or one beyond the memory limit of :mod:`holotorch.io.formats.limits`.
+        ValueError: The file is no picture, is damaged, or exceeds the memory limit of
+            :mod:`holotorch.io.formats.limits`.
     """
     import cv2
 
@@ -45,7 +46,7 @@ def decode(path: Path, flags: int, *, data: bytes | None = None, memory: int = _
     affordable(path, height * width * memory, len(data))
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:  # in place of None, for some kinds of damage
+    except cv2.error:  # OpenCV raises this for some kinds of damage, and returns None for others
         pixels = None
     if pixels is None:
         raise ValueError(_unreadable(path))
@@ -53,7 +54,7 @@ def decode(path: Path, flags: int, *, data: bytes | None = None, memory: int = _
 
 
 def picture_size(path: Path, data: bytes) -> tuple[int, int]:
-    """(H, W) of an encoded picture by its header, without decoding it; ValueError where it has none."""
+    """Size (H, W) of an encoded picture from its header, without decoding; ValueError if the header has none."""
     from PIL.BmpImagePlugin import BmpImageFile
     from PIL.JpegImagePlugin import JpegImageFile
     from PIL.TiffImagePlugin import TiffImageFile
@@ -64,21 +65,21 @@ def picture_size(path: Path, data: bytes) -> tuple[int, int]:
             return _png_size(data)
         if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
             return _webp_size(data)
-        # The classes rather than Image.open, whose limit knows nothing of the file's size.
+        # The reader classes are used directly, since the size limit of Image.open does not depend on the file's size.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             picture = readers[data[:2]](io.BytesIO(data))
         return picture.height, picture.width
-    except Exception:  # of a header that is cut short or damaged, many kinds
+    except Exception:  # truncated or damaged headers cause many kinds of errors
         raise ValueError(_unreadable(path)) from None
 
 
 def check_exr(path: Path, *, memory: int) -> None:
-    """Raise ValueError for an EXR file that is damaged, or asks for more than the memory limit.
+    """Raise ValueError for an EXR file that is damaged or needs more memory than the limit.
 
     Args:
-        path: Of the file.
-        memory: Bytes per pixel that the caller takes beside 4 for each channel of the file.
+        path: Path of the file.
+        memory: Bytes per pixel that the caller needs in addition to 4 bytes for each channel of the file.
     """
     import OpenEXR
 
@@ -96,12 +97,12 @@ def check_exr(path: Path, *, memory: int) -> None:
 
 
 def _scans(data: bytes) -> int:
-    """Number of scans of a JPEG, without those of a thumbnail in its metadata."""
+    """Number of scans of a JPEG, without the scans of a thumbnail in its metadata."""
     count, place = 0, 2
     while (match := _MARKER.search(data, place)) and (kind := match[1][0]) != 0xD9:
         count += kind == 0xDA
         place = match.end()
-        if kind not in _BARE:  # two bytes of length, which count themselves
+        if kind not in _BARE:  # the segment begins with its length, which includes these two bytes
             place += max(2, int.from_bytes(data[place : place + 2], "big"))
     return count
 
@@ -113,9 +114,9 @@ def _png_size(data: bytes) -> tuple[int, int]:
 
 
 def _png_end(data: bytes) -> int:
-    """Bytes up to the end of a PNG; an exception where a chunk is longer than the data.
+    """Length of a PNG in bytes up to the end of its last chunk; an exception if a chunk is longer than the data.
 
-    Decoders allocate what a chunk states before they look for it, also in what follows the last one.
+    Decoders allocate the stated size of a chunk before they read it, even for data after the last chunk.
     """
     place, kind = len(PNG), b""
     while kind != b"IEND":

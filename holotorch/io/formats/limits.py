@@ -1,4 +1,4 @@
-"""Memory limits of files: contents are unpacked only up to the stated size, which is itself limited."""
+"""Memory limits for reading files: data are decompressed only up to the stated size, which is itself limited."""
 
 import bz2
 import os
@@ -9,22 +9,23 @@ from pathlib import Path
 from holotorch.core.memory import available_memory
 
 MEMORY_LIMIT = 1 << 30  # bytes of memory allowed for any file
-# Memory allowed for a larger file, relative to its size: photographs and scans need less than 300, zeros up to 1000.
+# Larger files may use this many times their size in memory. Photographs and scans expand less than 300-fold, a file of
+# zeros up to 1000-fold.
 RATIO = 500
 VARIABLE = "HOLOTORCH_MEMORY_LIMIT"  # environment variable with a number of bytes that replaces MEMORY_LIMIT
-_CHUNK = 1 << 20  # bytes unpacked at once
+_CHUNK = 1 << 20  # bytes decompressed at once
 
 
 def affordable(source: Path | str, needed: int, stored: int) -> None:
-    """Raise ValueError where a file needs more memory than is plausible for its size.
+    """Raise ValueError if a file needs more memory than is plausible for its size.
 
-    Allowed are :data:`MEMORY_LIMIT` bytes, or :data:`RATIO` times the file's size where that is more. The environment
-    variable :data:`VARIABLE` raises the former.
+    The limit is :data:`MEMORY_LIMIT` bytes or :data:`RATIO` times the file's size, whichever is more. The environment
+    variable :data:`VARIABLE` replaces the former.
 
     Args:
         source: Name of the file.
-        needed: Bytes that reading it takes.
-        stored: Bytes of the file.
+        needed: Memory for reading the file in bytes.
+        stored: Size of the file in bytes.
     """
     try:
         limit = float(os.environ.get(VARIABLE, MEMORY_LIMIT))
@@ -39,21 +40,21 @@ def affordable(source: Path | str, needed: int, stored: int) -> None:
 
 
 def readable_at_once(size: int) -> bool:
-    """Whether so many bytes are read rather than mapped: up to :data:`MEMORY_LIMIT`, or half of the free memory."""
+    """Whether data of ``size`` bytes are read at once, not mapped: up to MEMORY_LIMIT or half of the free memory."""
     return size <= max(MEMORY_LIMIT, (available_memory() or 0) // 2)
 
 
 def unzipped(path: Path, size: int, offset: int = 0, *, kind: str = "gzip") -> bytearray:
-    """Content of a compressed file from ``offset`` on, which shall have ``size`` bytes; fewer are returned as they are.
+    """Decompress a file from ``offset`` on. Content shorter than ``size`` bytes is returned without an error.
 
     Args:
-        path: Of the file.
-        size: Bytes that the content has as the file or its header states; no more are unpacked.
-        offset: Where the compressed data begin.
-        kind: "gzip", which takes zlib's header too, or "bzip2"; several members one after another are one content.
+        path: Path of the file.
+        size: Expected size of the content in bytes, usually stated by a header; decompression stops beyond it.
+        offset: Position in the file, in bytes, at which the compressed data begin.
+        kind: "gzip", which also accepts zlib streams, or "bzip2". Concatenated members are joined.
 
     Raises:
-        ValueError: Data that are damaged or cut short, more than ``size`` bytes, or a size beyond the memory limit.
+        ValueError: The data are damaged or cut short, have more than ``size`` bytes, or exceed the memory limit.
     """
     affordable(path, size, path.stat().st_size)
     content = bytearray()
@@ -65,7 +66,7 @@ def unzipped(path: Path, size: int, offset: int = 0, *, kind: str = "gzip") -> b
 
 
 def inflated(data: bytes, size: int) -> bytes:
-    """Content of a block of zlib, at most ``size`` bytes; ValueError where it has more, zlib.error for damage."""
+    """Decompress a zlib block of at most ``size`` bytes; ValueError if it has more, zlib.error if it is damaged."""
     engine = zlib.decompressobj()
     content = engine.decompress(data, size + 1)
     if len(content) > size:
@@ -84,7 +85,7 @@ def _gzip(path: Path, offset: int) -> Iterator[bytes]:
             if members and not rest.strip(b"\0"):
                 rest = b""
                 continue
-            engine = zlib.decompressobj(32 + zlib.MAX_WBITS)  # whichever header it has
+            engine = zlib.decompressobj(32 + zlib.MAX_WBITS)  # accepts the headers of gzip and zlib
             try:
                 while rest and not engine.eof:
                     piece = engine.decompress(rest, _CHUNK)

@@ -16,9 +16,9 @@ _UNEVEN = 0.05  # tolerated deviation of a slice distance, relative to the media
 
 
 def read_nifti(path: Path) -> Scan:
-    """NIfTI, .nii (mapped if large) or .nii.gz, in the type of the file, or float32 where it states a scale.
+    """Read NIfTI, .nii (mapped if large) or .nii.gz, in the dtype of the file, or as float32 if it states a scale.
 
-    A file that states no unit is in millimetres, as in other readers of the format.
+    If a file states no unit, millimetres are assumed, as in other readers of the format.
     """
     nibabel = extra("nibabel", "reading NIfTI")
     with readable(path, "NIfTI file"):
@@ -43,19 +43,19 @@ def is_dicom(path: Path) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Slice:
-    """Header of one DICOM slice; lengths in millimetres, vectors (x, y, z)."""
+    """Header of one DICOM slice, with lengths in millimetres and vectors (x, y, z)."""
 
     path: Path
     series: str
-    single: bool  # one frame of one number per pixel
+    single: bool  # whether the file has one frame and one number per pixel
     size: tuple[int, int]  # (rows, columns)
-    position: np.ndarray  # of the first pixel
-    cosines: np.ndarray  # [2, 3]: from column to column, from row to row
-    spacing: np.ndarray | None  # from row to row, from column to column
+    position: np.ndarray  # position of the first pixel
+    cosines: np.ndarray  # [2, 3]: unit vectors from column to column and from row to row
+    spacing: np.ndarray | None  # distances from row to row and from column to column
     thickness: float | None
     scale: tuple[float, float]  # slope and intercept
     signed: bool
-    bits: tuple[int, int]  # allocated and stored
+    bits: tuple[int, int]  # bits allocated and bits stored per pixel
 
     @property
     def normal(self) -> np.ndarray:
@@ -67,9 +67,9 @@ class _Slice:
 
 
 def read_dicom(folder: Path) -> Scan:
-    """One DICOM series of single slices, sorted by position and rescaled as stated in the headers.
+    """Read one DICOM series of single slices, sorted by position and rescaled as stated in the headers.
 
-    Integers stay integers where slope and intercept are whole and the same for all slices; else float32.
+    The result has integers if slope and intercept are whole numbers and equal for all slices; otherwise float32.
     """
     pydicom = extra("pydicom", "reading DICOM")
     paths = sorted(path for path in folder.iterdir() if path.is_file() and is_dicom(path))
@@ -171,5 +171,6 @@ def _rescaled_type(slices: Sequence[_Slice]) -> np.dtype:
         return np.dtype(f"{'i' if slices[0].signed else 'u'}{allocated // 8}")
     limits = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if slices[0].signed else (0, 2**bits - 1)
     ends = [int(slope) * limit + int(intercept) for limit in limits]
-    # The smallest signed type that holds both ends: -max - 1 needs the same signed type as max.
+    # The smallest signed type that holds both ends. min_scalar_type would return an unsigned type for a positive
+    # maximum, so -maximum - 1 is used, which needs the signed type that also holds the maximum.
     return np.min_scalar_type(min(-1, *ends, -max(ends) - 1))

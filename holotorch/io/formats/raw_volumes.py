@@ -24,7 +24,7 @@ from holotorch.io.formats.scan import (
     unpacked,
 )
 
-_HEADER = 1 << 20  # bytes; longest header of unknown length that is accepted within compressed data
+_HEADER = 1 << 20  # bytes; largest accepted header of unknown length within compressed data
 _META_TYPES = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4",
     "MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4", "MET_DOUBLE": "f8",
@@ -44,10 +44,10 @@ _NRRD_TYPES = {
 
 
 def read_raw(path: Path, shape: Sequence[int] | None, dtype: DTypeLike | None) -> Scan:
-    """Voxels without a header, x fastest; a missing shape or dtype is taken from the file name.
+    """Read voxels without a header, x fastest; a missing shape or dtype is taken from the file name.
 
-    Names follow the Open SciVis Datasets, with sizes (x, y, z), such as bonsai_256x256x256_uint8.raw. ``path`` may end
-    in .gz.
+    The name then contains sizes (x, y, z) and the type, as in the Open SciVis Datasets, for example
+    bonsai_256x256x256_uint8.raw. A file whose name ends in .gz is decompressed.
     """
     stated = re.search(r"_(\d+)x(\d+)x(\d+)_(u?int\d+|float\d+)\.", path.name)
     if stated:
@@ -66,7 +66,7 @@ def read_raw(path: Path, shape: Sequence[int] | None, dtype: DTypeLike | None) -
 
 
 def read_metaimage(path: Path) -> Scan:
-    """MetaImage, .mhd with a data file or .mha in one; lengths are millimetres unless DistanceUnits says otherwise."""
+    """Read MetaImage, .mhd with a data file or a single .mha; in millimetres unless DistanceUnits states another unit."""
     fields, end = _metaimage_header(path)
     if fields.get("NDims", "3") != "3" or fields.get("ElementNumberOfChannels", "1") != "1":
         raise ValueError(
@@ -101,7 +101,7 @@ def read_metaimage(path: Path) -> Scan:
 
 
 def read_nrrd(path: Path) -> Scan:
-    """NRRD, or NHDR with its data file; encodings raw, gzip, bzip2 and ascii. Without units the volume is relative."""
+    """Read NRRD, or NHDR with its data file, encoded as raw, gzip, bzip2 or ascii; without units it is "relative"."""
     import nrrd
 
     with open(path, "rb") as stream:
@@ -172,7 +172,7 @@ def _nrrd_placed(values: np.ndarray, header: dict[str, Any], path: Path) -> Scan
     units = [unit for unit in header.get("space units" if in_space else "units", []) if unit.strip()]
     if len(units) not in (0, 3):
         raise ValueError(f"{path} gives units for {len(units)} of three axes; pass spacing= instead")
-    # One unit per axis; with directions, per component of every vector. Both are the columns.
+    # There is one unit per axis or, with space directions, per vector component. Both apply to the columns of ``axes``.
     scale = np.array([metres(unit, path) for unit in units] if units else [1.0, 1, 1])
     origin = np.asarray(header.get("space origin", [0.0, 0, 0]), dtype=np.float64)
     origin = np.where(np.isfinite(origin), origin, 0) * scale
@@ -180,14 +180,14 @@ def _nrrd_placed(values: np.ndarray, header: dict[str, Any], path: Path) -> Scan
 
 
 def _at_end(path: Path, shape: list[int], dtype: np.dtype) -> int:
-    # A header of unknown length is skipped by counting from the end; too short a file is reported by uncompressed.
+    # If the length of the header is unknown, the data are located from the end. ``uncompressed`` rejects short files.
     return max(0, path.stat().st_size - math.prod(shape) * dtype.itemsize)
 
 
 def _metaimage_header(path: Path) -> tuple[dict[str, str], int]:
     fields: dict[str, str] = {}
     with open(path, "rb") as stream:
-        # The data may follow: stop at the field that ends every header.
+        # The voxels may follow the header, so reading stops at its last field, which is always ElementDataFile.
         while "ElementDataFile" not in fields and (line := stream.readline(1 << 16)):
             name, equals, value = line.decode("latin-1").partition("=")
             if equals:

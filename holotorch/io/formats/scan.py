@@ -29,10 +29,10 @@ class Scan:
 
     Attributes:
         values: [D, H, W] in the dtype of the file, possibly memory-mapped.
-        spacing: Along (z, y, x) in ``unit``, or None where the file states none.
+        spacing: Distance between voxels along (z, y, x) in ``unit``, or None if the file states none.
         unit: "m" or "relative".
-        origin: Of voxel [0, 0, 0], (z, y, x) in ``unit``.
-        orientation: Unit rows for the axes z, y, x, with (z, y, x) components.
+        origin: Position (z, y, x) of voxel [0, 0, 0] in ``unit``.
+        orientation: Unit vectors of the axes z, y, x as rows with components (z, y, x).
     """
 
     values: np.ndarray
@@ -53,14 +53,14 @@ def metres(unit: str, path: Path) -> float:
 
 
 def placed(values: np.ndarray, axes: Any, origin: Any, unit: str, scale: float = 1.0) -> Scan:
-    """Scan of ``values`` whose file lists geometry in the order (x, y, z), as medical formats do.
+    """Scan of ``values`` for a file that lists geometry in the order (x, y, z), like medical formats.
 
     Args:
-        values: [D, H, W].
-        axes: [3, 3], the step from one voxel to the next along x, y and z as rows of (x, y, z) components.
-        origin: (x, y, z) of the first voxel.
+        values: Voxels [D, H, W].
+        axes: Steps from one voxel to the next along x, y and z, as rows with components (x, y, z), [3, 3].
+        origin: Position (x, y, z) of the first voxel.
         unit: "m" or "relative".
-        scale: Length of the file's unit in ``unit``.
+        scale: Length of the file's unit, expressed in ``unit``.
     """
     steps = np.asarray(axes, dtype=np.float64)[::-1, ::-1]
     lengths = np.linalg.norm(steps, axis=1)
@@ -83,16 +83,16 @@ def triple(values: Sequence[float] | np.ndarray) -> Triple:
 
 
 def existing(path: Path) -> Path:
-    """``path``, or ValueError where it is missing or an empty file."""
+    """``path``; ValueError if it does not exist, cannot be read or is an empty file."""
     return _not_empty(path, str(path))
 
 
 def named(header: Path, name: str) -> Path:
-    """The data file that a header names, in the header's folder or below it.
+    """Path of the data file that a header names, in the header's folder or below it.
 
     Raises:
-        ValueError: It is missing, empty or no file, or lies elsewhere: a header from someone else must not choose which
-            of the user's files are read.
+        ValueError: The data file is missing, empty or no file, or lies outside the folder: a header from someone else
+            must not choose which of the user's files are read.
     """
     path = header.parent / name
     if not path.resolve().is_relative_to(header.parent.resolve()):
@@ -108,7 +108,7 @@ def _not_empty(path: Path, where: str, *, file: bool = False) -> Path:
         path.stat()
     except FileNotFoundError:
         raise ValueError(f"{where} does not exist") from None
-    except OSError as error:  # a name that no file can have, a folder that may not be looked into
+    except OSError as error:  # an invalid file name, or no permission to read the folder
         raise ValueError(f"{where} cannot be read: {error.strerror}") from None
     if file and not path.is_file():
         raise ValueError(f"{where} is no file")
@@ -118,7 +118,7 @@ def _not_empty(path: Path, where: str, *, file: bool = False) -> Path:
 
 
 def number_type(dtype: DTypeLike) -> np.dtype:
-    """The type that ``dtype`` names; ValueError for what is no type of real numbers."""
+    """``dtype`` as a numpy dtype; ValueError if it is no type of real numbers."""
     try:
         kind = np.dtype(dtype)
         if kind.kind not in "buif":
@@ -131,7 +131,7 @@ def number_type(dtype: DTypeLike) -> np.dtype:
 
 
 def expect_bytes(path: Path, found: int, shape: Sequence[int], dtype: np.dtype) -> int:
-    """Number of bytes of ``shape`` voxels; ValueError where ``found`` is another, or for no voxels."""
+    """Number of bytes of ``shape`` voxels; ValueError if ``found`` differs from it, or if a size is below 1."""
     if any(size < 1 for size in shape):
         raise ValueError(f"{path} states {' x '.join(map(str, shape))} voxels (D x H x W); every size must be above 0")
     wanted = math.prod(shape) * dtype.itemsize
@@ -145,16 +145,17 @@ def expect_bytes(path: Path, found: int, shape: Sequence[int], dtype: np.dtype) 
 
 
 def uncompressed(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int = 0) -> np.ndarray:
-    """Voxels of a file that holds nothing else after ``offset`` bytes; see :func:`uncompressed_from`."""
+    """Voxels of a file that contains only voxels after ``offset`` bytes; see :func:`uncompressed_from`."""
     expect_bytes(path, path.stat().st_size - offset, shape, dtype)
     return uncompressed_from(path, shape, dtype, offset)
 
 
 def uncompressed_from(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int) -> np.ndarray:
-    """Voxels from ``offset`` bytes on: read, or mapped where they are over 1 GiB and more than half of the free memory.
+    """Voxels of a file from ``offset`` bytes on.
 
-    A mapped voxel is read on access, and the system terminates the program if the file has been truncated meanwhile.
-    Only volumes that may exceed the memory are therefore mapped. Changes to mapped voxels are not written to the file.
+    They are memory-mapped if they take over 1 GiB and over half of the free memory, and otherwise read at once. A
+    mapped voxel is read on access, and the system terminates the program if the file has been truncated meanwhile; only
+    volumes that may exceed the memory are therefore mapped. Changes to mapped voxels are not written to the file.
     """
     size = math.prod(shape) * dtype.itemsize
     if readable_at_once(size):
@@ -170,28 +171,28 @@ def uncompressed_from(path: Path, shape: Sequence[int], dtype: np.dtype, offset:
 
 
 def stated_bytes(path: Path, shape: Sequence[int], dtype: np.dtype) -> int:
-    """Bytes of the ``shape`` voxels that a file states; ValueError for none, or more than its own size allows."""
+    """Number of bytes of the stated ``shape``; ValueError if a size is below 1 or the bytes exceed the memory limit."""
     size = expect_bytes(path, math.prod(shape) * dtype.itemsize, shape, dtype)
     affordable(path, size, path.stat().st_size)
     return size
 
 
 def unpacked(path: Path, data: bytes | bytearray, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
-    """Voxels of decompressed ``data``."""
+    """Decompressed ``data`` as an array of ``shape``."""
     expect_bytes(path, len(data), shape, dtype)
     # torch needs a writable buffer, which a bytearray is.
     return np.frombuffer(data if isinstance(data, bytearray) else bytearray(data), dtype).reshape(tuple(shape))
 
 
 def from_words(words: Sequence[str] | Sequence[bytes], dtype: np.dtype) -> np.ndarray:
-    """Numbers written as text, of a type in the native byte order."""
+    """Convert numbers written as text to an array of ``dtype`` in native byte order."""
     # numpy's conversion from strings would store every word with the width of the longest.
     number = float if dtype.kind == "f" else int
     return np.array([number(word) for word in words], dtype.newbyteorder("="))
 
 
 def three_axes(values: np.ndarray, path: Path) -> np.ndarray:
-    """``values`` as [D, H, W] scalars; leading axes of length 1 are dropped, colours, vectors and series refused."""
+    """``values`` as [D, H, W] without leading axes of length 1; ValueError for colours, vectors and series."""
     if values.dtype.names or values.dtype.kind not in "buif":
         raise ValueError(f"{path} holds {values.dtype} elements, not one real number per voxel; convert it to scalars")
     while values.ndim > 3 and values.shape[0] == 1:
@@ -207,17 +208,17 @@ def three_axes(values: np.ndarray, path: Path) -> np.ndarray:
 
 @contextmanager
 def readable(path: Path, kind: str) -> Iterator[None]:
-    """Context for a decoder that turns any of its errors into a ValueError with the name of the file."""
+    """Context manager that converts any error of a decoder to a ValueError with the name of the file."""
     try:
         yield
     except MemoryError:
         raise
-    except Exception as error:  # libraries raise many kinds, bare RuntimeError and KeyError among them
+    except Exception as error:  # libraries raise many kinds, such as RuntimeError and KeyError
         raise ValueError(f"{path} is no readable {kind}, or is truncated: {error}") from None
 
 
 def extra(module: str, what: str) -> Any:
-    """Import an optional ``module``, or raise ImportError with the line that installs it."""
+    """Import an optional ``module``, or raise ImportError with the command that installs it."""
     try:
         return importlib.import_module(module)
     except ImportError:
@@ -227,13 +228,13 @@ def extra(module: str, what: str) -> Any:
 
 
 def split_member(path: str | Path) -> tuple[Path, str | None]:
-    """Path of the file and name of the array within it, written as ``file::name``."""
+    """Split ``file::name`` into the path of the file and the name of the array within it, or None."""
     file, _, member = str(path).partition("::")
     return Path(file), member or None
 
 
 def chosen(names: Sequence[str], member: str | None, path: Path) -> str:
-    """The array ``member`` of those in the file, or the only one."""
+    """Name of the array to read: ``member`` if given, otherwise the only one of ``names``; else ValueError."""
     if member is None and len(names) == 1:
         return names[0]
     if member is None or member not in names:

@@ -15,7 +15,7 @@ SLICE_SUFFIXES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg")
 
 
 def read_tiff(path: Path) -> Scan:
-    """Grey pages of a TIFF file, first page at z = 0. TIFF has no spacing between pages."""
+    """Read the grey pages of a TIFF file as slices, the first page at z = 0. TIFF states no spacing between pages."""
     import cv2
 
     pages = _tiff_pages(path)
@@ -30,7 +30,7 @@ def read_tiff(path: Path) -> Scan:
 
 
 def read_folder(folder: Path) -> Scan:
-    """Pictures of one folder, ordered by the last number in their names, which must count without a gap."""
+    """Read the pictures of a folder as slices, ordered by the last number in their names; no number may be missing."""
     paths = [path for path in folder.iterdir() if path.suffix.lower() in SLICE_SUFFIXES]
     if not paths:
         raise ValueError(f"{folder} holds no slices: neither DICOM, Zarr nor pictures ({', '.join(SLICE_SUFFIXES)})")
@@ -53,7 +53,7 @@ def read_folder(folder: Path) -> Scan:
 
 
 def read_tiles(path: Path, shape: Sequence[int] | None) -> Scan:
-    """Slices as tiles of one picture, row by row from the top left; ``shape`` is (D, H, W).
+    """Read slices stored as tiles of one picture, row by row from the top left; ``shape`` is (D, H, W).
 
     Tiles after the last slice must be empty.
     """
@@ -102,14 +102,14 @@ def _stacked(slices: Iterable[np.ndarray], sources: Sequence[str]) -> Scan:
 
 
 def _tiff_pages(path: Path) -> int:
-    """Number of pages by the chain of directories, since OpenCV omits pages that it cannot decode without an error.
+    """Number of pages from the TIFF directories, since OpenCV silently omits pages that it cannot decode.
 
     Raises:
         ValueError: A damaged file, or pages whose pixels need more than the memory limit.
     """
     data = np.memmap(path, np.uint8, "r")
     order = "big" if data[:2].tobytes() == b"MM" else "little"
-    # Version 42 has offsets of 4 bytes; 43, BigTIFF, of 8.
+    # Version 42 (TIFF) has offsets of 4 bytes, version 43 (BigTIFF) of 8 bytes.
     version = int.from_bytes(data[2:4].tobytes(), order)
     if data[:2].tobytes() not in (b"II", b"MM") or version not in (42, 43):
         raise ValueError(f"{path} is not a TIFF file")
@@ -122,7 +122,7 @@ def _tiff_pages(path: Path) -> int:
         return int.from_bytes(data[place : place + size].tobytes(), order)
 
     def fact(directory: int, tag: int, default: int) -> int:
-        """Value of the entry ``tag``, a number of 2, 4 or 8 bytes by its type; the first one where it has several."""
+        """First value of the entry ``tag``, or ``default``; the entry's type gives its size of 1, 2, 4 or 8 bytes."""
         for place in range(directory + counter, directory + counter + entry * number(directory, counter), entry):
             if number(place, 2) == tag:
                 size = {3: 2, 4: 4, 16: 8}.get(number(place + 2, 2), 1)

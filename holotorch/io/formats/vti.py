@@ -1,4 +1,4 @@
-"""VTK image data (.vti): XML with the voxels as text, base64 or raw bytes, plain or compressed by zlib."""
+"""VTK image data (.vti): XML with the voxels as text, base64 or raw bytes, uncompressed or compressed by zlib."""
 
 import base64
 import re
@@ -26,16 +26,16 @@ _TYPES = {
     "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4", "Int64": "i8",
     "UInt64": "u8", "Float32": "f4", "Float64": "f8",
 }  # fmt: skip
-# Repetitions are bounded, so that a search takes linear time in a file of many partial matches.
+# Repetitions are bounded, so that the search takes linear time even if a file has many partial matches.
 _APPENDED = re.compile(
     rb"<AppendedData\s[^<>]{0,200}encoding\s{0,9}=\s{0,9}[\"'](\w{1,20})[\"'][^<>]{0,200}>\s{0,999}_"
 )
 
 
 def read_vti(path: Path, member: str | None = None) -> Scan:
-    """A scalar array of the only piece: the active one, the only one, or ``member``. VTK knows no units: relative.
+    """Read a scalar array of a file with one piece: ``member``, else the active array, else the only one.
 
-    Raw appended data without compression are mapped if large.
+    VTK states no units, so the volume is "relative". Large raw appended data without compression are memory-mapped.
     """
     root, start, base64_coded = _document(path)
     image = root.find("ImageData")
@@ -70,7 +70,8 @@ def read_vti(path: Path, member: str | None = None) -> Scan:
 
 
 def _document(path: Path) -> tuple[ElementTree.Element, int, bool]:
-    """XML without the appended data, the offset of these data in the file, and whether they are base64."""
+    """Parse the XML without the appended data; also return their offset in the file (or -1) and whether they are base64.
+    """
     data = np.memmap(path, np.uint8, "r")
     match = _APPENDED.search(data)  # type: ignore[arg-type]
     text = bytes(data[: match.start()]) + b"</VTKFile>" if match else bytes(data)
@@ -82,7 +83,7 @@ def _document(path: Path) -> tuple[ElementTree.Element, int, bool]:
 
 
 def _array(piece: ElementTree.Element, member: str | None, path: Path) -> tuple[ElementTree.Element, int]:
-    """The selected array, and 1 for cell data, which has one value less per axis than point data, else 0."""
+    """The selected array, and 1 for cell data, which have one value fewer per axis than point data, else 0."""
     for name, cells in (("PointData", 0), ("CellData", 1)):
         holder = piece.find(name)
         arrays = {item.get("Name", ""): item for item in (holder if holder is not None else ())}
@@ -149,9 +150,9 @@ def _decoded(text: str) -> bytes:
 
 
 def _inflated(path: Path, data: bytes, count: np.dtype, size: int) -> bytearray:
-    """Decompress blocks that follow a table of their number, full size, size of the last one, and compressed sizes.
+    """Decompress blocks, which follow a table: their number, full size, size of the last one, and compressed sizes.
 
-    At most ``size`` bytes are unpacked.
+    More than ``size`` bytes of content are an error.
     """
     try:
         blocks = int(np.frombuffer(data, count, 1)[0])

@@ -46,7 +46,7 @@ def plane_pair(
     tilt: Sequence[float] | Tensor,
     wavelengths: Sequence[float],
 ) -> PlanePair:
-    """PlanePair from checked arguments.
+    """PlanePair after checking the arguments.
 
     Raises TypeError for arguments of a wrong type, and ValueError for a tilt at which part of the band is evanescent.
     """
@@ -66,9 +66,10 @@ def plane_pair(
 
 
 def shifts(planes: PlanePair, distance: Tensor, tilt: Tensor) -> list[Tensor]:
-    """Per axis, the position of sample 0 of the result relative to sample 0 of the source, along the carrier.
+    """Per axis, the position of sample 0 of the result relative to that of the source projected along the carrier.
 
-    In samples, float64 of the shape of ``distance``; differentiable in distance and tilt.
+    The projection is the point where the carrier ray from sample 0 of the source meets the plane of the result. In
+    samples of the source, float64 of the shape of ``distance``; differentiable in distance and tilt.
     """
     tangents = tilt / torch.sqrt(1 - tilt.square().sum())
     return [

@@ -7,27 +7,28 @@ from holotorch.core.quantities import DEPTH, DISTANCE, WAVELENGTH_CHANGE
 from holotorch.optics.light.quadrature import correlation
 from holotorch.optics.light.spectrum import Spectrum
 
-DEFOCUS = 2.3  # in depths of focus: shift of the focus at the optimum width, fitted over three colours of one volume
+DEFOCUS = 2.3  # shift of the focus, in depths of focus, at the optimum width; fitted over three colours of one volume
 
 
 def path_difference(distance: float, aperture: float, *, tilt: float = 0.0) -> float:
     """Greatest difference in metres between paths from a hologram through a pupil to the depth in focus.
 
-    A fixed hologram sends spatial frequency f to the sine f lambda. Followed to ``distance``, its phase is
-    -pi distance lambda f^2, so light of another wavelength is out of phase with the pupil's centre by
-    2 pi (distance aperture^2 / 2) (lambda - lambda') / lambda^2 at its edge. The depth of the sources themselves
-    does not enter: the hologram's own phase is fixed.
+    A fixed hologram diffracts light of spatial frequency f to the sine f lambda. Over ``distance`` the phase of this
+    light changes by -pi distance lambda f^2. From the centre to the edge of the pupil, the phases at two wavelengths
+    therefore come to differ by 2 pi (distance aperture^2 / 2) (lambda - lambda') / lambda^2. The depth of the object
+    points does not matter, because the phase of the hologram is the same at all wavelengths.
+
+    The result is paraxial; at a sine of 0.1 it is 1 % too small.
 
     Args:
         distance: From the hologram to the depth in focus, in metres; its sign does not matter.
-        aperture: Sine of the half angle under which the pupil collects light there, the lesser of that of the eye and
-            that of the hologram's window.
-        tilt: Sine of the pupil's centre as seen from there: points off the axis have more, 2 distance tilt aperture.
+        aperture: Sine of the half angle of the light that a point in focus sends into the pupil: the smaller of that of
+            the eye's pupil and that of the hologram's window.
+        tilt: Sine of the direction from the point in focus to the centre of the pupil, 0 for points on the axis. If
+            it is above ``aperture``, the difference is 2 distance tilt aperture.
 
     Raises:
-        ValueError: An aperture that is not above 0, or an edge beyond 1.
-
-    Paraxial to the order of lambda f; at a sine of 0.1 it is short by 1 %.
+        ValueError: An aperture that is not above 0, or an edge of the pupil at a sine above 1.
     """
     distance = abs(checks.quantity(DISTANCE, distance))
     aperture, tilt = checks.positive("aperture", aperture), abs(checks.finite("tilt", tilt))
@@ -40,14 +41,15 @@ def path_difference(distance: float, aperture: float, *, tilt: float = 0.0) -> f
 def predicted_contrast(spectrum: Spectrum, path_difference: float) -> float:
     """Speckle contrast of an evenly filled round pupil under ``spectrum``, between 0 and 1.
 
-    C^2 is the double integral of S(l) S(l') sinc^2(path_difference (l - l') / lambda^2), S the power over the band. A
-    Lorentzian that is not cut off has C^2 = 2 (b - 1 + exp(-b)) / b^2, b = 2 pi path_difference fwhm / lambda^2; the
-    cut-off at 10 % raises C. 1 for a path difference of 0.
+    C^2 is the double integral of S(l) S(l') sinc^2(path_difference (l - l') / lambda^2) over the wavelengths l and l',
+    where S is the power density, normalized over the band, and lambda the centre. For a Lorentzian that is not cut off,
+    C^2 = 2 (b - 1 + exp(-b)) / b^2 with b = 2 pi path_difference fwhm / lambda^2; the cut-off at 10 % raises C. For a
+    path difference of 0, C is 1.
 
-    Beside contrasts measured on holograms of a CT volume at 30 mm under an aperture of 0.056, in three colours: within
-    5 % for half widths of 5 to 10 nm, 8 % too low at 20 nm, 7 % too high for a laser.
+    Compared with contrasts measured on simulated holograms of a CT volume at 30 mm with an aperture of 0.056, in three
+    colours, the prediction is within 5 % for half widths of 5 to 10 nm, 8 % too low at 20 nm, 7 % too high for a laser.
 
-    Source: Goodman, Speckle Phenomena in Optics, Sec. 6.5: a correlation weighted by the spectrum twice.
+    Source: Goodman, Speckle Phenomena in Optics, Sec. 6.5.
     """
     difference = checks.finite("path_difference", path_difference, "metres")
     if difference < 0:
@@ -57,12 +59,13 @@ def predicted_contrast(spectrum: Spectrum, path_difference: float) -> float:
 
 
 def samples_needed(spectrum: Spectrum, path_difference: float, tolerance: float = 0.01, *, iris: bool = True) -> int:
-    """How many wavelengths bring the expected rms error of a picture, relative to its rms, within ``tolerance``.
+    """Number of wavelengths that keep the expected rms error of a picture, relative to its rms, within ``tolerance``.
 
-    For 1 % without an iris it is about one for every beat over the band, band path_difference / lambda^2, and two more.
-    A hologram 30 mm away under an aperture of 0.056 at 636, 520, 455 nm: 2, 2, 2 for the laser, 3, 4, 5 for the narrow
-    SLED, 5, 6, 8 for the SLED, 8, 11, 14 for the LED. Under an iris these give 2 to 3 %, and 1 % takes about twice as
-    many; the sum over every nanometre is itself off by 0.4 to 1.4 % there. Arguments as :meth:`Spectrum.samples`.
+    The arguments are those of :meth:`Spectrum.samples`. For 1 % without an iris the number is about
+    bandwidth path_difference / lambda^2 + 2. Example: a hologram at 30 mm with an aperture of 0.056 needs, at 636, 520
+    and 455 nm, 2, 2, 2 wavelengths for the laser, 3, 4, 5 for the narrow SLED, 5, 6, 8 for the SLED and 8, 11, 14 for
+    the LED. With an iris these numbers give an error of 2 to 3 %, and 1 % takes about twice as many; the sum over every
+    nanometre then has an error of 0.4 to 1.4 % itself.
     """
     return len(spectrum.samples(tolerance=tolerance, path_difference=path_difference, iris=iris)[0])
 
@@ -77,18 +80,22 @@ def chromatic_defocus(distance: float, wavelength: float, change: float) -> floa
 
 
 def depth_of_focus(wavelength: float, aperture: float) -> float:
-    """Range of depths in focus in metres, wavelength / aperture^2: a quarter wave at the edge to either side."""
+    """Range of depths in focus in metres, wavelength / aperture^2.
+
+    At either end of the range the defocus is a quarter of a wavelength at the edge of the aperture.
+    """
     return checks.wavelengths(wavelength)[0] / checks.positive("aperture", aperture) ** 2
 
 
 def optimum_fwhm(wavelength: float, aperture: float, distance: float, *, defocus: float = DEFOCUS) -> float:
     """Full width at half maximum in metres that balances speckle and blur.
 
-    2 defocus wavelength^2 / (aperture^2 distance): half of it moves the focus by ``defocus`` times the depth of focus.
-    The scaling is that of chromatic defocus and holds over colour and depth; the number is the scene's, and is fitted.
-    2.3 is that of a CT volume (the teapot) by SSIM against a disjoint mean of seeds, for Lorentzian spectra cut off at
-    10 %: half widths of 9.8, 6.6, 5.0 nm at 636, 520, 455 nm, 30 mm away, under an aperture of 0.056. PSNR prefers 1.5
-    to 2 times as much. A photograph full of fine texture wants less: 1.4 to 1.6 by the same measure at 20 to 60 mm.
+    The result is 2 defocus wavelength^2 / (aperture^2 distance): half of this width moves the focus by ``defocus``
+    times the depth of focus. The formula follows from chromatic defocus and holds for all colours and depths; the
+    value of ``defocus`` depends on the scene and is fitted. The value 2.3 maximizes, for a CT volume (the teapot)
+    and Lorentzian spectra cut off at 10 %, the SSIM against the mean picture of other random seeds: half widths of
+    9.8, 6.6, 5.0 nm at 636, 520, 455 nm, at 30 mm with an aperture of 0.056. By PSNR the best value is 1.5 to 2
+    times as large. For a photograph with much fine texture it is smaller: 1.4 to 1.6 by SSIM at 20 to 60 mm.
 
     Args:
         wavelength: In metres.

@@ -22,18 +22,19 @@ def incoherent_sum(
     *,
     recompute: bool = False,
 ) -> Tensor:
-    """Sum of ``weights[k] * intensity_of(places[k])``, one after another, so that one is in memory at a time.
+    """Sum of ``weights[k] * intensity_of(places[k])``, computed one by one, so that memory holds one intensity.
 
     Args:
-        intensity_of: Intensity [...] of one wavelength in metres, or of one tilt of the illumination.
-        places: Wavelengths [K], passed on as floats, or any sequence of arguments of ``intensity_of``.
-        weights: [K], such as those of ``Spectrum.samples``; a tensor may carry gradients.
-        recompute: When gradients are wanted, compute each intensity again in the backward pass instead of keeping its
-            intermediate results: memory of one intensity, for a third more time.
+        intensity_of: Function that returns the intensity [...] for one wavelength in metres, or for one direction of
+            the illumination.
+        places: Wavelengths [K], passed on as floats, or any sequence of arguments for ``intensity_of``.
+        weights: [K], such as those of ``Spectrum.samples``; a tensor may require gradients.
+        recompute: If gradients are enabled, compute each intensity again in the backward pass instead of keeping its
+            intermediate results. Memory is then that of one intensity, and the time a third longer.
 
     Raises:
-        TypeError: An intensity that is complex: a field was given.
-        ValueError: No places, or another number of weights.
+        TypeError: ``intensity_of`` returns a complex tensor, that is a field instead of an intensity.
+        ValueError: ``places`` is empty, or the number of weights differs from that of places.
     """
     items = places.tolist() if isinstance(places, Tensor) else list(places)
     if not items or len(items) != len(weights):
@@ -47,7 +48,7 @@ def incoherent_sum(
         )
         assert isinstance(part, Tensor)
         checks.real("intensity", part)
-        # A float, or a tensor's float64 scalar, leaves the dtype of the intensity as it is.
+        # A float or a scalar float64 tensor does not change the dtype of the intensity.
         weight = weight.to(part.device) if isinstance(weight, Tensor) else weight
         total = part * weight if total is None else total + part * weight
     assert total is not None
@@ -57,12 +58,12 @@ def incoherent_sum(
 def disc_source(radius: float, rings: int = 2) -> tuple[list[tuple[float, float]], Tensor]:
     """Points of a uniform disc and their weights: an extended source for :func:`incoherent_sum`.
 
-    Gauss's rule in the squared radius on ``rings`` rings, each of 4 rings equally spaced points: exact for polynomials
-    of the two sines up to degree 4 rings - 1.
+    The points are those of Gauss's rule in the squared radius: ``rings`` rings with 4 ``rings`` equally spaced points
+    each. The rule is exact for polynomials of the two sines up to degree 4 rings - 1.
 
     Args:
-        radius: Sine of the half angle under which the hologram sees the source, above 0 and below 1.
-        rings: At least 1.
+        radius: Sine of half the angle that the source subtends at the hologram, above 0 and below 1.
+        rings: Number of rings, at least 1.
 
     Returns:
         Sines (y, x) of 4 rings^2 directions, and weights [4 rings^2] that add up to 1, float64.
@@ -84,7 +85,7 @@ def tilted_wave(grid: Grid, wavelength: float, direction: tuple[float, float]) -
     """Plane wave exp(2 pi i (y sy + x sx) / wavelength) on ``grid``, complex128 [H, W]: illumination from one point.
 
     Args:
-        grid: Of the hologram, whose field is multiplied by this.
+        grid: Sampling of the hologram, whose field is multiplied by the wave.
         wavelength: In metres.
         direction: Sines (y, x) of the direction of the wave.
 

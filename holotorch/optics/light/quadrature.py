@@ -1,4 +1,4 @@
-"""Rules that stand for an integral over wavelength by few values: Gauss's, and the one of least error for speckle."""
+"""Quadrature rules with few nodes for integrals over wavelength: Gauss's, and the one of least error for speckle."""
 
 import torch
 from torch import Tensor
@@ -10,18 +10,18 @@ _STARTS = (0.85, 0.95)  # outermost nodes of evenly spaced initial nodes, as fra
 
 
 def gauss_rule(nodes: Tensor, weights: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Gauss's rule of a measure: ``count`` nodes and weights exact for polynomials up to degree 2 count - 1.
+    """Gauss's rule for a discrete measure: ``count`` nodes and weights, exact for polynomials up to degree 2 count - 1.
 
     Args:
-        nodes: Of the measure, float64 [M], around 0.
-        weights: Positive ones that add up to 1, float64 [M]. The rule is theirs, be they an integral or a sum over
-            every nanometre.
-        count: At most M, whose rule is the measure itself.
+        nodes: Nodes of the measure, float64 [M], around 0.
+        weights: Weights of the measure, float64 [M], positive with a sum of 1. The measure may approximate an integral
+            or be a sum over every nanometre.
+        count: At most M; for M the rule is the measure itself.
 
     Raises:
         ValueError: A count above M.
 
-    Source: Golub and Welsch (1969), with Lanczos' recurrence orthogonalised in full.
+    Source: Golub and Welsch (1969), with Lanczos' recurrence and full orthogonalisation.
     """
     if count > len(nodes):
         raise ValueError(f"count must be at most {len(nodes)}, the number of wavelengths given, got {count}")
@@ -31,7 +31,7 @@ def gauss_rule(nodes: Tensor, weights: Tensor, count: int) -> tuple[Tensor, Tens
     for _ in range(count):
         turned = nodes / half * vectors[-1]
         diagonal.append(vectors[-1] @ turned)
-        for _ in range(2):  # once more, for what rounding left
+        for _ in range(2):  # the second pass removes rounding errors of the first
             turned = turned - (vectors @ turned) @ vectors
         length = turned.norm()
         beside.append(length)
@@ -47,12 +47,14 @@ def gauss_rule(nodes: Tensor, weights: Tensor, count: int) -> tuple[Tensor, Tens
 def correlation(first: Tensor, second: Tensor, beat: float, rim: float = 0.0) -> Tensor:
     """Correlation [M, N] of speckle intensities at two wavelengths: sinc^2(beat (first - second)).
 
-    Light that fills a round pupil evenly arrives with phases 2 pi beat t lambda, t even in 0..1 (see ``coherence``).
-    The correlation of its intensities is the square of the mean of exp(2 pi i beat t (lambda - lambda')).
+    Light that fills a round pupil evenly arrives with phases 2 pi beat t lambda, where t is uniformly distributed in
+    0..1 and ``beat`` is the path difference divided by the squared wavelength (see ``coherence``). The correlation of
+    the intensities is the square of the mean of exp(2 pi i beat t (lambda - lambda')).
 
-    An iris passes directions, not frequencies: of a longer wavelength it cuts off the outer ones, 2 ``rim`` of the
-    power per metre, ``rim`` = 1 / wavelength. Only what passes at both wavelengths is correlated, so the correlation
-    falls from 1 in a corner: the light at a point is as rough, as a function of wavelength, as a random walk.
+    An iris passes fixed directions, not fixed frequencies: as the wavelength grows, it cuts off a fraction 2 ``rim`` of
+    the power per metre of wavelength, ``rim`` = 1 / wavelength; 0 is no iris. Only light that passes at both
+    wavelengths is correlated, so the correlation has a kink at equal wavelengths: the intensity at a point, as a
+    function of wavelength, is as rough as a random walk.
     """
     shared = 1 - 2 * rim * torch.maximum(first[:, None], second)
     return (shared * torch.sinc(beat * shared * (first[:, None] - second))).square()
@@ -63,8 +65,9 @@ def expected_error(
 ) -> Tensor:
     """Rms error of a rule (``places``, ``shares``) for a measure, relative to the rms of the picture; a scalar.
 
-    Expected over fully developed speckle whose correlation is :func:`correlation`, on the brightness that passes: the
-    squared error is the quadratic form of the difference of the two measures. Wavelengths from the band's middle.
+    The error is the expectation for fully developed speckle whose intensities correlate as in :func:`correlation`,
+    around the mean brightness that the iris passes. Its square is a quadratic form of the difference between the rule
+    and the measure. Wavelengths are relative to the middle of the band.
     """
     own = weights @ _second_moment(nodes, nodes, beat, rim) @ weights
     return (_square(own, nodes, weights, places, shares, beat, rim).clamp_min(0) / own).sqrt()
@@ -73,11 +76,12 @@ def expected_error(
 def speckle_rule(
     nodes: Tensor, weights: Tensor, beat: float, count: int, rim: float = 0.0, *, enough: float = _EXACT
 ) -> tuple[Tensor, Tensor]:
-    """Nodes and weights of least :func:`expected_error` found, the weights positive and adding up to 1.
+    """Nodes and weights with the smallest :func:`expected_error` found; the weights are positive and sum to 1.
 
-    For given nodes the best weights solve a linear system; the nodes then descend by L-BFGS from Gauss's and from even
-    ones. Up to a third fewer nodes than Gauss's rule where there are many, whose own lie denser at the ends than a
-    correlation that is the same everywhere asks for. An error of ``enough`` ends the search.
+    For given nodes the best weights solve a linear system; L-BFGS moves the nodes, starting from Gauss's and from
+    evenly spaced ones. Where many nodes are needed, this takes up to a third fewer than Gauss's rule, whose nodes lie
+    closer at the ends of the band although the correlation is the same over the band. The search stops at an error of
+    ``enough``.
     """
     best = gauss_rule(nodes, weights, count)
     least = float(expected_error(nodes, weights, *best, beat, rim))
@@ -104,7 +108,7 @@ def least_rule(
         ValueError: More than 512 wavelengths would be needed.
     """
     half = float(nodes.abs().max())
-    # No rule of fewer nodes than the band has correlation cells, halved, comes near; Gauss's bounds it from above.
+    # The search for an upper bound with Gauss's rule starts at 0.75 beat half nodes; fewer give far larger errors.
     count = max(1, int(beat * half * 0.75))
     while count <= min(_MOST, len(nodes)):
         rule = gauss_rule(nodes, weights, count)
@@ -116,7 +120,7 @@ def least_rule(
             f"an error of {tolerance:g} needs more than {min(_MOST, len(nodes))} wavelengths: the path difference is "
             "many times the coherence length; allow a larger error, or a narrower spectrum or pupil"
         )
-    low, high = 0, count  # what is known to be too few, and to do
+    low, high = 0, count  # counts known to be too small and to be sufficient
     while high - low > 1:
         middle = max((low + 2 * high) // 3, low + 1) if high - low > 2 else high - 1
         found = speckle_rule(nodes, weights, beat, middle, rim, enough=tolerance)
@@ -136,7 +140,7 @@ def _descended(nodes: Tensor, weights: Tensor, beat: float, rim: float, start: T
         search.zero_grad()
         places = torch.tanh(hidden)  # within the band
         shares = _best_weights(nodes, weights, places, beat, rim)
-        # The logarithm, since errors fall by decades; the addend is far below any tolerance.
+        # The logarithm is minimized because errors span decades; the addend is far below any tolerance.
         loss = (_square(own, nodes, weights, places, shares, beat, rim).clamp_min(0) + 1e-12).log()
         loss.backward()
         return loss
@@ -159,7 +163,7 @@ def _square(
 
 
 def _best_weights(nodes: Tensor, weights: Tensor, places: Tensor, beat: float, rim: float) -> Tensor:
-    """Least error for given nodes among weights that add up to 1: the brightness of what has no speckle is exact."""
+    """Weights of least error for given nodes. Their sum is 1, so that brightness without speckle is exact."""
     count = len(places)
     own = _second_moment(places, places, beat, rim) + _JITTER * torch.eye(count, dtype=places.dtype)
     ones = torch.ones(count, 1, dtype=places.dtype)

@@ -1,17 +1,17 @@
-"""Pictures under a spectrum: few wavelengths are followed through the optics, and their neighbours made from them.
+"""Pictures under a spectrum: few wavelengths are propagated, and pictures at nearby wavelengths are derived from them.
 
-Derivation. Under light of wavelength lambda a fixed hologram H makes at distance z the field U with (Fresnel, without
-its carrier) FT[U](f) = exp(-i pi lambda z f^2) FT[H](f). Wavelength and distance enter by their product alone: another
-wavelength is another depth, and
+Derivation. Under light of wavelength lambda a fixed hologram H produces at distance z the field U with (Fresnel,
+without its carrier) FT[U](f) = exp(-i pi lambda z f^2) FT[H](f). Only the product of wavelength and distance matters,
+so a change of wavelength acts like a change of depth:
 
     FT[U'](f) = exp(-i pi (lambda' - lambda) z f^2) FT[U](f).
 
-The retina shows g, what the pupil passes of U exp(i pi A x^2 / (lambda B)), as
-:mod:`holotorch.optics.viewing.imaging` derives it.
-Taken off and put back, the parabola leaves U as seen through the pupil, and with it the neighbour's picture. Only
-the pupil itself stays that of the wavelength followed: as a stop of directions it would cut off 2 |lambda' - lambda| /
-lambda more, or less, of the light at its rim. That error, and not the speckle, decides how far a neighbour may be: a
-neighbour costs two transforms of the picture, whereas speckle changes every nanometre or so.
+The retina shows g, the part of U exp(i pi A x^2 / (lambda B)) that the pupil passes
+(:mod:`holotorch.optics.viewing.imaging`). Divided by this parabolic phase, g is U as limited by the pupil, and the
+equation gives the field at the neighbouring wavelength. Only the pupil remains that of the propagated wavelength: as a
+stop of fixed directions it would cut off a fraction 2 |lambda' - lambda| / lambda more, or less, of the light at its
+edge. This error, not the speckle, limits the distance of a neighbour in wavelength. Speckle changes about every
+nanometre, but a neighbour costs only two transforms of the picture.
 """
 
 import math
@@ -43,24 +43,24 @@ def neighbours(
     *,
     elements: bool = False,
 ) -> Iterator[Tensor]:
-    """Fields on the retina at wavelengths near the one that was followed there.
+    """Fields on the retina at wavelengths near the one that was propagated there.
 
     Args:
         image: Field on the retina, complex [..., H, W], from :func:`propagate_collapsed` or
             :func:`propagate_elements` for the plane in focus.
-        grid: Its sampling.
-        wavelength: In metres, of ``image``.
-        others: In metres.
-        display: As it was for ``image``.
-        eye: Likewise. Its aberrations and its colour error are those of each wavelength.
-        elements: ``image`` comes from :func:`propagate_elements`, which keeps the retina's curvature.
+        grid: Sampling of ``image``.
+        wavelength: Wavelength of ``image`` in metres.
+        others: Wavelengths of the results in metres.
+        display: The display with which ``image`` was computed.
+        eye: The eye with which ``image`` was computed. Its aberrations and colour error are set for each wavelength.
+        elements: ``image`` comes from :func:`propagate_elements`, whose result includes the curvature of its phase.
 
     Yields:
-        Complex [..., H, W] for each of ``others``, one in memory at a time. Near the edges light is missing that was
-        outside ``grid``, and at the opposite edges it enters: :func:`spectral_image` takes room for it.
+        Complex [..., H, W] for each of ``others``, one in memory at a time. Light that was outside ``grid`` is missing
+        near the edges, and light that leaves it wraps to the opposite edge; :func:`spectral_image` adds a margin.
 
     Raises:
-        ValueError: An eye with aberrations or colour error whose pupil takes more than the band of ``grid``.
+        ValueError: An eye with aberrations or colour error whose pupil transmits more than the band of ``grid``.
     """
     centre = checks.wavelengths(wavelength)[0]
     if unseparated(grid, centre, display, eye):
@@ -112,29 +112,29 @@ def spectral_image(
     paraxial: bool = False,
     recompute: bool = False,
 ) -> Tensor:
-    """Picture of one hologram on the retina under light of many wavelengths, few of which go through the optics.
+    """Picture of one hologram on the retina under light of many wavelengths, few of which are propagated.
 
     Args:
-        field: Of the hologram, complex [..., H, W], the same for all wavelengths.
-        grid: Its sampling.
-        places: Wavelengths [K] in metres, increasing, as ``Spectrum.every`` or ``Spectrum.samples`` gives them.
-        weights: [K], at least 0; a tensor may carry gradients. [S, K] for S spectra at once.
+        field: Field of the hologram, complex [..., H, W], the same for all wavelengths.
+        grid: Sampling of the hologram.
+        places: Wavelengths [K] in metres, increasing, such as those of ``Spectrum.every`` or ``Spectrum.samples``.
+        weights: Weights of the wavelengths, at least 0, [K] or [S, K] for S spectra; a tensor may require gradients.
         display: Positions of hologram, eyepiece and eye.
         eye: Pupil, retina, accommodation; the picture is of the plane in focus.
         count: Number of wavelengths to propagate, with equal shares of the power; the others are :func:`neighbours`.
-        tolerance: In place of ``count``: accepted error of the picture from propagating few
-            wavelengths (:func:`neighbour_error`), relative to the mean picture.
-        reach: Half width in metres of the scene, for ``tolerance``.
+        tolerance: In place of ``count``: accepted error of the picture that results from propagating few wavelengths
+            (:func:`neighbour_error`), relative to the mean picture.
+        reach: Half width in metres of the scene, used with ``tolerance``.
         elements: Use :func:`propagate_elements` instead of :func:`propagate_collapsed`.
-        paraxial: As there.
-        recompute: As in :func:`incoherent_sum`, per wavelength followed.
+        paraxial: Argument of that function.
+        recompute: As in :func:`incoherent_sum`, for each propagated wavelength.
 
     Returns:
-        Intensity [..., H, W] or [S, ..., H, W], real, referred back to the plane in focus, as ``retinal_image``'s.
+        Intensity [..., H, W] or [S, ..., H, W], real, referred back to the plane in focus like ``retinal_image``.
 
     Raises:
-        ValueError: Neither or both of count and tolerance, places that do not increase, impossible weights, or what
-            :func:`neighbours` and the propagation to the retina raise.
+        ValueError: Neither or both of count and tolerance, places that do not increase, invalid weights, or an error
+            of :func:`neighbours` or of the propagation to the retina.
     """
     checks.field("field", field, grid.shape)
     if (count is None) == (tolerance is None):

@@ -1,4 +1,4 @@
-"""Spectrum: how the power of a light source is spread over wavelength."""
+"""Spectrum: distribution of the power of a light source over wavelength."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from holotorch.core.quantities import BANDWIDTH
 from holotorch.optics.light.quadrature import gauss_rule, least_rule, speckle_rule
 
 CUTOFF = 0.1  # fraction of the peak below which the thesis drops the power (Sec. 5.5.2.2)
-# Nodes of the integral over the band from which rules are derived; they resolve 200 rad of phase to rounding.
+# Nodes of the integral over the band from which rules are derived; accurate to rounding for up to 200 rad of phase.
 _NODES = 256
 
 
@@ -43,20 +43,20 @@ class _Gaussian:
 class Spectrum:
     """Power of a source against wavelength, from :meth:`lorentzian`, :meth:`gaussian`, :meth:`table` or a preset.
 
-    What is weaker than ``cutoff`` times the peak is dropped, and the rest, the band, has unit power: pictures under
-    different sources then compare at equal power of light (text below Eq. 5.16).
+    Power below ``cutoff`` times the peak is dropped, and the remaining band is normalized to unit power, so that
+    pictures under different sources are compared at equal power (text below Eq. 5.16).
 
-    The presets are those of Table 5.1, ``Spectrum.laser(636e-9)`` and so on, with its widths as true full widths at
-    half maximum. Eq. 5.15 as printed uses them as half widths; :meth:`lorentzian_as_printed` reproduces its figures.
+    The presets, such as ``Spectrum.laser(636e-9)``, have the widths of Table 5.1 as true full widths at half maximum.
+    Eq. 5.15 as printed uses them as half widths; :meth:`lorentzian_as_printed` reproduces the results printed with it.
 
     Attributes:
-        centre: Of the peak, in metres.
+        centre: Wavelength of the peak, in metres.
         fwhm: Full width at half maximum in metres.
-        cutoff: Least power kept, as a part of the peak, above 0 and below 1.
-        profile: The shape; for a table its wavelengths and powers.
+        cutoff: Lowest power kept, as a fraction of the peak, above 0 and below 1.
+        profile: Shape of the spectrum; for a table its wavelengths and powers.
 
     Raises:
-        ValueError: A width, wavelength or cutoff outside its range, or a band that would reach wavelength 0.
+        ValueError: A width, wavelength or cutoff outside its range, or a band that would extend to wavelength 0.
     """
 
     centre: float
@@ -77,12 +77,12 @@ class Spectrum:
 
     @classmethod
     def lorentzian(cls, centre: float, fwhm: float, *, cutoff: float = CUTOFF) -> "Spectrum":
-        """1 / (1 + (2 (lambda - centre) / fwhm)^2), Eq. 5.15 with its gamma, the half width, as fwhm / 2."""
+        """1 / (1 + (2 (lambda - centre) / fwhm)^2): Eq. 5.15, whose gamma, the half width, is fwhm / 2."""
         return cls(centre, fwhm, _Lorentzian(checks.quantity(BANDWIDTH, fwhm) / 2), cutoff)
 
     @classmethod
     def lorentzian_as_printed(cls, centre: float, gamma: float, *, cutoff: float = CUTOFF) -> "Spectrum":
-        """Eq. 5.15 to the letter. Its ``gamma`` is called the FWHM but is half of it: the source is twice as wide."""
+        """Eq. 5.15 as printed. The thesis calls ``gamma`` the FWHM, but it is half of the FWHM of this source."""
         return cls.lorentzian(centre, 2 * checks.quantity(BANDWIDTH, gamma, "gamma"), cutoff=cutoff)
 
     @classmethod
@@ -92,9 +92,10 @@ class Spectrum:
 
     @classmethod
     def table(cls, wavelengths: Sequence[float], power: Sequence[float], *, cutoff: float = CUTOFF) -> "Spectrum":
-        """Measured ``power``, in any unit, at increasing ``wavelengths`` in metres; straight lines between.
+        """Measured ``power``, in any unit, at increasing ``wavelengths`` in metres; linearly interpolated.
 
-        Where the ends are stronger than the cutoff, the band ends with the table, as does the width at half maximum.
+        If the power at an end of the table exceeds the cutoff, the band ends there. Likewise the width at half maximum
+        is limited by the table.
 
         Raises:
             ValueError: Fewer than two rows, unequal lengths, wavelengths that do not increase, negative or no power.
@@ -151,7 +152,7 @@ class Spectrum:
     def power(self, wavelengths: float | Sequence[float] | np.ndarray | Tensor) -> Tensor:
         """Power per metre of wavelength, float64 of the same shape: 0 outside the band, with an integral of 1.
 
-        ValueError for wavelengths outside a table, of which nothing is known.
+        Raises ValueError for wavelengths outside a table.
         """
         places = torch.as_tensor(wavelengths, dtype=torch.float64)
         checks.all_finite("wavelengths", places)
@@ -163,8 +164,8 @@ class Spectrum:
     def every(self, step: float = 1e-9) -> tuple[Tensor, Tensor]:
         """Wavelengths [K] ``step`` metres apart, one at the centre, and weights [K] in proportion to the power.
 
-        The thesis's sampling at 1 nm (Sec. 5.5.2.2). Its sum covers the band to the whole step only: see
-        :meth:`samples` for few wavelengths that do better.
+        This is the thesis's sampling at 1 nm (Sec. 5.5.2.2). The sum covers whole steps within the band only;
+        :meth:`samples` is more accurate with fewer wavelengths.
         """
         low, high = self.band()
         step, slack = checks.quantity(BANDWIDTH, step, "step"), 1e-9  # rounding must not drop the last one
@@ -182,22 +183,22 @@ class Spectrum:
         step: float | None = None,
         iris: bool = True,
     ) -> tuple[Tensor, Tensor]:
-        """Few wavelengths [K] in metres and weights [K], float64, whose weighted sum stands for the integral.
+        """Few wavelengths [K] in metres and weights [K], float64, whose weighted sum approximates the integral.
 
-        ``count`` alone gives Gauss's rule for the power over the band, exact for intensities that are polynomials of
-        wavelength up to degree 2 K - 1. With the ``path_difference`` in metres of the light that interferes
-        (``coherence.path_difference``), nodes and weights make the expected error least, which takes a third fewer
-        wavelengths where there are many; then ``tolerance`` may be given in place of ``count``: the rms error of a
-        picture relative to its rms brightness. It takes the least number that does.
+        With ``count`` alone the result is Gauss's rule for the power over the band, exact for intensities that are
+        polynomials of the wavelength up to degree 2 K - 1. With ``path_difference``, nodes and weights minimize the
+        expected error; where many wavelengths are needed, this takes a third fewer. Then ``tolerance`` may replace
+        ``count``, and the smallest sufficient number of wavelengths is used.
 
         Args:
-            count: How many, at least 1.
-            tolerance: Above 0.
-            path_difference: In metres, above 0.
-            iris: The light passes a sharp pupil of fixed size. Of longer wavelengths, which a hologram diffracts more,
-                it cuts off more: that makes intensity a rough function of wavelength, and errors below 2 % need many
-                wavelengths. False where the hologram's own band or window limits the light, or a soft pupil.
-            step: Stand for the sum over :meth:`every` ``step`` instead of the integral, such as the thesis's 1e-9.
+            count: Number of wavelengths, at least 1.
+            tolerance: Accepted rms error of a picture relative to its rms brightness, above 0.
+            path_difference: Greatest path difference in metres of the light that interferes
+                (``coherence.path_difference``), above 0.
+            iris: True if the light passes a sharp pupil of fixed size. A hologram diffracts longer wavelengths more, so
+                the pupil cuts off more of their light. This makes intensity a rough function of wavelength, and errors
+                below 2 % need many wavelengths. False if the hologram's band, its window or a soft pupil is the limit.
+            step: Approximate the sum over :meth:`every` ``step`` instead of the integral; the thesis's step is 1e-9.
 
         Raises:
             ValueError: Neither or both of count and tolerance, a tolerance without a path difference, or a count above
@@ -222,13 +223,13 @@ class Spectrum:
         return middle + nodes, weights
 
     def measure(self) -> tuple[Tensor, Tensor]:
-        """Many wavelengths [M] in the band and weights [M] that add up to 1: the integral, nearly to rounding."""
+        """Many wavelengths [M] in the band and weights [M] with sum 1; they integrate nearly to rounding error."""
         nodes, steps = self._steps()
         weights = self._shape(nodes) * steps
         return nodes, weights / weights.sum()
 
     def _steps(self) -> tuple[Tensor, Tensor]:
-        """Gauss-Legendre nodes and weights of the band, piece by piece."""
+        """Gauss-Legendre nodes and weights of the band, composed of a rule for each piece between joints."""
         low, high = self.band()
         ends = np.array([low, *(place for place in self._joints() if low < place < high), high])
         count = max(2, math.ceil(_NODES / (len(ends) - 1)))
@@ -238,7 +239,10 @@ class Spectrum:
         return torch.from_numpy(nodes.ravel()), torch.from_numpy((half * weight).ravel())
 
     def _joints(self) -> list[float]:
-        """Corners of a table; with a low cutoff, far wings are apart from the peak, which they would undersample."""
+        """Wavelengths that divide the band into pieces: the rows of a table, or distances of 4, 16, ... half widths.
+
+        Separate pieces keep the peak well sampled if a low cutoff includes wide wings.
+        """
         if isinstance(self.profile, _Table):
             return list(self.profile.wavelengths)
         offsets, joints = 4 * self.profile.half_width, []

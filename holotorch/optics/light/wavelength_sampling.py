@@ -1,4 +1,4 @@
-"""Selection of the wavelengths of a spectrum that are propagated, from the error of deriving the others."""
+"""Selection of the wavelengths of a spectrum that are propagated; the pictures at the others are derived from them."""
 
 import math
 from dataclasses import dataclass
@@ -19,11 +19,12 @@ class SeenLight:
     """Light of a hologram that enters an eye, from geometrical optics.
 
     Attributes:
-        rim: Fraction of the pupil's edge that the light reaches, 0 to 1; 0 if the window or band limits it.
+        rim: Fraction of the pupil's edge that the light illuminates, 0 to 1; 0 if the hologram's window or band limits
+            the light everywhere.
         path_difference: Greatest difference in metres between paths from the hologram to one point of the scene, as
-            ``coherence.path_difference`` has it, points off the axis included.
-        bend: Rms in metres, over the light of a point and without its mean, of the part z (slope)^4 / 8 of these paths
-            that the Fresnel model leaves out.
+            defined by ``coherence.path_difference``, over points on and off the axis.
+        bend: Standard deviation in metres, over the rays of a point, of the part z (slope)^4 / 8 of these paths that
+            the Fresnel model neglects.
     """
 
     rim: float
@@ -39,13 +40,13 @@ def seen_light(grid: Grid, wavelength: float, display: Display, eye: Eye, *, rea
         wavelength: In metres.
         display: Positions of hologram, eyepiece and eye.
         eye: Pupil and accommodation.
-        reach: Half width in metres of the scene, by default the hologram's, per axis.
+        reach: Half width in metres of the scene; that of the hologram on each axis by default.
     """
     centre, plane = checks.wavelengths(wavelength)[0], number(display.focus_plane(eye.accommodation))
     first, second, _, _ = (number(value) for value in display.matrix(plane))
     sides = [n * p / 2 if n > 1 else 0.0 for n, p in zip(grid.shape, grid.pitch, strict=True)]
     ends = sides if reach is None else [checks.positive("reach", reach, "metres") * (side > 0) for side in sides]
-    # Rings cover the part of the pupil that light may reach; in a much wider pupil rings would all be dark.
+    # The rings cover only the part of the pupil that can be illuminated; rings over a much wider pupil would be dark.
     steepest = [
         min(centre / (2 * p), (s + e) / max(abs(plane), 1e-30)) for p, s, e in zip(grid.pitch, sides, ends, strict=True)
     ]
@@ -68,7 +69,7 @@ def seen_light(grid: Grid, wavelength: float, display: Display, eye: Eye, *, rea
         inside = inside & ((point - plane * slope).abs() <= sides[axis])
         path = path + abs(plane) / 2 * slope.square()
     spread = (path.where(inside, -math.inf).amax((-2, -1)) - path.where(inside, math.inf).amin((-2, -1))).clamp_min(0)
-    # Rings stand for their share of the pupil. z s^4 / 8 = (z s^2 / 2)^2 / (2 z).
+    # Each ring is weighted with its area. z s^4 / 8 = (z s^2 / 2)^2 / (2 z).
     shares = inside * radii[:, None]
     left_out = path.square() / max(2 * abs(plane), 1e-30)
     mean = (shares * left_out).sum((-2, -1), keepdim=True) / shares.sum((-2, -1), keepdim=True).clamp_min(1e-30)
@@ -78,7 +79,7 @@ def seen_light(grid: Grid, wavelength: float, display: Display, eye: Eye, *, rea
 
 
 def followed(places: Tensor, weights: Tensor, count: int) -> tuple[list[int], list[int]]:
-    """Select ``count`` wavelengths with equal shares of the power, and the nearest of these for every wavelength.
+    """Select ``count`` wavelengths with equal shares of the power, and for every wavelength the nearest selected one.
 
     Args:
         places: Wavelengths [K] in metres, increasing.
@@ -86,8 +87,8 @@ def followed(places: Tensor, weights: Tensor, count: int) -> tuple[list[int], li
         count: Between 1 and K.
 
     Returns:
-        Indices into ``places`` of the selected wavelengths (fewer if the power is in few wavelengths), and for each of
-        ``places`` the number of the nearest selected one.
+        Indices into ``places`` of the selected wavelengths (fewer than ``count`` if few wavelengths hold the power),
+        and for each of ``places`` the index into this list of the nearest selected wavelength.
     """
     if not 1 <= checks.whole("count", count, 1) <= len(places):
         raise ValueError(f"count must be at most {len(places)}, the number of wavelengths given, got {count}")
@@ -100,11 +101,11 @@ def followed(places: Tensor, weights: Tensor, count: int) -> tuple[list[int], li
 def neighbour_error(places: Tensor, weights: Tensor, count: int, light: SeenLight) -> float:
     """Expected error of ``spectral_image`` that propagates ``count`` of ``places``, relative to the mean picture.
 
-    Light at the edge of the pupil changes with wavelength like a random walk, 2 rim / wavelength of its power per metre
-    (``rim`` is that of ``light``). Every step of the walk is weighted with the power of the wavelengths beyond it that
-    are derived from the same one. The fourth order of the slopes, which the Fresnel model leaves out between
-    neighbours, is added. The measured error, against propagation of every wavelength, is a half to a tenth of this
-    if light reaches only small parts of the edge.
+    The light at the edge of the pupil changes with wavelength like a random walk, by a fraction 2 rim / wavelength of
+    the power per metre of wavelength, with the ``rim`` of ``light``. Every step of the walk is weighted with the power
+    of all wavelengths beyond it that are derived from the same propagated one. The fourth order of the slopes, which
+    the Fresnel model between neighbours neglects, is added. The error measured against propagation of every wavelength
+    is only 0.1 to 0.5 times this value if the light illuminates only small parts of the edge.
     """
     nodes, nearest = followed(places, weights, count)
     share = weights / weights.sum()
@@ -117,7 +118,7 @@ def neighbour_error(places: Tensor, weights: Tensor, count: int, light: SeenLigh
             beyond = share[side][order].flip(0).cumsum(0).flip(0)
             walk += (beyond[1:].square() * distances.diff()).sum().item()
     middle = places.mean().item()
-    # The fourth order is 3 times as fast a function of wavelength as that of the path itself.
+    # The phase of the fourth order is proportional to wavelength^3: it changes 3 times as fast as that of the second.
     bent = math.sqrt(2) * 2 * math.pi * 3 * light.bend / middle * (share * offsets.abs()).sum().item() / middle
     return math.hypot(math.sqrt(4 * light.rim * walk / middle), bent)
 
@@ -132,9 +133,10 @@ def least_followed(
     *,
     reach: float | None = None,
 ) -> int:
-    """Least ``count`` for ``spectral_image`` whose :func:`neighbour_error` is within ``tolerance``.
+    """Smallest ``count`` for ``spectral_image`` whose :func:`neighbour_error` is within ``tolerance``.
 
-    All of them where the eye has errors and its pupil takes more than the band of ``grid``: see ``neighbours``.
+    If the eye has errors and its pupil transmits more than the band of ``grid``, the result is the number of all
+    wavelengths, because ``neighbours`` cannot derive any.
 
     Raises:
         ValueError: A tolerance that is not above 0.
@@ -155,7 +157,7 @@ def flawless(eye: Eye) -> bool:
 
 
 def unseparated(grid: Grid, centre: float, display: Display, eye: Eye) -> bool:
-    """Whether the eye's errors, a function of directions, cannot be told from samples of the picture."""
+    """Whether the eye has errors that cannot be removed from a picture because its pupil transmits several bands."""
     if flawless(eye):
         return False
     second = number(display.matrix(number(display.focus_plane(eye.accommodation)))[1])

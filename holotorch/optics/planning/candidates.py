@@ -1,4 +1,8 @@
-"""Every method of propagation, with its predicted error and its cost."""
+"""Every method of propagation, with its predicted error and its cost.
+
+The factor beyond Fresnel is the exact transfer function divided by Fresnel's. The taps of a method are the samples of
+its impulse response.
+"""
 
 import itertools
 import math
@@ -29,9 +33,10 @@ class Candidate:
 
     Attributes:
         method: Name of the method.
-        sampled: Per axis (y, x), whether the transfer function is sampled; otherwise the taps are cropped.
-        padded: Samples of the transforms.
-        paraxial: Whether the factor beyond Fresnel is left out.
+        sampled: Per axis (y, x), True if the transfer function is sampled in frequency; False if the impulse response
+            is sampled in space and cropped to the displacements between source and window.
+        padded: Samples (y, x) of the transforms.
+        paraxial: Whether the factor beyond Fresnel is neglected.
         predict: Computes the expected relative L2 error.
         captured: Computes the fraction of the energy that is expected to arrive in the window; the smallest one of
             several wavelengths and distances.
@@ -66,7 +71,7 @@ def candidates(
     content: FieldContent,
     dtype: torch.dtype = torch.complex64,
 ) -> list[Candidate]:
-    """Every method for ``planes``; its error is the largest one over the wavelengths and distances."""
+    """Every method for ``planes``; the error of each is the largest one over the wavelengths and distances."""
     if dtype not in (torch.complex64, torch.complex128):
         raise TypeError(f"dtype must be complex64 or complex128, got {dtype}")
     longest, farthest = max(wavelengths), max(distances, key=abs)
@@ -108,8 +113,10 @@ def _extremes(planes: PlanePair, distances: Sequence[float]) -> list[float]:
 def _axes(planes: PlanePair, wavelength: float, distance: float, content: FieldContent) -> Axes:
     requested = planes
     if not planes.same_pitch:
-        # The window of the result in samples of the source, with one sample more on each side. Its samples lie a
-        # quarter between those of the source: tails of the content vanish on them, and band ends cancel half-way.
+        # The error is predicted for a window of the source's pitch that covers the result, one sample more on each
+        # side. Its samples are a quarter of a pitch off those of the source. Other positions would underestimate the
+        # error: on the source's samples the tails of the content are zero, and half-way between them the
+        # contributions of the two ends of the band cancel.
         height, width = (
             math.ceil(extent / pitch) + 2 for extent, pitch in zip(planes.out.extent, planes.grid.pitch, strict=True)
         )
@@ -136,7 +143,7 @@ def _axes(planes: PlanePair, wavelength: float, distance: float, content: FieldC
         )
         for axis in (0, 1)
     )
-    # Equal axes share one object, and with it all cached results.
+    # Equal axes share one object, so that cached results are computed once.
     return (y, y) if y == x and content.signals is None else (y, x)
 
 
@@ -183,10 +190,10 @@ def _sampled(scenes: list[Axes], padded: tuple[int, ...], dtype: torch.dtype) ->
 def _cropped(
     scenes: list[Axes], sampled_axis: tuple[bool, bool], crop_pad: float | None, dtype: torch.dtype
 ) -> Candidate:
-    """Cropped taps on one or both axes; on the other axis a transfer function sampled at the largest padding below 2.
+    """Cropped taps on the axes where ``sampled_axis`` is False.
 
-    ``sampled_axis`` marks the axes of the latter kind. ``crop_pad`` is the padding for the taps and the factor beyond
-    Fresnel; None leaves this factor out.
+    On the other axes the transfer function is sampled at the largest padding below 2. ``crop_pad`` is the padding for
+    the taps and the factor beyond Fresnel; if it is None, this factor is neglected.
     """
 
     def length(axis: int) -> int:
@@ -204,7 +211,8 @@ def _cropped(
 
     def predict(axes: Axes) -> float:
         if any(axes[0].tilt):
-            # The light of a measured field may be concentrated where both axes crop it, which counts more.
+            # A measured field may have its light where both axes crop it. The sum of the errors of the two axes is then
+            # too small, so it is scaled up.
             mixing = 1 if axes[0].measured is None else 1 + sum(sine != 0 for sine in axes[0].tilt)
             taps = mixing * math.sqrt(_tilted_taps(axes, lengths, paraxial=False))
             return math.hypot(_rounding(axes, sampled_axis, dtype), taps)
@@ -226,9 +234,10 @@ def _cropped(
 
 
 def _resampled(planes: PlanePair, scenes: list[Axes], dtype: torch.dtype, tails: float | None) -> Candidate:
-    """Dense taps between any two grids, after the factor beyond Fresnel with room for its ``tails``.
+    """Fresnel propagation between two grids of any pitch, as dense matrix products.
 
-    Without ``tails`` that factor is left out.
+    The factor beyond Fresnel is applied first, by FFT on a grid padded for its ``tails`` (``resampled_padding``). If
+    ``tails`` is None, this factor is neglected.
     """
     height, width = planes.grid.shape
     wavelength, farthest = scenes[0][0].wavelength, max(axes[0].distance for axes in scenes)
@@ -273,7 +282,7 @@ def _resampled(planes: PlanePair, scenes: list[Axes], dtype: torch.dtype, tails:
 
 
 def _zoomed(planes: PlanePair, scenes: list[Axes], padded: tuple[int, ...], dtype: torch.dtype) -> Candidate:
-    """The sampled transfer function, whose result is summed from its spectrum at the points of the other grid."""
+    """The sampled transfer function; a chirp-z transform evaluates the result at the points of the other grid."""
     candidate = _sampled(scenes, padded, dtype)
     lines = 0.0
     for size, count, number in zip(padded, planes.out.shape, (planes.out.shape[1], padded[0]), strict=True):

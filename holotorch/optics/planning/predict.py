@@ -1,4 +1,9 @@
-"""Errors of kernels on transforms of finite length, predicted on one axis before any field is propagated."""
+"""Errors of kernels on transforms of finite length, predicted on one axis before any field is propagated.
+
+The factor beyond Fresnel is the exact transfer function divided by Fresnel's. The taps of a kernel are the samples of
+its impulse response, n + m - 1 of them for n samples of the source and m of the result. A slice of a kernel that mixes
+the axes is its restriction to one frequency of the other axis.
+"""
 
 import math
 from collections.abc import Callable
@@ -19,8 +24,8 @@ from holotorch.optics.free_space.impulse_response import (
 from holotorch.optics.free_space.kernels import turns_phasor
 
 _TONES = 17  # tones that represent the band of one axis
-_SLICES = 9  # frequencies of the other axis at which a kernel that mixes the axes is evaluated
-_QUANTILES = (0.02, 0.1, 0.25, 0.4, 0.6, 0.75, 0.9, 0.98)  # of the energy of a measured axis: further such frequencies
+_SLICES = 9  # number of evenly spaced slices
+_QUANTILES = (0.02, 0.1, 0.25, 0.4, 0.6, 0.75, 0.9, 0.98)  # of the energy of measured content: further slices
 _LONGER = 4  # length of the reference transform in units of source plus window, so that its own wrapping is negligible
 _LONGEST = 1 << 18  # samples of the longest reference transform; light that needs a longer one counts as lost
 
@@ -30,18 +35,19 @@ class AxisContent:
     """Light of one axis, and the errors of approximate kernels for it.
 
     All errors are energies relative to the energy that the exact kernel keeps in the window of the result. They are
-    means over tones exp(2 pi i f x) of the band, cut off by the window of the source or faded out over its margin,
-    which is the expectation for noise that fills band and window. Measured signals, if given, replace the tones.
+    means over tones exp(2 pi i f x) of the band, cut off by the window of the source or faded out over its margin.
+    These means are the expectation for noise that fills band and window. Measured signals, if given, replace the tones.
 
     Attributes:
         size: Samples n of the source.
-        pitch: In metres.
-        band: Highest frequency present, in cycles per metre, at most 1 / (2 pitch).
+        pitch: Pitch in metres of source and result.
+        band: Highest frequency of the content, in cycles per metre, at most 1 / (2 pitch).
         wavelength: In metres.
         distance: In metres, > 0.
         margin: Width in metres over which the content fades to zero at both ends; 0 for a hard edge.
-        out: Samples of the result; ``size`` if 0.
-        shift: Position of sample 0 of the result relative to sample 0 of the source, in samples, along the carrier.
+        out: Samples m of the result; ``size`` if 0.
+        shift: Position, in samples, of sample 0 of the result relative to sample 0 of the source projected along the
+            carrier.
         tilt: Sines (this axis, the other) of the carrier's direction.
         measured: Signals [K, size] that replace the tones: random mixtures of the lines of a field.
     """
@@ -93,7 +99,7 @@ class AxisContent:
         return ((weight * frequency**power).sum() / weight.sum().clamp(min=1e-300)).item()
 
     def standing(self) -> float:
-        """Error of leaving the field unchanged, including diffraction at its edges."""
+        """Error of returning the field unchanged, including the neglected diffraction at its edges."""
         still = (self._shifts == 0).to(torch.complex128)
         return self._energy(still - self._taps) / self.captured
 
@@ -113,19 +119,19 @@ class AxisContent:
         return self._energy(repeated[self._shifts % padded] - self._taps) / self.captured
 
     def wrapped_slices(self, padded: int, other: "AxisContent", *, limited: bool) -> float:
-        """:meth:`wrapped` with the exact kernel, for light steep enough that the other axis changes it.
+        """:meth:`wrapped` for the exact kernel, for light so steep that the kernel depends on both axes together.
 
-        Slices of the transfer function at frequencies of the ``other`` axis represent all of it. ``limited`` drops the
-        frequencies that :func:`angular_spectrum_kernel` drops on ``padded`` points.
+        The transfer function is represented by its slices at frequencies of the ``other`` axis. If ``limited``, the
+        frequencies are dropped that :func:`angular_spectrum_kernel` drops on ``padded`` points.
         """
         if any(self.tilt) and self._spread(other) > 2 * padded:
             return 1.0  # as much light wraps as arrives
         return self._from_exact(self._slices(padded, other, padded * self.pitch if limited else math.inf), other)
 
     def tilted_taps(self, padded: int, other: "AxisContent", *, paraxial: bool) -> float:
-        """Error of cropped taps about a tilted carrier, which mixes the axes: by slices at frequencies of the other.
+        """Error of cropped taps about a tilted carrier, computed on slices because the tilt mixes the axes.
 
-        ``paraxial`` leaves out the factor beyond Fresnel.
+        If ``paraxial``, the taps omit the factor beyond Fresnel.
         """
         if paraxial:
             return self._from_exact(self._taps * self._across(other), other)
@@ -134,7 +140,7 @@ class AxisContent:
         return self._from_exact(self._levelled(padded, other, shift.expand(len(other.slices), 1)), other)
 
     def _from_exact(self, approximate: Tensor, other: "AxisContent") -> float:
-        """Error of taps [K, n + m - 1] at the slices of the other axis."""
+        """Error of the taps ``approximate`` [K, n + m - 1] of the K slices, weighted with the energy of each slice."""
         exact = self._exact_slices(other)
         if exact is None:
             return 1.0
@@ -151,14 +157,14 @@ class AxisContent:
         return self._exact[0]
 
     def _long_slices(self, other: "AxisContent") -> Tensor | None:
-        """Taps [K, n + m - 1] at the slices of the other axis, not wrapped; None where no transform holds them."""
+        """Taps [K, n + m - 1] of the slices, without wrapping; None if the transform would be too long."""
         padded = _LONGER * (self.size + self.window)
         if not any(self.tilt):
-            return self._slices(4 * padded, other, math.inf)  # of which some are evanescent, with a singularity
+            return self._slices(4 * padded, other, math.inf)  # 4 times: the edge of evanescent waves is singular
         padded = good_length(max(padded, 2 * self._spread(other)), odd=True)
         if padded > _LONGEST:
             return None
-        # Each slice is levelled exactly: nothing jumps where the band closes upon itself.
+        # Each slice is shifted so that its phase is equal at both ends of the band, which are neighbours in the FFT.
         wavelength, distance, tilt = self._scene
         ends = torch.tensor((self.nyquist, -self.nyquist), dtype=torch.float64)
         cycles = tilted_turns(ends, other.slices, wavelength, distance, tilt, squares=False)
@@ -172,21 +178,21 @@ class AxisContent:
         return torch.fft.ifft(torch.fft.fft(taps) * factor)[:, self._shifts % padded]
 
     def _levelled_factor(self, padded: int, other: "AxisContent", shift: Tensor) -> Tensor:
-        """Factor beyond Fresnel without a shift in metres, at the slices of the other axis: [K, padded]."""
+        """Factor beyond Fresnel [K, padded] of the slices, without the phase of a displacement by ``shift`` metres."""
         wavelength, distance, tilt = self._scene
         frequency = torch.fft.fftfreq(padded, self.pitch, dtype=torch.float64)
         cycles = tilted_turns(frequency, other.slices, wavelength, distance, tilt, squares=False)
         return turns_phasor(cycles - frequency * shift) * self._across(other)
 
     def _across(self, other: "AxisContent") -> Tensor:
-        """Paraxial phase factor of the other axis at its slices [K, 1], which does not depend on this axis."""
+        """Paraxial phase factor [K, 1] of the slices, which depends on the other axis only."""
         along, across = self.tilt
         bent = self.distance * (1 - along**2) / (1 - along**2 - across**2) ** 1.5
         return turns_phasor(-self.wavelength * bent / 2 * other.slices.square())
 
     @property
     def _scene(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Wavelength, distance, tilt."""
+        """Wavelength, distance and tilt [2] as float64 tensors."""
         wavelength, distance, *tilt = torch.tensor((self.wavelength, self.distance, *self.tilt), dtype=torch.float64)
         return wavelength, distance, torch.stack(tilt)
 
@@ -209,7 +215,7 @@ class AxisContent:
     def _power(self) -> tuple[Tensor, Tensor]:
         """Frequencies of measured content and its energy at them.
 
-        The transform has twice the length of the window: on the window alone the field would repeat without edges.
+        The transform has twice the length of the window, so that the spectrum includes the edges of the window.
         """
         assert self.measured is not None
         frequency = torch.fft.fftfreq(2 * self.size, self.pitch, dtype=torch.float64)
@@ -227,7 +233,7 @@ class AxisContent:
 
     @cached_property
     def shares(self) -> list[float]:
-        """Fractions of the energy of the content that :attr:`slices` represent."""
+        """Fraction of the energy of the content that each of :attr:`slices` represents."""
         if self.measured is None:
             parts = torch.ones(_SLICES, dtype=torch.float64)
             parts[[0, -1]] = 0.5
@@ -238,7 +244,10 @@ class AxisContent:
         return (parts / parts.sum().clamp(min=1e-300)).tolist()
 
     def _slices(self, padded: int, other: "AxisContent", extent: float) -> Tensor:
-        """Taps [K, n + m - 1] of the exact kernel sampled at ``padded`` frequencies, for slices of the other axis."""
+        """Taps [K, n + m - 1] of the slices of the exact kernel, sampled at ``padded`` frequencies.
+
+        Frequencies that travel sideways by more than ``extent`` / 2 metres are dropped if the carrier is not tilted.
+        """
         wavelength, distance, tilt = self._scene
         frequency = torch.fft.fftfreq(padded, self.pitch, dtype=torch.float64)
         moved = frequency * self.shift * self.pitch
@@ -264,7 +273,7 @@ class AxisContent:
     def cropped(self, padded: int, cross: float) -> float:
         """Error of the factor beyond Fresnel on cropped taps, against the same factor on a longer transform.
 
-        ``cross`` is the frequency of the other axis, in cycles per metre, on which that factor depends too.
+        The factor depends on both axes; ``cross`` is the frequency of the other axis, in cycles per metre.
         """
         if self._moved > padded / 4:
             return self._band_edge_energy()
@@ -272,7 +281,7 @@ class AxisContent:
         return self._energy(self._beyond_fresnel(padded, cross) - longer) / self.captured
 
     def resampled(self, padded: int, cross: float) -> float:
-        """Error of the factor beyond Fresnel applied first, on ``padded`` samples around the window.
+        """Error of applying the factor beyond Fresnel before the Fresnel taps, on ``padded`` samples of the source.
 
         ``cross`` as in :meth:`cropped`.
         """
@@ -283,7 +292,7 @@ class AxisContent:
         return ((approximate - self._arriving(longer)).abs().square().sum() / self.size).item() / self.captured
 
     def resampled_slices(self, padded: int, other: "AxisContent") -> float:
-        """:meth:`resampled` about a tilted carrier, as in :meth:`tilted_taps`."""
+        """:meth:`resampled` about a tilted carrier, computed on slices as in :meth:`tilted_taps`."""
         exact = self._exact_slices(other)
         if exact is None:
             return 1.0
@@ -298,7 +307,7 @@ class AxisContent:
         return lost / max(whole, 1e-300)
 
     def _filtered_first(self, factor: Tensor, taps: Callable[[Tensor], Tensor]) -> Tensor:
-        """The content times ``factor`` [P], whose middle P samples are convolved with ``taps`` of the displacements."""
+        """The content filtered with ``factor`` [P] on P samples, then convolved with ``taps`` (displacements)."""
         padded = len(factor)
         extra = (padded - self.size) // 2
         kept = self.size + 2 * extra
@@ -324,8 +333,8 @@ class AxisContent:
     def _band_edge_energy(self) -> float:
         """Energy of the part of the kernel that comes from the ends of the band, whose phase is not reliable.
 
-        At such distances the steepest light has left the window; what remains are the two terms
-        f(u) ~ 1 / (pi u) of the taps beside the point source's 1 / sqrt(2), in random phase.
+        At such distances the steepest light has left the window. The part is the energy of the two terms
+        f(u) ~ 1 / (pi u) in the taps, in random phase, relative to the amplitude 1 / sqrt(2) of the point source.
         """
         product = self.wavelength * self.bent
         farthest = max(self.window - 1 + self.shift, self.size - 1 - self.shift, 0) * self.pitch
@@ -369,11 +378,11 @@ class AxisContent:
 
     @cached_property
     def _tones(self) -> Tensor:
-        """Spectra of the content, long enough for the samples of the result to be free of wrapping."""
+        """Spectra of the content, padded so that nothing wraps into the samples of the result."""
         return torch.fft.fft(self._signals, good_length(self.size + self.window - 1))
 
     def _fade(self, n: Tensor) -> Tensor:
-        """1 inside, infinitely smooth to 0 over the margin at both ends."""
+        """Window of the content: 1 inside, falling to 0 over the margin at both ends, infinitely differentiable."""
         if self.margin == 0:
             return torch.ones_like(n)
         position = (torch.minimum(n, self.size - 1 - n) + 0.5) * self.pitch / self.margin
@@ -381,7 +390,7 @@ class AxisContent:
         return torch.where(position < 1, 1 / (1 + torch.exp(1 / t - 1 / (1 - t))), 1.0)
 
     def _energy(self, taps: Tensor) -> float:
-        """Energy per sample of the source that a convolution with ``taps`` [n + m - 1] gives of the content."""
+        """Energy of the content after convolution with ``taps`` [n + m - 1], divided by the samples of the source."""
         return (self._arriving(taps).abs().square().sum() / self.size).item()
 
     def _arriving(self, taps: Tensor) -> Tensor:
@@ -391,10 +400,10 @@ class AxisContent:
 
 
 def rms_beyond_fresnel(axes: list[AxisContent]) -> float:
-    """Rms of the phase pi z s^4 / (4 lambda) that Fresnel leaves out, over the content that arrives in the window.
+    """Rms of the phase pi z s^4 / (4 lambda) that Fresnel neglects, over the content that arrives in the window.
 
-    It includes both axes but not the light that hard edges diffract beyond the band, for which see
-    :meth:`AxisContent.paraxial`.
+    z is the distance and s the sine of the angle to the axis. Both axes are included, but not the light that hard edges
+    diffract beyond the band; :meth:`AxisContent.paraxial` includes that light.
     """
     moments = []
     for axis in axes:

@@ -43,12 +43,12 @@ class Display:
 
     @classmethod
     def planar(cls, distance: Length) -> "Display":
-        """Hologram under a plane wave looked at from ``distance``, without an eyepiece (Fig. 5.4 top)."""
+        """Hologram under a plane wave with the eye at ``distance`` metres, without an eyepiece (Fig. 5.4 top)."""
         return cls(distance, math.inf, 0.0)
 
     @classmethod
     def spherical(cls, focal_length: Length, lens_radius: Length | None = None) -> "Display":
-        """Lens at the hologram and the eye at its focal point: spherical illumination (Fig. 5.4 bottom)."""
+        """Spherical illumination: lens at the hologram, eye at the focal point of the lens (Fig. 5.4 bottom)."""
         return cls(0.0, focal_length, focal_length, lens_radius)
 
     def matrix(self, plane: Length) -> Matrix:

@@ -1,7 +1,8 @@
-"""What a display shows of a scene, by geometry: fields of view, placement, eye box, spots. Plain metres, radians.
+"""Geometry of a display: fields of view, placement of the scene, eye box, spot sizes. Lengths in metres, angles in rad.
 
-Symbols of the thesis, Sec. 5.4 and 5.6.2: hologram of width w, eyepiece of focal length f, object s0 in front of it
-with its image s1 in front of it (virtual, on the same side), eye d_eye behind it and focused on s_eye = s1 + d_eye.
+Symbols of the thesis, Sec. 5.4 and 5.6.2: the hologram has width w and the eyepiece focal length f. The object lies s0
+in front of the eyepiece, and its virtual image s1 in front of it. The eye is d_eye behind the eyepiece and focused on
+the distance s_eye = s1 + d_eye. theta is the half angle of diffraction, sin(theta) = wavelength / (2 pitch).
 """
 
 import math
@@ -30,9 +31,9 @@ def planar_fov(pitch: float, wavelength: float) -> float:
 def magnified_fov(width: float, focal_length: float) -> float:
     """Field of view in radians, 2 atan(w / 2f), with the eye at the focal point of a lens.
 
-    For spherical illumination (the lens close to the hologram) and for the volume-magnifying display. It is limited
-    by the light that leaves the hologram; :func:`scene_fov` gives the angle that the scene fills, :func:`vignetting`
-    the light that passes the iris.
+    It applies to spherical illumination (lens close to the hologram) and to the volume-magnifying display. This is the
+    limit set by the light that leaves the hologram; :func:`scene_fov` gives the angle that the scene subtends, and
+    :func:`vignetting` the fraction of light that passes the iris.
     """
     return 2 * math.atan(checks.quantity(WIDTH, width) / (2 * _positive_focal_length(focal_length)))
 
@@ -75,7 +76,8 @@ def eyepiece_distance(volume_distance: float, focus_distance: float, focal_lengt
 def scene_fov(size: float, object_distance: float, focal_length: float, eye_distance: float) -> float:
     """Angle in radians that an object of ``size`` spans from the eye: 2 atan(V f / (2 (f - s0) (s1 + d_eye))).
 
-    Written V / (2 (s0 + d_eye (1 - s0 / f))), which is finite for an image at infinity (thesis Sec. 5.6.2).
+    V is ``size`` (thesis Sec. 5.6.2). The argument is computed as V / (2 (s0 + d_eye (1 - s0 / f))), which is finite
+    for an image at infinity.
     """
     image_distance(object_distance, focal_length)
     checks.quantity(SPACING, eye_distance, "eye_distance")
@@ -86,7 +88,7 @@ def scene_fov(size: float, object_distance: float, focal_length: float, eye_dist
 def volume_size(fov: float, focus_distance: float, focal_length: float, eye_distance: float) -> float:
     """Width V_max in metres of an object that spans ``fov`` radians, seen at ``focus_distance``.
 
-    10.919 mm for 40 deg, 120 mm, f = 10 mm and the d_eye = 50 mm that the thesis leaves out there (it prints 10.91).
+    Example: 10.919 mm for 40 deg, 120 mm, f = 10 mm and d_eye = 50 mm. The thesis prints 10.91 and omits d_eye.
     """
     if not 0 < fov < math.pi:
         raise ValueError(f"fov must lie between 0 and pi radians, got {fov!r}; 40 degrees are {math.radians(40):.3f}")
@@ -117,8 +119,9 @@ def region_apex(width: float, pitch: float, wavelength: float) -> float:
 def region(height: float, distance: float, width: float, pitch: float, wavelength: float) -> int:
     """Region 1, 2 or 3 of Sec. 5.6.2 (Fig. 5.11) of a point ``height`` beside the axis; 0 where no light arrives.
 
-    The point's cone cuts the hologram's plane in z tan(theta) to both sides. 1: all of it is hologram, finest spots.
-    3: the hologram is all within it, spots grow with distance only. 2: part of either.
+    The diffraction cone of a point at distance z covers z tan(theta) to both sides on the hologram's plane. Region 1:
+    the cone lies within the hologram, and spots are finest. Region 3: the hologram lies within the cone, and the spot
+    size depends on the distance only. Region 2: they overlap partly.
     """
     cone, half = _cone(height, distance, width, pitch, wavelength), width / 2
     if abs(height) + cone <= half:
@@ -129,10 +132,10 @@ def region(height: float, distance: float, width: float, pitch: float, wavelengt
 
 
 def placement(size: float, width: float, pitch: float, wavelength: float, depth: float | None = None) -> float:
-    """Distance in metres to the centre of a volume whose near face just lies in region III.
+    """Smallest distance in metres to the centre of a volume whose near face lies in region III.
 
-    (V + w) / (2 tan(theta)) + depth / 2, a cube by default. The thesis's 157.81 mm is for 455 nm: blue, with the
-    narrowest cone, decides.
+    The result is (V + w) / (2 tan(theta)) + depth / 2, with V = ``size`` and a cube by default. The thesis's 157.81 mm
+    is for 455 nm: blue has the narrowest cone and requires the largest distance.
     """
     across = checks.quantity(WIDTH, size, "size") + checks.quantity(WIDTH, width)
     deep = size if depth is None else checks.quantity(SPACING, depth, "depth")
@@ -140,7 +143,7 @@ def placement(size: float, width: float, pitch: float, wavelength: float, depth:
 
 
 def section(height: float, distance: float, width: float, pitch: float, wavelength: float) -> float:
-    """Length in metres, along one axis, of the part of the hologram whose cones hold a point."""
+    """Length in metres, along one axis, of the part of the hologram whose light can reach a point."""
     cone = _cone(height, distance, width, pitch, wavelength)
     return max(0.0, min(width / 2, height + cone) - max(-width / 2, height - cone))
 
@@ -156,17 +159,18 @@ def smallest_spot(wavelength: float, distance: float, section: float) -> float:
 
 
 def vignetting(height: float, first: float, second: float, pupil_radius: float, sine: float) -> float:
-    """Share of the light of a point that passes the pupil, relative to a pupil that it fills, along one axis.
+    """Width of the light of a point within the pupil, divided by the width of the pupil, along one axis: 0 to 1.
+
+    On the pupil's plane the light of a point at height y covers A y +- B sine. Diffraction is neglected: where the rays
+    miss the pupil, 0.5 % of the light still arrives in the thesis's display. With the eye at the focal point of the
+    eyepiece A is 0, and no light is lost off the axis.
 
     Args:
-        height: Of the point beside the axis, in metres.
+        height: Distance of the point from the axis, in metres.
         first: A of the ray matrix from the point's plane to the pupil (``Display.matrix``): 1 - d_eye / f.
         second: B in metres: s0 + d_eye (1 - s0 / f).
         pupil_radius: In metres.
         sine: Largest slope of the light, wavelength / (2 pitch) in regions I and II.
-
-    The light spans A y +- B sine on the pupil's plane. Rays only: where it misses the pupil 0.5 % still arrive by
-    diffraction in the thesis's display. A is 0, and nothing is lost, with the eye at the focal point of the eyepiece.
     """
     checks.quantity(OFFSET, height, "height")
     checks.finite("first", first)
@@ -176,15 +180,16 @@ def vignetting(height: float, first: float, second: float, pupil_radius: float, 
 
 
 def visible_half_width(first: float, second: float, pupil_radius: float, sine: float) -> float:
-    """Height in metres from which no light reaches the pupil: (r + B sine) / A, infinite for A = 0."""
+    """Height in metres beyond which no light of a point reaches the pupil: (r + B sine) / A, infinite for A = 0."""
     half_width = checks.quantity(PUPIL_RADIUS, pupil_radius) + _light_half_width(second, sine)
     return half_width / abs(first) if checks.finite("first", first) else math.inf
 
 
 def eye_box(size: float, first: float, second: float, sine: float) -> float:
-    """Width in metres of the box in the pupil's plane that light of every point within ``size`` reaches, at least 0.
+    """Width in metres of the part of the pupil's plane that receives light of every point of the scene, at least 0.
 
-    2 (B sine - A size / 2); arguments as for :func:`vignetting`. A ``size`` of 0 is a point on the axis.
+    The result is 2 (B sine - A size / 2) for a scene of width ``size`` metres, where 0 means a point on the axis. The
+    other arguments are those of :func:`vignetting`.
     """
     return max(0.0, 2 * abs(second) * sine - abs(first) * checks.quantity(SPACING, size, "size"))
 

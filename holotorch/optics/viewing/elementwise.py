@@ -21,7 +21,7 @@ from holotorch.optics.viewing.eye import Eye
 from holotorch.optics.viewing.imaging import retinal_scale
 from holotorch.optics.viewing.rays import Region, band, clipped, fringe, reach, refracted, steepest, travelled
 
-_ROOM = 1.05  # times the slope of the steepest ray, for the light that edges diffract beyond it
+_ROOM = 1.05  # factor on the slope of the steepest ray, for light that edges diffract beyond it
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,10 @@ class ElementSampling:
     """Sizes (y, x) of the element-by-element propagation from one grid.
 
     Attributes:
-        oversampling: How much finer than the hologram everything is sampled.
-        padded: Samples of the transform that leads to the eyepiece, at the hologram's pitch.
-        fine: Samples of eyepiece and eye at the hologram's pitch divided by ``oversampling``; nothing wraps on them.
+        oversampling: Pitch of the hologram divided by the pitch on eyepiece and eye.
+        padded: Samples, at the hologram's pitch, of the transform for the propagation to the eyepiece.
+        fine: Samples of eyepiece and eye at the hologram's pitch divided by ``oversampling``, enough for no light to
+            wrap into their openings.
     """
 
     oversampling: tuple[float, float]
@@ -40,31 +41,32 @@ class ElementSampling:
 
     @property
     def flops(self) -> float:
-        """Arithmetic of one image of one wavelength: six transforms, the first and last by chirp-z."""
+        """Floating-point operations for one image of one wavelength: six transforms, the first and last by chirp-z."""
         (py, px), (fy, fx) = self.padded, self.fine
         whole = 5 * fy * fx * math.log2(max(fy * fx, 2))
         zoom = sum(10 * lines * n * math.log2(n) for lines, n in ((py, px + fx), (fx, py + fy)))
         return 4 * whole + zoom
 
     def memory_bytes(self, itemsize: int = 8, batch: int = 1) -> int:
-        """Largest extra memory of images of one wavelength, within 3 % of what was measured at 1.4 to 2.4 GB.
+        """Largest extra memory in bytes for images of one wavelength, within 3 % of measurements at 1.4 to 2.4 GB.
 
         Args:
             itemsize: Bytes of a sample: 8 for complex64, 16 for complex128.
-            batch: Fields at once.
+            batch: Number of fields processed together.
         """
         each = itemsize * batch
-        return max(138 + each, 60 + 6 * each) * math.prod(self.fine)  # while a kernel is built, and behind the iris
+        return max(138 + each, 60 + 6 * each) * math.prod(self.fine)  # building a kernel; propagating behind the iris
 
 
 def least_oversampling(
     grid: Grid, wavelengths: Sequence[float], display: Display, eye: Eye, *, plane: Length | None = None
 ) -> ElementSampling:
-    """Least sampling that holds every lens phase, and the light behind every lens, unaliased.
+    """Coarsest sampling at which no lens phase, and no light behind a lens, aliases.
 
-    The rays of the hologram, a window times the slopes that its pitch carries, are followed as a polygon per axis
-    through the display; the steepest slope s of a ray, or of a lens within the rays, requires a pitch of
-    wavelength / (2 s), and the largest extent of the rays determines the window. 5 % and Fresnel fringes are added.
+    The rays of the hologram start anywhere in its window with any slope within the band of its pitch. On each axis the
+    polygon of these rays in position and slope is traced through the display. The largest slope s of a ray, or of a
+    lens where rays cross it, requires a pitch of wavelength / (2 s), and the largest extent of the rays determines the
+    window. 5 % is added to the slope, and Fresnel fringes to the window.
     """
     axes = [_axis(grid, axis, wavelengths, display, eye, plane) for axis in (0, 1)]
     oversampling, padded, fine = zip(*axes, strict=True)
@@ -84,28 +86,29 @@ def propagate_elements(
 ) -> Tensor:
     """Propagate a hologram to the retina element by element (thesis Algorithm 6), scaled as ``propagate_collapsed``.
 
+    This differs from Algorithm 6 in sampling only: there every step has the pitch of the hologram.
+
     Args:
-        field: Of the hologram, complex [..., C, H, W].
-        grid: Its sampling.
+        field: Field of the hologram, complex [..., C, H, W].
+        grid: Sampling of the hologram.
         wavelengths: In metres, one per channel.
         display: Positions of hologram, eyepiece and eye, and the radius of the eyepiece.
         eye: Pupil, retina, accommodation.
-        plane: Object plane in metres from the hologram that sets the scale only; by default the one in focus.
-        sampling: By default :func:`least_oversampling`.
-        paraxial: Fresnel's model of free space, or else the exact angular spectrum. Lenses are parabolas in both, as in
-            the thesis.
+        plane: Object plane in metres from the hologram, which only sets the scale; by default the one in focus.
+        sampling: Sampling of the elements; :func:`least_oversampling` by default.
+        paraxial: Use Fresnel's model of free space instead of the exact angular spectrum. Lenses have parabolic phases
+            in both cases, as in the thesis.
 
     Returns:
-        Complex [..., C, H, W]: the retina at its point ``scale`` x, times abs(scale) (per axis its root), so that
-        the sum of its intensity times the hologram's pitches is the power in that window of the retina.
+        Complex [..., C, H, W]: sample x of ``grid`` holds the field at the point s x of the retina times abs(s), with
+        s from :func:`retinal_scale`. The sum of the intensity times both pitches of the hologram is the power in this
+        window of the retina.
 
     Raises:
-        MemoryError: It would take more memory than is available; said before anything is allocated.
+        MemoryError: The operation would need more memory than is available; raised before anything is allocated.
 
     Warns:
         SamplingWarning: ``sampling`` is coarser than :func:`least_oversampling`.
-
-    Departs from Algorithm 6 in sampling only: there every step has the pitch of the hologram.
     """
     channel_wavelengths = checks.wavelengths(wavelengths)
     checks.field("field", field, (len(channel_wavelengths), *grid.shape))
@@ -154,7 +157,7 @@ def _axis(
         for distance, power, radius in zip((d_el, d_eye), powers, radii, strict=True):
             start = reach(rays)
             rays = travelled(rays, distance)
-            # Wrapped light must miss the opening; all that passes must lie within the window.
+            # Wrapped light must not reach the opening, and all light that passes must lie within the window.
             arrives, kept = reach(rays), min(reach(rays), radius + 8 * eye.softness)
             width = max(width, start + kept, arrives + kept, 2 * kept) + 2 * fringe(wavelength, distance)
             rays = clipped(rays, kept)
@@ -189,7 +192,7 @@ def _passed(
     fine, padded = Grid(sizes.fine, (pitches[0], pitches[1])), Grid(sizes.padded, grid.pitch)
 
     def space(where: Grid, distance: Length) -> Tensor:
-        # No band limit: the windows leave room for all light that matters.
+        # No band limit is needed: the windows are large enough for all light that passes the openings.
         kernel = (
             fresnel_kernel(where, wavelength, distance)
             if paraxial

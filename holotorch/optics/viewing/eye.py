@@ -24,19 +24,19 @@ class Eye:
     Lengths in metres; pupil radius, axial length and accommodation may be tensors that carry a gradient.
 
     Attributes:
-        pupil_radius: Of the iris; 1 to 4 mm, 1.5 mm in normal light.
+        pupil_radius: Radius of the opening of the iris; 1 to 4 mm, 1.5 mm in normal light.
         axial_length: d_r from the lens to the retina; 24 mm in the thesis.
         accommodation: Distance s in front of the lens that is in focus, above 0, infinite for the relaxed eye:
             1 / f_eye = 1 / s + 1 / d_r.
         aberrations: Wavefront error over the pupil: OSA/ANSI single index j of normalised Zernike polynomials to
             coefficient in metres, positive where the light is delayed (longer path). Index 4 is defocus; a coefficient
             c of it acts as a lens of power -4 sqrt(3) c / pupil_radius^2.
-        chromatic_reference: Wavelength in metres that is in focus at ``accommodation``, where others are off by
-            :func:`chromatic_refraction`; None for an eye without colour error.
+        chromatic_reference: Wavelength in metres that is in focus at ``accommodation``; the focus of other wavelengths
+            differs by the difference of :func:`chromatic_refraction`. None for an eye without colour error.
         softness: Width in metres of the pupil's edge, 0 for a hard one. A gradient in the radius needs a soft edge.
 
     Raises:
-        ValueError: A length that cannot be meant, such as one in millimetres, or an unknown Zernike index.
+        ValueError: A length outside its plausible range, such as one in millimetres, or an unknown Zernike index.
     """
 
     pupil_radius: Length = 1.5e-3
@@ -79,14 +79,14 @@ class Eye:
         return opening(square, radius, self.softness) * turns_phasor(self.path(y, x, wavelength) / wavelength)
 
     def path(self, y: Tensor, x: Tensor, wavelength: Length) -> Tensor:
-        """Path in metres by which aberrations and colour error lengthen the ideal lens, arguments as above, float64."""
+        """Path in metres, float64, that aberrations and colour error add; arguments as in :meth:`pupil_function`."""
         square = y.square() + x.square()
         radius = torch.as_tensor(self.pupil_radius, dtype=torch.float64, device=square.device)
         path = torch.zeros_like(square)
         for index, coefficient in self.aberrations.items():
             path = path + coefficient * zernike(index, y / radius, x / radius)
         if self.chromatic_reference is not None:
-            # A myopic refraction (below zero) is power in excess, and a path shorter towards the edge by P r^2 / 2.
+            # A myopic (negative) refraction is excess power P, which shortens the path at radius r by P r^2 / 2.
             excess = chromatic_refraction(self.chromatic_reference) - chromatic_refraction(wavelength)
             path = path - excess * square / 2
         return path
@@ -99,7 +99,7 @@ class EyeLens(Transmission):
         MemoryError: The grid has more samples than memory is available for.
 
     Warns:
-        SamplingWarning: As :class:`Lens`, within the pupil.
+        SamplingWarning: The grid is too coarse for the phase of the lens within the pupil, as for :class:`Lens`.
     """
 
     def __init__(self, grid: Grid, wavelengths: float | Sequence[float], eye: Eye):
@@ -119,11 +119,11 @@ def chromatic_refraction(wavelength: Length) -> Length:
     """Refractive error of the human eye in dioptres at a wavelength in metres, 0 near 590 nm and -1.7 at 400 nm.
 
     1.68524 - 0.63346 / (wavelength in um - 0.21410): Thibos, Ye, Zhang and Bradley (1992), "The chromatic eye: a new
-    reduced-eye model of ocular chromatic aberration in humans", Appl. Opt. 31, 3594. Negative is myopic: the eye is
-    too strong for blue, and what is sharp in blue lies nearer.
+    reduced-eye model of ocular chromatic aberration in humans", Appl. Opt. 31, 3594. Negative is myopic: the power of
+    the eye is too large for blue, and objects that are sharp in blue are nearer.
 
     Raises:
-        ValueError: Outside 380 .. 900 nm, beyond which the fit says nothing.
+        ValueError: A wavelength outside 380 .. 900 nm, the range of the fit.
     """
     if not 380e-9 <= number(wavelength) <= 900e-9:
         raise ValueError(f"the eye's colour error is known within 380 .. 900 nm, got {number(wavelength):g} m")
@@ -133,8 +133,9 @@ def chromatic_refraction(wavelength: Length) -> Length:
 def zernike(index: int, y: Tensor, x: Tensor) -> Tensor:
     """Normalised Zernike polynomial of OSA/ANSI single index j at (y, x) in units of the pupil radius, any shape.
 
-    Mean square 1 over the disc, orthogonal; angle counted from +x towards +y. j = (n (n + 2) + m) / 2.
-    Raises TypeError for an index that is no whole number and ValueError for one below 0. Source: ANSI Z80.28.
+    The polynomials are orthogonal with mean square 1 over the disc; the angle is measured from +x towards +y.
+    j = (n (n + 2) + m) / 2 for the radial order n and the angular frequency m. Raises TypeError for an index that is
+    not an integer and ValueError for one below 0. Source: ANSI Z80.28.
     """
     checks.whole("Zernike index", index, 0)
     order = math.ceil((-3 + math.sqrt(9 + 8 * index)) / 2)

@@ -1,25 +1,27 @@
-"""Collapsed propagation to the retina: eyepiece, eye and the space between them as one filter of the image.
+"""Collapsed propagation to the retina: eyepiece, eye and the space between them act as one filter on the image.
 
-Derivation. Let (A, B, C, D) be the paraxial ray matrix from an object plane, field U(x), to the pupil of the eye, as in
-``Display.matrix``. By Collins's integral the field on the pupil is
+Derivation. Let (A, B, C, D) be the paraxial ray matrix from an object plane with the field U(x) to the pupil of the
+eye (``Display.matrix``), and L the length of that path. The eye accommodates to the distance s, has the axial length
+d_r and stands d_eye behind the eyepiece, whose focal length is f_el. The object plane lies s0 in front of the eyepiece,
+and its image s1 = s0 / (1 - s0 / f_el). By Collins's integral the field on the pupil is
 
     V(xi) = e^{ikL} / (i lambda B) integral U(x) exp(i pi (A x^2 - 2 x xi + D xi^2) / (lambda B)) dx
 
-(two axes at once). The eye multiplies it by its pupil function P and by exp(-i pi xi^2 / (lambda f_eye)) with
-1 / f_eye = 1 / s + 1 / d_r, and Fresnel's integral over d_r leads to the retina:
+for both axes at once. The eye multiplies V by its pupil function P and by exp(-i pi xi^2 / (lambda f_eye)) with
+1 / f_eye = 1 / s + 1 / d_r. Fresnel's integral over d_r gives the field on the retina:
 
     R(u) = e^{ikd_r} / (i lambda d_r) exp(i pi u^2 / (lambda d_r)) integral P V
            exp(i pi xi^2 (1 / d_r - 1 / f_eye) / lambda) exp(-2 pi i u xi / (lambda d_r)) dxi.
 
-On the pupil the parabolas add up to D / B + 1 / d_r - 1 / f_eye = D / B - 1 / s: the defocus. It vanishes for the plane
-in focus, since B / D = d_eye + s0 / (1 - s0 / f) = d_eye + s1, the distance at which its image is seen. With
-xi = lambda B f the two integrals are a Fourier transform and an inverse one,
+The curvatures of the parabolic phases on the pupil add up to D / B + 1 / d_r - 1 / f_eye = D / B - 1 / s, the defocus.
+It vanishes for the plane in focus, since B / D = d_eye + s1 is the distance from the image of the plane to the eye.
+With the spatial frequency f = xi / (lambda B), the two integrals are a Fourier transform and an inverse one,
 
     g(x) = IFT[ P(lambda B f) exp(i pi lambda B (D - B / s) f^2) FT[ U(x) exp(i pi A x^2 / (lambda B)) ](f) ],
     |R(u)| = |B / d_r| |g(-u B / d_r)|,
 
-so the retina shows |g| scaled by -d_r / B, and sum |g|^2 pitch^2 is the power that arrives. The defocus phase has no B
-in a denominator and moves light by (D - B / s) xi in the object plane.
+so the retina shows |g| scaled by -d_r / B, and sum |g|^2 pitch^2 is the power that arrives. The defocus phase contains
+no division by B; it moves the light that crosses the pupil at xi by (D - B / s) xi in the object plane.
 """
 
 import math
@@ -47,9 +49,9 @@ from holotorch.optics.viewing.display import Display, Length, inverse, number
 from holotorch.optics.viewing.eye import Eye
 from holotorch.optics.viewing.rays import fringe
 
-_ROOM = 1.02  # of every limit, for what edges spread beyond the rays
-_FINEST = 64.0
-_SPOTS = 16  # of a point behind a hard pupil kept around the window: its tails carry light in and out
+_ROOM = 1.02  # factor on every limit, for light that edges diffract beyond the geometric rays
+_FINEST = 64.0  # largest oversampling
+_SPOTS = 16  # margin around the window in spot sizes lambda |B| / (2 r): the tails of a hard pupil's spot are long
 
 
 @dataclass(frozen=True)
@@ -58,9 +60,9 @@ class CollapseSampling:
 
     Attributes:
         oversampling: How much finer than the hologram the object plane is sampled.
-        padded: Samples of the transform that leads to the object plane, at the hologram's pitch.
-        window: The object plane at the hologram's pitch, with room for defocus and the tails of spots.
-        fine: The same window, oversampled.
+        padded: Samples, at the hologram's pitch, of the transform for the propagation to the object plane.
+        window: Samples of the object plane at the hologram's pitch, with a margin for defocus and the tails of spots.
+        fine: Samples of the same window at the oversampled pitch.
     """
 
     oversampling: tuple[float, float]
@@ -70,24 +72,25 @@ class CollapseSampling:
 
     @property
     def flops(self) -> float:
-        """Arithmetic of one image of one wavelength, 5 n log2 n for each transform."""
+        """Floating-point operations for one image of one wavelength, 5 n log2 n for each transform."""
         (py, px), (fy, fx) = self.padded, self.fine
-        # The chirp-z transform takes two of length padded + fine per line, rows first.
+        # The chirp-z transform needs two FFTs of length padded + fine per line, rows first.
         zoom = sum(10 * lines * n * math.log2(n) for lines, n in ((py, px + fx), (fx, py + fy)))
         return _fft(py * px) + zoom + _fft(fy * fx) + _fft(math.prod(self.window))
 
     def memory_bytes(self, passed: float, itemsize: int = 8, batch: int = 1) -> int:
-        """Largest extra memory of images of one wavelength.
+        """Largest extra memory, in bytes, for images of one wavelength.
 
-        Within 10 % of what was measured from 1 GB to 8 GB; below, up to 0.2 GB less than was measured.
+        The estimate is within 10 % of the measured memory from 1 GB to 8 GB; below 1 GB it is up to 0.2 GB too small.
 
         Args:
-            passed: Samples of the spectrum that the pupil takes (:func:`pupil_bands`), at least those of ``window``.
+            passed: Number of samples of the spectrum that the pupil transmits (:func:`pupil_bands`), at least as many
+                as in ``window``.
             itemsize: Bytes of a sample: 8 for complex64, 16 for complex128.
-            batch: Fields at once.
+            batch: Number of fields processed together.
         """
-        kernel = 110 * math.prod(self.padded)  # of the propagation to the object plane, while it is built
-        lines = 4.2 * itemsize * batch * self.fine[1] * (self.fine[0] + self.padded[0])  # of the chirp-z transform
+        kernel = 110 * math.prod(self.padded)  # building the kernel for the propagation to the object plane
+        lines = 4.2 * itemsize * batch * self.fine[1] * (self.fine[0] + self.padded[0])  # chirp-z transform
         return math.ceil(max(kernel, lines, (88 + 1.5 * itemsize * batch) * passed))
 
 
@@ -104,37 +107,38 @@ def propagate_collapsed(
 ) -> Tensor:
     """Field on the retina, referred back to the object plane: the g(x) of this module's derivation.
 
+    Neglected are the edge of the eyepiece (``plan_retina`` reports whether it blocks light that the pupil would
+    accept), the non-Fresnel phase behind the eyepiece for points beside the axis, and light that leaves the window of
+    ``grid`` before the object plane. This differs from Algorithm 6, which samples every lens phase at the hologram's
+    pitch, where the lens phases alias.
+
     Args:
-        field: Of the hologram, complex [..., C, H, W].
-        grid: Its sampling.
+        field: Field of the hologram, complex [..., C, H, W].
+        grid: Sampling of the hologram.
         wavelengths: In metres, one per channel.
         display: Positions of hologram, eyepiece and eye.
-        eye: Pupil, retina, accommodation. Its radius, accommodation and axial length and the display's lengths may
-            carry gradients.
-        plane: Distance in metres from the hologram of the object plane, to which light is propagated first; by default
-            the one in focus. It sets the scale of the result.
-        sampling: Of the object plane; by default :func:`collapse_sampling`.
-        paraxial: Fresnel's model throughout. Otherwise propagation to the eyepiece is exact, and the pupil takes over
-            the phase that Fresnel leaves out behind it for points on the axis, -k / 8 sum d_i u_i^4 over the slopes u_i
-            of the ray through xi: spherical aberration. The part that depends on the position beside the axis (mostly
-            a shift) is left out.
+        eye: Pupil, retina, accommodation. The pupil radius, accommodation and axial length of the eye and the lengths
+            of the display may require gradients.
+        plane: Distance in metres from the hologram to the object plane, to which light is propagated first; by default
+            the plane in focus. It sets the scale of the result.
+        sampling: Sampling of the object plane; :func:`collapse_sampling` by default.
+        paraxial: Use Fresnel's model for every distance. Otherwise propagation to the eyepiece is exact, and the pupil
+            function includes the fourth-order phase that Fresnel's model neglects behind the eyepiece for points on the
+            axis (spherical aberration): -k / 8 sum_i d_i u_i^4, where d_i are the distances eyepiece to eye and eye to
+            retina, and u_i the slopes there of the ray through xi. For points beside the axis the further terms
+            (mostly a shift) are neglected.
 
     Returns:
-        Complex [..., C, H, W] on ``grid``, upright: the retina shows it :func:`retinal_scale` times as large, turned
-        upside down, and the sum of its intensity times the pitches is the power on the retina. The phase misses the
-        curvature and carrier that the intensity does not show.
+        Complex [..., C, H, W] on ``grid``, upright: the image on the retina is :func:`retinal_scale` times as large and
+        upside down. The sum of the intensity times both pitches is the power on the retina. The phase omits the
+        curvature and the carrier, which do not affect the intensity.
 
     Raises:
-        ValueError: The pupil is an image of the object plane (B = 0), or needs oversampling beyond 64.
-        MemoryError: It would take more memory than is available; said before anything is allocated.
+        ValueError: The pupil is an image of the object plane (B = 0), or the oversampling would exceed 64.
+        MemoryError: The operation would need more memory than is available; raised before anything is allocated.
 
     Warns:
         SamplingWarning: ``sampling`` is coarser than :func:`collapse_sampling`.
-
-    It leaves out the edge of the eyepiece (``plan_retina`` says whether it blocks light that the pupil would accept),
-    the phase that Fresnel leaves out behind the eyepiece for points beside the axis, and light that leaves the window
-    of ``grid`` before the object plane.
-    Departs from Algorithm 6, which samples every lens phase at the pitch of the hologram, where they alias.
     """
     channel_wavelengths = checks.wavelengths(wavelengths)
     checks.field("field", field, (len(channel_wavelengths), *grid.shape))
@@ -173,8 +177,8 @@ def retinal_scale(display: Display, eye: Eye, plane: Length | None = None) -> Le
 
 
 def pupil_bands(grid: Grid, wavelength: float, display: Display, eye: Eye, plane: Length) -> tuple[int, int]:
-    """How many bands of the hologram's pitch (y, x), 1 / pitch each, the pupil takes from the object plane; odd."""
-    # A pupil may take more than one band: light beside the axis that comes in at a slant.
+    """Odd number (y, x) of frequency bands of width 1 / pitch of the object plane's field that the pupil transmits."""
+    # A pupil may transmit more than one band: light from points beside the axis arrives at a slant.
     taken = (number(eye.pupil_radius) + 8 * eye.softness) / (wavelength * abs(number(display.matrix(plane)[1])))
     y, x = (2 * math.ceil(max(0.0, pitch * taken * _ROOM - 0.5)) + 1 for pitch in grid.pitch)
     return y, x
@@ -183,10 +187,11 @@ def pupil_bands(grid: Grid, wavelength: float, display: Display, eye: Eye, plane
 def collapse_sampling(
     grid: Grid, wavelengths: Sequence[float], display: Display, eye: Eye, plane: Length
 ) -> CollapseSampling:
-    """Least sampling of the object plane that keeps aliases out of the pupil.
+    """Coarsest sampling of the object plane that keeps aliases out of the pupil.
 
-    There the field's frequencies, up to F = 1 / (2 pitch) + |A| x / (lambda |B|) at the end x of the window, may alias
-    as long as they do not come back into the pupil's, f <= r / (lambda |B|): 1 / fine pitch >= F + f suffices.
+    In the object plane the field times its parabolic phase (this module's derivation) has frequencies up to
+    F = 1 / (2 pitch) + |A| x / (lambda |B|), where x is the edge of the window. They may alias as long as no alias
+    falls into the band of the pupil with radius r, |f| <= r / (lambda |B|). That holds if 1 / (fine pitch) >= F + f.
     """
     first, second, _, back = (number(value) for value in display.matrix(plane))
     radius, distance = number(eye.pupil_radius) + 8 * eye.softness, number(plane)
@@ -197,7 +202,7 @@ def collapse_sampling(
             for each in (factors, padded, window, fine):
                 each.append(1)
             continue
-        # An even number more, so that the axis stays on sample n // 2 of both.
+        # An even number of samples is added, so that the axis stays on sample n // 2.
         spot = max(wavelengths) * abs(second) / (2 * radius)
         wide = size + 2 * math.ceil((blur + _SPOTS * spot) / pitch)
         factor = 1.0
@@ -206,7 +211,7 @@ def collapse_sampling(
                 raise ValueError("the pupil is an image of this object plane (B = 0); give another plane")
             taken = radius / (wavelength * abs(second))
             if taken > _ROOM / (2 * pitch):
-                # Light of the object beyond the pitch's band, which the hologram does not hold on the axis.
+                # The pupil passes frequencies beyond the band of the hologram's pitch: the sampling must hold them.
                 factor = max(factor, 2 * pitch * taken)
             highest = 1 / (2 * pitch) + abs(first) * wide * pitch / 2 / (wavelength * abs(second))
             factor = max(factor, _ROOM * pitch * (highest + taken))
@@ -221,7 +226,10 @@ def collapse_sampling(
 
 
 def _padding(size: int, wide: int, pitch: float, wavelength: float, distance: float) -> int:
-    """Length of a transform that wraps no light into the window: it holds all light, or is used with a taper."""
+    """Length of a transform that wraps no light into the window.
+
+    The transform either holds all the light, or has size + wide samples and a taper removes the light that would wrap.
+    """
     sine = wavelength / (2 * pitch)
     spread = abs(distance) * sine / math.sqrt(1 - sine**2) if sine < 1 else math.inf
     need = min(
@@ -250,7 +258,7 @@ def _image(
     if paraxial:
         kernel = fresnel_kernel(padded, wavelength, plane)
     else:
-        # On to the eyepiece exactly, and back to the plane as the ray matrix has it.
+        # Propagate exactly to the eyepiece, then back to the plane by Fresnel, because the ray matrix is paraxial.
         kernel = angular_spectrum_kernel(padded, wavelength, display.lens_distance, band_limit=False)
         kernel = kernel * fresnel_kernel(padded, wavelength, display.lens_distance - plane).conj()
     if whole:
@@ -263,7 +271,8 @@ def _image(
     light = light * (turns_phasor(rate * y.square()) * turns_phasor(rate * x.square())).to(field.dtype)
     bands = pupil_bands(grid, wavelength, display, eye, plane)
     spectrum = _centred(centred_fft2(light), [n * m for n, m in zip(window.shape, bands, strict=True)])
-    # The same window, so the same frequencies: those of its centred spectrum, and on.
+    # The window has the same width at both pitches, so the frequency step is the same: eta and xi are the positions on
+    # the pupil of the frequencies of the window's centred spectrum, continued over all bands.
     eta, xi = (
         (torch.arange(n * m, dtype=torch.float64, device=field.device) - n * m // 2) / (n * p) * (wavelength * second)
         for n, m, p in zip(window.shape, bands, window.pitch, strict=True)
@@ -277,13 +286,13 @@ def _image(
     passed = eye.pupil_function(eta, xi, wavelength) * turns_phasor(cycles)
     share = math.sqrt(math.prod(window.shape) / math.prod(fine.shape))
     image = spectrum * (passed * share).to(field.dtype)
-    # Samples at the hologram's pitch have the sum of all bands for their spectrum.
+    # Sampling at the hologram's pitch adds up all bands of the spectrum.
     image = image.unflatten(-1, (bands[1], -1)).sum(-2).unflatten(-2, (bands[0], -1)).sum(-3)
     return _centred(centred_ifft2(image), grid.shape)
 
 
 def _centred(values: Tensor, shape: Sequence[int]) -> Tensor:
-    """The middle ``shape`` samples, or the values amid zeros; sample n // 2 stays the origin."""
+    """Values cropped or padded with zeros to ``shape``, both sides of each axis; sample n // 2 stays the origin."""
     (h, w), (height, width) = values.shape[-2:], shape
     top, left = height // 2 - h // 2, width // 2 - w // 2
     return torch.nn.functional.pad(values, (left, width - w - left, top, height - h - top))

@@ -1,4 +1,4 @@
-"""Rays of a hologram through a display, on one axis, which determine windows and pitches. Plain numbers."""
+"""Rays of a hologram through a display, on one axis, which determine windows and pitches. Lengths in metres."""
 
 import math
 
@@ -11,7 +11,7 @@ def band(half: float, slope: float) -> Region:
 
 
 def travelled(region: Region, distance: float) -> Region:
-    """The rays after free space."""
+    """The rays after ``distance`` of free space."""
     return [(position + distance * slope, slope) for position, slope in region]
 
 
@@ -21,7 +21,7 @@ def refracted(region: Region, power: float) -> Region:
 
 
 def clipped(region: Region, radius: float) -> Region:
-    """The rays within ``radius`` of the axis; none at all if the region misses it."""
+    """The rays within ``radius`` of the axis; an empty list if there are none."""
     for sign in (1, -1):
         kept: Region = []
         for i, (position, slope) in enumerate(region):

@@ -24,8 +24,8 @@ from holotorch.optics.viewing.imaging import (
     retinal_scale,
 )
 
-# Error of a pupil with a hard edge, times the samples across its diameter. Measured: 1.1 to 3.2 for the collapse of
-# points with 1360 samples, 0.6 to 3.4 for noise with 42 to 55, 0.4 to 1.3 for elements with 3800.
+# Error of sampling the hard edge of a pupil, times the number of samples across its diameter. Measured: 1.1 to 3.2 for
+# the collapse of points with 1360 samples, 0.6 to 3.4 for noise with 42 to 55, 0.4 to 1.3 for elements with 3800.
 _EDGE_ERROR = 3.0
 _RAYS, _HEIGHTS = 512, 9  # rays across the pupil, and points of the scene, that predict the error of the collapse
 _UNUSABLE = 0.5  # expected relative error above which an image is refused
@@ -40,7 +40,7 @@ class RetinaPlan:
         sampling: Sizes of that method, for :func:`propagate_collapsed` or :func:`propagate_elements`.
         predicted_error: Expected relative L2 error of the intensity, over points of light within the scene.
         memory_bytes: Largest extra memory of one image of one wavelength.
-        flops: Arithmetic of one image of one wavelength.
+        flops: Floating-point operations for one image of one wavelength.
         reason: One sentence that says why this method was chosen.
         runner_up: One sentence on the other method.
         adequate: Whether ``predicted_error`` is within the tolerance.
@@ -77,7 +77,7 @@ def plan_retina(
         wavelengths: In metres, one per channel.
         display: Positions of hologram, eyepiece and eye.
         eye: Pupil, retina, accommodation.
-        tolerance: Largest relative L2 error of the intensity that is wanted.
+        tolerance: Largest accepted relative L2 error of the intensity.
         plane: Object plane in metres from the hologram, the one in focus by default.
         reach: Half width in metres of the scene in that plane, the hologram's by default.
         paraxial: Predict errors in the Fresnel model, in which the collapse has no error other than its sampling.
@@ -89,7 +89,7 @@ def plan_retina(
         The cheapest method within the tolerance, or else the most accurate one, marked as not adequate.
 
     Raises:
-        ValueError: Impossible numbers, more memory than the limit, or an expected error beyond 0.5.
+        ValueError: Invalid arguments, more memory than the limit, or an expected error above 0.5.
     """
     wavelengths = checks.wavelengths(wavelengths)
     tolerance = checks.positive("tolerance", tolerance)
@@ -149,13 +149,14 @@ def collapse_error(
     paraxial: bool = False,
     registered: bool = False,
 ) -> float:
-    """Relative L2 error of the intensity that the collapse makes of points at ``heights``, by rays.
+    """Relative L2 error of the intensity of the collapse for points at ``heights`` metres beside the axis, from rays.
 
-    For points y in the object plane, on one axis: the ray through xi on the pupil has slopes u0 = (xi - A y) / B, u1
-    behind the eyepiece and u2 behind the eye. Fresnel leaves out -k / 8 sum d u^4 along the last two, of which the
-    collapse has the part of y = 0; and it lacks the edge of the eyepiece. Spots with and without these are compared and
-    the errors averaged over y, weighted with energy. Most of the error is a shift of the spot by a part of its width,
-    which an observer does not see; ``registered`` compares after undoing it.
+    One axis is computed. The ray from the point y in the object plane through xi on the pupil has the slope
+    u0 = (xi - A y) / B before the eyepiece, u1 behind it and u2 behind the eye. Fresnel's model neglects the phase
+    -k / 8 (d_eye u1^4 + d_r u2^4), which the collapse includes for y = 0 only; the collapse also neglects the edge of
+    the eyepiece. Spots with and without these are compared, and the errors are averaged over y, weighted with energy.
+    Most of the error is a shift of the spot by a fraction of its width, which an observer does not notice; with
+    ``registered`` this shift is removed before the comparison.
     """
     first, second, _, back = (number(value) for value in display.matrix(plane))
     s0, eye_distance, d_r = (
@@ -193,7 +194,9 @@ def collapse_error(
 
 
 class Retina(nn.Module):
-    """Planned propagation from hologram to retina: fields complex [..., C, H, W] to the light on the retina.
+    """Planned propagation from hologram to retina: from complex fields [..., C, H, W] to the intensity on the retina.
+
+    Lengths given as tensors keep their gradients; the plan is made for their values at construction.
 
     Args:
         grid: Sampling of the hologram, also of the result, which is referred back to the object plane (upright).
@@ -203,13 +206,13 @@ class Retina(nn.Module):
         tolerance: Largest relative L2 error of the intensity.
         plane: Object plane in metres from the hologram, by default the one in focus.
         reach: Half width in metres of the scene.
-        paraxial: Fresnel's model throughout.
+        paraxial: Use Fresnel's model for every distance.
         registered: Do not count as an error that parts of the image move by a fraction of a spot.
-        memory_limit: Refuse to take more bytes than this for an image of one wavelength.
+        memory_limit: Refuse a method that needs more bytes than this for an image of one wavelength.
 
     Attributes:
-        plan: What was chosen and why.
-        scale: Size on the retina over size in the object plane, negative; the retina's pitch is abs(scale) times
+        plan: The chosen method and the reason for it.
+        scale: Size on the retina divided by size in the object plane, negative; the retina's pitch is abs(scale) times
             that of ``grid``.
 
     Raises:
@@ -217,9 +220,7 @@ class Retina(nn.Module):
         MemoryError: In a call, before anything is allocated: the field needs more memory than is available.
 
     Warns:
-        SamplingWarning: No method meets the tolerance; the most accurate one that fits is used.
-
-    Lengths given as tensors keep their gradients; the plan stands for the values they have when it is made.
+        SamplingWarning: No method meets the tolerance; the most accurate one within the memory limit is used.
     """
 
     def __init__(
@@ -255,7 +256,7 @@ class Retina(nn.Module):
         return retinal_scale(self.display, self.eye, self.plane)
 
     def field(self, field: Tensor) -> Tensor:
-        """Complex field on the retina, [..., C, H, W], as :func:`propagate_collapsed` gives it."""
+        """Complex field on the retina, [..., C, H, W], scaled as by :func:`propagate_collapsed`."""
         propagate = propagate_collapsed if self.plan.method == "collapse" else propagate_elements
         return propagate(
             field, self.grid, self.wavelengths, self.display, self.eye, plane=self.plane, paraxial=self.paraxial,

@@ -5,31 +5,32 @@ from torch import Tensor
 
 from holotorch.core import checks
 
-_CLIPPED = 3  # levels at both ends of the range that may be clipped
+_CLIPPED = 3  # number of levels at each end of the range that may be clipped
 _SMOOTH = 1.0  # weight of the mean squared curvature relative to the mean squared residual of the pixels
-_NEEDED = 0.8  # least share of the levels between the clipped ones that must occur
+_NEEDED = 0.8  # share of the unclipped levels that must occur, at least
 _MISFIT = 0.1  # largest rms residual of ln(light): exposures that are wrong by 10 %, or a moving scene, exceed it
 
 
 def tone_curve(frames: Tensor, exposures: Tensor) -> Tensor:
     """Estimate the light of each 8-bit level from frames of a still scene at known exposures.
 
-    A constant power of the exposures cannot be told from one of the curve: the exposure times must be true, gain and
-    white balance fixed. Averaging frames of the same exposure before helps against noise.
+    Exposures and curve raised to the same power fit the frames equally well, so the exposure times must be true, and
+    gain and white balance fixed. Averaging several frames of each exposure beforehand reduces noise.
 
     Args:
-        frames: uint8 [E, 3, H, W] or [E, H, W], E >= 3 exposures that together use the range of levels. The three
-            colours are taken to have one curve.
+        frames: uint8 [E, 3, H, W] or [E, H, W], E >= 3 exposures that together cover the range of levels. One
+            curve is assumed for all three colours.
         exposures: [E] exposure times, or ratios of them; only their ratios count.
 
     Returns:
-        float64 [256], rising from 0 to 1: ``Camera.tone``. Levels below 3 and above 252 are extrapolated.
+        float64 [256], increasing from 0 to 1, for ``Camera.tone``. Levels below 3 and above 252 are extrapolated.
 
     Raises:
-        TypeError, ValueError: Too few exposures or levels, exposures that do not fit the frames, or no rising curve.
+        TypeError, ValueError: There are too few exposures or levels, the exposures do not fit the frames, or the curve
+            does not increase.
 
-    Source: Debevec and Malik (1997), Eq. 3. Over the pairs of levels of all pixels in successive exposures instead of
-    a few hundred sampled pixels (as OpenCV has it), so that the radiances drop out and noise counts less.
+    Source: Debevec and Malik (1997), Eq. 3. Unlike OpenCV, which samples a few hundred pixels, this uses the pairs of
+    levels of all pixels in successive exposures, so that the radiances cancel and noise averages out.
     """
     counts, steps = _pairs(*_checked(frames, exposures))
     level = torch.arange(256, dtype=torch.float64)
@@ -40,7 +41,7 @@ def tone_curve(frames: Tensor, exposures: Tensor) -> Tensor:
             f"only {int(seen.sum())} of {int(inside.sum())} levels occur in two exposures that are not clipped; add "
             "exposures between the others, or a scene with more shades"
         )
-    # Noise of equal size in levels is one of 1 / level in the logarithm.
+    # Noise of constant size in levels has a standard deviation proportional to 1 / level in the logarithm.
     trust = torch.minimum(level, 255 - level).clamp(min=0) * inside
     weights = counts * trust[:, None] * trust
     weights = weights / weights.sum()
@@ -48,14 +49,14 @@ def tone_curve(frames: Tensor, exposures: Tensor) -> Tensor:
     for weight, step in zip(weights, steps, strict=True):  # g(second) - g(first) = step
         normal += torch.diag(weight.sum(0) + weight.sum(1)) - weight - weight.T
         right += step * (weight.sum(0) - weight.sum(1))
-    # Straight in the logarithm of the level, so that a power law is not bent.
+    # Curvature over the logarithm of the level, in which a power law is straight.
     place = level.clamp(min=0.5).log()
     curvature = torch.zeros(254, 256, dtype=torch.float64)
     rows = torch.arange(254)
     before, after = place.diff()[:-1], place.diff()[1:]
     curvature[rows, rows], curvature[rows, rows + 2] = 1 / before, 1 / after
     curvature[rows, rows + 1] = -(1 / before + 1 / after)
-    curvature *= (2 * (before + after)).sqrt()[:, None]  # finer steps are more of them
+    curvature *= (2 * (before + after)).sqrt()[:, None]  # weight of each point: its step in the logarithm
     normal += _SMOOTH / 254 * curvature.mT @ curvature
     normal[255, 255] += 1.0  # the scale: the logarithm of level 255 is 0
     curve = torch.linalg.solve(normal, right)
@@ -92,10 +93,15 @@ def _checked(frames: Tensor, exposures: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _pairs(levels: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
-    """[E - 1, 256, 256]: how many pixels have which level in one exposure and in the next; and ln of their ratios."""
+    """Pairs of levels in successive exposures.
+
+    Returns:
+        Counts [E - 1, 256, 256] of the pixels with level i in one exposure and j in the next, and the logarithm of the
+        ratio of both exposure times [E - 1].
+    """
     both = 256 * levels[:-1] + levels[1:]
     counts = torch.stack([torch.bincount(row, minlength=65536).view(256, 256) for row in both])
-    # A clipped level says nothing of the light.
+    # A clipped level does not determine the light.
     counts[:, :_CLIPPED], counts[:, 256 - _CLIPPED :] = 0, 0
     counts[:, :, :_CLIPPED], counts[:, :, 256 - _CLIPPED :] = 0, 0
     if not bool(counts.sum((1, 2)).gt(0).all()):

@@ -1,4 +1,4 @@
-"""Which stretch of a line shows which band: the line found among labels, the bands by the best order of stretches."""
+"""Detection of the tube's line among colour labels, and of the bands along it by dynamic programming."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -8,23 +8,24 @@ import numpy as np
 
 from holotorch.tracking.detection.colours import ColourTable
 
-_SIDE = 6  # pixels beside an edge whose colours must be right,
-_MIXED, _MOVED = 2, 11  # but for these next to it; and where the tube moved along itself meanwhile
-_RIGHT = 0.55  # share of them
-_VOTERS = 300  # of coloured pixels, that choose among lines; all of them say where the chosen one lies
+_SIDE = 6  # number of pixels on each side of an edge whose colours are checked
+_MIXED, _MOVED = 2, 11  # pixels next to an edge that are not checked: usually, and if the tube moved along itself
+_RIGHT = 0.55  # least share of the checked pixels that must have the right colour
+_VOTERS = 300  # most coloured pixels that vote for a line; the line is then fitted to all of them
 
 
 @dataclass(frozen=True, eq=False)
 class Stretches:
-    """Bands along a line.
+    """Bands along a line, at positions t in pixels.
 
     Attributes:
-        edges: Where each edge lies along the line in pixels, [N]; NaN where it is not seen.
-        shown: For each band, pixels of its colour.
-        whole: For each band, its length on the line.
-        doubtful: For each edge, whether what lies beyond it may be something in front of the tube, by its colours.
+        edges: [N] position of each edge along the line; NaN where it is not visible.
+        shown: For each band, the number of pixels of its colour.
+        whole: For each band, its length on the line in pixels.
+        doubtful: For each edge, whether by its colours it may belong to an object in front of the tube.
         flipped: Whether the tip lies towards larger t.
-        turned: Whether few edges are seen where the tip is known to lie, and the other direction fits better.
+        turned: Whether the direction of the tip was given, but fewer than three edges are visible and the reversed
+            direction fits better.
     """
 
     edges: np.ndarray
@@ -36,15 +37,16 @@ class Stretches:
 
     @property
     def known(self) -> int:
-        """Edges that are seen."""
+        """Number of visible edges."""
         return int(np.isfinite(self.edges).sum())
 
 
 def find_axis(labels: np.ndarray, t: np.ndarray, u: np.ndarray, reach: float) -> tuple[float, float] | None:
-    """Offset and slope (u = offset + slope t) of the coloured thin thing in labels [T, U], or None.
+    """Offset and slope (u = offset + slope t) of the thin coloured object in labels [T, U], or None if there is none.
 
-    ``t`` [T] and ``u`` [U] are places along and across in pixels, evenly spaced, t about 0; slopes to ``reach`` per
-    pixel. The most coloured of a fan of lines, then weighted least squares among what lies on it.
+    ``t`` [T], centred on 0, and ``u`` [U] are evenly spaced positions along and across the strip in pixels; ``reach``
+    is the largest slope. The line with the most coloured pixels among a fan of lines is refined by weighted least
+    squares over the coloured pixels near it.
     """
     along, across = np.divmod(np.flatnonzero(labels), labels.shape[1])
     if len(along) and int(np.bincount(along).max()) >= 0.6 * len(u):  # rows of one colour are not thin
@@ -63,7 +65,7 @@ def find_axis(labels: np.ndarray, t: np.ndarray, u: np.ndarray, reach: float) ->
     at = (offset[some] + (0.5 - low) - slopes[:, None] * place[some]).astype(np.intp)
     at += bins * np.arange(len(slopes))[:, None]
     counts = np.bincount(at.ravel(), minlength=bins * len(slopes)).reshape(len(slopes), bins)
-    sums = counts.cumsum(-1)  # of five neighbours is the difference of two
+    sums = counts.cumsum(-1)  # the difference of two of these is the sum of five neighbours
     best = int((sums[:, 5:] - sums[:, :-5]).argmax())
     slope, value = float(slopes[best // (bins - 5)]), best % (bins - 5) + 3 + low
     moments = np.empty((5, len(place)))
@@ -90,14 +92,18 @@ def find_stretches(
     *,
     onward: bool = False,
 ) -> Stretches | None:
-    """Bands along labels [T, R] of a line's R central rows, or None where no order of them fits, or both ways do.
+    """Bands along the labels [T, R] of a line's R central rows; None if they fit in no direction, or in both alike.
 
-    Where ``drape`` [T] is true the surroundings look the same, so that labels do not say what is a band; where
-    ``through`` [T] is, they shine through a tube that is none. ``middle`` is the index where t = 0. With ``onward`` the
-    tip is known to lie towards smaller t.
+    All ways to cut the line into "before, band 1, ..., band n, after", in both directions, have a score, and the best
+    one is taken (:func:`_sweep`). Hidden stretches cost little, so that a finger across a band does not divide it.
 
-    Of all ways to cut the line into "before, band 1, ..., band n, after", in both directions, that which is worth most
-    (:func:`_sweep`). Stretches that something hides count little, so that a finger within a band leaves it one band.
+    Args:
+        labels: [T, R] colour labels.
+        drape: [T] whether the surroundings have the same colour, so that the labels do not identify a band.
+        through: [T] whether the surroundings are visible through a transparent part of the tube.
+        table: Labels of colours.
+        middle: Index at which t = 0.
+        onward: Whether the tip is known to lie towards smaller t.
     """
     raw = _shares(labels, table)  # [C, T]
     share = raw * ~drape
@@ -109,7 +115,7 @@ def find_stretches(
         return None
     at, edges = value.shape[-1] - 1, []
     for total, reached in reversed(cuts):
-        # Where the best value so far was first reached; only one path is followed back.
+        # First index at which the best value was reached; only one path is traced back.
         at = int((total[int(flipped), : at + 1] >= reached[int(flipped), at]).argmax())
         edges.append(at)
     ways = (raw[:, ::-1], drape[::-1], through[::-1]) if flipped else (raw, drape, through)
@@ -121,19 +127,19 @@ def find_stretches(
 
 
 def order_scores(labels: np.ndarray, table: ColourTable) -> np.ndarray:
-    """What lines of labels [K, T, R] are worth in the better direction, above no bands on them: [K], in pixels."""
+    """Scores [K] in pixels of lines of labels [K, T, R] in the better direction, relative to lines without bands."""
     sums = _worth(_shares(labels, table).swapaxes(0, 1), table.bands)
     one, other = (_sweep(order)[0][:, -1] for order in (sums, _reversed(sums)))
     return np.maximum(one, other) - sums[0, :, -1]
 
 
 def _reversed(sums: np.ndarray) -> list[np.ndarray]:
-    """Sums for the bands in the other order; the other way round, the same stretches are worth the same."""
+    """Sums for the bands in reversed order: reversing the bands has the same effect as reversing the line."""
     return [sums[0], *sums[-2:0:-1], sums[-1]]
 
 
 def _shares(labels: np.ndarray, table: ColourTable) -> np.ndarray:
-    """Share of the last axis that shows each colour, float32 [C, ...] of labels [..., R]."""
+    """Share of the R labels [..., R] that have each of the C colours: float32 [C, ...]."""
     colours = len(table.colours)
     each = np.eye(colours + 1, colours, k=-1, dtype=np.float32) / labels.shape[-1]
     rows = [each.take(labels[..., i], axis=0) for i in range(labels.shape[-1])]
@@ -141,10 +147,11 @@ def _shares(labels: np.ndarray, table: ColourTable) -> np.ndarray:
 
 
 def _worth(share: np.ndarray, bands: tuple[int, ...]) -> np.ndarray:
-    """What pixels of lines [K, C, T] are worth before the bands, on each of them, and after: sums [n + 2, K, T + 1].
+    """Cumulative scores [n + 2, K, T + 1] of pixels along lines, if they lie before the n bands, on each, or after.
 
-    A pixel within a band is worth +1 where it shows the band's colour, -1 where it shows another band's and -0.6 where
-    it shows none, as fingers do; around the bands -0.25 where it shows one, and 0 where it shows none.
+    ``share`` [K, C, T] are the shares of the colours. The score of a pixel on a band is +1 if it has the band's colour,
+    -1 if it has another band's colour and -0.6 if it has neither (a finger, for example). The score of a pixel before
+    or after the bands is -0.25 if it has a band's colour, else 0.
     """
     gains, least = _gains(bands, share.shape[1])
     sums = np.zeros((len(least), len(share), share.shape[-1] + 1), dtype=np.float32)
@@ -154,7 +161,7 @@ def _worth(share: np.ndarray, bands: tuple[int, ...]) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def _gains(bands: tuple[int, ...], colours: int) -> tuple[np.ndarray, np.ndarray]:
-    """What a pixel that shows a colour is worth more [n + 2, colours] than one that shows none [n + 2, 1, 1]."""
+    """Scores of pixels of each colour minus those of pixels without one [n + 2, colours]; the latter [n + 2, 1, 1]."""
     gains = np.full((len(bands) + 2, colours), -0.4, dtype=np.float32)
     gains[[0, -1]] = -0.25
     for i, band in enumerate(bands):
@@ -163,7 +170,12 @@ def _gains(bands: tuple[int, ...], colours: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _sweep(order: Iterable[np.ndarray]) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
-    """Dynamic programming over the cuts between stretches worth [K, T + 1]: best value, what each cut chose from."""
+    """Dynamic programming over the cuts between stretches, given their cumulative scores [K, T + 1] in order.
+
+    Returns:
+        Best score [K, T + 1] up to each position, and for each cut the candidates for its position and their running
+        maximum, both [K, T + 1].
+    """
     value, *rest = order
     cuts = []
     for total in rest:
@@ -183,7 +195,7 @@ def _judged(
     flipped: bool,
     middle: float,
 ) -> Stretches:
-    # In plain numbers: of so few edges, the calls into NumPy would cost several times as much.
+    # Plain Python numbers: for so few edges, calls into NumPy would take several times as long.
     count, last = share.shape[1], len(bands)
     sums = _sums(share)
     own = _sums(share * ~through) if through.any() else sums
@@ -194,7 +206,7 @@ def _judged(
         return (row.item(high) - row.item(low)) / (high - low) if high > low else 0.0
 
     def clear(i: int, cut: int, mixed: int, side: int, longest: int) -> bool:
-        """Whether the right colours lie to both sides of an edge, beyond what is mixed there."""
+        """Whether both sides of an edge have the right colours; ``mixed`` pixels next to it are ignored."""
         before, after = (cut - mixed - side, cut - mixed), (cut + mixed, cut + mixed + side)
         if i > 0:
             was = sums[bands[i - 1]]
@@ -204,7 +216,7 @@ def _judged(
             then = sums[bands[i]]
             if mean(then, *after) <= _RIGHT or mean(then, *before) >= (_RIGHT if i else 1 - _RIGHT):
                 return False
-        # Beyond an outer edge lies tube, not the same colour and not a thing as thin in a band's colour.
+        # Beyond an outer edge lies the bare tube: neither the band's colour nor that of any other band.
         if i == 0:
             return all(mean(row, cut - longest // 2, before[1]) < _RIGHT for row in own)
         return i < last or all(mean(row, after[0], cut + longest // 2) < _RIGHT for row in own)
@@ -212,7 +224,7 @@ def _judged(
     edges, doubtful = [], []
     for i, cut in enumerate(cuts):
         length = [cuts[j + 1] - cuts[j] for j in (i - 1, i) if 0 <= j < last]
-        # A band that its surroundings drown has no length; the edge to it may be seen all the same.
+        # A band on a background of its colour has no length here, but its edge to the next band may be visible.
         shortest = min((value for value in length if value > _MIXED), default=0)
         seen = False
         if _SIDE // 2 < cut < count - _SIDE // 2:
@@ -234,7 +246,7 @@ def _judged(
 
 
 def _sums(values: np.ndarray) -> np.ndarray:
-    """Of values [C, T], those before each place: [C, T + 1]."""
+    """Sums [C, T + 1] of the values [C, T] before each position."""
     sums = np.zeros((len(values), values.shape[1] + 1), dtype=np.float32)
     np.cumsum(values, 1, out=sums[:, 1:])
     return sums

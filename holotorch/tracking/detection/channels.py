@@ -1,4 +1,4 @@
-"""Order of a frame's colour channels, and which exchanges of them a catheter's bands survive as another pose."""
+"""Order of a frame's colour channels, and the wrong orders in which a catheter's bands show another, valid pose."""
 
 import warnings
 from collections.abc import Sequence
@@ -11,12 +11,12 @@ from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.detection.colours import ColourTable
 from holotorch.tracking.pose.catheter import Catheter
 
-_EDGES = 3  # that a tracker answers with a pose
-_MARGIN = 8.0  # degrees of hue by which shading, gloss and a codec move a colour
+_EDGES = 3  # least number of edges for which a tracker gives a pose
+_MARGIN = 8.0  # degrees by which shading, gloss and a codec change the hue of a colour
 
 
 class ChannelOrder(Enum):
-    """What the channels of a frame [..., 3, H, W] are: BGR as OpenCV gives them, RGB as the readers of holotorch do."""
+    """Order of the channels of a frame [..., 3, H, W]: BGR in OpenCV, RGB from the readers of holotorch."""
 
     RGB = "RGB"
     RBG = "RBG"
@@ -26,14 +26,14 @@ class ChannelOrder(Enum):
     BGR = "BGR"
 
     def to_rgb(self, frames: Tensor) -> Tensor:
-        """Frames [..., 3, H, W] of this order as red, green and blue; the same tensor where they are."""
+        """Reorder the channels of frames [..., 3, H, W] to RGB; frames that are RGB are returned as they are."""
         if self is ChannelOrder.RGB:
             return frames
         return frames[..., [self.value.index(name) for name in "RGB"], :, :]
 
 
 class ChannelOrderWarning(UserWarning):
-    """Frames in another order of channels would show another pose, and nobody has said which order they have."""
+    """The order of the channels is not stated, and frames in another order would show another pose."""
 
 
 def need_frames(frames: Tensor) -> None:
@@ -45,7 +45,7 @@ def need_frames(frames: Tensor) -> None:
 
 
 def stated_order(channels: ChannelOrder | None, camera: Camera, catheter: Catheter) -> ChannelOrder:
-    """The order that a tracker's user has stated; else RGB, with a warning where the catheter cannot confirm it."""
+    """Channel order stated by the user, else RGB, with a warning if this catheter cannot reveal a wrong order."""
     if channels is None:
         if text := ambiguity_text(ambiguities(camera, catheter)):
             text += (
@@ -59,26 +59,26 @@ def stated_order(channels: ChannelOrder | None, camera: Camera, catheter: Cathet
 
 
 def ambiguities(camera: Camera, catheter: Catheter) -> tuple[ChannelOrder, ...]:
-    """Channel orders whose frames, taken for RGB, may show the bands where they are not.
+    """Channel orders whose frames, if taken for RGB, may show the bands of this catheter in wrong positions.
 
-    With the thesis's red, green and blue bands that is BGR: red and blue change places, and the bands read as the same
-    ones from the other end. Read so, three bands fit a pose whatever their lengths are (the cross-ratio of four edges
-    is the same in reverse), and only the tube's width may contradict it, or the lengths of tube beyond the bands where
-    they lie on the frame (:func:`~holotorch.tracking.detection.ends.shows_reversed`); so the colours must tell.
+    For the red, green and blue bands of the thesis, this is BGR: exchanging red and blue gives the same sequence of
+    bands from the other end. Three bands in reversed order fit some pose whatever their lengths are (the cross-ratio of
+    four edges is the same in reverse). Only the width of the tube may contradict this pose, or the lengths of the tube
+    beyond the bands if they are on the frame (:func:`~holotorch.tracking.detection.ends.shows_reversed`).
 
-    A mirrored frame is not among these: of a straight tube it is a possible frame, with any colours and lengths, and
-    only the scene beside the tube tells.
+    Mirrored frames are not covered: the mirror image of a straight tube is always the image of another pose, whatever
+    its colours and lengths are, so that only the scene beside the tube could reveal it.
 
     Args:
-        camera: Of whose frames; its tone curve says what hue levels have.
-        catheter: As :class:`CatheterTracker` takes it.
+        camera: Camera of the frames; its tone curve determines the hues of levels.
+        catheter: Catheter, as for :class:`CatheterTracker`.
 
     Returns:
-        The orders that leave at least three edges with the catheter's own colours on both sides, in the catheter's
-        sequence from either end. Empty for a catheter that no exchange of channels turns into a wrong pose.
+        Orders in which at least three edges have colours of the catheter on both sides, in the catheter's sequence from
+        either end. Empty if no order of channels can cause a wrong pose.
 
     Raises:
-        ValueError: Colours that no tracker can tell apart, as for ``CatheterTracker``.
+        ValueError: The colours of the bands are grey, too similar, or the same from both ends.
     """
     table = ColourTable(camera, catheter)
     bands = [{label} for label in table.bands]
@@ -88,7 +88,7 @@ def ambiguities(camera: Camera, catheter: Catheter) -> tuple[ChannelOrder, ...]:
         shown = torch.tensor([[colour["RGB".index(name)] for name in order.value] for colour in catheter.colours])
         labels = [set(each) for each in table.alike(shown, _MARGIN)]
         if labels == bands:
-            continue  # the exchange changes nothing
+            continue  # this order changes no band's label
         onward = _borders(labels)
         backward = [(after, before) for before, after in reversed(onward)]
         if max(_common(wanted, onward), _common(wanted, backward)) >= _EDGES:
@@ -97,7 +97,7 @@ def ambiguities(camera: Camera, catheter: Catheter) -> tuple[ChannelOrder, ...]:
 
 
 def ambiguity_text(orders: Sequence[ChannelOrder]) -> str:
-    """What a user should know of such orders, and what to do; empty where there are none."""
+    """Message for the user about ambiguous orders, with a remedy; empty if there are none."""
     names = " or ".join(order.value for order in orders)
     return names and (
         f"frames with channels in the order {names} show this catheter's bands as another pose, with a small stated "
@@ -108,17 +108,17 @@ def ambiguity_text(orders: Sequence[ChannelOrder]) -> str:
 
 
 _Border = tuple[set[int], set[int]]
-_NONE = -1  # where a band's colour is none of the catheter's, and beyond the bands
+_NONE = -1  # label beyond the bands, and of a colour that no band of the catheter has
 
 
 def _borders(labels: Sequence[set[int]]) -> list[_Border]:
-    """What each edge has before and after it."""
+    """Labels before and after each edge."""
     padded = [{_NONE}, *labels, {_NONE}]
     return list(zip(padded, padded[1:], strict=False))
 
 
 def _common(wanted: Sequence[_Border], shown: Sequence[_Border]) -> int:
-    """Longest common subsequence: edges that are seen with the colours wanted, in their order."""
+    """Number of the ``wanted`` edges that are among those ``shown`` in the same order: longest common subsequence."""
     best = [0] * (len(shown) + 1)
     for before, after in wanted:
         row = [0]

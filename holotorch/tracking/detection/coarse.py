@@ -1,4 +1,4 @@
-"""Where on a frame a thin straight thing with the bands' colours in a row may lie: a few lines, for a bounded cost."""
+"""Search of a whole frame for lines on which thin straight objects have the bands' colours, at a bounded cost."""
 
 import itertools
 from dataclasses import dataclass
@@ -11,19 +11,19 @@ from holotorch.tracking.detection.bands import order_scores
 from holotorch.tracking.detection.colours import ColourTable
 from holotorch.tracking.pose.status import Refusal, Status
 
-_STEP = 2  # every second pixel of every second row
-_TILE = 12  # of those, along the side of a tile
-_DENSE = 0.35  # share of a tile and those around it that thin things never fill
-_FEWEST = 6  # coloured pixels of a tile that count
-_TILES = 40  # for each colour
-_CANDIDATES = 16  # lines whose labels are read,
-_EVERY = 2  # coarse pixels along each,
-_LINES = 3  # and that are measured
-_ACROSS = 3.0  # coarse pixels beside a line that still count
+_STEP = 2  # every second pixel of every second row is read
+_TILE = 12  # side of a tile in coarse pixels, which are those that are read
+_DENSE = 0.35  # share of a colour in a tile and its neighbours that thin objects never reach
+_FEWEST = 6  # least number of pixels of a colour in a tile
+_TILES = 40  # most tiles of each colour
+_CANDIDATES = 16  # most lines whose labels are read
+_EVERY = 2  # distance of these labels along a line, in coarse pixels
+_LINES = 3  # most lines that are returned
+_ACROSS = 3.0  # distance from a line up to which tiles belong to it, in coarse pixels
 
 
 _Y, _X = np.divmod(np.arange(_TILE**2, dtype=np.float32), _TILE)
-_MOMENTS = np.stack([np.ones_like(_X), _X, _Y, _X * _X, _X * _Y, _Y * _Y], -1)  # of a tile's pixels
+_MOMENTS = np.stack([np.ones_like(_X), _X, _Y, _X * _X, _X * _Y, _Y * _Y], -1)  # monomials of a tile's pixels
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,10 @@ class Segment:
 
 
 def find_segments(frame: Tensor, table: ColourTable) -> list[Segment]:
-    """The most promising lines on a frame uint8 [3, H, W], best first, of two bands or more.
+    """The most promising lines with at least two bands on a frame uint8 [3, H, W], best first.
 
-    A Refusal where nothing thin is coloured (NO_CATHETER), or what is shows no two bands in a row (BANDS_MISSING).
+    Raises:
+        Refusal: NO_CATHETER where nothing thin has a band's colour, BANDS_MISSING where no line has two bands in a row.
     """
     labels = _labels(frame, table)
     tiles = _tiles(labels, len(table.colours))
@@ -51,21 +52,21 @@ def find_segments(frame: Tensor, table: ColourTable) -> list[Segment]:
 
 
 def _labels(frame: Tensor, table: ColourTable) -> np.ndarray:
-    """uint8 [h, w] of every second pixel of every second row; the one step in which a frame is read as a whole."""
+    """Labels uint8 [h, w] of every second pixel of every second row; no other step reads the whole frame."""
     rows, aside = frame.movedim(0, -1)[::_STEP], _STEP
     if frame.device.type != "cpu" or rows.stride()[1:] != (3, 1):
         rows, aside = rows[:, ::_STEP].contiguous().cpu(), 1
-    # As ColourTable.labels, but thinned out after the first step: to copy every second pixel takes longer.
+    # As ColourTable.labels, but columns are skipped after the first step: skipping them before takes longer.
     packed = cv2.cvtColor(rows.numpy(), cv2.COLOR_RGB2BGR555).view(np.uint16)[..., 0]
     if aside == 2 and packed.shape[1] % 2 == 0:
-        # The lower half of each pair of pixels is the first of them; a cast is four times as fast as a strided copy.
+        # The lower 16 bits of a pair of pixels are the first one; this cast is four times as fast as a strided copy.
         return cv2.LUT(packed.view("<u4").astype(np.uint16), table.table)
     return cv2.LUT(np.ascontiguousarray(packed[:, ::aside]), table.table)
 
 
 @dataclass(frozen=True, eq=False)
 class _Tiles:
-    """Coloured parts of tiles [M]: label, pixels, centre [M] and unit direction [M], complex, in coarse pixels."""
+    """Parts [M] of one colour in tiles: label, number of pixels, centre and unit direction (complex, coarse pixels)."""
 
     label: np.ndarray
     count: np.ndarray
@@ -75,11 +76,11 @@ class _Tiles:
 
 def _tiles(labels: np.ndarray, colours: int) -> _Tiles | None:
     height, width = labels.shape
-    down, aside = -height % _TILE, -width % (2 * _TILE)  # whole tiles, and whole words of eight pixels
+    down, aside = -height % _TILE, -width % (2 * _TILE)  # padding to whole tiles and to whole words of eight pixels
     if down or aside:
         labels = cv2.copyMakeBorder(labels, 0, down, 0, aside, cv2.BORDER_CONSTANT, value=0)
     blocks = labels.reshape(-1, _TILE, labels.shape[1])
-    # Eight pixels at a time: sums of so few ones do not overflow a byte.
+    # Add eight pixels (bytes) at a time; the sums are small, so no byte overflows.
     lit = np.add.reduce((blocks != 0).view(np.uint64), 1).view(np.uint8)
     lit = np.add.reduce(lit.reshape(len(lit), -1, _TILE), 2, dtype=np.float32)
     row, column = (lit >= _FEWEST).nonzero()
@@ -105,7 +106,7 @@ def _tiles(labels: np.ndarray, colours: int) -> _Tiles | None:
 
 
 def _most(worth: np.ndarray, count: int, least: float) -> np.ndarray:
-    """Places of the ``count`` largest values above ``least``, largest first."""
+    """Indices of the ``count`` largest values above ``least``, largest first."""
     if len(worth) > 4 * count:
         some = np.argpartition(-worth, count)[:count]
         some = some[np.argsort(-worth[some], kind="stable")]
@@ -115,7 +116,7 @@ def _most(worth: np.ndarray, count: int, least: float) -> np.ndarray:
 
 
 def _lines(tiles: _Tiles, table: ColourTable) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-    """Lines through two tiles of different bands: middle [K], direction [K], beginning and end [K] along it."""
+    """Lines through two tiles of different colours: middle, direction, first and last position along it, [K] each."""
     pairs = []
     for one, other in itertools.combinations(range(len(table.colours)), 2):
         i, j = (tiles.label == one).nonzero()[0], (tiles.label == other).nonzero()[0]
@@ -137,7 +138,7 @@ def _lines(tiles: _Tiles, table: ColourTable) -> tuple[np.ndarray, np.ndarray, n
     weight = np.where(used, tiles.count, 0)
     colours = len(table.colours)
     each = weight @ (tiles.label[:, None] == np.arange(colours)).astype(weight.dtype)
-    # Colours that are far from the others along the line are somebody else's.
+    # Tiles spread far along the line reduce its score: they probably belong to other objects.
     whole = np.maximum(weight.sum(-1), 1e-6)
     middle = (weight * t).sum(-1) / whole
     spread = np.sqrt((weight * (t - middle[:, None]) ** 2).sum(-1) / whole)
@@ -159,7 +160,7 @@ def _lines(tiles: _Tiles, table: ColourTable) -> tuple[np.ndarray, np.ndarray, n
     chosen = weight[best[keep]]
     mean = chosen @ tiles.centre / chosen.sum(-1)
     offsets = tiles.centre - mean[:, None]
-    # The longest axis of points lies at half the angle of their squares' sum.
+    # The angle of the principal axis of points is half the angle of the sum of their squares.
     onward = np.exp(0.5j * np.angle((chosen * offsets * offsets).sum(-1)))
     t = (offsets * onward.conj()[:, None]).real
     low = np.where(chosen > 0, t, np.inf).min(-1) - _TILE / 2
@@ -170,7 +171,7 @@ def _lines(tiles: _Tiles, table: ColourTable) -> tuple[np.ndarray, np.ndarray, n
 def _ranked(
     labels: np.ndarray, mean: np.ndarray, along: np.ndarray, low: np.ndarray, high: np.ndarray, table: ColourTable
 ) -> list[Segment]:
-    """The lines on which the bands' order explains most of the labels, best first."""
+    """The lines whose labels agree best with the order of the bands, best first."""
     height, width = labels.shape
     half = int(0.5 * max(height, width))
     places = np.arange(-half, half + 1.0, _EVERY)[:, None] + 1j * np.array([-1.0, 0.0, 1.0, -7.0, 7.0])

@@ -1,4 +1,4 @@
-"""Which 8-bit colours may belong to which band: a table of 32 x 32 x 32, looked up without a float frame."""
+"""Table of 32 x 32 x 32 colours that assigns 8-bit pixels to bands without conversion to floating point."""
 
 import math
 
@@ -11,21 +11,21 @@ from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.pose.catheter import Catheter
 
 _BITS = 5
-_TURN = math.radians(32)  # between chromas in linear light
-_PURE = 0.35  # of a band's own saturation; gloss and mixed pixels have less
-_DARK = 24 / 255  # levels below are noise
+_TURN = math.radians(32)  # largest angle between the chromas of a pixel and its band in linear light
+_PURE = 0.35  # least saturation relative to that of the band; gloss and mixed pixels have less
+_DARK = 24 / 255  # darker pixels are noise
 
 
 class ColourTable:
-    """Labels of pixels: 0 for none, c + 1 for the c-th of ``colours``, whatever the light's strength.
+    """Labels pixels by hue, at any brightness: c + 1 for ``colours[c]``, 0 for any other colour.
 
     Attributes:
         colours: The distinct colours of the catheter's bands.
-        bands: For each band, which of ``colours`` it has.
-        table: uint8 [65536], by the upper five bits of red, green and blue, whatever the highest of the sixteen.
+        bands: For each band, the index of its colour in ``colours``.
+        table: uint8 [65536] labels. The index has 16 bits: five of each colour, and a highest bit of no effect.
 
     Raises:
-        ValueError: Bands that are grey, whose hues cannot be told apart, or whose colours read the same from both ends.
+        ValueError: Bands are grey, their hues are too similar, or their sequence is the same from both ends.
     """
 
     def __init__(self, camera: Camera, catheter: Catheter):
@@ -52,14 +52,14 @@ class ColourTable:
         self.table = np.tile(torch.where(good, label + 1, 0).to(torch.uint8).numpy(), 2)
 
     def labels(self, levels: np.ndarray) -> np.ndarray:
-        """uint8 [T, U] of levels uint8 [T, U, 3], neither of them nought."""
-        # Five bits of each colour side by side, as the table wants them.
+        """Labels uint8 [T, U] of the levels uint8 [T, U, 3], T > 0 and U > 0."""
+        # Concatenate the upper five bits of each colour to an index of the table.
         return cv2.LUT(cv2.cvtColor(levels, cv2.COLOR_RGB2BGR555).view(np.uint16)[..., 0], self.table)
 
     def alike(self, levels: Tensor, margin: float) -> list[list[int]]:
-        """Of each of the levels [n, 3]: indices of ``colours`` that it may pass for, -1 for none of them.
+        """Possible labels of each of the levels [n, 3]: indices into ``colours``, and -1 if it may have no label.
 
-        ``margin``: degrees by which its hue may be moved.
+        ``margin`` is the largest error of the hue in degrees.
         """
         away = (_chroma(self._linear(levels.double()))[0] @ self._wanted.T).clamp(-1, 1).arccos()
         wide, narrow = (_TURN + sign * math.radians(margin) for sign in (1, -1))
@@ -67,7 +67,7 @@ class ColourTable:
 
 
 def _chroma(light: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit vector [..., 3] away from grey, and saturation [...]: its length over the light's."""
+    """Unit vector [..., 3] of light minus its grey part; and saturation [...]: its length over that of the light."""
     away = light - light.mean(-1, keepdim=True)
     length = away.norm(dim=-1)
     return away / length.clamp(min=1e-9)[..., None], length / light.norm(dim=-1).clamp(min=1e-9)

@@ -21,7 +21,7 @@ _SHARED = 1.2  # measured ratio of a position's deviation to that without pixels
 _STRANGE = 1.5  # ratio of the residual to its white part above which the model is incomplete
 _OWN = 1.4  # measured ratio of the channels' scatter, which shading and gloss increase, to that from noise
 _OTHER = 4.0  # standard deviations by which an edge's blur may differ from the shared one
-SHARPEST, BLUNTEST = 0.35, 10.0  # pixels: least and largest standard deviation of an edge's blur
+SHARPEST, BLUNTEST = 0.35, 10.0  # least and largest standard deviation of an edge's blur in pixels
 
 # Model of an edge: maps t [T], position [E] and blur [E], in samples, to its values and both derivatives, [E, 3, T].
 Shape = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -120,18 +120,18 @@ def fit_edges(
         deviation.append(_SHARED * math.sqrt(variance) * max(noise[e], 0.5) * doubt if good else math.inf)
     noise, deviation = np.array(noise), np.array(deviation)
     good = np.isfinite(deviation)
-    # Of an edge that is none, such as one whose other side lies beyond the frame, all of these are rounding.
+    # Where there is no edge (for example if one side lies beyond the frame), these values are only rounding errors.
     apart = _apart(terms.slope[good], terms.own[good], noise[good], rows[-1]) if good.any() else 1.0
     levels = mean - terms.amplitude * terms.middle
     steps, levels, told = (v.reshape(-1, *rows) for v in (terms.amplitude, levels, terms.told))
     return EdgeFit(np.array(place), blurs, apart * deviation, noise, steps, levels, told, np.full(len(place), apart))
 
 
-# What is known of each edge is a few plain numbers: of these, calls into NumPy would cost several times as much.
+# Plain Python numbers: for a few numbers per edge, calls into NumPy would take several times as long.
 def _each_by_itself(
     shape: Shape, t: np.ndarray, blur: float, given: tuple[np.ndarray, np.ndarray]
 ) -> tuple[list[float], list[float], list[float]]:
-    """Place and blur of each edge, and the inverse variance of the blur; ``given`` as :func:`_edge_terms` takes it."""
+    """Separate fits of position and blur of each edge, and inverse variance of the blur; ``given``: weights, total."""
     count, far = len(given[0]), float(t[-1])
     place, sigma, sure = [0.0] * count, [blur] * count, [0.0] * count
     for _ in range(_STEPS):
@@ -140,7 +140,7 @@ def _each_by_itself(
         for e, (((pp, pb), (_, bb)), (p, b)) in enumerate(terms.sums):
             sure[e] = _within(bb - pb * pb / max(pp, 1e-30), 0.0, 1e12)
             whole = (1 + 1e-6) * pp * bb - pb * pb
-            if whole > 0:  # an edge without weight has 0 / 0: it stays where it is, of infinite deviation
+            if whole > 0:  # without weight it is 0: the edge stays, and its deviation is infinite
                 along = _within((bb * p - pb * b) / whole, -1.5, 1.5)
                 wider = _within((pp * b - pb * p) / whole, -1.5, 1.5)
                 place[e] = _within(place[e] + along, -far, far)
@@ -153,10 +153,10 @@ def _each_by_itself(
 
 
 def _one_lens(sigma: list[float], sure: list[float]) -> tuple[list[float], list[float], list[bool]]:
-    """Blurs, their inverse variances, and which edges surely are not blurred by the lens that most of them show.
+    """Blurs, their inverse variances, and whether the blur of each edge significantly differs from the common one.
 
-    One lens blurs all edges alike. Where one side is dark and so has little noise, place and blur are hard to tell
-    apart, edge by edge; together they are not.
+    The lens blurs all edges equally. If one side of an edge is dark and so has little noise, position and blur of this
+    edge alone are strongly correlated; a common blur removes this ambiguity.
     """
     both = list(zip(sigma, sure, strict=True))
     common = max(sum(width * s for width, s in both) / max(sum(sure), 1e-30), 1e-30)
@@ -170,7 +170,7 @@ def _one_lens(sigma: list[float], sure: list[float]) -> tuple[list[float], list[
 
 
 def _left(left: np.ndarray, weight: np.ndarray) -> tuple[list[float], list[float], list[int]]:
-    """Of what fits leave [E, T, R]: its size over the noise, the same over its white part, and degrees of freedom."""
+    """Of residuals [E, T, R]: their size over the noise, the ratio of it to their white part, degrees of freedom."""
     bent = left[:, 2:] - 2 * left[:, 1:-1] + left[:, :-2]
     whole = (weight * left * left).sum((1, 2)).tolist()
     rough = (weight[:, 1:-1] * bent * bent).sum((1, 2)).tolist()
@@ -180,17 +180,22 @@ def _left(left: np.ndarray, weight: np.ndarray) -> tuple[list[float], list[float
     ends = used[:, :: used.shape[1] - 1].sum((1, 2)).tolist()
     free = [n - 2 * level - 2 for n, level in zip(count, levels, strict=True)]
     noise = [math.sqrt(value / max(n, 1)) for value, n in zip(whole, free, strict=True)]
-    # What varies from sample to sample is noise; what does not is something else that the edge is mixed with.
+    # Residuals that vary from sample to sample are noise; smooth ones come from something the model does not contain.
     white = [math.sqrt(rough[e] / (6 * max(count[e] - ends[e], 1))) for e in range(len(rough))]
     return noise, [value / max(part, 1e-9) for value, part in zip(noise, white, strict=True)], free
 
 
 class _Terms(NamedTuple):
-    """Of edges [E] of rows and channels [R], of a given place and blur.
+    """Terms of the fit to edges [E] in rows and channels [R] at given positions and blurs.
 
-    ``sums`` are entries of the normal matrix for place and blur, and slopes: ((pp, pb), (pb, bb)), (p, b) of each edge,
-    over all rows and channels. Of each of these ``own`` [E, R] is pp and ``slope`` p; ``told`` is pp of a step of 1,
-    had it and the levels been known. ``amplitude`` [E, R] of steps; ``rise`` [E, T] and its means ``middle`` [E, R].
+    Attributes:
+        sums: For each edge, normal matrix ((pp, pb), (pb, bb)) and right side (p, b) for position and blur, summed over
+            rows and channels.
+        own, slope: [E, R] pp and p of each row and channel.
+        told: [E, R] pp for a step of 1 if step and levels were known.
+        amplitude: [E, R] fitted steps.
+        middle: [E, R] weighted means of ``rise``.
+        rise: [E, T] model of the edge.
     """
 
     sums: list[tuple[list[list[float]], list[float]]]
@@ -203,9 +208,12 @@ class _Terms(NamedTuple):
 
 
 def _edge_terms(shape: np.ndarray, weights: np.ndarray, total: np.ndarray) -> _Terms:
-    """Of edges and their slopes [E, 3, T]; ``weights`` [E, T, 2 R], and light times it; ``total`` over T [E, R]."""
+    """Terms of the fit from the model and its derivatives [E, 3, T].
+
+    ``weights`` [E, T, 2 R] are the weights, then weights times light; ``total`` [E, R] are the weights summed over T.
+    """
     rows = total.shape[1]
-    # Weighted moments over T, of each row and channel; less what levels explain.
+    # Weighted moments over T of each row and channel, with the levels projected out.
     first = shape @ weights
     first, light = first[..., :rows], first[..., rows:]
     products = (shape[:, :, None] * shape[:, None]).reshape(len(shape), 9, -1)
@@ -216,7 +224,7 @@ def _edge_terms(shape: np.ndarray, weights: np.ndarray, total: np.ndarray) -> _T
     amplitude = light[:, 0] / power
     each = amplitude[:, None]
     slopes = (light[:, 1:] - across * each) * each
-    # What the rise itself explains is taken out of its slopes (Kaufman's form).
+    # The part of the derivatives parallel to the rise is projected out (Kaufman's form).
     normal = second[:, 1:, 1:] - across[:, :, None] * (across / power[:, None])[:, None]
     normal *= (each * each)[:, None]
     sums = list(zip(normal.sum(-1).tolist(), slopes.sum(-1).tolist(), strict=True))
@@ -228,11 +236,11 @@ def _within(value: float, least: float, most: float) -> float:
 
 
 def _apart(slope: np.ndarray, power: np.ndarray, noise: np.ndarray, colours: int) -> float:
-    """How much farther apart the channels put edges than noise does, 1 or more.
+    """Ratio of the scatter of an edge's positions in the channels to that from noise, at least 1.
 
-    Codecs keep colours at half the resolution of the luma, often half a pixel aside, and blur them in levels instead of
-    light. No one place is right for all channels then, and all edges suffer alike. Of slope and normal matrix [E, R]
-    for a place of its own in each row and channel.
+    Codecs store chroma at half the resolution of luma, often displaced by half a pixel, and blur levels instead of
+    light. The channels then disagree on the position of an edge, at all edges to the same degree. ``slope`` and
+    ``power`` [E, R] are right side and normal matrix for a separate position in each row and channel.
     """
     slope, power = (value.reshape(len(value), -1, colours).sum(1) for value in (slope, power))
     power = np.maximum(power, 1e-30)

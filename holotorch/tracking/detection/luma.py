@@ -1,7 +1,7 @@
-"""Edges in the luma of frames that a codec has taken the colours' resolution from: 4:2:0 video, JPEG, webcams.
+"""Fits of edges in luma, for frames with subsampled chroma (4:2:0 video, JPEG, webcams).
 
-Codecs keep each pixel's luma, a sum of gamma's levels, but one colour for two or four pixels, often half a pixel aside.
-What all channels say of an edge is then off by up to a pixel; its luma still shows where it is.
+Codecs store luma (a weighted sum of gamma-encoded levels) for each pixel, but chroma only once per two or four pixels,
+often displaced by half a pixel. A fit to all channels then misplaces an edge by up to a pixel; a fit to luma does not.
 """
 
 import dataclasses
@@ -13,18 +13,19 @@ from holotorch.tracking.camera.strips import Sampler
 from holotorch.tracking.detection.fits import EdgeFit, fit_edges, normal_step
 
 _LUMA = np.array([0.299, 0.587, 0.114])  # of red, green and blue levels in luma, ITU-R BT.601
-_MIXES = np.stack([_LUMA, np.array([1.0, 0.0, 0.0]) - _LUMA]).astype(np.float32)  # luma, and red less luma
-_LEVEL_SD = 2.5  # of a pixel's level; fits correct it by what they leave
-_PATCH, _COARSE = 24, 0.6  # pixels, and of luma's change
-_ASIDE = 0.25  # pixels: standard deviation of where an edge of coarse colours lies
+_MIXES = np.stack([_LUMA, np.array([1.0, 0.0, 0.0]) - _LUMA]).astype(np.float32)  # luma, and red minus luma
+_LEVEL_SD = 2.5  # assumed standard deviation of a pixel's level; fits rescale it by their residuals
+_PATCH, _COARSE = 24, 0.6  # side of a patch in pixels; largest ratio to luma's change at which chroma is coarse
+_ASIDE = 0.25  # standard deviation in pixels of the error that coarse chroma adds to the position of an edge
 
 
 def coarse_colours(sampler: Sampler, pixels: Points) -> np.ndarray:
-    """Whether near pixels x + i y [n] of a frame of at least 24 x 24 colours have fewer pixels than luma: bool [n].
+    """Whether chroma has a lower resolution than luma near each of the pixels x + i y [n]: bool [n].
 
-    Noise that is each channel's own changes red less luma 1.3 times as much from pixel to pixel as luma. Where a codec
-    has halved the colours' resolution, pixels that share a colour change less than those that do not, or, smoothed,
-    all of them bend less.
+    The frame must have at least 24 x 24 pixels. With independent noise in each channel, red minus luma changes 1.4
+    times as much between neighbouring pixels as luma does. Where a codec has halved the resolution of chroma, it
+    changes less within a pair of pixels that share their chroma than between pairs; where the decoder has
+    interpolated it smoothly, its second differences are smaller than those of luma.
     """
     patches = np.empty((3, len(pixels), _PATCH, _PATCH), dtype=np.float32)
     for n, pixel in enumerate(pixels.tolist()):
@@ -40,7 +41,7 @@ def coarse_colours(sampler: Sampler, pixels: Points) -> np.ndarray:
 
 
 def _median(values: np.ndarray) -> np.ndarray:
-    """Of sizes over the last two axes; of an even number the one above the middle."""
+    """Median of the absolute values over the last two axes; for an even count the upper one."""
     flat = np.abs(values).reshape(*values.shape[:-2], -1)
     middle = flat.shape[-1] // 2
     flat.partition(middle)
@@ -50,28 +51,29 @@ def _median(values: np.ndarray) -> np.ndarray:
 def fit_luma(
     fit: EdgeFit, light: np.ndarray, shown: np.ndarray, curve: np.ndarray, t: np.ndarray | None = None
 ) -> tuple[EdgeFit, EdgeFit]:
-    """Places of edges by luma, where it tells them better than all channels did.
+    """Fit edges to luma, and use its positions where they are more precise than those of all channels.
 
-    Blur acts on light and luma is a sum of levels: an edge's luma is no error function, but follows from the light on
-    both sides, which colours' lost resolution leaves alone.
+    Blur acts on linear light, whereas luma is a sum of gamma-encoded levels, so the luma profile of a blurred edge is
+    not an error function. It is computed from the light on both sides of the edge, which chroma subsampling does not
+    change.
 
     Args:
-        fit: Of all channels, to ``light``.
-        light: [E, T, U, 3] samples, red, green and blue, 0 to 1.
-        shown: [E, T, U], how much each sample counts, 0 to 1.
-        curve: [256] light of each level, rising.
-        t: [T], where the samples lie, as of :func:`fit_edges`.
+        fit: Fit of all channels to ``light``.
+        light: [E, T, U, 3] samples of linear red, green and blue, 0 to 1.
+        shown: [E, T, U] weight of each sample, 0 to 1.
+        curve: [256] light of each level, increasing.
+        t: [T] positions of the samples, as in :func:`fit_edges`.
 
     Returns:
-        ``fit`` with place, blur and deviation, in samples, of luma or, where they are surer, of all channels; the
-        deviation of these widened. And the fit of luma alone, whose steps say how light changes across a tube, where
-        coarse colours are smeared; it tells nothing of edges that are by all channels.
+        ``fit`` with position, blur and deviation (in samples) from luma where luma is more precise, and otherwise from
+        all channels with a larger deviation. Second, the fit to luma alone: its steps describe how the light changes
+        across a tube even where coarse chroma is smeared. Its ``told`` is 0 for the edges that use all channels.
     """
     rows = shown.sum(1)[..., None]
     low, step = ((value * rows).sum(1) / np.maximum(rows.sum(1), 1e-9) for value in (fit.levels, fit.steps))  # [E, 3]
 
     levels = np.arange(256.0)
-    steep = np.gradient(levels) / np.gradient(curve.astype(np.float64))  # of levels over light
+    steep = np.gradient(levels) / np.gradient(curve.astype(np.float64))  # derivative of the level with respect to light
 
     def shape(t: np.ndarray, place: np.ndarray, sigma: np.ndarray) -> np.ndarray:
         rise, *slopes = np.moveaxis(normal_step(t, place, sigma)[..., None], 1, 0)  # [E, T, 1] each
@@ -82,7 +84,8 @@ def fit_luma(
     luma = np.interp(light, curve, levels) @ _LUMA
     weight = shown[..., None] / (_LEVEL_SD**2 * float(_LUMA @ _LUMA))
     found = fit_edges(luma[..., None], np.broadcast_to(weight, (*shown.shape, 1)), float(np.median(fit.blur)), shape, t)
-    # All channels may be off together, too, by half a pixel of the colours' and farther where they are far apart.
+    # All channels together may also be displaced, by up to half a chroma pixel, and by more where their positions
+    # disagree: their deviation is increased.
     worse = np.hypot(fit.apart * fit.deviation, _ASIDE)
     better = found.deviation < worse
     fit = dataclasses.replace(fit, deviation=worse)

@@ -1,4 +1,4 @@
-"""Rays that meet a banded tube: which part of it each one sees, and the light that comes back along it."""
+"""Ray casting of a banded tube: the part of the tube that each ray hits, and the light that returns along the ray."""
 
 import math
 from dataclasses import dataclass
@@ -12,10 +12,11 @@ from holotorch.core import checks
 from holotorch.tracking.camera.camera import Camera, srgb_to_light
 from holotorch.tracking.pose.catheter import Catheter
 
-# A lattice of 8 points in the unit square: each axis meets 8 different values, where a 3 x 3 grid would offer 3.
+# A lattice of 8 points in the unit square with 8 different values along each axis, where a 3 x 3 grid has 3.
 _LATTICE = (np.stack([np.arange(8), 3 * np.arange(8) % 8], -1) + 0.5) / 8
-_TURN = np.array([0.7548776662466927, 0.5698402909980532])  # shifts it from one place to the next, evenly (R2 sequence)
-_DARKEST = 0.25  # light on a surface that faces the camera, below which no camera makes up for it
+# Shift of the lattice from one sample to the next (R2 sequence).
+_TURN = np.array([0.7548776662466927, 0.5698402909980532])
+_DARKEST = 0.25  # the light on a surface that faces the camera is normalized to 1, unless it is below this
 
 
 def light_of(colour: tuple[int, int, int]) -> np.ndarray:
@@ -25,21 +26,21 @@ def light_of(colour: tuple[int, int, int]) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Tube:
-    """A finite cylinder in front of a camera, and how it shines.
+    """A finite cylinder in front of a camera, and how it reflects light.
 
     Attributes:
-        tip: [3] in metres, camera frame.
+        tip: [3] tip in metres, in the camera frame.
         direction: Unit vector [3] from the tip to the rear.
-        radius: In metres.
-        length: In metres.
-        edges: [N] in metres from the tip.
-        colours: Linear light, float32 [N + 1, 3], of its parts: before the first band, the bands, behind the last.
-        clear: [N + 1], share of the background that shines through the same parts.
+        radius: Radius in metres.
+        length: Length in metres.
+        edges: [N] edges of the bands in metres from the tip.
+        colours: float32 [N + 1, 3] linear light of the parts: before the first band, the bands, behind the last.
+        clear: [N + 1] share of the background that is visible through each part.
         light: Unit vector [3] towards the light.
-        ambient: Share of the light that comes from everywhere.
-        level: Of all light: 1 over that on a surface which faces the camera, so that it shows its own colour.
-        highlight: Light of the gloss.
-        highlight_width: Standard deviation of its lobe in radians.
+        ambient: Share of the light that comes equally from all directions.
+        level: Factor on all light, by which a surface that faces the camera appears in its own colour.
+        highlight: Brightness of the specular reflection.
+        highlight_width: Standard deviation of the specular lobe in radians.
     """
 
     tip: np.ndarray
@@ -56,10 +57,10 @@ class Tube:
     highlight_width: float
 
     def shine(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Light and cover, float32 [..., 4], and the part that is seen, uint8 [...], of rays (x, y, 1) as [..., 2].
+        """Light and cover, float32 [..., 4], and visible part, uint8 [...], of rays (x, y, 1), given as [..., 2].
 
-        The part is 0 where a ray passes by (or is NaN), else 1 + its row in ``colours``. Light is that of the part
-        alone, to be added to what is left of the background, 1 - cover.
+        The part is 0 where a ray misses the tube (or is NaN), else 1 + its row in ``colours``. The light is that of
+        the part alone, to be added to 1 - cover times the background.
         """
         x, y = rays[..., 0], rays[..., 1]
         tip, axis, radius = self.tip, self.direction, self.radius
@@ -71,14 +72,14 @@ class Tube:
             along, square, ahead = dot(axis), x * x + y * y + 1, float(tip @ axis)
             across = square - along * along
             # The quadratic's discriminant without cancellation: b^2 - a |A|^2 = -(v . (A x d))^2 across the axis.
-            root = np.sqrt(across * radius**2 - dot(np.cross(tip, axis)) ** 2)  # NaN: passes by
+            root = np.sqrt(across * radius**2 - dot(np.cross(tip, axis)) ** 2)  # NaN: the ray misses
             depth = (dot(tip) - along * ahead - root) / across
             place = depth * along - ahead
             hit = (depth > 0) & (place >= 0) & (place <= self.length)
             size = np.sqrt(square)
             facing = root / (radius * size)
             lit = (depth * dot(self.light) - tip @ self.light - place * (axis @ self.light)) / radius
-            if ahead > 0 or ahead < -self.length:  # one of the flat ends is turned to the camera
+            if ahead > 0 or ahead < -self.length:  # one of the flat ends faces the camera
                 end = 0.0 if ahead > 0 else self.length
                 depth = (ahead + end) / along
                 centre = tip + end * axis
@@ -97,14 +98,14 @@ class Tube:
         return seen, part
 
     def _shade(self, part: np.ndarray, facing: np.ndarray, lit: np.ndarray, light: np.ndarray) -> np.ndarray:
-        """Light and cover, float32 [n, 4], of rays that meet a part.
+        """Light and cover, float32 [n, 4], of rays that hit the tube.
 
-        ``facing``, ``lit`` and ``light`` are cosines: of the normal with the way back, of the normal with the way to
-        the light, and of the ray with the way to the light.
+        ``facing``, ``lit`` and ``light`` are cosines of angles: between the normal and the direction to the camera,
+        between the normal and the direction to the light, and between the ray and the direction to the light.
         """
         halfway = (lit + facing) / np.sqrt(np.maximum(2 - 2 * light, 1e-6))
         gloss = np.exp((np.minimum(halfway, 1) ** 2 - 1) / (2 * self.highlight_width**2))
-        # The way through a wall that is seen at a slant is longer.
+        # The path through the wall is longer at oblique incidence.
         cover = 1 - self.clear[part] ** (1 / np.maximum(facing, 0.05))
         shade = self.level * cover * (self.ambient + (1 - self.ambient) * np.maximum(lit, 0))
         seen = np.empty((len(part), 4), np.float32)
@@ -113,20 +114,20 @@ class Tube:
         return seen
 
     def outline(self, camera: Camera, size: tuple[int, int], pad: int) -> np.ndarray:
-        """Pixels that may see the tube: uint8 [H + 2 pad, W + 2 pad], 0 or 255, wider than its image on all sides."""
+        """Mask that contains the image of the tube with a margin: uint8 [H + 2 pad, W + 2 pad], 0 or 255."""
         mask = np.zeros((size[0] + 2 * pad, size[1] + 2 * pad), np.uint8)
         axis = self.tip + np.linspace(0, self.length, 256)[:, None] * self.direction
         beside = np.cross(self.tip, self.direction)
-        if np.linalg.norm(beside) < 1e-6:  # it points at the camera: any normal will do
+        if np.linalg.norm(beside) < 1e-6:  # it points at the camera: any normal is suitable
             beside = np.cross(self.direction, np.eye(3)[np.argmin(np.abs(self.direction))])
         beside *= self.radius / np.linalg.norm(beside)
         over = np.cross(self.direction, beside)
         rings = np.stack([axis, axis + beside, axis - beside, axis + over, axis - over])
         pixels = camera.project(torch.from_numpy(rings)).detach().numpy()
-        # The image of a ring is an ellipse within the root of the squares of any two conjugate half axes.
+        # The image of a ring is an ellipse; two conjugate half axes a, b bound its radius by sqrt(a^2 + b^2).
         wide = 1.05 * np.linalg.norm(pixels[1::2] - pixels[0], axis=(0, -1)) + 1
         for start, end, half in zip(pixels[0, :-1] + pad, pixels[0, 1:] + pad, wide, strict=False):
-            if np.abs([*start, *end, half]).max() < 1e6:  # not NaN: behind the camera or too far aside
+            if np.abs([*start, *end, half]).max() < 1e6:  # else NaN: behind the camera or too far aside
                 first, last = ([round(16 * float(value)) for value in point] for point in (start, end))
                 cv2.line(mask, first, last, 255, min(2 * math.ceil(half), 32767), cv2.LINE_8, 4)
         return mask
@@ -143,11 +144,11 @@ def tube_of(
     colour: tuple[int, int, int],
     opacity: float,
 ) -> Tube:
-    """A catheter at a pose as a :class:`Tube`; ``highlight`` is (light, width), ``colour`` that outside the bands.
+    """Tube of a catheter at a pose; ``highlight`` is (brightness, width), ``colour`` is the colour outside the bands.
 
     Raises:
-        TypeError, ValueError: No vectors of 3 finite numbers, a direction that is no unit vector, or a tube that comes
-            so close to the camera that its image has no bounds.
+        TypeError, ValueError: ``tip`` or ``direction`` is not a vector of 3 finite numbers, ``direction`` is not a unit
+            vector, or the tube comes within 10 radii of the camera.
     """
     vectors = []
     for name, value in (("tip", tip), ("direction", direction)):
@@ -181,19 +182,19 @@ def tube_of(
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays of pixels: through the centre, and how they change from a pixel to the next on the right and below.
+    """Rays (x, y, 1) through pixel centres, and their changes to the next pixel on the right and below.
 
-    Distortion bends so little within a pixel that a straight line is good to 2e-5 pixels.
+    Distortion is nearly linear within a pixel: this approximation is accurate to 2e-5 pixels.
     """
 
-    index: np.ndarray  # int32, over the padded frame: row in the arrays below, -1 for none
+    index: np.ndarray  # int32 [H + 2 pad, W + 2 pad]: row in the arrays below, -1 for none
     centre: np.ndarray  # [n, 2]
     right: np.ndarray
     down: np.ndarray
 
     @staticmethod
     def of(camera: Camera, mask: np.ndarray, pad: int) -> "Rays":
-        """Those of the pixels that ``mask`` of the padded frame marks."""
+        """Rays of the pixels where ``mask`` of the padded frame is not 0."""
         found = cv2.findNonZero(mask)
         x, y = np.asarray([] if found is None else found, dtype=np.intp).reshape(-1, 2).T
         index = np.full(mask.shape, -1, np.int32)
@@ -204,14 +205,14 @@ class Rays:
         return Rays(index, plane[0], 2 * (plane[1] - plane[0]), 2 * (plane[2] - plane[0]))
 
     def at(self, row: np.ndarray, offset: np.ndarray) -> np.ndarray:
-        """Rays [..., 2] at an ``offset`` [..., 2] in pixels, (x, y), from the centres of pixels ``row`` [...]."""
+        """Rays [..., 2] at ``offset`` [..., 2] (x, y) in pixels from the centres of pixels ``row`` [...]."""
         return self.centre[row] + self.right[row] * offset[..., :1] + self.down[row] * offset[..., 1:]
 
 
 def cast(tube: Tube, rays: Rays, window: tuple[slice, slice], fine: int) -> np.ndarray:
-    """Light and cover, float32 [h fine, w fine, 4], of a window of the padded frame, ``fine`` samples a pixel's side.
+    """Light and cover, float32 [h fine, w fine, 4], of a window of the padded frame, fine^2 samples a pixel.
 
-    One ray for each sample, 8 where its neighbours see other parts of the tube.
+    Each sample is one ray, or the mean of 8 rays where a neighbouring sample shows another part of the tube.
     """
     index = rays.index[window]
     height, width = index.shape
@@ -227,7 +228,7 @@ def cast(tube: Tube, rays: Rays, window: tuple[slice, slice], fine: int) -> np.n
     rim &= np.repeat(np.repeat(index >= 0, fine, 0), fine, 1)
     y, x = np.nonzero(rim)
     corner = np.stack([x % fine, y % fine], -1) / fine - 0.5
-    # Counted from the frame's corner: the same place has the same rays whatever the window.
+    # Count from the corner of the frame, so that the rays of a sample do not depend on the window.
     across, down = x + fine * window[1].start, y + fine * window[0].start
     turn = np.stack([across * _TURN[0] + down * _TURN[1], across * _TURN[1] + down * _TURN[0]], -1)[:, None]
     offset = corner[:, None] + (_LATTICE + turn) % 1 / fine

@@ -18,7 +18,7 @@ from holotorch.tracking.simulation.exposure import sensed
 
 Colour = tuple[int, int, int]
 _FINE = 4  # samples along a pixel's side before the blur; a sample on an edge has 8 rays
-_TILE = 96  # side of a tile, which is ray-cast and blurred at a time, in pixels
+_TILE = 96  # largest side in pixels of a tile; tiles are cast and blurred one at a time
 _LARGEST = 8192  # largest side of a frame in pixels
 
 
@@ -54,8 +54,8 @@ class Look:
     Attributes:
         background: Image uint8 [3, H, W] of the scene without the catheter, already blurred by the lens, or one colour.
         gain: Factor on all light, as from the exposure.
-        light: Direction towards the light in the camera's coordinates; its length does not matter. Its strength shows a
-            surface that faces the camera, such as the background, in its own colour, with a factor of at most four.
+        light: Direction towards the light in the camera's coordinates; its length does not matter. Its strength is such
+            that a surface that faces the camera appears in its own colour, with a factor of at most four.
         ambient: Share of the light that comes equally from all directions, 0 to 1.
         ramp: Relative change of all light from the centre of the frame to its right and to its lower border.
         highlight: Brightness of the specular reflection of the tube; 1 is that of white paper.
@@ -123,24 +123,25 @@ def render(
     *,
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """Frame uint8 [3, H, W], RGB, of a catheter whose tip is at ``tip``; synthetic, made on the CPU.
+    """Render a synthetic RGB frame, uint8 [3, H, W], of a catheter at a pose, on the CPU.
 
-    Rays through each sample of a pixel, undistorted, meet the cylinder exactly, so that outline, ring curvature and
-    foreshortening are those of the camera. All light adds up linearly; then come motion, the lens's point spread, the
-    sensor's square pixels, the tone curve, noise, rounding and compression, in this order. No edge is drawn from a
-    formula: how much of a pixel is covered comes from counting rays, 128 in those on an edge.
+    The rays of each pixel's samples are undistorted and intersected exactly with the cylinder, so that outline,
+    curvature of rings and foreshortening are correct. Light adds up linearly. Motion, the lens's point spread, the
+    sensor's square pixels, tone curve, noise, rounding and compression follow in this order. The covered share of a
+    pixel is the share of its rays that hit the tube, of 128 rays on an edge.
 
     Args:
-        catheter: None for a scene without one; ``tip`` and ``direction`` are then not read.
-        camera: Its intrinsics fit ``size``.
-        tip: [3] in metres, camera frame.
+        catheter: Catheter; None for a scene without one, which ignores ``tip`` and ``direction``.
+        camera: Camera with intrinsics for frames of ``size``.
+        tip: [3] tip in metres, in the camera frame.
         direction: Unit vector [3] from the tip to the rear.
         size: (H, W) in pixels.
-        look: Everything else; None for the defaults.
-        generator: Of the noise, on the CPU.
+        look: Appearance and image errors; None for the defaults.
+        generator: Random generator of the noise, on the CPU.
 
     Raises:
-        TypeError, ValueError: Shapes, NaN, a direction that is no unit vector, a tube that touches the camera.
+        TypeError, ValueError: Wrong shapes, NaN, ``direction`` is not a unit vector, or the tube is too close to the
+            camera.
     """
     look = look or Look()
     levels = mean_levels(catheter, camera, (tip, direction), size, look)
@@ -154,9 +155,9 @@ def mean_levels(
     size: tuple[int, int],
     look: Look,
 ) -> np.ndarray:
-    """Levels float32 [3, H, W], neither noisy nor rounded, of the frame that :func:`render` makes of the same.
+    """Levels float32 [3, H, W] of the frame that :func:`render` makes, before noise, rounding and compression.
 
-    ``pose`` are tip and direction, as there; so are the errors raised.
+    ``pose`` is (tip, direction). The other arguments and the errors are those of :func:`render`.
     """
     height, width = (checks.whole("size", side, 8) for side in size)
     if max(size) > _LARGEST:
@@ -181,14 +182,14 @@ def mean_levels(
 
 
 def _backdrop(look: Look, camera: Camera, size: tuple[int, int]) -> np.ndarray:
-    """Levels of the background, float32 [3, H, W], not rounded."""
+    """Levels of the background, float32 [3, H, W], before rounding."""
     light = look.gain * camera.table().cpu()
     image = _image(look, size).numpy().reshape(-1, size[1])
     if not any(look.ramp):
         table = camera.levels(light).to(torch.float32).numpy()
         return cv2.LUT(image, table.reshape(1, 256)).reshape(3, *size)
     lit = cv2.LUT(image, light.numpy().reshape(1, 256)).reshape(3, *size) * _ramp(look, size)
-    # The tone curve as a table: 65536 steps are a twentieth of a level where sRGB is steepest.
+    # Tone curve as a table of 65536 entries, a twentieth of a level apart where sRGB is steepest.
     table = camera.levels(torch.linspace(0, 1, 65536, dtype=torch.float64)).to(torch.float32).numpy()
     return table[(np.clip(lit, 0, 1) * 65535 + 0.5).astype(np.uint16)]
 
@@ -200,20 +201,20 @@ def _image(look: Look, size: tuple[int, int]) -> Tensor:
 
 
 def _ramp(look: Look, size: tuple[int, int]) -> np.ndarray:
-    """Factor on the light, float32 [H, W]."""
+    """Factor of ``look.ramp`` on the light, float32 [H, W]."""
     down, right = (np.linspace(-1, 1, side, dtype=np.float32) for side in size)
     return 1 + look.ramp[0] * right + look.ramp[1] * down[:, None]
 
 
 def _draw(frame: np.ndarray, look: Look, camera: Camera, tube: Tube | None) -> None:
-    """Put tube and occluders into levels [3, H, W], tile by tile: only what they touch is cast, blurred and changed."""
+    """Draw tube and occluders into levels [3, H, W], in place, in tiles that cover the pixels they affect."""
     size = (frame.shape[1], frame.shape[2])
     pad = math.ceil(4 * look.blur_px + math.hypot(*look.motion_px) / 2) + 1
     mask = np.zeros([side + 2 * pad for side in size], np.uint8) if tube is None else tube.outline(camera, size, pad)
     rays = Rays.of(camera, mask, pad)
     for occluder in look.occluders:
         cv2.fillPoly(mask, [_corners(occluder, pad, 1)], 255, cv2.LINE_8, 4)
-    # Where what lies in the mask can shine to, in frame coordinates.
+    # Pixels of the frame that the blur and motion of the masked pixels reach.
     touched = cv2.dilate(mask, np.ones((2 * pad + 1, 2 * pad + 1), np.uint8))[pad:-pad, pad:-pad]
     image, ramp = _image(look, size), _ramp(look, size) if any(look.ramp) else None
     for tile in _tiles(touched):
@@ -237,7 +238,7 @@ def _draw(frame: np.ndarray, look: Look, camera: Camera, tube: Tube | None) -> N
 
 
 def _tiles(touched: np.ndarray) -> Iterator[tuple[slice, slice]]:
-    """Rectangles of at most _TILE pixels a side that hold all that is marked."""
+    """Rectangles of at most _TILE pixels a side that cover all marked pixels."""
     for top in range(0, touched.shape[0], _TILE):
         band = touched[top : top + _TILE]
         for left in range(0, touched.shape[1], _TILE):
@@ -247,12 +248,12 @@ def _tiles(touched: np.ndarray) -> Iterator[tuple[slice, slice]]:
 
 
 def _corners(occluder: Occluder, shift: float, scale: int) -> np.ndarray:
-    """Corners on samples ``scale`` times as fine, in sixteenths, as cv2 takes them."""
+    """Corners in sixteenths of a sample for cv2, shifted by ``shift`` pixels; a pixel has ``scale`` samples a side."""
     return np.round(((np.asarray(occluder.corners) + shift + 0.5) * scale - 0.5) * 16).astype(np.int32)
 
 
 def _cover(fine: np.ndarray, occluder: Occluder, origin: tuple[int, int]) -> None:
-    """Lay an occluder over light and cover [h, w, 4] whose first pixel is ``origin`` (x, y), in place."""
+    """Draw an occluder over light and cover [h, w, 4] of a window with first pixel ``origin`` (x, y), in place."""
     corners = _corners(occluder, 0.0, _FINE) - 16 * _FINE * np.array(origin, np.int32)
     low, high = corners.min(0) // 16 - 1, corners.max(0) // 16 + 3
     part = fine[max(low[1], 0) : max(high[1], 0), max(low[0], 0) : max(high[0], 0)]
@@ -266,7 +267,7 @@ def _cover(fine: np.ndarray, occluder: Occluder, origin: tuple[int, int]) -> Non
 
 
 def _streak(motion: tuple[float, float]) -> np.ndarray:
-    """Kernel of a straight path at constant speed, on fine samples, sum 1, centred."""
+    """Centred kernel, of sum 1, of a straight path at constant speed; ``motion`` in pixels, kernel in fine samples."""
     side = math.ceil(_FINE * max(map(abs, motion)) / 2) + 1
     kernel = np.zeros((2 * side + 1, 2 * side + 1), np.float32)
     steps = 8 * side
@@ -280,7 +281,7 @@ def _streak(motion: tuple[float, float]) -> np.ndarray:
 
 @lru_cache(maxsize=256)
 def _lens(blur_px: float, count: int, pad: int) -> np.ndarray:
-    """Point spread and square pixel along one axis: float32 [count, (count + 2 pad) _FINE], rows of sum 1."""
+    """Matrix float32 [count, (count + 2 pad) _FINE] of point spread and square pixels along one axis; rows sum to 1."""
     half = _FINE * pad
     spread = np.exp(-0.5 * (np.arange(-half, half + 1) / (_FINE * max(blur_px, 1e-6))) ** 2)
     kernel = np.convolve(spread / spread.sum(), np.full(_FINE, 1 / _FINE))  # 2 half + _FINE values

@@ -1,6 +1,6 @@
-"""What the thesis's pipeline decides besides image processing: colour windows, oriented Sobel, which edge is which.
+"""Parts of the thesis's pipeline besides image processing: thresholds, oriented Sobel kernel, assignment of edges.
 
-Shared by ``ThesisTracker`` (kornia) and its twin in OpenCV, so that both refuse alike.
+``ThesisTracker`` (kornia) and its counterpart in OpenCV share them, so that both refuse the same frames.
 """
 
 import colorsys
@@ -16,8 +16,8 @@ from torch import Tensor
 from holotorch.tracking.pose.catheter import Catheter
 from holotorch.tracking.pose.status import Pose, Refusal, Status
 
-# The rows of Table 3.1, in its order and words. The median belongs to "Gradient", the binary image to "Connected
-# components"; "Other" is what the call takes beyond the stages.
+# The rows of Table 3.1, in its order and words. "Gradient" includes the median, "Connected components" the binary
+# image; "Other" is the rest of the time of a call.
 STAGES: tuple[str, ...] = (
     "Undistort",
     "Color segmentation",
@@ -32,33 +32,34 @@ STAGES: tuple[str, ...] = (
 
 # The thesis gives no numbers for its thresholds; these make its method run on synthetic frames.
 HUE_REACH = 15.0  # degrees to either side of a band's hue
-LEAST_SATURATION, LEAST_VALUE = 0.55, 0.3  # of the palest and of the darkest band
-LEAST_PIXELS = 30  # of the catheter, and a fifth of it of each band, after the erosion
-AXIS_ROUNDS = 6  # of leaving out the pixels far from the line and fitting the others
-AXIS_REACH_PX = 3.0  # pixels further from the axis than this and than twice the rms do not take part in the next fit
-AXIS_RMS_PX = 4.0  # the pixels that are left are a line no wider than this
-AXIS_SHARE = 0.5  # and are this share of all
+LEAST_SATURATION, LEAST_VALUE = 0.55, 0.3  # relative to the least saturation and value of the bands' colours
+LEAST_PIXELS = 30  # least number of pixels after the erosion: of the catheter, and a fifth of it for each band
+AXIS_ROUNDS = 6  # most rounds of removing pixels far from the line and fitting it again
+AXIS_REACH_PX = 3.0  # pixels farther from the axis than this and than twice the rms are left out of the next fit
+AXIS_RMS_PX = 4.0  # largest rms distance of the remaining pixels from the axis
+AXIS_SHARE = 0.5  # least share of the pixels that must remain
 KERNEL_RADIUS, ALONG_PX, ACROSS_PX = 4, 1.2, 1.5
 MEDIAN = 3
-LEAST_GRADIENT = 25.0  # levels between the two sides of a border
-MARGIN_PX = 16  # around the pixels of the bands: room for the kernel and for the ends that the erosion took
+LEAST_GRADIENT = 25.0  # least difference in levels between the two sides of an edge
+MARGIN_PX = 16  # margin around the bands' pixels, for the kernel and the ends removed by the erosion
 OFF_AXIS_PX = 3.0
-OFF_BORDER_PX, OFF_BORDER_SHARE = 6.0, 0.1  # from where the colours change, in pixels and of a band's length
-DEVIATION_PX = 0.3  # of an endpoint, stated
-NUDGE_PX = 1e-4  # of an endpoint, to see where its pose goes
+# Largest distance of an edge from the change of colour: pixels plus share of a band.
+OFF_BORDER_PX, OFF_BORDER_SHARE = 6.0, 0.1
+DEVIATION_PX = 0.3  # assumed standard deviation of an endpoint in x and y
+NUDGE_PX = 1e-4  # step of an endpoint for the numerical derivatives of the pose
 NO_POSE = "the endpoints are not the image of the bands in front of the camera"
 REFUSED_AT = {
     Status.EDGES_UNCLEAR: "Calculate catheter position",
     Status.INCONSISTENT: "Calculate catheter position",
 }
 
-Box = tuple[int, int, int, int]  # left, top, right, bottom; the last two are not part of it
+Box = tuple[int, int, int, int]  # left, top, right, bottom; the last two are exclusive
 Endpoints = list[tuple[float, float] | None]
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Thresholds in hue (degrees, one per band), saturation and value (0 to 1) that a catheter's colours imply."""
+    """Thresholds from a catheter's colours: hues (degrees, one per band), tolerance, saturation and value."""
 
     hues: tuple[float, ...]
     reach: float
@@ -70,7 +71,7 @@ def windows(catheter: Catheter) -> Windows:
     """Hue, saturation and value windows around the bands' colours.
 
     Raises:
-        ValueError: Colours that a hue cannot tell apart: a pale one, or two hues less than 20 degrees apart.
+        ValueError: A colour is pale or dark, or two hues are less than 20 degrees apart.
     """
     colours = [colorsys.rgb_to_hsv(*(level / 255 for level in colour)) for colour in catheter.colours]
     hues = [360 * hue for hue, _, _ in colours]
@@ -94,8 +95,8 @@ def windows(catheter: Catheter) -> Windows:
 def oriented_sobel(x: float, y: float) -> np.ndarray:
     """Derivative along the unit vector (x, y), smoothed more across it than along: float32 [9, 9], for correlation.
 
-    A step of one level across the axis's direction answers with one level at most. Source: K_Laxis of Sec. 3.4.3; its
-    weights are not given there and are Gaussian here.
+    The largest response to a step of one level along (x, y) is one level. Source: K_Laxis of Sec. 3.4.3, which does not
+    give the weights; here they are Gaussian.
     """
     steps = np.arange(-KERNEL_RADIUS, KERNEL_RADIUS + 1, dtype=np.float64)
     along = x * steps[None, :] + y * steps[:, None]
@@ -106,14 +107,14 @@ def oriented_sobel(x: float, y: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Axis:
-    """The fitted line in pixels of the undistorted frame, and where each band's pixels lie along it."""
+    """Fitted line in pixels of the undistorted frame, and the range of each band's pixels along it."""
 
     origin: tuple[float, float]
     direction: tuple[float, float]
-    extents: tuple[tuple[float, float] | None, ...]  # first and last place along the axis; None: too few pixels
+    extents: tuple[tuple[float, float] | None, ...]  # first and last position; None: too few pixels
 
     def along(self, x: float, y: float) -> float:
-        """Place of a pixel along the axis, from its origin."""
+        """Position of a pixel along the axis, from its origin."""
         return (x - self.origin[0]) * self.direction[0] + (y - self.origin[1]) * self.direction[1]
 
     def across(self, x: float, y: float) -> float:
@@ -122,7 +123,7 @@ class Axis:
 
 
 def need_frames(frames: Tensor) -> None:
-    """Raise unless ``frames`` is uint8 [B, 3, H, W] of at least 32 pixels to a side."""
+    """Raise TypeError or ValueError unless ``frames`` is uint8 [B, 3, H, W] with H, W >= 32."""
     if not isinstance(frames, Tensor) or frames.dtype != torch.uint8:
         raise TypeError(f"frames must be a tensor of uint8, got {getattr(frames, 'dtype', type(frames))}")
     if frames.ndim != 4 or frames.shape[1] != 3 or not len(frames) or min(frames.shape[-2:]) < 32:
@@ -130,18 +131,18 @@ def need_frames(frames: Tensor) -> None:
 
 
 def missing_edges(names: Sequence[str]) -> str:
-    """Reason of an answer in which these edges had no endpoint; "" for none."""
+    """Reason stated with a pose for which these edges were not found; "" for none."""
     return f"edges not found, pose from the others: {', '.join(names)}" if names else ""
 
 
 def need_pixels(count: int) -> None:
-    """Refuse a frame with fewer pixels of the bands' colours than a line can be fitted to."""
+    """Raise a Refusal if too few pixels have a band's colour to fit a line."""
     if count < LEAST_PIXELS:
         raise Refusal(Status.NO_CATHETER, f"{count} pixels have a band's colour after the erosion, not {LEAST_PIXELS}")
 
 
 def need_line(count: int, kept: int, rms_px: float) -> None:
-    """Refuse pixels that are no line: ``kept`` of ``count`` near the axis, ``rms_px`` from it."""
+    """Raise a Refusal if the pixels form no line: ``kept`` of ``count`` are near the axis, ``rms_px`` from it."""
     if kept < max(LEAST_PIXELS, AXIS_SHARE * count) or not rms_px <= AXIS_RMS_PX:
         raise Refusal(
             Status.NO_AXIS,
@@ -150,7 +151,7 @@ def need_line(count: int, kept: int, rms_px: float) -> None:
 
 
 def need_order(axis: Axis) -> None:
-    """Refuse unless two neighbouring bands are seen and all that are seen lie in the catheter's order."""
+    """Raise a Refusal unless two neighbouring bands are visible and all visible bands have the catheter's order."""
     seen = [(i, extent[0] + extent[1]) for i, extent in enumerate(axis.extents) if extent is not None]
     names = ", ".join(str(i + 1) for i, _ in seen) or "none"
     if not any(b[0] == a[0] + 1 for a, b in zip(seen, seen[1:], strict=False)):
@@ -160,10 +161,13 @@ def need_order(axis: Axis) -> None:
 
 
 def endpoints(axis: Axis, centroids: Sequence[tuple[float, float]]) -> Endpoints:
-    """Centroid that is each edge of the bands, in the catheter's order; None where there is none.
+    """Centroid of each edge of the bands, in the catheter's order; None where there is none.
 
-    An edge is looked for where the pixels of the bands beside it end: half way between the two colours, or at the far
-    end of the one that is seen. Refuses unless two neighbouring bands have all three.
+    The expected position of an edge is halfway between the pixels of the two bands beside it, or at the end of the
+    pixels of one band if the other is missing. The nearest centroid within a tolerance is taken.
+
+    Raises:
+        Refusal: No two neighbouring bands have all three edges.
     """
     extents = axis.extents
     middles = [sum(extent) for extent in extents if extent is not None]
@@ -186,7 +190,7 @@ def endpoints(axis: Axis, centroids: Sequence[tuple[float, float]]) -> Endpoints
 
 
 def triples(found: Endpoints) -> list[int]:
-    """First edges of the pairs of neighbouring bands whose three endpoints were found."""
+    """Indices of the first edge of each pair of neighbouring bands whose three endpoints were found."""
     return [i for i in range(len(found) - 2) if None not in found[i : i + 3]]
 
 
@@ -198,14 +202,14 @@ def box(first: Sequence[int], last: Sequence[int], size: tuple[int, int]) -> Box
 
 
 def nudged(found: Endpoints) -> np.ndarray:
-    """Endpoints as float64 [1 + 2 n, n, 2], NaN for None: as they are, then with each number moved by ``NUDGE_PX``."""
+    """Endpoints float64 [1 + 2 n, n, 2], NaN for None: unchanged, then with each number changed by ``NUDGE_PX``."""
     edges = np.array([spot or (np.nan, np.nan) for spot in found])
     nudges = np.concatenate([np.zeros((1, edges.size)), NUDGE_PX * np.eye(edges.size)])
     return edges + nudges.reshape(-1, *edges.shape)
 
 
 def answer(found: Endpoints, tip: np.ndarray, direction: np.ndarray, device: torch.device | None = None) -> Pose:
-    """Pose from the tips and directions [1 + 2 n, 3] of the :func:`nudged` endpoints; refuses what is none."""
+    """Pose from the tips and directions [1 + 2 n, 3] of :func:`nudged` endpoints; raises a Refusal if invalid."""
     both = np.concatenate([tip, direction], -1)
     slopes = (both[1:] - both[0]).T / NUDGE_PX
     covariance = DEVIATION_PX**2 * slopes @ slopes.T
@@ -225,7 +229,7 @@ def answer(found: Endpoints, tip: np.ndarray, direction: np.ndarray, device: tor
 
 
 class Stopwatch:
-    """Seconds of each stage of one call, by name; ``wait`` runs before each look at the clock."""
+    """Seconds of each stage of one call, by name; ``wait`` is called before each reading of the clock."""
 
     def __init__(self, wait: Callable[[], None] | None = None):
         self.times: dict[str, float] = dict.fromkeys(STAGES, 0.0)
@@ -239,7 +243,7 @@ class Stopwatch:
         self._last = now
 
     def stop(self) -> dict[str, float]:
-        """Seconds by stage, what is left of the whole call as "Other"."""
+        """Seconds of each stage; "Other" is the rest of the call."""
         self.times["Other"] = 0.0
         self.times["Other"] = max(0.0, self._now() - self._start - math.fsum(self.times.values()))
         return self.times

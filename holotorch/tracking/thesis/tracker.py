@@ -18,32 +18,33 @@ from holotorch.tracking.thesis.stages import Axis, Box, Endpoints, Stopwatch
 
 
 class ThesisTracker:
-    """Pose of a banded catheter in frames of one camera, by the method of the thesis and no better.
+    """Pose of a banded catheter in frames of one camera, by the unimproved method of the thesis.
 
-    Stages: undistort the whole frame; threshold hue, saturation and value; erode; fit a line to the pixels that are
-    left (the axis); gradient along it by an oriented Sobel, median; threshold and connected components; their weighted
-    centroids are the endpoints of the bands; closed-form pose of each pair of neighbouring bands, averaged.
+    Stages: undistort the whole frame; threshold hue, saturation and value; erode; fit a line (the axis) to the
+    remaining pixels; compute the gradient along it with an oriented Sobel kernel and a median filter; threshold it and
+    label connected components. The weighted centroids of the components are the endpoints of the bands. The pose is the
+    mean of the closed-form poses of all pairs of neighbouring bands.
 
-    Known to fail, as the method does: it answers for narrow coloured papers in a row, takes an occluded end of a band
-    for the end, and refuses distant catheters whose bands the erosion removes and clutter in the bands' colours. An
-    answer is OK when all edges were found, UNVERIFIED when some are missing; nothing checks it in either case
-    (``freedom`` is 0). Its covariance is that of endpoints 0.3 px off in x and y, carried through the closed form.
+    Known failures of the method: it gives a pose for narrow coloured papers in a row, takes the border of an occluder
+    for the end of a band, and refuses distant catheters, whose bands the erosion removes, and clutter in the bands'
+    colours. The status is OK if all edges were found and UNVERIFIED if some are missing; the pose is not checked in
+    either case (``freedom`` is 0). The covariance is propagated from errors of the endpoints of 0.3 px in x and y.
 
-    On a CPU this takes about eight times as long as the same stages in OpenCV, which are the baseline to compare times
-    with (holotorch.experiments.tracking_benchmark.thesis_opencv). It needs about 0.2 GB per 1080p frame of the batch.
+    On a CPU this takes about eight times as long as the same stages in OpenCV, which are the reference for times
+    (holotorch.experiments.tracking_benchmark.thesis_opencv). It needs about 0.2 GB per 1080p frame of the batch.
 
     Args:
         camera: Intrinsics.
-        catheter: What to look for.
+        catheter: Catheter to track.
         channels: Order of the frames' channels.
 
     Attributes:
         times: Seconds of each stage of the last call, by the names of Table 3.1; all frames of the batch together.
-        endpoints: Of each frame of the last call, the bands' edges (x, y) in pixels of the undistorted frame, in the
-            catheter's order, None where not found; an empty list where the frame was refused before.
+        endpoints: For each frame of the last call, the bands' edges (x, y) in pixels of the undistorted frame, in the
+            catheter's order, None where not found; an empty list if an earlier stage refused the frame.
 
     Raises:
-        ValueError: Colours that thresholds in hue cannot tell apart.
+        ValueError: Thresholds in hue cannot distinguish the colours.
 
     Source: Sec. 3.4 and Table 3.1 of the thesis, with its equations 3.5 to 3.12 corrected.
     """
@@ -53,7 +54,7 @@ class ThesisTracker:
         self.times: dict[str, float] = dict.fromkeys(stages.STAGES, 0.0)
         self.endpoints: list[Endpoints] = []
         self._windows = stages.windows(catheter)
-        self._pinhole = Camera(camera.matrix.detach(), torch.zeros(5))  # of the undistorted frames
+        self._pinhole = Camera(camera.matrix.detach(), torch.zeros(5))  # camera of the undistorted frames
         self._map = torch.empty(0, 0, 2)
 
     @torch.no_grad()
@@ -61,7 +62,7 @@ class ThesisTracker:
         """Pose in metres, or refusal, of each frame of uint8 [B, 3, H, W].
 
         Raises:
-            TypeError, ValueError: Not such a tensor.
+            TypeError, ValueError: ``frames`` is not such a tensor.
         """
         stages.need_frames(frames)
         self.camera.need_size(frames)
@@ -102,7 +103,7 @@ class ThesisTracker:
         return [pose for pose in poses if pose is not None]
 
     def _undistorted(self, frames: Tensor) -> Tensor:
-        """Frames 0 to 1, float32, seen by a camera with the same matrix and no distortion; black beyond its radius."""
+        """Frames float32, 0 to 1, of the same camera without distortion; black beyond its valid radius."""
         height, width = frames.shape[-2:]
         if self._map.shape[:2] != (height, width) or self._map.device != frames.device:
             y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
@@ -115,7 +116,7 @@ class ThesisTracker:
         return remap(frames.to(torch.float32) / 255, x, y, align_corners=True)
 
     def _segmented(self, image: Tensor) -> Tensor:
-        """Number of the band, from 1, whose colour each pixel has, 0 for none: uint8 [B, 1, H, W]."""
+        """Number (from 1) of the band whose colour each pixel has, or 0: uint8 [B, 1, H, W]."""
         hue, saturation, value = rgb_to_hsv(image).split(1, 1)
         hue = torch.rad2deg(hue)
         coloured = (saturation >= self._windows.saturation) & (value >= self._windows.value)
@@ -126,7 +127,7 @@ class ThesisTracker:
         return bands
 
     def _axis(self, solid: Tensor, bands: Tensor) -> tuple[Axis, Box]:
-        """Line through the pixels [H, W] that the erosion left, without those far from it, and the box around them."""
+        """Line through the pixels [H, W] left by the erosion, except those far from it; and their box."""
         rows, columns = torch.nonzero(solid, as_tuple=True)
         stages.need_pixels(len(rows))
         points, numbers = torch.stack([columns, rows], -1).to(torch.float64), bands[rows, columns]
@@ -157,9 +158,9 @@ class ThesisTracker:
         return axis, stages.box(first, last, (solid.shape[1], solid.shape[0]))
 
     def _gradient(self, image: Tensor, axes: dict[int, tuple[Axis, Box]]) -> tuple[Tensor, list[tuple[int, int]]]:
-        """Greatest change of the three colours along each axis in levels, [n, 1, h, w], and each crop's left and top.
+        """Largest gradient of the three colours along each axis in levels, [n, 1, h, w], and left and top of each crop.
 
-        All crops have the size of the largest box, so that one call filters each with its own kernel.
+        All crops have the size of the largest box, so that one call filters each with its kernel.
         """
         boxes = [box for _, box in axes.values()]
         height, width = max(box[3] - box[1] for box in boxes), max(box[2] - box[0] for box in boxes)
@@ -173,7 +174,7 @@ class ThesisTracker:
         return median_blur(change, stages.MEDIAN), corners
 
     def _inside(self, axes: dict[int, tuple[Axis, Box]], corners: list[tuple[int, int]], crops: Tensor) -> Tensor:
-        """Which pixels of each crop lie in its own box."""
+        """Mask of the pixels of each crop that lie in the box of its frame."""
         inside = torch.zeros_like(crops, dtype=torch.bool)
         for row, ((_, box), (x, y)) in enumerate(zip(axes.values(), corners, strict=True)):
             inside[row, :, box[1] - y : box[3] - y, box[0] - x : box[2] - x] = True
@@ -192,7 +193,7 @@ class ThesisTracker:
 
 
 def _line(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Point [2] and unit direction [2] of the line with the least squares across it."""
+    """Point [2] and unit direction [2] of the line with the least squared distances."""
     line = fit_line(points[None])
     return line.origin[0], line.direction[0]
 
@@ -203,7 +204,7 @@ def _across(points: Tensor, origin: Tensor, direction: Tensor) -> Tensor:
 
 
 def _centroids(gradient: Tensor, labels: Tensor, corners: list[tuple[int, int]]) -> list[list[tuple[float, float]]]:
-    """Weighted centres (x, y) in the frame of the components of each crop [n, 1, h, w]."""
+    """Weighted centroids (x, y), in pixels of the frame, of the components in each crop [n, 1, h, w]."""
     crop, _, rows, columns = torch.nonzero(labels, as_tuple=True)
     spots: list[list[tuple[float, float]]] = [[] for _ in corners]
     if not len(crop):

@@ -80,9 +80,9 @@ class SimulationSettings(Settings):
     and 80 deg differ by 150 ms (thesis Sec. 2.4.2). ``slope_spread``, ``scale_spread``, ``local_spread``: standard
     deviations of the logarithms of a participant's slope, of all scales of a participant, and of the scale at each
     eccentricity. ``time_spread``: standard deviation of a participant's times in seconds. ``trial``: standard deviation
-    of a single reaction time in seconds, a Gaussian plus an exponential; ``gaussian``: the Gaussian's share of it.
-    ``miss``: share of missed targets. ``false_alarm``: share of answered distractions. ``lapse``: share of answers that
-    are delayed by up to 1.5 s.
+    of a single reaction time in seconds, a Gaussian plus an exponential. ``gaussian``: standard deviation of the
+    Gaussian as a share of ``trial``. ``miss``: share of missed targets. ``false_alarm``: share of answered
+    distractions. ``lapse``: share of answers that are delayed by up to 1.5 s.
     """
 
     participants: Annotated[Count, Field(le=100_000)] = 40
@@ -113,8 +113,8 @@ class SimulationSettings(Settings):
 class PowerSettings(Settings):
     """Simulated studies that determine how often a slope, in degrees per degree, is found to differ from 0.
 
-    ``studies``: number of simulated studies per slope. ``participants``: sizes of these studies. The lines of all
-    slopes have the scale of the simulation in the middle of ``range_deg``.
+    ``studies``: number of simulated studies per slope. ``participants``: numbers of participants of these
+    studies. The lines of all slopes have the simulation's scale in the middle of ``range_deg``.
     """
 
     slopes: Annotated[tuple[Annotated[Number, Field(ge=0, lt=5)], ...], BeforeValidator(several), Field(min_length=1)]

@@ -26,7 +26,7 @@ class Responses:
         participant: Number of the participant.
         eccentricity_deg: Eccentricity of the pattern.
         size_deg: Size of the pattern.
-        target: Whether the pattern was the target, which is to be answered.
+        target: Whether the pattern was the target, which should be answered.
         reaction_s: Reaction time in seconds; NaN without an answer.
         frame_s: Frame interval of the display in seconds.
         simulated: Whether the answers are simulated.
@@ -119,7 +119,7 @@ class Times:
 
 
 def perception_times(responses: Responses, rule: CleaningSettings) -> Times:
-    """Clean the answers by the rule and take medians.
+    """Remove invalid answers by the rule, and compute the medians.
 
     Raises:
         ConfigError: No valid answer remains, because all targets were missed or all times are out of bounds.
@@ -205,7 +205,7 @@ class Curves:
 
 
 def fit_curves(times: Times, from_deg: float, least_sizes: int) -> Curves:
-    """Fit each participant's times at each eccentricity from ``from_deg`` on.
+    """Fit each participant's times at each eccentricity of ``from_deg`` or more.
 
     Raises:
         ConfigError: No such eccentricity was shown, or no participant has times of enough sizes at any of them.
@@ -236,7 +236,7 @@ def fit_curves(times: Times, from_deg: float, least_sizes: int) -> Curves:
 class Scales:
     """Equal-efficiency scales S = exp((T - b) / a) of each participant (Sec. 2.4.3).
 
-    If times do not fall with the size (a >= 0), no size takes the target time and the scale is undefined. For medians,
+    If times do not fall with the size (a >= 0), no size has the target time and the scale is undefined. For medians,
     it still has a rank: above all other scales if the participant's times exceed the target time, below them otherwise.
     Leaving these participants out would make the line too flat.
 
@@ -259,7 +259,7 @@ class Scales:
 
 
 def equal_efficiency(curves: Curves, target_s: Array, limits_deg: tuple[float, float]) -> Scales:
-    """The sizes at which each participant takes the target time, given in seconds [P]."""
+    """The sizes whose perception time is each participant's target time, given in seconds [P]."""
     target = target_s[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         measured = np.isfinite(curves.a) & np.isfinite(target)

@@ -1,4 +1,4 @@
-"""Figures 2.3 to 2.7 of the thesis for the answers of a study, and its power; functions return bytes of PNG files."""
+"""Figures 2.3 to 2.7 of the thesis for the answers of a study, and its power; functions return the bytes of PNGs."""
 
 import io
 from collections.abc import Sequence

@@ -24,8 +24,8 @@ class Finding:
         repeated: Repeated-measures analysis; None if it was not requested.
         mixed: Mixed model; None if it was not requested or not fitted.
         undefined: Number of undefined scales within the range of the line.
-        limited: Number of defined scales there that are clipped to a limit.
-        missing: Number of scales there without a measured time.
+        limited: Number of defined scales within this range that are clipped to a limit.
+        missing: Number of scales within this range that lack a measured time.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The kind ``perception_analysis``: from the answers of a study to equal-efficiency scales."""
+"""The kind ``perception_analysis``: computes equal-efficiency scales from the answers of a study."""
 
 from __future__ import annotations
 

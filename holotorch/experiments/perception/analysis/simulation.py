@@ -1,8 +1,9 @@
 """Simulated participants of the perception study, whose equal-efficiency scales are known.
 
-The spread between participants reproduces two results of the thesis: F = 7.02 for the target of 5 deg at 10 deg in
-Table 2.2, and the share of undefined scales. Perception times are expected medians of recorded times, which are half a
-frame longer than the true ones.
+The spread between participants reproduces two results of the thesis: the F statistic of 7.02 for the target time of a
+5 deg pattern at 10 deg (first row of Table 2.2), and the share of scales that are undefined because a participant's
+times do not fall with the size. The perception times of the settings are expected medians of recorded times, which are
+on average half a frame longer than the actual times, because they are rounded up to frames.
 """
 
 import math
@@ -16,15 +17,16 @@ from holotorch.experiments.perception.analysis.config import SimulationSettings,
 from holotorch.experiments.perception.analysis.curves import Responses
 from holotorch.experiments.perception.study.design import THESIS_CONDITIONS
 
-_INNER = 40.0  # degrees; nearer to the fixation point, patterns only define target times
+_INNER = 40.0  # degrees; patterns nearer to the fixation point have no scale and only serve as targets
 _LATE = 1.5  # seconds; longest delay of a lapse
 
 
 def inner_seconds(size_deg: float, eccentricity_deg: float) -> float:
-    """Time in seconds by which a pattern within 40 deg takes longer than one of 5 deg at 10 deg.
+    """Perception time of a pattern within 40 deg minus that of a 5 deg pattern at 10 deg, in seconds.
 
     The time falls by 27 ms when the size grows by a factor of e, and rises by 0.3 ms per degree of eccentricity. Both
-    numbers follow from the distances between the lines of Table 2.2 at 55 deg, with 122 ms per factor of e.
+    numbers are derived from the distances between the lines of Table 2.2 at 55 deg, converted to times with a slope of
+    122 ms per factor of e in size.
     """
     return 3e-4 * (eccentricity_deg - 10) - 0.027 * math.log(size_deg / 5)
 
@@ -65,7 +67,7 @@ def simulate(
         generator: Source of all randomness.
         conditions: (eccentricity, size) in degrees.
         targets: Trials per condition with the target pattern.
-        distractions: Trials per condition with the other pattern, not to be answered.
+        distractions: Trials per condition with the other pattern, which should not be answered.
     """
     people = settings.participants
     where = np.array(conditions, dtype=float).reshape(-1, 2)
@@ -77,7 +79,7 @@ def simulate(
     times = np.empty((people, len(where)))
     for k, (angle, size) in enumerate(where):
         if angle < _INNER:
-            # Proportional to the slope, so that a change of the target time scales all participants' S(E) equally.
+            # Proportional to the slope, so that another target time scales the S(E) of all participants equally.
             times[:, k] = base + slope / settings.slope * inner_seconds(size, angle)
         else:
             middle = math.log(settings.alpha * angle + settings.beta)
@@ -106,7 +108,7 @@ def simulate(
 def _trials(
     settings: SimulationSettings, generator: np.random.Generator, shape: tuple[int, ...], answers: int
 ) -> "np.ndarray[tuple[int, ...], np.dtype[np.float64]]":
-    """Gaussian plus exponential noise; the median of ``answers`` samples, rounded up to frames, has mean 0."""
+    """Gaussian plus exponential noise; the median of ``answers`` samples, after rounding up to frames, has mean 0."""
     gaussian = settings.trial * settings.gaussian
     scale = math.sqrt(settings.trial**2 - gaussian**2)
     noise = gaussian * generator.standard_normal(shape) + scale * generator.exponential(size=shape)

@@ -58,7 +58,7 @@ def fit_line(
     too narrow for few participants; the levels used here are expanded to match a t interval of a mean (Hesterberg
     2015).
     """
-    some = degrees[np.isfinite(degrees).any(1)]  # participants without any scale do not count
+    some = degrees[np.isfinite(degrees).any(1)]  # participants without any scale are ignored
     people, number = len(some), np.isfinite(degrees).sum(0)
     medians, quartiles = _median(degrees), _quantiles(degrees, [0.25, 0.75])
     # Exactly half is already too many: the median would then average a scale with the limit itself.
@@ -135,7 +135,7 @@ class Anova:
     Attributes:
         f: The F statistic; NaN if there are too few values, or no variance within the groups.
         p: Its p-value.
-        freedom: Degrees of freedom between the groups, and within them (one-way) or of the error (repeated).
+        freedom: Degrees of freedom between the groups, and within the groups (one-way) or of the error (repeated).
         participants: Number of participants used.
         left_out: Number of scales (one-way) or participants (repeated measures) left out as missing or undefined.
         epsilon: Greenhouse-Geisser epsilon; 1 for a one-way analysis.

@@ -11,7 +11,7 @@ Angle = Annotated[Number, Field(ge=-180, le=180)]
 
 
 class TargetPatternSettings(Settings):
-    """A row of thesis Table 2.2: the pattern whose perception time all icons must have."""
+    """A row of thesis Table 2.2: the pattern whose perception time all icons should have."""
 
     size_deg: Annotated[Number, Field(gt=0, le=90)]
     eccentricity_deg: Annotated[Number, Field(ge=0, le=90)]

@@ -54,7 +54,7 @@ class _Pen:
         self.axes, self.at, self.width, self.height, self.zorder = axes, at, width, height, zorder
 
     def line(self, *points: tuple[float, float], thick: float = 0.05, **options: Any) -> None:
-        # Lines are polygons, because Matplotlib line widths are in points and do not scale with the icon.
+        # Lines are drawn as polygons, because Matplotlib's line widths are in points and do not scale with the icon.
         for (x0, y0), (x1, y1) in zip(points, points[1:], strict=False):
             length = math.hypot(x1 - x0, y1 - y0) or 1.0
             dx, dy = (x1 - x0) / length * thick / 2, (y1 - y0) / length * thick / 2

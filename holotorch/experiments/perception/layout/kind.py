@@ -19,7 +19,7 @@ class LayoutKind(ExperimentKind[LayoutSettings, "Layouts"]):
 
     settings = LayoutSettings
     example = "configs/perception/layout.yaml"
-    announces = False  # its plan is its result
+    announces = False  # the plan is not printed before the run, because it already contains the results
 
     def build(self, settings: LayoutSettings) -> Layouts:
         from holotorch.experiments.perception.layout.run import build_layouts

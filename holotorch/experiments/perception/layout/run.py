@@ -32,7 +32,7 @@ from holotorch.perception import (
 )
 
 _HALO = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.7}
-_ROUNDING_DEG = 1e-9  # an icon that touches the edge of the field is not cut
+_ROUNDING_DEG = 1e-9  # rounding tolerance, so that an icon that touches the edge of the field does not count as cut
 _FITTED, _KEPT, _BEYOND, _UNTESTED, _ENDS = "#1b5e20", "#555555", "#d35400", "#b000b0", "#1a4a8a"
 _STYLES = {
     (_FITTED, "-"): "scaled by Table 2.2, 40 to 70 deg",

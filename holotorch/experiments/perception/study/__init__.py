@@ -1,1 +1,1 @@
-"""The study of perception time, in a browser."""
+"""The study of perception time, which runs in a browser."""

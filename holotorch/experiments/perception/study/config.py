@@ -49,7 +49,7 @@ def _unit_if_unusual(value: Any) -> Any:
 Distance = Annotated[Metres, BeforeValidator(_unit_if_unusual)]
 Seconds = Annotated[Number, within(0.02, 60, "a time between 0.02 and 60 seconds, not milliseconds")]
 Whole = Annotated[int, BeforeValidator(number), Field(ge=0)]
-_TOLERANCE_PX = 0.5  # of a pattern's outline beyond the edge of the screen, where nothing visible is lost
+_TOLERANCE_PX = 0.5  # a pattern may extend this far beyond the edge of the screen, since nothing visible is lost
 
 
 def _ordered(times: tuple[float, float]) -> tuple[float, float]:
@@ -74,7 +74,7 @@ class _ScreenSettings(Settings):
 
 
 class FlatSettings(_ScreenSettings):
-    """A flat screen, its centre straight ahead at ``distance`` metres."""
+    """A flat screen whose centre is straight ahead at ``distance`` metres."""
 
     kind: Literal["flat"]
 
@@ -101,7 +101,7 @@ class RepeatSettings(Settings):
 
 
 class TimingSettings(Settings):
-    """Times in seconds: the wait before a pattern (shortest, longest), its duration, and that of an error message."""
+    """Times in seconds: wait before a pattern (shortest, longest), duration of a pattern and of an error message."""
 
     wait_s: Annotated[tuple[Seconds, Seconds], AfterValidator(_ordered)] = (0.8, 1.6)
     show_s: Seconds = 2.0
@@ -148,7 +148,7 @@ class StudySettings(Settings):
 
 @dataclass(frozen=True)
 class Cut:
-    """A pattern that extends beyond the edge of the screen; ``text`` says how far."""
+    """A pattern that extends beyond the edge of the screen; ``text`` states by how much."""
 
     eccentricity_deg: float
     size_deg: float
@@ -156,7 +156,7 @@ class Cut:
 
 
 def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudySettings:
-    """Read the file of a study, apply the overrides and check the settings.
+    """Read the configuration file of a study, apply the overrides and check the settings.
 
     Raises:
         ConfigError: All mistakes in the file, one line per mistake with file, line and column.
@@ -170,7 +170,7 @@ def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudySettings
             mistakes.append((("screen", "distance"), "expected an eye inside the cylinder: less than twice the radius"))
         if screen.size[1] > 2 * math.pi * screen.radius:
             mistakes.append((("screen", "size"), "expected an arc of at most one turn, 2 pi times the radius"))
-    if settings.trials > MOST_TRIALS:  # too many to list the conditions
+    if settings.trials > MOST_TRIALS:  # listing the conditions would take too long
         raise ConfigError([source.mistake(("repeats",), too_many(settings.trials))])
     conditions: set[tuple[float, float]] = set()
     for i, group in enumerate(settings.patterns):
@@ -203,7 +203,7 @@ def beyond_screen(settings: StudySettings) -> list[Cut]:
     for eccentricity, size in settings.conditions:
         y, x = screen.pixels(*_outline(eccentricity, size))
         # Pixel centres have integer coordinates, so that the screen ends half a pixel beyond the last centre.
-        # Directions that do not meet the screen surface give NaN, which compares as outside.
+        # Directions that do not meet the screen surface give NaN, which counts as outside.
         fits_width = ((x - (columns - 1) / 2).abs() <= columns / 2 + _TOLERANCE_PX).all()
         high = (y - (rows - 1) / 2).abs().max().item()
         name = f"{size:g} deg at {eccentricity:g} deg"
@@ -217,7 +217,7 @@ def beyond_screen(settings: StudySettings) -> list[Cut]:
 
 
 def build_screen(settings: FlatSettings | CurvedSettings) -> FlatScreen | CurvedScreen:
-    """The geometry of the screen."""
+    """Create the geometry of the screen."""
     if isinstance(settings, FlatSettings):
         return FlatScreen(settings.shape, settings.size, settings.distance)
     return CurvedScreen(settings.shape, settings.size, settings.distance, settings.radius)

@@ -20,7 +20,7 @@ ORDERS = ("thesis", "williams")
 THESIS_CONDITIONS = tuple((float(e), float(s)) for e in (0, 10, 20, 30) for s in (5, 10, 15)) + tuple(
     (float(e), float(s)) for e in (40, 50, 60, 70, 80) for s in (5, 8, 11, 14, 17, 20, 23, 26)
 )
-MOST_TRIALS = 10_000  # per participant; seven hours at 2.5 s per trial
+MOST_TRIALS = 10_000  # largest number of trials per participant; they take seven hours at 2.5 s per trial
 _ROUNDS: tuple[tuple[Pattern, int], ...] = (("cross", 1), ("circle", 1), ("cross", 2), ("circle", 2))
 
 
@@ -35,8 +35,8 @@ class Trial:
         size_deg: Angle that the pattern subtends.
         side: Side of the fixation point.
         pattern: Shape of the pattern.
-        target: Whether the pattern is the target of the round, which is to be answered.
-        wait_s: Time from the end of the previous trial to the appearance, in seconds.
+        target: Whether the pattern is the target of the round, which should be answered.
+        wait_s: Time from the end of the previous trial to the appearance of the pattern, in seconds.
     """
 
     round: int

@@ -1,4 +1,4 @@
-"""Log of a study: one line of JSON per trial, on the disk before the next trial begins.
+"""Log of a study: one line of JSON per trial, which is saved before the next trial begins.
 
 The first line is a header, ``{"format": "holotorch-trials", "version": 1, ...}``; each other line is a trial. Lines are
 only ever appended, and each is followed by fsync, so that a crash loses at most the trial on the screen. A line that a
@@ -64,7 +64,7 @@ def read_log(path: Path) -> Trials:
             parse_record(LogHeader, header)
         except ValueError as error:
             mistakes.append(f"{path}:1:1: {error}")
-    first_lines: dict[tuple[int, int], int] = {}  # of each (round, trial)
+    first_lines: dict[tuple[int, int], int] = {}  # line number of the first line of each (round, trial)
     for number, trial in enumerate(trials, 2):
         if trial is None:
             continue
@@ -130,7 +130,8 @@ class TrialLog:
         self.header = json.loads(json.dumps({"format": FORMAT, "version": VERSION, **header}, allow_nan=False))
         self.trials: list[dict[str, Any]] = []
         self._size = 0  # bytes of all complete lines
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)  # personal data
+        # Only the owner can read the file, since it contains personal data.
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
         try:
             self._lock()
             # After a crash, the header itself may be incomplete.
@@ -198,7 +199,7 @@ class TrialLog:
             while line:  # os.write may write only a part
                 line = line[os.write(self._file, line) :]
             os.fsync(self._file)
-        except OSError as error:  # such as a full disk: leave complete lines only
+        except OSError as error:  # such as a full disk: only complete lines are kept
             with contextlib.suppress(OSError):
                 os.ftruncate(self._file, self._size)
             raise OSError(error.errno, error.strerror, str(self.path)) from None

@@ -1,4 +1,4 @@
-"""Pydantic models of the JSON that comes from outside: lines of a log, and requests of the page.
+"""Pydantic models of JSON input: lines of a log, and requests of the page.
 
 The ``description`` of a field completes the message "expected ..." when a value is refused.
 """
@@ -62,13 +62,13 @@ class TrialRecord(Record):
 
 
 class SessionRequest(Record):
-    """What a window sends to become the one whose results count."""
+    """Request of a browser window to become the one whose results are recorded."""
 
     window: Window
 
 
 class TrialResult(SessionRequest):
-    """What the page sends after a trial; times in seconds on the clock of the browser."""
+    """Request of the page after a trial; times are in seconds on the clock of the browser."""
 
     index: Annotated[int, Field(ge=0, description="the index of the trial, 0 or more")]
     onset_s: Seconds
@@ -92,7 +92,7 @@ class TrialResult(SessionRequest):
         return self
 
     def measured(self) -> dict[str, Any]:
-        """The part of a line of the log that was measured."""
+        """The measured part of a line of the log."""
         return {
             "responded": self.response_s is not None,
             "onset_s": self.onset_s,
@@ -109,7 +109,7 @@ Model = TypeVar("Model", bound=Record)
 
 
 def parse_record(model: type[Model], value: Any) -> Model:
-    """Validate a value. ValueError names the first field that is wrong, what was expected and what came."""
+    """Validate a value. ValueError names the first wrong field, the expected value and the value received."""
     try:
         return model.model_validate(value)
     except ValidationError as error:

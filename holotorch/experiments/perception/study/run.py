@@ -1,4 +1,4 @@
-"""Run the study of one participant: load the settings, serve the page until the end, and print a summary."""
+"""Run the study of one participant: load the settings, serve the page until the study ends, and print a summary."""
 
 import asyncio
 import os

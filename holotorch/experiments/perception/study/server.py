@@ -1,14 +1,14 @@
 """Server of the study page, reachable only from the machine that it runs on.
 
-The page (page.html) requests the design once and sends one result per trial; a trial is on the disk before its request
+The page (page.html) requests the design once and sends one result per trial; a trial is saved before its request
 is answered. The page itself contains no data of the study. All other requests need the participant's token, which is
 in the fragment of the printed address: browsers never send fragments to a server, whereas a cookie would go to all
 servers on the machine.
 
 ``onset_s`` is the time stamp of the first frame after the one that drew the pattern, the earliest moment at which the
 pattern can be visible. ``response_s`` is the time stamp of the key event on the same clock or, for a gamepad, which is
-polled once per frame, that of the frame. The delays of the screen and the keyboard, which vary little between trials,
-are not measured.
+polled once per frame, the time stamp of the frame. The delays of the screen and the keyboard, which vary little between
+trials, are not measured.
 """
 
 import asyncio
@@ -61,7 +61,7 @@ class _Connections(web.Server):
         self._ends[handler] = transport, asyncio.get_running_loop().call_later(_SECONDS, self._end, handler)
 
     def connection_lost(self, handler: web.RequestHandler, exc: BaseException | None = None) -> None:
-        """Forget the connection."""
+        """Remove the connection from the list of open ones."""
         super().connection_lost(handler, exc)
         self._end(handler)
 

@@ -1,4 +1,4 @@
-"""The session of one participant: gives the design to the page and records the results that the page sends."""
+"""The session of one participant, which sends the design to the page and records the results of the page."""
 
 import sys
 from dataclasses import asdict
@@ -13,7 +13,7 @@ from holotorch.experiments.perception.study.records import TrialResult, parse_re
 
 
 class StudySession:
-    """Gives the design to the page and appends its results to the log; each result is on the disk before the answer.
+    """Sends the design to the page and appends its results to the log. Each result is saved before it is acknowledged.
 
     Args:
         settings: The study.
@@ -42,7 +42,7 @@ class StudySession:
         }
 
     def record(self, request: Any) -> tuple[HTTPStatus, dict[str, Any]]:
-        """Append a result sent by the page; return the HTTP status and the answer, which says which trial is next.
+        """Append a result sent by the page; return the HTTP status and the answer, which names the next trial.
 
         A result that is already in the log is not written again.
         """
@@ -51,7 +51,7 @@ class StudySession:
         except ValueError as error:
             return HTTPStatus.BAD_REQUEST, {"error": str(error)}
         index = result.index
-        # After a restart of the server, the window that is already open continues.
+        # After a restart of the server, the window that was already open may continue.
         self.holder = self.holder or result.window
         if result.window != self.holder:
             return HTTPStatus.CONFLICT, {"error": "the study was opened in another window; close this one"}
