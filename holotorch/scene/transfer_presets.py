@@ -1,4 +1,4 @@
-"""Transfer functions for common materials, and import of transfer functions that ParaView or 3D Slicer saved as JSON."""
+"""Transfer functions for common materials, and import of those that ParaView or 3D Slicer saved as JSON."""
 
 import json
 import sys

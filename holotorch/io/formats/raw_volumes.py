@@ -66,7 +66,7 @@ def read_raw(path: Path, shape: Sequence[int] | None, dtype: DTypeLike | None) -
 
 
 def read_metaimage(path: Path) -> Scan:
-    """Read MetaImage, .mhd with a data file or a single .mha; in millimetres unless DistanceUnits states another unit."""
+    """Read MetaImage (.mhd with a data file, or .mha); in millimetres unless DistanceUnits states another unit."""
     fields, end = _metaimage_header(path)
     if fields.get("NDims", "3") != "3" or fields.get("ElementNumberOfChannels", "1") != "1":
         raise ValueError(
