@@ -70,7 +70,7 @@ def read_vti(path: Path, member: str | None = None) -> Scan:
 
 
 def _document(path: Path) -> tuple[ElementTree.Element, int, bool]:
-    """Parse the XML without the appended data; return also their offset in the file, or -1, and whether it is base64."""
+    """Parse XML without the appended data; also return their offset in the file, or -1, and whether it is base64."""
     data = np.memmap(path, np.uint8, "r")
     match = _APPENDED.search(data)  # type: ignore[arg-type]
     text = bytes(data[: match.start()]) + b"</VTKFile>" if match else bytes(data)
