@@ -17,7 +17,7 @@ from holotorch.io.files import read_bytes
 from holotorch.modulator.dispersion import Birefringence, BirefringenceTable, Cauchy, phase_scale
 from holotorch.modulator.panel import PhaseModulator, checked_lut, even_lut
 
-# Largest relative difference at which a wavelength uses a calibration as it is: lasers deviate from nominal wavelengths.
+# Largest relative deviation of a wavelength that uses a calibration unchanged: real lasers deviate from nominal values.
 _SAME = 1e-3
 
 
