@@ -49,7 +49,7 @@ class PECExperiment:
     Attributes:
         settings: The configuration.
         source: The picture as loaded, float64 [C', h, w].
-        lit: Indices or mask of the colours that are not black, among all colours.
+        lit: Mask of the colours that are not black, bool [all colours].
         array: The phased array, over the lit colours.
         start: Kind of the phases at the start, as in ``solver.start``.
         device: Device of the solver.

@@ -46,7 +46,7 @@ def pec() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
 
 
 def _solvers(bench: Bench) -> dict[str, Callable[[Callback], Any]]:
-    """Solvers by name, from the thesis's hot start unless the name states another; only a step count stops them."""
+    """Solvers by name, from the thesis's hot start unless their entry uses another; only a step count stops them."""
     hot, quadratic = bench.start("hot"), bench.start("quadratic")
     problem, amplitude = bench.problem(), bench.problem(amplitude=True)
     precondition = spread_preconditioner(bench.crosstalk.kernel)
