@@ -1,4 +1,4 @@
-"""Chart of an observer's view: error against time, wavelengths against error, and speckle against sharpness."""
+"""Chart of an observer's view: error over time, error over the number of wavelengths, and speckle over sharpness."""
 
 import math
 import warnings
@@ -70,7 +70,8 @@ def _quarter_size(settings: ObserverSettings, scene: VolumeSettings) -> Observer
 def _methods(observer: Observer) -> list[dict]:
     """Collapsed and element-by-element propagation of green light, paraxial.
 
-    Errors are those of the intensity on the retina, relative to elements with 1.3 times the least oversampling.
+    Errors are relative L2 errors of the intensity on the retina. The reference is the element-by-element propagation
+    with 1.3 times the least oversampling.
     """
     grid, depth, wavelength = observer.scene.grid, observer.focus[0], observer.scene.settings.wavelengths[1]
     hologram, _ = observer.scene.hologram(0)

@@ -22,8 +22,8 @@ class Result:
     """One method's outcome.
 
     Attributes:
-        phase: Heater phases in rad, [F, C, H, W].
-        picture: Intensity, scaled so that it can be compared with the target picture, float64 [C, h, w].
+        phase: Heater phases in rad, [F, C, H, W] for F frames and C colours.
+        picture: Intensity, scaled so that it can be compared with the target, float64 [C, h, w] in its pixels.
         isolated: The same for a single chip without periodic repetition; None in the far field.
         numbers: Entry of summary.json for the method.
     """
@@ -35,7 +35,7 @@ class Result:
 
 
 def quality(experiment: PECExperiment, phase: Tensor) -> float:
-    """Mean of the first metric over the lit colours for their phases [F, C, H, W]; fast enough for progress bars."""
+    """First metric of ``report.metrics``, mean over the lit colours, of heater phases [F, C, H, W]; for progress bars."""
     name = experiment.settings.report.metrics[0]
     formed = experiment.picture_in(experiment.intensity(phase.double())).cpu()
     picture = _as_picture(experiment, formed, at_best_scale=experiment.scale_free)
@@ -45,7 +45,8 @@ def quality(experiment: PECExperiment, phase: Tensor) -> float:
 def evaluate(experiment: PECExperiment, phase: Tensor) -> Result:
     """Score heater phases [F, C, H, W] of the lit colours.
 
-    The image is scored at its samples in the model of the run, half a sample off them, and for a single chip.
+    There are three scores: at the samples of the image, half a sample off them, and for a single chip without periodic
+    repetition.
     """
     phase = phase.detach().double()
     formed = experiment.picture_in(experiment.intensity(phase)).cpu()
@@ -120,7 +121,7 @@ def _scores(experiment: PECExperiment, picture: Tensor, image: Tensor) -> dict[s
 
 
 def _as_picture(experiment: PECExperiment, formed: Tensor, *, at_best_scale: bool) -> Tensor:
-    """Relative intensity of the lit colours [C, h, w] on the scale of the picture, with the dark colours as zeros."""
+    """Intensity of the lit colours [C, h, w] scaled to the target's mean in each; zeros for the other colours."""
     if at_best_scale:
         formed = formed * best_scale(formed, experiment.wanted)[:, None, None]
     mean = experiment.image[experiment.lit].mean((-2, -1), keepdim=True)

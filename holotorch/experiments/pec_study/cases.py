@@ -12,7 +12,7 @@ Case = TypeVar("Case")
 
 
 class Cases:
-    """Iterator over the cases of a study, and the rows of its table so far.
+    """Progress of a study: the table rows computed so far, and the cases that remain.
 
     Attributes:
         rows: Rows of all cases so far; a study appends to this list.

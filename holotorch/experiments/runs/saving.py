@@ -71,7 +71,7 @@ class Checkpoint:
                 try:
                     content = content | {"fingerprint": self.fingerprint}
                     torch.save(content | {"checksum": checksum(content)}, stream)
-                except RuntimeError as error:  # torch raises it while it handles the OSError of a failed write
+                except RuntimeError as error:  # torch's, with the OSError of the failed write as context
                     raise error.__context__ if isinstance(error.__context__, OSError) else error from None
         except (OSError, RuntimeError) as error:
             is_disk = isinstance(error, OSError)

@@ -14,7 +14,7 @@ from holotorch.tracking.pose.status import Pose, Status
 from holotorch.tracking.streaming.packet import now
 from holotorch.tracking.streaming.stream import PORT, PoseReceiver, PoseSender
 
-_EVERY = 50  # one of this many packets is a refusal
+_EVERY = 50  # one of this many packets has no pose but the status of a refused frame
 _FAST = 1e-3  # seconds: largest accepted median transit on the loopback
 
 
@@ -113,7 +113,7 @@ class Relay(asyncio.DatagramProtocol):
     Attributes:
         came, dropped, overtaken, repeated: Numbers of received, lost, delayed and repeated packets. A packet counts as
             overtaken if it was sent on after a later one.
-        newest: Largest number, counted in the order of arrival, of a packet that was sent on.
+        newest: Largest number of a forwarded packet; packets are numbered in the order of arrival.
     """
 
     def __init__(self, port: int, seed: int = 7):

@@ -62,7 +62,7 @@ def _stream(options: argparse.Namespace) -> int:
 
 
 def _listens(options: argparse.Namespace) -> None:
-    """Raise ConfigError for arguments that ``--check`` and ``--view``, which send no poses of the user, do not use."""
+    """Raise ConfigError for arguments that ``--check`` or ``--view`` ignores: neither sends the user's poses."""
     from holotorch.experiments.config.errors import ConfigError
 
     chosen = "--check" if options.check else "--view"

@@ -1,4 +1,4 @@
-"""Figures 2.3 to 2.7 of the thesis for the answers of a study, and its power; functions return the bytes of PNGs."""
+"""Plots of a study's answers as in thesis Figs. 2.3 to 2.7, and of its statistical power, as bytes of PNG files."""
 
 import io
 from collections.abc import Sequence
@@ -21,12 +21,12 @@ _COLOURS = "viridis"
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """The data of one target time for the figures.
+    """Fit for one target perception time, as the figures show it.
 
     Attributes:
         name: The target in words.
-        eccentricities: Degrees [K].
-        line: Line and medians of the target.
+        eccentricities: Of the median scales, in degrees, [K].
+        line: Line of scale over eccentricity, with the median scales.
     """
 
     name: str
@@ -35,9 +35,10 @@ class Shown:
 
 
 def surface(times: Times, levels: Sequence[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sizes [N], and quantiles over the participants of the times in ms at these sizes, [len(levels), E, N].
+    """Sizes [N] in degrees, and quantiles over participants of their times in ms, [len(levels), E, N].
 
-    Between the sizes shown at an eccentricity, times are interpolated linearly in ln S; beyond them they are NaN.
+    E is the number of eccentricities. Times are interpolated linearly in the logarithm of the size; they are NaN beyond
+    the sizes that were shown at an eccentricity.
     """
     fine = np.linspace(times.sizes[0], times.sizes[-1], 64)
     fine = np.unique(np.concatenate([fine, times.sizes, [s for s, _ in _SLICES if fine[0] <= s <= fine[-1]]]))
@@ -156,7 +157,7 @@ def time_slices(times: Times) -> bytes:
 def scale_lines(
     times: Times, targets: Sequence[Shown], fitted: tuple[float, float], tested: tuple[float, float], confidence: float
 ) -> bytes:
-    """Fig. 2.7: median scales with intervals, the line fitted within the range, and the tested sizes."""
+    """Fig. 2.7: median scales with intervals, the line over eccentricities ``fitted``, and sizes ``tested``; degrees."""
     columns = min(len(targets), 3)
     rows = -(-len(targets) // columns)
     figure = Figure(figsize=(4.2 * columns, 3.7 * rows), layout="constrained", dpi=110)

@@ -14,7 +14,7 @@ from holotorch.experiments.perception.study.frames import Quantisation
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """Results for one target time.
+    """Results for one target time. A scale is the size at which a participant sees a pattern as fast as the target.
 
     Attributes:
         name: The target in words.
@@ -23,7 +23,7 @@ class Finding:
         thesis: One-way analysis of variance, as in the thesis.
         repeated: Repeated-measures analysis; None if it was not requested.
         mixed: Mixed model; None if it was not requested or not fitted.
-        undefined: Number of undefined scales within the range of the line.
+        undefined: Number of scales in the fitted range that do not exist, as times do not fall with size there.
         limited: Number of defined scales within this range that are clipped to a limit.
         missing: Number of scales within this range that lack a measured time.
     """

@@ -34,8 +34,8 @@ class ItemSettings(Settings):
 class LayoutSettings(Settings):
     """Icons over a wide field, scaled for equal perception time (thesis Fig. 2.8); the picture has a panel per target.
 
-    ``extrapolate``: use the lines of Table 2.2 beyond 70 deg of eccentricity; otherwise such icons have the target's
-    size. ``field_deg``: field of the picture (vertical, horizontal), with equal angles per pixel.
+    ``extrapolate``: scale icons beyond 70 deg of eccentricity by the lines of Table 2.2; otherwise they have the
+    target's size. ``field_deg``: field of the picture (vertical, horizontal), with equal angles per pixel.
     """
 
     experiment: Literal["perception_layout"]
