@@ -35,7 +35,7 @@ class Result:
 
 
 def quality(experiment: PECExperiment, phase: Tensor) -> float:
-    """First metric of ``report.metrics``, mean over the lit colours, of heater phases [F, C, H, W]; for progress bars."""
+    """First metric of ``report.metrics``, mean over the lit colours, of phases [F, C, H, W]; for progress bars."""
     name = experiment.settings.report.metrics[0]
     formed = experiment.picture_in(experiment.intensity(phase.double())).cpu()
     picture = _as_picture(experiment, formed, at_best_scale=experiment.scale_free)

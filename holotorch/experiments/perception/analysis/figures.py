@@ -157,7 +157,7 @@ def time_slices(times: Times) -> bytes:
 def scale_lines(
     times: Times, targets: Sequence[Shown], fitted: tuple[float, float], tested: tuple[float, float], confidence: float
 ) -> bytes:
-    """Fig. 2.7: median scales with intervals, the line over eccentricities ``fitted``, and sizes ``tested``; degrees."""
+    """Fig. 2.7: median scales with intervals, the line over eccentricities ``fitted``, sizes ``tested``; degrees."""
     columns = min(len(targets), 3)
     rows = -(-len(targets) // columns)
     figure = Figure(figsize=(4.2 * columns, 3.7 * rows), layout="constrained", dpi=110)
