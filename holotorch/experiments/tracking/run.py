@@ -125,10 +125,16 @@ def plan_tracking(experiment: TrackingExperiment) -> RunPlan:
     count = "an unknown number of frames" if frames.total is None else f"{frames.total} frames"
     count = "without end; Ctrl-C ends it" if frames.live else count
     lines = [f"Source     {frames.name}: {width} x {height} px, {frames.rate:g} per second, {count}"]
-    if settings.record and frames.total is None:
-        lines.append(f"Recording  {recording_bytes(frames.shape, 1) * frames.rate / 1e6:.1f} MB per second")
-    elif settings.record:
-        lines.append(f"Recording  {recording_bytes(frames.shape, frames.total or 0) / 1e9:.3f} GB")
+    if settings.record:
+        free = free_bytes(Path())
+        if frames.total is None:
+            rate = recording_bytes(frames.shape, 1) * frames.rate
+            lines.append(
+                f"Recording  {rate / 1e6:.1f} MB per second; {free / 1e9:.1f} GB free here, {free / rate:.0f} s"
+            )
+        else:
+            size = recording_bytes(frames.shape, frames.total)
+            lines.append(f"Recording  {size / 1e9:.3f} GB; {free / 1e9:.1f} GB free here")
     return RunPlan("\n".join([*lines, *frames.notes]))
 
 
@@ -194,10 +200,8 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
             summary["failure"] = f"{type(failure).__name__}: {failure}"
         lines = [verdict(summary), *summary["notes"][printed:], *([compared(comparison)] if comparison else [])]
         print("\n".join(lines), flush=True)
-        if failure is None:
-            save_figure(folder, log)
-        else:
-            results.write(save_figure, folder, log)
+        results.write(save_figure, folder, log)
+        if failure is not None:
             results.failure = None  # only the first failure is reported
         done = failure is None and (not run.pressed or frames.live)
         complete = conclude(run, _without_nan(summary), results, done=done)

@@ -61,7 +61,11 @@ def open_inputs(
     for name in files:
         if files[name] is None and replayed and (Path(source) / name).is_file():
             files[name] = Path(source) / name
-    missing = [f"no {name}: say which with --{name[:-5]}" for name, path in files.items() if path is None]
+    missing = [
+        f"no {name}: say which with --{name[:-5]}, or {name[:-5]}: in a configuration"
+        for name, path in files.items()
+        if path is None
+    ]
     if missing:
         raise ConfigError(missing)
     paths = {name: find_config(path) or path for name, path in files.items() if path is not None}

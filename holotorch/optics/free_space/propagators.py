@@ -95,10 +95,10 @@ class AngularSpectrum(SpectralFilter):
         band_limit: bool = True,
     ):
         distance = checks.quantity(DISTANCE, distance)
-        waves = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
-        padded = _affordable(type(self).__name__, grid.padded(pad), len(waves), 90)
-        kernel = angular_spectrum_kernel(padded, waves, distance, band_limit=band_limit)
-        super().__init__(grid, wavelengths, kernel * carrier(waves, distance)[:, None, None])
+        wavelength_tensor = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
+        padded = _affordable(type(self).__name__, grid.padded(pad), len(wavelength_tensor), 90)
+        kernel = angular_spectrum_kernel(padded, wavelength_tensor, distance, band_limit=band_limit)
+        super().__init__(grid, wavelengths, kernel * carrier(wavelength_tensor, distance)[:, None, None])
         self.distance = distance
         _warn_if_short(self, least_padding(grid, max(self.wavelengths), distance), wraps=not band_limit)
 
@@ -119,10 +119,10 @@ class Fresnel(SpectralFilter):
         pad: float | tuple[float, float] = 2,
     ):
         distance = checks.quantity(DISTANCE, distance)
-        waves = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
-        padded = _affordable(type(self).__name__, grid.padded(pad), len(waves), 40)
-        kernel = fresnel_kernel(padded, waves, distance)
-        super().__init__(grid, wavelengths, kernel * carrier(waves, distance)[:, None, None])
+        wavelength_tensor = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
+        padded = _affordable(type(self).__name__, grid.padded(pad), len(wavelength_tensor), 40)
+        kernel = fresnel_kernel(padded, wavelength_tensor, distance)
+        super().__init__(grid, wavelengths, kernel * carrier(wavelength_tensor, distance)[:, None, None])
         self.distance = distance
         _warn_if_short(self, least_padding(grid, max(self.wavelengths), distance, paraxial=True), wraps=True)
 

@@ -131,11 +131,11 @@ class ResampledKernel(nn.Module):
         longest = max(self.wavelengths)
         if min(grid.pitch) < FINEST * longest:
             raise ValueError(f"pitch must be at least {FINEST} wavelengths of {longest:g} m, got {min(grid.pitch):g} m")
-        waves = torch.tensor(self.wavelengths, dtype=torch.float64)
+        wavelength_tensor = torch.tensor(self.wavelengths, dtype=torch.float64)
         distance_tensor = torch.tensor(self.distance, dtype=torch.float64)
         if padded is None and not paraxial:
             padded = resampled_padding(planes, longest, abs(self.distance))
-        factors = resampling_factors(planes, waves, distance_tensor, padded=None if paraxial else padded)
+        factors = resampling_factors(planes, wavelength_tensor, distance_tensor, padded=None if paraxial else padded)
         for name, values in zip(("columns", "rows", "beyond"), factors, strict=True):
             pair = None if values is None else torch.view_as_real(values).contiguous()
             self.register_buffer(name, pair, persistent=False)

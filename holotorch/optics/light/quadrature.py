@@ -40,8 +40,8 @@ def gauss_rule(nodes: Tensor, weights: Tensor, count: int) -> tuple[Tensor, Tens
     if count > 1:
         side = torch.stack(beside[:-1])
         matrix = matrix + torch.diag(side, 1) + torch.diag(side, -1)
-    places, directions = torch.linalg.eigh(matrix)
-    return half * places, directions[0].square()
+    positions, directions = torch.linalg.eigh(matrix)
+    return half * positions, directions[0].square()
 
 
 def correlation(first: Tensor, second: Tensor, beat: float, rim: float = 0.0) -> Tensor:
@@ -61,16 +61,16 @@ def correlation(first: Tensor, second: Tensor, beat: float, rim: float = 0.0) ->
 
 
 def expected_error(
-    nodes: Tensor, weights: Tensor, places: Tensor, shares: Tensor, beat: float, rim: float = 0.0
+    nodes: Tensor, weights: Tensor, positions: Tensor, shares: Tensor, beat: float, rim: float = 0.0
 ) -> Tensor:
-    """Rms error of a rule (``places``, ``shares``) for a measure, relative to the rms of the picture; a scalar.
+    """Rms error of a rule (``positions``, ``shares``) for a measure, relative to the rms of the picture; a scalar.
 
     The error is the expectation for fully developed speckle whose intensities correlate as in :func:`correlation`,
     around the mean brightness that the iris passes. Its square is a quadratic form of the difference between the rule
     and the measure. Wavelengths are relative to the middle of the band.
     """
     own = weights @ _second_moment(nodes, nodes, beat, rim) @ weights
-    return (_square(own, nodes, weights, places, shares, beat, rim).clamp_min(0) / own).sqrt()
+    return (_square(own, nodes, weights, positions, shares, beat, rim).clamp_min(0) / own).sqrt()
 
 
 def speckle_rule(
@@ -138,17 +138,17 @@ def _descended(nodes: Tensor, weights: Tensor, beat: float, rim: float, start: T
 
     def closure() -> Tensor:
         search.zero_grad()
-        places = torch.tanh(hidden)  # within the band
-        shares = _best_weights(nodes, weights, places, beat, rim)
+        positions = torch.tanh(hidden)  # within the band
+        shares = _best_weights(nodes, weights, positions, beat, rim)
         # The logarithm is minimized because errors span decades; the addend is far below any tolerance.
-        loss = (_square(own, nodes, weights, places, shares, beat, rim).clamp_min(0) + 1e-12).log()
+        loss = (_square(own, nodes, weights, positions, shares, beat, rim).clamp_min(0) + 1e-12).log()
         loss.backward()
         return loss
 
     with torch.enable_grad():
         search.step(closure)
-    places = torch.tanh(hidden.detach()).sort().values
-    return places, _best_weights(nodes, weights, places, beat, rim)
+    positions = torch.tanh(hidden.detach()).sort().values
+    return positions, _best_weights(nodes, weights, positions, beat, rim)
 
 
 def _second_moment(first: Tensor, second: Tensor, beat: float, rim: float) -> Tensor:
@@ -156,18 +156,18 @@ def _second_moment(first: Tensor, second: Tensor, beat: float, rim: float) -> Te
 
 
 def _square(
-    own: Tensor, nodes: Tensor, weights: Tensor, places: Tensor, shares: Tensor, beat: float, rim: float
+    own: Tensor, nodes: Tensor, weights: Tensor, positions: Tensor, shares: Tensor, beat: float, rim: float
 ) -> Tensor:
-    cross = shares @ _second_moment(places, nodes, beat, rim) @ weights
-    return own - 2 * cross + shares @ _second_moment(places, places, beat, rim) @ shares
+    cross = shares @ _second_moment(positions, nodes, beat, rim) @ weights
+    return own - 2 * cross + shares @ _second_moment(positions, positions, beat, rim) @ shares
 
 
-def _best_weights(nodes: Tensor, weights: Tensor, places: Tensor, beat: float, rim: float) -> Tensor:
+def _best_weights(nodes: Tensor, weights: Tensor, positions: Tensor, beat: float, rim: float) -> Tensor:
     """Weights of least error for given nodes. Their sum is 1, so that brightness without speckle is exact."""
-    count = len(places)
-    own = _second_moment(places, places, beat, rim) + _JITTER * torch.eye(count, dtype=places.dtype)
-    ones = torch.ones(count, 1, dtype=places.dtype)
+    count = len(positions)
+    own = _second_moment(positions, positions, beat, rim) + _JITTER * torch.eye(count, dtype=positions.dtype)
+    ones = torch.ones(count, 1, dtype=positions.dtype)
     top = torch.cat([own, ones], 1)
-    bottom = torch.cat([ones.T, torch.zeros(1, 1, dtype=places.dtype)], 1)
-    wanted = torch.cat([_second_moment(places, nodes, beat, rim) @ weights, torch.ones(1, dtype=places.dtype)])
+    bottom = torch.cat([ones.T, torch.zeros(1, 1, dtype=positions.dtype)], 1)
+    wanted = torch.cat([_second_moment(positions, nodes, beat, rim) @ weights, torch.ones(1, dtype=positions.dtype)])
     return torch.linalg.solve(torch.cat([top, bottom]), wanted)[:count]

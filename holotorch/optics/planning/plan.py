@@ -54,12 +54,12 @@ def plan_propagation(
         ValueError: An argument outside its range, or a plan that needs more than ``memory_limit``; the message says
             how to propagate in tiles.
     """
-    waves = checks.wavelengths(wavelength)
-    planes = plane_pair(grid, out_grid, offset, tilt, waves)
+    wavelengths = checks.wavelengths(wavelength)
+    planes = plane_pair(grid, out_grid, offset, tilt, wavelengths)
     distances = list(distance) if isinstance(distance, Sequence) else [distance]
     distances = [checks.quantity(DISTANCE, each) for each in distances]
-    content = field_content(grid, waves, distances, band=band, spread=spread, margin=margin, field=field)
-    return plan_from(candidates(planes, waves, distances, content, dtype), planes, tolerance, memory_limit, dtype)
+    content = field_content(grid, wavelengths, distances, band=band, spread=spread, margin=margin, field=field)
+    return plan_from(candidates(planes, wavelengths, distances, content, dtype), planes, tolerance, memory_limit, dtype)
 
 
 def plan_from(

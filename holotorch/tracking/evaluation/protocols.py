@@ -205,8 +205,8 @@ def coverage(tips: Tensor, covariance: Tensor, truth: Tensor, level: float = 0.9
 
 def counts(statuses: Iterable[IntEnum]) -> dict[str, int]:
     """Number of frames of each status that occurs, by name, in the order of the enumeration."""
-    found = Counter(statuses)
-    return {status.name: found[status] for status in sorted(found)}
+    numbers = Counter(statuses)
+    return {status.name: numbers[status] for status in sorted(numbers)}
 
 
 def wrong_poses(tips: Tensor, truth: Tensor, limit: float = 5e-3) -> WrongPoses:

@@ -108,7 +108,8 @@ def test_track_hands_its_arguments_on(monkeypatch):
 def test_track_without_a_camera_or_a_catheter_asks_for_them(capsys):
     cv2.imwrite("0.png", np.zeros((48, 64, 3), np.uint8))
     error = said(capsys, "track", ".")
-    assert "no camera.yaml: say which with --camera" in error and "no catheter.yaml: say which with --catheter" in error
+    assert "no camera.yaml: say which with --camera, or camera: in a configuration" in error
+    assert "no catheter.yaml: say which with --catheter" in error
     error = said(capsys, "track", ".", *FILES[2:])
     assert "--camera" in error and "--catheter" not in error
     assert not Path("runs").exists()

@@ -223,3 +223,13 @@ def test_ctrl_c_before_the_first_frame_leaves_nothing(tmp_path, tracker, monkeyp
     with pytest.raises(KeyboardInterrupt):
         tracked(tmp_path, pictures(tmp_path / "in", [9]), record=True)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_figure_that_cannot_be_written_costs_no_summary(tmp_path, tracker, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(track, "save_figure", full)
+    with pytest.raises(OSError, match="No space left"):
+        tracked(tmp_path, pictures(tmp_path / "in", [9, 12]), video=False)
+    assert len(read(tmp_path / "out")) == 2 and summary(tmp_path / "out", "interrupted.json")["frames"] == 2
