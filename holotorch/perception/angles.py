@@ -1,4 +1,4 @@
-"""Conversion of angles and sizes to tensors, with consistent checks and error messages."""
+"""Conversion of angles and sizes to tensors, and checks of their ranges."""
 
 from typing import Any
 
@@ -28,31 +28,37 @@ def as_tensor(name: str, value: Any, unit: str = "degrees") -> Tensor:
             raise TypeError(f"{name} must be numbers in {unit}, got {type(value).__name__}") from None
     if tensor.numel() == 0:
         raise ValueError(f"{name} must hold at least one value in {unit}, got shape {tuple(tensor.shape)}")
-    bad = ~torch.isfinite(tensor)
-    if bad.any():
-        raise ValueError(f"{name} must be finite in {unit}, got {first(tensor, bad):g} ({int(bad.sum())} such values)")
+    finite = torch.isfinite(tensor)
+    require(finite, f"{name} must be finite in {unit}", tensor, f" ({int((~finite).sum())} such values)")
     return tensor
 
 
 def eccentricity(value: Any, name: str = "eccentricity_deg") -> Tensor:
-    """Convert eccentricities to a tensor. ValueError outside 0 to 180 deg; they have no sign for left or right."""
+    """Convert eccentricities to a tensor, or raise ValueError outside 0 to 180 deg."""
     tensor = as_tensor(name, value)
-    bad = (tensor < 0) | (tensor > 180)
-    if bad.any():
-        cure = "it is an angle from the fixation point without a sign for left or right; take the absolute value"
-        raise ValueError(f"{name} must be within 0 to 180 degrees, got {first(tensor, bad):g}; {cure}")
+    cure = "; it is an angle from the fixation point without a sign for left or right; take the absolute value"
+    require(within(tensor, 0, 180), f"{name} must be within 0 to 180 degrees", tensor, cure)
     return tensor
 
 
 def size(value: Any, name: str = "size_deg") -> Tensor:
-    """Convert sizes of patterns to a tensor. ValueError for sizes that are not above 0 or exceed 360 deg."""
+    """Convert sizes of patterns to a tensor, or raise ValueError unless they are above 0 and at most 360 deg."""
     tensor = as_tensor(name, value)
-    bad = (tensor <= 0) | (tensor > 360)
-    if bad.any():
-        raise ValueError(f"{name} must be above zero and at most 360 degrees, got {first(tensor, bad):g}")
+    require((tensor > 0) & (tensor <= 360), f"{name} must be above zero and at most 360 degrees", tensor)
     return tensor
 
 
-def first(tensor: Tensor, where: Tensor) -> float:
-    """The first element of ``tensor`` at which the mask ``where`` is true, as a number."""
-    return tensor.detach()[where].flatten()[0].item()
+def within(values: Tensor, low: float, high: float, tolerance: float = 0.0) -> Tensor:
+    """Whether each value lies within ``low`` .. ``high``, ends included and widened by ``tolerance``; bool."""
+    return (values >= low - tolerance) & (values <= high + tolerance)
+
+
+def require(valid: Tensor, rule: str, values: Tensor, cure: str = "") -> None:
+    """Raise ValueError with ``rule``, the first of ``values`` where the mask ``valid`` is False, and ``cure``."""
+    if not valid.all():
+        raise ValueError(f"{rule}, got {first(values, ~valid):g}{cure}")
+
+
+def first(values: Tensor, where: Tensor) -> float:
+    """The first of ``values`` at which the mask ``where`` is true, as a number."""
+    return values.detach()[where].flatten()[0].item()

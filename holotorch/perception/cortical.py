@@ -1,8 +1,13 @@
-"""Size of content over eccentricity, from cortical magnification and from empirical laws."""
+"""Size of content over eccentricity, from cortical magnification and from empirical laws.
+
+A law is a function of the eccentricity E in degrees, within 0 .. 180. It returns the size S in degrees, or 1 / M in
+deg/mm, to which sizes are proportional. M is the cortical magnification, the length of cortex per visual angle; M0
+(``m0``, in mm/deg) is its value in the fovea.
+"""
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -12,25 +17,21 @@ from holotorch.core import checks
 from holotorch.perception import angles
 
 
-def _positive(law: Any, *names: str) -> None:
-    for name in names:
-        checks.positive(name, getattr(law, name))
+@dataclass(frozen=True)
+class _Law:
+    """Base class of the laws: every parameter must be above zero."""
+
+    def __post_init__(self):
+        for parameter in fields(self):
+            checks.positive(parameter.name, getattr(self, parameter.name))
 
 
 @dataclass(frozen=True)
-class LinearMagnification:
-    """1 / M = (1 + E / E2) / M0, thesis Eqs. 2.1 and 2.2 with a = 1 / E2.
-
-    Attributes:
-        m0: Magnification in the fovea: length of cortex per visual angle, mm/deg.
-        e2_deg: Eccentricity in degrees at which sizes are twice those at the fixation point.
-    """
+class LinearMagnification(_Law):
+    """1 / M = (1 + E / E2) / M0, thesis Eqs. 2.1 and 2.2 with a = 1 / E2; at E2, sizes are twice the foveal ones."""
 
     m0: float
     e2_deg: float
-
-    def __post_init__(self):
-        _positive(self, "m0", "e2_deg")
 
     def __call__(self, eccentricity_deg: Any) -> Tensor:
         """1 / M in deg/mm."""
@@ -44,21 +45,12 @@ DOUGHERTY = LinearMagnification(29.2 / 3.67, 3.67)  # printed as M = 29.2 / (E +
 
 
 @dataclass(frozen=True)
-class RovamoVirsu:
-    """1 / M = (1 + a E + b E^3) / M0; Rovamo and Virsu (1979), with one pair (a, b) per half-meridian.
-
-    Attributes:
-        a: Linear coefficient, 1/deg.
-        b: Cubic coefficient, 1/deg^3.
-        m0: Foveal magnification in mm/deg.
-    """
+class RovamoVirsu(_Law):
+    """1 / M = (1 + a E + b E^3) / M0 with a in 1/deg and b in 1/deg^3; Rovamo and Virsu (1979)."""
 
     a: float
     b: float
     m0: float = 7.99
-
-    def __post_init__(self):
-        _positive(self, "a", "b", "m0")
 
     def __call__(self, eccentricity_deg: Any) -> Tensor:
         """1 / M in deg/mm."""
@@ -72,19 +64,11 @@ SUPERIOR, INFERIOR = RovamoVirsu(0.42, 1.2e-4), RovamoVirsu(0.42, 5.5e-5)
 
 
 @dataclass(frozen=True)
-class TolhurstLing:
-    """1 / M = (1 + a E)^1.1 / M0; Tolhurst and Ling (1988). The thesis gives M0 and not a, which must be chosen.
-
-    Attributes:
-        a: Linear coefficient, 1/deg.
-        m0: Foveal magnification in mm/deg.
-    """
+class TolhurstLing(_Law):
+    """1 / M = (1 + a E)^1.1 / M0 with a in 1/deg; Tolhurst and Ling (1988). The thesis gives no value for a."""
 
     a: float
     m0: float = 24.88
-
-    def __post_init__(self):
-        _positive(self, "a", "m0")
 
     def __call__(self, eccentricity_deg: Any) -> Tensor:
         """1 / M in deg/mm."""
@@ -92,14 +76,11 @@ class TolhurstLing:
 
 
 @dataclass(frozen=True)
-class StrasburgerLetters:
-    """S = 0.022 E + 0.25 / (log10 C + 2.07 - 0.0345 E), the size in degrees at which a letter is recognised.
+class StrasburgerLetters(_Law):
+    """S = 0.022 E + 0.25 / (log10 C + 2.07 - 0.0345 E), the size at which a letter of contrast C is recognised.
 
-    The denominator is zero at E = (log10 C + 2.07) / 0.0345, which is 60 deg at full contrast and 0 deg at C = 0.0085.
-    At this pole and beyond, where sizes would be negative, the formula raises ValueError.
-
-    Attributes:
-        contrast: Michelson contrast C of the letter, above 0.0085 and at most 1.
+    ``contrast`` is the Michelson contrast C, above 10^-2.07 = 0.0085 and at most 1. The denominator is zero at
+    ``pole_deg``, which is 60 deg at full contrast; beyond this pole, S would be negative.
 
     Source: Strasburger et al. (2011), in thesis Sec. 2.2.1.
     """
@@ -107,7 +88,7 @@ class StrasburgerLetters:
     contrast: float = 1.0
 
     def __post_init__(self):
-        _positive(self, "contrast")
+        super().__post_init__()
         if not (self.pole_deg > 0 and self.contrast <= 1):
             raise ValueError(f"contrast must be above 10^-2.07 = 0.0085 and at most 1, got {self.contrast:g}")
 
@@ -119,35 +100,24 @@ class StrasburgerLetters:
     def __call__(self, eccentricity_deg: Any) -> Tensor:
         """S in degrees. ValueError at the pole and beyond."""
         where = angles.eccentricity(eccentricity_deg)
-        if (bad := where >= self.pole_deg).any():
-            limit = f"below {self.pole_deg:.4g} degrees, its pole at a contrast of {self.contrast:g}"
-            raise ValueError(f"eccentricity_deg must be {limit}, got {angles.first(where, bad):g}; use another law")
+        limit = f"below {self.pole_deg:.4g} degrees, its pole at a contrast of {self.contrast:g}"
+        angles.require(where < self.pole_deg, f"eccentricity_deg must be {limit}", where, "; use another law")
         return 0.022 * where + 0.25 / (0.0345 * (self.pole_deg - where))
 
 
 @dataclass(frozen=True)
-class LinearSize:
-    """S = slope E + foveal_deg within 0 .. 40 deg, as in Grogorick et al.; the thesis gives no coefficients.
-
-    Attributes:
-        slope: Degrees of size per degree of eccentricity.
-        foveal_deg: Size at the fixation point.
-        high_deg: Greatest eccentricity for which the law is valid.
-    """
+class LinearSize(_Law):
+    """S = slope E + foveal_deg for E up to ``high_deg``, as in Grogorick et al.; the thesis gives no coefficients."""
 
     slope: float
     foveal_deg: float
     high_deg: float = 40.0
 
-    def __post_init__(self):
-        _positive(self, "slope", "foveal_deg", "high_deg")
-
     def __call__(self, eccentricity_deg: Any) -> Tensor:
         """S in degrees. ValueError beyond ``high_deg``."""
         where = angles.eccentricity(eccentricity_deg)
-        if (bad := where > self.high_deg).any():
-            limit = f"at most {self.high_deg:g} degrees, as far as it was tested"
-            raise ValueError(f"eccentricity_deg must be {limit}, got {angles.first(where, bad):g}")
+        limit = f"at most {self.high_deg:g} degrees, as far as it was tested"
+        angles.require(where <= self.high_deg, f"eccentricity_deg must be {limit}", where)
         return self.slope * where + self.foveal_deg
 
 

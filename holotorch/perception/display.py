@@ -20,12 +20,12 @@ class WideDisplay:
         name: Name in the table, with examples.
         field_deg: Field of view along ``axis``.
         height_deg: Vertical field of view; None if it is not reported.
-        axis: Axis of ``field_deg``; "full" surrounds the viewer.
+        axis: Axis of ``field_deg``; "full" for a display that surrounds the viewer.
         arcmin: Size of a pixel, (finest, coarsest) in minutes of arc; None if only a pitch is known.
-        pitch: Pixel pitch in metres of a holographic display, whose angular size depends on the eyepiece.
-        colour: Whether the display shows RGB; otherwise one colour.
+        pitch: Pixel pitch in metres of a holographic display; the angular size of its pixels depends on the eyepiece.
+        colour: Whether the display shows RGB; otherwise it has one colour.
         derived: Whether the values are calculated from other reported numbers (* in the table).
-        year: Year in the table; None if there is none.
+        year: Year in the table, if any.
     """
 
     name: str
@@ -71,7 +71,7 @@ TABLE_2_1 = (
 
 @dataclass(frozen=True, eq=False)
 class DisplayCheck:
-    """Whether a display can show the sizes of a scale, for N eccentricities on both sides of the fixation point.
+    """Whether a display can show the sizes of a scale at N eccentricities, both left and right of the fixation point.
 
     Attributes:
         size_deg: S(E), [N].
@@ -115,8 +115,7 @@ def check_display(
     checks.whole("samples", samples, 1)
     where = angles.eccentricity(eccentricity_deg)
     sizes = scale(where, extrapolate=extrapolate)
-    needed = samples / sizes
-    available = display.pixels_per_degree
+    needed, available = samples / sizes, display.pixels_per_degree
     resolved = None if available is None else needed <= available
     covered = where + sizes / 2 <= display.half_field_deg
     return DisplayCheck(sizes, covered, needed, resolved, display.half_field_deg, scale.tested(where))

@@ -1,8 +1,9 @@
 """Geometry of flat, curved and headset displays: conversion between directions in degrees, metres and pixels.
 
-The eye is at the origin and fixates straight ahead. A direction is (elevation, azimuth) in degrees: the elevation above
-the horizontal plane, positive upwards, and the azimuth within that plane, positive to the right. Pixels and metres on a
-screen are (y, x) with y downwards; the centre of the top left pixel is (0, 0), and 0 m is in the middle of the display.
+The eye is at the origin and fixates straight ahead, along z. A direction is (elevation, azimuth) in degrees: the
+elevation above the horizontal plane, positive upwards, and the azimuth within that plane, positive to the right. Pixels
+and metres on a screen are (y, x) with y downwards. The centre of the top left pixel is (0, 0) in pixels, and the middle
+of the display is (0, 0) in metres.
 """
 
 import math
@@ -30,7 +31,7 @@ def separation(elevation_deg: Any, azimuth_deg: Any, other_elevation_deg: Any, o
     directions = (elevation_deg, azimuth_deg, other_elevation_deg, other_azimuth_deg)
     e1, a1, e2, a2 = (angles.as_tensor("angles", value).deg2rad() for value in directions)
     half = torch.sin((e1 - e2) / 2).square() + e1.cos() * e2.cos() * torch.sin((a1 - a2) / 2).square()
-    # Masked before the square roots, whose gradients are infinite at 0 and 1.
+    # 0 and 1 are replaced before the square roots, one of which has an infinite gradient at each of them.
     inside = (half > 0) & (half < 1)
     safe = torch.where(inside, half, 0.5)
     angle = 2 * torch.atan2(safe.sqrt(), (1 - safe).sqrt())
@@ -41,8 +42,7 @@ def separation(elevation_deg: Any, azimuth_deg: Any, other_elevation_deg: Any, o
 class Display:
     """Base class of all displays. ``shape`` is (H, W) in pixels.
 
-    Subclasses convert between pixels and directions, and compute pixels per degree. Their methods take numbers or
-    tensors that broadcast to [...], and return two tensors [...].
+    The methods take numbers or tensors that broadcast to [...]. Pairs are returned as two tensors [...].
     """
 
     shape: tuple[int, int]
@@ -107,7 +107,7 @@ class Display:
 
 @dataclass(frozen=True)
 class _Screen(Display):
-    """A screen of ``size`` (height, width) in metres along its surface, viewed from ``distance`` before its middle."""
+    """A screen of ``size`` (height, width) along its surface, ``distance`` from the eye to its middle, in metres."""
 
     size: tuple[float, float]
     distance: float
@@ -133,14 +133,37 @@ class _Screen(Display):
         y, x = angles.as_tensor("y_m", y_m, "metres"), angles.as_tensor("x_m", x_m, "metres")
         return self._from_middle(*torch.broadcast_tensors(y / self.pitch[0], x / self.pitch[1]))
 
-    def _pixels_per_degree(self, point: Tensor, tangent: Tensor, pitch: float) -> Tensor:
-        """Pixels per degree along a unit tangent t [..., 3] at a point p [..., 3].
+    def angles(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
+        """See :class:`Display`."""
+        x, y, z = self._surface(*self.metres(y_px, x_px))[0].unbind(-1)
+        return torch.atan2(-y, torch.hypot(x, z)).rad2deg(), torch.atan2(x, z).rad2deg()
 
-        With u = p / |p|, a step ds changes the direction by du = (t - (t.u) u) ds / |p|.
+    def pixels(self, elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
+        """See :class:`Display`."""
+        visible, y, x = self._intersection(*_directions(elevation_deg, azimuth_deg))
+        y, x = self.pixels_at(y, x)
+        return torch.where(visible, y, math.nan), torch.where(visible, x, math.nan)
+
+    def pixels_per_degree(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
+        """See :class:`Display`.
+
+        With u = p / |p|, a step ds along the tangent t at the point p changes the direction by (t - (t.u) u) ds / |p|.
         """
-        distance_squared = point.square().sum(-1)
-        across = torch.linalg.cross(point, tangent.expand_as(point)).square().sum(-1).sqrt()
-        return math.radians(1) * distance_squared / (across * pitch)
+        point, right = self._surface(*self.metres(y_px, x_px))
+
+        def along(tangent: Tensor, pitch: float) -> Tensor:
+            across = torch.linalg.cross(point, tangent.expand_as(point)).square().sum(-1).sqrt()
+            return math.radians(1) * point.square().sum(-1) / (across * pitch)
+
+        return along(point.new_tensor([0.0, 1.0, 0.0]), self.pitch[0]), along(right, self.pitch[1])
+
+    def _surface(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Points [..., 3] at metres (y, x) on the surface, and their unit tangents to the right, as (x, y, z)."""
+        raise NotImplementedError
+
+    def _intersection(self, up: Tensor, side: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Whether rays at (elevation, azimuth) in radians meet the surface, and where: (y, x) in metres along it."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -156,33 +179,22 @@ class FlatScreen(_Screen):
         height, width = (2 * distance * math.tan(math.radians(side) / 2) for side in field_deg)
         return cls(shape, (height, width), distance)
 
-    def angles(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
-        """See :class:`Display`."""
-        y, x = self.metres(y_px, x_px)
-        ahead = torch.full_like(x, self.distance)
-        return torch.atan2(-y, torch.hypot(x, ahead)).rad2deg(), torch.atan2(x, ahead).rad2deg()
+    def _surface(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        point = torch.stack([x, y, torch.full_like(x, self.distance)], -1)
+        return point, point.new_tensor([1.0, 0.0, 0.0])
 
-    def pixels(self, elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
-        """See :class:`Display`; NaN for directions at 90 deg and beyond."""
-        up, side = _directions(elevation_deg, azimuth_deg)
+    def _intersection(self, up: Tensor, side: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         in_front = (side.abs() < math.pi / 2) & (up.abs() < math.pi / 2)
         up, side = torch.where(in_front, up, 0), torch.where(in_front, side, 0)
-        y, x = -self.distance * up.tan() / side.cos(), self.distance * side.tan()
-        return tuple(torch.where(in_front, part, math.nan) for part in self.pixels_at(y, x))  # type: ignore[return-value]
-
-    def pixels_per_degree(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
-        """See :class:`Display`."""
-        y, x = self.metres(y_px, x_px)
-        point = torch.stack([x, y, torch.full_like(x, self.distance)], -1)
-        down, right = point.new_tensor([0.0, 1.0, 0.0]), point.new_tensor([1.0, 0.0, 0.0])
-        return self._pixels_per_degree(point, down, self.pitch[0]), self._pixels_per_degree(point, right, self.pitch[1])
+        return in_front, -self.distance * up.tan() / side.cos(), self.distance * side.tan()
 
 
 @dataclass(frozen=True)
 class CurvedScreen(_Screen):
     """Part of an upright cylinder of ``radius`` metres, concave towards the eye; its middle is straight ahead.
 
-    ``size`` is (height, arc length). The eye may be off the axis of the cylinder.
+    ``size`` is (height, arc length). The eye may be off the axis of the cylinder. A ray from an eye outside the
+    cylinder intersects it twice; the farther point counts.
     """
 
     radius: float
@@ -193,35 +205,20 @@ class CurvedScreen(_Screen):
         if self.size[1] > 2 * math.pi * self.radius * (1 + 1e-12):
             raise ValueError(f"the arc must be at most a full turn of {self.radius:g} m radius, got {self.size[1]:g} m")
 
-    def angles(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
-        """See :class:`Display`."""
-        x, y, z = self._point(*self.metres(y_px, x_px)).unbind(-1)
-        return torch.atan2(-y, torch.hypot(x, z)).rad2deg(), torch.atan2(x, z).rad2deg()
+    def _surface(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        angle = x / self.radius
+        ahead = self.distance - self.radius + self.radius * angle.cos()
+        right = torch.stack([angle.cos(), torch.zeros_like(angle), -angle.sin()], -1)
+        return torch.stack([self.radius * angle.sin(), y, ahead], -1), right
 
-    def pixels(self, elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
-        """See :class:`Display`; the farther of two intersections of a ray. NaN if the ray misses the cylinder."""
-        up, side = _directions(elevation_deg, azimuth_deg)
+    def _intersection(self, up: Tensor, side: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         offset = self.distance - self.radius  # distance from the eye to the axis of the cylinder
         root = self.radius**2 - offset**2 * side.sin().square()
         visible = (root > 0) & (up.abs() < math.pi / 2)
         distance = offset * side.cos() + torch.where(visible, root, 1).sqrt()  # in the horizontal plane
         visible = visible & (distance > 0)
         x, y = distance * side.sin(), -distance * torch.where(visible, up, 0).tan()
-        arc = self.radius * torch.atan2(x, distance * side.cos() - offset)
-        return tuple(torch.where(visible, part, math.nan) for part in self.pixels_at(y, arc))  # type: ignore[return-value]
-
-    def pixels_per_degree(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
-        """See :class:`Display`."""
-        y, arc = self.metres(y_px, x_px)
-        point, angle = self._point(y, arc), arc / self.radius
-        along = torch.stack([angle.cos(), torch.zeros_like(angle), -angle.sin()], -1)
-        down = point.new_tensor([0.0, 1.0, 0.0])
-        return self._pixels_per_degree(point, down, self.pitch[0]), self._pixels_per_degree(point, along, self.pitch[1])
-
-    def _point(self, y: Tensor, arc: Tensor) -> Tensor:
-        angle = arc / self.radius
-        ahead = self.distance - self.radius + self.radius * angle.cos()
-        return torch.stack([self.radius * angle.sin(), y, ahead], -1)
+        return visible, y, self.radius * torch.atan2(x, distance * side.cos() - offset)
 
 
 @dataclass(frozen=True)
@@ -242,7 +239,7 @@ class Headset(Display):
 
     @property
     def field_deg(self) -> tuple[float, float]:
-        """See :class:`Display`; computed from the resolution, as elevations are limited to 90 deg."""
+        """See :class:`Display`; may exceed 180 deg vertically, although elevations are limited to 90 deg."""
         return self.shape[0] / self.resolution, self.shape[1] / self.resolution
 
     def angles(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
@@ -255,12 +252,12 @@ class Headset(Display):
         return up.rad2deg(), torch.atan2(x * share, angle.cos()).rad2deg()
 
     def pixels(self, elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
-        """See :class:`Display`; NaN for the direction straight behind, which is a circle in the image."""
+        """See :class:`Display`; NaN for the direction straight behind the eye, whose image is a circle."""
         up, side = _directions(elevation_deg, azimuth_deg)
         x, y = up.cos() * side.sin(), -up.sin()
         sine = _norm(y, x)
         angle = torch.atan2(sine, up.cos() * side.cos()).rad2deg()
-        # Masked before the division, which has a NaN gradient at 0.
+        # 0 is replaced before the division, whose gradient would be NaN.
         share = angle * self.resolution / torch.where(sine > 0, sine, 1)
         share = torch.where(sine > 0, share, self.resolution * math.degrees(1))
         share = torch.where((sine < 1e-12) & (angle > 90), math.nan, share)
@@ -283,11 +280,10 @@ class Headset(Display):
 
 
 def _directions(elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
+    """(elevation, azimuth) in radians, broadcast. ValueError for elevations beyond 90 or azimuths beyond 180 deg."""
     up, side = angles.as_tensor("elevation_deg", elevation_deg), angles.as_tensor("azimuth_deg", azimuth_deg)
-    if (bad := up.abs() > 90).any():
-        raise ValueError(f"elevation_deg must be within -90 .. 90 degrees, got {angles.first(up, bad):g}")
-    if (bad := side.abs() > 180).any():
-        raise ValueError(f"azimuth_deg must be within -180 .. 180 degrees, got {angles.first(side, bad):g}")
+    angles.require(up.abs() <= 90, "elevation_deg must be within -90 .. 90 degrees", up)
+    angles.require(side.abs() <= 180, "azimuth_deg must be within -180 .. 180 degrees", side)
     up, side = torch.broadcast_tensors(up.deg2rad(), side.deg2rad())
     return up, side
 

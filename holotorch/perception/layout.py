@@ -45,8 +45,8 @@ def scale_layout(
 
     Args:
         centres_deg: (elevation, azimuth) of each item, [N, 2]; azimuths to the left are negative.
-        size_deg: (height, width) of each item, [N, 2]. The larger side becomes S(E); the
-            patterns of the study were as high as wide.
+        size_deg: (height, width) of each item, [N, 2]. The larger side becomes S(E); the patterns of the study were as
+            high as wide.
         scale: Scale of the sizes, such as a row of Table 2.2; the result is differentiable in its parameters.
         extrapolate: Use the line beyond ``scale.high_deg`` too; otherwise such items keep their size.
 
@@ -58,13 +58,12 @@ def scale_layout(
     where = eccentricity_of(centres[:, 0], centres[:, 1])
     fitted = scale.inside(where)
     beyond = ~fitted & (where > scale.high_deg) & extrapolate
-    used = fitted | beyond
-    # Unused items are evaluated at a valid eccentricity, so that they cause neither errors nor gradients.
-    target_size = scale(torch.where(used, where, torch.full_like(where, scale.high_deg)), extrapolate=extrapolate)
-    factor = torch.where(used, target_size / sizes.amax(-1), torch.ones_like(target_size))
+    scaled_items = fitted | beyond
+    # The line is evaluated at a valid eccentricity for all other items, which then cause neither errors nor gradients.
+    target_size = scale(torch.where(scaled_items, where, scale.high_deg), extrapolate=extrapolate)
+    factor = torch.where(scaled_items, target_size / sizes.amax(-1), 1)
     scaled = sizes * factor[:, None]
-    largest = scaled.detach().amax(-1)
-    tested = (largest >= TESTED_DEG[0]) & (largest <= TESTED_DEG[1])
+    tested = angles.within(scaled.detach().amax(-1), *TESTED_DEG)
     return ScaledLayout(scaled, where, fitted, beyond, tested)
 
 
@@ -83,14 +82,14 @@ def overlaps(centres_deg: Any, size_deg: Any) -> tuple[Tensor, Tensor]:
     """
     centres, sizes = _items(centres_deg, size_deg)
     first, second = torch.triu_indices(len(centres), len(centres), 1, device=centres.device)
-    level = centres[:, 0].deg2rad().cos().clamp(min=1e-6)
-    height, width = sizes[:, 0], (sizes[:, 1] / level).clamp(max=360)
+    cosine = centres[:, 0].deg2rad().cos().clamp(min=1e-6)
+    height, width = sizes[:, 0], (sizes[:, 1] / cosine).clamp(max=360)
     apart = (centres[first, 1] - centres[second, 1] + 180).remainder(360) - 180  # wrapped at 180 deg
-    free_y = (height[first] + height[second]) / 2 - (centres[first, 0] - centres[second, 0]).abs()
-    free_x = ((width[first] + width[second]) / 2 - apart.abs()) * torch.minimum(level[first], level[second])
-    depth = torch.minimum(free_y, free_x)
-    covered = depth > 1e-9
-    return torch.stack([first, second], -1)[covered], depth[covered]
+    overlap_y = (height[first] + height[second]) / 2 - (centres[first, 0] - centres[second, 0]).abs()
+    overlap_x = ((width[first] + width[second]) / 2 - apart.abs()) * torch.minimum(cosine[first], cosine[second])
+    overlap = torch.minimum(overlap_y, overlap_x)
+    overlapping = overlap > 1e-9
+    return torch.stack([first, second], -1)[overlapping], overlap[overlapping]
 
 
 def _items(centres_deg: Any, size_deg: Any) -> tuple[Tensor, Tensor]:
@@ -98,8 +97,6 @@ def _items(centres_deg: Any, size_deg: Any) -> tuple[Tensor, Tensor]:
     if centres.ndim != 2 or centres.shape[-1] != 2 or sizes.shape != centres.shape:
         shapes = f"{tuple(centres.shape)} and {tuple(sizes.shape)}"
         raise ValueError(f"centres_deg and size_deg must both be [N, 2], (y, x), got {shapes}")
-    limits = centres.new_tensor([90.0, 180.0])
-    if (bad := centres.abs() > limits).any():
-        got = angles.first(centres, bad)
-        raise ValueError(f"centres_deg must be within 90 degrees of elevation and 180 of azimuth, got {got:g}")
+    valid = centres.abs() <= centres.new_tensor([90.0, 180.0])
+    angles.require(valid, "centres_deg must be within 90 degrees of elevation and 180 of azimuth", centres)
     return centres, sizes

@@ -22,8 +22,7 @@ class EqualEfficiencyScale:
     Attributes:
         alpha: Slope, degrees of size per degree of eccentricity; a number or a tensor of one value.
         beta: Intercept in degrees.
-        low_deg: Smallest eccentricity of the fit.
-        high_deg: Greatest eccentricity of the fit.
+        low_deg, high_deg: Smallest and greatest eccentricity of the fit.
         covariance: Covariance of (alpha, beta), [2, 2]; None for the lines of Table 2.2, where it is not printed.
 
     Source: thesis Sec. 2.4.3.
@@ -67,14 +66,8 @@ class EqualEfficiencyScale:
             ValueError: There are fewer than two different eccentricities within 40 .. 70 deg, or a size there is not
                 finite.
         """
-        where = angles.eccentricity(eccentricity_deg).double()
         sizes = size_deg if isinstance(size_deg, Tensor) else torch.as_tensor(size_deg, dtype=torch.float64)
-        if where.ndim != 1 or sizes.shape != where.shape:
-            shapes = f"{tuple(where.shape)} and {tuple(sizes.shape)}"
-            raise ValueError(f"eccentricities and sizes must both be [N], got {shapes}")
-        inside = (where >= FITTED_DEG[0]) & (where <= FITTED_DEG[1])
-        if len(where[inside].unique()) < 2:
-            raise ValueError("a line needs two or more eccentricities within 40 .. 70 degrees")
+        where, inside = _fitted(eccentricity_deg, sizes.shape, "size")
         x, y = where[inside], angles.size(sizes[inside]).double()
         spread = (x - x.mean()).square().sum()
         alpha = ((x - x.mean()) * y).sum() / spread
@@ -90,14 +83,7 @@ class EqualEfficiencyScale:
 
         As in the thesis, only laws within 40 .. 70 deg are used. ValueError if one of them has a >= 0.
         """
-        where = angles.eccentricity(eccentricity_deg).double()
-        if where.ndim != 1 or times.slope.shape != where.shape:
-            raise ValueError(
-                f"expected one law per eccentricity, got {tuple(times.slope.shape)} and {tuple(where.shape)}"
-            )
-        inside = (where >= FITTED_DEG[0]) & (where <= FITTED_DEG[1])
-        if not inside.any():
-            raise ValueError("a line needs two or more eccentricities within 40 .. 70 degrees")
+        where, inside = _fitted(eccentricity_deg, times.slope.shape, "law")
         return cls.fit(where[inside], times[inside].size(seconds))
 
     @classmethod
@@ -126,10 +112,10 @@ class EqualEfficiencyScale:
                 extrapolated line is not above zero there.
         """
         where = angles.eccentricity(eccentricity_deg)
-        if not extrapolate and not (inside := self.inside(where)).all():
+        if not extrapolate:
             limits = f"{self.low_deg:g} .. {self.high_deg:g} degrees, where the line was fitted"
-            got = angles.first(where, ~inside)
-            raise ValueError(f"eccentricity_deg must be within {limits}, got {got:g}; or pass extrapolate=True")
+            rule = f"eccentricity_deg must be within {limits}"
+            angles.require(self.inside(where), rule, where, "; or pass extrapolate=True")
         sizes = self._line(where)
         if (bad := sizes <= 0).any():
             got = f"{angles.first(sizes, bad):.3g} degrees at {angles.first(where, bad):g}"
@@ -137,45 +123,48 @@ class EqualEfficiencyScale:
         return sizes
 
     def inverse(self, size_deg: Any, *, extrapolate: bool = False) -> Tensor:
-        """The eccentricity E in degrees with S(E) = ``size_deg``, within the same limits. ValueError if alpha is 0."""
+        """The eccentricity E in degrees with S(E) = ``size_deg``; limits as in a call. ValueError if alpha is 0."""
         if not torch.as_tensor(self.alpha).detach().any():
             raise ValueError("alpha is 0: the size is the same at every eccentricity, so that there is no inverse")
         sizes = angles.size(size_deg)
-        where = (sizes - self._like(self.beta, sizes)) / self._like(self.alpha, sizes)
-        tolerance = _tolerance(sizes)
-        outside = (where < self.low_deg - tolerance) | (where > self.high_deg + tolerance)
-        if not extrapolate and outside.any():
-            ends = self._line(torch.tensor([self.low_deg, self.high_deg], dtype=torch.float64)).detach().sort().values
-            span = f"{ends[0]:.4g} .. {ends[1]:.4g} degrees, the sizes of the line"
-            raise ValueError(
-                f"size_deg must be within {span}, got {angles.first(sizes, outside):g}; or pass extrapolate=True"
-            )
+        alpha, beta = self._coefficients(sizes)
+        where = (sizes - beta) / alpha
         if extrapolate:
             return angles.eccentricity(where, "the eccentricity of size_deg")
+        low, high = self._line(torch.tensor([self.low_deg, self.high_deg], dtype=torch.float64)).detach().sort().values
+        limits = f"{low:.4g} .. {high:.4g} degrees, the sizes of the line"
+        angles.require(self._covers(where), f"size_deg must be within {limits}", sizes, "; or pass extrapolate=True")
         return where.clamp(self.low_deg, self.high_deg)
 
     def inside(self, eccentricity_deg: Any) -> Tensor:
         """Whether eccentricities lie within those of the fit, up to rounding errors; bool, of the given shape."""
-        where = angles.eccentricity(eccentricity_deg)
-        tolerance = _tolerance(where)
-        return (where >= self.low_deg - tolerance) & (where <= self.high_deg + tolerance)
+        return self._covers(angles.eccentricity(eccentricity_deg))
 
     def tested(self, eccentricity_deg: Any) -> Tensor:
         """Whether S(E) is within the sizes tested in the study, 5 .. 26 deg; bool, at any eccentricity.
 
         Lines of Table 2.2 exceed the tested sizes by up to 4 deg at 70 deg; such sizes are allowed and only marked.
         """
-        sizes = self._line(angles.eccentricity(eccentricity_deg))
-        return (sizes >= TESTED_DEG[0]) & (sizes <= TESTED_DEG[1])
+        return angles.within(self._line(angles.eccentricity(eccentricity_deg)), *TESTED_DEG)
+
+    def _covers(self, where: Tensor) -> Tensor:
+        """Whether eccentricities lie within those of the fit, up to the rounding errors of their dtype."""
+        return angles.within(where, self.low_deg, self.high_deg, 1e-9 if where.dtype == torch.float64 else 1e-4)
 
     def _line(self, where: Tensor) -> Tensor:
-        return self._like(self.alpha, where) * where + self._like(self.beta, where)
+        alpha, beta = self._coefficients(where)
+        return alpha * where + beta
 
-    @staticmethod
-    def _like(value: float | Tensor, other: Tensor) -> Tensor:
-        return torch.as_tensor(value, dtype=torch.float64).to(other)
+    def _coefficients(self, like: Tensor) -> list[Tensor]:
+        return [torch.as_tensor(value, dtype=torch.float64).to(like) for value in (self.alpha, self.beta)]
 
 
-def _tolerance(values: Tensor) -> float:
-    """Tolerance in degrees for rounding errors of angles computed from coordinates or by ``inverse``."""
-    return 1e-9 if values.dtype == torch.float64 else 1e-4
+def _fitted(eccentricity_deg: Any, shape: torch.Size, what: str) -> tuple[Tensor, Tensor]:
+    """Eccentricities [N] in float64, and the mask [N] of those within ``FITTED_DEG``, at least two of which differ."""
+    where = angles.eccentricity(eccentricity_deg).double()
+    if where.ndim != 1 or shape != where.shape:
+        raise ValueError(f"expected one {what} per eccentricity [N], got {tuple(shape)} and {tuple(where.shape)}")
+    inside = angles.within(where, *FITTED_DEG)
+    if len(where[inside].unique()) < 2:
+        raise ValueError("a line needs two or more eccentricities within 40 .. 70 degrees")
+    return where, inside

@@ -7,22 +7,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from holotorch.core import checks
 from holotorch.perception import angles
-
-_LARGEST = 360.0  # degrees; largest possible size of a pattern
 
 
 @dataclass(frozen=True, eq=False)
 class PerceptionTime:
     """T(S) = a ln S + b in seconds for a pattern of S degrees: one law or a batch [...], such as one per eccentricity.
 
-    As in the thesis, the time includes the decision and the press of a button. The logarithm is natural.
+    As in the thesis, the time includes the decision and the press of a button.
 
     Attributes:
         slope: a in seconds, [...]; negative if a larger pattern is perceived sooner.
         intercept: b in seconds, [...]: the time at 1 degree.
-        covariance: Covariance of (a, b) in s^2, [..., 2, 2]; NaN for a fit to two points.
-        deviation: Standard deviation of the residuals in seconds, [...]; NaN for a fit to two points.
+        covariance: Covariance of (a, b) in s^2, [..., 2, 2]; this and ``deviation`` are NaN for a fit to two points.
+        deviation: Standard deviation of the residuals in seconds, [...].
         freedom: Degrees of freedom of the residuals, the number of points minus two, [...].
 
     Source: thesis Eq. 2.3 (in milliseconds there).
@@ -35,8 +34,9 @@ class PerceptionTime:
     freedom: Tensor | None = None
 
     def __post_init__(self):
-        for name in ("slope", "intercept"):
-            object.__setattr__(self, name, angles.as_tensor(name, getattr(self, name), "seconds"))
+        for name, value in (("slope", self.slope), ("intercept", self.intercept)):
+            checks.real(name, value)
+            angles.as_tensor(name, value, "seconds")
         if self.slope.shape != self.intercept.shape:
             shapes = f"{tuple(self.slope.shape)} and {tuple(self.intercept.shape)}"
             raise ValueError(f"slope and intercept must share a shape, got {shapes}")
@@ -54,29 +54,25 @@ class PerceptionTime:
             ValueError: A time is not above zero, or a law has fewer than two different sizes.
         """
         times = seconds if isinstance(seconds, Tensor) else torch.as_tensor(seconds, dtype=torch.float64)
-        if seen is not None:
-            if seen.dtype != torch.bool:
-                raise TypeError(f"seen must be a bool tensor, got {seen.dtype}")
-            times = torch.where(seen, times, torch.ones_like(times))
-        times = angles.as_tensor("seconds", times, "seconds").double()
-        measured = times.detach() if seen is None else times.detach()[seen.expand_as(times)]
+        seen = torch.ones_like(times, dtype=torch.bool) if seen is None else seen
+        if seen.dtype != torch.bool:
+            raise TypeError(f"seen must be a bool tensor, got {seen.dtype}")
+        times = angles.as_tensor("seconds", torch.where(seen, times, torch.ones_like(times)), "seconds").double()
         if times.ndim == 0 or (times <= 0).any():
             raise ValueError("seconds must be times above zero with the patterns on their last axis")
-        if measured.median() > 30:
-            raise ValueError(f"seconds must be in seconds, got a median of {measured.median():g}; 450 ms is 0.45")
-        x, times = torch.broadcast_tensors(angles.size(size_deg).to(times).log(), times)
-        weight = torch.ones_like(times) if seen is None else seen.to(times).expand_as(times)
+        if (median := times.detach()[seen.expand_as(times)].median()) > 30:
+            raise ValueError(f"seconds must be in seconds, got a median of {median:g}; 450 ms is 0.45")
+        x, times, weight = torch.broadcast_tensors(angles.size(size_deg).to(times).log(), times, seen.to(times))
         count = weight.sum(-1)
         mean_x = (weight * x).sum(-1, keepdim=True) / count.clamp(min=1)[..., None]
         spread = (weight * (x - mean_x).square()).sum(-1)
         bad = ~(spread > 1e-12)
         if bad.any():
-            which = f", as {int(bad.sum())} of {bad.numel()} have" if bad.ndim else ""
+            which = f" in {int(bad.sum())} of {bad.numel()} laws" if bad.ndim else ""
             got = "no seen pattern" if angles.first(count, bad) == 0 else "one size only"
             raise ValueError(f"a law T(S) = a ln S + b needs patterns of two sizes or more, got {got}{which}")
-        mean = (weight * times).sum(-1) / count
         slope = (weight * (x - mean_x) * times).sum(-1) / spread
-        intercept = mean - slope * mean_x[..., 0]
+        intercept = (weight * times).sum(-1) / count - slope * mean_x[..., 0]
         freedom = count - 2
         residual = times - slope[..., None] * x - intercept[..., None]
         variance = (weight * residual.square()).sum(-1) / freedom.clamp(min=1)
@@ -94,29 +90,26 @@ class PerceptionTime:
 
     def __getitem__(self, index) -> "PerceptionTime":
         """Select laws by an index, a slice or a mask over [...]."""
-        rest = (self.covariance, self.deviation, self.freedom)
-        rest = (None if part is None else part[index] for part in rest)
-        return PerceptionTime(self.slope[index], self.intercept[index], *rest)
+        parts = (self.slope, self.intercept, self.covariance, self.deviation, self.freedom)
+        return PerceptionTime(*(None if part is None else part[index] for part in parts))  # type: ignore[arg-type]
 
     def seconds(self, size_deg: Any) -> Tensor:
         """T(S) in seconds for sizes that broadcast with [...]. ValueError for sizes that are not above zero."""
         return self.slope * angles.size(size_deg).to(self.slope.device).log() + self.intercept
 
     def size(self, seconds: Any) -> Tensor:
-        """The size in degrees with the time ``seconds``, which broadcast with [...]; infinite above 360 deg.
+        """The size in degrees whose time is ``seconds``, which broadcast with [...].
 
-        An infinite size has gradient 0. :class:`EqualEfficiencyScale` tells whether a size was tested in the study.
+        A size above 360 deg is returned as infinity, with gradient 0.
 
         Raises:
             ValueError: A law has a >= 0, so that larger patterns are not perceived sooner and no size is a solution.
         """
         times = angles.as_tensor("seconds", seconds, "seconds").to(self.slope.device)
-        if not self.falls.all():
-            bad = (
-                f"a = {angles.first(self.slope, ~self.falls):g} s in {int((~self.falls).sum())} of {self.slope.numel()}"
-            )
+        if (bad := ~self.falls).any():
+            laws = f"a = {angles.first(self.slope, bad):g} s in {int(bad.sum())} of {bad.numel()} laws"
             cure = "select the laws that fall with time[time.falls]"
-            raise ValueError(f"a larger pattern is not perceived sooner ({bad} laws), so no size is the answer; {cure}")
+            raise ValueError(f"a larger pattern is not perceived sooner ({laws}), so no size is the answer; {cure}")
         exponent = (times - self.intercept) / self.slope
-        limit = math.log(_LARGEST)
+        limit = math.log(360.0)
         return torch.where(exponent > limit, math.inf, exponent.clamp(max=limit).exp())

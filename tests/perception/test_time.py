@@ -49,7 +49,7 @@ def test_missed_patterns_are_left_out_of_a_batch():
     torch.testing.assert_close(found[1].covariance, alone.covariance)
     (gradient,) = torch.autograd.grad(found.slope.sum() + found.intercept.sum(), gaps)
     assert gradient.isfinite().all() and not gradient[~seen].any()
-    with pytest.raises(ValueError, match="no seen pattern, as 1 of 3 have"):
+    with pytest.raises(ValueError, match="no seen pattern in 1 of 3 laws"):
         PerceptionTime.fit(SIZES, times, seen=seen & torch.tensor([[True], [False], [True]]))
     with pytest.raises(ValueError, match="must be finite"):
         PerceptionTime.fit(SIZES, gaps.detach())
