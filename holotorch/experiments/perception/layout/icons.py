@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.patches import Ellipse, FancyBboxPatch, Polygon, Rectangle
-
-Position = Callable[[float, float], tuple[float, float]]
+from matplotlib.patches import Circle, Ellipse, FancyBboxPatch, Patch, Polygon, Rectangle
+from matplotlib.transforms import Affine2D, Transform
 
 
 def draw_ground(axes: Axes, field_deg: tuple[float, float]) -> None:
@@ -29,46 +30,48 @@ def draw_icon(axes: Axes, name: str, centre: tuple[float, float], size: tuple[fl
     """Draw an icon on a rounded plate; ``centre`` (x, y) and ``size`` (height, width) are in the units of the axes."""
     height, width = size
     left, bottom = centre[0] - width / 2, centre[1] - height / 2
-
-    def at(x: float, y: float) -> tuple[float, float]:
-        return left + x * width, bottom + y * height
-
+    shapes, colour = _ICONS[name]
     plate = FancyBboxPatch(
-        at(0.04, 0.04),
+        (left + 0.04 * width, bottom + 0.04 * height),
         0.92 * width,
         0.92 * height,
         boxstyle=f"round,pad=0,rounding_size={0.16 * min(size)}",
-        facecolor=_PLATES[name],
+        facecolor=colour,
         edgecolor="white",
         linewidth=0.8,
         zorder=zorder,
     )
     axes.add_patch(plate)
-    _ICONS[name](_Pen(axes, at, width, height, zorder + 0.1))
+    unit_square = Affine2D().scale(width, height).translate(left, bottom) + axes.transData
+    shapes(_Pen(axes, unit_square, zorder + 0.1, colour))
 
 
+@dataclass(frozen=True)
 class _Pen:
-    """Draws shapes, white by default, in the unit square of an icon."""
+    """Draws shapes, white by default, in the unit square of an icon on a plate of colour ``plate``."""
 
-    def __init__(self, axes: Axes, at: Position, width: float, height: float, zorder: float):
-        self.axes, self.at, self.width, self.height, self.zorder = axes, at, width, height, zorder
+    axes: Axes
+    transform: Transform
+    zorder: float
+    plate: str
 
     def line(self, *points: tuple[float, float], thick: float = 0.05, **options: Any) -> None:
         # Lines are drawn as polygons, because Matplotlib's line widths are in points and do not scale with the icon.
-        for (x0, y0), (x1, y1) in zip(points, points[1:], strict=False):
+        for (x0, y0), (x1, y1) in pairwise(points):
             length = math.hypot(x1 - x0, y1 - y0) or 1.0
             dx, dy = (x1 - x0) / length * thick / 2, (y1 - y0) / length * thick / 2
             corners = [(x0 - dx - dy, y0 - dy + dx), (x0 - dx + dy, y0 - dy - dx)]
             self.shape(*corners, (x1 + dx + dy, y1 + dy - dx), (x1 + dx - dy, y1 + dy + dx), **options)
 
     def shape(self, *points: tuple[float, float], color: str = "white") -> None:
-        self.axes.add_patch(Polygon([self.at(*p) for p in points], color=color, linewidth=0, zorder=self.zorder))
+        self._add(Polygon(points, color=color))
 
     def disc(self, x: float, y: float, radius: float, color: str = "white") -> None:
-        middle, size = self.at(x, y), 2 * radius
-        self.axes.add_patch(
-            Ellipse(middle, size * self.width, size * self.height, color=color, linewidth=0, zorder=self.zorder)
-        )
+        self._add(Circle((x, y), radius, color=color))
+
+    def _add(self, patch: Patch) -> None:
+        patch.set(linewidth=0, zorder=self.zorder, transform=self.transform)
+        self.axes.add_patch(patch)
 
 
 def _wheel(pen: _Pen) -> None:
@@ -96,8 +99,8 @@ def _castle(pen: _Pen) -> None:
         pen.shape((x - 0.09, 0.16), (x - 0.09, top), (x + 0.09, top), (x + 0.09, 0.16))
         pen.shape((x - 0.12, top), (x, top + 0.2), (x + 0.12, top), color="#ffe08a")
     pen.shape((0.2, 0.16), (0.2, 0.44), (0.8, 0.44), (0.8, 0.16))
-    pen.disc(0.5, 0.26, 0.08, _PLATES["castle"])
-    pen.shape((0.42, 0.16), (0.42, 0.26), (0.58, 0.26), (0.58, 0.16), color=_PLATES["castle"])
+    pen.disc(0.5, 0.26, 0.08, pen.plate)
+    pen.shape((0.42, 0.16), (0.42, 0.26), (0.58, 0.26), (0.58, 0.16), color=pen.plate)
 
 
 def _boat(pen: _Pen) -> None:
@@ -134,23 +137,14 @@ def _first_aid(pen: _Pen) -> None:
     pen.line((0.2, 0.5), (0.8, 0.5), thick=0.2)
 
 
-_PLATES = {
-    "wheel": "#2f5d8a",
-    "coaster": "#a23b3b",
-    "castle": "#6b4a8f",
-    "boat": "#21737d",
-    "tent": "#b3592a",
-    "carousel": "#94386e",
-    "food": "#7d5a2b",
-    "first_aid": "#2c7a4b",
-}
-_ICONS = {
-    "wheel": _wheel,
-    "coaster": _coaster,
-    "castle": _castle,
-    "boat": _boat,
-    "tent": _tent,
-    "carousel": _carousel,
-    "food": _food,
-    "first_aid": _first_aid,
+# The shapes of each icon and the colour of its plate.
+_ICONS: dict[str, tuple[Callable[[_Pen], None], str]] = {
+    "wheel": (_wheel, "#2f5d8a"),
+    "coaster": (_coaster, "#a23b3b"),
+    "castle": (_castle, "#6b4a8f"),
+    "boat": (_boat, "#21737d"),
+    "tent": (_tent, "#b3592a"),
+    "carousel": (_carousel, "#94386e"),
+    "food": (_food, "#7d5a2b"),
+    "first_aid": (_first_aid, "#2c7a4b"),
 }

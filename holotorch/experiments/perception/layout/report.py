@@ -1,8 +1,5 @@
 """The part of a report page that shows a layout over a wide field."""
 
-from collections.abc import Sequence
-from typing import Any
-
 from holotorch.experiments.runs.page import element, figure, heading, table
 from holotorch.experiments.runs.record import RunRecord
 
@@ -18,10 +15,8 @@ def layout_section(record: RunRecord) -> list[str]:
     parts.append(element("pre", "\n".join(record.summary["lines"])))
     displays = "Displays of thesis Table 2.1: greatest eccentricity at which they show the sizes"
     for title, lines in (("Sizes", rows), (displays, record.rows("displays.csv"))):
-        parts += [element("h2", title), *_table(lines)]
+        parts.append(element("h2", title))
+        if lines:
+            names = [key.replace("_", " ") for key in lines[0]]
+            parts.append(table(names, [[str(value) for value in line.values()] for line in lines]))
     return parts
-
-
-def _table(rows: Sequence[dict[str, Any]]) -> list[str]:
-    names = [key.replace("_", " ") for key in rows[0]] if rows else []
-    return [table(names, [[str(value) for value in row.values()] for row in rows])] if rows else []

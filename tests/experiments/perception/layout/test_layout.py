@@ -84,10 +84,10 @@ def test_the_legend_holds_what_is_drawn_and_items_have_their_names(extrapolate, 
 
     def keep(figure):
         drawn.append(figure)
-        return canvas(figure)
+        return figure_png(figure)
 
-    canvas = perception_layout.FigureCanvasAgg
-    monkeypatch.setattr(perception_layout, "FigureCanvasAgg", keep)
+    figure_png = perception_layout.figure_png
+    monkeypatch.setattr(perception_layout, "figure_png", keep)
     main(["run", str(LAYOUT), f"extrapolate={str(extrapolate).lower()}", "--out", str(tmp_path / "a")])
     (figure,) = drawn
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
