@@ -1,5 +1,6 @@
 """Perception times, curves and equal-efficiency scales of each participant of a study (thesis Sec. 2.4)."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +12,9 @@ from scipy import ndimage
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.perception.analysis.config import CleaningSettings, TargetTimeSettings
+from holotorch.experiments.perception.analysis.statistics import Array, listed
 from holotorch.experiments.perception.study.log import read_logs
 from holotorch.perception.time import PerceptionTime
-
-Array = NDArray[np.float64]
-_CONSISTENT = 1.4826  # ratio of a Gaussian's standard deviation to its median absolute deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,16 +66,13 @@ def read_responses(paths: Iterable[str]) -> Responses:
     }
     if wrong:
         raise ConfigError(sorted(wrong))
-    trials = [trial for _, trial in rows]
-    return Responses(
-        np.array([trial["participant"] for trial in trials]),
-        np.array([trial["eccentricity_deg"] for trial in trials], dtype=float),
-        np.array([trial["size_deg"] for trial in trials], dtype=float),
-        np.array([trial["target"] for trial in trials]),
-        np.array([np.nan if trial["reaction_s"] is None else trial["reaction_s"] for trial in trials], dtype=float),
-        np.array([trial["frame_s"] for trial in trials], dtype=float),
-        torn=sum(log.torn for log in logs),
-    )
+
+    def column(key: str, dtype: type = float) -> NDArray:
+        return np.array([trial[key] for _, trial in rows], dtype)  # float makes NaN of None
+
+    pattern = column("eccentricity_deg"), column("size_deg"), column("target", bool)
+    times = column("reaction_s"), column("frame_s")
+    return Responses(column("participant", int), *pattern, *times, torn=sum(log.torn for log in logs))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,13 +105,12 @@ class Times:
         assert size is not None and angle is not None  # checked by TargetTimeSettings
         e = np.flatnonzero(np.abs(self.eccentricities - angle) < 1e-6)
         s = np.flatnonzero(np.abs(self.sizes - size) < 1e-6)
-        if not (len(e) and len(s)) or not np.isfinite(self.seconds[:, e[0], s[0]]).any():
-            shown = (
-                ", ".join(f"{x:g}" for x in self.sizes[np.isfinite(self.seconds[:, e]).any((0, 1))]) if len(e) else ""
-            )
-            available = f"sizes there: {shown or 'none'}" if len(e) else f"at {_list(self.eccentricities)} deg"
+        seconds = self.seconds[:, e][:, :, s]  # [P, 0 or 1, 0 or 1]
+        if not np.isfinite(seconds).any():
+            shown = listed(self.sizes[np.isfinite(self.seconds[:, e]).any((0, 1))])
+            available = f"sizes there: {shown or 'none'}" if len(e) else f"at {listed(self.eccentricities)} deg"
             raise ConfigError([f"targets: no answers to a pattern of {target}; there are some with {available}"])
-        return self.seconds[:, e[0], s[0]]
+        return seconds[:, 0, 0]
 
 
 def perception_times(responses: Responses, rule: CleaningSettings) -> Times:
@@ -143,38 +138,31 @@ def perception_times(responses: Responses, rule: CleaningSettings) -> Times:
     eccentricities, e = np.unique(responses.eccentricity_deg, return_inverse=True)
     sizes, s = np.unique(responses.size_deg, return_inverse=True)
     shape = (len(participants), len(eccentricities), len(sizes))
-    cell = np.ravel_multi_index((p, e, s), shape)
+    condition, conditions = np.ravel_multi_index((p, e, s), shape), math.prod(shape)
     kept = np.flatnonzero(valid)
     logarithm = np.log(np.maximum(time[kept], 1e-6))
-    middle = _medians(cell[kept], logarithm, int(np.prod(shape)))
-    deviation = np.abs(logarithm - middle[cell[kept]])
-    spread = _CONSISTENT * _medians(p[kept], deviation, shape[0])[p[kept]]
+    middle = _medians(condition[kept], logarithm, conditions)[condition[kept]]
+    deviation = np.abs(logarithm - middle)
+    # 1.4826 is the ratio of a Gaussian's standard deviation to its median absolute deviation.
+    spread = 1.4826 * _medians(p[kept], deviation, shape[0])[p[kept]]
     # Coarse frames can make all times equal; the spread is therefore at least half a frame.
-    spread = np.maximum(spread, responses.frame_s[kept] / (2 * np.exp(middle[cell[kept]])))
+    spread = np.maximum(spread, responses.frame_s[kept] / (2 * np.exp(middle)))
     outlier = deviation > rule.deviations * spread
     counts["outliers"] = int(outlier.sum())
     kept = kept[~outlier]
-    number = np.bincount(cell[kept], minlength=int(np.prod(shape)))
-    seconds = _medians(cell[kept], time[kept], int(np.prod(shape)))
-    shown = np.bincount(cell[target], minlength=len(number)) > 0
+    number = np.bincount(condition[kept], minlength=conditions)
+    seconds = _medians(condition[kept], time[kept], conditions)
+    shown = np.bincount(condition[target], minlength=conditions) > 0
     missing = shown & (number < rule.responses)
     seconds[missing] = np.nan
     counts["conditions"] = int(shown.sum())
     counts["missing conditions"] = int(missing.sum())
     counts["unfinished trials"] = responses.torn
     if not np.isfinite(seconds).any():
-        raise ConfigError(
-            [f"no condition has {rule.responses} answers (cleaning.responses); {int(number.max())} at most"]
-        )
-    return Times(
-        participants,
-        eccentricities,
-        sizes,
-        seconds.reshape(shape),
-        number.reshape(shape),
-        counts,
-        responses.simulated,
-    )
+        most = int(number.max())
+        raise ConfigError([f"no condition has {rule.responses} answers (cleaning.responses); {most} at most"])
+    seconds, number = seconds.reshape(shape), number.reshape(shape)
+    return Times(participants, eccentricities, sizes, seconds, number, counts, responses.simulated)
 
 
 def _medians(group: NDArray[np.int64], values: Array, groups: int) -> Array:
@@ -212,15 +200,14 @@ def fit_curves(times: Times, from_deg: float, least_sizes: int) -> Curves:
     """
     peripheral = times.eccentricities >= from_deg
     if not peripheral.any():
-        raise ConfigError([f"no eccentricity of {from_deg:g} deg or more; there are {_list(times.eccentricities)} deg"])
+        shown = listed(times.eccentricities)
+        raise ConfigError([f"no eccentricity of {from_deg:g} deg or more; there are {shown} deg"])
     seconds = times.seconds[:, peripheral]
     measured = np.isfinite(seconds)
     enough = measured.sum(-1) >= least_sizes
     if not enough.any():
-        most = int(measured.sum(-1).max())
-        raise ConfigError(
-            [f"a curve T(S) needs times of {least_sizes} sizes (cleaning.sizes) at an eccentricity, got {most} at most"]
-        )
+        needed = f"a curve T(S) needs times of {least_sizes} sizes (cleaning.sizes) at an eccentricity"
+        raise ConfigError([f"{needed}, got {int(measured.sum(-1).max())} at most"])
     fit = PerceptionTime.fit(
         torch.from_numpy(times.sizes), torch.from_numpy(seconds[enough]), seen=torch.from_numpy(measured[enough])
     )
@@ -241,13 +228,11 @@ class Scales:
     Leaving these participants out would make the line too flat.
 
     Attributes:
-        eccentricities: Degrees [K].
         degrees: Scales [P, K], clipped to the limits; NaN if a time is missing.
         defined: Whether a < 0, [P, K].
         limited: Whether a defined scale was clipped to a limit, [P, K].
     """
 
-    eccentricities: Array
     degrees: Array
     defined: NDArray[np.bool_]
     limited: NDArray[np.bool_]
@@ -272,8 +257,4 @@ def equal_efficiency(curves: Curves, target_s: Array, limits_deg: tuple[float, f
     degrees = np.where(exponent >= high, limits_deg[1], np.where(exponent <= low, limits_deg[0], degrees))
     degrees = np.where(measured, degrees, np.nan)
     limited = defined & ((exponent < low) | (exponent > high))
-    return Scales(curves.eccentricities, degrees, defined, limited)
-
-
-def _list(values: Array) -> str:
-    return ", ".join(f"{value:g}" for value in values)
+    return Scales(degrees, defined, limited)

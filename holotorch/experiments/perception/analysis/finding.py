@@ -23,9 +23,9 @@ class Finding:
         thesis: One-way analysis of variance, as in the thesis.
         repeated: Repeated-measures analysis; None if it was not requested.
         mixed: Mixed model; None if it was not requested or not fitted.
-        undefined: Number of scales in the fitted range that do not exist, as times do not fall with size there.
-        limited: Number of defined scales within this range that are clipped to a limit.
-        missing: Number of scales within this range that lack a measured time.
+        undefined: Number of scales in the fitted range that do not exist, because times do not fall with the size.
+        limited: Number of defined scales in this range that are clipped to a limit.
+        missing: Number of scales in this range without a measured time.
     """
 
     name: str
@@ -42,20 +42,19 @@ class Finding:
         """The row of metrics.csv; ``truth`` is the true (alpha, beta) of simulated participants."""
         line = self.line
         row: dict[str, Any] = {"target": self.name, "alpha": line.alpha, "beta": line.beta}
-        row |= dict(zip(("alpha_low", "alpha_high"), line.alpha_interval, strict=True))
-        row |= dict(zip(("beta_low", "beta_high"), line.beta_interval, strict=True))
+        row["alpha_low"], row["alpha_high"] = line.alpha_interval
+        row["beta_low"], row["beta_high"] = line.beta_interval
         if truth is not None:
             row |= {"true_alpha": truth[0], "true_beta": truth[1]}
         row |= _anova("one_way", self.thesis)
         if self.repeated is not None:
             row |= _anova("repeated", self.repeated)
             row |= {"epsilon": self.repeated.epsilon, "repeated_p_corrected": self.repeated.p_corrected}
-            row |= {"repeated_left_out": self.repeated.left_out}
-            mixed = self.mixed
-            row |= {"mixed_alpha": mixed.alpha if mixed else math.nan, "mixed_beta": mixed.beta if mixed else math.nan}
-            low, high = mixed.alpha_interval if mixed else (math.nan, math.nan)
-            row |= {"mixed_alpha_low": low, "mixed_alpha_high": high, "mixed_p": mixed.p if mixed else math.nan}
-            row |= {"mixed_effects": mixed.effects if mixed else "not fitted"}
+            nan = math.nan
+            mixed = self.mixed or Mixed(nan, nan, (nan, nan), (nan, nan), nan, "not fitted", 0, 0)
+            row |= {"repeated_left_out": self.repeated.left_out, "mixed_alpha": mixed.alpha, "mixed_beta": mixed.beta}
+            row["mixed_alpha_low"], row["mixed_alpha_high"] = mixed.alpha_interval
+            row |= {"mixed_p": mixed.p, "mixed_effects": mixed.effects}
         row |= {"undefined": self.undefined, "at_limits": self.limited, "missing": self.missing}
         return {key: in_json(value) for key, value in row.items()} | {"refused": line.refused}
 

@@ -135,14 +135,13 @@ def run_analysis(settings: AnalysisSettings, opened: RunFolder) -> bool:
     files.write(write_table, folder / "metrics.csv", rows)
     files.write(write_table, folder / "conditions.csv", _conditions(times))
     files.write(write_table, folder / "curves.csv", _curves(times, curves))
-    drawn = [figures.Shown(f.name, curves.eccentricities, f.line) for f in findings]
-    place = int(np.flatnonzero(times.participants == shown)[0])
+    lines = [(finding.name, finding.line) for finding in findings]
     images = {
         "time_surface": figures.time_surface(times),
-        "time_map": figures.time_map(times, drawn, settings.range_deg, settings.tested_deg),
-        "participant": figures.single_participant(times, curves, place),
+        "time_map": figures.time_map(times, lines, settings.range_deg, settings.tested_deg),
+        "participant": figures.single_participant(times, curves, int(np.flatnonzero(times.participants == shown)[0])),
         "time_slices": figures.time_slices(times),
-        "scale_lines": figures.scale_lines(times, drawn, settings.range_deg, settings.tested_deg, settings.confidence),
+        "scale_lines": figures.scale_lines(times, lines, settings.range_deg, settings.tested_deg, settings.confidence),
     }
     power: list[dict[str, Any]] = []
     if settings.power:

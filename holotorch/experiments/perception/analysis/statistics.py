@@ -20,23 +20,25 @@ LEAST = 5  # participants needed for an interval; fewer give too few distinct bo
 class Line:
     """The line S(E) = alpha E + beta through the medians over participants, with confidence intervals.
 
+    All intervals are NaN if fewer than ``LEAST`` participants have a scale.
+
     Attributes:
+        eccentricities: Degrees [K].
         alpha: Degrees per degree; NaN if a median is missing, or if half the scales or more are at a limit.
-        beta: Degrees.
-        alpha_interval: Lower and upper end; NaN if fewer than ``LEAST`` participants have a scale.
-        beta_interval: As ``alpha_interval``.
+        beta: Degrees; NaN like ``alpha``.
+        alpha_interval: Lower and upper end.
+        beta_interval: Lower and upper end.
         medians: Degrees [K].
-        quartiles: 25 % and 75 % quantiles over the participants, [2, K].
-        median_intervals: Lower and upper ends of the medians' intervals, [2, K].
+        median_intervals: Lower and upper ends of the medians' intervals in degrees, [2, K].
         refused: The reason why there is no line; empty if there is one.
     """
 
+    eccentricities: Array
     alpha: float
     beta: float
     alpha_interval: tuple[float, float]
     beta_interval: tuple[float, float]
     medians: Array
-    quartiles: Array
     median_intervals: Array
     refused: str = ""
 
@@ -53,51 +55,51 @@ def fit_line(
 ) -> Line:
     """Fit a line by least squares to the medians of ``degrees`` [P, K] at the eccentricities [K] that are ``inside``.
 
-    The scales of one participant are correlated, because they share one target time. The bootstrap therefore draws
-    whole participants with replacement, and the intervals are percentiles of the resulting lines. Plain percentiles are
-    too narrow for few participants; the levels used here are expanded to match a t interval of a mean (Hesterberg
-    2015).
+    ``degrees`` are the scales of P participants, clipped to ``limits`` in degrees. The scales of one participant are
+    correlated, because they share one target time. The bootstrap therefore draws whole participants with replacement,
+    and the intervals are percentiles of the resulting lines. Plain percentiles are too narrow for few participants; the
+    levels used here are expanded to match a t interval of a mean (Hesterberg 2015).
     """
     some = degrees[np.isfinite(degrees).any(1)]  # participants without any scale are ignored
-    people, number = len(some), np.isfinite(degrees).sum(0)
-    medians, quartiles = _median(degrees), _quantiles(degrees, [0.25, 0.75])
+    people = len(some)
+    medians = _median(degrees)
+    drawn, level = np.full_like(medians, np.nan)[None], 0.5  # with too few participants, every interval is NaN
+    if people >= LEAST:
+        drawn = _median(some[generator.integers(people, size=(resamples, people))], 1)
+        level = _expanded_level(people, confidence)
+    levels = [level, 1 - level]
+    refused = _refusal(eccentricities, degrees, medians, inside, limits)
+    alpha, beta, ends = math.nan, math.nan, np.full((2, 2), np.nan)
+    if not refused:
+        design = np.stack([eccentricities[inside], np.ones(int(inside.sum()))], -1)
+        solve = np.linalg.pinv(design)
+        alpha, beta = (solve @ medians[inside]).tolist()
+        ends = _quantiles(drawn[:, inside] @ solve.T, levels)
+    alpha_interval, beta_interval = zip(*ends.tolist(), strict=True)
+    median_intervals = _quantiles(drawn, levels)
+    return Line(eccentricities, alpha, beta, alpha_interval, beta_interval, medians, median_intervals, refused)
+
+
+def _refusal(
+    eccentricities: Array, degrees: Array, medians: Array, inside: NDArray[np.bool_], limits: tuple[float, float]
+) -> str:
+    """The reason why no line can be fitted to the medians that are ``inside``; empty if it can."""
+    if inside.sum() < 2:
+        return f"a line needs two eccentricities in its range, got {int(inside.sum())}"
+    if not np.isfinite(medians[inside]).all():
+        return f"no participant has a scale at {listed(eccentricities[inside & ~np.isfinite(medians)])} deg"
     # Exactly half is already too many: the median would then average a scale with the limit itself.
     at_limit = np.maximum((degrees <= limits[0]).sum(0), (degrees >= limits[1]).sum(0))
-    refused = ""
-    if inside.sum() < 2:
-        refused = f"a line needs two eccentricities in its range, got {int(inside.sum())}"
-    elif not np.isfinite(medians[inside]).all():
-        where = ", ".join(f"{e:g}" for e in eccentricities[inside & ~np.isfinite(medians)])
-        refused = f"no participant has a scale at {where} deg"
-    elif (beyond := inside & (2 * at_limit >= number)).any():
-        where = ", ".join(f"{e:g}" for e in eccentricities[beyond])
-        refused = (
-            f"half the participants or more have no scale within {limits[0]:g} .. {limits[1]:g} deg at {where} deg"
-        )
-    no_interval, median_intervals = (math.nan, math.nan), np.full((2, len(medians)), np.nan)
-    level = _expanded_level(people, confidence) if people >= LEAST else None
-    if level is not None:
-        drawn = _median(some[generator.integers(people, size=(resamples, people))], 1)
-        median_intervals = _quantiles(drawn, [level, 1 - level])
-    else:
-        drawn = np.empty((0, len(medians)))
-    if refused:
-        return Line(math.nan, math.nan, no_interval, no_interval, medians, quartiles, median_intervals, refused)
-    design = np.stack([eccentricities[inside], np.ones(int(inside.sum()))], -1)
-    solve = np.linalg.pinv(design)
-    alpha, beta = solve @ medians[inside]
-    ends = np.full((2, 2), np.nan)
-    if level is not None:
-        ends = _quantiles(drawn[:, inside] @ solve.T, [level, 1 - level])
-    return Line(
-        float(alpha),
-        float(beta),
-        (float(ends[0, 0]), float(ends[1, 0])),
-        (float(ends[0, 1]), float(ends[1, 1])),
-        medians,
-        quartiles,
-        median_intervals,
-    )
+    beyond = inside & (2 * at_limit >= np.isfinite(degrees).sum(0))
+    if beyond.any():
+        range_deg = f"{limits[0]:g} .. {limits[1]:g} deg"
+        return f"half the participants or more have no scale within {range_deg} at {listed(eccentricities[beyond])} deg"
+    return ""
+
+
+def listed(values: Array) -> str:
+    """Numbers separated by commas."""
+    return ", ".join(f"{value:g}" for value in values)
 
 
 def _expanded_level(people: int, confidence: float) -> float:
@@ -107,25 +109,20 @@ def _expanded_level(people: int, confidence: float) -> float:
 
 
 def _median(values: Array, axis: int = 0) -> Array:
-    return _ignore_nan(np.median, np.nanmedian, values, axis)
+    return _ignore_nan(np.median, np.nanmedian, values, axis=axis)
 
 
 def _quantiles(values: Array, levels: Sequence[float]) -> Array:
-    return _ignore_nan(
-        lambda v, axis: np.quantile(v, levels, axis=axis),
-        lambda v, axis: np.nanquantile(v, levels, axis=axis),
-        values,
-        0,
-    )
+    return _ignore_nan(np.quantile, np.nanquantile, values, levels, axis=0)
 
 
-def _ignore_nan(plain: Callable[..., Array], nan_aware: Callable[..., Array], values: Array, axis: int) -> Array:
+def _ignore_nan(plain: Callable[..., Array], nan_aware: Callable[..., Array], values: Array, *args, axis: int) -> Array:
     """Call ``plain``, which is much faster, if no value is NaN, otherwise ``nan_aware``; NaN for a column of NaN."""
     if not np.isnan(values).any():
-        return plain(values, axis=axis)
+        return plain(values, *args, axis=axis)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "All-NaN slice")
-        return nan_aware(values, axis=axis)
+        return nan_aware(values, *args, axis=axis)
 
 
 @dataclass(frozen=True)
@@ -185,14 +182,15 @@ def repeated_measures(values: Array) -> Anova:
     complete = values[np.isfinite(values).all(1)]
     people, columns = complete.shape
     freedom = (columns - 1, (columns - 1) * (people - 1))
+    undefined = Anova(math.nan, math.nan, freedom, people, len(values) - people, math.nan)
     if min(freedom) < 1:
-        return Anova(math.nan, math.nan, freedom, people, len(values) - people, math.nan)
+        return undefined
     person, column = np.indices(complete.shape)
     frame = pandas.DataFrame({"scale": complete.ravel(), "participant": person.ravel(), "place": column.ravel()})
     centred = np.eye(columns) - 1 / columns
     spread = centred @ np.cov(complete.T) @ centred
     if np.trace(spread) <= 1e-24 * np.square(complete).mean():  # all equal within rounding errors
-        return Anova(math.nan, math.nan, freedom, people, len(values) - people, math.nan)
+        return undefined
     row = AnovaRM(frame, "scale", "participant", within=["place"]).fit().anova_table.iloc[0]
     f, p = float(row["F Value"]), float(row["Pr > F"])
     epsilon = float(np.trace(spread) ** 2 / ((columns - 1) * np.trace(spread @ spread)))

@@ -31,8 +31,8 @@ def made():
             confidence=0.9,
         )
 
-    shown = [figures.Shown("450 ms", curves.eccentricities, line(limits)) for limits in ((1, 60), (59, 60))]
-    assert not shown[0].line.refused and shown[1].line.refused
+    shown = [("450 ms", line(limits)) for limits in ((1, 60), (59, 60))]
+    assert not shown[0][1].refused and shown[1][1].refused
     return times, curves, shown
 
 
@@ -78,7 +78,7 @@ def test_no_interval_is_drawn_of_too_few_people():
             confidence=0.9,
         )
         axes = Figure().add_subplot()
-        figures._points(axes, figures.Shown("450 ms", curves.eccentricities, line), (40, 80), 0.9)
+        figures._points(axes, line, (40, 80), 0.9)
         assert words in axes.get_legend_handles_labels()[1]
         (bars,) = [part for part in axes.collections if isinstance(part, LineCollection)]
         lengths = [np.ptp(bar[:, 1]) for bar in bars.get_segments() if bar.size and np.isfinite(bar).all()]
