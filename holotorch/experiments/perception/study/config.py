@@ -1,8 +1,9 @@
 """Settings of a perception study: screen, patterns, order of trials and times."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -58,12 +59,6 @@ def _ordered(times: tuple[float, float]) -> tuple[float, float]:
     return times
 
 
-def _some(items: tuple) -> tuple:
-    if not items:
-        raise PydanticCustomError("some", "expected at least one")
-    return items
-
-
 class _ScreenSettings(Settings):
     """``shape``: pixels (rows, columns). ``size``: metres (height, width). ``cut``: allow patterns cut by the edge."""
 
@@ -89,8 +84,13 @@ class CurvedSettings(_ScreenSettings):
 class ConditionSettings(Settings):
     """Eccentricities in degrees, each shown with all of the sizes in degrees."""
 
-    eccentricities_deg: Annotated[tuple[Eccentricity, ...], BeforeValidator(several), AfterValidator(_some)]
-    sizes_deg: Annotated[tuple[Size, ...], BeforeValidator(several), AfterValidator(_some)]
+    eccentricities_deg: Annotated[tuple[Eccentricity, ...], BeforeValidator(several), Field(min_length=1)]
+    sizes_deg: Annotated[tuple[Size, ...], BeforeValidator(several), Field(min_length=1)]
+
+    @property
+    def pairs(self) -> Iterator[tuple[float, float]]:
+        """All pairs of an eccentricity and a size."""
+        return product(self.eccentricities_deg, self.sizes_deg)
 
 
 class RepeatSettings(Settings):
@@ -113,7 +113,7 @@ class StudySettings(Settings):
 
     seed: Whole
     screen: Annotated[FlatSettings | CurvedSettings, Discriminator("kind")]
-    patterns: Annotated[tuple[ConditionSettings, ...], AfterValidator(_some)]
+    patterns: Annotated[tuple[ConditionSettings, ...], Field(min_length=1)]
     repeats: RepeatSettings = RepeatSettings()
     order: Literal["thesis", "williams"] = "thesis"
     sides: Literal["both", "left", "right"] = "both"
@@ -123,7 +123,7 @@ class StudySettings(Settings):
     @property
     def conditions(self) -> tuple[tuple[float, float], ...]:
         """All pairs of eccentricity and size in degrees."""
-        return tuple((e, s) for group in self.patterns for e in group.eccentricities_deg for s in group.sizes_deg)
+        return tuple(pair for group in self.patterns for pair in group.pairs)
 
     @property
     def trials(self) -> int:
@@ -174,7 +174,7 @@ def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudySettings
         raise ConfigError([source.mistake(("repeats",), too_many(settings.trials))])
     conditions: set[tuple[float, float]] = set()
     for i, group in enumerate(settings.patterns):
-        for pair in [(e, s) for e in group.eccentricities_deg for s in group.sizes_deg]:
+        for pair in group.pairs:
             if pair in conditions:
                 words = f"{pair[0]:g} deg with size {pair[1]:g} deg is there twice; raise the repeats instead"
                 mistakes.append((("patterns", i), words))

@@ -15,6 +15,8 @@ from typing import Any, Literal
 Pattern = Literal["cross", "circle"]
 Side = Literal["left", "right"]
 _Appearance = tuple[float, float, Side, Pattern, bool]  # eccentricity, size, side, pattern, target
+_OTHER: dict[Pattern, Pattern] = {"cross": "circle", "circle": "cross"}
+_SIDES: dict[str, tuple[Side, ...]] = {"left": ("left",), "right": ("right",), "both": ("left", "right")}
 ORDERS = ("thesis", "williams")
 # (eccentricity, size) in degrees: three sizes at the inner four eccentricities, eight at the outer five.
 THESIS_CONDITIONS = tuple((float(e), float(s)) for e in (0, 10, 20, 30) for s in (5, 10, 15)) + tuple(
@@ -56,7 +58,7 @@ class Trial:
     @property
     def goal(self) -> Pattern:
         """The target pattern of this round."""
-        return self.pattern if self.target else "circle" if self.pattern == "cross" else "cross"
+        return self.pattern if self.target else _OTHER[self.pattern]
 
 
 @dataclass(frozen=True)
@@ -152,21 +154,20 @@ def make_design(
     if isinstance(participant, bool) or participant < 1:
         raise ValueError(f"participant: expected a number from 1, got {participant}")
     _check(conditions, target_repeats, distraction_repeats, practice, wait_s)
-    if sides not in ("left", "right", "both"):
+    if sides not in _SIDES:
         raise ValueError(f"sides: expected left, right or both, got {sides!r}")
     orders = round_orders(order)
-    shared = order == "thesis"
-    rng = random.Random(f"holotorch {seed}" if shared else f"holotorch {seed} {participant}")
+    rng = random.Random(f"holotorch {seed}" + (f" {participant}" if order == "williams" else ""))
     blocks: dict[tuple[Pattern, int], list[_Appearance]] = {}
     for goal in ("cross", "circle"):
         drawn = _shuffled(rng, conditions, goal, target_repeats, distraction_repeats, sides)
         half = (len(drawn) + 1) // 2
         blocks[goal, 1], blocks[goal, 2] = drawn[:half], drawn[half:]
-    waits = {name: [_wait(rng, wait_s) for _ in block] for name, block in blocks.items()}
+    waits = {name: [round(rng.uniform(*wait_s), 4) for _ in block] for name, block in blocks.items()}
     sequence = [_ROUNDS[i] for i in orders[(participant - 1) % len(orders)]]
     exercise = random.Random(f"holotorch practice {seed} {participant}")
     pool = _shuffled(exercise, conditions, sequence[0][0], target_repeats, distraction_repeats, sides)
-    trials = [Trial(0, i, *item, _wait(exercise, wait_s)) for i, item in enumerate(pool[:practice], 1)]
+    trials = [Trial(0, i, *item, round(exercise.uniform(*wait_s), 4)) for i, item in enumerate(pool[:practice], 1)]
     for number, name in enumerate(sequence, 1):
         timed = zip(blocks[name], waits[name], strict=True)
         trials += [Trial(number, i, *item, wait) for i, (item, wait) in enumerate(timed, 1)]
@@ -181,22 +182,16 @@ def too_many(trials: int) -> str:
 def _shuffled(
     rng: random.Random, conditions, goal: Pattern, targets: int, distractions: int, sides: str
 ) -> list[_Appearance]:
-    other: Pattern = "circle" if goal == "cross" else "cross"
-    roles: tuple[tuple[Pattern, int], ...] = ((goal, targets), (other, distractions))
+    roles: tuple[tuple[Pattern, int], ...] = ((goal, targets), (_OTHER[goal], distractions))
     appearances: list[_Appearance] = []
     for eccentricity, size in conditions:
         for pattern, count in roles:
             start = rng.randrange(2)
-            for i in range(count):
-                alternating: Side = "right" if (start + i) % 2 else "left"
-                side: Side = alternating if sides == "both" else "left" if sides == "left" else "right"
+            for i in range(start, start + count):
+                side = _SIDES[sides][i % len(_SIDES[sides])]
                 appearances.append((float(eccentricity), float(size), side, pattern, pattern == goal))
     rng.shuffle(appearances)
     return appearances
-
-
-def _wait(rng: random.Random, bounds: tuple[float, float]) -> float:
-    return round(rng.uniform(*bounds), 4)
 
 
 def _check(conditions, targets: int, distractions: int, practice: int, wait_s: tuple[float, float]) -> None:

@@ -13,13 +13,11 @@ from holotorch.experiments.config.errors import short
 FORMAT, VERSION = "holotorch-trials", 1
 
 Finite = Annotated[float, Field(description="a finite number")]
-FiniteOrNull = Annotated[float | None, Field(description="a finite number or null")]
 Whole = Annotated[int, Field(description="a whole number")]
 Flag = Annotated[bool, Field(description="true or false")]
 Text = Annotated[str, Field(description="text")]
-Seconds = Annotated[float, Field(ge=0, description="seconds, 0 or more")]
 Count = Annotated[int, Field(ge=0, description="a count, 0 or more")]
-Window = Annotated[str, Field(min_length=1, description="the name of the window")]
+Device = Literal["key", "pointer", "gamepad"]
 
 
 class Record(BaseModel):
@@ -50,7 +48,7 @@ class TrialRecord(Record):
     design: Text
     time_utc: Text
     pattern: Annotated[Literal["cross", "circle"], Field(description="cross or circle")]
-    response_s: FiniteOrNull
+    response_s: Annotated[float | None, Field(description="a finite number or null")]
     reaction_s: Annotated[float | None, Field(ge=0, description="a finite number, 0 or more, or null")]
 
     @model_validator(mode="after")
@@ -64,21 +62,19 @@ class TrialRecord(Record):
 class SessionRequest(Record):
     """Request of a browser window to become the one whose results are recorded."""
 
-    window: Window
+    window: Annotated[str, Field(min_length=1, description="the name of the window")]
 
 
 class TrialResult(SessionRequest):
     """Request of the page after a trial; times are in seconds on the clock of the browser."""
 
     index: Annotated[int, Field(ge=0, description="the index of the trial, 0 or more")]
-    onset_s: Seconds
+    onset_s: Annotated[float, Field(ge=0, description="seconds, 0 or more")]
     frame_s: Annotated[float, Field(gt=0, description="more than 0 seconds")]
     response_s: Annotated[float | None, Field(ge=0, description="seconds, 0 or more, or null")] = None
     early: Count = 0
     dropped_frames: Count = 0
-    device: Annotated[
-        Literal["key", "pointer", "gamepad"] | None, Field(description="key, pointer, gamepad or null")
-    ] = None
+    device: Annotated[Device | None, Field(description="key, pointer, gamepad or null")] = None
 
     @property
     def reaction_s(self) -> float | None:
@@ -93,16 +89,8 @@ class TrialResult(SessionRequest):
 
     def measured(self) -> dict[str, Any]:
         """The measured part of a line of the log."""
-        return {
-            "responded": self.response_s is not None,
-            "onset_s": self.onset_s,
-            "frame_s": self.frame_s,
-            "response_s": self.response_s,
-            "reaction_s": self.reaction_s,
-            "early": self.early,
-            "dropped_frames": self.dropped_frames,
-            "device": self.device,
-        }
+        times = {"responded": self.response_s is not None, "reaction_s": self.reaction_s}
+        return times | self.model_dump(exclude={"index", "window"})
 
 
 Model = TypeVar("Model", bound=Record)

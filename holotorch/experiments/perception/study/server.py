@@ -19,7 +19,6 @@ import socket
 import traceback
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from http import HTTPStatus
 from importlib import resources
 from typing import Any
 
@@ -114,10 +113,10 @@ class StudyServer:
         try:
             response = await self._answer(request)
         except web.HTTPException as refusal:
-            response = _json(refusal.status, {"error": refusal.text})
+            response = web.json_response({"error": refusal.text}, status=refusal.status)
         except Exception:
             traceback.print_exc()
-            response = _json(HTTPStatus.INTERNAL_SERVER_ERROR, {"error": "the recording program failed"})
+            response = web.json_response({"error": "the recording program failed"}, status=500)
         response.headers.update(_HEADERS)
         response.force_close()
         return response
@@ -138,11 +137,11 @@ class StudyServer:
                 window = parse_record(SessionRequest, value).window
             except ValueError as error:
                 raise web.HTTPBadRequest(text=str(error)) from None
-            return _json(HTTPStatus.OK, self.session.open(window))
-        response = _json(*self.session.record(value))
+            return web.json_response(self.session.open(window))
+        status, answer = self.session.record(value)
         if self.session.complete:
             self.stop.set()  # pending requests are answered before the server ends
-        return response
+        return web.json_response(answer, status=status)
 
     def _check_host(self, request: web.BaseRequest) -> None:
         """Refuse requests whose host name is foreign but resolves to this machine (DNS rebinding)."""
@@ -159,10 +158,6 @@ class StudyServer:
         authorization = request.headers.get("Authorization", "").encode(errors="surrogateescape")
         if not hmac.compare_digest(authorization, f"Bearer {self.token}".encode()):
             raise web.HTTPForbidden(text="open the whole address that the recording program has printed, with its end")
-
-
-def _json(status: int, value: dict[str, Any]) -> web.Response:
-    return web.json_response(value, status=status)
 
 
 async def _read_json(request: web.BaseRequest) -> Any:

@@ -311,7 +311,7 @@ def test_the_study_of_the_thesis():
             "eccentricities_deg: expected an eccentricity between 0",
         ),
         (["patterns=[{eccentricities_deg: [9, 9], sizes_deg: 5}]"], "9 deg with size 5 deg is there twice"),
-        (["patterns=[]"], "patterns: expected at least one"),
+        (["patterns=[]"], "patterns: expected at least 1 entry"),
         (["timing={wait_s: [800, 1600]}"], "seconds, not milliseconds"),
         (["timing={wait_s: [2, 1]}"], "the shortest wait, then the longest"),
         (["ordr=thesis"], "did you mean 'order'"),
