@@ -13,16 +13,14 @@ Seconds = Annotated[Number, Field(gt=0, le=60)]
 Share = Annotated[Number, Field(ge=0, lt=1)]
 Spread = Annotated[Number, Field(ge=0, le=10)]
 Resamples = Annotated[Count, Field(ge=100, le=1_000_000)]
-Seed = Annotated[int, BeforeValidator(number), Field(ge=0, lt=2**63)]
 
 
 def _rising(pair: tuple[float, float]) -> tuple[float, float]:
-    if not pair[0] < pair[1]:
+    if pair[0] >= pair[1]:
         raise PydanticCustomError("range", "expected two numbers, the smaller one first")
     return pair
 
 
-Range = Annotated[tuple[Angle, Angle], AfterValidator(_rising)]
 Sizes = Annotated[tuple[Size, Size], AfterValidator(_rising)]
 
 
@@ -64,7 +62,7 @@ class CleaningSettings(Settings):
 
     @model_validator(mode="after")
     def _in_order(self) -> "CleaningSettings":
-        if not self.fastest < self.slowest:
+        if self.fastest >= self.slowest:
             raise PydanticCustomError("range", "expected fastest below slowest")
         return self
 
@@ -133,12 +131,12 @@ class AnalysisSettings(Settings):
     """
 
     experiment: Literal["perception_analysis"]
-    seed: Seed = 0
+    seed: Annotated[int, BeforeValidator(number), Field(ge=0, lt=2**63)] = 0
     logs: Annotated[tuple[ExistingPath, ...], BeforeValidator(several)] = ()
     simulation: SimulationSettings = SimulationSettings()
     cleaning: CleaningSettings = CleaningSettings()
     targets: Annotated[tuple[TargetTimeSettings, ...], BeforeValidator(several), Field(min_length=1)]
-    range_deg: Range = (40.0, 70.0)
+    range_deg: Annotated[tuple[Angle, Angle], AfterValidator(_rising)] = (40.0, 70.0)
     tested_deg: Sizes = (5.0, 26.0)
     limits_deg: Sizes = (1.0, 60.0)
     resamples: Resamples = 2000

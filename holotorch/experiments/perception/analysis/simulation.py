@@ -1,9 +1,7 @@
 """Simulated participants of the perception study, whose equal-efficiency scales are known.
 
-The spread between participants reproduces two results of the thesis: the F statistic of 7.02 for the target time of a
-5 deg pattern at 10 deg (first row of Table 2.2), and the share of scales that are undefined because a participant's
-times do not fall with the size. The perception times of the settings are expected medians of recorded times, which are
-on average half a frame longer than the actual times, because they are rounded up to frames.
+The times of the settings are expected medians of recorded times. Recorded times are on average half a frame longer than
+the actual times, because they are rounded up to whole frames.
 """
 
 import math
@@ -15,6 +13,7 @@ from scipy import special, stats
 
 from holotorch.experiments.perception.analysis.config import SimulationSettings, TargetTimeSettings
 from holotorch.experiments.perception.analysis.curves import Responses
+from holotorch.experiments.perception.analysis.statistics import Array
 from holotorch.experiments.perception.study.design import THESIS_CONDITIONS
 
 _INNER = 40.0  # degrees; patterns nearer to the fixation point have no scale and only serve as targets
@@ -107,7 +106,7 @@ def simulate(
 
 def _trials(
     settings: SimulationSettings, generator: np.random.Generator, shape: tuple[int, ...], answers: int
-) -> "np.ndarray[tuple[int, ...], np.dtype[np.float64]]":
+) -> Array:
     """Gaussian plus exponential noise; the median of ``answers`` samples, after rounding up to frames, has mean 0."""
     gaussian = settings.trial * settings.gaussian
     scale = math.sqrt(settings.trial**2 - gaussian**2)
@@ -126,12 +125,10 @@ def _mean_of_medians(gaussian: float, scale: float, answers: int) -> float:
     if not gaussian and not scale:
         return 0.0
     t = np.linspace(-8 * gaussian, 8 * gaussian + 40 * scale, 20001)
-    if not gaussian:
-        noise = stats.expon(scale=scale)
-    elif not scale:
-        noise = stats.norm(scale=gaussian)
-    else:
+    if gaussian and scale:
         noise = stats.exponnorm(scale / gaussian, scale=gaussian)
+    else:
+        noise = stats.norm(scale=gaussian) if gaussian else stats.expon(scale=scale)
     below = noise.cdf(t)
     middle = ((answers + 1) // 2, answers // 2 + 1)  # ranks of the one or two samples that define the median
     first, second = (special.betainc(rank, answers - rank + 1, below) for rank in middle)

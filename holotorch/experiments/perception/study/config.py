@@ -60,7 +60,7 @@ def _ordered(times: tuple[float, float]) -> tuple[float, float]:
 
 
 class _ScreenSettings(Settings):
-    """``shape``: pixels (rows, columns). ``size``: metres (height, width). ``cut``: allow patterns cut by the edge."""
+    """``shape``: pixels (rows, columns). ``size``: metres (height, width). ``cut``: show patterns that do not fit."""
 
     shape: tuple[Side, Side]
     size: tuple[Metres, Metres]
@@ -101,7 +101,7 @@ class RepeatSettings(Settings):
 
 
 class TimingSettings(Settings):
-    """Times in seconds: wait before a pattern (shortest, longest), duration of a pattern and of an error message."""
+    """Times in seconds: wait before a pattern (shortest, longest), duration of a pattern, of the mark of an error."""
 
     wait_s: Annotated[tuple[Seconds, Seconds], AfterValidator(_ordered)] = (0.8, 1.6)
     show_s: Seconds = 2.0
@@ -109,7 +109,7 @@ class TimingSettings(Settings):
 
 
 class StudySettings(Settings):
-    """A study; see ``make_design``. ``practice``: number of trials before the first round, which are not analysed."""
+    """A study; see ``make_design``. ``practice``: number of trials before the first round, excluded from analyses."""
 
     seed: Whole
     screen: Annotated[FlatSettings | CurvedSettings, Discriminator("kind")]
@@ -205,14 +205,14 @@ def beyond_screen(settings: StudySettings) -> list[Cut]:
         # Pixel centres have integer coordinates, so that the screen ends half a pixel beyond the last centre.
         # Directions that do not meet the screen surface give NaN, which counts as outside.
         fits_width = ((x - (columns - 1) / 2).abs() <= columns / 2 + _TOLERANCE_PX).all()
-        high = (y - (rows - 1) / 2).abs().max().item()
-        name = f"{size:g} deg at {eccentricity:g} deg"
+        half_height = (y - (rows - 1) / 2).abs().max().item()
         if not fits_width:
-            extent, half_field = eccentricity + size / 2, screen.field_deg[1] / 2
-            cuts.append(Cut(eccentricity, size, f"{name} reaches {extent:g} deg and the screen {half_field:.1f} deg"))
-        elif high > rows / 2 + _TOLERANCE_PX:
-            text = f"{name} takes {math.ceil(2 * high)} pixels in height and the screen has {rows}"
-            cuts.append(Cut(eccentricity, size, text))
+            text = f"reaches {eccentricity + size / 2:g} deg and the screen {screen.field_deg[1] / 2:.1f} deg"
+        elif half_height > rows / 2 + _TOLERANCE_PX:
+            text = f"takes {math.ceil(2 * half_height)} pixels in height and the screen has {rows}"
+        else:
+            continue
+        cuts.append(Cut(eccentricity, size, f"{size:g} deg at {eccentricity:g} deg {text}"))
     return cuts
 
 

@@ -1,15 +1,15 @@
 """Log of a study: one line of JSON per trial, which is saved before the next trial begins.
 
 The first line is a header, ``{"format": "holotorch-trials", "version": 1, ...}``; each other line is a trial. Lines are
-only ever appended, and each is followed by fsync, so that a crash loses at most the trial on the screen. A line that a
-crash interrupts has no line end: readers ignore it and set ``torn``, and ``TrialLog`` removes it.
+only ever appended, and each is followed by fsync, so that a crash loses at most the trial on the screen. A line during
+which the recording crashed has no line end: readers ignore it and set ``torn``, and ``TrialLog`` removes it.
 """
 
 import contextlib
 import json
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from holotorch.experiments.perception.study.records import FORMAT, VERSION, LogH
 from holotorch.io.files import read_bytes
 
 
-@dataclass
+@dataclass(frozen=True)
 class Trials:
     """The content of a log.
 
@@ -33,9 +33,9 @@ class Trials:
 
     path: Path
     header: dict[str, Any]
-    trials: list[dict[str, Any]] = field(default_factory=list)
-    torn: bool = False
-    size: int = 0
+    trials: list[dict[str, Any]]
+    torn: bool
+    size: int
 
 
 def read_log(path: Path) -> Trials:
@@ -50,16 +50,14 @@ def read_log(path: Path) -> Trials:
     except OSError as error:
         raise ConfigError([f"{path}: cannot read the log: {error.strerror}"]) from None
     complete, _, torn = data.rpartition(b"\n")
-    lines = complete.split(b"\n") if complete else []
-    if not lines:
+    if not complete:
         raise ConfigError([f"{path}:1:1: the log is empty; expected a header and trials written by 'holotorch study'"])
     mistakes: list[str] = []
-    header, *trials = [_parse(path, number, line, mistakes) for number, line in enumerate(lines, 1)]
+    header, *trials = [_parse(path, number, line, mistakes) for number, line in enumerate(complete.split(b"\n"), 1)]
     if header is not None:
         if header.get("format") != FORMAT or header.get("version") != VERSION:
-            raise ConfigError(
-                [f"{path}:1:1: not a log of a study: expected a header of format {FORMAT}, version {VERSION}"]
-            )
+            expected = f"expected a header of format {FORMAT}, version {VERSION}"
+            raise ConfigError([f"{path}:1:1: not a log of a study: {expected}"])
         try:
             parse_record(LogHeader, header)
         except ValueError as error:
@@ -97,9 +95,8 @@ def read_logs(paths: Iterable[Path]) -> list[Trials]:
     for log in logs:
         number = log.header.get("participant")
         if number in owner:
-            mistakes.append(
-                f"{log.path}:1:1: participant {number} is in {owner[number]} too; two people need two numbers"
-            )
+            other = f"participant {number} is in {owner[number]} too"
+            mistakes.append(f"{log.path}:1:1: {other}; two people need two numbers")
         owner.setdefault(number, log.path)
     if not logs and not mistakes:
         mistakes.append("no logs: expected files such as participant-001.jsonl, written by 'holotorch study'")
@@ -108,23 +105,21 @@ def read_logs(paths: Iterable[Path]) -> list[Trials]:
     return logs
 
 
-class TrialLog:
+class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
     """Appends trials to a new or existing log; a context manager that closes the log.
 
     On systems with ``fcntl`` file locks (not Windows), only one program at a time can have a log open.
+
+    Args:
+        path: The file; its folder must exist.
+        header: Content of the first line, with the key ``participant``. An existing log must have the same header.
+
+    Raises:
+        ConfigError: The log is open in another program, cannot be read, or has another header.
+        OSError: The log cannot be written.
     """
 
     def __init__(self, path: Path, header: dict[str, Any]):
-        """Open a log.
-
-        Args:
-            path: The file; its folder must exist.
-            header: Content of the first line, with the key ``participant``. An existing log must have the same header.
-
-        Raises:
-            ConfigError: Another program has the log open, it cannot be read, or it has another header.
-            OSError: The log cannot be written.
-        """
         self.path = path
         # The round trip through JSON turns tuples into lists, so that the header equals the one read from the file.
         self.header = json.loads(json.dumps({"format": FORMAT, "version": VERSION, **header}, allow_nan=False))
@@ -158,9 +153,6 @@ class TrialLog:
         os.close(self._file)
         self._file = -1
 
-    def __enter__(self) -> "TrialLog":
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.close()
 
@@ -172,22 +164,17 @@ class TrialLog:
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            number = self.header.get("participant")
-            raise ConfigError(
-                [f"{self.path}: participant {number} is being recorded by another program; two people need two numbers"]
-            ) from None
+            busy = f"participant {self.header.get('participant')} is being recorded by another program"
+            raise ConfigError([f"{self.path}: {busy}; two people need two numbers"]) from None
 
     def _continue(self) -> None:
         log = read_log(self.path)
         for key in sorted(self.header.keys() | log.header.keys()):
-            if self.header.get(key) != log.header.get(key):
-                raise ConfigError(
-                    [
-                        f"{self.path}:1:1: this log was begun with another {key}: {short(log.header.get(key))}, now "
-                        f"{short(self.header.get(key))}; restore the configuration, or choose another participant "
-                        "or another folder"
-                    ]
-                )
+            begun, now = log.header.get(key), self.header.get(key)
+            if begun != now:
+                change = f"this log was begun with another {key}: {short(begun)}, now {short(now)}"
+                cure = "restore the configuration, or choose another participant or another folder"
+                raise ConfigError([f"{self.path}:1:1: {change}; {cure}"])
         os.ftruncate(self._file, log.size)
         self.trials, self._size = log.trials, log.size
 
@@ -213,7 +200,7 @@ def _parse(path: Path, number: int, line: bytes, mistakes: list[str]) -> dict[st
         mistakes.append(f"{path}:{number}:{error.colno}: not a line of JSON: {error.msg}")
     except UnicodeDecodeError as error:
         mistakes.append(f"{path}:{number}:{error.start + 1}: not UTF-8 text")
-    except (ValueError, RecursionError):  # a number of thousands of digits, or brackets nested too deeply
+    except (ValueError, RecursionError):  # a number has thousands of digits, or brackets are nested too deeply
         mistakes.append(f"{path}:{number}:1: not a line of JSON that can be read")
     else:
         if isinstance(value, dict):
@@ -223,7 +210,7 @@ def _parse(path: Path, number: int, line: bytes, mistakes: list[str]) -> dict[st
 
 
 def _sync_folder(folder: Path) -> None:
-    """Write the folder's entry of a new file to the disk, on systems that can open folders."""
+    """Write the folder's entry for a new file to the disk, on systems that can open folders."""
     try:
         handle = os.open(folder, os.O_RDONLY)
     except OSError:

@@ -69,8 +69,7 @@ class StudySession:
 
     def _line(self, result: TrialResult) -> dict[str, Any]:
         trial = self.design.trials[result.index]
-        planned = asdict(trial)
-        del planned["wait_s"]
+        planned = {key: value for key, value in asdict(trial).items() if key != "wait_s"}
         now = datetime.now(UTC).isoformat(timespec="milliseconds")
         outcome = {"practice": trial.practice, **result.measured(), "design": self.design.name, "time_utc": now}
         return {"participant": self.design.participant, **planned, **outcome}
