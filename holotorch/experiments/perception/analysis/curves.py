@@ -19,27 +19,16 @@ from holotorch.perception.time import PerceptionTime
 
 @dataclass(frozen=True, eq=False)
 class Responses:
-    """Trials of a study without the practice round, one array entry per trial.
+    """Trials of a study without the practice round: arrays with an entry per trial."""
 
-    Attributes:
-        participant: Number of the participant.
-        eccentricity_deg: Eccentricity of the pattern.
-        size_deg: Size of the pattern.
-        target: Whether the pattern was the target, which should be answered.
-        reaction_s: Reaction time in seconds; NaN without an answer.
-        frame_s: Frame interval of the display in seconds.
-        simulated: Whether the answers are simulated.
-        torn: Number of logs that end in an incomplete line, because the recording was killed during a trial.
-    """
-
-    participant: NDArray[np.int64]
+    participant: NDArray[np.int64]  # number of the participant
     eccentricity_deg: Array
     size_deg: Array
-    target: NDArray[np.bool_]
-    reaction_s: Array
-    frame_s: Array
-    simulated: bool = False
-    torn: int = 0
+    target: NDArray[np.bool_]  # whether the pattern was the target, which should be answered
+    reaction_s: Array  # reaction time; NaN without an answer
+    frame_s: Array  # frame interval of the display
+    simulated: bool = False  # whether the answers are simulated
+    torn: int = 0  # number of logs whose last line is incomplete, because the recording was killed during a trial
 
 
 def read_responses(paths: Iterable[str]) -> Responses:
@@ -77,25 +66,15 @@ def read_responses(paths: Iterable[str]) -> Responses:
 
 @dataclass(frozen=True, eq=False)
 class Times:
-    """Perception times: the median of each participant's answers in each condition.
+    """Perception times: the median of the answers of each of P participants in each condition."""
 
-    Attributes:
-        participants: Numbers [P].
-        eccentricities: Degrees [E], rising.
-        sizes: Degrees [S], rising.
-        seconds: Median times [P, E, S]; NaN for conditions that were not shown or have too few valid answers.
-        kept: Number of answers behind each median, [P, E, S].
-        counts: Number of answers that each part of :class:`CleaningSettings` excluded, by name.
-        simulated: Whether the answers are simulated.
-    """
-
-    participants: NDArray[np.int64]
-    eccentricities: Array
-    sizes: Array
-    seconds: Array
-    kept: NDArray[np.int64]
-    counts: dict[str, int]
-    simulated: bool = False
+    participants: NDArray[np.int64]  # numbers [P]
+    eccentricities: Array  # degrees [E], rising
+    sizes: Array  # degrees [S], rising
+    seconds: Array  # medians [P, E, S]; NaN for conditions that were not shown or have too few valid answers
+    kept: NDArray[np.int64]  # number of answers behind each median, [P, E, S]
+    counts: dict[str, int]  # number of answers that each criterion of ``CleaningSettings`` excluded, by name
+    simulated: bool = False  # whether the answers are simulated
 
     def of(self, target: TargetTimeSettings) -> Array:
         """The target time of each participant in seconds [P]. ConfigError for a pattern that was not shown."""
@@ -175,21 +154,16 @@ def _medians(group: NDArray[np.int64], values: Array, groups: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """The curves T(S) = a ln S + b of each participant at each peripheral eccentricity (thesis Eq. 2.3).
+    """The curves T(S) = a ln S + b of P participants at K peripheral eccentricities (thesis Eq. 2.3).
 
-    Attributes:
-        eccentricities: Degrees [K].
-        a: Seconds [P, K]; NaN if too few sizes have a time.
-        b: Seconds [P, K].
-        middle_size: Geometric mean of the sizes of the fit, in degrees, [P, K].
-        a_deviation: Standard error of a in seconds, [P, K]; NaN for two sizes.
+    All arrays [P, K] are NaN where too few sizes have a time.
     """
 
-    eccentricities: Array
-    a: Array
-    b: Array
-    middle_size: Array
-    a_deviation: Array
+    eccentricities: Array  # degrees [K]
+    a: Array  # seconds [P, K]
+    b: Array  # seconds [P, K]
+    middle_size: Array  # geometric mean of the sizes of the fit, in degrees, [P, K]
+    a_deviation: Array  # standard error of a in seconds, [P, K]; NaN for two sizes
 
 
 def fit_curves(times: Times, from_deg: float, least_sizes: int) -> Curves:
@@ -226,16 +200,11 @@ class Scales:
     If times do not fall with the size (a >= 0), no size has the target time and the scale is undefined. For medians,
     it still has a rank: above all other scales if the participant's times exceed the target time, below them otherwise.
     Leaving these participants out would make the line too flat.
-
-    Attributes:
-        degrees: Scales [P, K], clipped to the limits; NaN if a time is missing.
-        defined: Whether a < 0, [P, K].
-        limited: Whether a defined scale was clipped to a limit, [P, K].
     """
 
-    degrees: Array
-    defined: NDArray[np.bool_]
-    limited: NDArray[np.bool_]
+    degrees: Array  # scales [P, K], clipped to the limits; NaN if a time is missing
+    defined: NDArray[np.bool_]  # whether a < 0, [P, K]
+    limited: NDArray[np.bool_]  # whether a defined scale was clipped to a limit, [P, K]
 
     @property
     def defined_degrees(self) -> Array:

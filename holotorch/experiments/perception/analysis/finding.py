@@ -14,29 +14,17 @@ from holotorch.experiments.perception.study.frames import Quantisation
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """Results for one target time. A scale is the size at which a participant sees a pattern as fast as the target.
+    """Results for one target time. A scale is the size at which a participant sees a pattern as fast as the target."""
 
-    Attributes:
-        name: The target in words.
-        scales: Scales of all participants at all eccentricities.
-        line: Line through the medians.
-        thesis: One-way analysis of variance, as in the thesis.
-        repeated: Repeated-measures analysis; None if it was not requested.
-        mixed: Mixed model; None if it was not requested or not fitted.
-        undefined: Number of scales in the fitted range that do not exist, because times do not fall with the size.
-        limited: Number of defined scales in this range that are clipped to a limit.
-        missing: Number of scales in this range without a measured time.
-    """
-
-    name: str
-    scales: Scales
-    line: Line
-    thesis: Anova
-    repeated: Anova | None
-    mixed: Mixed | None
-    undefined: int
-    limited: int
-    missing: int
+    name: str  # the target in words
+    scales: Scales  # of all participants at all eccentricities
+    line: Line  # through the medians
+    thesis: Anova  # one-way analysis of variance, as in the thesis
+    repeated: Anova | None  # repeated-measures analysis; None if it was not requested
+    mixed: Mixed | None  # mixed model; None if it was not requested or not fitted
+    undefined: int  # number of scales in the fitted range that do not exist, because times do not fall with the size
+    limited: int  # number of defined scales in this range that are clipped to a limit
+    missing: int  # number of scales in this range without a measured time
 
     def row(self, truth: tuple[float, float] | None) -> dict[str, Any]:
         """The row of metrics.csv; ``truth`` is the true (alpha, beta) of simulated participants."""

@@ -39,11 +39,6 @@ from holotorch.experiments.runs.saving import Results
 from holotorch.experiments.runs.tables import write_table
 from holotorch.io.files import save_array, write_bytes, write_json
 
-LEFT_OUT = (
-    "repeated measures and the mixed model, which need statsmodels: pip install 'holotorch[stats]' and run it again; "
-    "the one-way ANOVA takes the answers of one participant as independent"
-)
-
 
 def analyse(settings: AnalysisSettings, times: Times, curves: Curves) -> list[Finding]:
     """Analyse all target times. ConfigError for a target that was not shown, or if statsmodels is missing."""
@@ -107,10 +102,8 @@ def run_analysis(settings: AnalysisSettings, opened: RunFolder) -> bool:
     """Run the analysis and write all files of the run folder. Returns whether the run is complete."""
     started = time.perf_counter()
     folder, files = opened.path, Results()
-    if settings.logs:
-        responses = read_responses(settings.logs)
-    else:
-        responses = simulate(settings.simulation, np.random.default_rng([settings.seed, 0]))
+    generator = np.random.default_rng([settings.seed, 0])
+    responses = read_responses(settings.logs) if settings.logs else simulate(settings.simulation, generator)
     times = perception_times(responses, settings.cleaning)
     curves = fit_curves(times, settings.range_deg[0], settings.cleaning.sizes)
     shown = int(times.participants[0]) if settings.shown is None else settings.shown
@@ -119,19 +112,20 @@ def run_analysis(settings: AnalysisSettings, opened: RunFolder) -> bool:
     findings = analyse(settings, times, curves)
     frames = quantisation(responses.frame_s.tolist())
     assert frames is not None  # there is at least one trial
-    truths = [true_line(settings.simulation, target) if not settings.logs else None for target in settings.targets]
+    truths = [None if settings.logs else true_line(settings.simulation, target) for target in settings.targets]
     rows = [finding.row(truth) for finding, truth in zip(findings, truths, strict=True)]
     whole = on_frames(responses)
     text = in_words(settings, times, curves, findings, frames, whole)
     if settings.repeated_measures is None and not _uses_repeated_measures(settings):
-        text += f"\nLeft out   {LEFT_OUT}"
+        text += "\nLeft out   repeated measures and the mixed model, which need statsmodels: pip install "
+        text += "'holotorch[stats]' and run it again; the one-way ANOVA takes the answers of one participant as "
+        text += "independent"
     print(text, flush=True)
     (folder / "arrays").mkdir(exist_ok=True)
     files.write(write_json, folder / "plan.json", {"rule": settings.cleaning.model_dump(), "counts": times.counts})
     files.write(save_array, folder / "arrays" / "times.npy", torch.from_numpy(times.seconds))
-    files.write(
-        save_array, folder / "arrays" / "scales.npy", torch.from_numpy(np.stack([f.scales.degrees for f in findings]))
-    )
+    scales = np.stack([finding.scales.degrees for finding in findings])
+    files.write(save_array, folder / "arrays" / "scales.npy", torch.from_numpy(scales))
     files.write(write_table, folder / "metrics.csv", rows)
     files.write(write_table, folder / "conditions.csv", _conditions(times))
     files.write(write_table, folder / "curves.csv", _curves(times, curves))

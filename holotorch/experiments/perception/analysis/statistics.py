@@ -18,29 +18,19 @@ LEAST = 5  # participants needed for an interval; fewer give too few distinct bo
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """The line S(E) = alpha E + beta through the medians over participants, with confidence intervals.
+    """The line S(E) = alpha E + beta through the medians over participants, with confidence intervals (lower, upper).
 
-    All intervals are NaN if fewer than ``LEAST`` participants have a scale.
-
-    Attributes:
-        eccentricities: Degrees [K].
-        alpha: Degrees per degree; NaN if a median is missing, or if half the scales or more are at a limit.
-        beta: Degrees; NaN like ``alpha``.
-        alpha_interval: Lower and upper end.
-        beta_interval: Lower and upper end.
-        medians: Degrees [K].
-        median_intervals: Lower and upper ends of the medians' intervals in degrees, [2, K].
-        refused: The reason why there is no line; empty if there is one.
+    The intervals are NaN if fewer than ``LEAST`` participants have a scale.
     """
 
-    eccentricities: Array
-    alpha: float
-    beta: float
+    eccentricities: Array  # degrees [K]
+    alpha: float  # degrees per degree; NaN without a line
+    beta: float  # degrees; NaN without a line
     alpha_interval: tuple[float, float]
     beta_interval: tuple[float, float]
-    medians: Array
-    median_intervals: Array
-    refused: str = ""
+    medians: Array  # degrees [K]
+    median_intervals: Array  # lower and upper ends in degrees, [2, K]
+    refused: str  # why there is no line, such as a missing median or half the scales at a limit; otherwise empty
 
 
 def fit_line(
@@ -127,25 +117,15 @@ def _ignore_nan(plain: Callable[..., Array], nan_aware: Callable[..., Array], va
 
 @dataclass(frozen=True)
 class Anova:
-    """Result of an analysis of variance.
+    """Result of an analysis of variance, one-way or with repeated measures."""
 
-    Attributes:
-        f: The F statistic; NaN if there are too few values, or no variance within the groups.
-        p: Its p-value.
-        freedom: Degrees of freedom between the groups, and within the groups (one-way) or of the error (repeated).
-        participants: Number of participants used.
-        left_out: Number of scales (one-way) or participants (repeated measures) left out as missing or undefined.
-        epsilon: Greenhouse-Geisser epsilon; 1 for a one-way analysis.
-        p_corrected: p-value with both degrees of freedom multiplied by epsilon.
-    """
-
-    f: float
+    f: float  # the F statistic; NaN if there are too few values, or no variance within the groups
     p: float
-    freedom: tuple[int, int]
-    participants: int
-    left_out: int
-    epsilon: float = 1.0
-    p_corrected: float = math.nan
+    freedom: tuple[int, int]  # between the groups, and within the groups (one-way) or of the error (repeated)
+    participants: int  # number of participants used
+    left_out: int  # number of scales (one-way) or participants (repeated measures) that are missing or undefined
+    epsilon: float = 1.0  # Greenhouse-Geisser epsilon; 1 for a one-way analysis
+    p_corrected: float = math.nan  # p-value with both degrees of freedom multiplied by epsilon
 
 
 def one_way(values: Array) -> Anova:
@@ -153,8 +133,7 @@ def one_way(values: Array) -> Anova:
 
     The values of one participant are not independent, so that the p-value is only nominal.
     """
-    groups = [column[np.isfinite(column)] for column in values.T]
-    groups = [group for group in groups if len(group)]
+    groups = [column[np.isfinite(column)] for column in values.T if np.isfinite(column).any()]
     number, missing = sum(map(len, groups)), int((~np.isfinite(values)).sum())
     people = int(np.isfinite(values).any(1).sum())
     freedom = (len(groups) - 1, number - len(groups))
@@ -200,27 +179,16 @@ def repeated_measures(values: Array) -> Anova:
 
 @dataclass(frozen=True)
 class Mixed:
-    """A linear mixed model of the scale over the eccentricity.
+    """A linear mixed model of the scale over the eccentricity, with confidence intervals (lower, upper)."""
 
-    Attributes:
-        alpha: Slope of the mean over participants, degrees per degree.
-        beta: Intercept in degrees.
-        alpha_interval: Lower and upper end.
-        beta_interval: Lower and upper end.
-        p: p-value of the hypothesis alpha = 0.
-        effects: Random effects of a participant: "line" (alpha and beta) or "intercept".
-        participants: Number of participants used.
-        values: Number of scales used.
-    """
-
-    alpha: float
-    beta: float
+    alpha: float  # slope of the mean over participants, degrees per degree
+    beta: float  # intercept in degrees
     alpha_interval: tuple[float, float]
     beta_interval: tuple[float, float]
-    p: float
-    effects: str
-    participants: int
-    values: int
+    p: float  # p-value of the hypothesis alpha = 0
+    effects: str  # random effects of a participant: "line" (alpha and beta) or "intercept"
+    participants: int  # number of participants used
+    values: int  # number of scales used
 
 
 def mixed_model(eccentricities: Array, values: Array, confidence: float = 0.95) -> Mixed | None:
@@ -245,11 +213,10 @@ def mixed_model(eccentricities: Array, values: Array, confidence: float = 0.95) 
     scale, where = values[person, column], eccentricities[column]
     middle, unit = float(where.mean()), float(where.std())
     design = np.stack([np.ones_like(where), (where - middle) / unit], -1)
-    for effects in ("line", "intercept"):
+    for effects, random in (("line", design), ("intercept", design[:, :1])):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # convergence is checked below
             try:
-                random = design if effects == "line" else design[:, :1]
                 fit = MixedLM(scale, design, groups=person, exog_re=random).fit(reml=True)
             except (np.linalg.LinAlgError, ValueError):
                 continue
@@ -257,19 +224,12 @@ def mixed_model(eccentricities: Array, values: Array, confidence: float = 0.95) 
         if not (fit.converged and np.isfinite(covariance).all() and (np.diag(covariance) > 0).all()):
             continue
         to_line = np.array([[0, 1 / unit], [1, -middle / unit]])  # (alpha, beta) from the normalised coefficients
-        (alpha, beta), covariance = to_line @ np.asarray(fit.fe_params), to_line @ covariance @ to_line.T
-        t = float(stats.t.isf((1 - confidence) / 2, people - 1))
-        a, b = np.sqrt(np.diag(covariance))
-        return Mixed(
-            float(alpha),
-            float(beta),
-            (float(alpha - t * a), float(alpha + t * a)),
-            (float(beta - t * b), float(beta + t * b)),
-            float(2 * stats.t.sf(abs(alpha / a), people - 1)),
-            effects,
-            people,
-            len(scale),
-        )
+        line, errors = to_line @ np.asarray(fit.fe_params), np.sqrt(np.diag(to_line @ covariance @ to_line.T))
+        half = float(stats.t.isf((1 - confidence) / 2, people - 1)) * errors
+        alpha_interval, beta_interval = zip((line - half).tolist(), (line + half).tolist(), strict=True)
+        p = float(2 * stats.t.sf(abs(line[0] / errors[0]), people - 1))
+        alpha, beta = line.tolist()
+        return Mixed(alpha, beta, alpha_interval, beta_interval, p, effects, people, len(scale))
     return None
 
 

@@ -101,7 +101,7 @@ class RepeatSettings(Settings):
 
 
 class TimingSettings(Settings):
-    """Times in seconds: wait before a pattern (shortest, longest), duration of a pattern, of the mark of an error."""
+    """Times in seconds: before a pattern (shortest, longest), of a pattern, and of a wrongly answered one in red."""
 
     wait_s: Annotated[tuple[Seconds, Seconds], AfterValidator(_ordered)] = (0.8, 1.6)
     show_s: Seconds = 2.0
@@ -176,17 +176,17 @@ def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudySettings
     for i, group in enumerate(settings.patterns):
         for pair in group.pairs:
             if pair in conditions:
-                words = f"{pair[0]:g} deg with size {pair[1]:g} deg is there twice; raise the repeats instead"
-                mistakes.append((("patterns", i), words))
+                twice = f"{pair[0]:g} deg with size {pair[1]:g} deg is there twice; raise the repeats instead"
+                mistakes.append((("patterns", i), twice))
             conditions.add(pair)
     if not mistakes:
         cuts = beyond_screen(settings)
         shows = build_screen(screen).shows
         middles = sorted({cut.eccentricity_deg for cut in cuts if not shows(0.0, cut.eccentricity_deg)})
         if cuts and not screen.cut:
-            words = "; sit nearer, use a larger screen, leave them out, or say 'cut: true' to show the part that fits"
+            cure = "sit nearer, use a larger screen, leave them out, or say 'cut: true' to show the part that fits"
             listed = "; ".join(cut.text for cut in cuts[:4]) + (f"; and {len(cuts) - 4} more" if len(cuts) > 4 else "")
-            mistakes.append((("screen",), f"patterns beyond the screen: {listed}{words}"))
+            mistakes.append((("screen",), f"patterns beyond the screen: {listed}; {cure}"))
         elif middles:
             names = ", ".join(f"{eccentricity:g} deg" for eccentricity in middles)
             mistakes.append((("screen", "cut"), f"at {names} even the middle of a pattern is beyond the screen"))
@@ -225,8 +225,8 @@ def build_screen(settings: FlatSettings | CurvedSettings) -> FlatScreen | Curved
 
 def _outline(eccentricity: float, size: float) -> tuple[Tensor, Tensor]:
     """(elevation, azimuth) in degrees of points on the circle pattern, which also encloses the cross pattern."""
-    turn = torch.arange(0, 360, 5, dtype=torch.float64).deg2rad()
+    angle = torch.arange(0, 360, 5, dtype=torch.float64).deg2rad()
     centre, half = math.radians(eccentricity), math.tan(math.radians(size) / 2)
-    u, v = half * turn.cos(), half * turn.sin()  # in the plane tangent to the unit sphere at the centre
+    u, v = half * angle.cos(), half * angle.sin()  # in the plane tangent to the unit sphere at the centre
     x, z = math.sin(centre) + u * math.cos(centre), math.cos(centre) - u * math.sin(centre)
     return torch.atan2(v, torch.hypot(x, z)).rad2deg(), torch.atan2(x, z).rad2deg()

@@ -28,27 +28,16 @@ _ROUNDS: tuple[tuple[Pattern, int], ...] = (("cross", 1), ("circle", 1), ("cross
 
 @dataclass(frozen=True)
 class Trial:
-    """One appearance of a pattern.
+    """One appearance of a pattern."""
 
-    Attributes:
-        round: 1 to 4; 0 is the practice round.
-        trial: 1, 2, ... within the round.
-        eccentricity_deg: Angle between the fixation point and the pattern's centre, >= 0.
-        size_deg: Angle that the pattern subtends.
-        side: Side of the fixation point.
-        pattern: Shape of the pattern.
-        target: Whether the pattern is the target of the round, which should be answered.
-        wait_s: Time from the end of the previous trial to the appearance of the pattern, in seconds.
-    """
-
-    round: int
-    trial: int
-    eccentricity_deg: float
-    size_deg: float
-    side: Side
+    round: int  # 1 to 4; 0 is the practice round
+    trial: int  # 1, 2, ... within the round
+    eccentricity_deg: float  # angle between the fixation point and the centre of the pattern, >= 0
+    size_deg: float  # angle that the pattern subtends
+    side: Side  # side of the fixation point
     pattern: Pattern
-    target: bool
-    wait_s: float
+    target: bool  # whether the pattern is the target of the round, which should be answered
+    wait_s: float  # time from the end of the previous trial to the appearance of the pattern
 
     @property
     def practice(self) -> bool:

@@ -8,21 +8,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Quantisation:
-    """Quantisation of reaction times, from the frame intervals measured by the browser.
-
-    Attributes:
-        trials: Number of trials.
-        frame_s: Median frame interval in seconds: patterns can only appear at multiples of it.
-        least_s: Shortest frame interval in seconds.
-        most_s: Longest frame interval in seconds.
-        deviation_s: Standard deviation of the quantisation error of a reaction time, frame / sqrt(12).
-    """
+    """Quantisation of reaction times, from the frame intervals measured by the browser."""
 
     trials: int
-    frame_s: float
-    least_s: float
-    most_s: float
-    deviation_s: float
+    frame_s: float  # median frame interval; patterns can only appear at multiples of it
+    least_s: float  # shortest frame interval
+    most_s: float  # longest frame interval
+    deviation_s: float  # standard deviation of the quantisation error of a reaction time, frame / sqrt(12)
 
     def __str__(self) -> str:
         text = (

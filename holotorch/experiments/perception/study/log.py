@@ -21,21 +21,13 @@ from holotorch.io.files import read_bytes
 
 @dataclass(frozen=True)
 class Trials:
-    """The content of a log.
-
-    Attributes:
-        path: The file.
-        header: The first line of the file.
-        trials: The other lines, as dictionaries, in order.
-        torn: Whether an unfinished line at the end was ignored.
-        size: Bytes up to the end of the last complete line.
-    """
+    """The content of a log."""
 
     path: Path
-    header: dict[str, Any]
-    trials: list[dict[str, Any]]
-    torn: bool
-    size: int
+    header: dict[str, Any]  # the first line of the file
+    trials: list[dict[str, Any]]  # the other lines in order
+    torn: bool  # whether an unfinished line at the end was ignored
+    size: int  # bytes up to the end of the last complete line
 
 
 def read_log(path: Path) -> Trials:
