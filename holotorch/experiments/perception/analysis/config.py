@@ -71,16 +71,17 @@ class SimulationSettings(Settings):
     """Simulated participants whose equal-efficiency scales are known: alpha E + beta for a 5 deg pattern at 10 deg.
 
     The default noise reproduces the first row of Table 2.2: F is near 7, which corresponds to a standard deviation of
-    about 14.5 deg between participants, and 2 to 5 % of the scales are undefined (the p-values of the table belong to
-    148 to 153 degrees of freedom within the groups instead of 156).
+    about 14.5 deg between participants, and 2 to 5 % of the scales are undefined. The p-values of the table belong to
+    148 to 153 degrees of freedom within the groups, whereas 40 participants at four eccentricities have 156.
 
-    ``slope``: derivative of the time with respect to ln S, in seconds; with the default, times of 5 deg patterns at 40
-    and 80 deg differ by 150 ms (thesis Sec. 2.4.2). ``slope_spread``, ``scale_spread``, ``local_spread``: standard
-    deviations of the logarithms of a participant's slope, of all scales of a participant, and of the scale at each
-    eccentricity. ``time_spread``: standard deviation of a participant's times in seconds. ``trial``: standard deviation
-    of a single reaction time in seconds, a Gaussian plus an exponential. ``gaussian``: standard deviation of the
-    Gaussian as a share of ``trial``. ``miss``: share of missed targets. ``false_alarm``: share of answered
-    distractions. ``lapse``: share of answers that are delayed by up to 1.5 s.
+    ``seconds``: median time of the 5 deg pattern. ``slope``: derivative of the time with respect to ln S, in seconds;
+    with the default, times of 5 deg patterns at 40 and 80 deg differ by 150 ms (thesis Sec. 2.4.2). ``slope_spread``,
+    ``scale_spread``, ``local_spread``: standard deviations of the logarithms of a participant's slope, of all scales of
+    a participant, and of the scale at each eccentricity. ``time_spread``: standard deviation of ``seconds`` between
+    participants. ``trial``: standard deviation of the noise of a single reaction time in seconds, a Gaussian plus an
+    exponential. ``gaussian``: standard deviation of the Gaussian as a share of ``trial``. ``miss``: share of missed
+    targets. ``false_alarm``: share of answered distractions. ``lapse``: share of answers that are delayed by up to
+    1.5 s. ``frame``: frame interval of the display in seconds.
     """
 
     participants: Annotated[Count, Field(le=100_000)] = 40

@@ -21,7 +21,7 @@ from holotorch.perception.time import PerceptionTime
 class Responses:
     """Trials of a study without the practice round: arrays with an entry per trial."""
 
-    participant: NDArray[np.int64]  # number of the participant
+    participant: NDArray[np.int64]  # number
     eccentricity_deg: Array
     size_deg: Array
     target: NDArray[np.bool_]  # whether the pattern was the target, which should be answered
@@ -96,7 +96,7 @@ def perception_times(responses: Responses, rule: CleaningSettings) -> Times:
     """Remove invalid answers by the rule, and compute the medians.
 
     Raises:
-        ConfigError: No valid answer remains, because all targets were missed or all times are out of bounds.
+        ConfigError: No valid answer remains, or no condition has enough of them.
     """
     target, time = responses.target, responses.reaction_s
     answered = target & np.isfinite(time)

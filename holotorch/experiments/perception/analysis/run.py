@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
@@ -127,7 +128,7 @@ def run_analysis(settings: AnalysisSettings, opened: RunFolder) -> bool:
     scales = np.stack([finding.scales.degrees for finding in findings])
     files.write(save_array, folder / "arrays" / "scales.npy", torch.from_numpy(scales))
     files.write(write_table, folder / "metrics.csv", rows)
-    files.write(write_table, folder / "conditions.csv", _conditions(times))
+    files.write(write_table, folder / "conditions.csv", list(_conditions(times)))
     files.write(write_table, folder / "curves.csv", _curves(times, curves))
     lines = [(finding.name, finding.line) for finding in findings]
     images = {
@@ -164,22 +165,18 @@ def run_analysis(settings: AnalysisSettings, opened: RunFolder) -> bool:
     return conclude(opened, summary, files, done=True)
 
 
-def _conditions(times: Times) -> list[dict[str, Any]]:
-    rows = []
+def _conditions(times: Times) -> Iterator[dict[str, Any]]:
     for e, s in zip(*np.nonzero(np.isfinite(times.seconds).any(0)), strict=True):
         low, middle, high = np.nanquantile(times.seconds[:, e, s], (0.25, 0.5, 0.75))
-        rows.append(
-            {
-                "eccentricity_deg": times.eccentricities[e],
-                "size_deg": times.sizes[s],
-                "participants": int(np.isfinite(times.seconds[:, e, s]).sum()),
-                "answers": int(times.kept[:, e, s].sum()),
-                "quartile_25_s": low,
-                "median_s": middle,
-                "quartile_75_s": high,
-            }
-        )
-    return rows
+        yield {
+            "eccentricity_deg": times.eccentricities[e],
+            "size_deg": times.sizes[s],
+            "participants": int(np.isfinite(times.seconds[:, e, s]).sum()),
+            "answers": int(times.kept[:, e, s].sum()),
+            "quartile_25_s": low,
+            "median_s": middle,
+            "quartile_75_s": high,
+        }
 
 
 def _curves(times: Times, curves: Curves) -> list[dict[str, Any]]:

@@ -23,6 +23,7 @@ THESIS_CONDITIONS = tuple((float(e), float(s)) for e in (0, 10, 20, 30) for s in
     (float(e), float(s)) for e in (40, 50, 60, 70, 80) for s in (5, 8, 11, 14, 17, 20, 23, 26)
 )
 MOST_TRIALS = 10_000  # largest number of trials per participant; they take seven hours at 2.5 s per trial
+# Target of each round, and which half of the trials with this target the round has.
 _ROUNDS: tuple[tuple[Pattern, int], ...] = (("cross", 1), ("circle", 1), ("cross", 2), ("circle", 2))
 
 
@@ -153,11 +154,11 @@ def make_design(
         half = (len(drawn) + 1) // 2
         blocks[goal, 1], blocks[goal, 2] = drawn[:half], drawn[half:]
     waits = {name: [round(rng.uniform(*wait_s), 4) for _ in block] for name, block in blocks.items()}
-    sequence = [_ROUNDS[i] for i in orders[(participant - 1) % len(orders)]]
-    exercise = random.Random(f"holotorch practice {seed} {participant}")
-    pool = _shuffled(exercise, conditions, sequence[0][0], target_repeats, distraction_repeats, sides)
-    trials = [Trial(0, i, *item, round(exercise.uniform(*wait_s), 4)) for i, item in enumerate(pool[:practice], 1)]
-    for number, name in enumerate(sequence, 1):
+    rounds = [_ROUNDS[i] for i in orders[(participant - 1) % len(orders)]]
+    rng = random.Random(f"holotorch practice {seed} {participant}")
+    drawn = _shuffled(rng, conditions, rounds[0][0], target_repeats, distraction_repeats, sides)
+    trials = [Trial(0, i, *item, round(rng.uniform(*wait_s), 4)) for i, item in enumerate(drawn[:practice], 1)]
+    for number, name in enumerate(rounds, 1):
         timed = zip(blocks[name], waits[name], strict=True)
         trials += [Trial(number, i, *item, wait) for i, (item, wait) in enumerate(timed, 1)]
     return Design(participant, tuple(trials))
@@ -171,6 +172,7 @@ def too_many(trials: int) -> str:
 def _shuffled(
     rng: random.Random, conditions, goal: Pattern, targets: int, distractions: int, sides: str
 ) -> list[_Appearance]:
+    """All trials with the target ``goal``, in random order."""
     roles: tuple[tuple[Pattern, int], ...] = ((goal, targets), (_OTHER[goal], distractions))
     appearances: list[_Appearance] = []
     for eccentricity, size in conditions:
