@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from tqdm import tqdm
 
 from holotorch.experiments.config.errors import ConfigError
-from holotorch.experiments.perception.analysis import figures
+from holotorch.experiments.perception.analysis import figures, statistics
 from holotorch.experiments.perception.analysis.config import AnalysisSettings
 from holotorch.experiments.perception.analysis.curves import (
     Curves,
@@ -26,14 +26,6 @@ from holotorch.experiments.perception.analysis.curves import (
 from holotorch.experiments.perception.analysis.finding import Finding, in_json, in_words
 from holotorch.experiments.perception.analysis.power import needed, power_rows, with_slope
 from holotorch.experiments.perception.analysis.simulation import simulate, true_line
-from holotorch.experiments.perception.analysis.statistics import (
-    fit_line,
-    has_statsmodels,
-    mixed_model,
-    need_statsmodels,
-    one_way,
-    repeated_measures,
-)
 from holotorch.experiments.perception.study.frames import quantisation
 from holotorch.experiments.runs.folder import RunFolder, conclude
 from holotorch.experiments.runs.saving import Results
@@ -43,14 +35,14 @@ from holotorch.io.files import save_array, write_bytes, write_json
 
 def analyse(settings: AnalysisSettings, times: Times, curves: Curves) -> list[Finding]:
     """Analyse all target times. ConfigError for a target that was not shown, or if statsmodels is missing."""
-    low, high = settings.range_deg
-    inside = (curves.eccentricities >= low) & (curves.eccentricities <= high)
+    eccentricities, (low, high) = curves.eccentricities, settings.range_deg
+    inside = (eccentricities >= low) & (eccentricities <= high)
     findings = []
     repeated = _uses_repeated_measures(settings)
     for k, target in enumerate(settings.targets):
         scales = equal_efficiency(curves, times.of(target), settings.limits_deg)
-        line = fit_line(
-            curves.eccentricities,
+        line = statistics.fit_line(
+            eccentricities,
             scales.degrees,
             np.random.default_rng([settings.seed, 2, k]),
             inside=inside,
@@ -64,9 +56,9 @@ def analyse(settings: AnalysisSettings, times: Times, curves: Curves) -> list[Fi
                 str(target),
                 scales,
                 line,
-                one_way(defined),
-                repeated_measures(defined) if repeated else None,
-                mixed_model(curves.eccentricities[inside], defined, settings.confidence) if repeated else None,
+                statistics.one_way(defined),
+                statistics.repeated_measures(defined) if repeated else None,
+                statistics.mixed_model(eccentricities[inside], defined, settings.confidence) if repeated else None,
                 int((measured & ~scales.defined[:, inside]).sum()),
                 int(scales.limited[:, inside].sum()),
                 int((~measured).sum()),
@@ -77,7 +69,7 @@ def analyse(settings: AnalysisSettings, times: Times, curves: Curves) -> list[Fi
 
 def _uses_repeated_measures(settings: AnalysisSettings) -> bool:
     """Whether a repeated-measures analysis and a mixed model are computed."""
-    return has_statsmodels() if settings.repeated_measures is None else settings.repeated_measures
+    return statistics.has_statsmodels() if settings.repeated_measures is None else settings.repeated_measures
 
 
 def on_frames(responses: Responses) -> float:
@@ -90,7 +82,7 @@ def on_frames(responses: Responses) -> float:
 def prepare_analysis(settings: AnalysisSettings) -> None:
     """Raise ConfigError for settings with which the analysis would fail later."""
     if settings.repeated_measures:
-        need_statsmodels()
+        statistics.need_statsmodels()
     if settings.power:
         for alpha in settings.power.slopes:
             try:
