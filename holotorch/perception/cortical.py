@@ -54,8 +54,8 @@ class RovamoVirsu(_Law):
 
     def __call__(self, eccentricity_deg: Any) -> Tensor:
         """1 / M in deg/mm."""
-        where = angles.eccentricity(eccentricity_deg)
-        return (1 + self.a * where + self.b * where**3) / self.m0
+        eccentricity = angles.eccentricity(eccentricity_deg)
+        return (1 + self.a * eccentricity + self.b * eccentricity**3) / self.m0
 
 
 # The thesis gives no coefficients; these are the commonly quoted ones for each half of the visual field.
@@ -99,10 +99,12 @@ class StrasburgerLetters(_Law):
 
     def __call__(self, eccentricity_deg: Any) -> Tensor:
         """S in degrees. ValueError at the pole and beyond."""
-        where = angles.eccentricity(eccentricity_deg)
-        limit = f"below {self.pole_deg:.4g} degrees, its pole at a contrast of {self.contrast:g}"
-        angles.require(where < self.pole_deg, f"eccentricity_deg must be {limit}", where, "; use another law")
-        return 0.022 * where + 0.25 / (0.0345 * (self.pole_deg - where))
+        eccentricity = angles.eccentricity(eccentricity_deg)
+        rule = (
+            f"eccentricity_deg must be below {self.pole_deg:.4g} degrees, its pole at a contrast of {self.contrast:g}"
+        )
+        angles.require(eccentricity < self.pole_deg, rule, eccentricity, "; use another law")
+        return 0.022 * eccentricity + 0.25 / (0.0345 * (self.pole_deg - eccentricity))
 
 
 @dataclass(frozen=True)
@@ -115,10 +117,10 @@ class LinearSize(_Law):
 
     def __call__(self, eccentricity_deg: Any) -> Tensor:
         """S in degrees. ValueError beyond ``high_deg``."""
-        where = angles.eccentricity(eccentricity_deg)
-        limit = f"at most {self.high_deg:g} degrees, as far as it was tested"
-        angles.require(where <= self.high_deg, f"eccentricity_deg must be {limit}", where)
-        return self.slope * where + self.foveal_deg
+        eccentricity = angles.eccentricity(eccentricity_deg)
+        rule = f"eccentricity_deg must be at most {self.high_deg:g} degrees, as far as it was tested"
+        angles.require(eccentricity <= self.high_deg, rule, eccentricity)
+        return self.slope * eccentricity + self.foveal_deg
 
 
 Law = Callable[[Any], Tensor]
@@ -136,8 +138,8 @@ def cortical_scale(eccentricity_deg: Any, law: Law, size_deg: float = 1.0) -> Te
     Raises:
         ValueError: An eccentricity is below 0, above 180, or outside the validity of the law.
     """
-    where, foveal = angles.eccentricity(eccentricity_deg), angles.size(size_deg)
-    return foveal.to(where) * law(where) / law(torch.zeros_like(where))
+    eccentricity, foveal = angles.eccentricity(eccentricity_deg), angles.size(size_deg)
+    return foveal.to(eccentricity) * law(eccentricity) / law(torch.zeros_like(eccentricity))
 
 
 def peripheral_weight(eccentricity_deg: Any, law: Law, *, least: float = 0.0) -> Tensor:
@@ -161,8 +163,8 @@ def peripheral_weight(eccentricity_deg: Any, law: Law, *, least: float = 0.0) ->
     least = checks.finite("least", least)
     if not 0 <= least <= 1:
         raise ValueError(f"least must be within 0 .. 1, got {least:g}")
-    where = angles.eccentricity(eccentricity_deg)
-    if where.ndim < 2:
-        raise ValueError(f"eccentricity_deg must end in (H, W), got {tuple(where.shape)}")
-    weight = cortical_scale(where, law).pow(-2).clamp(min=least)
+    eccentricity = angles.eccentricity(eccentricity_deg)
+    if eccentricity.ndim < 2:
+        raise ValueError(f"eccentricity_deg must end in (H, W), got {tuple(eccentricity.shape)}")
+    weight = cortical_scale(eccentricity, law).pow(-2).clamp(min=least)
     return weight / weight.mean((-2, -1), keepdim=True)

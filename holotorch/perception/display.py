@@ -113,9 +113,9 @@ def check_display(
         ValueError: As in the call of ``scale``, or ``samples`` is below 1.
     """
     checks.whole("samples", samples, 1)
-    where = angles.eccentricity(eccentricity_deg)
-    sizes = scale(where, extrapolate=extrapolate)
+    eccentricity = angles.eccentricity(eccentricity_deg)
+    sizes = scale(eccentricity, extrapolate=extrapolate)
     needed, available = samples / sizes, display.pixels_per_degree
     resolved = None if available is None else needed <= available
-    covered = where + sizes / 2 <= display.half_field_deg
-    return DisplayCheck(sizes, covered, needed, resolved, display.half_field_deg, scale.tested(where))
+    covered = eccentricity + sizes / 2 <= display.half_field_deg
+    return DisplayCheck(sizes, covered, needed, resolved, display.half_field_deg, scale.tested(eccentricity))

@@ -55,16 +55,16 @@ def scale_layout(
             (azimuth).
     """
     centres, sizes = _items(centres_deg, size_deg)
-    where = eccentricity_of(centres[:, 0], centres[:, 1])
-    fitted = scale.inside(where)
-    beyond = ~fitted & (where > scale.high_deg) & extrapolate
+    eccentricity = eccentricity_of(centres[:, 0], centres[:, 1])
+    fitted = scale.inside(eccentricity)
+    beyond = ~fitted & (eccentricity > scale.high_deg) & extrapolate
     scaled_items = fitted | beyond
     # The line is evaluated at a valid eccentricity for all other items, which then cause neither errors nor gradients.
-    target_size = scale(torch.where(scaled_items, where, scale.high_deg), extrapolate=extrapolate)
+    target_size = scale(torch.where(scaled_items, eccentricity, scale.high_deg), extrapolate=extrapolate)
     factor = torch.where(scaled_items, target_size / sizes.amax(-1), 1)
     scaled = sizes * factor[:, None]
     tested = angles.within(scaled.detach().amax(-1), *TESTED_DEG)
-    return ScaledLayout(scaled, where, fitted, beyond, tested)
+    return ScaledLayout(scaled, eccentricity, fitted, beyond, tested)
 
 
 def overlaps(centres_deg: Any, size_deg: Any) -> tuple[Tensor, Tensor]:

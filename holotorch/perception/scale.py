@@ -67,8 +67,8 @@ class EqualEfficiencyScale:
                 finite.
         """
         sizes = size_deg if isinstance(size_deg, Tensor) else torch.as_tensor(size_deg, dtype=torch.float64)
-        where, inside = _fitted(eccentricity_deg, sizes.shape, "size")
-        x, y = where[inside], angles.size(sizes[inside]).double()
+        eccentricity, inside = _fitted(eccentricity_deg, sizes.shape, "size")
+        x, y = eccentricity[inside], angles.size(sizes[inside]).double()
         spread = (x - x.mean()).square().sum()
         alpha = ((x - x.mean()) * y).sum() / spread
         beta = y.mean() - alpha * x.mean()
@@ -83,8 +83,8 @@ class EqualEfficiencyScale:
 
         As in the thesis, only laws within 40 .. 70 deg are used. ValueError if one of them has a >= 0.
         """
-        where, inside = _fitted(eccentricity_deg, times.slope.shape, "law")
-        return cls.fit(where[inside], times[inside].size(seconds))
+        eccentricity, inside = _fitted(eccentricity_deg, times.slope.shape, "law")
+        return cls.fit(eccentricity[inside], times[inside].size(seconds))
 
     @classmethod
     def from_surface(
@@ -94,11 +94,11 @@ class EqualEfficiencyScale:
 
         ValueError if there is no law at ``target_deg``.
         """
-        where = angles.eccentricity(eccentricity_deg).double()
-        at = (where == target_deg).nonzero()
-        if where.ndim != 1 or len(at) != 1:
+        eccentricity = angles.eccentricity(eccentricity_deg).double()
+        at = (eccentricity == target_deg).nonzero()
+        if eccentricity.ndim != 1 or len(at) != 1:
             raise ValueError(f"expected one law at {target_deg} degrees among the eccentricities, got {len(at)}")
-        return cls.from_time(times[int(at[0])].seconds(size_deg), times, where)
+        return cls.from_time(times[int(at[0])].seconds(size_deg), times, eccentricity)
 
     def __call__(self, eccentricity_deg: Any, *, extrapolate: bool = False) -> Tensor:
         """S(E) in degrees, a tensor with the dtype and device of the input; float64 for numbers.
@@ -111,14 +111,14 @@ class EqualEfficiencyScale:
             ValueError: An eccentricity is outside ``low_deg`` .. ``high_deg`` without ``extrapolate``, or the
                 extrapolated line is not above zero there.
         """
-        where = angles.eccentricity(eccentricity_deg)
+        eccentricity = angles.eccentricity(eccentricity_deg)
         if not extrapolate:
             limits = f"{self.low_deg:g} .. {self.high_deg:g} degrees, where the line was fitted"
             rule = f"eccentricity_deg must be within {limits}"
-            angles.require(self.inside(where), rule, where, "; or pass extrapolate=True")
-        sizes = self._line(where)
+            angles.require(self.inside(eccentricity), rule, eccentricity, "; or pass extrapolate=True")
+        sizes = self._line(eccentricity)
         if (bad := sizes <= 0).any():
-            got = f"{angles.first(sizes, bad):.3g} degrees at {angles.first(where, bad):g}"
+            got = f"{angles.first(sizes, bad):.3g} degrees at {angles.first(eccentricity, bad):g}"
             raise ValueError(f"the line holds in the far periphery only: its size is {got} degrees of eccentricity")
         return sizes
 
@@ -128,13 +128,13 @@ class EqualEfficiencyScale:
             raise ValueError("alpha is 0: the size is the same at every eccentricity, so that there is no inverse")
         sizes = angles.size(size_deg)
         alpha, beta = self._coefficients(sizes)
-        where = (sizes - beta) / alpha
+        eccentricity = (sizes - beta) / alpha
         if extrapolate:
-            return angles.eccentricity(where, "the eccentricity of size_deg")
+            return angles.eccentricity(eccentricity, "the eccentricity of size_deg")
         low, high = self._line(torch.tensor([self.low_deg, self.high_deg], dtype=torch.float64)).detach().sort().values
-        limits = f"{low:.4g} .. {high:.4g} degrees, the sizes of the line"
-        angles.require(self._covers(where), f"size_deg must be within {limits}", sizes, "; or pass extrapolate=True")
-        return where.clamp(self.low_deg, self.high_deg)
+        rule = f"size_deg must be within {low:.4g} .. {high:.4g} degrees, the sizes of the line"
+        angles.require(self._covers(eccentricity), rule, sizes, "; or pass extrapolate=True")
+        return eccentricity.clamp(self.low_deg, self.high_deg)
 
     def inside(self, eccentricity_deg: Any) -> Tensor:
         """Whether eccentricities lie within those of the fit, up to rounding errors; bool, of the given shape."""
@@ -147,13 +147,14 @@ class EqualEfficiencyScale:
         """
         return angles.within(self._line(angles.eccentricity(eccentricity_deg)), *TESTED_DEG)
 
-    def _covers(self, where: Tensor) -> Tensor:
+    def _covers(self, eccentricity: Tensor) -> Tensor:
         """Whether eccentricities lie within those of the fit, up to the rounding errors of their dtype."""
-        return angles.within(where, self.low_deg, self.high_deg, 1e-9 if where.dtype == torch.float64 else 1e-4)
+        tolerance = 1e-9 if eccentricity.dtype == torch.float64 else 1e-4  # degrees
+        return angles.within(eccentricity, self.low_deg, self.high_deg, tolerance)
 
-    def _line(self, where: Tensor) -> Tensor:
-        alpha, beta = self._coefficients(where)
-        return alpha * where + beta
+    def _line(self, eccentricity: Tensor) -> Tensor:
+        alpha, beta = self._coefficients(eccentricity)
+        return alpha * eccentricity + beta
 
     def _coefficients(self, like: Tensor) -> list[Tensor]:
         return [torch.as_tensor(value, dtype=torch.float64).to(like) for value in (self.alpha, self.beta)]
@@ -161,10 +162,11 @@ class EqualEfficiencyScale:
 
 def _fitted(eccentricity_deg: Any, shape: torch.Size, what: str) -> tuple[Tensor, Tensor]:
     """Eccentricities [N] in float64, and the mask [N] of those within ``FITTED_DEG``, at least two of which differ."""
-    where = angles.eccentricity(eccentricity_deg).double()
-    if where.ndim != 1 or shape != where.shape:
-        raise ValueError(f"expected one {what} per eccentricity [N], got {tuple(shape)} and {tuple(where.shape)}")
-    inside = angles.within(where, *FITTED_DEG)
-    if len(where[inside].unique()) < 2:
+    eccentricity = angles.eccentricity(eccentricity_deg).double()
+    if eccentricity.ndim != 1 or shape != eccentricity.shape:
+        shapes = f"{tuple(shape)} and {tuple(eccentricity.shape)}"
+        raise ValueError(f"expected one {what} per eccentricity [N], got {shapes}")
+    inside = angles.within(eccentricity, *FITTED_DEG)
+    if len(eccentricity[inside].unique()) < 2:
         raise ValueError("a line needs two or more eccentricities within 40 .. 70 degrees")
-    return where, inside
+    return eccentricity, inside

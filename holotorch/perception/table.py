@@ -7,14 +7,9 @@ from dataclasses import dataclass
 class EqualEfficiencyRow:
     """One row: a target pattern, the line S(E) = alpha E + beta, and the one-way ANOVA over the eccentricities.
 
-    Attributes:
-        size_deg: Size of the target pattern.
-        eccentricity_deg: Eccentricity of the target pattern.
-        alpha: Slope, degrees of size per degree of eccentricity.
-        beta: Intercept in degrees.
-        freedom: Degrees of freedom between the groups: four eccentricities minus one.
-        f: The F statistic, which treats a participant's sizes at different eccentricities as independent.
-        p: p-value of ``f``.
+    Sizes, eccentricities and ``beta`` are in degrees, and ``alpha`` in degrees of size per degree of eccentricity.
+    ``freedom`` is the number of degrees of freedom between the groups, four eccentricities minus one. The statistic
+    ``f`` treats the sizes of one participant at different eccentricities as independent; ``p`` is its p-value.
     """
 
     size_deg: float

@@ -165,12 +165,12 @@ def repeated_measures(values: Array) -> Anova:
     if min(freedom) < 1:
         return undefined
     person, column = np.indices(complete.shape)
-    frame = pandas.DataFrame({"scale": complete.ravel(), "participant": person.ravel(), "place": column.ravel()})
+    frame = pandas.DataFrame({"scale": complete.ravel(), "participant": person.ravel(), "column": column.ravel()})
     centred = np.eye(columns) - 1 / columns
     spread = centred @ np.cov(complete.T) @ centred
     if np.trace(spread) <= 1e-24 * np.square(complete).mean():  # all equal within rounding errors
         return undefined
-    row = AnovaRM(frame, "scale", "participant", within=["place"]).fit().anova_table.iloc[0]
+    row = AnovaRM(frame, "scale", "participant", within=["column"]).fit().anova_table.iloc[0]
     f, p = float(row["F Value"]), float(row["Pr > F"])
     epsilon = float(np.trace(spread) ** 2 / ((columns - 1) * np.trace(spread @ spread)))
     corrected = float(stats.f.sf(f, epsilon * freedom[0], epsilon * freedom[1]))
@@ -198,7 +198,7 @@ def mixed_model(eccentricities: Array, values: Array, confidence: float = 0.95) 
     describes means, which are sensitive to a few large scales, and assumes that values are missing at random.
 
     Returns:
-        None if there are too few values or neither fit converges.
+        The model, or None if there are too few values or neither fit converges.
 
     Raises:
         ConfigError: statsmodels is not installed.
@@ -239,7 +239,7 @@ def has_statsmodels() -> bool:
 
 
 def need_statsmodels() -> None:
-    """Raise ConfigError with the command that installs statsmodels if it is missing."""
+    """Raise ConfigError with the command that installs statsmodels, unless it is installed."""
     if not has_statsmodels():
         raise ConfigError(
             ["statsmodels is missing: pip install 'holotorch[stats]', or leave it out with repeated_measures=false"]

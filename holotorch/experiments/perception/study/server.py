@@ -74,10 +74,8 @@ class _Connections(web.Server):
 class StudyServer:
     """Serves the page and the session of one participant.
 
-    Args:
-        session: Session of the participant.
-        token: Token that every request must contain, except the one for the page.
-        script: JavaScript to add to the page, such as the scripted participant of a test.
+    Every request must contain ``token``, except the one for the page. ``script`` is JavaScript to add to the page, such
+    as the scripted participant of a test.
 
     Attributes:
         stop: Event that ends the server; set when the study is complete.

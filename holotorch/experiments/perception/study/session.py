@@ -15,10 +15,7 @@ from holotorch.experiments.perception.study.records import TrialResult, parse_re
 class StudySession:
     """Sends the design to the page and appends its results to the log. Each result is saved before it is acknowledged.
 
-    Args:
-        settings: The study.
-        design: The participant's trials.
-        log: An open log. The session continues after the trials that it already contains.
+    ``design`` is that of the participant. The session continues after the trials that the open ``log`` contains.
     """
 
     def __init__(self, settings: StudySettings, design: Design, log: TrialLog):
