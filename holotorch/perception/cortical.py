@@ -100,9 +100,8 @@ class StrasburgerLetters(_Law):
     def __call__(self, eccentricity_deg: Any) -> Tensor:
         """S in degrees. ValueError at the pole and beyond."""
         eccentricity = angles.eccentricity(eccentricity_deg)
-        rule = (
-            f"eccentricity_deg must be below {self.pole_deg:.4g} degrees, its pole at a contrast of {self.contrast:g}"
-        )
+        pole = f"{self.pole_deg:.4g} degrees, its pole at a contrast of {self.contrast:g}"
+        rule = f"eccentricity_deg must be below {pole}"
         angles.require(eccentricity < self.pole_deg, rule, eccentricity, "; use another law")
         return 0.022 * eccentricity + 0.25 / (0.0345 * (self.pole_deg - eccentricity))
 

@@ -80,7 +80,7 @@ class Display:
     def shows(self, elevation_deg: Any, azimuth_deg: Any) -> Tensor:
         """Whether a direction meets a pixel of the display; bool."""
         y, x = self.pixels(elevation_deg, azimuth_deg)
-        return (y >= -0.5) & (y <= self.shape[0] - 0.5) & (x >= -0.5) & (x <= self.shape[1] - 0.5)
+        return angles.within(y, -0.5, self.shape[0] - 0.5) & angles.within(x, -0.5, self.shape[1] - 0.5)
 
     def width_px(self, azimuth_deg: Any, size_deg: Any) -> Tensor:
         """Width in pixels of a pattern of ``size_deg`` centred at an azimuth on the horizon."""

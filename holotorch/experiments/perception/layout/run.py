@@ -1,6 +1,7 @@
 """Layouts of icons over a wide field, scaled for equal perception time: picture and tables (thesis Fig. 2.8)."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -88,7 +89,7 @@ def run_layout(layouts: Layouts, opened: RunFolder) -> bool:
     rows = [row for target, layout in layouts.scaled for row in _rows(settings, target.name, layout)]
     files.write(write_table, opened.path / "layout.csv", rows)
     files.write(write_bytes, opened.path / "images" / "layout.png", _picture(layouts))
-    files.write(write_table, opened.path / "displays.csv", _displays(settings))
+    files.write(write_table, opened.path / "displays.csv", list(_displays(settings)))
     summary = {
         "experiment": settings.experiment,
         "status": "",
@@ -125,17 +126,15 @@ def _flags(settings: LayoutSettings, layout: ScaledLayout) -> dict[str, Any]:
 
 def _note(layout: ScaledLayout, i: int, cut: bool) -> str:
     """Warnings about an icon's size; empty if Table 2.2 gives the size, the study tested it and the icon is not cut."""
-    parts = []
-    if layout.extrapolated[i]:
-        parts.append("extrapolated beyond 70 deg")
-    elif layout.kept[i]:
-        near = layout.eccentricity_deg[i] < FITTED_DEG[0]
-        parts.append(f"not scaled: {'nearer than 40 deg' if near else 'beyond 70 deg it would need extrapolation'}")
-    if not layout.tested[i]:
-        parts.append("size not tested")
-    if cut:
-        parts.append("cut by the edge of the field")
-    return "; ".join(parts)
+    near = layout.eccentricity_deg[i] < FITTED_DEG[0]
+    notes = {
+        "extrapolated beyond 70 deg": layout.extrapolated[i],
+        "not scaled: nearer than 40 deg": layout.kept[i] & near,
+        "not scaled: beyond 70 deg it would need extrapolation": layout.kept[i] & ~near,
+        "size not tested": ~layout.tested[i],
+        "cut by the edge of the field": cut,
+    }
+    return "; ".join(note for note, applies in notes.items() if applies)
 
 
 def _rows(settings: LayoutSettings, title: str, layout: ScaledLayout) -> list[dict[str, Any]]:
@@ -155,10 +154,9 @@ def _rows(settings: LayoutSettings, title: str, layout: ScaledLayout) -> list[di
     ]
 
 
-def _displays(settings: LayoutSettings) -> list[dict[str, Any]]:
+def _displays(settings: LayoutSettings) -> Iterator[dict[str, Any]]:
     """For each display of Table 2.1, the greatest eccentricity at which it can show each target's sizes."""
     grid = torch.linspace(*FITTED_DEG, 301, dtype=torch.float64)
-    rows = []
     for display in TABLE_2_1:
         row: dict[str, Any] = {"display": display.name, "half_field_deg": display.half_field_deg}
         for target in settings.targets:
@@ -173,8 +171,7 @@ def _displays(settings: LayoutSettings) -> list[dict[str, Any]]:
             elif not check.resolved.all():
                 limit += ", too coarse"
             row[target.name] = limit
-        rows.append(row)
-    return rows
+        yield row
 
 
 def _picture(layouts: Layouts) -> bytes:
@@ -199,7 +196,7 @@ def _picture(layouts: Layouts) -> bytes:
             halo = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.7}
             axes.text(*position, label, ha="center", va="top", fontsize=7.5, color=colour, zorder=301, bbox=halo)
             if abs(layout.eccentricity_deg[i].item() - target.eccentricity_deg) < 0.05:
-                # 0.4 deg around the target, whose size differs from that of the fitted line at 40 deg.
+                # The box has the size of the target plus 0.4 deg on each side; at 40 deg, the icon has another size.
                 _box(axes, centre, (target.size_deg + 0.8, target.size_deg + 0.8), "#d00000", "--")
         axes.plot(0, 0, "k+", markersize=11, zorder=400)
         axes.set(xlim=(-wide, wide), ylim=(-high, high), aspect="equal")
