@@ -1,6 +1,6 @@
 """Far-periphery perception (thesis chapter 2): perception times, sizes of content over eccentricity, and displays.
 
-Angles are in degrees, which the suffix ``_deg`` of their names states; times are in seconds.
+Angles are in degrees, as the suffix ``_deg`` of their names says; times are in seconds.
 """
 
 from holotorch.perception.cortical import (

@@ -75,11 +75,11 @@ class DisplayCheck:
 
     Attributes:
         size_deg: S(E), [N].
-        covered: Whether the whole pattern lies within the field of view, [N] bool. For a diagonal field of view, whose
-            horizontal part is smaller, True only means that it is possible.
+        covered: Whether the whole pattern lies within the field of view, [N] bool. If the field of view is diagonal,
+            the horizontal one is smaller, so that True only means that the pattern may fit.
         needed: Pixels per degree needed to draw the pattern with the requested samples, [N].
         resolved: Whether the display has this resolution, [N] bool; None if its angular resolution is not known.
-        reach_deg: Half the field of view in degrees.
+        reach_deg: Half the field of view of the display in degrees.
         tested: Whether the size was tested in the study, [N] bool.
     """
 
@@ -105,8 +105,8 @@ def check_display(
         display: A row of ``TABLE_2_1``, or another display.
         scale: Scale of the sizes.
         eccentricity_deg: Eccentricities of the patterns, [N].
-        samples: Pixels across a pattern needed to recognise it. With 12, a cross or ring has strokes of two pixels and
-            gaps of four. The resolution of the eye is not considered, because it is no stricter at these sizes.
+        samples: Pixels across a pattern needed to recognise it. With 12, the strokes of a cross or ring are 2.4 pixels
+            wide. The resolution of the eye is not considered, because it is no stricter at these sizes.
         extrapolate: As in the call of ``scale``.
 
     Raises:

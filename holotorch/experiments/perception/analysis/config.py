@@ -126,9 +126,10 @@ class AnalysisSettings(Settings):
     """Analysis of the logs of a perception study, or of a simulated study if there are no ``logs``.
 
     ``range_deg``: eccentricities to which lines are fitted. ``limits_deg``: scales outside are clipped to these limits.
-    ``tested_deg``: sizes shown in the study; scales outside are extrapolated. ``confidence``: level of all intervals.
-    ``shown``: the participant of Fig. 2.5, by default the first. ``repeated_measures``: whether to add a
-    repeated-measures analysis and a mixed model, which need statsmodels; by default, if it is installed.
+    ``tested_deg``: sizes shown in the study; scales outside are extrapolated. ``resamples``: number of bootstrap
+    samples. ``confidence``: level of all intervals. ``shown``: the participant of Fig. 2.5, by default the first.
+    ``repeated_measures``: whether to add a repeated-measures analysis and a mixed model, which need statsmodels; by
+    default, they are added if statsmodels is installed.
     """
 
     experiment: Literal["perception_analysis"]

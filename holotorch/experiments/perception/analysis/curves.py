@@ -21,7 +21,7 @@ from holotorch.perception.time import PerceptionTime
 class Responses:
     """Trials of a study without the practice round: arrays with an entry per trial."""
 
-    participant: NDArray[np.int64]  # number
+    participant: NDArray[np.int64]  # number of the participant
     eccentricity_deg: Array
     size_deg: Array
     target: NDArray[np.bool_]  # whether the pattern was the target, which should be answered
@@ -57,7 +57,7 @@ def read_responses(paths: Iterable[str]) -> Responses:
         raise ConfigError(sorted(wrong))
 
     def column(key: str, dtype: type = float) -> NDArray:
-        return np.array([trial[key] for _, trial in rows], dtype)  # float makes NaN of None
+        return np.array([trial[key] for _, trial in rows], dtype)  # None becomes NaN
 
     pattern = column("eccentricity_deg"), column("size_deg"), column("target", bool)
     times = column("reaction_s"), column("frame_s")
@@ -73,7 +73,7 @@ class Times:
     sizes: Array  # degrees [S], rising
     seconds: Array  # medians [P, E, S]; NaN for conditions that were not shown or have too few valid answers
     kept: NDArray[np.int64]  # number of answers behind each median, [P, E, S]
-    counts: dict[str, int]  # number of answers that each criterion of ``CleaningSettings`` excluded, by name
+    counts: dict[str, int]  # number of all trials and of those that each criterion excluded, by name
     simulated: bool = False  # whether the answers are simulated
 
     def of(self, target: TargetTimeSettings) -> Array:
@@ -93,7 +93,7 @@ class Times:
 
 
 def perception_times(responses: Responses, rule: CleaningSettings) -> Times:
-    """Remove invalid answers by the rule, and compute the medians.
+    """Remove the answers that ``rule`` excludes, and compute the medians.
 
     Raises:
         ConfigError: No valid answer remains, or no condition has enough of them.
@@ -195,7 +195,7 @@ def fit_curves(times: Times, from_deg: float, least_sizes: int) -> Curves:
 
 @dataclass(frozen=True, eq=False)
 class Scales:
-    """Equal-efficiency scales S = exp((T - b) / a) of each participant (Sec. 2.4.3).
+    """Equal-efficiency scales S = exp((T - b) / a) of P participants at K eccentricities (thesis Sec. 2.4.3).
 
     If times do not fall with the size (a >= 0), no size has the target time and the scale is undefined. For medians,
     it still has a rank: above all other scales if the participant's times exceed the target time, below them otherwise.
@@ -203,7 +203,7 @@ class Scales:
     """
 
     degrees: Array  # scales [P, K], clipped to the limits; NaN if a time is missing
-    defined: NDArray[np.bool_]  # whether a < 0, [P, K]
+    defined: NDArray[np.bool_]  # whether a < 0 and no time is missing, [P, K]
     limited: NDArray[np.bool_]  # whether a defined scale was clipped to a limit, [P, K]
 
     @property
@@ -213,7 +213,7 @@ class Scales:
 
 
 def equal_efficiency(curves: Curves, target_s: Array, limits_deg: tuple[float, float]) -> Scales:
-    """The sizes whose perception time is each participant's target time, given in seconds [P]."""
+    """The scales of all participants for their target times in seconds [P]."""
     target = target_s[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         measured = np.isfinite(curves.a) & np.isfinite(target)

@@ -14,7 +14,7 @@ from holotorch.experiments.perception.study.frames import Quantisation
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """Results for one target time. A scale is the size at which a participant sees a pattern as fast as the target."""
+    """Results for one target time. A scale is the size of a pattern that a participant perceives in this time."""
 
     name: str  # the target in words
     scales: Scales  # of all participants at all eccentricities

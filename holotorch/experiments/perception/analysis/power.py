@@ -24,7 +24,7 @@ def with_slope(settings: SimulationSettings, alpha: float, middle_deg: float) ->
     """Settings whose line has the slope ``alpha`` and an unchanged scale at ``middle_deg``.
 
     Raises:
-        ValueError: The line has sizes below zero between 40 and 80 deg.
+        ValueError: The line is not above zero everywhere from 40 to 80 deg.
     """
     beta = settings.beta + (settings.alpha - alpha) * middle_deg
     return SimulationSettings.model_validate({**settings.model_dump(), "alpha": alpha, "beta": beta})
@@ -79,7 +79,7 @@ def power_rows(settings: AnalysisSettings, power: PowerSettings) -> Iterator[dic
 
 
 def needed(rows: list[dict[str, Any]], power: float = 0.8) -> list[str]:
-    """Describe, for each slope, the smallest simulated number of participants that reaches ``power``."""
+    """For each slope, a sentence with the smallest number of participants whose studies reach ``power``."""
     lines = []
     for alpha in dict.fromkeys(row["alpha"] for row in rows):
         results = sorted((row["participants"], row["power"]) for row in rows if row["alpha"] == alpha)

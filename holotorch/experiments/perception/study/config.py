@@ -101,7 +101,10 @@ class RepeatSettings(Settings):
 
 
 class TimingSettings(Settings):
-    """Times in seconds: before a pattern (shortest, longest), of a pattern, and of a wrongly answered one in red."""
+    """Times in seconds: ``wait_s`` before a pattern (shortest, longest), ``show_s`` of a pattern without an answer.
+
+    A pattern that was answered by mistake is shown in red for ``feedback_s``.
+    """
 
     wait_s: Annotated[tuple[Seconds, Seconds], AfterValidator(_ordered)] = (0.8, 1.6)
     show_s: Seconds = 2.0
