@@ -145,7 +145,7 @@ def peripheral_weight(eccentricity_deg: Any, law: Law, *, least: float = 0.0) ->
     """Weights of the squared error of each image sample by the eye's resolution at its eccentricity; mean 1.
 
     To be equally visible, a detail must be law(E) / law(0) times as wide as at the fixation point. If the energy of an
-    error is uniform over the frequencies of both axes, a share (law(0) / law(E))^2 of it is visible. This is the weight.
+    error is uniform over the frequencies of both axes, the visible share is (law(0) / law(E))^2, which is the weight.
 
     Args:
         eccentricity_deg: Eccentricities of the samples, [..., H, W]; see ``Display.eccentricity_map``.

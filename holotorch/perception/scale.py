@@ -143,7 +143,7 @@ class EqualEfficiencyScale:
     def tested(self, eccentricity_deg: Any) -> Tensor:
         """Whether S(E) is within the sizes tested in the study, 5 .. 26 deg; bool, at any eccentricity.
 
-        The lines of Table 2.2 give sizes from 4.0 deg at E = 40 deg to 29.0 deg at E = 70 deg, which are allowed as well.
+        The lines of Table 2.2 give sizes from 4.0 deg at E = 40 deg to 29.0 deg at E = 70 deg; all are allowed.
         """
         return angles.within(self._line(angles.eccentricity(eccentricity_deg)), *TESTED_DEG)
 
