@@ -54,7 +54,7 @@ def within(values: Tensor, low: float, high: float, tolerance: float = 0.0) -> T
 
 
 def require(valid: Tensor, rule: str, values: Tensor, cure: str = "") -> None:
-    """Raise ValueError unless all ``values`` are ``valid``; the message is ``rule``, the first bad value and ``cure``."""
+    """Raise ValueError unless all ``values`` are ``valid``; the message has ``rule``, the first bad value, ``cure``."""
     if not valid.all():
         raise ValueError(f"{rule}, got {first(values, ~valid):g}{cure}")
 

@@ -223,10 +223,9 @@ class CurvedScreen(_Screen):
 
 @dataclass(frozen=True)
 class Headset(Display):
-    """A headset with a constant angle per pixel along each radius (f-theta); FlatScreen describes rectilinear headsets.
+    """A headset with ``resolution`` pixels per degree along each radius from the middle (f-theta projection).
 
-    Attributes:
-        resolution: Pixels per degree along a radius from the middle.
+    FlatScreen describes headsets with rectilinear projection.
     """
 
     resolution: float
@@ -274,9 +273,9 @@ class Headset(Display):
         around = torch.where(radius > 0, angle.sin() / torch.where(radius > 0, angle, 1), 1)
         safe = torch.where(radius > 0, radius, 1)
         cosine, sine = torch.where(radius > 0, x / safe, 1), y / safe
-        turn_x = torch.hypot(cosine, sine * around)  # eye rotation per radial angle
-        turn_y = torch.hypot(sine, cosine * around)
-        return self.resolution / turn_y, self.resolution / turn_x
+        rotation_x = torch.hypot(cosine, sine * around)  # eye rotation, relative to that of a radial step
+        rotation_y = torch.hypot(sine, cosine * around)
+        return self.resolution / rotation_y, self.resolution / rotation_x
 
 
 def _directions(elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:

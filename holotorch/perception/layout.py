@@ -16,7 +16,7 @@ class ScaledLayout:
     """A scaled layout of N items, in the given order.
 
     Attributes:
-        size_deg: (height, width) of each item, [N, 2]; the larger is its size.
+        size_deg: (height, width) of each item, [N, 2]; the larger side is its size.
         eccentricity_deg: Eccentricity of each item's centre, [N].
         fitted: Whether the item lies within the eccentricities of the fitted line, which gives its size, [N] bool.
         extrapolated: Whether the line gives the size beyond these eccentricities, [N] bool.
@@ -72,9 +72,7 @@ def overlaps(centres_deg: Any, size_deg: Any) -> tuple[Tensor, Tensor]:
 
     A width of w degrees at elevation e spans w / cos e of azimuth. Boxes that only touch do not overlap.
 
-    Args:
-        centres_deg: (elevation, azimuth), [N, 2].
-        size_deg: (height, width), [N, 2].
+    The arguments [N, 2] are those of :func:`scale_layout`.
 
     Returns:
         Indices of the pairs [K, 2], the lower index first, and the overlap of each pair [K]: the smallest shift in

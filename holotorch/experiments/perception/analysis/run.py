@@ -107,8 +107,8 @@ def run_analysis(settings: AnalysisSettings, opened: RunFolder) -> bool:
     assert frames is not None  # there is at least one trial
     truths = [None if settings.logs else true_line(settings.simulation, target) for target in settings.targets]
     rows = [finding.row(truth) for finding, truth in zip(findings, truths, strict=True)]
-    whole = on_frames(responses)
-    text = in_words(settings, times, curves, findings, frames, whole)
+    whole_frames = on_frames(responses)
+    text = in_words(settings, times, curves, findings, frames, whole_frames)
     if settings.repeated_measures is None and not _uses_repeated_measures(settings):
         text += "\nLeft out   repeated measures and the mixed model, which need statsmodels: pip install "
         text += "'holotorch[stats]' and run it again; the one-way ANOVA takes the answers of one participant as "
@@ -148,7 +148,7 @@ def run_analysis(settings: AnalysisSettings, opened: RunFolder) -> bool:
         "repeated_measures": _uses_repeated_measures(settings),
         "participants": len(times.participants),
         "counts": times.counts,
-        "quantisation": asdict(frames) | {"on_frames": in_json(whole)},
+        "quantisation": asdict(frames) | {"on_frames": in_json(whole_frames)},
         "rows": rows,
         "power": power,
         "lines": text.splitlines(),
