@@ -55,8 +55,7 @@ def run_study_server(
     header = {
         "participant": participant,
         "design": design.name,
-        "screen": settings.screen.model_dump(mode="json"),
-        "timing": settings.timing.model_dump(mode="json"),
+        **settings.model_dump(mode="json", include={"screen", "timing"}),
         "cut": [[cut.eccentricity_deg, cut.size_deg] for cut in beyond_screen(settings)],
     }
     with TrialLog(path, header) as log:

@@ -32,8 +32,7 @@ class StudySession:
         self.holder = window
         return {
             "participant": self.design.participant,
-            "screen": self.settings.screen.model_dump(mode="json"),
-            "timing": self.settings.timing.model_dump(mode="json"),
+            **self.settings.model_dump(mode="json", include={"screen", "timing"}),
             "trials": [asdict(trial) | {"goal": trial.goal} for trial in self.design.trials],
             "next": len(self.log.trials),
         }
