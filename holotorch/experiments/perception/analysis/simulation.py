@@ -13,7 +13,6 @@ from scipy import special, stats
 
 from holotorch.experiments.perception.analysis.config import SimulationSettings, TargetTimeSettings
 from holotorch.experiments.perception.analysis.curves import Responses
-from holotorch.experiments.perception.analysis.statistics import Array
 from holotorch.experiments.perception.study.design import THESIS_CONDITIONS
 
 _INNER = 40.0  # degrees; patterns nearer to the fixation point have no scale and only serve as targets
@@ -85,8 +84,13 @@ def simulate(
             times[:, k] = base + slope * (math.log(size) - middle - shift[:, np.searchsorted(angles, angle)])
     repeats = targets + distractions
     shape = (people, len(where), repeats)
-    reaction = times[..., None] + _trials(settings, generator, shape, targets)
-    reaction = reaction + np.where(generator.random(shape) < settings.lapse, _LATE * generator.random(shape), 0)
+    gaussian = settings.trial * settings.gaussian
+    scale = math.sqrt(settings.trial**2 - gaussian**2)
+    noise = gaussian * generator.standard_normal(shape) + scale * generator.exponential(size=shape)
+    # The offset makes the expected median of the answers, after rounding up to frames, equal to the participant's time.
+    noise = noise - _mean_of_medians(gaussian, scale, targets) - settings.frame / 2
+    lapses = np.where(generator.random(shape) < settings.lapse, _LATE * generator.random(shape), 0)
+    reaction = times[..., None] + noise + lapses
     # Patterns appear at the start of a frame, and the button is read once per frame.
     reaction = np.ceil(np.maximum(reaction, 0) / settings.frame) * settings.frame
     target = np.broadcast_to(np.arange(repeats) < targets, shape)
@@ -102,16 +106,6 @@ def simulate(
         np.full(math.prod(shape), settings.frame),
         simulated=True,
     )
-
-
-def _trials(
-    settings: SimulationSettings, generator: np.random.Generator, shape: tuple[int, ...], answers: int
-) -> Array:
-    """Gaussian plus exponential noise; the median of ``answers`` samples, after rounding up to frames, has mean 0."""
-    gaussian = settings.trial * settings.gaussian
-    scale = math.sqrt(settings.trial**2 - gaussian**2)
-    noise = gaussian * generator.standard_normal(shape) + scale * generator.exponential(size=shape)
-    return noise - _mean_of_medians(gaussian, scale, answers) - settings.frame / 2
 
 
 @lru_cache

@@ -3,8 +3,10 @@
 import importlib.util
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +57,7 @@ def fit_line(
     medians = _median(degrees)
     drawn, level = np.full_like(medians, np.nan)[None], 0.5  # with too few participants, every interval is NaN
     if people >= LEAST:
-        drawn = _median(some[generator.integers(people, size=(resamples, people))], 1)
+        drawn = _median(some[generator.integers(people, size=(resamples, people))], axis=1)
         level = _expanded_level(people, confidence)
     levels = [level, 1 - level]
     refused = _refusal(eccentricities, degrees, medians, inside, limits)
@@ -98,21 +100,19 @@ def _expanded_level(people: int, confidence: float) -> float:
     return float(stats.norm.cdf(math.sqrt(people / (people - 1)) * t))
 
 
-def _median(values: Array, axis: int = 0) -> Array:
-    return _ignore_nan(np.median, np.nanmedian, values, axis=axis)
-
-
-def _quantiles(values: Array, levels: Sequence[float]) -> Array:
-    return _ignore_nan(np.quantile, np.nanquantile, values, levels, axis=0)
-
-
-def _ignore_nan(plain: Callable[..., Array], nan_aware: Callable[..., Array], values: Array, *args, axis: int) -> Array:
+def _ignore_nan(
+    plain: Callable[..., Array], nan_aware: Callable[..., Array], values: Array, *args: Any, axis: int = 0
+) -> Array:
     """Call ``plain``, which is much faster, if no value is NaN, otherwise ``nan_aware``; NaN for a column of NaN."""
     if not np.isnan(values).any():
         return plain(values, *args, axis=axis)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "All-NaN slice")
         return nan_aware(values, *args, axis=axis)
+
+
+_median = partial(_ignore_nan, np.median, np.nanmedian)
+_quantiles = partial(_ignore_nan, np.quantile, np.nanquantile)
 
 
 @dataclass(frozen=True)
