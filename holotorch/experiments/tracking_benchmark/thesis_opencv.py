@@ -117,12 +117,12 @@ class ThesisOpenCV:
     def _axis(self, solid: np.ndarray, bands: np.ndarray) -> tuple[Axis, Box]:
         """Line through the pixels of ``solid`` [H, W], which the erosion left, except those far from it; their box."""
         nonzero = cv2.findNonZero(solid)
-        points = np.empty((0, 2), dtype=np.int32) if nonzero is None else np.asarray(nonzero).reshape(-1, 2)
+        points = np.asarray([] if nonzero is None else nonzero, dtype=np.int32).reshape(-1, 2)
         numbers, size = bands[points[:, 1], points[:, 0]], (solid.shape[1], solid.shape[0])
         return stages.fit_axis(points, numbers, len(self._positions) - 1, size, _line)
 
     def _pose(self, found: Endpoints) -> Pose:
-        """Mean of the closed-form poses from all pairs of neighbouring bands whose three endpoints were found."""
+        """Mean of the closed-form poses of each pair of neighbouring bands whose three endpoints were found."""
         edges = stages.nudged(found)
         rays = np.ones((*edges.shape[:2], 3))
         rays[..., :2] = (edges - self._matrix[:2, 2]) / self._matrix.diagonal()[:2]

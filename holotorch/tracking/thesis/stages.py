@@ -7,6 +7,7 @@ import colorsys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -238,10 +239,10 @@ def answer(found: Endpoints, tip: np.ndarray, direction: np.ndarray, device: tor
     if not np.isfinite(covariance).all() or not np.isfinite(both).all() or tip[0, 2] <= 0:
         raise Refusal(Status.INCONSISTENT, "the endpoints are not the image of the bands in front of the camera")
     missing = ", ".join(str(edge + 1) for edge, spot in enumerate(found) if spot is None)
-    parts = (tip[0], direction[0], covariance, 0, 0)
-    tensors = (torch.tensor(part, dtype=torch.float64, device=device) for part in parts)
+    status = Status.UNVERIFIED if missing else Status.OK
     reason = f"edges not found, pose from the others: {missing}" if missing else ""
-    return Pose(*tensors, Status.UNVERIFIED if missing else Status.OK, reason)
+    tensor = partial(torch.tensor, dtype=torch.float64, device=device)
+    return Pose(tensor(tip[0]), tensor(direction[0]), tensor(covariance), tensor(0), tensor(0), status, reason)
 
 
 class Stopwatch:

@@ -7,6 +7,7 @@ from kornia.filters import filter2d, median_blur
 from kornia.geometry import fit_line, remap
 from kornia.morphology import erosion
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.detection.channels import ChannelOrder
@@ -157,13 +158,10 @@ class ThesisTracker:
     def _pose(self, found: Endpoints, device: torch.device) -> Pose:
         """Mean of the closed-form poses of each pair of neighbouring bands whose three endpoints were found."""
         edges = torch.from_numpy(stages.nudged(found))
-        tips, directions = [], []
-        for i in stages.triples(found):
-            tip, direction = closed_form(edges[:, i : i + 3], self.catheter.positions[i : i + 3], self._pinhole)
-            tips.append(tip)
-            directions.append(direction)
-        direction = torch.nn.functional.normalize(torch.stack(directions).mean(0), dim=-1)
-        return stages.answer(found, torch.stack(tips).mean(0).numpy(), direction.numpy(), device)
+        triples = [slice(i, i + 3) for i in stages.triples(found)]
+        poses = [closed_form(edges[:, triple], self.catheter.positions[triple], self._pinhole) for triple in triples]
+        tip, direction = (torch.stack(parts).mean(0) for parts in zip(*poses, strict=True))
+        return stages.answer(found, tip.numpy(), normalize(direction, dim=-1).numpy(), device)
 
 
 def _line(points: Tensor) -> Axis:
