@@ -30,7 +30,7 @@ offset bytes type     meaning
 ====== ===== ======== =================================================================================================
 
 A clock request or reply has 52 bytes: the first 24 as above, with ``stream`` and ``sequence`` chosen by the receiver of
-poses, which sends the request; three float64 times in seconds at 24, 32 and 40: sending of the request, its arrival, and
+poses, which sends the request; at 24, 32 and 40 float64 times in seconds: sending of the request, its arrival, and
 sending of the reply (the last two are 0 in a request); CRC-32 at 48.
 
 A capture time must not lie after the time of sending: a receiver does not use such a packet, since its age is unknown.
