@@ -1,5 +1,7 @@
 """ThesisTracker: the tracking pipeline of Sec. 3.4, stage by stage in kornia."""
 
+from collections.abc import Sequence
+
 import torch
 from kornia.color import rgb_to_hsv
 from kornia.contrib import connected_components_union_find
@@ -60,8 +62,8 @@ class ThesisTracker:
         self._map = torch.empty(0, 0, 2)
 
     @torch.no_grad()
-    def __call__(self, frames: Tensor) -> list[Pose]:
-        """Pose in metres, or refusal, of each frame of uint8 [B, 3, H, W].
+    def __call__(self, frames: Tensor, previous: Sequence[Pose] | None = None) -> list[Pose]:
+        """Pose in metres, or refusal, of each frame of uint8 [B, 3, H, W]; ``previous`` poses are not used.
 
         Raises:
             TypeError, ValueError: ``frames`` is not such a tensor.
