@@ -127,15 +127,15 @@ def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, A
     }
     if answered:
         stated = torch.tensor([value for value in log.deviations if math.isfinite(value)], dtype=torch.float64)
-        summary["tip_sd_mm"] = {"median": 1e3 * _at(stated, 0.5), "largest": 1e3 * _at(stated, 1.0)}
+        summary["tip_sd_mm"] = {"median": 1e3 * quantile(stated, 0.5), "largest": 1e3 * quantile(stated, 1.0)}
         summary["tip_sd_holds"] = _STATED
     if log.seconds:
         taken = 1e3 * torch.tensor(log.seconds, dtype=torch.float64)
         summary["milliseconds"] = {
             "first": float(taken[0]),
-            "median": _at(taken, 0.5),
-            "p95": _at(taken, 0.95),
-            "largest": _at(taken, 1.0),
+            "median": quantile(taken, 0.5),
+            "p95": quantile(taken, 0.95),
+            "largest": quantile(taken, 1.0),
         }
     if log.timed:
         whole = sum(log.stages.values())
@@ -233,10 +233,9 @@ def _smaller(drawn: Tensor) -> Tensor:
     return torch.nn.functional.avg_pool2d(drawn.double() / 255, factor)
 
 
-def _at(values: Tensor, share: float) -> float:
-    if not len(values):
-        return math.nan
-    return float(values.sort().values[round(share * (len(values) - 1))])
+def quantile(values: Tensor, share: float) -> float:
+    """Value [n] below which a share of the values lies; NaN if there are none."""
+    return float(values.sort().values[round(share * (len(values) - 1))]) if len(values) else math.nan
 
 
 def drawn_track(log: Log) -> Any:
