@@ -1,7 +1,6 @@
 """A synthetic recording of a catheter that moves over a drape, with its true poses."""
 
 import csv
-import io
 import math
 import shutil
 import tempfile
@@ -14,6 +13,7 @@ from tqdm import tqdm
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.runs.folder import claim
+from holotorch.experiments.runs.tables import write_table
 from holotorch.experiments.tracking.devices import (
     build_camera,
     build_catheter,
@@ -24,7 +24,6 @@ from holotorch.experiments.tracking.devices import (
 )
 from holotorch.experiments.tracking.report import COLUMNS, quantile
 from holotorch.io.bundled import find_config
-from holotorch.io.files import write_text
 from holotorch.io.recording import Recorder, is_recording
 from holotorch.io.video import Frame
 from holotorch.tracking.evaluation.protocols import coverage
@@ -89,9 +88,7 @@ def _render(folder: Path, frames: int, world: World) -> None:
     cloth = drape(size, 0, (70, 120, 130))
     scale = float(world.camera.matrix[0, 0]) / 1400  # the finger's sizes below are for fx = 1400 px
     middle = (tool.edges[0] + tool.edges[-1]) / 2  # metres from the tip
-    table = io.StringIO()
-    rows = csv.writer(table, lineterminator="\n")
-    rows.writerow(_TRUTH)
+    rows = []
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as temporary:
         copies = {name: Path(temporary, name) for name in ("camera.yaml", "catheter.yaml")}
         save_camera(copies["camera.yaml"], world.camera, size)
@@ -107,8 +104,9 @@ def _render(folder: Path, frames: int, world: World) -> None:
                 fingers = finger((x, y - 260 * scale), (x, y + 14 * scale), 16 * scale, SKIN) if covered else ()
                 case = world.case(f"synthetic {i}", (tip, along), lambda: cloth, occluders=tuple(fingers))
                 recorder.write(Frame(i / RATE, case.frame()))
-                rows.writerow([i, f"{i / RATE:.6f}", *(f"{value:.9f}" for value in torch.cat([tip, along]).tolist())])
-    write_text(folder / "truth.csv", table.getvalue())
+                numbers = [f"{value:.9f}" for value in torch.cat([tip, along]).tolist()]
+                rows.append(dict(zip(_TRUTH, (i, f"{i / RATE:.6f}", *numbers), strict=True)))
+    write_table(folder / "truth.csv", rows)
 
 
 def read_truth(folder: Path) -> dict[str, list[float]]:
