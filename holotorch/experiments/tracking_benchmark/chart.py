@@ -154,8 +154,8 @@ def _accuracy(name: str, rows: list[Row], tables: dict[str, list[Row]]) -> list[
         median = f"absolute median {row['median_mm']} mm{_goal(row['median_mm'], median_goal)}"
         p95 = f"p95 {row['p95_mm']} mm{_goal(row['p95_mm'], p95_goal)}"
         lines.append(
-            f"{grid} grid, {name}: {median}, {p95}, {row['refused']} of {row['points']} refused, Acc {row['acc_mm']} mm; "
-            f"thesis in OpenCV {base['median_mm']}, {base['p95_mm']}, {base['refused']} refused, "
+            f"{grid} grid, {name}: {median}, {p95}, {row['refused']} of {row['points']} refused, Acc {row['acc_mm']} "
+            f"mm; thesis in OpenCV {base['median_mm']}, {base['p95_mm']}, {base['refused']} refused, "
             f"Acc {base['acc_mm']} (dissertation, real camera: Acc {printed})"
         )
     for row in tables["still"]:

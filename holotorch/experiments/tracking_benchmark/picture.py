@@ -1,12 +1,11 @@
 """Figure of the chart of trackers."""
 
-import io
 import math
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from holotorch.experiments.runs.figures import figure_png
 from holotorch.experiments.tracking_benchmark.bench import STILL, TIP, Row, one
 from holotorch.experiments.tracking_benchmark.methods import BASE, COLD, FEWER, PRIOR
 
@@ -17,13 +16,11 @@ _STYLE = {BASE: ("tab:gray", "s"), COLD: ("tab:blue", "o"), PRIOR: ("tab:green",
 def draw(rows: list[Row], tables: dict[str, list[Row]]) -> bytes:
     """PNG of the chart: error over time, spread at rest with its bounds, and shares of right, refused and wrong."""
     figure = Figure(figsize=(14, 4.6), layout="constrained")
-    first, second, third = (figure.add_subplot(1, 3, k + 1) for k in range(3))
+    first, second, third = figure.subplots(1, 3)
     _errors(first, rows)
     _precision(second, tables["still"])
     _outcomes(third, tables["reliability"])
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer)
-    return buffer.getvalue()
+    return figure_png(figure)
 
 
 def _errors(axes: Axes, rows: list[Row]) -> None:
