@@ -61,7 +61,7 @@ class PoseSender:
         for link in self.links:
             if link.transport is not None:
                 link.transport.close()
-        await asyncio.sleep(0)  # lets the sockets close before the loop may
+        await asyncio.sleep(0)  # lets the sockets close before the event loop may end
 
     def send(self, pose: Pose, captured: float, *, lag: float = 0.0) -> int:
         """Send one pose or refusal and return its sequence number.
@@ -84,7 +84,7 @@ class PoseSender:
 class Newest(asyncio.BaseProtocol):
     """Connection that writes at once; while the system's buffer is full, it keeps only the newest data.
 
-    ``dropped`` counts the data that newer data replaced. A subclass implements ``_write`` for its kind of transport.
+    ``dropped`` counts the data that newer data replaced.
     """
 
     def __init__(self):
@@ -119,7 +119,7 @@ class Newest(asyncio.BaseProtocol):
             self.offer(data)
 
     def _write(self, data: bytes) -> None:
-        raise NotImplementedError
+        self.transport.write(data)
 
 
 class Link(Newest, asyncio.DatagramProtocol):
