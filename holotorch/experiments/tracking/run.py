@@ -27,7 +27,7 @@ from holotorch.experiments.tracking.source import Tracker, TrackingInputs, open_
 from holotorch.experiments.tracking.synthetic import compared, errors, frame_size, read_truth, write_synthetic
 from holotorch.io.files import append, replacing, write_bytes
 from holotorch.io.recording import Recorder, free_bytes, recording_bytes
-from holotorch.io.video import Frame, Frames, replacing_video
+from holotorch.io.video import Frame, replacing_video
 from holotorch.tracking import Pose, Status
 from holotorch.tracking.pose.overlay import overlay
 from holotorch.tracking.streaming.packet import now
@@ -56,10 +56,10 @@ def follow(frames: Iterable[Frame], tracker: Tracker) -> Iterator[Tracked]:
 def live(
     sources: Sequence[str], camera: Path | None, catheter: Path | None, rate: float | None = None
 ) -> Iterator[tuple[float, Pose]]:
-    """Yield the capture time and the pose of each frame of one source; times are on the clock of ``packet.now``.
+    """Yield the capture time, in seconds of the clock ``packet.now``, and the pose of each frame of one source.
 
-    For a file, the capture time is when the frame is due at the pace of its time stamps, which may be in the future.
-    The call opens and checks the source and its files; frames are read when the poses are requested.
+    For a file, the capture time is the time at which the frame is due at the pace of its time stamps, which may be in
+    the future. The call opens and checks the source and its files; frames are read when poses are requested.
     """
     if len(sources) != 1:
         raise ConfigError([f"expected one source to track and stream, got {len(sources)}"])
@@ -127,8 +127,7 @@ def plan_tracking(experiment: TrackingExperiment) -> RunPlan:
     frames = experiment.inputs.frames
     height, width = frames.shape
     count = "an unknown number of frames" if frames.total is None else f"{frames.total} frames"
-    if frames.live:
-        count = "without end; Ctrl-C ends it"
+    count = "without end; Ctrl-C ends it" if frames.live else count
     lines = [f"Source     {frames.name}: {width} x {height} px, {frames.rate:g} per second, {count}"]
     if settings.record:
         free, rate = free_bytes(Path()), recording_bytes(frames.shape, 1) * frames.rate
@@ -165,8 +164,9 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
     folder, settings, frames = run.path, experiment.settings, inputs.frames
     log, results, failure = Log(folder / "images"), Results(), None
     printed = len(frames.notes)
-    if settings.record:
-        _check_room(folder, frames)
+    size, free = recording_bytes(frames.shape, frames.total or 0), free_bytes(folder)
+    if settings.record and size > free:
+        raise ConfigError([f"the recording takes {size / 1e9:.2f} GB and {free / 1e9:.2f} GB are free; choose --out"])
     opened: list[AbstractContextManager[Any]] = [frames]
     try:
         _track_all(inputs, settings, run, log, opened)
@@ -242,13 +242,6 @@ def _track_all(
             bar.update()
         if run.pressed:
             break
-
-
-def _check_room(folder: Path, frames: Frames) -> None:
-    """Raise ConfigError if the disk has too little space for a recording of all frames."""
-    size, free = recording_bytes(frames.shape, frames.total or 0), free_bytes(folder)
-    if size > free:
-        raise ConfigError([f"the recording takes {size / 1e9:.2f} GB and {free / 1e9:.2f} GB are free; choose --out"])
 
 
 def _recorded(frames: Iterator[Frame], recorder: Recorder, pressed: list[int]) -> Iterator[Frame]:

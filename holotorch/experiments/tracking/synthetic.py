@@ -35,7 +35,6 @@ RATE = 30.0  # frames per second
 _SIZE = (1080, 1920)  # (H, W) for a camera without a frame size
 _TIP, _COVARIANCE = COLUMNS[5:8], COLUMNS[11:17]
 _TRUTH = ("frame", "time_s", *COLUMNS[5:11])  # columns of truth.csv
-_SHARES = {"median": 0.5, "p95": 0.95, "worst": 1.0}
 _WRONG = 5.0  # mm: error above which a pose counts as wrong
 
 
@@ -145,7 +144,7 @@ def read_truth(folder: Path) -> dict[str, list[float]]:
 
 
 def errors(poses: Path, true: Mapping[str, Sequence[float]]) -> dict[str, float]:
-    """Statistics of the distances from the tips in a poses.csv to the truth, as JSON values; empty without a truth.
+    """Statistics of the distances from the tips in a poses.csv to the true tips, as JSON values; empty without truth.
 
     ``true`` is a result of :func:`read_truth`. Keys ending in ``_mm`` are quantiles of the distances in millimetres,
     ``coverage`` is the share of poses whose 95 % ellipsoid contains the truth, and ``wrong`` the number of poses with
@@ -159,12 +158,11 @@ def errors(poses: Path, true: Mapping[str, Sequence[float]]) -> dict[str, float]
     statistics: dict[str, float] = {"frames": len(rows), "refused": len(known) - len(rows)}
     if not rows:
         return statistics
-    tips, true_tips = (
-        torch.tensor(part, dtype=torch.float64)
-        for part in ([[float(row[name]) for name in _TIP] for row in rows], [true[row["frame"]] for row in rows])
-    )
+    tips = torch.tensor([[float(row[name]) for name in _TIP] for row in rows], dtype=torch.float64)
+    true_tips = torch.tensor([true[row["frame"]] for row in rows], dtype=torch.float64)
     distances = 1e3 * (tips - true_tips).norm(dim=-1)
-    statistics |= {f"{name}_mm": quantile(distances, share) for name, share in _SHARES.items()}
+    for name, share in (("median", 0.5), ("p95", 0.95), ("worst", 1.0)):
+        statistics[f"{name}_mm"] = quantile(distances, share)
     statistics["wrong"] = int((distances > _WRONG).sum())
     if all(rows[0].get(name) for name in _COVARIANCE):
         upper = torch.tensor([[float(row[name]) for name in _COVARIANCE] for row in rows], dtype=torch.float64)
