@@ -115,7 +115,7 @@ class ThesisOpenCV:
         return pose
 
     def _axis(self, solid: np.ndarray, bands: np.ndarray) -> tuple[Axis, Box]:
-        """Line through the pixels of ``solid`` [H, W], which the erosion left, except those far from it; their box."""
+        """Line through the pixels [H, W] left by the erosion, except those far from the line, and their box."""
         nonzero = cv2.findNonZero(solid)
         points = np.asarray([] if nonzero is None else nonzero, dtype=np.int32).reshape(-1, 2)
         numbers, size = bands[points[:, 1], points[:, 0]], (solid.shape[1], solid.shape[0])

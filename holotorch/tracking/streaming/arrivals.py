@@ -46,14 +46,14 @@ class Statistics:
         received: Number of packets received, each counted once.
         reordered: Packets that arrived after a newer one; not used.
         duplicated: Packets that arrived again.
-        late: Packets that were older than the receiver's ``late`` when they arrived.
+        late: Packets that arrived more than the receiver's ``late`` after their capture.
         refused: Packets that carry a refusal instead of a pose.
         future: Packets captured more than the receiver's ``ahead`` in the future; not used or counted as ``received``.
         jumped: Packets whose number or time of sending did not continue the stream; not used, not ``received``.
         foreign: Packets of another stream while this one was active; not used.
         invalid: Unreadable packets; ``last_error`` is the reason of the last one.
         restarts: Number of streams before this one.
-        jitter: Smoothed difference of the transit of neighbouring packets (RFC 3550, Sec. 6.4.1).
+        jitter: Smoothed absolute difference of the transit times of successive packets (RFC 3550, Sec. 6.4.1).
         offset: The sender's clock minus the receiver's, by the clock request with the shortest round trip among the
             last eight; None before the first reply. Without an offset, the transit time of a packet is its excess over
             the fastest packet.
@@ -74,20 +74,23 @@ class Statistics:
     jitter: float = 0.0
     offset: float | None = None
     round_trip: float | None = None
-    _first: int = -1  # smallest and largest sequence number; -1 before the first packet
-    _highest: int = -1
+    _first: int = -1  # smallest sequence number; -1 before the first packet
+    _highest: int = -1  # largest sequence number
     _arrived: int = field(default=0, repr=False)  # bit i is set if the packet ``_highest - i`` arrived
-    _counted: int = 0  # packets since ``_first``
-    _missed: int = 0  # packets lost before the sequence numbers started anew
+    _counted: int = 0  # packets received since the sequence numbers last started anew
+    _missed: int = 0  # packets lost before that
     _newest: _Mark | None = None
     _candidates: list[_Mark] = field(default_factory=list, repr=False)  # continue each other, but not the stream
-    _fastest: float = math.inf  # smallest difference of arrival and sending, each by its own clock
-    _previous: float | None = None  # difference of the newest packet
-    # Difference of arrival and sending, and time from capture to sending, of the last packets.
+    _fastest: float = math.inf  # smallest ``raw``, see ``transit``
+    _previous: float | None = None  # ``raw`` of the newest packet
+    # ``raw`` and time from capture to sending of the last packets.
     _delays: deque = field(default_factory=lambda: deque(maxlen=_KEPT), repr=False)
 
     def heard(self, packet: PosePacket, arrived: float, late: float, ahead: float) -> bool:
-        """Count a packet that arrived at ``arrived`` (receiver's clock). Returns whether it is the newest so far."""
+        """Count a packet that arrived at ``arrived`` (receiver's clock). Returns whether it is the newest so far.
+
+        ``late`` and ``ahead`` are those of :class:`~holotorch.tracking.streaming.stream.PoseReceiver`, in seconds.
+        """
         raw, waited = arrived - packet.sent, packet.sent - packet.captured
         if self._in_future(raw, waited, ahead):
             self.future += 1

@@ -17,7 +17,7 @@ offset bytes type     meaning
 44     2     bytes    unit of length: ``m`` and a zero
 46     2     bytes    order of the matrix: ``RM``, row by row, for points as columns: p_camera = M p_tool
 48     32    bytes    name of the matrix, ASCII, filled with zeros: ``camera_from_tool``
-80     2     uint16   status: the integer of ``holotorch.tracking.Status``; 0 OK, 1 UNVERIFIED, above: refused
+80     2     uint16   status: the integer of ``holotorch.tracking.Status``; 0 OK, 1 UNVERIFIED, larger: a refusal
 82     2     uint16   degrees of freedom of chi-square; 0 if the pose was not checked
 84     4     float32  seconds by which smoothing lags behind a steady motion; 0 without smoothing
 88     128   float64  matrix [4, 4]. The last column is the tip, the third the direction from the tip to the rear;
@@ -212,9 +212,9 @@ def _pose_packet(fields: tuple, flags: int, stream: int, sequence: int) -> PoseP
 
 
 def _matrix(tip: list[float], along: list[float]) -> list[float]:
-    """The matrix of :attr:`Pose.camera_from_tool` [16], row by row, in a thirtieth of the time.
+    """The matrix of :attr:`Pose.camera_from_tool` [16], row by row, in a thirtieth of the time of that property.
 
-    ``tip`` [3] in metres and ``along`` [3], the direction, are columns of it without rounding.
+    ``tip`` [3] in metres and the direction ``along`` [3] are columns of the matrix without rounding.
     """
     x, y, z = along
     square = x * x + y * y

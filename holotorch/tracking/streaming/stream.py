@@ -22,14 +22,14 @@ from holotorch.tracking.streaming.arrivals import Statistics
 from holotorch.tracking.streaming.packet import FRAME, Echo, PacketError, PosePacket, decode, encode, now
 
 PORT = 18950
-_ROUNDING = 2e-6  # seconds: bounds the rounding of a round trip; each of its four stamps is a multiple of 2.4e-7
+_ROUNDING = 2e-6  # seconds: bounds the rounding error of a round trip, whose four times are multiples of 2.4e-7
 
 
 class PoseSender:
     """Sends every pose to every receiver: ``async with PoseSender([("10.0.0.7", 18950)]) as sender: sender.send(...)``.
 
     Sending never waits. While the system's buffer for a receiver is full, only the newest pose is kept for it; packets
-    that a receiver refuses are only counted. The sender also answers the clock requests of its receivers.
+    that cannot be delivered are only counted. The sender also answers the clock requests of its receivers.
 
     Args:
         receivers: Hosts (names or addresses) and ports.
@@ -126,9 +126,9 @@ class Link(Newest, asyncio.DatagramProtocol):
     """Connection of a sender to one receiver, which counts packets.
 
     Attributes:
-        sent: Packets that the system took and that nobody refused; UDP does not report whether they arrived.
+        sent: Packets handed to the system, without those that failed; UDP does not report whether packets arrived.
         dropped: Packets that newer ones replaced before they were sent.
-        errors: Packets that were refused; ``last_error`` is the reason of the last one.
+        errors: Packets that failed; ``last_error`` is the reason of the last one.
     """
 
     def __init__(self, host: str, port: int):

@@ -34,8 +34,8 @@ class ThesisTracker:
     not checked in either case (``freedom`` is 0). The covariance is propagated from errors of the endpoints of 0.3 px
     in x and y.
 
-    On a CPU this takes about eight times as long as the same stages in OpenCV, which are the reference for times
-    (holotorch.experiments.tracking_benchmark.thesis_opencv). It needs about 0.2 GB per 1080p frame of the batch.
+    On a CPU this tracker takes about eight times as long as the same stages in OpenCV, which are the reference for
+    times (holotorch.experiments.tracking_benchmark.thesis_opencv). It needs about 0.2 GB per 1080p frame of the batch.
 
     Args:
         camera: Intrinsics.
@@ -130,7 +130,7 @@ class ThesisTracker:
         return bands
 
     def _axis(self, solid: Tensor, bands: Tensor) -> tuple[Axis, Box]:
-        """Line through the pixels of ``solid`` [H, W], which the erosion left, except those far from it; their box."""
+        """Line through the pixels [H, W] left by the erosion, except those far from the line, and their box."""
         rows, columns = torch.nonzero(solid, as_tuple=True)
         points, size = torch.stack([columns, rows], -1).to(torch.float64), (solid.shape[1], solid.shape[0])
         return stages.fit_axis(points, bands[rows, columns], len(self._windows.hues), size, _line)
