@@ -1,6 +1,7 @@
 """Report of a tracking run: counts by status, time per stage, stability, and the section of the report page."""
 
 import math
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
@@ -71,18 +72,18 @@ def row(item: Tracked) -> list[str]:
     return [*cells, *numbers, "" if item.frame.pixels is None else f"{1e3 * item.seconds:.3f}"]
 
 
+@dataclass
 class Log:
     """Results of all frames of a run, and the first overlay of each status."""
 
-    def __init__(self, images: Path):
-        self.images = images
-        self.statuses: list[Status] = []
-        self.times: list[float] = []
-        self.tips: list[list[float]] = []
-        self.deviations: list[float] = []
-        self.seconds: list[float] = []
-        self.stages: list[dict[str, float]] = []
-        self.pictures: dict[str, str] = {}
+    images: Path  # folder of the overlays
+    statuses: list[Status] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)  # time stamps of the frames in seconds
+    tips: list[list[float]] = field(default_factory=list)  # metres; NaN for a refusal
+    deviations: list[float] = field(default_factory=list)  # standard deviations of the tips in metres
+    seconds: list[float] = field(default_factory=list)  # time of the tracker for each frame that could be read
+    stages: list[dict[str, float]] = field(default_factory=list)  # seconds of its stages
+    pictures: dict[str, str] = field(default_factory=dict)  # captions of the overlays by status
 
     def wants(self, item: Tracked) -> bool:
         """Whether the page will show the overlay of this frame."""
@@ -109,25 +110,17 @@ class Log:
 def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, Any]:
     """The summary of a run as plain JSON values; keys name their units (mm, ms)."""
     answered = sum(status.answered for status in log.statuses)
-    summary: dict[str, Any] = {
-        "experiment": "track",
-        "status": "",
-        "source": frames.name,
-        "method": method,
-        "frames": len(log.statuses),
-        "answered": answered,
-        "statuses": counts(log.statuses),
-        "seconds": log.times[-1] - log.times[0],
-        "stated_rate_hz": frames.rate,
-    }
+    summary: dict[str, Any] = {"experiment": "track", "status": "", "source": frames.name, "method": method}
+    summary |= {"frames": len(log.statuses), "answered": answered, "statuses": counts(log.statuses)}
+    summary |= {"seconds": log.times[-1] - log.times[0], "stated_rate_hz": frames.rate}
     stated = torch.tensor([value for value in log.deviations if math.isfinite(value)], dtype=torch.float64)
     if answered:
         summary["tip_sd_mm"] = {"median": 1e3 * quantile(stated, 0.5), "largest": 1e3 * quantile(stated, 1.0)}
         summary["tip_sd_holds"] = _STATED
     if log.seconds:
         taken = 1e3 * torch.tensor(log.seconds, dtype=torch.float64)
-        values = zip(("median", "p95", "largest"), (quantile(taken, share) for share in (0.5, 0.95, 1.0)), strict=True)
-        summary["milliseconds"] = {"first": float(taken[0])} | dict(values)
+        shares = (("median", 0.5), ("p95", 0.95), ("largest", 1.0))
+        summary["milliseconds"] = {"first": float(taken[0])} | {name: quantile(taken, share) for name, share in shares}
     if log.stages:
         counted = log.stages[1:] or log.stages  # without the first call if possible, which also builds tables
         names = dict.fromkeys(name for each in counted for name in each)
@@ -140,12 +133,8 @@ def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, A
     if still:
         try:
             stability = s_rms(torch.tensor(log.tips, dtype=torch.float64))
-            summary["stability"] = {
-                "s_rms_mm": 1e3 * stability.s_rms,
-                "sd_mm": 1e3 * stability.sd,
-                "differences": stability.differences,
-                "answered": stability.answered,
-            }
+            summary["stability"] = {"s_rms_mm": 1e3 * stability.s_rms, "sd_mm": 1e3 * stability.sd}
+            summary["stability"] |= {"differences": stability.differences, "answered": stability.answered}
             allowed = float(stated.square().mean().sqrt()) if len(stated) else math.inf
             if stability.sd > _MOVED * allowed:
                 notes.append(

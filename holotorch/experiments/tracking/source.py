@@ -7,14 +7,7 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from holotorch.experiments.config.errors import ConfigError
-from holotorch.experiments.tracking.devices import (
-    CameraSettings,
-    build_camera,
-    build_catheter,
-    load_camera,
-    load_catheter,
-    misfit,
-)
+from holotorch.experiments.tracking import devices
 from holotorch.io.bundled import find_config
 from holotorch.io.recording import is_recording, open_recording
 from holotorch.io.video import Frames, is_camera, no_such_source, open_frames
@@ -70,11 +63,11 @@ def open_inputs(
     if missing:
         raise ConfigError(missing)
     lens, tool = _loaded(paths)
-    model = build_camera(lens)
+    model = devices.build_camera(lens)
     try:
         tracker = make_tracker(method, model, tool)
     except ValueError as error:
-        raise misfit(paths["catheter.yaml"], error) from None
+        raise devices.misfit(paths["catheter.yaml"], error) from None
     try:
         frames = open_recording(Path(source)) if replayed else open_frames(source, rate)
     except ValueError as error:
@@ -103,18 +96,18 @@ def _is_replay(source: str | Path) -> bool:
     return False
 
 
-def _loaded(paths: dict[str, Path]) -> tuple[CameraSettings, Catheter]:
+def _loaded(paths: dict[str, Path]) -> tuple[devices.CameraSettings, Catheter]:
     """Load the camera and the catheter. ConfigError lists the mistakes of both files."""
     mistakes: list[str] = []
     loaded: list[Any] = []
-    for load, name in ((load_camera, "camera.yaml"), (load_catheter, "catheter.yaml")):
+    for load, name in ((devices.load_camera, "camera.yaml"), (devices.load_catheter, "catheter.yaml")):
         try:
             loaded.append(load(paths[name]))
         except ConfigError as error:
             mistakes += error.mistakes
     if mistakes:
         raise ConfigError(mistakes)
-    return loaded[0], build_catheter(loaded[1])
+    return loaded[0], devices.build_catheter(loaded[1])
 
 
 def make_tracker(method: str, camera: Camera, catheter: Catheter) -> Tracker:
@@ -124,7 +117,7 @@ def make_tracker(method: str, camera: Camera, catheter: Catheter) -> Tracker:
     return CatheterTracker(camera, catheter, channels=ChannelOrder.RGB)  # all sources deliver RGB
 
 
-def _check_intrinsics(lens: CameraSettings, frames: Frames) -> None:
+def _check_intrinsics(lens: devices.CameraSettings, frames: Frames) -> None:
     """Check that the intrinsics belong to these frames, since wrong ones give wrong poses that look plausible.
 
     Raises ConfigError for another frame size, and adds a note for a principal point far from the centre or an uncertain

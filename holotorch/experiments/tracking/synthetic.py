@@ -14,14 +14,7 @@ from tqdm import tqdm
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.runs.folder import claim
 from holotorch.experiments.runs.tables import write_table
-from holotorch.experiments.tracking.devices import (
-    build_camera,
-    build_catheter,
-    load_camera,
-    load_catheter,
-    save_camera,
-    save_catheter,
-)
+from holotorch.experiments.tracking import devices
 from holotorch.experiments.tracking.report import COLUMNS, quantile
 from holotorch.io.bundled import find_config
 from holotorch.io.recording import Recorder, is_recording
@@ -60,10 +53,12 @@ def write_synthetic(
     Raises:
         ConfigError: A file cannot be used, the folder is in use, or the catheter would not be in front of the camera.
     """
-    settings = None if camera is None else load_camera(find_config(camera) or camera)
-    tool = THESIS if catheter is None else build_catheter(load_catheter(find_config(catheter) or catheter))
+    settings = None if camera is None else devices.load_camera(find_config(camera) or camera)
+    tool = THESIS
+    if catheter is not None:
+        tool = devices.build_catheter(devices.load_catheter(find_config(catheter) or catheter))
     size = (settings and settings.size) or size
-    model = synthetic_camera(size) if settings is None else build_camera(settings)
+    model = synthetic_camera(size) if settings is None else devices.build_camera(settings)
     folder = claim(out, "synthetic")
     try:
         _render(folder, frames, World(size=size, camera=model, catheter=tool))
@@ -77,7 +72,7 @@ def write_synthetic(
 
 def frame_size(camera: Path | None) -> tuple[int, int]:
     """(H, W) of the frames that :func:`write_synthetic` renders for a camera. ConfigError for an invalid file."""
-    return (None if camera is None else load_camera(find_config(camera) or camera).size) or _SIZE
+    return (None if camera is None else devices.load_camera(find_config(camera) or camera).size) or _SIZE
 
 
 def _render(folder: Path, frames: int, world: World) -> None:
@@ -90,8 +85,8 @@ def _render(folder: Path, frames: int, world: World) -> None:
     rows = []
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as temporary:
         copies = {name: Path(temporary, name) for name in ("camera.yaml", "catheter.yaml")}
-        save_camera(copies["camera.yaml"], world.camera, size)
-        save_catheter(copies["catheter.yaml"], tool)
+        devices.save_camera(copies["camera.yaml"], world.camera, size)
+        devices.save_catheter(copies["catheter.yaml"], tool)
         with Recorder(folder, size, RATE, "synthetic", copies) as recorder:
             for i in tqdm(range(frames), desc="rendering", unit="frame"):
                 phase = 2 * math.pi * i / 45

@@ -54,9 +54,8 @@ FRAME = "camera_from_tool"
 _MAGIC, _AXES, _UNIT, _ORDER = b"HTPS", b"RDF\0", b"m\0", b"RM"
 _HEAD, _CRC = struct.Struct("<4sHBBQQ"), struct.Struct("<I")
 _BODY, _STAMPS = struct.Struct("<dd4s2s2s32sHHf16d21dd64s"), struct.Struct("<ddd")
-_LENGTHS = {
-    kind: _HEAD.size + part.size + _CRC.size for kind, part in ((POSE, _BODY), (ASK, _STAMPS), (REPLY, _STAMPS))
-}
+_ECHO_LENGTH = _HEAD.size + _STAMPS.size + _CRC.size
+_LENGTHS = {POSE: _HEAD.size + _BODY.size + _CRC.size, ASK: _ECHO_LENGTH, REPLY: _ECHO_LENGTH}
 _UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
 _DIAGONAL = [n for n, (i, j) in enumerate(_UPPER) if i == j]
 _ALL = [_UPPER.index((min(i, j), max(i, j))) for i in range(6) for j in range(6)]

@@ -21,15 +21,8 @@ from holotorch.tracking.pose.status import Pose, Refusal, Status
 # The rows of Table 3.1, in its order and words. "Gradient" includes the median, "Connected components" the binary
 # image; "Other" is the rest of the time of a call.
 STAGES: tuple[str, ...] = (
-    "Undistort",
-    "Color segmentation",
-    "Erosion",
-    "Get axis",
-    "Gradient",
-    "Connected components",
-    "Weighted centroids",
-    "Calculate catheter position",
-    "Other",
+    *("Undistort", "Color segmentation", "Erosion", "Get axis", "Gradient", "Connected components"),
+    *("Weighted centroids", "Calculate catheter position", "Other"),
 )
 
 # The thesis gives no numbers for its thresholds; with these, its method works on synthetic frames.
