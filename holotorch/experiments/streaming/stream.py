@@ -27,17 +27,11 @@ TimedPose = tuple[float, Pose]  # capture time in seconds, and pose
 
 
 class Streamed(NamedTuple):
-    """Result of a stream.
+    """Result of a stream."""
 
-    Attributes:
-        frames: Number of poses and refusals sent.
-        complete: Whether all poses were sent; False if the user interrupted the stream.
-        delivered: False if all packets to all receivers failed and there was no OpenIGTLink server.
-    """
-
-    frames: int
-    complete: bool
-    delivered: bool
+    frames: int  # number of poses and refusals sent
+    complete: bool  # whether all poses were sent; False if the user interrupted the stream
+    delivered: bool  # False if all packets to all receivers failed and there was no OpenIGTLink server
 
 
 def read_poses(path: Path) -> list[TimedPose]:

@@ -44,16 +44,9 @@ def _track(options: argparse.Namespace) -> int:
     from holotorch.experiments.execute import execute
     from holotorch.experiments.tracking.config import TrackSettings
 
-    given = {
-        "source": options.source,
-        "camera": options.camera and str(options.camera),
-        "catheter": options.catheter and str(options.catheter),
-        "method": options.method,
-        "record": options.record,
-        "video": not options.no_video,
-        "still": options.still,
-        "rate_hz": options.rate,
-    }
+    given = {"source": options.source, "method": options.method, "record": options.record, "still": options.still}
+    given |= {"video": not options.no_video, "rate_hz": options.rate}
+    given |= {name: str(path) for name in ("camera", "catheter") if (path := getattr(options, name))}
     arguments: dict[Key, str] = {("method",): "argument --method", ("rate_hz",): "argument --rate"}
     settings = validated(Source(Path("track"), {"experiment": "track", **given}, arguments), TrackSettings)
     folder, complete = execute(settings, options.out, "track")

@@ -36,21 +36,13 @@ _SHOWN = 4  # number of statuses whose first frame the page shows
 
 
 class Tracked(NamedTuple):
-    """One frame and its pose.
+    """One frame and its pose."""
 
-    Attributes:
-        number: Number of the frame, from 0.
-        frame: The frame as it was read.
-        pose: The pose or a refusal, BAD_FRAME for a frame that could not be read.
-        seconds: Time that the tracker took; 0 for a frame that could not be read.
-        stages: Seconds of each stage of the tracker, if it measures them.
-    """
-
-    number: int
+    number: int  # of the frame, from 0
     frame: Frame
-    pose: Pose
-    seconds: float
-    stages: dict[str, float]
+    pose: Pose  # or a refusal, BAD_FRAME for a frame that could not be read
+    seconds: float  # time that the tracker took; 0 for a frame that could not be read
+    stages: dict[str, float]  # seconds of each stage of the tracker, if it measures them
 
     @property
     def status(self) -> Status:

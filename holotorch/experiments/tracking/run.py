@@ -81,17 +81,11 @@ def _live(inputs: TrackingInputs) -> Iterator[tuple[float, Pose]]:
 
 @dataclass(frozen=True, eq=False)
 class TrackingExperiment:
-    """A configuration with its source.
-
-    Attributes:
-        settings: The configuration.
-        inputs: Source, camera, catheter and tracker; None for a synthetic source, which the run renders first.
-        truth: True tips in metres by frame number; empty if they are unknown.
-    """
+    """A configuration with its source."""
 
     settings: TrackSettings
-    inputs: TrackingInputs | None
-    truth: dict[str, list[float]]
+    inputs: TrackingInputs | None  # None for a synthetic source, which the run renders first
+    truth: dict[str, list[float]]  # true tips in metres by frame number; empty if they are unknown
 
 
 def build_tracking(settings: TrackSettings) -> TrackingExperiment:

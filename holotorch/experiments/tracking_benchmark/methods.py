@@ -32,26 +32,17 @@ class Answer(NamedTuple):
     """Answer of one method to one frame.
 
     It holds plain numbers, because thousands of small tensors between the frames would fragment the memory.
-
-    Attributes:
-        method: Name of the method.
-        name, answerable: Attributes of the case.
-        truth: True position [3] of the tip in metres; None if the frame shows no catheter.
-        status, reason: Status and reason of the pose.
-        tip: Position [3] of the tip in metres; NaN for a refusal.
-        covariance: Covariance [3, 3] of the tip in m^2.
-        seconds: Time that the method took.
     """
 
-    method: str
-    name: str
-    answerable: bool
-    truth: list[float] | None
-    status: Status
-    reason: str
-    tip: list[float]
-    covariance: list[list[float]]
-    seconds: float
+    method: str  # name of the method
+    name: str  # of the case
+    answerable: bool  # whether the frame determines a pose
+    truth: list[float] | None  # true position [3] of the tip in metres; None if the frame shows no catheter
+    status: Status  # of the pose
+    reason: str  # of the pose
+    tip: list[float]  # [3] in metres; NaN for a refusal
+    covariance: list[list[float]]  # [3, 3] of the tip in m^2
+    seconds: float  # time that the method took
 
     @staticmethod
     def of(method: str, case: Case, pose: Pose, seconds: float) -> "Answer":
