@@ -28,6 +28,7 @@ STILL |= dict.fromkeys([(350, 20), (520, 0), (520, 20)])
 # S_RMS by up to a half.
 TIP, MIDDLE = "tip", "middle of the bands"
 POINTS: dict[str, float | None] = {TIP: 0.0, MIDDLE: None}
+# Changes of a world's ``Look`` for each codec, and for each light.
 _CODECS: dict[str, dict[str, Any]] = {"none": {}, "video 4:2:0": {"video": True}}
 _CODECS |= {f"JPEG {quality}, 4:2:0": {"jpeg_quality": quality} for quality in (95, 75)}
 _LIGHTS: dict[str, dict[str, Any]] = {
@@ -38,8 +39,8 @@ _LIGHTS: dict[str, dict[str, Any]] = {
     "a quarter of it": {"gain": 0.25},
 }
 _POSITIONS = 5  # positions of a catheter at rest, less than a pixel apart
-# Statuses that count as correct reasons for refusing a scene that cannot be answered, by the beginning of its name.
 _INVISIBLE = {Status.NO_CATHETER, Status.BANDS_MISSING, Status.NO_AXIS}
+# Statuses that count as correct reasons for refusing a scene that cannot be answered, by the beginning of its name.
 _FITTING: dict[str, set[Status]] = {
     "motion across": _INVISIBLE | {Status.TOO_NARROW, Status.EDGES_UNCLEAR, Status.INCONSISTENT},
     "tilt": {Status.UNCERTAIN, Status.EDGES_UNCLEAR, Status.TOO_NARROW},

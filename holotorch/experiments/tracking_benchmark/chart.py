@@ -52,23 +52,23 @@ def tracking(
     two, three = ({name: trackers[name] for name in names} for names in ((BASE, COLD), (BASE, COLD, PRIOR)))
     tables: dict[str, list[Row]] = {"times": timing(world, amount.rounds), "stages": stages(world, amount.rounds)}
     tables["slowest"] = spread(world, amount.seeds, amount.share)
-    found: dict[str, list[Answer]] = {}
-    tables["still"], found["still"] = bench.still(world, trackers, amount.still)
-    tables["grids"], found["grids"] = bench.grids(world, trackers, amount.share)
-    tables["codecs"], found["codecs"] = bench.codecs(world, three, amount.share)
+    answers: dict[str, list[Answer]] = {}
+    tables["still"], answers["still"] = bench.still(world, trackers, amount.still)
+    tables["grids"], answers["grids"] = bench.grids(world, trackers, amount.share)
+    tables["codecs"], answers["codecs"] = bench.codecs(world, three, amount.share)
     tables["lights"] = bench.lights(world, trackers[COLD], amount.still // 4, amount.share)
     for kind, count in (("conditions", amount.seeds), ("occlusions", amount.poses)):
-        tables[kind], found[kind] = bench.scenes(world, three, count, kind, amount.share)
-    tables["negatives"], found["negatives"] = bench.empty(world, two, amount.negatives)
+        tables[kind], answers[kind] = bench.scenes(world, three, count, kind, amount.share)
+    tables["negatives"], answers["negatives"] = bench.empty(world, two, amount.negatives)
     # The frames of catheters at rest are left out of the sum: they repeat a few poses.
-    found[_ALL] = [each for kind in ("grids", "codecs", "conditions", "occlusions") for each in found[kind]]
+    answers[_ALL] = [each for kind in ("grids", "codecs", "conditions", "occlusions") for each in answers[kind]]
     tables["reliability"] = [
         _share(kind, name, own)
-        for kind, given in found.items()
+        for kind, given in answers.items()
         for name in trackers
         if (own := [answer for answer in given if answer.method == name])
     ]
-    rows = _methods(tables, found)
+    rows = _methods(tables, answers)
     return rows, tables, {"chart": draw(rows, tables)}, _verdict(world, rows, tables)
 
 
@@ -95,11 +95,11 @@ def _methods(tables: dict[str, list[Row]], answers: dict[str, list[Answer]]) -> 
         worst = max(each["ratio"] for each in tables["times"] if each["method"] == name)
         row |= {"worst_ratio_of_frames": worst}
         for grid in ("2D", "3D"):
-            found = one(tables["grids"], grid=grid, method=name)
-            row |= {f"{grid}_{key}": found[key] for key in ("median_mm", "p95_mm", "rigid_median_mm", "acc_mm")}
+            errors = one(tables["grids"], grid=grid, method=name)
+            row |= {f"{grid}_{key}": errors[key] for key in ("median_mm", "p95_mm", "rigid_median_mm", "acc_mm")}
         for depth, tilt in STILL:
-            found = one(tables["still"], depth_mm=depth, tilt_deg=tilt, point=TIP, method=name)
-            row[f"s_rms_mm_{depth}_{tilt}"] = found["s_rms_mm"]
+            still = one(tables["still"], depth_mm=depth, tilt_deg=tilt, point=TIP, method=name)
+            row[f"s_rms_mm_{depth}_{tilt}"] = still["s_rms_mm"]
         # Both kinds are counted separately, since frames of catheters at rest repeat only a few errors.
         for kind in ("grids", "still"):
             row[f"coverage_{kind}"] = bench.covered([answer for answer in answers[kind] if answer.method == name])

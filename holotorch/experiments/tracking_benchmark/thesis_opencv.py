@@ -68,7 +68,7 @@ class ThesisOpenCV:
 
     def _prepare(self, size: tuple[int, int]) -> None:
         """Compute the undistortion maps for frames of this (width, height), black beyond the valid radius."""
-        if size == self._size and self._maps is not None:
+        if size == self._size:
             return
         x, y = cv2.initUndistortRectifyMap(self._matrix, self._distortion, np.eye(3), self._matrix, size, cv2.CV_32FC1)
         across = (np.arange(size[0]) - self._matrix[0, 2]) / self._matrix[0, 0]
@@ -121,13 +121,13 @@ class ThesisOpenCV:
         numbers, size = bands[points[:, 1], points[:, 0]], (solid.shape[1], solid.shape[0])
         return stages.fit_axis(points, numbers, len(self._positions) - 1, size, _line)
 
-    def _pose(self, found: Endpoints) -> Pose:
+    def _pose(self, edges: Endpoints) -> Pose:
         """Mean of the closed-form poses of each pair of neighbouring bands whose three endpoints were found."""
-        edges = stages.nudged(found)
-        rays = np.ones((*edges.shape[:2], 3))
-        rays[..., :2] = (edges - self._matrix[:2, 2]) / self._matrix.diagonal()[:2]
+        nudged = stages.nudged(edges)
+        rays = np.ones((*nudged.shape[:2], 3))
+        rays[..., :2] = (nudged - self._matrix[:2, 2]) / self._matrix.diagonal()[:2]
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        return stages.answer(found, *_closed_form(rays, self._positions, stages.triples(found)))
+        return stages.answer(edges, *_closed_form(rays, self._positions, stages.triples(edges)))
 
 
 def _line(points: np.ndarray) -> Axis:
@@ -145,25 +145,25 @@ def _centroids(gradient: np.ndarray, labels: np.ndarray, count: int, left: int, 
     return list(zip((x / sums + left).tolist(), (y / sums + top).tolist(), strict=True))
 
 
-def _closed_form(rays: np.ndarray, positions: np.ndarray, first: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean tip and direction [B, 3] over the triples of edges that begin at ``first``, from unit rays [B, N, 3].
+def _closed_form(rays: np.ndarray, positions: np.ndarray, starts: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean tip and direction [B, 3] over the triples of edges that begin at ``starts``, from unit rays [B, N, 3].
 
     Applies the sine rule to the triangles formed by the camera and each band (corrected Eqs. 3.5 to 3.12); bands may
     have any length. This repeats :func:`holotorch.tracking.pose.pose.closed_form` in NumPy, since it belongs to the
     baseline of the times.
     """
     tips, directions = [], []
-    for i in first:
+    for i in starts:
         a, b, c = rays[:, i], rays[:, i + 1], rays[:, i + 2]
-        front, back = positions[i + 1] - positions[i], positions[i + 2] - positions[i + 1]
+        first, second = positions[i + 1] - positions[i], positions[i + 2] - positions[i + 1]
         p1, p2 = _angle(a, b), _angle(b, c)
         both = p1 + p2
         sine = np.sin(both)
-        delta = np.arctan2(front * np.sin(p2) * sine, back * np.sin(p1) - front * np.sin(p2) * np.cos(both))
-        scale = (front + back) / sine
-        near, far = (scale * np.sin(delta))[:, None] * a, (scale * np.sin(both + delta))[:, None] * c
-        direction = (far - near) / np.linalg.norm(far - near, axis=-1, keepdims=True)
-        tips.append(near - positions[i] * direction)
+        delta = np.arctan2(first * np.sin(p2) * sine, second * np.sin(p1) - first * np.sin(p2) * np.cos(both))
+        scale = (first + second) / sine
+        front, rear = (scale * np.sin(delta))[:, None] * a, (scale * np.sin(both + delta))[:, None] * c
+        direction = (rear - front) / np.linalg.norm(rear - front, axis=-1, keepdims=True)
+        tips.append(front - positions[i] * direction)
         directions.append(direction)
     direction = np.mean(directions, 0)
     return np.mean(tips, 0), direction / np.linalg.norm(direction, axis=-1, keepdims=True)

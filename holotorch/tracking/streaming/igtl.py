@@ -50,7 +50,7 @@ def messages(pose: Pose, captured: float | None = None, *, name: str = "ToolToCa
     status = pose.status
     if not isinstance(status, Status):
         raise TypeError(f"one frame at a time, got {len(status)} poses; index the batch")
-    # pyigtl hangs on other characters.
+    # pyigtl can only encode ASCII.
     reason = pose.reason.encode("ascii", "replace").decode()[:200]
     text = f"{status.name}: {reason}" if reason else status.name
     string = igtl.StringMessage(text, timestamp=stamp, device_name=f"{name}Status").pack()

@@ -196,42 +196,42 @@ def endpoints(axis: Axis, centroids: Sequence[tuple[float, float]]) -> Endpoints
     middles = [sum(extent) for extent in extents if extent is not None]
     forward = int(middles[-1] > middles[0])
     spots = [(axis.along(*spot), spot) for spot in centroids if abs(axis.across(*spot)) <= OFF_AXIS_PX]
-    found: Endpoints = []
+    edges: Endpoints = []
     for before, after in zip((None, *extents), (*extents, None), strict=True):
         ends = [extent[side] for extent, side in ((before, forward), (after, 1 - forward)) if extent is not None]
-        found.append(None)
+        edges.append(None)
         if ends and spots:
             expected = sum(ends) / len(ends)
             longest = max(extent[1] - extent[0] for extent in (before, after) if extent is not None)
             distance, spot = min((abs(position - expected), spot) for position, spot in spots)
             if distance <= OFF_BORDER_PX + OFF_BORDER_SHARE * longest:
-                found[-1] = spot
-    if not triples(found):
-        names = ", ".join(str(i + 1) for i, spot in enumerate(found) if spot is not None) or "none"
+                edges[-1] = spot
+    if not triples(edges):
+        names = ", ".join(str(i + 1) for i, edge in enumerate(edges) if edge is not None) or "none"
         raise Refusal(Status.EDGES_UNCLEAR, f"three neighbouring edges of the bands are needed, found: {names}")
-    return found
+    return edges
 
 
-def triples(found: Endpoints) -> list[int]:
+def triples(edges: Endpoints) -> list[int]:
     """Indices of the first edge of each pair of neighbouring bands whose three endpoints were found."""
-    return [i for i in range(len(found) - 2) if None not in found[i : i + 3]]
+    return [i for i in range(len(edges) - 2) if None not in edges[i : i + 3]]
 
 
-def nudged(found: Endpoints) -> np.ndarray:
+def nudged(edges: Endpoints) -> np.ndarray:
     """Endpoints float64 [1 + 2 n, n, 2], NaN for None: unchanged, then with each number changed by ``NUDGE_PX``."""
-    edges = np.array([spot or (np.nan, np.nan) for spot in found])
-    nudges = np.concatenate([np.zeros((1, edges.size)), NUDGE_PX * np.eye(edges.size)])
-    return edges + nudges.reshape(-1, *edges.shape)
+    pixels = np.array([edge or (np.nan, np.nan) for edge in edges])
+    nudges = np.concatenate([np.zeros((1, pixels.size)), NUDGE_PX * np.eye(pixels.size)])
+    return pixels + nudges.reshape(-1, *pixels.shape)
 
 
-def answer(found: Endpoints, tip: np.ndarray, direction: np.ndarray, device: torch.device | None = None) -> Pose:
+def answer(edges: Endpoints, tip: np.ndarray, direction: np.ndarray, device: torch.device | None = None) -> Pose:
     """Pose from the tips and directions [1 + 2 n, 3] of :func:`nudged` endpoints; raises a Refusal if invalid."""
     both = np.concatenate([tip, direction], -1)
     slopes = (both[1:] - both[0]).T / NUDGE_PX
     covariance = DEVIATION_PX**2 * slopes @ slopes.T
     if not np.isfinite(covariance).all() or not np.isfinite(both).all() or tip[0, 2] <= 0:
         raise Refusal(Status.INCONSISTENT, "the endpoints are not the image of the bands in front of the camera")
-    missing = ", ".join(str(edge + 1) for edge, spot in enumerate(found) if spot is None)
+    missing = ", ".join(str(i + 1) for i, edge in enumerate(edges) if edge is None)
     status = Status.UNVERIFIED if missing else Status.OK
     reason = f"edges not found, pose from the others: {missing}" if missing else ""
     tensor = partial(torch.tensor, dtype=torch.float64, device=device)

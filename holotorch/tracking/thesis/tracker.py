@@ -157,13 +157,13 @@ class ThesisTracker:
             gradient[inside] = smooth[inside]
         return gradient, corners
 
-    def _pose(self, found: Endpoints, device: torch.device) -> Pose:
+    def _pose(self, edges: Endpoints, device: torch.device) -> Pose:
         """Mean of the closed-form poses of each pair of neighbouring bands whose three endpoints were found."""
-        edges = torch.from_numpy(stages.nudged(found))
-        triples = [slice(i, i + 3) for i in stages.triples(found)]
-        poses = [closed_form(edges[:, triple], self.catheter.positions[triple], self._pinhole) for triple in triples]
+        nudged = torch.from_numpy(stages.nudged(edges))
+        triples = [slice(i, i + 3) for i in stages.triples(edges)]
+        poses = [closed_form(nudged[:, triple], self.catheter.positions[triple], self._pinhole) for triple in triples]
         tip, direction = (torch.stack(parts).mean(0) for parts in zip(*poses, strict=True))
-        return stages.answer(found, tip.numpy(), normalize(direction, dim=-1).numpy(), device)
+        return stages.answer(edges, tip.numpy(), normalize(direction, dim=-1).numpy(), device)
 
 
 def _line(points: Tensor) -> Axis:
