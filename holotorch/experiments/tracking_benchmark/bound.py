@@ -18,15 +18,12 @@ _DITHER = 0.6  # levels: noise of rendered frames, which makes the mean of round
 
 
 class Bounds(NamedTuple):
-    """Smallest covariances [3, 3] in m^2 of an unbiased estimate of the tip from one synthetic frame.
+    """Smallest covariances [3, 3] in m^2 of an unbiased estimate of the tip from one synthetic frame."""
 
-    Attributes:
-        pixels: Bound from all pixels. They include the shading, which reveals the tube's slant if the light is known.
-        edges: Bound from what trackers use, the positions of the band edges along the tube and of the tube across it.
-            The levels on both sides of an edge are taken as known; estimating them costs a few per cent.
-    """
-
+    # From all pixels, including the shading, which reveals the slant of the tube if the light is known.
     pixels: Tensor
+    # From what trackers use: positions of the band edges along the tube, and of the tube across it. The levels on both
+    # sides of an edge are taken as known; estimating them costs a few per cent.
     edges: Tensor
 
 

@@ -77,11 +77,9 @@ def _share(kind: str, name: str, own: list[Answer]) -> Row:
     row: Row = {"frames_of": kind, "method": name} | bench.outcomes(own)
     row["answerable"] = answerable = sum(answer.answerable for answer in own)
     lost = sum(answer.answerable and not answer.answered for answer in own)
-    row |= {
-        "refused_though_answerable": lost,
-        "refused_though_answerable_percent": round(100 * lost / answerable, 2) if answerable else "",
-        "refused_unanswerable": row["refused"] - lost,
-    }
+    row["refused_though_answerable"] = lost
+    row["refused_though_answerable_percent"] = round(100 * lost / answerable, 2) if answerable else ""
+    row["refused_unanswerable"] = row["refused"] - lost
     return row | {"wrong_cases": "; ".join(answer.name for answer in own if answer.wrong and name != BASE)}
 
 

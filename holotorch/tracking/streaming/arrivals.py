@@ -40,40 +40,24 @@ class _Mark(NamedTuple):
 
 @dataclass
 class Statistics:
-    """Statistics of one stream; times are in seconds.
+    """Statistics of one stream; times are in seconds."""
 
-    Attributes:
-        received: Number of packets received, each counted once.
-        reordered: Packets that arrived after a newer one; not used.
-        duplicated: Packets that arrived again.
-        late: Packets that arrived more than the receiver's ``late`` after their capture.
-        refused: Packets that carry a refusal instead of a pose.
-        future: Packets captured more than the receiver's ``ahead`` in the future; not used or counted as ``received``.
-        jumped: Packets whose number or time of sending did not continue the stream; not used, not ``received``.
-        foreign: Packets of another stream while this one was active; not used.
-        invalid: Unreadable packets; ``last_error`` is the reason of the last one.
-        restarts: Number of streams before this one.
-        jitter: Smoothed absolute difference of the transit times of successive packets (RFC 3550, Sec. 6.4.1).
-        offset: The sender's clock minus the receiver's, by the clock request with the shortest round trip among the
-            last eight; None before the first reply. Without an offset, the transit time of a packet is its excess over
-            the fastest packet.
-        round_trip: Round trip of that clock request; half of it bounds the error of ``offset``.
-    """
-
-    received: int = 0
-    reordered: int = 0
-    duplicated: int = 0
-    late: int = 0
-    refused: int = 0
-    future: int = 0
-    jumped: int = 0
-    foreign: int = 0
-    invalid: int = 0
-    restarts: int = 0
-    last_error: str = ""
-    jitter: float = 0.0
+    received: int = 0  # packets received, each counted once
+    reordered: int = 0  # packets that arrived after a newer one; not used
+    duplicated: int = 0  # packets that arrived again
+    late: int = 0  # packets that arrived more than the receiver's ``late`` after their capture
+    refused: int = 0  # packets that carry a refusal instead of a pose
+    future: int = 0  # packets captured more than the receiver's ``ahead`` in the future; not used, not ``received``
+    jumped: int = 0  # packets whose number or time of sending did not continue the stream; not used, not ``received``
+    foreign: int = 0  # packets of another stream while this one was active; not used
+    invalid: int = 0  # unreadable packets
+    restarts: int = 0  # number of streams before this one
+    last_error: str = ""  # reason of the last unreadable packet
+    jitter: float = 0.0  # smoothed absolute difference of successive transit times (RFC 3550, Sec. 6.4.1)
+    # The sender's clock minus the receiver's, by the clock request with the shortest round trip among the last eight;
+    # None before the first reply. Without it, the transit time of a packet is its excess over the fastest packet.
     offset: float | None = None
-    round_trip: float | None = None
+    round_trip: float | None = None  # of that clock request; half of it bounds the error of ``offset``
     _first: int = -1  # smallest sequence number; -1 before the first packet
     _highest: int = -1  # largest sequence number
     _arrived: int = field(default=0, repr=False)  # bit i is set if the packet ``_highest - i`` arrived

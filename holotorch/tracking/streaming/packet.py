@@ -79,25 +79,15 @@ def now() -> float:
 
 @dataclass(frozen=True, eq=False)
 class PosePacket:
-    """One pose or refusal as it is sent. Times are in seconds by the sender's :func:`now`.
+    """One pose or refusal as it is sent. Times are in seconds by the sender's :func:`now`."""
 
-    Attributes:
-        pose: A single pose, without leading axes.
-        captured: Time at which the camera took the frame.
-        sent: Time of sending.
-        sequence: Number of the packet within the stream.
-        stream: Number of the stream; each start of a sender draws another one.
-        frame: Name of the matrix; "camera_from_tool" maps the tool's coordinates to the camera's.
-        lag: Delay in seconds that smoothing added.
-    """
-
-    pose: Pose
-    captured: float
-    sent: float
-    sequence: int
-    stream: int = 0
-    frame: str = FRAME
-    lag: float = 0.0
+    pose: Pose  # a single pose, without leading axes
+    captured: float  # time at which the camera took the frame
+    sent: float  # time of sending
+    sequence: int  # number of the packet within the stream
+    stream: int = 0  # number of the stream; each start of a sender draws another one
+    frame: str = FRAME  # name of the matrix; "camera_from_tool" maps the tool's coordinates to the camera's
+    lag: float = 0.0  # delay in seconds that smoothing added
 
     @property
     def answered(self) -> bool:
@@ -107,17 +97,13 @@ class PosePacket:
 
 @dataclass(frozen=True)
 class Echo:
-    """Clock request or reply, whose times compare two clocks as NTP does (RFC 5905, Sec. 8).
-
-    ``asked`` is the time of sending the request, by the clock of the receiver of poses. ``heard`` and ``answered`` are
-    the times of its arrival and of the reply, by the clock of the sender of poses; they are 0 in a request.
-    """
+    """Clock request or reply, whose times in seconds compare two clocks as NTP does (RFC 5905, Sec. 8)."""
 
     stream: int
     number: int
-    asked: float
-    heard: float = 0.0
-    answered: float = 0.0
+    asked: float  # time at which the receiver of poses sent the request, by its clock
+    heard: float = 0.0  # time of arrival by the clock of the sender of poses; 0 in a request
+    answered: float = 0.0  # time of the reply by the same clock; 0 in a request
     reply: bool = False
 
 
