@@ -35,7 +35,6 @@ def _tone(value: Any) -> Any:
 
 Positive = Annotated[Number, Field(gt=0)]
 Level = Annotated[int, BeforeValidator(number), Field(ge=0, le=255)]
-Five = Annotated[tuple[Number, ...], Field(min_length=5, max_length=5)]
 Row = tuple[Number, Number, Number, Number]
 
 
@@ -64,7 +63,7 @@ class CameraSettings(Settings):
     fy: Positive
     cx: Number
     cy: Number
-    distortion: Five = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: Annotated[tuple[Number, ...], Field(min_length=5, max_length=5)] = (0.0, 0.0, 0.0, 0.0, 0.0)
     size: tuple[Side, Side] | None = None
     tone: Annotated[str | tuple[Number, ...], BeforeValidator(_tone)] = "srgb"
     calibration: EvidenceSettings | None = None
