@@ -123,18 +123,13 @@ class Newest(asyncio.BaseProtocol):
 
 
 class Link(Newest, asyncio.DatagramProtocol):
-    """Connection of a sender to one receiver, which counts packets.
-
-    Attributes:
-        sent: Packets handed to the system, without those that failed; UDP does not report whether packets arrived.
-        dropped: Packets that newer ones replaced before they were sent.
-        errors: Packets that failed; ``last_error`` is the reason of the last one.
-    """
+    """Connection of a sender to one receiver; ``dropped`` counts packets that newer ones replaced before sending."""
 
     def __init__(self, host: str, port: int):
         super().__init__()
         self.host, self.port = host, port
-        self.sent, self.errors, self.last_error = 0, 0, ""
+        self.sent = 0  # packets handed to the system, without those that failed; UDP does not report arrivals
+        self.errors, self.last_error = 0, ""  # number of packets that failed, and the reason of the last one
 
     def _write(self, data: bytes) -> None:
         self.sent += 1
@@ -205,10 +200,6 @@ class PoseReceiver(UdpSocket):
         clock: Returns the time in seconds; by default the clock of the packets. The receiver measures the offset of the
             sender's clock from it.
 
-    Attributes:
-        packet: Newest packet, of any status and age; None before the first.
-        statistics: Counts and times of the stream, see :class:`~holotorch.tracking.streaming.arrivals.Statistics`.
-
     Raises:
         ValueError, OSError: As UdpSocket; also ValueError for times that are not above zero.
     """
@@ -228,7 +219,7 @@ class PoseReceiver(UdpSocket):
         self.oldest, self.late = checks.positive("oldest", oldest, "s"), checks.positive("late", late, "s")
         self.ahead = checks.positive("ahead", ahead, "s")
         self.statistics = Statistics()
-        self.packet: PosePacket | None = None
+        self.packet: PosePacket | None = None  # the newest packet, of any status and age
         self._new_packet = asyncio.Event()
         self._arrived = self._arrived_monotonic = -math.inf  # by ``clock`` and by the monotonic clock
         self._asked: dict[int, float] = {}  # times of the last clock requests by their numbers
@@ -267,11 +258,11 @@ class PoseReceiver(UdpSocket):
         arrived = self.clock()
         try:
             packet = decode(data)
+            if isinstance(packet, Echo):
+                self._compare(packet, arrived)
+                return
         except PacketError as error:
             self.statistics.invalid, self.statistics.last_error = self.statistics.invalid + 1, str(error)
-            return
-        if isinstance(packet, Echo):
-            self._compare(packet, arrived)
             return
         statistics = self.statistics
         if self.packet is not None and packet.stream != self.packet.stream:
@@ -306,9 +297,7 @@ class PoseReceiver(UdpSocket):
             return
         round_trip = arrived - echo.asked - (echo.answered - echo.heard)
         if round_trip < -_ROUNDING:
-            self.statistics.invalid += 1
-            self.statistics.last_error = f"a clock reply that took {round_trip:.3g} s on its way there and back"
-            return
+            raise PacketError(f"a clock reply that took {round_trip:.3g} s on its way there and back")
         offset = (echo.heard - echo.asked + echo.answered - arrived) / 2
         self._echoes.append((round_trip, offset))
         self.statistics.round_trip, self.statistics.offset = min(self._echoes)
