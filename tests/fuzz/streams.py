@@ -103,7 +103,7 @@ def _received(folder: Path) -> None:
         _told(receiver)
     invalid, last = receiver.statistics.invalid, receiver.statistics.last_error
     # Five, as a sender's own clock is compared while it sends: three are needed to be followed.
-    receiver._arrived_here -= 60.0
+    receiver._arrived_monotonic -= 60.0
     for number in range(1000, 1005):
         time[0] += 0.02 if number > 1000 else 60.0
         receiver.datagram_received(_sent(number, 99, time[0], _pose()), _SENDER)

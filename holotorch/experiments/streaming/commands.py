@@ -33,7 +33,7 @@ def _port(text: str) -> int:
 
 def _stream(options: argparse.Namespace) -> int:
     if options.check or options.view:
-        _listens(options)
+        _need_no_source(options)
     if options.check:
         from holotorch.experiments.streaming.check import check
 
@@ -46,7 +46,7 @@ def _stream(options: argparse.Namespace) -> int:
     from holotorch.experiments.tracking.run import live
     from holotorch.io.video import is_camera
 
-    found = stream.stream(
+    result = stream.stream(
         options.sources,
         options.to or (),
         igtl=options.igtl,
@@ -54,22 +54,22 @@ def _stream(options: argparse.Namespace) -> int:
         smooth=options.smooth,
         track=lambda sources: live(sources, options.camera, options.catheter, options.rate),
     )
-    if not found.delivered:
+    if not result.delivered:
         print("nothing could be delivered: does a receiver run there? holotorch stream --view is one", file=sys.stderr)
         return FAILED
     # A camera never ends, so that Ctrl-C is the normal end of its stream.
-    return OK if found.complete or is_camera(options.sources[0]) else INTERRUPTED
+    return OK if result.complete or is_camera(options.sources[0]) else INTERRUPTED
 
 
-def _listens(options: argparse.Namespace) -> None:
-    """Raise ConfigError for arguments that ``--check`` or ``--view`` ignores: neither sends the user's poses."""
+def _need_no_source(options: argparse.Namespace) -> None:
+    """Raise ConfigError for arguments that ``--check`` or ``--view`` would ignore: neither sends poses of a source."""
     from holotorch.experiments.config.errors import ConfigError
 
-    chosen = "--check" if options.check else "--view"
     unused = ["SOURCE"] if options.sources else []
     names = ("to", "igtl", "rate", "smooth", "camera", "catheter", *(["view"] if options.check else []))
     given = {name: getattr(options, name) for name in names}
     unused += [f"--{name}" for name, value in given.items() if value is not None and value is not False]
     if unused:
-        does = "sends to this computer itself" if options.check else "only listens; send from another terminal"
-        raise ConfigError([f"{chosen} {does}: it takes no {', '.join(unused)}"])
+        listening = "--view only listens; send from another terminal"
+        option = "--check sends to this computer itself" if options.check else listening
+        raise ConfigError([f"{option}: it takes no {', '.join(unused)}"])

@@ -17,31 +17,28 @@ from holotorch.tracking.pose.smoothing import OneEuro
 from holotorch.tracking.pose.status import Pose, Status
 from holotorch.tracking.streaming.igtl import TransformServer
 from holotorch.tracking.streaming.packet import PosePacket, encode, now
-from holotorch.tracking.streaming.stream import PORT, Link, PoseReceiver, PoseSender
+from holotorch.tracking.streaming.stream import PORT, PoseReceiver, PoseSender
 
-_PLACE, _SPREAD = COLUMNS[5:11], COLUMNS[11:17]  # tip and direction; covariance of the tip
-_COLUMNS = ("time_s", "status", "reason", *_PLACE, *_SPREAD, "chi_square", "freedom")
+_NUMBERS = COLUMNS[5:19]  # tip, direction, covariance of the tip, chi-square and degrees of freedom
+_COLUMNS = ("time_s", "status", "reason", *_NUMBERS)
+
+Show = Callable[[str], None]  # prints a line
+TimedPose = tuple[float, Pose]  # capture time in seconds, and pose
 
 
 class Streamed(NamedTuple):
-    """Result of a stream.
+    """Result of a stream."""
 
-    Attributes:
-        frames: Number of poses and refusals sent.
-        complete: Whether all poses were sent; False if the user interrupted the stream.
-        delivered: False if all packets to all receivers failed and there was no OpenIGTLink server.
-    """
-
-    frames: int
-    complete: bool
-    delivered: bool
+    frames: int  # number of poses and refusals sent
+    complete: bool  # whether all poses were sent; False if the user interrupted the stream
+    delivered: bool  # False if all packets to all receivers failed and there was no OpenIGTLink server
 
 
-def read_poses(path: Path) -> list[tuple[float, Pose]]:
+def read_poses(path: Path) -> list[TimedPose]:
     """Read capture times in seconds and poses from a poses.csv of ``holotorch track``.
 
-    The table has no covariance of the direction. It is set to a variance of 1 along each axis, which stands
-    for an unknown unit vector.
+    The table has no covariance of the direction, so that the returned poses have a variance of 1 along each axis of it,
+    as for an unknown unit vector.
 
     Raises:
         ConfigError: The file is not a poses.csv, a line cannot be read or sent, or the times do not increase.
@@ -51,7 +48,7 @@ def read_poses(path: Path) -> list[tuple[float, Pose]]:
             table = csv.DictReader(stream)
             if missing := [name for name in _COLUMNS if name not in (table.fieldnames or ())]:
                 raise ConfigError([f"{path}: not a table of poses, columns {', '.join(missing[:4])} ... are missing"])
-            poses: list[tuple[float, Pose]] = []
+            poses: list[TimedPose] = []
             for row in table:
                 try:
                     poses.append(_pose(row))
@@ -68,7 +65,7 @@ def read_poses(path: Path) -> list[tuple[float, Pose]]:
     return poses
 
 
-def _pose(row: dict[str, str]) -> tuple[float, Pose]:
+def _pose(row: dict[str, str]) -> TimedPose:
     if None in row.values():
         raise ValueError("the line is cut off")
     captured, status, reason = float(row["time_s"]), Status[row["status"]], row["reason"]
@@ -76,18 +73,17 @@ def _pose(row: dict[str, str]) -> tuple[float, Pose]:
         raise ValueError(f"time_s is {captured}")
     if not status.answered:
         return captured, Pose.refused(status, reason)
-    values = torch.tensor([float(row[name]) for name in (*_PLACE, *_SPREAD)], dtype=torch.float64)
-    if not bool(values.isfinite().all()):
+    values = torch.tensor([float(row[name]) for name in _NUMBERS], dtype=torch.float64)
+    if not bool(values[:12].isfinite().all()):
         raise ValueError(f"{status.name}, but not all its numbers are finite")
-    covariance, upper = torch.eye(6, dtype=torch.float64), torch.triu_indices(3, 3)
-    covariance[upper[0], upper[1]] = covariance[upper[1], upper[0]] = values[6:]
-    chi, freedom = torch.tensor([float(row[name]) for name in _COLUMNS[-2:]], dtype=torch.float64)
-    pose = Pose(values[:3], values[3:6], covariance, chi, freedom, status, reason)
+    covariance, (i, j) = torch.eye(6, dtype=torch.float64), torch.triu_indices(3, 3)
+    covariance[i, j] = covariance[j, i] = values[6:12]
+    pose = Pose(values[:3], values[3:6], covariance, values[12], values[13], status, reason)
     encode(PosePacket(pose, 0.0, 0.0, 0))  # raises for a pose that cannot be sent, so that the error names its line
     return captured, pose
 
 
-def replay(poses: Sequence[tuple[float, Pose]], rate: float | None = None) -> Iterator[tuple[float, Pose]]:
+def replay(poses: Sequence[TimedPose], rate: float | None = None) -> Iterator[TimedPose]:
     """Yield recorded poses with capture times moved to the present. ``rate`` in Hz replaces the recorded pace."""
     start, first = now(), poses[0][0]
     for i, (captured, pose) in enumerate(poses):
@@ -101,8 +97,8 @@ def stream(
     igtl: int | None = None,
     rate: float | None = None,
     smooth: bool = False,
-    track: Callable[[Sequence[str]], Iterable[tuple[float, Pose]]] | None = None,
-    show: Callable[[str], None] = print,
+    track: Callable[[Sequence[str]], Iterable[TimedPose]] | None = None,
+    show: Show = print,
 ) -> Streamed:
     """Send poses until the sources end or the user interrupts the stream.
 
@@ -111,9 +107,9 @@ def stream(
         to: Receivers, each ``HOST`` or ``HOST:PORT``.
         igtl: Port of an OpenIGTLink server, to which Slicer connects; None for no server.
         rate: Poses per second of a poses.csv, instead of the recorded pace.
-        smooth: Whether to smooth the poses by :class:`OneEuro`; the packets then state its lag.
-        track: Yields capture times (by ``packet.now``) and poses for the sources, as frames arrive. A pose with a
-            future time is sent at that time.
+        smooth: Smooth the poses by :class:`OneEuro`; the packets then state the lag of the filter.
+        track: Function that yields capture times (by ``packet.now``) and poses of the sources, as frames arrive. A pose
+            with a future time is sent at that time.
         show: Function that prints a line.
 
     Raises:
@@ -125,44 +121,46 @@ def stream(
     if rate is not None and not (math.isfinite(rate) and rate > 0):
         raise ConfigError([f"rate must be above 0 Hz, got {rate}"])
     if len(sources) == 1 and sources[0].lower().endswith(".csv"):
-        poses: Iterable[tuple[float, Pose]] = replay(read_poses(Path(sources[0])), rate)
+        poses: Iterable[TimedPose] = replay(read_poses(Path(sources[0])), rate)
     elif sources and track is not None:
         poses = track(sources)
     else:
         raise ConfigError([f"expected one poses.csv or videos to track, got {' '.join(sources) or 'nothing'}"])
-    count, links, complete = [0], list[Link](), True
     try:
-        asyncio.run(_send(iter(poses), receivers, igtl, OneEuro() if smooth else None, count, links, show))
+        server = None if igtl is None else TransformServer(igtl)
+    except ImportError as error:
+        raise ConfigError([str(error)]) from None
+    sender, count, complete = PoseSender(receivers) if receivers else None, [0], True
+    try:
+        asyncio.run(_send(iter(poses), sender, server, smooth, count, show))
     except KeyboardInterrupt:
         show("interrupted")
         complete = False
-    except ImportError as error:
-        raise ConfigError([str(error)]) from None
     except OSError as error:
-        raise _said(error) from None
-    failed = igtl is None and bool(links) and all(link.errors and not link.sent for link in links)
-    return Streamed(count[0], complete, not failed)
+        raise _config_error(error) from None
+    delivered = sender is None or server is not None or any(link.sent or not link.errors for link in sender.links)
+    return Streamed(count[0], complete, delivered)
 
 
-def _said(error: OSError) -> Exception:
+def _config_error(error: OSError) -> Exception:
     """Convert an error about an address or port to ConfigError; an error about a file stays unchanged."""
     return ConfigError([error.strerror or str(error)]) if error.filename is None else error
 
 
 async def _send(
-    poses: Iterator[tuple[float, Pose]],
-    receivers: list[tuple[str, int]],
-    igtl: int | None,
-    smoother: OneEuro | None,
+    poses: Iterator[TimedPose],
+    sender: PoseSender | None,
+    server: TransformServer | None,
+    smooth: bool,
     count: list[int],
-    links: list[Link],
-    show: Callable[[str], None],
+    show: Show,
 ) -> None:
+    """Send all poses; ``count[0]`` is the number of those sent so far, also if the call is interrupted."""
+    links, smoother = sender.links if sender else [], OneEuro() if smooth else None
     async with AsyncExitStack() as stack:
-        sender = await stack.enter_async_context(PoseSender(receivers)) if receivers else None
-        server = await stack.enter_async_context(TransformServer(igtl)) if igtl is not None else None
-        links += sender.links if sender else ()
-        show(f"Sending    to {', '.join(f'{host}:{port}' for host, port in receivers) or 'OpenIGTLink clients'}")
+        for connection in filter(None, (sender, server)):
+            await stack.enter_async_context(connection)
+        show(f"Sending    to {', '.join(f'{link.host}:{link.port}' for link in links) or 'OpenIGTLink clients'}")
         if server:
             show(f"Slicer     connects to {own_address()}, port {server.port}")
         try:
@@ -185,37 +183,36 @@ async def _send(
                 show(f"Receiver   {link.host}:{link.port}: {link.sent} sent, {link.dropped} dropped for newer{text}")
 
 
-def view(port: int = PORT, *, seconds: float = math.inf, show: Callable[[str], None] = print) -> None:
+def view(port: int = PORT, *, seconds: float = math.inf, show: Show = print) -> None:
     """Print the newest packet at ``port`` once a second, and finally statistics. ConfigError if the port is in use."""
-    state: list[PoseReceiver] = []
+    receiver = PoseReceiver(port)
+
+    async def listen() -> None:
+        async with receiver:
+            show(f"Listening  at {own_address()}, UDP port {receiver.port}")
+            end = now() + seconds
+            while (remaining := end - now()) > 0:
+                await asyncio.sleep(min(1.0, remaining))
+                show(_line(receiver))
+
     try:
         with suppress(KeyboardInterrupt):
-            asyncio.run(_view(port, seconds, show, state))
+            asyncio.run(listen())
     except OSError as error:
-        raise _said(error) from None
-    if state:
-        for line in statistics_text(state[0]):
-            show(line)
-
-
-async def _view(port: int, seconds: float, show: Callable[[str], None], state: list[PoseReceiver]) -> None:
-    async with PoseReceiver(port) as receiver:
-        state.append(receiver)
-        show(f"Listening  at {own_address()}, UDP port {receiver.port}")
-        end = now() + seconds
-        while (left := end - now()) > 0:
-            await asyncio.sleep(min(1.0, left))
-            show(_line(receiver))
+        raise _config_error(error) from None
+    for line in statistics_text(receiver):
+        show(line)
 
 
 def _line(receiver: PoseReceiver) -> str:
-    newest = receiver.packet
+    """The newest packet in a line, or what arrived instead."""
+    newest, counts, age = receiver.packet, receiver.statistics, receiver.age()
+    if newest is None and counts.future:
+        return f"{counts.future} packets captured in the future, not used: compare the sender's clock and its camera's"
+    if newest is None and counts.invalid:
+        return f"{counts.invalid} unreadable packets, the last: {counts.last_error}"
     if newest is None:
-        bad = receiver.statistics
-        if bad.future:
-            return f"{bad.future} packets captured in the future, not used: compare the sender's clock and its camera's"
-        return f"{bad.invalid} unreadable packets, the last: {bad.last_error}" if bad.invalid else "nothing yet"
-    age = receiver.age()
+        return "nothing yet"
     if not newest.answered:
         assert isinstance(newest.pose.status, Status)
         return f"refused ({newest.pose.status.name}): {newest.pose.reason}; {age * 1e3:.0f} ms old"
@@ -231,7 +228,7 @@ def statistics_text(receiver: PoseReceiver) -> list[str]:
     if not counts.received:
         text = f"Received   nothing; {counts.invalid} unreadable packets {counts.last_error}".rstrip()
         return [f"{text}; {counts.future} captured in the future" if counts.future else text]
-    ms = {name: value * 1e3 for name, value in counts.latency().items()}
+    ms = {name: 1e3 * seconds for name, seconds in counts.latency().items()}
     clock = "not measured: transit counted from the fastest packet"
     if counts.offset is not None and counts.round_trip is not None:
         clock = f"sender's is {counts.offset * 1e3:+.3f} ms ahead, within {counts.round_trip * 5e2:.3f} ms"
@@ -248,7 +245,7 @@ def statistics_text(receiver: PoseReceiver) -> list[str]:
 
 
 def address(text: str) -> tuple[str, int]:
-    """Read host and port from ``HOST``, ``HOST:PORT`` or ``[IPv6]:PORT``. ConfigError for other text."""
+    """Host and port from ``HOST``, ``HOST:PORT`` or ``[IPv6]:PORT``; ConfigError for other text."""
     host, colon, port = text.rpartition(":") if not text.endswith("]") and text.count(":") else (text, "", "")
     host = host.removeprefix("[").removesuffix("]")
     number = int(port) if port.isascii() and port.isdigit() else 0
@@ -260,10 +257,10 @@ def address(text: str) -> tuple[str, int]:
 
 
 def own_address() -> str:
-    """IPv4 address of this computer for other computers, or 127.0.0.1 if there is no network."""
+    """IPv4 address at which other computers reach this one, or 127.0.0.1 if there is no network."""
     with socket.socket(type=socket.SOCK_DGRAM) as probe:
         try:
-            # This sends nothing, but selects the interface for foreign addresses. RFC 5737 reserves this address.
+            # Sends nothing, but selects the interface for addresses outside; RFC 5737 reserves this one for examples.
             probe.connect(("192.0.2.1", 9))
             return probe.getsockname()[0]
         except OSError:

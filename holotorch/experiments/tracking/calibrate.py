@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -44,9 +45,9 @@ def calibrate_photographs(
     missing: dict[str, str] = {}
     views: list[View] = []
     sizes: dict[str, tuple[int, int]] = {}
-    names = [path.name for path in paths]
+    names = Counter(path.name for path in paths)
     for path in paths:
-        name = path.name if names.count(path.name) == 1 else str(path)
+        name = path.name if names[path.name] == 1 else str(path)
         if not path.exists():
             mistakes.append(f"{path}: no such file or folder")
             continue
@@ -55,23 +56,22 @@ def calibrate_photographs(
         except (ValueError, OSError) as error:
             mistakes.append(f"{path}: {getattr(error, 'strerror', None) or error}")
             continue
-        sizes[name] = (grey.shape[0], grey.shape[1])
+        sizes[name] = grey.shape[0], grey.shape[1]
         try:
             views.append(find_board(grey, wanted, name))
         except ValueError as error:
             missing[name] = str(error)
-    if len(set(sizes.values())) > 1:
-        usual = max(set(sizes.values()), key=list(sizes.values()).count)
-        mistakes += [
-            f"{name}: {size[1]} x {size[0]} px, the others have {usual[1]} x {usual[0]}; a calibration takes "
-            "photographs of one size, not cropped or turned"
-            for name, size in sizes.items()
-            if size != usual
-        ]
+    usual = Counter(sizes.values()).most_common(1)[0][0] if sizes else (0, 0)
+    mistakes += [
+        f"{name}: {size[1]} x {size[0]} px, the others have {usual[1]} x {usual[0]}; a calibration takes "
+        "photographs of one size, not cropped or turned"
+        for name, size in sizes.items()
+        if size != usual
+    ]
     if mistakes:
         raise ConfigError(mistakes)
     try:
-        calibration = calibrate(views, next(iter(sizes.values())))
+        calibration = calibrate(views, usual)
     except ValueError as error:
         raise ConfigError([str(error), *(f"{name}: {reason}" for name, reason in missing.items())]) from None
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -81,28 +81,25 @@ def calibrate_photographs(
 
 def parse_board(words: Sequence[str]) -> Chessboard | Charuco:
     """Create the board that the words after ``--board`` describe. ConfigError for words that describe no board."""
-    kind, *rest = " ".join(words).split() or ("",)
-    sides = re.fullmatch(r"(\d{1,3})x(\d{1,3})", rest[0]) if rest else None
-    wanted = {"chessboard": 1, "charuco": 2}.get(kind, -1)
-    if not sides or len(rest) != (2 if wanted == 1 else 4) or wanted < 0:
-        raise ConfigError([f"--board: expected {_KINDS}, got {' '.join(words)!r}"])
+    text, sides = " ".join(" ".join(words).split()), r"(\d{1,3})x(\d{1,3})"
+    chessboard = re.fullmatch(rf"chessboard {sides} (\S+)", text)
+    charuco = re.fullmatch(rf"charuco {sides} (\S+) (\S+) (\S+)", text)
     try:
-        lengths = [float(metres(word)) for word in rest[1 : 1 + wanted]]
-        if wanted == 1:
-            return Chessboard(int(sides[1]), int(sides[2]), lengths[0])
-        return Charuco(int(sides[1]), int(sides[2]), *lengths, dictionary=rest[3])
+        if chessboard:
+            return Chessboard(int(chessboard[1]), int(chessboard[2]), float(metres(chessboard[3])))
+        if charuco:
+            square, marker = float(metres(charuco[3])), float(metres(charuco[4]))
+            return Charuco(int(charuco[1]), int(charuco[2]), square, marker, dictionary=charuco[5])
     except (PydanticCustomError, ValueError) as error:
         raise ConfigError([f"--board: {error}"]) from None
+    raise ConfigError([f"--board: expected {_KINDS}, got {' '.join(words)!r}"])
 
 
 def calibration_text(calibration: Calibration, missing: dict[str, str], board: Sequence[str] = BOARD) -> str:
     """The result of a calibration in a few lines."""
     matrix, distortion = calibration.camera.matrix, calibration.camera.distortion.tolist()
     values = [matrix[0, 0].item(), matrix[1, 1].item(), matrix[0, 2].item(), matrix[1, 2].item(), *distortion]
-    words = [
-        f"{name} {_rounded(value, calibration.deviations[name])}"
-        for name, value in zip(PARAMETERS, values, strict=True)
-    ]
+    words = [f"{name} {_rounded(x, calibration.deviations[name])}" for name, x in zip(PARAMETERS, values, strict=True)]
     coverage = calibration.coverage
     between = f", {math.degrees(coverage.between):.0f} deg between boards at most" if len(calibration.views) > 1 else ""
     low, high = (math.degrees(angle) for angle in coverage.tilts)
@@ -131,20 +128,17 @@ def _rounded(value: float, deviation: float) -> str:
 
 
 def _listed(files: Sequence[Path]) -> list[Path]:
+    """Photographs among the files and in the folders; ConfigError if there are none, or if one is given twice."""
     paths: list[Path] = []
     for path in files:
-        if path.is_dir():
-            inside = sorted(item for item in path.iterdir() if item.suffix.lower() in PICTURES)
-            if not inside:
-                raise ConfigError([f"{path}: no pictures in this folder ({', '.join(PICTURES)})"])
-            paths += inside
-        else:
-            paths.append(path)
+        inside = sorted(item for item in path.iterdir() if item.suffix.lower() in PICTURES) if path.is_dir() else [path]
+        if not inside:
+            raise ConfigError([f"{path}: no pictures in this folder ({', '.join(PICTURES)})"])
+        paths += inside
     if not paths:
         raise ConfigError(["no photographs given; expected files or folders of them"])
-    resolved = [path.resolve() for path in paths]
-    twice = {str(path) for path, place in zip(paths, resolved, strict=True) if resolved.count(place) > 1}
-    if twice:
+    times_given = Counter(path.resolve() for path in paths)
+    if twice := sorted({str(path) for path in paths if times_given[path.resolve()] > 1}):
         # Counting a view twice would lower the stated deviations without adding information.
-        raise ConfigError([f"{path}: given twice" for path in sorted(twice)])
+        raise ConfigError([f"{path}: given twice" for path in twice])
     return paths

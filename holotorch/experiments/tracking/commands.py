@@ -41,22 +41,14 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
 def _track(options: argparse.Namespace) -> int:
     from holotorch.experiments.config.messages import validated
     from holotorch.experiments.config.source import Key, Source
+    from holotorch.experiments.execute import execute
     from holotorch.experiments.tracking.config import TrackSettings
 
-    given = {
-        "source": options.source,
-        "camera": options.camera and str(options.camera),
-        "catheter": options.catheter and str(options.catheter),
-        "method": options.method,
-        "record": options.record,
-        "video": not options.no_video,
-        "still": options.still,
-        "rate_hz": options.rate,
-    }
-    places: dict[Key, str] = {("method",): "argument --method", ("rate_hz",): "argument --rate"}
-    settings = validated(Source(Path("track"), {"experiment": "track", **given}, places), TrackSettings)
-    from holotorch.experiments.execute import execute
-
+    given = {"source": options.source, "method": options.method, "record": options.record, "still": options.still}
+    given |= {"video": not options.no_video, "rate_hz": options.rate}
+    given |= {name: str(path) for name in ("camera", "catheter") if (path := getattr(options, name))}
+    arguments: dict[Key, str] = {("method",): "argument --method", ("rate_hz",): "argument --rate"}
+    settings = validated(Source(Path("track"), {"experiment": "track", **given}, arguments), TrackSettings)
     folder, complete = execute(settings, options.out, "track")
     page = folder / "report.html"
     print(page if page.is_file() else folder)
@@ -68,6 +60,5 @@ def _calibrate(options: argparse.Namespace) -> int:
 
     board = options.board or BOARD
     calibration, missing = calibrate_photographs(options.files, options.out, board)
-    print(calibration_text(calibration, missing, board))
-    print(options.out)
+    print(calibration_text(calibration, missing, board), options.out, sep="\n")
     return OK

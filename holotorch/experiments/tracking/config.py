@@ -18,10 +18,10 @@ class TrackSettings(Settings):
     """Tracking of a catheter in a video, a folder of pictures, a recording, or the frames of a live camera.
 
     ``source``: a path, the index of a camera, or ``synthetic``, which first renders a recording of ``frames`` frames
-    with the true poses. ``camera``, ``catheter``: YAML files; by default those beside a recording, or a synthetic
-    camera and the dissertation's catheter. ``record``: save every frame without loss, so that it can be tracked again.
-    ``video``: write the overlay video. ``still``: measure the stability of the tip, for a catheter at rest.
-    ``rate_hz``: frames per second of a source without time stamps.
+    with the true poses. ``camera``, ``catheter``: YAML files; by default, those beside the recording or, for
+    ``synthetic``, a synthetic camera and the dissertation's catheter. ``record``: save every frame without loss, so
+    that it can be tracked again. ``video``: write a video with the pose drawn on every frame. ``still``: measure the
+    stability of the tip, for a catheter at rest. ``rate_hz``: frames per second of a source without time stamps.
     """
 
     experiment: Literal["track"]

@@ -1,6 +1,7 @@
 """YAML files of cameras, of catheters, and of a camera's position on a headset."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -13,7 +14,7 @@ from holotorch.core.quantities import TOOL_LENGTH, TOOL_POSITION, TOOL_RADIUS
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.config.messages import validated
 from holotorch.experiments.config.settings import Count, Length, Number, Settings, Side, number, plausible
-from holotorch.experiments.config.source import Source, read_source
+from holotorch.experiments.config.source import read_source
 from holotorch.io.files import write_text
 from holotorch.tracking.camera.calibration import PARAMETERS, Calibration
 from holotorch.tracking.camera.camera import Camera
@@ -26,7 +27,7 @@ def _tone(value: Any) -> Any:
         isinstance(value, list | tuple)
         and len(value) == 256
         and all(isinstance(item, float | int) and 0 <= item <= 1 for item in value)
-        and all(b > a for a, b in zip(value, value[1:], strict=False))
+        and all(b > a for a, b in pairwise(value))
     ):
         return value
     raise PydanticCustomError("tone", "expected srgb, linear, or the light of the 256 levels, rising from 0 to 1")
@@ -34,17 +35,11 @@ def _tone(value: Any) -> Any:
 
 Positive = Annotated[Number, Field(gt=0)]
 Level = Annotated[int, BeforeValidator(number), Field(ge=0, le=255)]
-Five = Annotated[tuple[Number, ...], Field(min_length=5, max_length=5)]
 Row = tuple[Number, Number, Number, Number]
 
 
 class EvidenceSettings(Settings):
-    """Quality of a calibration, for users and for warnings while tracking. Angles are in radians.
-
-    ``deviations``: standard deviation of each parameter. ``views`` and ``left_out``: rms reprojection error
-    in pixels of each photograph that was used or left out. ``cells``, ``radius``, ``tilts`` and ``between``: see
-    ``Coverage``.
-    """
+    """Quality of a calibration, for users and for warnings while tracking; see ``Calibration`` and ``Coverage``."""
 
     deviations: dict[str, Number]
     rms_px: Number
@@ -68,7 +63,7 @@ class CameraSettings(Settings):
     fy: Positive
     cx: Number
     cy: Number
-    distortion: Five = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: Annotated[tuple[Number, ...], Field(min_length=5, max_length=5)] = (0.0, 0.0, 0.0, 0.0, 0.0)
     size: tuple[Side, Side] | None = None
     tone: Annotated[str | tuple[Number, ...], BeforeValidator(_tone)] = "srgb"
     calibration: EvidenceSettings | None = None
@@ -86,8 +81,8 @@ class CatheterSettings(Settings):
 class HeadsetSettings(Settings):
     """Position of a camera on a headset: rows of the 4 x 4 matrix from camera to headset coordinates, in metres.
 
-    ``residuals`` and ``leave_one_out``: errors in metres of the alignments from which the matrix was computed; see
-    ``Alignment``. An error is null if its alignment could not be left out.
+    ``residuals`` and ``leave_one_out``: errors in metres of the alignments from which the matrix was computed, see
+    ``Alignment``; null in ``leave_one_out`` for an alignment without which the others determine no matrix.
     """
 
     headset_from_camera: tuple[Row, Row, Row, Row]
@@ -101,8 +96,33 @@ AnySettings = TypeVar("AnySettings", bound=Settings)
 
 def load_camera(path: Path | str, overrides: Sequence[str] = ()) -> CameraSettings:
     """Read a camera's file, apply overrides and check it. ConfigError gives file, line and column of mistakes."""
-    source, settings = _read(CameraSettings, path, overrides)
-    _tried(source, build_camera, settings)
+    return _load(CameraSettings, build_camera, path, overrides)
+
+
+def load_catheter(path: Path | str, overrides: Sequence[str] = ()) -> CatheterSettings:
+    """Read a catheter's file as :func:`load_camera`."""
+    return _load(CatheterSettings, build_catheter, path, overrides)
+
+
+def load_headset(path: Path | str, overrides: Sequence[str] = ()) -> HeadsetSettings:
+    """Read the file of a camera's position on a headset as :func:`load_camera`."""
+    return _load(HeadsetSettings, build_headset, path, overrides)
+
+
+def _load(
+    model: type[AnySettings], build: Callable[[AnySettings], Any], path: Path | str, overrides: Sequence[str]
+) -> AnySettings:
+    """Read and check settings; an error of ``build`` that begins with the name of a key is reported at its line."""
+    needed = ", ".join(name for name, field in model.model_fields.items() if field.is_required())
+    kind = model.__name__.removesuffix("Settings").lower()
+    source = read_source(Path(path), list(overrides), f"the settings of a {kind}: {needed}")
+    settings = validated(source, model)
+    try:
+        build(settings)
+    except ValueError as error:
+        word, _, rest = str(error).partition(" ")
+        known = word in model.model_fields
+        raise ConfigError([source.mistake((word,) if known else (), rest if known else str(error))]) from None
     return settings
 
 
@@ -114,111 +134,66 @@ def build_camera(settings: CameraSettings) -> Camera:
     return Camera(torch.tensor(matrix, dtype=torch.float64), distortion, tone, settings.size)
 
 
-def save_camera(path: Path, camera: Camera | Calibration, size: tuple[int, int] | None = None) -> None:
-    """Write a camera, or a calibration with its quality. ``size`` (H, W) is the frame size of a plain camera."""
-    values: dict[str, Any] = {}
-    if isinstance(camera, Calibration):
-        calibration, camera, size = camera, camera.camera, camera.size
-        coverage = calibration.coverage
-        values["calibration"] = EvidenceSettings(
-            deviations=calibration.deviations,
-            rms_px=calibration.rms_px,
-            views=calibration.views,
-            left_out=calibration.left_out,
-            cells=coverage.cells,
-            radius=coverage.radius,
-            tilts=coverage.tilts,
-            between=coverage.between,
-            warnings=calibration.warnings,
-        )
-    matrix = camera.matrix.detach()
-    intrinsics = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
-    tone = camera.tone if isinstance(camera.tone, str) else tuple(camera.tone.tolist())
-    settings = CameraSettings(
-        **dict(zip(PARAMETERS, map(float, intrinsics), strict=False)),
-        distortion=tuple(camera.distortion.detach().tolist()),
-        size=size,
-        tone=tone,
-        **values,
-    )
-    _write(path, "A camera: pixels; distortion k1, k2, p1, p2, k3; size in rows and columns.", settings)
-
-
-def load_catheter(path: Path | str, overrides: Sequence[str] = ()) -> CatheterSettings:
-    """Read a catheter's file, apply overrides and check it. ConfigError gives file, line and column of mistakes."""
-    source, settings = _read(CatheterSettings, path, overrides)
-    _tried(source, build_catheter, settings)
-    return settings
-
-
 def build_catheter(settings: CatheterSettings) -> Catheter:
     """Create the catheter that the settings describe."""
     return Catheter(settings.edges, settings.colours, settings.radius, settings.length)
 
 
-def misfit(path: Path, error: ValueError) -> ConfigError:
-    """Error for a catheter that a tracker refused. It points to the colours, which are the only reason for this."""
-    return ConfigError([read_source(path, []).mistake(("colours",), str(error))])
-
-
-def save_catheter(path: Path, catheter: Catheter) -> None:
-    """Write a catheter, for instance one whose edges were measured."""
-    settings = CatheterSettings(
-        edges=catheter.edges, colours=catheter.colours, radius=catheter.radius, length=catheter.length
-    )
-    _write(path, "A catheter: lengths in metres, edges of its bands from the tip, colours as 8-bit sRGB.", settings)
-
-
-def load_headset(path: Path | str, overrides: Sequence[str] = ()) -> HeadsetSettings:
-    """Read a camera's position, apply overrides and check it. ConfigError gives file, line and column of mistakes."""
-    source, settings = _read(HeadsetSettings, path, overrides)
-    _tried(source, build_headset, settings)
-    return settings
-
-
 def build_headset(settings: HeadsetSettings) -> torch.Tensor:
     """The matrix headset_from_camera, float64 [4, 4]. ValueError unless it is rigid."""
-    matrix = torch.tensor(settings.headset_from_camera, dtype=torch.float64)
-    rotation, last = matrix[:3, :3], torch.tensor([0.0, 0, 0, 1], dtype=torch.float64)
-    missed = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().max()
-    if missed > 1e-6 or rotation.det() < 0 or not torch.equal(matrix[3], last) or matrix[:3, 3].abs().max() > 10:
+    matrix, last = torch.tensor(settings.headset_from_camera, dtype=torch.float64), torch.eye(4, dtype=torch.float64)[3]
+    rotation, shift = matrix[:3, :3], matrix[:3, 3]
+    orthogonal = torch.allclose(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-6)
+    if not orthogonal or rotation.det() < 0 or not torch.equal(matrix[3], last) or shift.abs().max() > 10:
         raise ValueError(
             "headset_from_camera must be a rotation without mirroring, a shift in metres, and the last row 0, 0, 0, 1"
         )
     return matrix
 
 
+def save_camera(path: Path, camera: Camera | Calibration, size: tuple[int, int] | None = None) -> None:
+    """Write a camera, or a calibration with its quality. ``size`` (H, W) is the frame size of a plain camera."""
+    evidence = None
+    if isinstance(camera, Calibration):
+        values = vars(camera) | vars(camera.coverage)
+        evidence = EvidenceSettings(**{name: values[name] for name in EvidenceSettings.model_fields})
+        camera, size = camera.camera, camera.size
+    matrix = camera.matrix.detach()
+    intrinsics = map(float, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
+    settings = CameraSettings(
+        **dict(zip(PARAMETERS, intrinsics, strict=False)),
+        distortion=tuple(camera.distortion.detach().tolist()),
+        size=size,
+        tone=camera.tone if isinstance(camera.tone, str) else tuple(camera.tone.tolist()),
+        calibration=evidence,
+    )
+    _write(path, "A camera: pixels; distortion k1, k2, p1, p2, k3; size in rows and columns.", settings)
+
+
+def save_catheter(path: Path, catheter: Catheter) -> None:
+    """Write a catheter, for instance one whose edges were measured."""
+    settings = CatheterSettings(**{name: getattr(catheter, name) for name in CatheterSettings.model_fields})
+    _write(path, "A catheter: lengths in metres, edges of its bands from the tip, colours as 8-bit sRGB.", settings)
+
+
 def save_headset(path: Path, alignment: Alignment) -> None:
     """Write the position of a camera on a headset, with the residuals of the alignment."""
     left_out = [value if value != float("inf") else None for value in alignment.leave_one_out.tolist()]
-    rows = [(a, b, c, d) for a, b, c, d in alignment.headset_from_camera.detach().tolist()]
-    settings = HeadsetSettings(
-        headset_from_camera=(rows[0], rows[1], rows[2], rows[3]),
-        residuals=tuple(alignment.residuals.tolist()),
-        leave_one_out=tuple(left_out),
-        alignments=len(left_out),
-    )
-    _write(path, "From the camera's frame to the headset's: metres, points as columns.", settings)
+    settings = {
+        "headset_from_camera": alignment.headset_from_camera.detach().tolist(),
+        "residuals": alignment.residuals.tolist(),
+        "leave_one_out": left_out,
+        "alignments": len(left_out),
+    }
+    _write(path, "From the camera's frame to the headset's: metres, points as columns.", HeadsetSettings(**settings))
 
 
-def _read(model: type[AnySettings], path: Path | str, overrides: Sequence[str]) -> tuple[Source, AnySettings]:
-    needed = ", ".join(name for name, field in model.model_fields.items() if field.is_required())
-    kind = model.__name__.removesuffix("Settings").lower()
-    source = read_source(Path(path), list(overrides), f"the settings of a {kind}: {needed}")
-    return source, validated(source, model)
+def misfit(path: Path, error: ValueError) -> ConfigError:
+    """Error for a catheter that a tracker refused, at the line of its colours, the only possible reason."""
+    return ConfigError([read_source(path, []).mistake(("colours",), str(error))])
 
 
-def _tried(source: Source, build: Any, settings: Settings) -> None:
-    """Call ``build`` with the settings; an error that begins with the name of a key is reported at this key's line."""
-    try:
-        build(settings)
-    except ValueError as error:
-        word = str(error).split()[0]
-        key = (word,) if word in type(settings).model_fields else ()
-        raise ConfigError([source.mistake(key, str(error).removeprefix(f"{word} ") if key else str(error))]) from None
-
-
-def _write(path: Path, words: str, settings: Settings) -> None:
+def _write(path: Path, comment: str, settings: Settings) -> None:
     data = settings.model_dump(mode="json", exclude_none=True)
     text = yaml.safe_dump(data, sort_keys=False, width=110, allow_unicode=True, default_flow_style=None)
-    write_text(path, f"# {words}\n{text}")
+    write_text(path, f"# {comment}\n{text}")

@@ -1,12 +1,14 @@
 """Report of a tracking run: counts by status, time per stage, stability, and the section of the report page."""
 
-import io
 import math
+from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import fmean
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from holotorch.experiments.runs.memory import peak_memory
 from holotorch.experiments.runs.page import element, figure, heading, plain, table
@@ -27,7 +29,6 @@ COLUMNS = (
     *("cov_xx_m2", "cov_xy_m2", "cov_xz_m2", "cov_yy_m2", "cov_yz_m2", "cov_zz_m2"),
     *("chi_square", "freedom", "milliseconds"),
 )
-_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 _STATED = "what the frames leave open; not what is unknown of the camera (its calibration) and of the catheter's edges"
 _MOVED = 3.0  # a catheter counts as resting if its tips spread by at most this many stated deviations
@@ -35,21 +36,13 @@ _SHOWN = 4  # number of statuses whose first frame the page shows
 
 
 class Tracked(NamedTuple):
-    """One frame and its pose.
+    """One frame and its pose."""
 
-    Attributes:
-        number: Number of the frame, from 0.
-        frame: The frame as it was read.
-        pose: The pose or a refusal, BAD_FRAME for a frame that could not be read.
-        seconds: Time that the tracker took; 0 for a frame that could not be read.
-        stages: Seconds of each stage of the tracker, if it measures them.
-    """
-
-    number: int
+    number: int  # of the frame, from 0
     frame: Frame
-    pose: Pose
-    seconds: float
-    stages: dict[str, float]
+    pose: Pose  # or a refusal, BAD_FRAME for a frame that could not be read
+    seconds: float  # time that the tracker took; 0 for a frame that could not be read
+    stages: dict[str, float]  # seconds of each stage of the tracker, if it measures them
 
     @property
     def status(self) -> Status:
@@ -59,41 +52,41 @@ class Tracked(NamedTuple):
 
 
 def row(item: Tracked) -> list[str]:
-    """The frame as cells of ``COLUMNS``. Floats are exact; a refused frame has empty cells instead of a pose."""
+    """The frame as cells of ``COLUMNS``."""
     pose = item.pose
     cells = [str(item.number), repr(item.frame.seconds), item.status.name]
     cells += ["" if pose.answered else item.status.stage, " ".join(pose.reason.split())]
-    taken = "" if item.frame.pixels is None else f"{1e3 * item.seconds:.3f}"
-    if not pose.answered:
-        return [*cells, *[""] * (len(COLUMNS) - len(cells) - 1), taken]
-    values = [*pose.tip.tolist(), *pose.direction.tolist(), *(float(pose.covariance[i, j]) for i, j in _UPPER)]
-    values += [float(pose.chi_square), float(pose.freedom)]
-    return [*cells, *map(repr, values), taken]
+    numbers = [""] * (len(COLUMNS) - len(cells) - 1)
+    if pose.answered:
+        i, j = torch.triu_indices(3, 3)
+        values = [*pose.tip.tolist(), *pose.direction.tolist(), *pose.covariance[i, j].tolist()]
+        numbers = [repr(value) for value in (*values, float(pose.chi_square), float(pose.freedom))]
+    return [*cells, *numbers, "" if item.frame.pixels is None else f"{1e3 * item.seconds:.3f}"]
 
 
+@dataclass
 class Log:
     """Results of all frames of a run, and the first overlay of each status."""
 
-    def __init__(self, images: Path):
-        self.images = images
-        self.statuses: list[Status] = []
-        self.times: list[float] = []
-        self.tips: list[list[float]] = []
-        self.deviations: list[float] = []
-        self.seconds: list[float] = []
-        self.stages: dict[str, float] = {}
-        self.timed, self.warm = 0, False
-        self.pictures: dict[str, str] = {}
+    images: Path  # folder of the overlays
+    statuses: list[Status] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)  # time stamps of the frames in seconds
+    tips: list[list[float]] = field(default_factory=list)  # metres; NaN for a refusal
+    deviations: list[float] = field(default_factory=list)  # standard deviations of the tips in metres
+    seconds: list[float] = field(default_factory=list)  # time of the tracker for each frame that could be read
+    stages: list[dict[str, float]] = field(default_factory=list)  # seconds of its stages
+    pictures: dict[str, str] = field(default_factory=dict)  # captions of the overlays by status
 
     def wants(self, item: Tracked) -> bool:
         """Whether the page will show the overlay of this frame."""
         return item.status.name not in self.pictures and len(self.pictures) < _SHOWN
 
     def take(self, item: Tracked, drawn: Tensor | None) -> None:
-        """Add a frame."""
+        """Add a frame and its overlay, uint8 [3, H, W]."""
         pose = item.pose
         if drawn is not None and self.wants(item):
-            save_picture(self.images / item.status.name, _smaller(drawn))
+            smaller = avg_pool2d(drawn.double() / 255, max(1, min(drawn.shape[-2:]) // 400))
+            save_picture(self.images / item.status.name, smaller)
             reason = f": {pose.reason}" if pose.reason else ""
             self.pictures[item.status.name] = f"frame {item.number}, {item.status.name}{reason}"
         self.statuses.append(item.status)
@@ -103,73 +96,47 @@ class Log:
         if item.frame.pixels is not None:
             self.seconds.append(item.seconds)
         if item.stages:
-            if self.timed == 1 and not self.warm:
-                self.warm = True  # the first call also builds tables; it only counts if it is the only one
-                self.timed, self.stages = 0, {}
-            self.timed += 1
-            for name, value in item.stages.items():
-                self.stages[name] = self.stages.get(name, 0.0) + value
+            self.stages.append(item.stages)
 
 
 def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, Any]:
     """The summary of a run as plain JSON values; keys name their units (mm, ms)."""
     answered = sum(status.answered for status in log.statuses)
-    summary: dict[str, Any] = {
-        "experiment": "track",
-        "status": "",
-        "source": frames.name,
-        "method": method,
-        "frames": len(log.statuses),
-        "answered": answered,
-        "statuses": counts(log.statuses),
-        "seconds": log.times[-1] - log.times[0],
-        "stated_rate_hz": frames.rate,
-    }
+    summary: dict[str, Any] = {"experiment": "track", "status": "", "source": frames.name, "method": method}
+    summary |= {"frames": len(log.statuses), "answered": answered, "statuses": counts(log.statuses)}
+    summary |= {"seconds": log.times[-1] - log.times[0], "stated_rate_hz": frames.rate}
+    stated = torch.tensor([value for value in log.deviations if math.isfinite(value)], dtype=torch.float64)
     if answered:
-        stated = torch.tensor([value for value in log.deviations if math.isfinite(value)], dtype=torch.float64)
-        summary["tip_sd_mm"] = {"median": 1e3 * _at(stated, 0.5), "largest": 1e3 * _at(stated, 1.0)}
+        summary["tip_sd_mm"] = {"median": 1e3 * quantile(stated, 0.5), "largest": 1e3 * quantile(stated, 1.0)}
         summary["tip_sd_holds"] = _STATED
     if log.seconds:
         taken = 1e3 * torch.tensor(log.seconds, dtype=torch.float64)
-        summary["milliseconds"] = {
-            "first": float(taken[0]),
-            "median": _at(taken, 0.5),
-            "p95": _at(taken, 0.95),
-            "largest": _at(taken, 1.0),
-        }
-    if log.timed:
-        whole = sum(log.stages.values())
+        shares = (("median", 0.5), ("p95", 0.95), ("largest", 1.0))
+        summary["milliseconds"] = {"first": float(taken[0])} | {name: quantile(taken, share) for name, share in shares}
+    if log.stages:
+        counted = log.stages[1:] or log.stages  # without the first call if possible, which also builds tables
+        names = dict.fromkeys(name for each in counted for name in each)
+        means = {name: fmean(each.get(name, 0.0) for each in counted) for name in names}
+        total = max(sum(means.values()), 1e-12)
         summary["stages"] = [
-            {"stage": name, "milliseconds": 1e3 * value / log.timed, "percent": 100 * value / max(whole, 1e-12)}
-            for name, value in log.stages.items()
+            {"stage": name, "milliseconds": 1e3 * mean, "percent": 100 * mean / total} for name, mean in means.items()
         ]
     notes = list(frames.notes)
     if still:
         try:
             stability = s_rms(torch.tensor(log.tips, dtype=torch.float64))
-            summary["stability"] = {
-                "s_rms_mm": 1e3 * stability.s_rms,
-                "sd_mm": 1e3 * stability.sd,
-                "differences": stability.differences,
-                "answered": stability.answered,
-            }
-            notes += _moved(log, stability.sd)
+            summary["stability"] = {"s_rms_mm": 1e3 * stability.s_rms, "sd_mm": 1e3 * stability.sd}
+            summary["stability"] |= {"differences": stability.differences, "answered": stability.answered}
+            allowed = float(stated.square().mean().sqrt()) if len(stated) else math.inf
+            if stability.sd > _MOVED * allowed:
+                notes.append(
+                    f"was the catheter at rest? The tips spread by {1e3 * stability.sd:.3f} mm about their mean, more "
+                    f"than {_MOVED:g} times their stated deviation of {1e3 * allowed:.3f} mm (root mean squares); "
+                    "S_RMS of a moving catheter says nothing of stability"
+                )
         except ValueError as error:
             notes.append(f"no stability: {error}")
     return summary | {"notes": notes, "pictures": log.pictures, "peak_memory_bytes": peak_memory()}
-
-
-def _moved(log: Log, spread: float) -> list[str]:
-    """A note if ``spread`` (rms distance of the tips from their mean, metres) far exceeds the stated deviation."""
-    stated = torch.tensor([value for value in log.deviations if math.isfinite(value)], dtype=torch.float64)
-    allowed = float(stated.square().mean().sqrt()) if len(stated) else math.inf
-    if spread <= _MOVED * allowed:
-        return []
-    return [
-        f"was the catheter at rest? The tips spread by {1e3 * spread:.3f} mm about their mean, more than {_MOVED:g} "
-        f"times their stated deviation of {1e3 * allowed:.3f} mm (root mean squares); S_RMS of a moving catheter says "
-        "nothing of stability"
-    ]
 
 
 def verdict(summary: dict[str, Any]) -> str:
@@ -185,7 +152,9 @@ def verdict(summary: dict[str, Any]) -> str:
 
 def save_figure(folder: Path, log: Log) -> None:
     """Draw the tip over time to ``images/track.png``."""
-    write_bytes(folder / "images" / "track.png", _png(drawn_track(log)))
+    from holotorch.experiments.runs.figures import figure_png
+
+    write_bytes(folder / "images" / "track.png", figure_png(drawn_track(log)))
 
 
 def track_section(record: RunRecord) -> list[str]:
@@ -217,26 +186,16 @@ def _truth(truth: dict[str, float]) -> str:
     """HTML of the distances between the tips and the truth of a synthetic recording."""
     text = f"The recording is synthetic, and where the tip truly is is known. Of {truth['frames']} frames with a pose "
     text = element("p", text + f"{truth.get('wrong', 0)} are wrong by more than 5 mm.")
-    shares = [
-        (f"{name} (mm)", f"{value:.3f}")
-        for name in ("median", "p95", "worst")
-        if (value := truth.get(f"{name}_mm")) is not None
-    ]
+    lengths = {name: length for name in ("median", "p95", "worst") if (length := truth.get(f"{name}_mm")) is not None}
+    rows = [[f"{name} (mm)", f"{length:.3f}"] for name, length in lengths.items()]
     if "coverage" in truth:
-        shares.append(("truth within the stated 95 % ellipsoid", f"{100 * truth['coverage']:.1f} % of the frames"))
-    return text + table(["tip's distance from the truth", ""], [list(pair) for pair in shares])
+        rows.append(["truth within the stated 95 % ellipsoid", f"{100 * truth['coverage']:.1f} % of the frames"])
+    return text + table(["tip's distance from the truth", ""], rows)
 
 
-def _smaller(drawn: Tensor) -> Tensor:
-    """Convert the levels of a frame [3, H, W] to values from 0 to 1, and reduce its size for the page."""
-    factor = max(1, min(drawn.shape[-2:]) // 400)
-    return torch.nn.functional.avg_pool2d(drawn.double() / 255, factor)
-
-
-def _at(values: Tensor, share: float) -> float:
-    if not len(values):
-        return math.nan
-    return float(values.sort().values[round(share * (len(values) - 1))])
+def quantile(values: Tensor, share: float) -> float:
+    """Quantile of values [n] at the nearest rank, without interpolation; NaN if there are no values."""
+    return float(values.sort().values[round(share * (len(values) - 1))]) if len(values) else math.nan
 
 
 def drawn_track(log: Log) -> Any:
@@ -258,24 +217,13 @@ def drawn_track(log: Log) -> Any:
         for axes in (upper, lower):
             axes.text(0.5, 0.5, "no pose", transform=axes.transAxes, ha="center", va="center", color="0.4")
             axes.set_yticks([])
-    for axis, name in enumerate("xyz"):
-        middle = torch.tensor(log.tips, dtype=torch.float64)[:, axis]
-        offset = 1e3 * (middle - middle.nanmedian())
-        upper.plot(seconds, offset.tolist(), ".-", linewidth=0.8, markersize=size, label=name)
-    upper.set_ylabel("tip from its median (mm)")
+    tips = torch.tensor(log.tips, dtype=torch.float64)
+    for name, offsets in zip("xyz", (1e3 * (tips - tips.nanmedian(0).values)).T.tolist(), strict=True):
+        upper.plot(seconds, offsets, ".-", linewidth=0.8, markersize=size, label=name)
     upper.legend(ncols=3)
-    upper.grid(alpha=0.3)
     lower.plot(seconds, [1e3 * value for value in log.deviations], ".", markersize=size)
-    lower.set_ylabel("sd of the tip (mm)")
     lower.set_xlabel("time (s)")
-    lower.grid(alpha=0.3)
+    for axes, label in ((upper, "tip from its median (mm)"), (lower, "sd of the tip (mm)")):
+        axes.set_ylabel(label)
+        axes.grid(alpha=0.3)
     return drawn
-
-
-def _png(drawn: Any) -> bytes:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    FigureCanvasAgg(drawn)
-    data = io.BytesIO()
-    drawn.savefig(data, format="png", dpi=100)
-    return data.getvalue()

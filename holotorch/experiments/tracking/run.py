@@ -5,15 +5,14 @@ import io
 import math
 import shutil
 import sys
-import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 from holotorch.experiments.config.errors import ConfigError
@@ -21,13 +20,14 @@ from holotorch.experiments.runs.folder import RunFolder, conclude
 from holotorch.experiments.runs.plan import RunPlan
 from holotorch.experiments.runs.saving import Results
 from holotorch.experiments.runs.signals import deferred
+from holotorch.experiments.timing import timed
 from holotorch.experiments.tracking.config import SYNTHETIC, TrackSettings
 from holotorch.experiments.tracking.report import COLUMNS, Log, Tracked, row, save_figure, summarise, verdict
 from holotorch.experiments.tracking.source import Tracker, TrackingInputs, open_inputs
 from holotorch.experiments.tracking.synthetic import compared, errors, frame_size, read_truth, write_synthetic
 from holotorch.io.files import append, replacing, write_bytes
 from holotorch.io.recording import Recorder, free_bytes, recording_bytes
-from holotorch.io.video import Frame, Frames, replacing_video
+from holotorch.io.video import Frame, replacing_video
 from holotorch.tracking import Pose, Status
 from holotorch.tracking.pose.overlay import overlay
 from holotorch.tracking.streaming.packet import now
@@ -36,10 +36,11 @@ Entered = TypeVar("Entered")
 
 
 def follow(frames: Iterable[Frame], tracker: Tracker) -> Iterator[Tracked]:
-    """Track frame by frame. The tracker gets the previous frame's pose, or None if that frame was refused.
+    """Track frame by frame.
 
-    ``tracker`` is called as ``tracker(frames [1, 3, H, W], previous)``. If it has a dict ``times``, this gives the
-    seconds of each stage of its last call.
+    The tracker is called as ``tracker(frames [1, 3, H, W], previous)``, where ``previous`` holds the pose of the
+    previous frame, or is None if that frame was refused. A tracker may have a dict ``times``, the seconds of each stage
+    of its last call.
     """
     previous: list[Pose] | None = None
     for number, frame in enumerate(frames):
@@ -47,9 +48,7 @@ def follow(frames: Iterable[Frame], tracker: Tracker) -> Iterator[Tracked]:
             previous = None
             yield Tracked(number, frame, Pose.refused(Status.BAD_FRAME, frame.problem), 0.0, {})
             continue
-        started = time.perf_counter()
-        pose = tracker(frame.pixels[None], previous)[0]
-        seconds = time.perf_counter() - started
+        (pose,), seconds = timed(partial(tracker, frame.pixels[None], previous))
         previous = [pose] if pose.answered else None
         yield Tracked(number, frame, pose, seconds, dict(getattr(tracker, "times", {})))
 
@@ -57,10 +56,10 @@ def follow(frames: Iterable[Frame], tracker: Tracker) -> Iterator[Tracked]:
 def live(
     sources: Sequence[str], camera: Path | None, catheter: Path | None, rate: float | None = None
 ) -> Iterator[tuple[float, Pose]]:
-    """Yield the capture time and the pose of each frame of one source; times are on the clock of ``packet.now``.
+    """Yield the capture time, in seconds of the clock ``packet.now``, and the pose of each frame of one source.
 
-    For a file, a capture time is the time at which the frame is due at the pace of its time stamps, which may be in the
-    future. The source and its files are opened and checked by the call; frames are read when the poses are requested.
+    For a file, the capture time is the time at which the frame is due at the pace of its time stamps, which may be in
+    the future. The call opens and checks the source and its files; frames are read when poses are requested.
     """
     if len(sources) != 1:
         raise ConfigError([f"expected one source to track and stream, got {len(sources)}"])
@@ -74,7 +73,7 @@ def _live(inputs: TrackingInputs) -> Iterator[tuple[float, Pose]]:
         printed, start = len(frames.notes), None
         for item in follow(frames, inputs.tracker):
             start = now() - item.frame.seconds if start is None else start
-            # The camera captured the frame before the tracker began.
+            # A camera captured the frame before the tracker began.
             yield (now() - item.seconds if frames.live else start + item.frame.seconds), item.pose
         for note in frames.notes[printed:]:
             print(note, flush=True)
@@ -82,17 +81,11 @@ def _live(inputs: TrackingInputs) -> Iterator[tuple[float, Pose]]:
 
 @dataclass(frozen=True, eq=False)
 class TrackingExperiment:
-    """A configuration with its source.
-
-    Attributes:
-        settings: The configuration.
-        inputs: Source, camera, catheter and tracker; None for a synthetic source, which the run renders first.
-        truth: True tips in metres by frame number; empty if they are unknown.
-    """
+    """A configuration with its source."""
 
     settings: TrackSettings
-    inputs: TrackingInputs | None
-    truth: dict[str, list[float]]
+    inputs: TrackingInputs | None  # None for a synthetic source, which the run renders first
+    truth: dict[str, list[float]]  # true tips in metres by frame number; empty if they are unknown
 
 
 def build_tracking(settings: TrackSettings) -> TrackingExperiment:
@@ -104,19 +97,24 @@ def build_tracking(settings: TrackSettings) -> TrackingExperiment:
     if settings.source == SYNTHETIC:
         return TrackingExperiment(settings, None, {})
     truth = read_truth(Path(settings.source))
-    return TrackingExperiment(settings, _opened(settings, settings.source), truth)
+    return TrackingExperiment(settings, _open(settings, settings.source), truth)
 
 
-def _opened(settings: TrackSettings, source: str | Path) -> TrackingInputs:
-    camera, catheter = _path(settings.camera), _path(settings.catheter)
-    return open_inputs(source, camera, catheter, settings.method, settings.rate_hz)
+def _open(settings: TrackSettings, source: str | Path) -> TrackingInputs:
+    return open_inputs(source, *_files(settings), settings.method, settings.rate_hz)
+
+
+def _files(settings: TrackSettings) -> tuple[Path | None, Path | None]:
+    """Files of the camera and the catheter."""
+    camera, catheter = (Path(name) if name else None for name in (settings.camera, settings.catheter))
+    return camera, catheter
 
 
 def plan_tracking(experiment: TrackingExperiment) -> RunPlan:
     """Describe the source, and the disk space that a recording of it needs."""
     settings = experiment.settings
     if experiment.inputs is None:
-        height, width = frame_size(_path(settings.camera))
+        height, width = frame_size(_files(settings)[0])
         gigabytes = recording_bytes((height, width), settings.frames) / 1e9
         size = f"{width} x {height} px, {gigabytes:.2f} GB"
         return RunPlan(f"Source     synthetic: {settings.frames} frames are rendered first, {size}")
@@ -126,20 +124,12 @@ def plan_tracking(experiment: TrackingExperiment) -> RunPlan:
     count = "without end; Ctrl-C ends it" if frames.live else count
     lines = [f"Source     {frames.name}: {width} x {height} px, {frames.rate:g} per second, {count}"]
     if settings.record:
-        free = free_bytes(Path())
-        if frames.total is None:
-            rate = recording_bytes(frames.shape, 1) * frames.rate
-            lines.append(
-                f"Recording  {rate / 1e6:.1f} MB per second; {free / 1e9:.1f} GB free here, {free / rate:.0f} s"
-            )
-        else:
-            size = recording_bytes(frames.shape, frames.total)
-            lines.append(f"Recording  {size / 1e9:.3f} GB; {free / 1e9:.1f} GB free here")
+        free, rate = free_bytes(Path()), recording_bytes(frames.shape, 1) * frames.rate
+        text = f"{rate / 1e6:.1f} MB per second; {free / 1e9:.1f} GB free here, {free / rate:.0f} s"
+        if frames.total is not None:
+            text = f"{recording_bytes(frames.shape, frames.total) / 1e9:.3f} GB; {free / 1e9:.1f} GB free here"
+        lines.append(f"Recording  {text}")
     return RunPlan("\n".join([*lines, *frames.notes]))
-
-
-def _path(name: str | None) -> Path | None:
-    return Path(name) if name else None
 
 
 def run_tracking(experiment: TrackingExperiment, folder: RunFolder) -> bool:
@@ -158,9 +148,9 @@ def run_tracking(experiment: TrackingExperiment, folder: RunFolder) -> bool:
     if experiment.inputs is not None:
         return _tracked(experiment, experiment.inputs, folder)
     settings = experiment.settings
-    camera, catheter = _path(settings.camera), _path(settings.catheter)
+    camera, catheter = _files(settings)
     recording = write_synthetic(folder.path / SYNTHETIC, settings.frames, camera=camera, catheter=catheter)
-    inputs = _opened(settings, recording)
+    inputs = _open(settings, recording)
     return _tracked(TrackingExperiment(settings, inputs, read_truth(recording)), inputs, folder)
 
 
@@ -168,26 +158,25 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
     folder, settings, frames = run.path, experiment.settings, inputs.frames
     log, results, failure = Log(folder / "images"), Results(), None
     printed = len(frames.notes)
-    if settings.record:
-        _check_room(folder, frames)
-    parts: list[ExitStack] = []  # each part is closed even if closing another one fails
-    parts.append(ExitStack())
-    parts[0].enter_context(frames)
+    size, free = recording_bytes(frames.shape, frames.total or 0), free_bytes(folder)
+    if settings.record and size > free:
+        raise ConfigError([f"the recording takes {size / 1e9:.2f} GB and {free / 1e9:.2f} GB are free; choose --out"])
+    opened: list[AbstractContextManager[Any]] = [frames]
     try:
-        _track_all(inputs, settings, run, log, parts)
+        _track_all(inputs, settings, run, log, opened)
     except KeyboardInterrupt:
         pass
     except Exception as error:  # it is raised again after the poses before it are saved
         failure = error
     with deferred(run.pressed):
-        for part in reversed(parts):
+        for each in reversed(opened):  # each is closed as after a success, even if closing another one fails
             try:
-                part.close()
+                each.__exit__(None, None, None)
             except OSError as error:
                 failure = failure or error
         if not log.statuses:
             if not _holds_frames(folder):
-                shutil.rmtree(folder)  # it belongs to this run alone and contains no frame or pose
+                shutil.rmtree(folder)  # created by this run, and without a frame or pose
                 raise failure or KeyboardInterrupt
             print(f"no frame was tracked to its end; what there is of the first is in {folder}", file=sys.stderr)
             if failure is not None:
@@ -199,7 +188,7 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
         if failure is not None:
             summary["failure"] = f"{type(failure).__name__}: {failure}"
         lines = [verdict(summary), *summary["notes"][printed:], *([compared(comparison)] if comparison else [])]
-        print("\n".join(lines), flush=True)
+        print(*lines, sep="\n", flush=True)
         results.write(save_figure, folder, log)
         if failure is not None:
             results.failure = None  # only the first failure is reported
@@ -211,25 +200,35 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
 
 
 def _track_all(
-    inputs: TrackingInputs, settings: TrackSettings, run: RunFolder, log: Log, parts: list[ExitStack]
+    inputs: TrackingInputs, settings: TrackSettings, run: RunFolder, log: Log, opened: list[AbstractContextManager[Any]]
 ) -> None:
-    """Track all frames and write the results until a signal arrives. Opened files are appended to ``parts``."""
+    """Track all frames and write the results until a signal arrives; the files it opens are appended to ``opened``."""
     folder, frames = run.path, inputs.frames
+
+    def entered(context: AbstractContextManager[Entered]) -> Entered:
+        value = context.__enter__()
+        opened.append(context)
+        return value
+
     for name, path in inputs.paths.items():
         write_bytes(folder / name, path.read_bytes())
-    table = _entered(parts, replacing(folder / "poses.csv", buffering=0))
+    table = entered(replacing(folder / "poses.csv", buffering=0))
     _append(table, COLUMNS)
     movie, source = None, iter(frames)
     if settings.video:
-        movie = _entered(parts, replacing_video(folder / "overlay.mp4", frames.shape, frames.rate))
+        movie = entered(replacing_video(folder / "overlay.mp4", frames.shape, frames.rate))
     if settings.record:
         recorder = Recorder(folder / "recording", frames.shape, frames.rate, frames.name, inputs.paths)
-        source = _recorded(source, _entered(parts, recorder), run.pressed)
-    bar = _entered(parts, tqdm(total=frames.total, unit="frame", desc="tracking", dynamic_ncols=True))
+        source = _recorded(source, entered(recorder), run.pressed)
+    bar = entered(tqdm(total=frames.total, unit="frame", desc="tracking", dynamic_ncols=True))
     for item in follow(source, inputs.tracker):
         with deferred(run.pressed):
             _append(table, row(item))
-            drawn = _drawn(item, inputs) if movie or log.wants(item) else None
+            drawn = None
+            if movie or log.wants(item):
+                black = torch.zeros(3, *frames.shape, dtype=torch.uint8)
+                pixels = black if item.frame.pixels is None else item.frame.pixels
+                drawn = overlay(pixels, item.pose, inputs.camera, inputs.catheter)
             if movie and drawn is not None:
                 movie.write(drawn)
             log.take(item, drawn)
@@ -239,32 +238,12 @@ def _track_all(
             break
 
 
-def _check_room(folder: Path, frames: Frames) -> None:
-    """Raise ConfigError if the disk has too little space for a recording of all frames."""
-    size, free = recording_bytes(frames.shape, frames.total or 0), free_bytes(folder)
-    if size > free:
-        raise ConfigError([f"the recording takes {size / 1e9:.2f} GB and {free / 1e9:.2f} GB are free; choose --out"])
-
-
-def _entered(parts: list[ExitStack], context: AbstractContextManager[Entered]) -> Entered:
-    """Enter a context manager and append it to ``parts``, which closes each entry separately."""
-    parts.append(ExitStack())
-    return parts[-1].enter_context(context)
-
-
 def _recorded(frames: Iterator[Frame], recorder: Recorder, pressed: list[int]) -> Iterator[Frame]:
     """Record each frame and then yield it."""
     for frame in frames:
         with deferred(pressed):
             recorder.write(frame)
         yield frame
-
-
-def _drawn(item: Tracked, inputs: TrackingInputs) -> Tensor:
-    pixels = item.frame.pixels
-    if pixels is None:
-        pixels = torch.zeros(3, *inputs.frames.shape, dtype=torch.uint8)
-    return overlay(pixels, item.pose, inputs.camera, inputs.catheter)
 
 
 def _append(table: IO[bytes], cells: Sequence[str]) -> None:

@@ -7,23 +7,16 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from holotorch.experiments.config.errors import ConfigError
-from holotorch.experiments.tracking.devices import (
-    CameraSettings,
-    build_camera,
-    build_catheter,
-    load_camera,
-    load_catheter,
-    misfit,
-)
+from holotorch.experiments.tracking import devices
 from holotorch.io.bundled import find_config
 from holotorch.io.recording import is_recording, open_recording
 from holotorch.io.video import Frames, is_camera, no_such_source, open_frames
-from holotorch.tracking import Camera, Catheter, Pose
+from holotorch.tracking import Camera, Catheter, CatheterTracker, ChannelOrder, Pose, ThesisTracker
 from holotorch.tracking.camera.calibration import SURE
-from holotorch.tracking.detection.channels import ChannelOrder, ambiguities, ambiguity_text
+from holotorch.tracking.detection.channels import ambiguities, ambiguity_text
 
-# Largest distance of a principal point from the centre, as a share of the side. Intrinsics for 1080 rows that are used
-# for 720 rows, or vice versa, lead to a sixth or more.
+# Largest distance of a principal point from the centre of the frame, as a share of the frame's side. For frames of 720
+# rows and a camera calibrated for 1080 rows, or vice versa, the distance is a sixth or more.
 _OFF_CENTRE = 0.15
 Tracker = Callable[[Tensor, Sequence[Pose] | None], list[Pose]]
 
@@ -57,24 +50,24 @@ def open_inputs(
         ConfigError: An input cannot be used, or the inputs do not fit together.
     """
     replayed = _is_replay(source)
-    files = {"camera.yaml": camera, "catheter.yaml": catheter}
-    for name in files:
-        if files[name] is None and replayed and (Path(source) / name).is_file():
-            files[name] = Path(source) / name
-    missing = [
-        f"no {name}: say which with --{name[:-5]}, or {name[:-5]}: in a configuration"
-        for name, path in files.items()
-        if path is None
-    ]
+    paths: dict[str, Path] = {}
+    missing: list[str] = []
+    for name, path in (("camera", camera), ("catheter", catheter)):
+        beside = Path(source) / f"{name}.yaml"
+        if path is not None:
+            paths[f"{name}.yaml"] = find_config(path) or path
+        elif replayed and beside.is_file():
+            paths[f"{name}.yaml"] = beside
+        else:
+            missing.append(f"no {name}.yaml: say which with --{name}, or {name}: in a configuration")
     if missing:
         raise ConfigError(missing)
-    paths = {name: find_config(path) or path for name, path in files.items() if path is not None}
     lens, tool = _loaded(paths)
-    model = build_camera(lens)
+    model = devices.build_camera(lens)
     try:
         tracker = make_tracker(method, model, tool)
     except ValueError as error:
-        raise misfit(paths["catheter.yaml"], error) from None
+        raise devices.misfit(paths["catheter.yaml"], error) from None
     try:
         frames = open_recording(Path(source)) if replayed else open_frames(source, rate)
     except ValueError as error:
@@ -103,55 +96,37 @@ def _is_replay(source: str | Path) -> bool:
     return False
 
 
-def _loaded(paths: dict[str, Path]) -> tuple[CameraSettings, Catheter]:
+def _loaded(paths: dict[str, Path]) -> tuple[devices.CameraSettings, Catheter]:
     """Load the camera and the catheter. ConfigError lists the mistakes of both files."""
     mistakes: list[str] = []
     loaded: list[Any] = []
-    for load, name in ((load_camera, "camera.yaml"), (load_catheter, "catheter.yaml")):
+    for load, name in ((devices.load_camera, "camera.yaml"), (devices.load_catheter, "catheter.yaml")):
         try:
             loaded.append(load(paths[name]))
         except ConfigError as error:
             mistakes += error.mistakes
     if mistakes:
         raise ConfigError(mistakes)
-    return loaded[0], build_catheter(loaded[1])
+    return loaded[0], devices.build_catheter(loaded[1])
 
 
 def make_tracker(method: str, camera: Camera, catheter: Catheter) -> Tracker:
     """Create the tracker for a method. ValueError for a catheter whose colours it cannot distinguish."""
     if method == "thesis":
-        from holotorch.tracking.thesis.tracker import ThesisTracker
-
-        return _Cold(ThesisTracker(camera, catheter))
-    from holotorch.tracking.detection.tracker import CatheterTracker
-
+        return ThesisTracker(camera, catheter)
     return CatheterTracker(camera, catheter, channels=ChannelOrder.RGB)  # all sources deliver RGB
 
 
-class _Cold:
-    """Adapter for a tracker that does not use previous poses."""
-
-    def __init__(self, tracker: Callable[[Tensor], list[Pose]]):
-        self._tracker = tracker
-
-    def __call__(self, frames: Tensor, previous: Sequence[Pose] | None = None) -> list[Pose]:
-        return self._tracker(frames)
-
-    @property
-    def times(self) -> dict[str, float]:
-        return getattr(self._tracker, "times", {})
-
-
-def _check_intrinsics(lens: CameraSettings, frames: Frames) -> None:
-    """Check that the intrinsics belong to these frames.
+def _check_intrinsics(lens: devices.CameraSettings, frames: Frames) -> None:
+    """Check that the intrinsics belong to these frames, since wrong ones give wrong poses that look plausible.
 
     Raises ConfigError for another frame size, and adds a note for a principal point far from the centre or an uncertain
-    focal length. Such intrinsics give wrong poses that look plausible.
+    focal length.
     """
     height, width = frames.shape
     if lens.size is not None and tuple(lens.size) != frames.shape:
-        held = f"{lens.size[1]} x {lens.size[0]}"
-        raise ConfigError([f"the camera's file holds for frames of {held} px, and these have {width} x {height} px"])
+        size = f"{lens.size[1]} x {lens.size[0]}"
+        raise ConfigError([f"the camera's file holds for frames of {size} px, and these have {width} x {height} px"])
     if lens.size is None and max(abs(lens.cx / width - 0.5), abs(lens.cy / height - 0.5)) > _OFF_CENTRE:
         frames.notes.append(
             f"the principal point ({lens.cx:.0f}, {lens.cy:.0f}) is far from the middle of frames of {width} x "

@@ -1,9 +1,9 @@
 """A synthetic recording of a catheter that moves over a drape, with its true poses."""
 
 import csv
-import io
 import math
 import shutil
+import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -13,16 +13,10 @@ from tqdm import tqdm
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.runs.folder import claim
-from holotorch.experiments.tracking.devices import (
-    build_camera,
-    build_catheter,
-    load_camera,
-    load_catheter,
-    save_camera,
-    save_catheter,
-)
+from holotorch.experiments.runs.tables import write_table
+from holotorch.experiments.tracking import devices
+from holotorch.experiments.tracking.report import COLUMNS, quantile
 from holotorch.io.bundled import find_config
-from holotorch.io.files import write_text
 from holotorch.io.recording import Recorder, is_recording
 from holotorch.io.video import Frame
 from holotorch.tracking.evaluation.protocols import coverage
@@ -32,11 +26,9 @@ from holotorch.tracking.simulation.world import World, synthetic_camera
 
 RATE = 30.0  # frames per second
 _SIZE = (1080, 1920)  # (H, W) for a camera without a frame size
-_TIP = ("tip_x_m", "tip_y_m", "tip_z_m")
-_COVARIANCE = ("cov_xx_m2", "cov_xy_m2", "cov_xz_m2", "cov_yy_m2", "cov_yz_m2", "cov_zz_m2")
-_SHARES = {"median": 0.5, "p95": 0.95, "worst": 1.0}
+_TIP, _COVARIANCE = COLUMNS[5:8], COLUMNS[11:17]
+_TRUTH = ("frame", "time_s", *COLUMNS[5:11])  # columns of truth.csv
 _WRONG = 5.0  # mm: error above which a pose counts as wrong
-_COLUMNS = ("frame", "time_s", *_TIP, "direction_x", "direction_y", "direction_z")
 
 
 def write_synthetic(
@@ -61,25 +53,26 @@ def write_synthetic(
     Raises:
         ConfigError: A file cannot be used, the folder is in use, or the catheter would not be in front of the camera.
     """
-    lens = None if camera is None else load_camera(find_config(camera) or camera)
-    tool = THESIS if catheter is None else build_catheter(load_catheter(find_config(catheter) or catheter))
-    size = (lens and lens.size) or size
-    seen = synthetic_camera(size) if lens is None else build_camera(lens)
+    settings = None if camera is None else devices.load_camera(find_config(camera) or camera)
+    tool = THESIS
+    if catheter is not None:
+        tool = devices.build_catheter(devices.load_catheter(find_config(catheter) or catheter))
+    size = (settings and settings.size) or size
+    model = synthetic_camera(size) if settings is None else devices.build_camera(settings)
     folder = claim(out, "synthetic")
     try:
-        _render(folder, frames, World(size=size, camera=seen, catheter=tool))
-    except ValueError as error:
-        shutil.rmtree(folder)
-        raise ConfigError([f"this catheter cannot be rendered with this camera: {error}"]) from None
-    except BaseException:
-        shutil.rmtree(folder)  # it was empty when this function began
+        _render(folder, frames, World(size=size, camera=model, catheter=tool))
+    except BaseException as error:
+        shutil.rmtree(folder)  # it was empty before
+        if isinstance(error, ValueError):
+            raise ConfigError([f"this catheter cannot be rendered with this camera: {error}"]) from None
         raise
     return folder
 
 
 def frame_size(camera: Path | None) -> tuple[int, int]:
     """(H, W) of the frames that :func:`write_synthetic` renders for a camera. ConfigError for an invalid file."""
-    return (None if camera is None else load_camera(find_config(camera) or camera).size) or _SIZE
+    return (None if camera is None else devices.load_camera(find_config(camera) or camera).size) or _SIZE
 
 
 def _render(folder: Path, frames: int, world: World) -> None:
@@ -88,35 +81,26 @@ def _render(folder: Path, frames: int, world: World) -> None:
     size, tool = world.size, world.catheter
     cloth = drape(size, 0, (70, 120, 130))
     scale = float(world.camera.matrix[0, 0]) / 1400  # the finger's sizes below are for fx = 1400 px
-    across = (tool.edges[0] + tool.edges[-1]) / 2
-    table = io.StringIO()
-    rows = csv.writer(table, lineterminator="\n")
-    rows.writerow(_COLUMNS)
-    own = folder.with_name(f".{folder.name}.parts")
-    own.mkdir(exist_ok=True)
-    try:
-        save_camera(own / "camera.yaml", world.camera, size)
-        save_catheter(own / "catheter.yaml", world.catheter)
-        copies = {name: own / name for name in ("camera.yaml", "catheter.yaml")}
+    middle = (tool.edges[0] + tool.edges[-1]) / 2  # metres from the tip
+    rows = []
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as temporary:
+        copies = {name: Path(temporary, name) for name in ("camera.yaml", "catheter.yaml")}
+        devices.save_camera(copies["camera.yaml"], world.camera, size)
+        devices.save_catheter(copies["catheter.yaml"], tool)
         with Recorder(folder, size, RATE, "synthetic", copies) as recorder:
             for i in tqdm(range(frames), desc="rendering", unit="frame"):
-                turn = 2 * math.pi * i / 45
-                at = (0.05 * math.sin(turn), 0.03 * math.cos(turn))
-                tip, along = world.pose(0.5 + 0.03 * math.sin(turn), math.radians(15 + 8 * math.cos(turn)), 0.4, at)
-                middle = world.camera.project((tip + across * along)[None])[0]
+                phase = 2 * math.pi * i / 45
+                at = (0.05 * math.sin(phase), 0.03 * math.cos(phase))
+                tip, along = world.pose(0.5 + 0.03 * math.sin(phase), math.radians(15 + 8 * math.cos(phase)), 0.4, at)
+                x, y = world.camera.project((tip + middle * along)[None])[0].tolist()
                 # A finger covers the middle of the bands in 10 of 45 frames.
-                covers = 20 <= i % 45 < 30
-                start = (float(middle[0]), float(middle[1]) - 260 * scale)
-                end = (float(middle[0]), float(middle[1]) + 14 * scale)
-                fingers = finger(start, end, 16 * scale, SKIN) if covers else ()
+                covered = 20 <= i % 45 < 30
+                fingers = finger((x, y - 260 * scale), (x, y + 14 * scale), 16 * scale, SKIN) if covered else ()
                 case = world.case(f"synthetic {i}", (tip, along), lambda: cloth, occluders=tuple(fingers))
                 recorder.write(Frame(i / RATE, case.frame()))
-                rows.writerow([i, f"{i / RATE:.6f}", *(f"{value:.9f}" for value in torch.cat([tip, along]).tolist())])
-    finally:
-        for path in own.iterdir():
-            path.unlink()
-        own.rmdir()
-    write_text(folder / "truth.csv", table.getvalue())
+                numbers = [f"{value:.9f}" for value in torch.cat([tip, along]).tolist()]
+                rows.append(dict(zip(_TRUTH, (i, f"{i / RATE:.6f}", *numbers), strict=True)))
+    write_table(folder / "truth.csv", rows)
 
 
 def read_truth(folder: Path) -> dict[str, list[float]]:
@@ -155,7 +139,7 @@ def read_truth(folder: Path) -> dict[str, list[float]]:
 
 
 def errors(poses: Path, true: Mapping[str, Sequence[float]]) -> dict[str, float]:
-    """Statistics of the distances from the tips in a poses.csv to the truth, as JSON values; empty without a truth.
+    """Statistics of the distances from the tips in a poses.csv to the true tips, as JSON values; empty without truth.
 
     ``true`` is a result of :func:`read_truth`. Keys ending in ``_mm`` are quantiles of the distances in millimetres,
     ``coverage`` is the share of poses whose 95 % ellipsoid contains the truth, and ``wrong`` the number of poses with
@@ -169,20 +153,17 @@ def errors(poses: Path, true: Mapping[str, Sequence[float]]) -> dict[str, float]
     statistics: dict[str, float] = {"frames": len(rows), "refused": len(known) - len(rows)}
     if not rows:
         return statistics
-    tips, true_tips = (
-        torch.tensor([[float(value) for value in values] for values in part], dtype=torch.float64)
-        for part in ([[row[name] for name in _TIP] for row in rows], [true[row["frame"]] for row in rows])
-    )
-    distances = (1e3 * (tips - true_tips).norm(dim=-1)).sort().values
-    last = len(distances) - 1
-    statistics |= {f"{name}_mm": float(distances[round(share * last)]) for name, share in _SHARES.items()}
+    tips = torch.tensor([[float(row[name]) for name in _TIP] for row in rows], dtype=torch.float64)
+    true_tips = torch.tensor([true[row["frame"]] for row in rows], dtype=torch.float64)
+    distances = 1e3 * (tips - true_tips).norm(dim=-1)
+    for name, share in (("median", 0.5), ("p95", 0.95), ("worst", 1.0)):
+        statistics[f"{name}_mm"] = quantile(distances, share)
     statistics["wrong"] = int((distances > _WRONG).sum())
     if all(rows[0].get(name) for name in _COVARIANCE):
         upper = torch.tensor([[float(row[name]) for name in _COVARIANCE] for row in rows], dtype=torch.float64)
         with suppress(ValueError):  # a singular covariance has no ellipsoid
-            statistics["coverage"] = coverage(tips, upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3), true_tips)[
-                0
-            ]
+            covariance = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+            statistics["coverage"] = coverage(tips, covariance, true_tips)[0]
     return statistics
 
 

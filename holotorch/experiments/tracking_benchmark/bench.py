@@ -19,27 +19,18 @@ from holotorch.tracking.simulation.world import World
 
 Row = dict[str, Any]
 
-# Goals for S_RMS (Eq. 3.13, change of a resting tip from frame to frame) in mm, for poses given by distance in mm and
-# tilt in degrees. None marks poses that have a goal for the efficiency instead.
-STILL: dict[tuple[int, int], float | None] = {
-    (450, 20): 0.05,
-    (520, 5): 0.12,
-    (700, 30): 1.1,
-    (350, 20): None,
-    (520, 0): None,
-    (520, 20): None,
-}
+# Poses of catheters at rest, by distance in mm and tilt in degrees. The first three have a goal for S_RMS in mm (Eq.
+# 3.13, change of a resting tip from frame to frame). The others (None) have a goal for the efficiency.
+STILL: dict[tuple[int, int], float | None] = {(450, 20): 0.05, (520, 5): 0.12, (700, 30): 1.1}
+STILL |= dict.fromkeys([(350, 20), (520, 0), (520, 20)])
 # Point of the catheter that lies at the distance given in ``STILL``, in metres from the tip; None is the middle of the
 # bands. The goals refer to the tip. Tilt brings the bands nearer to the camera than the tip, so that the choice changes
 # S_RMS by up to a half.
 TIP, MIDDLE = "tip", "middle of the bands"
 POINTS: dict[str, float | None] = {TIP: 0.0, MIDDLE: None}
-_CODECS: dict[str, dict[str, Any]] = {
-    "none": {},
-    "video 4:2:0": {"video": True},
-    "JPEG 95, 4:2:0": {"jpeg_quality": 95},
-    "JPEG 75, 4:2:0": {"jpeg_quality": 75},
-}
+# Changes of a world's ``Look`` for each codec, and for each light.
+_CODECS: dict[str, dict[str, Any]] = {"none": {}, "video 4:2:0": {"video": True}}
+_CODECS |= {f"JPEG {quality}, 4:2:0": {"jpeg_quality": quality} for quality in (95, 75)}
 _LIGHTS: dict[str, dict[str, Any]] = {
     "as everywhere here": {},
     "even, without gloss": {"ambient": 1.0, "highlight": 0.0},
@@ -47,17 +38,17 @@ _LIGHTS: dict[str, dict[str, Any]] = {
     "half of it": {"gain": 0.5},
     "a quarter of it": {"gain": 0.25},
 }
-_PLACES = 5  # positions of a catheter at rest, less than a pixel apart
+_POSITIONS = 5  # positions of a catheter at rest, less than a pixel apart
+_INVISIBLE = {Status.NO_CATHETER, Status.BANDS_MISSING, Status.NO_AXIS}
 # Statuses that count as correct reasons for refusing a scene that cannot be answered, by the beginning of its name.
-_UNSEEN = frozenset({Status.NO_CATHETER, Status.BANDS_MISSING, Status.NO_AXIS})
-_SAYS: dict[str, frozenset[Status]] = {
-    "motion across": _UNSEEN | {Status.TOO_NARROW, Status.EDGES_UNCLEAR, Status.INCONSISTENT},
-    "tilt": frozenset({Status.UNCERTAIN, Status.EDGES_UNCLEAR, Status.TOO_NARROW}),
-    "1200 mm away": frozenset({Status.TOO_NARROW, Status.UNCERTAIN}),
-    "rear out": frozenset({Status.OUT_OF_FRAME, Status.BANDS_MISSING}),
-    "tip out": frozenset({Status.OUT_OF_FRAME, Status.BANDS_MISSING}),
-    "line of sight": _UNSEEN,
-    "over": frozenset({Status.BANDS_MISSING, Status.EDGES_UNCLEAR}),
+_FITTING: dict[str, set[Status]] = {
+    "motion across": _INVISIBLE | {Status.TOO_NARROW, Status.EDGES_UNCLEAR, Status.INCONSISTENT},
+    "tilt": {Status.UNCERTAIN, Status.EDGES_UNCLEAR, Status.TOO_NARROW},
+    "1200 mm away": {Status.TOO_NARROW, Status.UNCERTAIN},
+    "rear out": {Status.OUT_OF_FRAME, Status.BANDS_MISSING},
+    "tip out": {Status.OUT_OF_FRAME, Status.BANDS_MISSING},
+    "line of sight": _INVISIBLE,
+    "over": {Status.BANDS_MISSING, Status.EDGES_UNCLEAR},
 }
 
 
@@ -70,41 +61,40 @@ def still(world: World, trackers: dict[str, Method], count: int) -> tuple[list[R
     Each pose is measured at five positions less than a pixel apart. The spread of a pose is the root mean square over
     these positions, since the spread at one position depends on where edges fall between pixels, by 10 % or more.
     """
-    rows, said = [], []
+    rows, all_answers = [], []
     pixel = 1 / float(world.camera.matrix[0, 0])
-    offsets = (pixel * (torch.rand(_PLACES, 2, generator=torch.Generator().manual_seed(world.seed)) - 0.5)).tolist()
+    generator = torch.Generator().manual_seed(world.seed)
+    offsets = (pixel * (torch.rand(_POSITIONS, 2, generator=generator) - 0.5)).tolist()
     for (where, point), ((depth, tilt), goal) in product(POINTS.items(), STILL.items()):
-        place = (1e-3 * depth, math.radians(tilt))
-        pose = world.pose(*place, point=point)
-        bound, of_edges = (1e3 * math.sqrt(own.trace()) for own in tip_bounds(world, pose))
-        parts = [world.still(*place, max(2, count // _PLACES), at, point) for at in offsets]
-        found = [list(answers(part, trackers, f"still, {depth} mm, {tilt} deg")) for part in parts]
-        said += [answer for part in found for answer in part]
+        pose = (1e-3 * depth, math.radians(tilt))
+        bounds = tip_bounds(world, world.pose(*pose, point=point))
+        bound, edges_bound = (1e3 * math.sqrt(covariance.trace()) for covariance in bounds)
+        cases = [world.still(*pose, max(2, count // _POSITIONS), at, point) for at in offsets]
+        label = f"still, {depth} mm, {tilt} deg"
+        groups = [_by(answers(part, trackers, label), lambda answer: answer.method) for part in cases]
         for name in trackers:
-            groups = [[answer for answer in part if answer.method == name] for part in found]
-            own = [answer for group in groups for answer in group]
+            own = [answer for group in groups for answer in group[name]]
             row: Row = {"depth_mm": depth, "point": where, "tilt_deg": tilt, "method": name, "frames": len(own)}
-            row |= {
-                "answered": sum(answer.answered for answer in own),
-                "s_rms_mm": "",
-                "s_rms_error_mm": "",
-                "s_rms_goal_mm": goal or "",
-            }
-            row |= {"sd_mm": "", "bias_mm": "", "bound_mm": round(bound, 4), "edges_bound_mm": round(of_edges, 4)}
-            row |= {"efficiency": "", "coverage": ""}
-            known = [tips_of(g) for g in groups if any(a.answered and b.answered for a, b in pairwise(g))]
-            if known:
-                seen = [protocols.s_rms(tips) for tips in known]
-                sd, s_rms = (
-                    math.hypot(*values) / math.sqrt(len(seen))
-                    for values in ([each.sd for each in seen], [each.s_rms for each in seen])
-                )
+            row |= {"answered": sum(answer.answered for answer in own), "s_rms_mm": "", "s_rms_error_mm": ""}
+            row |= {"s_rms_goal_mm": goal or "", "sd_mm": "", "bias_mm": "", "bound_mm": round(bound, 4)}
+            row |= {"edges_bound_mm": round(edges_bound, 4), "efficiency": "", "coverage": ""}
+            stabilities = [_stability(group[name]) for group in groups]
+            if known := [stability for stability in stabilities if stability is not None]:
+                spreads = [stability.s_rms for stability in known]
+                sd = _rms([stability.sd for stability in known])
                 bias = float((tips_of(own) - truth_of(own)).nanmean(0).norm())
-                row |= {"s_rms_mm": _mm(s_rms), "s_rms_error_mm": _mm(_error([each.s_rms for each in seen]))}
+                row |= {"s_rms_mm": _mm(_rms(spreads)), "s_rms_error_mm": _mm(_error(spreads))}
                 row |= {"sd_mm": _mm(sd), "bias_mm": _mm(bias)}
                 row |= {"efficiency": round((bound / (1e3 * sd)) ** 2, 3), "coverage": covered(own)}
             rows.append(row)
-    return rows, said
+        all_answers += [answer for group in groups for own in group.values() for answer in own]
+    return rows, all_answers
+
+
+def _stability(own: list[Answer]) -> protocols.Stability | None:
+    """Stability of a resting tip; None without two consecutive poses."""
+    known = any(a.answered and b.answered for a, b in pairwise(own))
+    return protocols.s_rms(tips_of(own)) if known else None
 
 
 def grids(world: World, trackers: dict[str, Method], share: float = 1.0) -> tuple[list[Row], list[Answer]]:
@@ -114,31 +104,30 @@ def grids(world: World, trackers: dict[str, Method], share: float = 1.0) -> tupl
     """
     parts = {"2D": world.grid_2d()} | {f"3D {face}": cases for face, cases in world.grid_3d().items()}
     every = max(1, round(1 / share))
-    said = {part: list(answers(cases[::every], trackers, f"grid {part}")) for part, cases in parts.items()}
+    found = {part: list(answers(cases[::every], trackers, f"grid {part}")) for part, cases in parts.items()}
     rows = []
     for name in trackers:
-        own = {part: [answer for answer in found if answer.method == name] for part, found in said.items()}
-        faces = [_grid_row(part, name, answers_) for part, answers_ in own.items()]
-        whole = _grid_row("3D", name, [answer for part, found in own.items() if part != "2D" for answer in found])
-        seen = [row["acc_mm"] for row in faces[1:] if row["acc_mm"] != ""]
-        whole["acc_mm"] = round(sum(seen) / len(seen), 4) if seen else ""  # the mean over the faces, as in the thesis
-        rows += [*faces, whole]
-    return rows, [answer for found in said.values() for answer in found]
+        own_rows = [_grid_row(part, name, given) for part, given in found.items()]
+        whole = _grid_row("3D", name, [answer for part, given in found.items() if part != "2D" for answer in given])
+        known = [row["acc_mm"] for row in own_rows[1:] if row["acc_mm"] != ""]
+        whole["acc_mm"] = round(sum(known) / len(known), 4) if known else ""  # mean over the faces, as in the thesis
+        rows += [*own_rows, whole]
+    return rows, [answer for given in found.values() for answer in given]
 
 
 def codecs(world: World, trackers: dict[str, Method], share: float = 1.0) -> tuple[list[Row], list[Answer]]:
     """Errors on every fourth point of the 2-D grid, for frames without compression and with several codecs."""
     every = max(1, round(4 / share))
-    rows, said = [], []
+    rows, all_answers = [], []
     for codec, changes in _CODECS.items():
         cases = replace(world, look=replace(world.look, **changes)).grid_2d()[::every]
         found = list(answers(cases, trackers, codec))
         for name in trackers:
-            row = _grid_row("2D", name, [answer for answer in found if answer.method == name])
+            row = _grid_row("2D", name, found)
             kept = ("method", "points", "refused", "median_mm", "p95_mm", "worst_mm", "coverage")
             rows.append({"codec": codec} | {key: row[key] for key in kept})
-        said += found
-    return rows, said
+        all_answers += found
+    return rows, all_answers
 
 
 def lights(world: World, tracker: Method, count: int, share: float = 1.0) -> list[Row]:
@@ -150,11 +139,10 @@ def lights(world: World, tracker: Method, count: int, share: float = 1.0) -> lis
         for (depth, tilt), goal in STILL.items():
             if goal is not None:
                 cases = lit.still(1e-3 * depth, math.radians(tilt), max(2, count), point=POINTS[TIP])
-                own = list(answers(cases, {light: tracker}, f"light, {light}"))
-                known = any(a.answered and b.answered for a, b in pairwise(own))
-                row[f"s_rms_mm_{depth}_{tilt}"] = _mm(protocols.s_rms(tips_of(own)).s_rms) if known else ""
-        found = answers(lit.grid_2d()[:: max(1, round(2 / share))], {light: tracker}, f"light, {light}")
-        grid = _grid_row("2D", light, list(found))
+                stability = _stability(list(answers(cases, {light: tracker}, f"light, {light}")))
+                row[f"s_rms_mm_{depth}_{tilt}"] = _mm(stability.s_rms) if stability else ""
+        cases = lit.grid_2d()[:: max(1, round(2 / share))]
+        grid = _grid_row("2D", light, list(answers(cases, {light: tracker}, f"light, {light}")))
         rows.append(row | {key: grid[key] for key in ("points", "refused", "median_mm", "p95_mm", "coverage")})
     return rows
 
@@ -178,29 +166,18 @@ def scenes(
         cases = occlusions(world, count)
     found = list(answers(cases[:: max(1, round(1 / share))], trackers, kind))
     rows = []
-    for (name, method), own in _by(found, lambda answer: (_plain(answer.name), answer.method)).items():
+    for (name, method), own in _by(found, lambda answer: (_scene(answer.name), answer.method)).items():
         errors = sorted(answer.error for answer in own if answer.answered)
         refused = [answer for answer in own if not answer.answered]
         fitting: Any = ""
         if not own[0].answerable:
-            right = next(says for start, says in _SAYS.items() if name.startswith(start))
-            fitting = sum(answer.status in right for answer in refused)
-        rows.append(
-            {
-                "scene": name,
-                "method": method,
-                "answerable": own[0].answerable,
-                "frames": len(own),
-                "right": sum(answer.right for answer in own),
-                "wrong": sum(answer.wrong for answer in own),
-                "refused": len(refused),
-                "reason_fits": fitting,
-                "median_error_mm": _mm(errors[len(errors) // 2]) if errors else "",
-                "worst_error_mm": _mm(errors[-1]) if errors else "",
-                "statuses": count_statuses(answer.status for answer in own),
-                "reason": next((answer.reason for answer in refused), ""),
-            }
-        )
+            statuses = next(statuses for start, statuses in _FITTING.items() if name.startswith(start))
+            fitting = sum(answer.status in statuses for answer in refused)
+        row: Row = {"scene": name, "method": method, "answerable": own[0].answerable} | outcomes(own)
+        row |= {"reason_fits": fitting, "median_error_mm": _mm(errors[len(errors) // 2]) if errors else ""}
+        row |= {"worst_error_mm": _mm(errors[-1]) if errors else ""}
+        row["statuses"] = count_statuses(answer.status for answer in own)
+        rows.append(row | {"reason": next((answer.reason for answer in refused), "")})
     return rows, found
 
 
@@ -211,7 +188,7 @@ def empty(world: World, trackers: dict[str, Method], count: int) -> tuple[list[R
     """
     found = list(answers(negatives(world, count), trackers, "negatives"))
     rows = []
-    for (kind, method), own in _by(found, lambda answer: (_kind(answer.name), answer.method)).items():
+    for (kind, method), own in _by(found, lambda answer: (answer.name.split(", ")[1], answer.method)).items():
         false = [answer.name.split(",")[0].split()[-1] for answer in own if answer.answered]
         row: Row = {"kind": kind, "method": method, "frames": len(own), "false": len(false)}
         row["statuses"] = count_statuses(answer.status for answer in own)
@@ -226,11 +203,17 @@ def one(rows: list[Row], **wanted: Any) -> Row:
 
 def covered(own: Sequence[Answer]) -> float | str:
     """Share of poses whose 95 % ellipsoid contains the true tip; "" without any pose."""
-    seen = [answer for answer in own if answer.answered and answer.truth is not None]
-    if not seen:
+    known = [answer for answer in own if answer.answered and answer.truth is not None]
+    if not known:
         return ""
-    covariance = torch.tensor([answer.covariance for answer in seen], dtype=torch.float64)
-    return round(protocols.coverage(tips_of(seen), covariance, truth_of(seen))[0], 3)
+    covariance = torch.tensor([answer.covariance for answer in known], dtype=torch.float64)
+    return round(protocols.coverage(tips_of(known), covariance, truth_of(known))[0], 3)
+
+
+def outcomes(own: Sequence[Answer]) -> Row:
+    """Numbers of frames: all, right, wrong, and refused."""
+    right, wrong = sum(answer.right for answer in own), sum(answer.wrong for answer in own)
+    return {"frames": len(own), "right": right, "wrong": wrong, "refused": len(own) - sum(a.answered for a in own)}
 
 
 def count_statuses(statuses: Iterable[Status]) -> str:
@@ -238,7 +221,9 @@ def count_statuses(statuses: Iterable[Status]) -> str:
     return ", ".join(f"{status.name} {times}" for status, times in Counter(statuses).most_common())
 
 
-def _grid_row(part: str, name: str, own: list[Answer]) -> Row:
+def _grid_row(part: str, name: str, given: list[Answer]) -> Row:
+    """Errors of one method on a part of a grid."""
+    own = [answer for answer in given if answer.method == name]
     tips, truth = tips_of(own), truth_of(own)
     row: Row = {"grid": part, "method": name, "points": len(own), "refused": int(tips.isnan().any(-1).sum())}
     row |= dict.fromkeys(
@@ -250,15 +235,17 @@ def _grid_row(part: str, name: str, own: list[Answer]) -> Row:
     if len(known) >= 3:
         # The reference is the point with a pose that is nearest to the middle of the grid.
         reference = min(known, key=lambda i: abs(i - len(own) // 2))
-        seen = protocols.grid_accuracy(tips, truth, reference, truth)
-        row |= dict(zip(("median_mm", "p95_mm", "worst_mm"), map(_mm, seen.absolute), strict=True))
+        accuracy = protocols.grid_accuracy(tips, truth, reference, truth)
+        row |= dict(zip(("median_mm", "p95_mm", "worst_mm"), map(_mm, accuracy.absolute), strict=True))
+        row |= {"acc_mm": _mm(accuracy.acc)}
+        row |= dict(zip(("rigid_median_mm", "rigid_p95_mm"), map(_mm, accuracy.rigid), strict=False))
         if part == "2D":
             row["in_plane_mm"] = _mm(protocols.planar_accuracy(tips, truth[:, :2], right, down, reference).in_plane)
-        row |= {"acc_mm": _mm(seen.acc), "rigid_median_mm": _mm(seen.rigid[0]), "rigid_p95_mm": _mm(seen.rigid[1])}
     return row
 
 
 def _by(found: Iterable[Answer], key: Callable[[Answer], Any]) -> dict[Any, list[Answer]]:
+    """Answers grouped by a key, in the order in which the keys first occur."""
     groups: dict[Any, list[Answer]] = {}
     for answer in found:
         groups.setdefault(key(answer), []).append(answer)
@@ -271,13 +258,13 @@ def _seeded(world: World, i: int) -> World:
     return replace(world, photographs=tuple(images), seed=world.seed + i)
 
 
-def _plain(name: str) -> str:
-    """Name of a scene without the number of its pose; all photographs have the same name."""
+def _scene(name: str) -> str:
+    """Name of a case without the number of its pose; all photographs have the same name."""
     return "photograph" if name.startswith("photograph") else name.split(",")[0]
 
 
-def _kind(name: str) -> str:
-    return name.split(", ")[1]
+def _rms(values: list[float]) -> float:
+    return math.hypot(*values) / math.sqrt(len(values))
 
 
 def _error(values: list[float]) -> float:

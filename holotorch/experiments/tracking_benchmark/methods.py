@@ -1,9 +1,8 @@
 """The trackers to compare, and their answers to synthetic frames with exact ground truth, with the time of each."""
 
 import math
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +10,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from holotorch.experiments.timing import timed
 from holotorch.experiments.tracking_benchmark.thesis_opencv import ThesisOpenCV
 from holotorch.io.images import load_image
 from holotorch.tracking.detection.channels import ChannelOrder
@@ -32,31 +32,22 @@ class Answer(NamedTuple):
     """Answer of one method to one frame.
 
     It holds plain numbers, because thousands of small tensors between the frames would fragment the memory.
-
-    Attributes:
-        method: Name of the method.
-        name, answerable: Attributes of the case.
-        truth: True position of the tip in metres; None where the frame shows no catheter.
-        status, reason: Status and reason of the pose.
-        tip: Position of the tip in metres; NaN where refused.
-        covariance: Covariance of the tip, three rows of three, in m^2.
-        seconds: Time that the method took.
     """
 
-    method: str
-    name: str
-    answerable: bool
-    truth: list[float] | None
-    status: Status
-    reason: str
-    tip: list[float]
-    covariance: list[list[float]]
-    seconds: float
+    method: str  # name of the method
+    name: str  # of the case
+    answerable: bool  # whether the frame determines a pose
+    truth: list[float] | None  # true position [3] of the tip in metres; None if the frame shows no catheter
+    status: Status  # of the pose
+    reason: str  # of the pose
+    tip: list[float]  # [3] in metres; NaN for a refusal
+    covariance: list[list[float]]  # [3, 3] of the tip in m^2
+    seconds: float  # time that the method took
 
     @staticmethod
     def of(method: str, case: Case, pose: Pose, seconds: float) -> "Answer":
-        """Create the answer from a single pose (not a batch)."""
-        assert isinstance(pose.status, Status) and isinstance(pose.reason, str)
+        """Create the answer from a single pose, not a batch."""
+        assert isinstance(pose.status, Status)
         truth = None if case.tip is None else case.tip.tolist()
         tip, covariance = pose.tip.tolist(), pose.covariance[:3, :3].tolist()
         return Answer(method, case.name, case.answerable, truth, pose.status, pose.reason, tip, covariance, seconds)
@@ -68,7 +59,7 @@ class Answer(NamedTuple):
 
     @property
     def error(self) -> float:
-        """Error of the tip in metres; NaN where refused or without a catheter."""
+        """Error of the tip in metres; NaN for a refusal or a frame without a catheter."""
         return math.nan if self.truth is None else math.dist(self.tip, self.truth)
 
     @property
@@ -83,7 +74,7 @@ class Answer(NamedTuple):
 
 
 def photographs(folder: Path | None = None) -> tuple[Tensor, ...]:
-    """Colour photographs uint8 [3, h, w] for backgrounds: PNG and JPEG files of ``folder``, or those of scikit-image.
+    """Colour photographs uint8 [3, h, w] for backgrounds: PNG and JPEG files of ``folder``, or three of scikit-image.
 
     Raises:
         ValueError: ``folder`` holds no colour photograph.
@@ -98,9 +89,9 @@ def photographs(folder: Path | None = None) -> tuple[Tensor, ...]:
 def methods(world: World, names: Sequence[str] = (BASE, LITERAL, COLD, PRIOR, FEWER)) -> dict[str, Method]:
     """Trackers by name, each a function of one frame [3, H, W] and its case; only PRIOR uses the truth of the case."""
     camera, catheter = world.camera, world.catheter
-    thesis, ours = ThesisOpenCV(camera, catheter), CatheterTracker(camera, catheter, channels=ChannelOrder.RGB)
-    literal = ThesisOpenCV(camera, catheter, literal=True)
-    fewer = CatheterTracker(camera, catheter, channels=ChannelOrder.RGB, stations=FEWER_STATIONS)
+    thesis, literal = ThesisOpenCV(camera, catheter), ThesisOpenCV(camera, catheter, literal=True)
+    create = partial(CatheterTracker, camera, catheter, channels=ChannelOrder.RGB)
+    ours, fewer = create(), create(stations=FEWER_STATIONS)
     expected = lru_cache(maxsize=16)(before)  # cached, so that its computation does not count as time of the tracker
     known: dict[str, Method] = {
         BASE: lambda frame, _: thesis(frame[None])[0],
@@ -113,7 +104,10 @@ def methods(world: World, names: Sequence[str] = (BASE, LITERAL, COLD, PRIOR, FE
 
 
 def before(case: Case, moved: tuple[float, float, float] = (2e-3, -1.5e-3, 3e-3), turned: float = 0.01) -> Pose:
-    """Pose of the catheter 1/30 s before a case: 4 mm away (a speed of 120 mm/s) and rotated by 0.6 degrees."""
+    """Pose of the catheter 1/30 s before a case: moved by 4 mm (a speed of 120 mm/s) and rotated by 0.6 degrees.
+
+    ``moved`` is the displacement of the tip in metres, and ``turned`` is proportional to the rotation.
+    """
     if case.tip is None or case.direction is None:
         return Pose.refused(Status.NO_CATHETER, "no catheter was there")
     direction = case.direction + turned * torch.tensor([0.6, -0.6, 0.5], dtype=torch.float64)
@@ -127,9 +121,7 @@ def answers(cases: Iterable[Case], trackers: dict[str, Method], label: str = "fr
     for case in tqdm(list(cases), desc=label, unit="frame", dynamic_ncols=True):
         frame = as_camera(case.frame())
         for name, track in trackers.items():
-            started = time.perf_counter()
-            pose = track(frame, case)
-            yield Answer.of(name, case, pose, time.perf_counter() - started)
+            yield Answer.of(name, case, *timed(partial(track, frame, case)))
 
 
 def as_camera(frame: Tensor) -> Tensor:
@@ -138,7 +130,7 @@ def as_camera(frame: Tensor) -> Tensor:
 
 
 def tips_of(own: Sequence[Answer]) -> Tensor:
-    """Tips [n, 3] of answers in metres; NaN where refused."""
+    """Tips [n, 3] of answers in metres; NaN for refusals."""
     return torch.tensor([answer.tip for answer in own], dtype=torch.float64)
 
 

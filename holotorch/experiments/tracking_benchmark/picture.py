@@ -1,32 +1,33 @@
 """Figure of the chart of trackers."""
 
-import io
 import math
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from holotorch.experiments.runs.figures import figure_png
 from holotorch.experiments.tracking_benchmark.bench import STILL, TIP, Row, one
 from holotorch.experiments.tracking_benchmark.methods import BASE, COLD, FEWER, PRIOR
 
-_FALSE, _RIGHT, _REFUSED = "tab:red", "tab:green", "lightgray"
 _STYLE = {BASE: ("tab:gray", "s"), COLD: ("tab:blue", "o"), PRIOR: ("tab:green", "^"), FEWER: ("tab:orange", "v")}
 
 
 def draw(rows: list[Row], tables: dict[str, list[Row]]) -> bytes:
     """PNG of the chart: error over time, spread at rest with its bounds, and shares of right, refused and wrong."""
     figure = Figure(figsize=(14, 4.6), layout="constrained")
-    first, second, third = (figure.add_subplot(1, 3, k + 1) for k in range(3))
+    first, second, third = figure.subplots(1, 3)
     _errors(first, rows)
     _precision(second, tables["still"])
+    for axes in (first, second):
+        axes.set_title("synthetic frames")
+        axes.grid(alpha=0.3, which="both")
+        axes.legend(fontsize=7)
     _outcomes(third, tables["reliability"])
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer)
-    return buffer.getvalue()
+    return figure_png(figure)
 
 
 def _errors(axes: Axes, rows: list[Row]) -> None:
+    """Error of the tip on the grids over the time per frame: the median, and a line up to the 95th percentile."""
     for row in rows:
         if row["method"] not in _STYLE:
             continue
@@ -37,39 +38,35 @@ def _errors(axes: Axes, rows: list[Row]) -> None:
                 label = f"{row['method']}, {grid} grid"
                 axes.semilogy([row["milliseconds"]] * 2, ends, color=colour, linewidth=0.8)
                 axes.semilogy(row["milliseconds"], ends[0], marker, color=colour, markerfacecolor=fill, label=label)
+    axes.set(xlabel="milliseconds per frame, plain desk", ylabel="tip error: median, line up to p95 (mm)")
     axes.set_xlim(left=0)
-    axes.set_xlabel("milliseconds per frame, plain desk")
-    axes.set_ylabel("tip error: median, line up to p95 (mm)")
-    axes.set_title("synthetic frames")
-    axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize=7)
 
 
 def _precision(axes: Axes, rows: list[Row]) -> None:
+    """Spread of a resting tip by method and pose, with the Cramér-Rao bounds."""
     poses = list(STILL)
+
+    def column(name: str, method: str) -> list[float]:
+        own = [one(rows, depth_mm=depth, tilt_deg=tilt, point=TIP, method=method) for depth, tilt in poses]
+        return [row[name] if row[name] != "" else math.nan for row in own]
+
     for name, (colour, marker) in _STYLE.items():
-        own_rows = [one(rows, depth_mm=depth, tilt_deg=tilt, point=TIP, method=name) for depth, tilt in poses]
-        values = [row["sd_mm"] if row["sd_mm"] != "" else math.nan for row in own_rows]
-        axes.semilogy(range(len(poses)), values, marker, color=colour, label=name)
-    own = [one(rows, depth_mm=depth, tilt_deg=tilt, point=TIP, method=BASE) for depth, tilt in poses]
-    for of, colour, label in (("edges_bound_mm", "gray", ", of edges"), ("bound_mm", "black", ", of all pixels")):
-        bounds = [row[of] for row in own]
-        axes.semilogy(range(len(poses)), bounds, "_", color=colour, markersize=20, label=f"Cramér-Rao bound{label}")
+        axes.semilogy(range(len(poses)), column("sd_mm", name), marker, color=colour, label=name)
+    for name, colour, label in (("edges_bound_mm", "gray", ", of edges"), ("bound_mm", "black", ", of all pixels")):
+        label = f"Cramér-Rao bound{label}"
+        axes.semilogy(range(len(poses)), column(name, BASE), "_", color=colour, markersize=20, label=label)
     axes.set_xticks(range(len(poses)), [f"{depth} mm\n{tilt}°" for depth, tilt in poses])
     axes.set_ylim(top=8 * axes.get_ylim()[1])  # room for the legend
-    axes.set_xlabel("distance of the tip and tilt")
-    axes.set_ylabel("sd of a resting tip, unfiltered (mm)")
-    axes.set_title("synthetic frames")
-    axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize=7)
+    axes.set(xlabel="distance of the tip and tilt", ylabel="sd of a resting tip, unfiltered (mm)")
 
 
 def _outcomes(axes: Axes, rows: list[Row]) -> None:
+    """Shares of right, refused and wrong frames by kind of frame and method."""
     rows = [row for row in rows if row["frames_of"] in ("conditions", "occlusions", "negatives")]
     kinds = (
-        ("right", _RIGHT, "within 5 mm"),
-        ("refused", _REFUSED, "refused, as negatives must be"),
-        ("wrong", _FALSE, "wrong or false"),
+        ("right", "tab:green", "within 5 mm"),
+        ("refused", "lightgray", "refused, as negatives must be"),
+        ("wrong", "tab:red", "wrong or false"),
     )
     left = [0.0] * len(rows)
     for key, colour, label in kinds:

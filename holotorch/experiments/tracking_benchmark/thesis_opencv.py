@@ -8,32 +8,22 @@ from torch import Tensor
 
 from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.pose.catheter import Catheter
-from holotorch.tracking.pose.status import Pose, Refusal
+from holotorch.tracking.pose.status import Pose, Refusal, Status
 from holotorch.tracking.thesis import stages
 from holotorch.tracking.thesis.stages import Axis, Box, Endpoints, Stopwatch
 
 
 class ThesisOpenCV:
-    """The stages of ``holotorch.tracking.thesis.tracker.ThesisTracker``, with the same decisions, on 8-bit images.
+    """The stages of :class:`~holotorch.tracking.thesis.tracker.ThesisTracker` on 8-bit images, with the same decisions.
 
-    It is written to be a fair baseline: the undistortion maps are in fixed point and are computed once, all images have
-    8 bits, and filters run only within the box around the bands. Frames with the memory layout [H, W, 3], as cameras
-    deliver them, are not copied.
+    It is written to be a fair baseline: the undistortion maps are in fixed point and are computed once, and filters run
+    only within the box around the bands. Frames with the memory layout [H, W, 3], as cameras deliver them, are not
+    copied. The attributes ``times`` and ``endpoints`` and the errors are those of ThesisTracker.
 
     Args:
         camera: Camera of the frames.
         catheter: Catheter to track.
         literal: Undistort each frame by ``cv2.undistort``, which computes its maps again on every call.
-
-    Attributes:
-        times: Seconds of each stage in the last call, summed over the frames of the batch, by the names of Table 3.1.
-        endpoints: For each frame of the last call, the edges of the bands (x, y) in pixels of the undistorted frame, in
-            the catheter's order. An edge that was not found is None; the list is empty if the frame was refused before.
-
-    Raises:
-        ValueError: Hue thresholds cannot distinguish the colours of the catheter.
-
-    Source: Sec. 3.4 and Table 3.1 of the thesis, with its equations 3.5 to 3.12 corrected.
     """
 
     def __init__(self, camera: Camera, catheter: Catheter, *, literal: bool = False):
@@ -44,7 +34,7 @@ class ThesisOpenCV:
         hue = np.arange(256) * 2.0  # OpenCV's unit is 2 degrees
         self._bands = np.zeros(256, dtype=np.uint8)
         for number, middle in enumerate(windows.hues, 1):
-            self._bands[np.abs((hue - middle + 180) % 360 - 180) <= windows.reach] = number
+            self._bands[np.abs((hue - middle + 180) % 360 - 180) <= windows.tolerance] = number
         self._low = np.ceil([0, 255 * windows.saturation, 255 * windows.value])
         self._matrix = camera.matrix.detach().cpu().numpy()
         self._distortion = camera.distortion.detach().cpu().numpy()
@@ -69,14 +59,16 @@ class ThesisOpenCV:
             try:
                 poses.append(self._track(frame, watch))
             except Refusal as refused:
-                watch.lap(stages.REFUSED_AT.get(refused.status, "Get axis"))
+                from_endpoints = refused.status in (Status.EDGES_UNCLEAR, Status.INCONSISTENT)
+                watch.lap("Calculate catheter position" if from_endpoints else "Get axis")
                 poses.append(Pose.refused(refused.status, refused.reason))
-        self.times = watch.stop()
+        watch.lap("Other")
+        self.times = watch.times
         return poses
 
     def _prepare(self, size: tuple[int, int]) -> None:
         """Compute the undistortion maps for frames of this (width, height), black beyond the valid radius."""
-        if size == self._size and self._maps is not None:
+        if size == self._size:
             return
         x, y = cv2.initUndistortRectifyMap(self._matrix, self._distortion, np.eye(3), self._matrix, size, cv2.CV_32FC1)
         across = (np.arange(size[0]) - self._matrix[0, 2]) / self._matrix[0, 0]
@@ -102,7 +94,7 @@ class ThesisOpenCV:
         bands = cv2.LUT(cv2.extractChannel(hsv, 0), self._bands)
         cv2.bitwise_and(bands, coloured, bands)  # the number of the band where ``coloured`` is 255, and 0 elsewhere
         watch.lap("Color segmentation")
-        solid = cv2.erode(bands, _SQUARE)
+        solid = cv2.erode(bands, np.ones((3, 3), dtype=np.uint8))
         watch.lap("Erosion")
         axis, box = self._axis(solid, bands)
         watch.lap("Get axis")
@@ -123,49 +115,25 @@ class ThesisOpenCV:
         return pose
 
     def _axis(self, solid: np.ndarray, bands: np.ndarray) -> tuple[Axis, Box]:
-        """Fit a line to the pixels that the erosion left, without outliers. Returns the line and the pixels' box."""
-        places = cv2.findNonZero(solid)
-        stages.need_pixels(0 if places is None else len(places))
-        points = np.asarray(places, dtype=np.int32).reshape(-1, 2)
-        near, kept = np.ones(len(points), dtype=bool), points
-        x, y, dx, dy = _line(points)
-        for _ in range(stages.AXIS_ROUNDS):
-            across = np.abs((points[:, 1] - y) * dx - (points[:, 0] - x) * dy)
-            closer = across <= max(stages.AXIS_REACH_PX, 2 * np.sqrt(np.square(across[near]).mean()))
-            settled = np.array_equal(closer, near)
-            near, kept = closer, points[closer]
-            if settled or len(kept) < stages.LEAST_PIXELS:
-                break
-            x, y, dx, dy = _line(kept)
-        rms = np.sqrt(np.square((kept[:, 1] - y) * dx - (kept[:, 0] - x) * dy).mean())
-        stages.need_line(len(points), len(kept), float(rms))
-        along = (kept[:, 0] - x) * dx + (kept[:, 1] - y) * dy
-        numbers = bands[kept[:, 1], kept[:, 0]]
-        extents: list[tuple[float, float] | None] = []
-        for number in range(1, len(self._positions)):
-            of_band = along[numbers == number]
-            seen = len(of_band) >= stages.LEAST_PIXELS // 5
-            extents.append((float(of_band.min()), float(of_band.max())) if seen else None)
-        axis = Axis((x, y), (dx, dy), tuple(extents))
-        stages.need_order(axis)
-        return axis, stages.box(kept.min(0).tolist(), kept.max(0).tolist(), (solid.shape[1], solid.shape[0]))
+        """Line through the pixels [H, W] left by the erosion, except those far from the line, and their box."""
+        nonzero = cv2.findNonZero(solid)
+        points = np.asarray([] if nonzero is None else nonzero, dtype=np.int32).reshape(-1, 2)
+        numbers, size = bands[points[:, 1], points[:, 0]], (solid.shape[1], solid.shape[0])
+        return stages.fit_axis(points, numbers, len(self._positions) - 1, size, _line)
 
-    def _pose(self, found: Endpoints) -> Pose:
-        """Mean of the closed-form poses from all pairs of neighbouring bands whose three endpoints were found."""
-        edges = stages.nudged(found)
-        rays = np.ones((*edges.shape[:2], 3))
-        rays[..., :2] = (edges - self._matrix[:2, 2]) / self._matrix.diagonal()[:2]
+    def _pose(self, edges: Endpoints) -> Pose:
+        """Mean of the closed-form poses of each pair of neighbouring bands whose three endpoints were found."""
+        nudged = stages.nudged(edges)
+        rays = np.ones((*nudged.shape[:2], 3))
+        rays[..., :2] = (nudged - self._matrix[:2, 2]) / self._matrix.diagonal()[:2]
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        return stages.answer(found, *_closed_form(rays, self._positions, stages.triples(found)))
+        return stages.answer(edges, *_closed_form(rays, self._positions, stages.triples(edges)))
 
 
-_SQUARE = np.ones((3, 3), dtype=np.uint8)
-
-
-def _line(points: np.ndarray) -> tuple[float, float, float, float]:
-    """Point (x, y) and unit direction of the line with the least sum of squared perpendicular distances."""
+def _line(points: np.ndarray) -> Axis:
+    """Line with the least sum of squared distances from points [n, 2]."""
     dx, dy, x, y = cv2.fitLine(points, cv2.DIST_L2, 0, 0.01, 0.01).ravel().tolist()
-    return x, y, dx, dy
+    return Axis((x, y), (dx, dy))
 
 
 def _centroids(gradient: np.ndarray, labels: np.ndarray, count: int, left: int, top: int) -> list[tuple[float, float]]:
@@ -173,31 +141,29 @@ def _centroids(gradient: np.ndarray, labels: np.ndarray, count: int, left: int, 
     rows, columns = np.nonzero(labels)
     weights = gradient[rows, columns].astype(np.float64)
     kind = labels[rows, columns]
-    whole = np.bincount(kind, weights, count)[1:]
-    x = np.bincount(kind, weights * columns, count)[1:] / whole + left
-    y = np.bincount(kind, weights * rows, count)[1:] / whole + top
-    return list(zip(x.tolist(), y.tolist(), strict=True))
+    sums, x, y = (np.bincount(kind, values, count)[1:] for values in (weights, weights * columns, weights * rows))
+    return list(zip((x / sums + left).tolist(), (y / sums + top).tolist(), strict=True))
 
 
-def _closed_form(rays: np.ndarray, positions: np.ndarray, first: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean tip and direction [B, 3] over the triples of edges that begin at ``first``, from unit rays [B, N, 3].
+def _closed_form(rays: np.ndarray, positions: np.ndarray, starts: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean tip and direction [B, 3] over the triples of edges that begin at ``starts``, from unit rays [B, N, 3].
 
     Applies the sine rule to the triangles formed by the camera and each band (corrected Eqs. 3.5 to 3.12); bands may
     have any length. This repeats :func:`holotorch.tracking.pose.pose.closed_form` in NumPy, since it belongs to the
     baseline of the times.
     """
     tips, directions = [], []
-    for i in first:
+    for i in starts:
         a, b, c = rays[:, i], rays[:, i + 1], rays[:, i + 2]
-        front, back = positions[i + 1] - positions[i], positions[i + 2] - positions[i + 1]
+        first, second = positions[i + 1] - positions[i], positions[i + 2] - positions[i + 1]
         p1, p2 = _angle(a, b), _angle(b, c)
         both = p1 + p2
         sine = np.sin(both)
-        delta = np.arctan2(front * np.sin(p2) * sine, back * np.sin(p1) - front * np.sin(p2) * np.cos(both))
-        scale = (front + back) / sine
-        near, far = (scale * np.sin(delta))[:, None] * a, (scale * np.sin(both + delta))[:, None] * c
-        direction = (far - near) / np.linalg.norm(far - near, axis=-1, keepdims=True)
-        tips.append(near - positions[i] * direction)
+        delta = np.arctan2(first * np.sin(p2) * sine, second * np.sin(p1) - first * np.sin(p2) * np.cos(both))
+        scale = (first + second) / sine
+        front, rear = (scale * np.sin(delta))[:, None] * a, (scale * np.sin(both + delta))[:, None] * c
+        direction = (rear - front) / np.linalg.norm(rear - front, axis=-1, keepdims=True)
+        tips.append(front - positions[i] * direction)
         directions.append(direction)
     direction = np.mean(directions, 0)
     return np.mean(tips, 0), direction / np.linalg.norm(direction, axis=-1, keepdims=True)

@@ -1,7 +1,6 @@
 """Times of trackers on the same synthetic frames, measured alternately in one process, and of their stages."""
 
 import statistics
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -9,7 +8,7 @@ from functools import partial
 from torch import Tensor
 from tqdm import tqdm
 
-from holotorch.experiments.timing import interleaved
+from holotorch.experiments.timing import interleaved, timed
 from holotorch.experiments.tracking_benchmark.bench import Row, count_statuses
 from holotorch.experiments.tracking_benchmark.methods import BASE, COLD, PRIOR, Method, as_camera, before, methods
 from holotorch.experiments.tracking_benchmark.thesis_opencv import ThesisOpenCV
@@ -24,7 +23,7 @@ KORNIA = "thesis, kornia"
 # Names of the conditions whose frames are timed, by kind of frame.
 _FRAMES = {"plain desk": ("plain",), "clutter": ("heavy clutter",), "drape": ("cloth as band 3",)}
 _PHOTOGRAPH = ("photograph 0", "texture")  # the texture is used if the world has no photographs
-_STREAM = 6  # different frames of each kind, 6 MB each: more than the caches of a processor hold
+_STREAM = 6  # different frames of each kind, of 6 MB each, which together exceed the caches of a processor
 _REPEATS = 9  # repetitions of a call, whose median is not affected by single stalls of the machine
 
 
@@ -42,17 +41,12 @@ def timing(world: World, rounds: int) -> list[Row]:
     for kind, names in tqdm((_FRAMES | {"photograph": _PHOTOGRAPH}).items(), desc="times", unit="frame"):
         name = next(name for name in names if name in scenes[0])
         frames = [(as_camera(cases[name].frame()), cases[name]) for cases in scenes]
-        seconds = interleaved({name: partial(_all, track, frames) for name, track in trackers.items()}, rounds)
-        rows += [
-            {
-                "frame": kind,
-                "method": name,
-                "milliseconds": round(1e3 * value / _STREAM, 2),
-                "ratio": round(value / seconds[BASE], 3),
-                "status": count_statuses(Status(pose.status) for pose in _all(trackers[name], frames)),
-            }
-            for name, value in seconds.items()
-        ]
+        calls = {method: partial(_all, track, frames) for method, track in trackers.items()}
+        seconds = interleaved(calls, rounds)
+        for method, value in seconds.items():
+            status = count_statuses(Status(pose.status) for pose in _all(trackers[method], frames))
+            row: Row = {"frame": kind, "method": method, "milliseconds": round(1e3 * value / _STREAM, 2)}
+            rows.append(row | {"ratio": round(value / seconds[BASE], 3), "status": status})
     return rows
 
 
@@ -78,23 +72,14 @@ def stages(world: World, rounds: int) -> list[Row]:
         call()
         spent: dict[str, float] = {}
         for _ in range(rounds):
-            started = time.perf_counter()
-            call()
-            whole = time.perf_counter() - started
+            _, total = timed(call)
             own = dict(tracker.times)
-            own["Other"] = own.get("Other", 0.0) + whole - sum(own.values())
+            own["Other"] = own.get("Other", 0.0) + total - sum(own.values())
             spent = {stage: spent.get(stage, 0.0) + value for stage, value in own.items()}
-        total = sum(spent.values())
-        spent["Total"] = total
-        rows += [
-            {
-                "method": name,
-                "stage": stage,
-                "milliseconds": round(1e3 * value / rounds, 3),
-                "percent": round(100 * value / total, 2),
-            }
-            for stage, value in spent.items()
-        ]
+        spent["Total"] = total = sum(spent.values())
+        for stage, value in spent.items():
+            row: Row = {"method": name, "stage": stage, "milliseconds": round(1e3 * value / rounds, 3)}
+            rows.append(row | {"percent": round(100 * value / total, 2)})
     return rows
 
 
@@ -106,43 +91,30 @@ def spread(world: World, seeds: int, share: float = 1.0) -> list[Row]:
     frame directly before it, which removes most of the influence of other load on the machine.
     """
     cases, plain = [], next(case for case in conditions(world) if case.name == "plain")
-    usual = as_camera(plain.frame()), plain
+    plain_frame = as_camera(plain.frame())
     for i in range(seeds):
-        some = replace(world, photographs=world.photographs[2 * i : 2 * i + 2], seed=world.seed + i)
-        found = [*conditions(some), *occlusions(some), *negatives(some, 10)][:: max(1, round(1 / share))]
-        cases += [replace(case, name=f"{case.name}, seed {some.seed}") for case in found]
+        seeded = replace(world, photographs=world.photographs[2 * i : 2 * i + 2], seed=world.seed + i)
+        some = [*conditions(seeded), *occlusions(seeded), *negatives(seeded, 10)][:: max(1, round(1 / share))]
+        cases += [replace(case, name=f"{case.name}, seed {seeded.seed}") for case in some]
     trackers = methods(world, (BASE, COLD, PRIOR))
-    taken: dict[str, list[tuple[float, str]]] = {name: [] for name in trackers}
-    besides: dict[str, list[float]] = {name: [] for name in trackers}
+    ratios: dict[str, list[tuple[float, str]]] = {name: [] for name in trackers}
+    plain_seconds: dict[str, list[float]] = {name: [] for name in trackers}
     for case in tqdm(cases, desc="slowest frames", unit="frame", dynamic_ncols=True):
         frame = as_camera(case.frame())
         for name, track in trackers.items():
             if name == PRIOR and case.tip is None:
                 continue  # a frame without a catheter has no previous pose
             track(frame, case)
-            pairs = [(_seconds(track, *usual), _seconds(track, frame, case)) for _ in range(_REPEATS)]
-            taken[name].append((statistics.median(own / beside for beside, own in pairs), case.name))
-            besides[name] += [beside for beside, _ in pairs]
+            calls = partial(track, plain_frame, plain), partial(track, frame, case)
+            pairs = [[timed(call)[1] for call in calls] for _ in range(_REPEATS)]
+            ratios[name].append((statistics.median(own / before for before, own in pairs), case.name))
+            plain_seconds[name] += [before for before, _ in pairs]
     rows = []
-    for name, values in taken.items():
-        if not values:
-            continue
-        middle, (slowest, which) = statistics.median(ratio for ratio, _ in values), max(values)
-        unit = 1e3 * statistics.median(besides[name])
-        rows.append(
-            {
-                "method": name,
-                "frames": len(values),
-                "median_ms": round(unit * middle, 2),
-                "slowest_ms": round(unit * slowest, 2),
-                "ratio": round(slowest / middle, 2),
-                "slowest": which,
-            }
-        )
+    for name, values in ratios.items():
+        if values:
+            middle, (slowest, case_name) = statistics.median(ratio for ratio, _ in values), max(values)
+            unit = 1e3 * statistics.median(plain_seconds[name])
+            row: Row = {"method": name, "frames": len(values), "median_ms": round(unit * middle, 2)}
+            row |= {"slowest_ms": round(unit * slowest, 2), "ratio": round(slowest / middle, 2)}
+            rows.append(row | {"slowest": case_name})
     return rows
-
-
-def _seconds(track: Method, frame: Tensor, case: Case) -> float:
-    started = time.perf_counter()
-    track(frame, case)
-    return time.perf_counter() - started

@@ -1,14 +1,15 @@
-"""Poses for 3D Slicer and whoever speaks OpenIGTLink, encoded by pyigtl (``pip install 'holotorch[slicer]'``).
+"""Poses for 3D Slicer and other clients of OpenIGTLink, encoded by pyigtl (``pip install 'holotorch[slicer]'``).
 
-Each frame gives one STRING, ``<name>Status``: ``OK``, ``UNVERIFIED: ...`` or ``NO_CATHETER: the reason``. An answered
-frame has a TRANSFORM before it, ``<name>``, stamped with its capture time. A refused one has none, so a client's last
-transform stays where it was: show the status beside it, and hide the tool when the stamps stop advancing, since a
-sender that has died says nothing. A pose captured in the future is sent as a refusal: its age is unknown.
+Each frame gives one STRING, ``<name>Status``: ``OK``, ``UNVERIFIED: ...`` or, for a refusal, its status and reason such
+as ``NO_CATHETER: ...``. A frame with a pose also gives a TRANSFORM, ``<name>``, before it. Both are stamped with the
+capture time. After a refusal a client keeps its last transform, so show the status beside it, and hide the tool when
+the stamps stop advancing, since a sender that has crashed sends nothing. A pose captured in the future is sent as a
+refusal, because its age is unknown.
 
-The matrix is camera_from_tool, ``ToolToCamera`` in the words of PLUS, with its translation in MILLIMETRES. Its axes are
-the camera's (x right, y down, z forward) and neither RAS nor LPS. Slicer takes a TRANSFORM's numbers as they are, in
-RAS, without exchanging signs as it does for files; so put the node below a registration ``CameraToRas``. The tool's
-+z axis runs from the tip to the rear; the roll about it is not observed.
+The matrix is camera_from_tool (``ToolToCamera`` in PLUS) with its translation in MILLIMETRES. Its axes are those of the
+camera (x right, y down, z forward), neither RAS nor LPS. Slicer takes the numbers of a TRANSFORM as RAS, without the
+change of signs that it applies to files; so put the node below a registration ``CameraToRas``. The tool's +z axis runs
+from the tip to the rear; the roll about it is not observed.
 
 Source: openigtlink.org, protocol version 2, messages TRANSFORM and STRING.
 """
@@ -24,16 +25,17 @@ from holotorch.tracking.streaming.packet import now
 from holotorch.tracking.streaming.stream import Newest
 
 PORT = 18944
-_AHEAD = 0.05  # seconds that a capture time may lie in the future, by errors of the clocks
+_AHEAD = 0.05  # seconds that a capture time may lie in the future, because of errors of the clocks
 
 
 def messages(pose: Pose, captured: float | None = None, *, name: str = "ToolToCamera") -> bytes:
     """TRANSFORM and STRING of one frame, or the STRING alone for a refusal.
 
     Args:
-        pose: A single one.
-        captured: Seconds since 1970 at which the camera took it; now by default. It becomes the stamp, unchecked.
-        name: Of the transform, 1 to 14 ASCII characters: OpenIGTLink allows 20, and ``Status`` is appended.
+        pose: A single pose, not a batch.
+        captured: Time at which the camera took the frame, in seconds since 1970; now by default. It becomes the stamp,
+            also if it lies in the future.
+        name: Name of the transform, 1 to 14 ASCII characters: OpenIGTLink allows 20, and ``Status`` is appended.
 
     Raises:
         ImportError: pyigtl is not installed.
@@ -48,36 +50,36 @@ def messages(pose: Pose, captured: float | None = None, *, name: str = "ToolToCa
     status = pose.status
     if not isinstance(status, Status):
         raise TypeError(f"one frame at a time, got {len(status)} poses; index the batch")
-    # pyigtl cannot encode other characters (it waits for the error of decoding).
+    # pyigtl can only encode ASCII.
     reason = pose.reason.encode("ascii", "replace").decode()[:200]
     text = f"{status.name}: {reason}" if reason else status.name
-    said = igtl.StringMessage(text, timestamp=stamp, device_name=f"{name}Status").pack()
+    string = igtl.StringMessage(text, timestamp=stamp, device_name=f"{name}Status").pack()
     if not status.answered:
-        return said
+        return string
     matrix = pose.camera_from_tool.detach().cpu().double().clone()
     checks.all_finite("camera_from_tool", matrix)
     matrix[:3, 3] *= 1e3
-    return igtl.TransformMessage(matrix.numpy(), timestamp=stamp, device_name=name).pack() + said
+    return igtl.TransformMessage(matrix.numpy(), timestamp=stamp, device_name=name).pack() + string
 
 
 class TransformServer:
-    """TCP server to which Slicer connects (OpenIGTLinkIF, a connector of type client); several clients, newest wins.
+    """TCP server to which Slicer connects (OpenIGTLinkIF, a connector of type client); it can serve several clients.
 
-    ``async with TransformServer() as server: server.send(pose, captured)``. Sending never waits. A client that does not
-    read keeps only the newest frame waiting here, and a new client gets nothing until the next frame. What its and this
-    system's TCP buffers hold already is out of reach: a few kilobytes here.
+    ``async with TransformServer() as server: server.send(pose, captured)``. Sending never waits. For a client that does
+    not read, only the newest frame is kept, besides a few kilobytes in the TCP buffers of both systems. A new client
+    gets nothing until the next frame.
 
     Args:
-        port: 18944 is OpenIGTLink's; 0 picks a free one, then to be read from ``port``.
-        host: Address to listen on; all of this computer's by default, ``127.0.0.1`` for itself only.
+        port: 18944 is OpenIGTLink's; 0 picks a free one, which the attribute ``port`` names once the server is open.
+        host: Address to listen on; by default all addresses of this computer, ``127.0.0.1`` for local clients only.
         name: As in :func:`messages`.
 
     Attributes:
-        future: Frames whose capture time lay more than 50 ms in the future; their poses were not sent.
+        future: Number of frames whose pose was not sent, since its capture time lay more than 50 ms in the future.
 
     Raises:
         ImportError: pyigtl is not installed.
-        OSError: The port is in use; when it is opened.
+        OSError: The port is in use; raised by ``async with``.
     """
 
     def __init__(self, port: int = PORT, *, host: str = "0.0.0.0", name: str = "ToolToCamera"):
@@ -98,18 +100,15 @@ class TransformServer:
             self._server.close()
         for client in list(self._clients):
             client.transport.abort()
-        await asyncio.sleep(0)  # lets the connections end before the loop may
+        await asyncio.sleep(0)  # lets the connections close before the event loop may end
 
     @property
     def clients(self) -> int:
-        """How many are connected."""
+        """Number of connected clients."""
         return len(self._clients)
 
     def send(self, pose: Pose, captured: float | None = None) -> None:
-        """Hand one frame to every client, without its pose if it is ``captured`` in the future.
-
-        Errors as of :func:`messages`.
-        """
+        """Send a frame to every client, as a refusal if ``captured`` lies in the future; errors as :func:`messages`."""
         if captured is not None and (ahead := captured - now()) > _AHEAD:
             self.future += 1
             pose = Pose.refused(Status.UNCERTAIN, f"capture time {ahead:.3g} s in the future: age unknown")
@@ -126,15 +125,12 @@ class _Client(Newest, asyncio.Protocol):
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
-        # Old frames must not queue in the system either; asyncio has set TCP_NODELAY.
+        # A small buffer, so that old frames do not queue in the system; asyncio has set TCP_NODELAY.
         transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
         self._clients.add(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._clients.discard(self)
-
-    def _write(self, data: bytes) -> None:
-        self.transport.write(data)
 
 
 def _pyigtl() -> Any:

@@ -1,13 +1,15 @@
-"""Parts of the thesis's pipeline besides image processing: thresholds, oriented Sobel kernel, assignment of edges.
+"""Parts of the thesis's pipeline besides image processing: thresholds, oriented Sobel kernel, fit of the axis, edges.
 
 ``ThesisTracker`` (kornia) and its counterpart in OpenCV share them, so that both refuse the same frames.
 """
 
 import colorsys
-import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,56 +21,45 @@ from holotorch.tracking.pose.status import Pose, Refusal, Status
 # The rows of Table 3.1, in its order and words. "Gradient" includes the median, "Connected components" the binary
 # image; "Other" is the rest of the time of a call.
 STAGES: tuple[str, ...] = (
-    "Undistort",
-    "Color segmentation",
-    "Erosion",
-    "Get axis",
-    "Gradient",
-    "Connected components",
-    "Weighted centroids",
-    "Calculate catheter position",
-    "Other",
+    *("Undistort", "Color segmentation", "Erosion", "Get axis", "Gradient", "Connected components"),
+    *("Weighted centroids", "Calculate catheter position", "Other"),
 )
 
-# The thesis gives no numbers for its thresholds; these make its method run on synthetic frames.
-HUE_REACH = 15.0  # degrees to either side of a band's hue
+# The thesis gives no numbers for its thresholds; with these, its method works on synthetic frames.
+HUE_TOLERANCE = 15.0  # degrees: largest difference from a band's hue
 LEAST_SATURATION, LEAST_VALUE = 0.55, 0.3  # relative to the least saturation and value of the bands' colours
-LEAST_PIXELS = 30  # least number of pixels after the erosion: of the catheter, and a fifth of it for each band
-AXIS_ROUNDS = 6  # most rounds of removing pixels far from the line and fitting it again
-AXIS_REACH_PX = 3.0  # pixels farther from the axis than this and than twice the rms are left out of the next fit
+LEAST_PIXELS = 30  # least number of pixels of all bands after the erosion; a visible band has at least a fifth of it
+AXIS_ROUNDS = 6  # largest number of rounds that remove pixels far from the line and fit it again
+AXIS_DISTANCE_PX = 3.0  # pixels farther from the axis than this and than twice the rms are left out of the next fit
 AXIS_RMS_PX = 4.0  # largest rms distance of the remaining pixels from the axis
 AXIS_SHARE = 0.5  # least share of the pixels that must remain
-KERNEL_RADIUS, ALONG_PX, ACROSS_PX = 4, 1.2, 1.5
-MEDIAN = 3
+KERNEL_RADIUS = 4  # half-width of the Sobel kernel in pixels
+ALONG_PX, ACROSS_PX = 1.2, 1.5  # standard deviations of the Sobel kernel's Gaussian along and across the axis
+MEDIAN = 3  # side of the median filter in pixels
 LEAST_GRADIENT = 25.0  # least difference in levels between the two sides of an edge
-MARGIN_PX = 16  # margin around the bands' pixels, for the kernel and the ends removed by the erosion
-OFF_AXIS_PX = 3.0
-# Largest distance of an edge from the change of colour: pixels plus share of a band.
+MARGIN_PX = 16  # margin around the bands' pixels, for the kernel and for what the erosion removed
+OFF_AXIS_PX = 3.0  # largest distance of an edge from the axis
+# Largest distance of an edge from the border between two colours: pixels, plus a share of the longer band's length.
 OFF_BORDER_PX, OFF_BORDER_SHARE = 6.0, 0.1
 DEVIATION_PX = 0.3  # assumed standard deviation of an endpoint in x and y
 NUDGE_PX = 1e-4  # step of an endpoint for the numerical derivatives of the pose
-NO_POSE = "the endpoints are not the image of the bands in front of the camera"
-REFUSED_AT = {
-    Status.EDGES_UNCLEAR: "Calculate catheter position",
-    Status.INCONSISTENT: "Calculate catheter position",
-}
 
-Box = tuple[int, int, int, int]  # left, top, right, bottom; the last two are exclusive
-Endpoints = list[tuple[float, float] | None]
+Box = tuple[int, int, int, int]  # left, top, right, bottom in pixels; the last two are exclusive
+Endpoints = list[tuple[float, float] | None]  # pixels (x, y) of each edge of the bands; None if it was not found
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Thresholds from a catheter's colours: hues (degrees, one per band), tolerance, saturation and value."""
+    """Hue of each band and largest difference from it, in degrees; least saturation and value, from 0 to 1."""
 
     hues: tuple[float, ...]
-    reach: float
+    tolerance: float
     saturation: float
     value: float
 
 
 def windows(catheter: Catheter) -> Windows:
-    """Hue, saturation and value windows around the bands' colours.
+    """Thresholds in hue, saturation and value for the bands' colours.
 
     Raises:
         ValueError: A colour is pale or dark, or two hues are less than 20 degrees apart.
@@ -89,14 +80,14 @@ def windows(catheter: Catheter) -> Windows:
         )
     saturation = LEAST_SATURATION * min(saturation for _, saturation, _ in colours)
     value = LEAST_VALUE * min(value for _, _, value in colours)
-    return Windows(tuple(hues), min(HUE_REACH, min(gaps) / 2), saturation, value)
+    return Windows(tuple(hues), min(HUE_TOLERANCE, min(gaps) / 2), saturation, value)
 
 
 def oriented_sobel(x: float, y: float) -> np.ndarray:
     """Derivative along the unit vector (x, y), smoothed more across it than along: float32 [9, 9], for correlation.
 
-    The largest response to a step of one level along (x, y) is one level. Source: K_Laxis of Sec. 3.4.3, which does not
-    give the weights; here they are Gaussian.
+    The largest response to a step of one level along (x, y) is one level. Source: K_Laxis of Sec. 3.4.3. The thesis
+    does not give its weights; here they are Gaussian.
     """
     steps = np.arange(-KERNEL_RADIUS, KERNEL_RADIUS + 1, dtype=np.float64)
     along = x * steps[None, :] + y * steps[:, None]
@@ -107,18 +98,21 @@ def oriented_sobel(x: float, y: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Axis:
-    """Fitted line in pixels of the undistorted frame, and the range of each band's pixels along it."""
+    """Fitted line in pixels of the undistorted frame: a point and a unit direction, (x, y) each.
+
+    ``extents`` holds the first and last position along the line of each band's pixels, None if they are too few.
+    """
 
     origin: tuple[float, float]
     direction: tuple[float, float]
-    extents: tuple[tuple[float, float] | None, ...]  # first and last position; None: too few pixels
+    extents: tuple[tuple[float, float] | None, ...] = ()
 
-    def along(self, x: float, y: float) -> float:
-        """Position of a pixel along the axis, from its origin."""
+    def along(self, x: Any, y: Any) -> Any:
+        """Positions of pixels (numbers, arrays or tensors) along the axis, from its origin."""
         return (x - self.origin[0]) * self.direction[0] + (y - self.origin[1]) * self.direction[1]
 
-    def across(self, x: float, y: float) -> float:
-        """Signed distance of a pixel from the axis."""
+    def across(self, x: Any, y: Any) -> Any:
+        """Signed distances of pixels (numbers, arrays or tensors) from the axis."""
         return (y - self.origin[1]) * self.direction[0] - (x - self.origin[0]) * self.direction[1]
 
 
@@ -130,38 +124,67 @@ def need_frames(frames: Tensor) -> None:
         raise ValueError(f"frames must be [B, 3, H, W] with B >= 1 and H, W >= 32, got {list(frames.shape)}")
 
 
-def missing_edges(names: Sequence[str]) -> str:
-    """Reason stated with a pose for which these edges were not found; "" for none."""
-    return f"edges not found, pose from the others: {', '.join(names)}" if names else ""
+def fit_axis(
+    points: Any, numbers: Any, bands: int, size: tuple[int, int], line: Callable[[Any], Axis]
+) -> tuple[Axis, Box]:
+    """Fit a line to the pixels that the erosion left, without outliers.
+
+    Args:
+        points: Pixels (x, y), an array or tensor [n, 2].
+        numbers: Number of each pixel's band, from 1, an array or tensor [n].
+        bands: Number of bands of the catheter.
+        size: Width and height of the frame in pixels.
+        line: Function that fits a line to points, with the least sum of squared distances.
+
+    Returns:
+        The line, and the box around the pixels near it with its margin.
+
+    Raises:
+        Refusal: Too few pixels, or no line; no two neighbouring bands visible, or bands in another order.
+    """
+    if len(points) < LEAST_PIXELS:
+        reason = f"{len(points)} pixels have a band's colour after the erosion, not {LEAST_PIXELS}"
+        raise Refusal(Status.NO_CATHETER, reason)
+    axis, near, kept = line(points), numbers > 0, points
+    for _ in range(AXIS_ROUNDS):
+        distances = abs(axis.across(points[:, 0], points[:, 1]))
+        closer = distances <= max(AXIS_DISTANCE_PX, 2 * _rms(distances[near]))
+        settled = bool((closer == near).all())
+        near, kept = closer, points[closer]
+        if settled or len(kept) < LEAST_PIXELS:
+            break
+        axis = line(kept)
+    x, y, numbers = kept[:, 0], kept[:, 1], numbers[near]
+    rms = _rms(axis.across(x, y))
+    if len(kept) < max(LEAST_PIXELS, AXIS_SHARE * len(points)) or not rms <= AXIS_RMS_PX:
+        counted = f"{len(kept)} of {len(points)} near the axis, {rms:.1f} px rms"
+        raise Refusal(Status.NO_AXIS, f"the pixels of the bands' colours are no line: {counted}")
+    of_bands = [axis.along(x, y)[numbers == number] for number in range(1, bands + 1)]
+    extents = [
+        (float(along.min()), float(along.max())) if len(along) >= LEAST_PIXELS // 5 else None for along in of_bands
+    ]
+    _need_order(extents)
+    left, top = (max(int(values.min()) - MARGIN_PX, 0) for values in (x, y))
+    right, bottom = (min(int(values.max()) + MARGIN_PX + 1, side) for values, side in zip((x, y), size, strict=True))
+    return replace(axis, extents=tuple(extents)), (left, top, right, bottom)
 
 
-def need_pixels(count: int) -> None:
-    """Raise a Refusal if too few pixels have a band's colour to fit a line."""
-    if count < LEAST_PIXELS:
-        raise Refusal(Status.NO_CATHETER, f"{count} pixels have a band's colour after the erosion, not {LEAST_PIXELS}")
+def _rms(values: Any) -> float:
+    return float((values**2).mean()) ** 0.5
 
 
-def need_line(count: int, kept: int, rms_px: float) -> None:
-    """Raise a Refusal if the pixels form no line: ``kept`` of ``count`` are near the axis, ``rms_px`` from it."""
-    if kept < max(LEAST_PIXELS, AXIS_SHARE * count) or not rms_px <= AXIS_RMS_PX:
-        raise Refusal(
-            Status.NO_AXIS,
-            f"the pixels of the bands' colours are no line: {kept} of {count} near the axis, {rms_px:.1f} px rms",
-        )
-
-
-def need_order(axis: Axis) -> None:
+def _need_order(extents: Sequence[tuple[float, float] | None]) -> None:
     """Raise a Refusal unless two neighbouring bands are visible and all visible bands have the catheter's order."""
-    seen = [(i, extent[0] + extent[1]) for i, extent in enumerate(axis.extents) if extent is not None]
-    names = ", ".join(str(i + 1) for i, _ in seen) or "none"
-    if not any(b[0] == a[0] + 1 for a, b in zip(seen, seen[1:], strict=False)):
-        raise Refusal(Status.BANDS_MISSING, f"two neighbouring bands are needed, of {len(axis.extents)} seen: {names}")
-    if len({b[1] > a[1] for a, b in zip(seen, seen[1:], strict=False)}) == 2:
+    visible = [(i, extent[0] + extent[1]) for i, extent in enumerate(extents) if extent is not None]
+    names = ", ".join(str(i + 1) for i, _ in visible) or "none"
+    if not any(b[0] == a[0] + 1 for a, b in pairwise(visible)):
+        raise Refusal(Status.BANDS_MISSING, f"two neighbouring bands are needed, of {len(extents)} seen: {names}")
+    if len({b[1] > a[1] for a, b in pairwise(visible)}) == 2:
         raise Refusal(Status.BANDS_MISSING, "the colours along the axis are not in the catheter's order")
 
 
 def endpoints(axis: Axis, centroids: Sequence[tuple[float, float]]) -> Endpoints:
-    """Centroid of each edge of the bands, in the catheter's order; None where there is none.
+    """Centroid of each edge of the bands, in the catheter's order; None for an edge without a centroid.
 
     The expected position of an edge is halfway between the pixels of the two bands beside it, or at the end of the
     pixels of one band if the other is missing. The nearest centroid within a tolerance is taken.
@@ -173,82 +196,60 @@ def endpoints(axis: Axis, centroids: Sequence[tuple[float, float]]) -> Endpoints
     middles = [sum(extent) for extent in extents if extent is not None]
     forward = int(middles[-1] > middles[0])
     spots = [(axis.along(*spot), spot) for spot in centroids if abs(axis.across(*spot)) <= OFF_AXIS_PX]
-    found: Endpoints = []
+    edges: Endpoints = []
     for before, after in zip((None, *extents), (*extents, None), strict=True):
         ends = [extent[side] for extent, side in ((before, forward), (after, 1 - forward)) if extent is not None]
-        found.append(None)
+        edges.append(None)
         if ends and spots:
-            place = sum(ends) / len(ends)
+            expected = sum(ends) / len(ends)
             longest = max(extent[1] - extent[0] for extent in (before, after) if extent is not None)
-            apart, spot = min((abs(at - place), spot) for at, spot in spots)
-            if apart <= OFF_BORDER_PX + OFF_BORDER_SHARE * longest:
-                found[-1] = spot
-    if not triples(found):
-        names = ", ".join(str(i + 1) for i, spot in enumerate(found) if spot is not None) or "none"
+            distance, spot = min((abs(position - expected), spot) for position, spot in spots)
+            if distance <= OFF_BORDER_PX + OFF_BORDER_SHARE * longest:
+                edges[-1] = spot
+    if not triples(edges):
+        names = ", ".join(str(i + 1) for i, edge in enumerate(edges) if edge is not None) or "none"
         raise Refusal(Status.EDGES_UNCLEAR, f"three neighbouring edges of the bands are needed, found: {names}")
-    return found
+    return edges
 
 
-def triples(found: Endpoints) -> list[int]:
+def triples(edges: Endpoints) -> list[int]:
     """Indices of the first edge of each pair of neighbouring bands whose three endpoints were found."""
-    return [i for i in range(len(found) - 2) if None not in found[i : i + 3]]
+    return [i for i in range(len(edges) - 2) if None not in edges[i : i + 3]]
 
 
-def box(first: Sequence[int], last: Sequence[int], size: tuple[int, int]) -> Box:
-    """Box around the pixels from ``first`` (x, y) to ``last`` with its margin, within a frame of ``size`` (W, H)."""
-    left, top = (max(low - MARGIN_PX, 0) for low in first)
-    right, bottom = (min(high + MARGIN_PX + 1, side) for high, side in zip(last, size, strict=True))
-    return left, top, right, bottom
-
-
-def nudged(found: Endpoints) -> np.ndarray:
+def nudged(edges: Endpoints) -> np.ndarray:
     """Endpoints float64 [1 + 2 n, n, 2], NaN for None: unchanged, then with each number changed by ``NUDGE_PX``."""
-    edges = np.array([spot or (np.nan, np.nan) for spot in found])
-    nudges = np.concatenate([np.zeros((1, edges.size)), NUDGE_PX * np.eye(edges.size)])
-    return edges + nudges.reshape(-1, *edges.shape)
+    pixels = np.array([edge or (np.nan, np.nan) for edge in edges])
+    nudges = np.concatenate([np.zeros((1, pixels.size)), NUDGE_PX * np.eye(pixels.size)])
+    return pixels + nudges.reshape(-1, *pixels.shape)
 
 
-def answer(found: Endpoints, tip: np.ndarray, direction: np.ndarray, device: torch.device | None = None) -> Pose:
+def answer(edges: Endpoints, tip: np.ndarray, direction: np.ndarray, device: torch.device | None = None) -> Pose:
     """Pose from the tips and directions [1 + 2 n, 3] of :func:`nudged` endpoints; raises a Refusal if invalid."""
     both = np.concatenate([tip, direction], -1)
     slopes = (both[1:] - both[0]).T / NUDGE_PX
     covariance = DEVIATION_PX**2 * slopes @ slopes.T
     if not np.isfinite(covariance).all() or not np.isfinite(both).all() or tip[0, 2] <= 0:
-        raise Refusal(Status.INCONSISTENT, NO_POSE)
-    missing = [str(edge + 1) for edge, spot in enumerate(found) if spot is None]
-    zero = torch.zeros((), dtype=torch.float64, device=device)
-    return Pose(
-        tip=torch.from_numpy(tip[0].copy()).to(device),
-        direction=torch.from_numpy(direction[0].copy()).to(device),
-        covariance=torch.from_numpy(covariance).to(device),
-        chi_square=zero,
-        freedom=zero,
-        status=Status.UNVERIFIED if missing else Status.OK,
-        reason=missing_edges(missing),
-    )
+        raise Refusal(Status.INCONSISTENT, "the endpoints are not the image of the bands in front of the camera")
+    missing = ", ".join(str(i + 1) for i, edge in enumerate(edges) if edge is None)
+    status = Status.UNVERIFIED if missing else Status.OK
+    reason = f"edges not found, pose from the others: {missing}" if missing else ""
+    tensor = partial(torch.tensor, dtype=torch.float64, device=device)
+    return Pose(tensor(tip[0]), tensor(direction[0]), tensor(covariance), tensor(0), tensor(0), status, reason)
 
 
 class Stopwatch:
     """Seconds of each stage of one call, by name; ``wait`` is called before each reading of the clock."""
 
-    def __init__(self, wait: Callable[[], None] | None = None):
+    def __init__(self, wait: Callable[[], None] = lambda: None):
         self.times: dict[str, float] = dict.fromkeys(STAGES, 0.0)
         self._wait = wait
-        self._start = self._last = self._now()
+        wait()
+        self._last = time.perf_counter()
 
     def lap(self, stage: str) -> None:
         """Add the time since the last lap to a stage."""
-        now = self._now()
+        self._wait()
+        now = time.perf_counter()
         self.times[stage] += now - self._last
         self._last = now
-
-    def stop(self) -> dict[str, float]:
-        """Seconds of each stage; "Other" is the rest of the call."""
-        self.times["Other"] = 0.0
-        self.times["Other"] = max(0.0, self._now() - self._start - math.fsum(self.times.values()))
-        return self.times
-
-    def _now(self) -> float:
-        if self._wait is not None:
-            self._wait()
-        return time.perf_counter()

@@ -1,5 +1,7 @@
 """ThesisTracker: the tracking pipeline of Sec. 3.4, stage by stage in kornia."""
 
+from collections.abc import Sequence
+
 import torch
 from kornia.color import rgb_to_hsv
 from kornia.contrib import connected_components_union_find
@@ -7,6 +9,7 @@ from kornia.filters import filter2d, median_blur
 from kornia.geometry import fit_line, remap
 from kornia.morphology import erosion
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.detection.channels import ChannelOrder
@@ -25,13 +28,14 @@ class ThesisTracker:
     label connected components. The weighted centroids of the components are the endpoints of the bands. The pose is the
     mean of the closed-form poses of all pairs of neighbouring bands.
 
-    Known failures of the method: it gives a pose for narrow coloured papers in a row, takes the border of an occluder
-    for the end of a band, and refuses distant catheters, whose bands the erosion removes, and clutter in the bands'
-    colours. The status is OK if all edges were found and UNVERIFIED if some are missing; the pose is not checked in
-    either case (``freedom`` is 0). The covariance is propagated from errors of the endpoints of 0.3 px in x and y.
+    Known failures of the method: it gives a pose for narrow coloured papers in a row, and takes the border of an
+    occluder for the end of a band. It refuses frames with clutter in the bands' colours, and distant catheters, whose
+    bands the erosion removes. The status is OK if all edges were found and UNVERIFIED if some are missing; the pose is
+    not checked in either case (``freedom`` is 0). The covariance is propagated from errors of the endpoints of 0.3 px
+    in x and y.
 
-    On a CPU this takes about eight times as long as the same stages in OpenCV, which are the reference for times
-    (holotorch.experiments.tracking_benchmark.thesis_opencv). It needs about 0.2 GB per 1080p frame of the batch.
+    On a CPU this tracker takes about eight times as long as the same stages in OpenCV, which are the reference for
+    times (holotorch.experiments.tracking_benchmark.thesis_opencv). It needs about 0.2 GB per 1080p frame of the batch.
 
     Args:
         camera: Intrinsics.
@@ -40,11 +44,11 @@ class ThesisTracker:
 
     Attributes:
         times: Seconds of each stage of the last call, by the names of Table 3.1; all frames of the batch together.
-        endpoints: For each frame of the last call, the bands' edges (x, y) in pixels of the undistorted frame, in the
-            catheter's order, None where not found; an empty list if an earlier stage refused the frame.
+        endpoints: For each frame of the last call, the edges of the bands (x, y) in pixels of the undistorted frame, in
+            the catheter's order. An edge that was not found is None; an earlier refusal leaves an empty list.
 
     Raises:
-        ValueError: Thresholds in hue cannot distinguish the colours.
+        ValueError: Thresholds in hue cannot distinguish the colours of the catheter.
 
     Source: Sec. 3.4 and Table 3.1 of the thesis, with its equations 3.5 to 3.12 corrected.
     """
@@ -58,8 +62,8 @@ class ThesisTracker:
         self._map = torch.empty(0, 0, 2)
 
     @torch.no_grad()
-    def __call__(self, frames: Tensor) -> list[Pose]:
-        """Pose in metres, or refusal, of each frame of uint8 [B, 3, H, W].
+    def __call__(self, frames: Tensor, previous: Sequence[Pose] | None = None) -> list[Pose]:
+        """Pose in metres, or refusal, of each frame of uint8 [B, 3, H, W]; ``previous`` poses are not used.
 
         Raises:
             TypeError, ValueError: ``frames`` is not such a tensor.
@@ -67,7 +71,7 @@ class ThesisTracker:
         stages.need_frames(frames)
         self.camera.need_size(frames)
         frames = self.channels.to_rgb(frames)
-        watch = Stopwatch(torch.cuda.synchronize if frames.is_cuda else None)
+        watch = Stopwatch(torch.cuda.synchronize) if frames.is_cuda else Stopwatch()
         poses: list[Pose | None] = [None] * len(frames)
         self.endpoints = [[] for _ in poses]
         image = self._undistorted(frames)
@@ -86,20 +90,19 @@ class ThesisTracker:
         if axes:
             gradient, corners = self._gradient(image, axes)
             watch.lap("Gradient")
-            binary = (gradient >= stages.LEAST_GRADIENT - 0.5) & self._inside(axes, corners, gradient)
-            labels = connected_components_union_find(binary)
+            labels = connected_components_union_find(gradient >= stages.LEAST_GRADIENT - 0.5)
             watch.lap("Connected components")
             centroids = _centroids(gradient, labels, corners)
-            found = {item: centroids[row] for row, item in enumerate(axes)}
             watch.lap("Weighted centroids")
-            for item, (axis, _) in axes.items():
+            for (item, (axis, _)), spots in zip(axes.items(), centroids, strict=True):
                 try:
-                    self.endpoints[item] = stages.endpoints(axis, found[item])
+                    self.endpoints[item] = stages.endpoints(axis, spots)
                     poses[item] = self._pose(self.endpoints[item], frames.device)
                 except Refusal as refused:
                     poses[item] = Pose.refused(refused.status, refused.reason)
             watch.lap("Calculate catheter position")
-        self.times = watch.stop()
+        watch.lap("Other")
+        self.times = watch.times
         return [pose for pose in poses if pose is not None]
 
     def _undistorted(self, frames: Tensor) -> Tensor:
@@ -116,51 +119,27 @@ class ThesisTracker:
         return remap(frames.to(torch.float32) / 255, x, y, align_corners=True)
 
     def _segmented(self, image: Tensor) -> Tensor:
-        """Number (from 1) of the band whose colour each pixel has, or 0: uint8 [B, 1, H, W]."""
+        """Number (from 1) of the band whose colour a pixel has, or 0: uint8 [B, 1, H, W]."""
         hue, saturation, value = rgb_to_hsv(image).split(1, 1)
         hue = torch.rad2deg(hue)
         coloured = (saturation >= self._windows.saturation) & (value >= self._windows.value)
         bands = torch.zeros_like(hue, dtype=torch.uint8)
         for number, middle in enumerate(self._windows.hues, 1):
-            near = ((hue - middle + 180).remainder(360) - 180).abs() <= self._windows.reach
-            bands[near & coloured] = number
+            similar = ((hue - middle + 180).remainder(360) - 180).abs() <= self._windows.tolerance
+            bands[similar & coloured] = number
         return bands
 
     def _axis(self, solid: Tensor, bands: Tensor) -> tuple[Axis, Box]:
-        """Line through the pixels [H, W] left by the erosion, except those far from it; and their box."""
+        """Line through the pixels [H, W] left by the erosion, except those far from the line, and their box."""
         rows, columns = torch.nonzero(solid, as_tuple=True)
-        stages.need_pixels(len(rows))
-        points, numbers = torch.stack([columns, rows], -1).to(torch.float64), bands[rows, columns]
-        near = torch.ones_like(numbers, dtype=torch.bool)
-        origin, direction = _line(points)
-        for _ in range(stages.AXIS_ROUNDS):
-            across = _across(points, origin, direction)
-            reach = 2 * across[near].square().mean().sqrt()
-            closer = across.abs() <= reach.clamp(min=stages.AXIS_REACH_PX)
-            settled = torch.equal(closer, near)
-            near = closer
-            if settled or int(near.sum()) < stages.LEAST_PIXELS:
-                break
-            origin, direction = _line(points[near])
-        total, points, numbers = len(points), points[near], numbers[near]
-        rms = _across(points, origin, direction).square().mean().sqrt()
-        stages.need_line(total, len(points), float(rms))
-        along = (points - origin) @ direction
-        extents: list[tuple[float, float] | None] = []
-        for number in range(1, len(self._windows.hues) + 1):
-            of_band = along[numbers == number]
-            seen = len(of_band) >= stages.LEAST_PIXELS // 5
-            extents.append((float(of_band.min()), float(of_band.max())) if seen else None)
-        (x, y), (dx, dy) = origin.tolist(), direction.tolist()
-        axis = Axis((x, y), (dx, dy), tuple(extents))
-        stages.need_order(axis)
-        first, last = points.amin(0).long().tolist(), points.amax(0).long().tolist()
-        return axis, stages.box(first, last, (solid.shape[1], solid.shape[0]))
+        points, size = torch.stack([columns, rows], -1).to(torch.float64), (solid.shape[1], solid.shape[0])
+        return stages.fit_axis(points, bands[rows, columns], len(self._windows.hues), size, _line)
 
     def _gradient(self, image: Tensor, axes: dict[int, tuple[Axis, Box]]) -> tuple[Tensor, list[tuple[int, int]]]:
-        """Largest gradient of the three colours along each axis in levels, [n, 1, h, w], and left and top of each crop.
+        """Largest gradient of the three colours along each axis within its box, and the corners of the crops.
 
-        All crops have the size of the largest box, so that one call filters each with its kernel.
+        All crops have the size of the largest box, so that one call filters all of them. Returns the gradient in levels
+        [n, 1, h, w], 0 outside the boxes, and left and top of each crop in pixels.
         """
         boxes = [box for _, box in axes.values()]
         height, width = max(box[3] - box[1] for box in boxes), max(box[2] - box[0] for box in boxes)
@@ -171,51 +150,37 @@ class ThesisTracker:
         )
         kernels = [torch.from_numpy(stages.oriented_sobel(*axis.direction)) for axis, _ in axes.values()]
         change = filter2d(255 * crops, torch.stack(kernels).to(crops)).abs().amax(1, keepdim=True)
-        return median_blur(change, stages.MEDIAN), corners
+        smooth = median_blur(change, stages.MEDIAN)
+        gradient = torch.zeros_like(smooth)
+        for row, (box, (x, y)) in enumerate(zip(boxes, corners, strict=True)):
+            inside = row, 0, slice(box[1] - y, box[3] - y), slice(box[0] - x, box[2] - x)
+            gradient[inside] = smooth[inside]
+        return gradient, corners
 
-    def _inside(self, axes: dict[int, tuple[Axis, Box]], corners: list[tuple[int, int]], crops: Tensor) -> Tensor:
-        """Mask of the pixels of each crop that lie in the box of its frame."""
-        inside = torch.zeros_like(crops, dtype=torch.bool)
-        for row, ((_, box), (x, y)) in enumerate(zip(axes.values(), corners, strict=True)):
-            inside[row, :, box[1] - y : box[3] - y, box[0] - x : box[2] - x] = True
-        return inside
-
-    def _pose(self, found: Endpoints, device: torch.device) -> Pose:
+    def _pose(self, edges: Endpoints, device: torch.device) -> Pose:
         """Mean of the closed-form poses of each pair of neighbouring bands whose three endpoints were found."""
-        edges = torch.from_numpy(stages.nudged(found))
-        tips, directions = [], []
-        for i in stages.triples(found):
-            tip, direction = closed_form(edges[:, i : i + 3], self.catheter.positions[i : i + 3], self._pinhole)
-            tips.append(tip)
-            directions.append(direction)
-        direction = torch.nn.functional.normalize(torch.stack(directions).mean(0), dim=-1)
-        return stages.answer(found, torch.stack(tips).mean(0).numpy(), direction.numpy(), device)
+        nudged = torch.from_numpy(stages.nudged(edges))
+        triples = [slice(i, i + 3) for i in stages.triples(edges)]
+        poses = [closed_form(nudged[:, triple], self.catheter.positions[triple], self._pinhole) for triple in triples]
+        tip, direction = (torch.stack(parts).mean(0) for parts in zip(*poses, strict=True))
+        return stages.answer(edges, tip.numpy(), normalize(direction, dim=-1).numpy(), device)
 
 
-def _line(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Point [2] and unit direction [2] of the line with the least squared distances."""
+def _line(points: Tensor) -> Axis:
+    """Line with the least squared distances from points [n, 2]."""
     line = fit_line(points[None])
-    return line.origin[0], line.direction[0]
-
-
-def _across(points: Tensor, origin: Tensor, direction: Tensor) -> Tensor:
-    offset = points - origin
-    return offset[:, 1] * direction[0] - offset[:, 0] * direction[1]
+    (x, y), (dx, dy) = line.origin[0].tolist(), line.direction[0].tolist()
+    return Axis((x, y), (dx, dy))
 
 
 def _centroids(gradient: Tensor, labels: Tensor, corners: list[tuple[int, int]]) -> list[list[tuple[float, float]]]:
-    """Weighted centroids (x, y), in pixels of the frame, of the components in each crop [n, 1, h, w]."""
+    """Centroids (x, y) in pixels of the frame of the components in each crop [n, 1, h, w], weighted by the gradient."""
     crop, _, rows, columns = torch.nonzero(labels, as_tuple=True)
-    spots: list[list[tuple[float, float]]] = [[] for _ in corners]
-    if not len(crop):
-        return spots
-    kinds, kind = torch.unique(labels[labels > 0], return_inverse=True)
+    component = torch.unique(labels[labels > 0], return_inverse=True)[1]
     weights = gradient[labels > 0].to(torch.float64)
-    sums = weights.new_zeros(4, len(kinds))
-    for row, value in zip(sums, (weights, weights * columns, weights * rows), strict=False):
-        row.index_add_(0, kind, value)
-    sums[3].index_copy_(0, kind, crop.to(sums))  # every pixel of a component is in the same crop
-    for weight, x, y, owner in sums.T.tolist():
-        left, top = corners[int(owner)]
-        spots[int(owner)].append((x / weight + left, y / weight + top))
-    return spots
+    sums, x, y = (torch.bincount(component, values) for values in (weights, weights * columns, weights * rows))
+    crops = torch.zeros(len(sums), dtype=torch.int64, device=crop.device).scatter_(0, component, crop)
+    centroids: list[list[tuple[float, float]]] = [[] for _ in corners]
+    for i, *centroid in zip(crops.tolist(), (x / sums).tolist(), (y / sums).tolist(), strict=True):
+        centroids[i].append((centroid[0] + corners[i][0], centroid[1] + corners[i][1]))
+    return centroids
