@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import memory
-from holotorch.core.quantities import WAVELENGTH, Quantity
+from holotorch.core.quantities import OFFSET, WAVELENGTH, Quantity
 
 _UNASKED = 64 << 20  # bytes up to which the available memory is not read, which takes 0.1 ms
 _TURNED = 0.01  # rad: phase error above which rounding is reported, 1 % of a field
@@ -137,6 +137,12 @@ def pair(name: str, values: Sequence[float], unit: str = "") -> tuple[float, flo
     if len(items) != 2:
         raise TypeError(f"{name} must be two numbers (y, x){_in(unit)}, got {values!r}")
     return finite(name, items[0], unit), finite(name, items[1], unit)
+
+
+def offset(values: Sequence[float]) -> tuple[float, float]:
+    """Return a position (y, x) in metres on a plane as floats, or raise as :func:`pair` and :func:`quantity`."""
+    y, x = pair("offset", values, "metres")
+    return quantity(OFFSET, y), quantity(OFFSET, x)
 
 
 def wavelengths(values: float | Sequence[float]) -> tuple[float, ...]:
