@@ -191,7 +191,7 @@ def test_refusals():
         spectrum.samples(0)
     with pytest.raises(ValueError, match="needs more than 256 wavelengths"):
         spectrum.samples(tolerance=0.01, path_difference=1.0)
-    with pytest.raises(ValueError, match="must not be below 0"):
+    with pytest.raises(ValueError, match="path_difference must be at least zero"):
         predicted_contrast(spectrum, -1e-6)
     with pytest.raises(ValueError, match="sines and must add up to at most 1"):
         path_difference(0.03, 0.7, tilt=0.5)
