@@ -72,10 +72,9 @@ def penalty_schedule(
     """Stages in which L-BFGS computes a hologram, under a limit on the phase after spreading if one is given.
 
     The first stage minimises the loss of the amplitude, whose gradient does not vanish in dark pixels. Without a limit,
-    the second and last stage minimises the loss of the intensity. With a limit, the first stage stays in the box
-    X <= limit / sum K, in which no P(X) exceeds the limit; the stages after it have no such box, but a penalty with
-    growing weight on P(X) above 98.5 % of the limit. The margin of 1.5 % leaves little for ``limit_peak_phase`` to
-    scale down.
+    the second and last stage minimises the loss of the intensity. With a limit, the first stage stays in the box X <=
+    limit / sum K, in which no P(X) exceeds the limit; the stages after it have no such box, but a penalty with growing
+    weight on P(X) above 98.5 % of the limit. The margin of 1.5 % leaves little for ``limit_peak_phase`` to scale down.
 
     Args:
         make: Builds the problem from ``amplitude``, ``limit`` and ``limit_weight``, as keywords of ``PECProblem``.

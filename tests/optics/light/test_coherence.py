@@ -16,7 +16,7 @@ from holotorch.optics.light.coherence import (
     predicted_contrast,
     samples_needed,
 )
-from holotorch.optics.light.quadrature import expected_error
+from holotorch.optics.light.quadrature import SpeckleIntegral
 from holotorch.optics.light.spectrum import Spectrum
 
 PITCH, DISTANCE, APERTURE = 3.74e-6, 0.03, 0.056
@@ -81,7 +81,7 @@ def test_few_wavelengths_reach_the_sum_over_every_nanometre(preset, colour, iris
 
 def error_of(rule, dense, centre: float, iris: bool = False) -> float:
     away, there = dense[0] - centre, rule[0] - centre
-    return expected_error(away, dense[1], there, rule[1], PATH / centre**2, iris / centre).item()
+    return SpeckleIntegral(away, dense[1], PATH / centre**2, iris / centre).error(there, rule[1]).item()
 
 
 def test_the_least_error_takes_fewer_wavelengths_than_gauss():
