@@ -1,4 +1,4 @@
-"""Propagation of light, lenses and eyes, and the picture that a display shows."""
+"""Propagation of light, optical elements, eyes, and the images that a display shows."""
 
 from holotorch.core.deprecation import renamed
 from holotorch.optics.elements.converging import ConvergingFresnel, converging_fresnel
