@@ -11,6 +11,8 @@ from holotorch.core import checks
 from holotorch.core.fourier import good_length
 from holotorch.core.quantities import PITCH
 
+Pair = tuple[float, float]  # (y, x)
+
 
 @dataclass(frozen=True)
 class Grid:

@@ -9,6 +9,8 @@ from torch import Tensor, nn
 from holotorch.core import checks
 from holotorch.core.grid import Grid
 
+Wavelengths = float | Sequence[float]  # in metres: one number, or one per channel
+
 
 class LinearOperator(Protocol):
     """A linear map and its conjugate transpose."""
@@ -26,7 +28,8 @@ class FieldOperator(nn.Module):
     """Base class of operators from fields [..., C, H, W] on ``grid`` to fields [..., C, H', W'] on ``out_grid``.
 
     Fields are complex64 or complex128 and keep their dtype. Kernels are float64 buffers; ``.to`` and ``.float()`` move
-    them to another device but do not round them. Each call converts them to the precision of its field.
+    them to another device but do not round them. Each call converts them to the precision of its field. Subclasses
+    implement ``_forward`` and ``_adjoint``, whose argument is checked already.
 
     Args:
         grid: Sampling of the field.
@@ -36,11 +39,31 @@ class FieldOperator(nn.Module):
 
     wavelengths: tuple[float, ...]
 
-    def __init__(self, grid: Grid, wavelengths: float | Sequence[float] | None, out_grid: Grid | None = None):
+    def __init__(self, grid: Grid, wavelengths: Wavelengths | None, out_grid: Grid | None = None):
         super().__init__()
         self.grid, self.out_grid = grid, out_grid or grid
         if wavelengths is not None:
             self.wavelengths = checks.wavelengths(wavelengths)
+
+    def forward(self, field: Tensor) -> Tensor:
+        """Apply the operator to ``field`` [..., C, H, W] of ``grid``.
+
+        Returns [..., C, H', W'] of ``out_grid`` in the same dtype. Raises TypeError for a real field and ValueError for
+        a field of another shape.
+        """
+        self.check_field(field, self.grid)
+        return self._forward(field)
+
+    def adjoint(self, field: Tensor) -> Tensor:
+        """Apply the conjugate transpose to ``field`` [..., C, H', W'] of ``out_grid``; otherwise as :meth:`forward`."""
+        self.check_field(field, self.out_grid)
+        return self._adjoint(field)
+
+    def _forward(self, field: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def _adjoint(self, field: Tensor) -> Tensor:
+        raise NotImplementedError
 
     def register_complex(self, name: str, values: Tensor | None) -> None:
         """Keep a complex tensor as a buffer of real pairs, since ``Module.to(dtype)`` drops imaginary parts."""

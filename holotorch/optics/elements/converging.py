@@ -2,7 +2,6 @@
 
 import math
 import warnings
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -10,8 +9,8 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.fourier import filter_spectrum, good_length
-from holotorch.core.grid import Grid
-from holotorch.core.operator import FieldOperator
+from holotorch.core.grid import Grid, Pair
+from holotorch.core.operator import FieldOperator, Wavelengths
 from holotorch.core.quantities import DISTANCE, FOCAL_LENGTH, WAVELENGTH
 from holotorch.optics.elements.lens_response import lens_matrices
 from holotorch.optics.free_space.impulse_response import fresnel_taps, tap_indices
@@ -28,7 +27,7 @@ def converging_fresnel(
     focus: float | Tensor,
     out_grid: Grid,
     *,
-    offset: tuple[float, float] = (0.0, 0.0),
+    offset: Pair = (0, 0),
 ) -> Tensor:
     """:class:`ConvergingFresnel` as a function with gradients in wavelength, distance and focus.
 
@@ -83,8 +82,7 @@ class ConvergingFresnel(FieldOperator):
     are exact in the paraxial model, up to rounding.
 
     Args:
-        grid: Sampling of the field.
-        wavelengths: In metres, one per channel.
+        grid, wavelengths: As for :class:`FieldOperator`.
         distance: In metres, not 0, negative for backward propagation.
         focus: Focal length in metres, not 0, positive for a converging and negative for a diverging lens, infinite for
             no lens.
@@ -112,12 +110,12 @@ class ConvergingFresnel(FieldOperator):
     def __init__(
         self,
         grid: Grid,
-        wavelengths: float | Sequence[float],
+        wavelengths: Wavelengths,
         distance: float,
         focus: float,
         *,
         out_grid: Grid | None = None,
-        offset: tuple[float, float] = (0.0, 0.0),
+        offset: Pair = (0, 0),
     ):
         super().__init__(grid, wavelengths)
         self.distance, self.offset = checks.quantity(DISTANCE, distance), checks.offset(offset)
@@ -157,18 +155,14 @@ class ConvergingFresnel(FieldOperator):
                 stacklevel=2,
             )
 
-    def forward(self, field: Tensor) -> Tensor:
-        """Propagate ``field``, complex [..., C, H, W], to [..., C, H', W'] of the output grid, same dtype."""
-        self.check_field(field, self.grid)
+    def _forward(self, field: Tensor) -> Tensor:
         columns, rows = (self.complex_buffer(name, field) for name in ("columns", "rows"))
         if not self.scaled:
             return columns @ field @ rows.transpose(-1, -2)
         picture = filter_spectrum(field, columns[..., :, None] * rows[..., None, :])
         return self._oriented(picture) * self._curvatures(field)
 
-    def adjoint(self, field: Tensor) -> Tensor:
-        """Apply the conjugate transpose to ``field`` [..., C, H', W'] of the output grid."""
-        self.check_field(field, self.out_grid)
+    def _adjoint(self, field: Tensor) -> Tensor:
         columns, rows = (self.complex_buffer(name, field) for name in ("columns", "rows"))
         if not self.scaled:
             return columns.transpose(-1, -2).conj() @ field @ rows.conj()

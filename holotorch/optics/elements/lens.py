@@ -10,7 +10,7 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.grid import Grid
-from holotorch.core.operator import FieldOperator
+from holotorch.core.operator import FieldOperator, Wavelengths
 from holotorch.core.quantities import APERTURE_RADIUS, FOCAL_LENGTH, PITCH, SOFTNESS, WAVELENGTH
 from holotorch.optics.free_space.kernels import turns_phasor
 
@@ -87,34 +87,26 @@ class Transmission(FieldOperator):
     """A thin element, which multiplies fields by one complex number per sample.
 
     Args:
-        grid: Sampling of the field and of the result.
-        wavelengths: In metres, one per channel.
+        grid, wavelengths: As for :class:`FieldOperator`.
         values: complex128, shape [C, H, W], or [1, H, W] for all channels.
     """
 
-    def __init__(self, grid: Grid, wavelengths: float | Sequence[float], values: Tensor):
+    def __init__(self, grid: Grid, wavelengths: Wavelengths, values: Tensor):
         super().__init__(grid, wavelengths)
         self.register_complex("values", values)
 
-    def forward(self, field: Tensor) -> Tensor:
-        """Transmit ``field`` [..., C, H, W]; TypeError if it is real, ValueError if its shape differs."""
-        return field * self._values_for(field)
+    def _forward(self, field: Tensor) -> Tensor:
+        return field * self.complex_buffer("values", field)
 
-    def adjoint(self, field: Tensor) -> Tensor:
-        """Multiply by the complex conjugates; same shapes as :meth:`forward`."""
-        return field * self._values_for(field).conj()
-
-    def _values_for(self, field: Tensor) -> Tensor:
-        self.check_field(field, self.grid)
-        return self.complex_buffer("values", field)
+    def _adjoint(self, field: Tensor) -> Tensor:
+        return field * self.complex_buffer("values", field).conj()
 
 
 class Lens(Transmission):
     """Thin lens with a circular edge: :func:`lens_phase` inside ``radius``, opaque outside.
 
     Args:
-        grid: Sampling of the field.
-        wavelengths: In metres, one per channel.
+        grid, wavelengths: As for :class:`FieldOperator`.
         focal_length: In metres, not 0, positive for a converging lens. One number for all channels (a refractive or
             achromatic lens) or one per channel (a holographic optical element, whose focal length is proportional to
             1 / wavelength).
@@ -136,7 +128,7 @@ class Lens(Transmission):
     def __init__(
         self,
         grid: Grid,
-        wavelengths: float | Sequence[float],
+        wavelengths: Wavelengths,
         focal_length: float | Sequence[float],
         *,
         radius: float | None = None,
@@ -168,8 +160,7 @@ class Aperture(Transmission):
     """Opening in an opaque screen.
 
     Args:
-        grid: Sampling of the field.
-        wavelengths: In metres, one per channel.
+        grid, wavelengths: As for :class:`FieldOperator`.
         shape: Radius in metres of a circle around the axis, or the amplitude transmission, real [H, W] within 0 .. 1.
 
     Raises:
@@ -177,7 +168,7 @@ class Aperture(Transmission):
         MemoryError: The grid has more samples than memory is available for.
     """
 
-    def __init__(self, grid: Grid, wavelengths: float | Sequence[float], shape: float | Tensor):
+    def __init__(self, grid: Grid, wavelengths: Wavelengths, shape: float | Tensor):
         if isinstance(shape, Tensor) and shape.ndim:
             mask = shape.to(torch.float64) if shape.dtype == torch.bool else shape
             checks.field("aperture", mask, grid.shape, complex_valued=False)

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from holotorch.core.grid import Grid
+from holotorch.core.grid import Grid, Pair
 from holotorch.core.special import FRESNEL_BORDER, fresnel_auxiliary, fresnel_integral
 from holotorch.optics.free_space.kernels import carrier, turns_phasor
 
@@ -44,7 +44,7 @@ def lens_taps(
 
 
 def lens_matrices(
-    grid: Grid, wavelength: Tensor, distance: Tensor, focus: Tensor, out_grid: Grid, offset: tuple[float, float]
+    grid: Grid, wavelength: Tensor, distance: Tensor, focus: Tensor, out_grid: Grid, offset: Pair
 ) -> tuple[Tensor, Tensor]:
     """Weights of both axes, complex128 [..., H', H] with the carrier exp(ikz), and [..., W', W]."""
     columns, rows = (

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.fourier import fft, good_length, ifft_unscaled
-from holotorch.core.grid import Grid
+from holotorch.core.grid import Grid, Pair
 from holotorch.core.operator import FieldOperator
 from holotorch.optics.free_space.impulse_response import tap_indices
 
@@ -44,7 +44,7 @@ class PixelShape(FieldOperator):
     Source: Goodman, Sec. 2.4 (sampled functions) and 4.4 (rectangular aperture).
     """
 
-    def __init__(self, grid: Grid, *, fill: float | tuple[float, float] = 1.0, orders: int = 0):
+    def __init__(self, grid: Grid, *, fill: float | Pair = 1.0, orders: int = 0):
         finer = 2 * checks.whole("orders", orders, 0) + 1
         (height, width), (y, x) = grid.shape, grid.pitch
         super().__init__(grid, None, Grid((finer * height, finer * width), (y / finer, x / finer)))
@@ -52,9 +52,7 @@ class PixelShape(FieldOperator):
         for name, size, part in zip(("columns", "rows"), grid.shape, self.fill, strict=True):
             self.register_complex(name, _axis_kernel(size, part, finer))
 
-    def forward(self, field: Tensor) -> Tensor:
-        """Emit from pixel values ``field``, complex [..., C, H, W]; returns [..., C, sH, sW] in the same dtype."""
-        self.check_field(field, self.grid)
+    def _forward(self, field: Tensor) -> Tensor:
         height, width = self.out_grid.shape
         checks.affordable(
             5.5 * field.dtype.itemsize * (2 * self.orders + 1) ** 2 * field.numel(),  # measured
@@ -66,9 +64,7 @@ class PixelShape(FieldOperator):
             field = _spread(field.transpose(-1, -2), self.complex_buffer(name, field))
         return field
 
-    def adjoint(self, field: Tensor) -> Tensor:
-        """Apply the conjugate transpose to ``field`` [..., C, sH, sW] of the output grid."""
-        self.check_field(field, self.out_grid)
+    def _adjoint(self, field: Tensor) -> Tensor:
         for name in ("rows", "columns"):
             field = _gather(field, self.complex_buffer(name, field)).transpose(-1, -2)
         return field
@@ -78,7 +74,7 @@ class PixelShape(FieldOperator):
         return f"{super().extra_repr()}, fill={self.fill}, orders={self.orders}"
 
 
-def order_efficiency(fill: float | tuple[float, float], order: tuple[float, float]) -> float:
+def order_efficiency(fill: float | Pair, order: Pair) -> float:
     """Fraction of the light on a uniform panel in one diffraction order: the product of (a sinc(m a))^2 over the axes.
 
     Per axis, a is ``fill`` as in :class:`PixelShape` and m the order in the direction sin(angle) = m wavelength /
@@ -100,7 +96,7 @@ def order_efficiency(fill: float | tuple[float, float], order: tuple[float, floa
     return efficiency
 
 
-def _fill_pair(fill: float | tuple[float, float]) -> tuple[float, float]:
+def _fill_pair(fill: float | Pair) -> Pair:
     parts = tuple(fill) if isinstance(fill, Sequence) else (fill, fill)
     if len(parts) != 2:
         raise ValueError(f"fill must be one number or a pair (y, x), got {fill!r}")

@@ -1,12 +1,11 @@
 """CroppedKernel: propagation at any distance that neither wraps light around nor limits its band."""
 
-from collections.abc import Sequence
-
 import torch
 
 from holotorch.core import checks
 from holotorch.core.fourier import good_length
-from holotorch.core.grid import Grid
+from holotorch.core.grid import Grid, Pair
+from holotorch.core.operator import Wavelengths
 from holotorch.core.quantities import DISTANCE
 from holotorch.optics.free_space.padding import FINEST, crop_length
 from holotorch.optics.free_space.plane_pair import PlanePair
@@ -27,8 +26,7 @@ class CroppedKernel(SpectralFilter):
     pitch of 8 um and 5e-4 for 3.74 um. For smooth fields, and with ``paraxial``, there is only rounding error.
 
     Args:
-        grid: Sampling of the field, which is also that of the result.
-        wavelengths: In metres, one per channel.
+        grid, wavelengths: As for :class:`FieldOperator`.
         distance: In metres, negative for backward propagation.
         paraxial: Leave out the factor beyond Fresnel.
         offset: Position (y, x) in metres of the axis of the result relative to the axis of the field, which need not be
@@ -40,13 +38,7 @@ class CroppedKernel(SpectralFilter):
     """
 
     def __init__(
-        self,
-        grid: Grid,
-        wavelengths: float | Sequence[float],
-        distance: float,
-        *,
-        paraxial: bool = False,
-        offset: tuple[float, float] = (0.0, 0.0),
+        self, grid: Grid, wavelengths: Wavelengths, distance: float, *, paraxial: bool = False, offset: Pair = (0, 0)
     ):
         distance = torch.tensor(checks.quantity(DISTANCE, distance), dtype=torch.float64)
         wavelength = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from holotorch.core import checks
 from holotorch.core.fourier import fft2, ifft2
 from holotorch.optics.free_space.propagators import SpectralFilter
 
@@ -37,7 +38,8 @@ class DepthStack(nn.Module):
 
     def forward(self, field: Tensor) -> Tensor:
         """Propagate ``field`` [..., C, H, W] to all depths, [..., C, D, H, W], same dtype."""
-        kernels = [each.kernel_for(field, self.grid) for each in self._filters()]
+        checks.field("field", field, (len(self.wavelengths), *self.grid.shape))
+        kernels = [each.kernel_for(field) for each in self._filters()]
         spectrum = fft2(field, (kernels[0].shape[-2], kernels[0].shape[-1]))
         return torch.stack([ifft2(spectrum * kernel, self.grid.shape) for kernel in kernels], -3)
 

@@ -3,11 +3,11 @@
 import math
 
 from holotorch.core import checks
-from holotorch.core.grid import Grid
+from holotorch.core.grid import Grid, Pair
 from holotorch.core.quantities import DISTANCE, WAVELENGTH
 
 
-def diffraction_angle(grid: Grid, wavelength: float) -> tuple[float, float]:
+def diffraction_angle(grid: Grid, wavelength: float) -> Pair:
     """Largest angle (y, x) from the axis, in radians, that the pitch can sample: its sine is wavelength / (2 pitch).
 
     It is pi / 2 where the pitch is at most half a wavelength.
@@ -17,7 +17,7 @@ def diffraction_angle(grid: Grid, wavelength: float) -> tuple[float, float]:
     return y, x
 
 
-def lateral_spread(grid: Grid, wavelength: float, distance: float, *, paraxial: bool = False) -> tuple[float, float]:
+def lateral_spread(grid: Grid, wavelength: float, distance: float, *, paraxial: bool = False) -> Pair:
     """Lateral shift (y, x) in metres of light at the angle of :func:`diffraction_angle`: abs(distance) tan(angle).
 
     It is infinite where the pitch is at most half a wavelength. With ``paraxial`` it is abs(distance) sin(angle), the
@@ -32,7 +32,7 @@ def lateral_spread(grid: Grid, wavelength: float, distance: float, *, paraxial: 
     return y, x
 
 
-def least_padding(grid: Grid, wavelength: float, distance: float, *, paraxial: bool = False) -> tuple[float, float]:
+def least_padding(grid: Grid, wavelength: float, distance: float, *, paraxial: bool = False) -> Pair:
     """Least padding factor (y, x) for which light of any frequency of the grid does not wrap around into the window.
 
     Padding by P leaves (P - 1) times the extent for light that leaves the window. So P = 1 + shift / extent, where the

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.complex import phasor
-from holotorch.core.grid import Grid
+from holotorch.core.grid import Grid, Pair
 from holotorch.core.quantities import DISTANCE, WAVELENGTH
 
 
@@ -77,9 +77,7 @@ def fresnel_kernel(grid: Grid, wavelength: Tensor | float, distance: Tensor | fl
     return turns_phasor(-product / 2 * fy.square()) * turns_phasor(-product / 2 * fx.square())
 
 
-def window_taper(
-    grid: Grid, wavelength: float, distance: float, reach: tuple[float, float], *, paraxial: bool = False
-) -> Tensor:
+def window_taper(grid: Grid, wavelength: float, distance: float, reach: Pair, *, paraxial: bool = False) -> Tensor:
     """Weights, float64 [H, W] in FFT order, that remove light which would wrap around into a window.
 
     Light that moves sideways by at most ``reach`` keeps weight 1. Light that moves by the padded extent minus ``reach``

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
-from holotorch.core.grid import Grid
+from holotorch.core.grid import Grid, Pair
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class PlanePair:
 
     grid: Grid
     out: Grid
-    offset: tuple[float, float] = (0.0, 0.0)
-    tilt: tuple[float, float] = (0.0, 0.0)
+    offset: Pair = (0.0, 0.0)
+    tilt: Pair = (0.0, 0.0)
 
     @property
     def straight(self) -> bool:

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -11,8 +11,8 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.fourier import centred_fft2, centred_ifft2, filter_spectrum
-from holotorch.core.grid import Grid
-from holotorch.core.operator import FieldOperator
+from holotorch.core.grid import Grid, Pair
+from holotorch.core.operator import FieldOperator, Wavelengths
 from holotorch.core.quantities import DISTANCE
 from holotorch.optics.free_space.geometry import least_padding
 from holotorch.optics.free_space.kernels import angular_spectrum_kernel, carrier, fresnel_kernel
@@ -22,8 +22,7 @@ class SpectralFilter(FieldOperator):
     """A linear operator that is diagonal in frequency.
 
     Args:
-        grid: Sampling of the field.
-        wavelengths: In metres, one per channel.
+        grid, wavelengths: As for :class:`FieldOperator`.
         kernel: Transfer function, complex128 [C, P, Q] in FFT order, with P >= H and Q >= W. The field is padded with
             zeros to P x Q samples.
         out_grid: Sampling of the result, which is cropped to the first samples of the padded grid; ``grid`` by default.
@@ -37,24 +36,19 @@ class SpectralFilter(FieldOperator):
     kernel: Tensor
     single: Tensor
 
-    def __init__(
-        self, grid: Grid, wavelengths: float | Sequence[float], kernel: Tensor, *, out_grid: Grid | None = None
-    ):
+    def __init__(self, grid: Grid, wavelengths: Wavelengths, kernel: Tensor, *, out_grid: Grid | None = None):
         super().__init__(grid, wavelengths, out_grid)
         self.register_complex("kernel", kernel)
         self.register_buffer("single", self.kernel.to(torch.float32), persistent=False)
 
-    def forward(self, field: Tensor) -> Tensor:
-        """Apply the filter to ``field`` [..., C, H, W]; TypeError if it is real, ValueError if its shape differs."""
-        return filter_spectrum(field, self.kernel_for(field, self.grid), self.out_grid.shape)
+    def _forward(self, field: Tensor) -> Tensor:
+        return filter_spectrum(field, self.kernel_for(field), self.out_grid.shape)
 
-    def adjoint(self, field: Tensor) -> Tensor:
-        """Apply the conjugate transpose to ``field`` [..., C, H', W'] of the output grid."""
-        return filter_spectrum(field, self.kernel_for(field, self.out_grid).conj(), self.grid.shape)
+    def _adjoint(self, field: Tensor) -> Tensor:
+        return filter_spectrum(field, self.kernel_for(field).conj(), self.grid.shape)
 
-    def kernel_for(self, field: Tensor, grid: Grid) -> Tensor:
-        """The transfer function, complex [C, P, Q], in the dtype of ``field``; raises unless it is on ``grid``."""
-        self.check_field(field, grid)
+    def kernel_for(self, field: Tensor) -> Tensor:
+        """The transfer function, complex [C, P, Q], in the dtype of ``field``."""
         return torch.view_as_complex(self.single if field.dtype == torch.complex64 else self.kernel)
 
     def extra_repr(self) -> str:
@@ -68,9 +62,9 @@ class _PaddedKernel(SpectralFilter):
     def __init__(
         self,
         grid: Grid,
-        wavelengths: float | Sequence[float],
+        wavelengths: Wavelengths,
         distance: float,
-        pad: float | tuple[float, float],
+        pad: float | Pair,
         transfer_function: Callable[[Grid, Tensor, float], Tensor],
         bytes_each: int,
         *,
@@ -110,8 +104,7 @@ class AngularSpectrum(_PaddedKernel):
     """Exact scalar propagation over ``distance`` by the angular spectrum; includes the carrier exp(ikz).
 
     Args:
-        grid: Sampling of the field, which is also that of the result.
-        wavelengths: In metres, one per channel.
+        grid, wavelengths: As for :class:`FieldOperator`.
         distance: In metres, negative for backward propagation.
         pad: Zero padding as a factor >= 1, one number or one per axis (y, x). 1 is the periodic model: light that
             leaves on one side enters on the other.
@@ -129,13 +122,7 @@ class AngularSpectrum(_PaddedKernel):
     """
 
     def __init__(
-        self,
-        grid: Grid,
-        wavelengths: float | Sequence[float],
-        distance: float,
-        *,
-        pad: float | tuple[float, float] = 2,
-        band_limit: bool = True,
+        self, grid: Grid, wavelengths: Wavelengths, distance: float, *, pad: float | Pair = 2, band_limit: bool = True
     ):
         kernel = partial(angular_spectrum_kernel, band_limit=band_limit)
         super().__init__(grid, wavelengths, distance, pad, kernel, 90, paraxial=False, wraps=not band_limit)
@@ -148,9 +135,7 @@ class Fresnel(_PaddedKernel):
     k z (wavelength f)^4 / 8, where f is the highest frequency of the field. ``pad=1`` is the thesis's model (Sec. 4.5).
     """
 
-    def __init__(
-        self, grid: Grid, wavelengths: float | Sequence[float], distance: float, *, pad: float | tuple[float, float] = 2
-    ):
+    def __init__(self, grid: Grid, wavelengths: Wavelengths, distance: float, *, pad: float | Pair = 2):
         super().__init__(grid, wavelengths, distance, pad, fresnel_kernel, 40, paraxial=True, wraps=True)
 
 
@@ -159,21 +144,13 @@ class Fraunhofer(FieldOperator):
 
     Output sample m (counted from the centre) of an axis with n samples is the direction
     sin(angle) = m wavelength / (n pitch). Source: thesis Eq. 4.10.
-
-    Args:
-        grid: Sampling of the field; the result has as many samples.
-        wavelengths: In metres, one per channel.
     """
 
-    def __init__(self, grid: Grid, wavelengths: float | Sequence[float]):
+    def __init__(self, grid: Grid, wavelengths: Wavelengths):
         super().__init__(grid, wavelengths)
 
-    def forward(self, field: Tensor) -> Tensor:
-        """Transform ``field`` [..., C, H, W]; TypeError if it is real, ValueError if its shape differs."""
-        self.check_field(field, self.grid)
+    def _forward(self, field: Tensor) -> Tensor:
         return centred_fft2(field)
 
-    def adjoint(self, field: Tensor) -> Tensor:
-        """Apply the conjugate transpose, which is the inverse; same shapes as :meth:`forward`."""
-        self.check_field(field, self.grid)
+    def _adjoint(self, field: Tensor) -> Tensor:
         return centred_ifft2(field)

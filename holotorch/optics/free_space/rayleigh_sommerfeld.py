@@ -2,15 +2,15 @@
 
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
-from holotorch.core.grid import Grid
-from holotorch.core.operator import FieldOperator
+from holotorch.core.grid import Grid, Pair
+from holotorch.core.operator import FieldOperator, Wavelengths
 from holotorch.core.quantities import DISTANCE
 from holotorch.optics.free_space.kernels import turns_phasor
 
@@ -27,10 +27,8 @@ class RayleighSommerfeld(FieldOperator):
     2 L pitch / wavelength, with L the extent of the grid.
 
     Args:
-        grid: Sampling of the field.
-        wavelengths: In metres, one per channel.
+        grid, wavelengths, out_grid: As for :class:`FieldOperator`.
         distance: In metres, not 0.
-        out_grid: Sampling of the result, with any shape and pitch; ``grid`` by default.
         offset: Position (y, x) in metres of the axis of the result relative to the axis of the field.
 
     Raises:
@@ -45,11 +43,11 @@ class RayleighSommerfeld(FieldOperator):
     def __init__(
         self,
         grid: Grid,
-        wavelengths: float | Sequence[float],
+        wavelengths: Wavelengths,
         distance: float,
         *,
         out_grid: Grid | None = None,
-        offset: tuple[float, float] = (0.0, 0.0),
+        offset: Pair = (0, 0),
     ):
         super().__init__(grid, wavelengths, out_grid)
         self.distance, self.offset = checks.quantity(DISTANCE, distance), checks.offset(offset)
@@ -67,16 +65,12 @@ class RayleighSommerfeld(FieldOperator):
                     stacklevel=2,
                 )
 
-    def forward(self, field: Tensor) -> Tensor:
-        """Propagate ``field``, complex [..., C, H, W], to [..., C, H', W'] of the output grid, same dtype."""
-        self.check_field(field, self.grid)
+    def _forward(self, field: Tensor) -> Tensor:
         flat = field.to(torch.complex128).flatten(-2)
         parts = [torch.einsum("...cq,cpq->...cp", flat, kernel) for kernel in self._kernels(field.device)]
         return torch.cat(parts, -1).unflatten(-1, self.out_grid.shape).to(field.dtype)
 
-    def adjoint(self, field: Tensor) -> Tensor:
-        """Apply the conjugate transpose to ``field`` [..., C, H', W'] of the output grid."""
-        self.check_field(field, self.out_grid)
+    def _adjoint(self, field: Tensor) -> Tensor:
         flat = field.to(torch.complex128).flatten(-2)
         total, begin = torch.zeros(1, dtype=torch.complex128, device=field.device), 0
         for kernel in self._kernels(field.device):

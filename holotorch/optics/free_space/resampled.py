@@ -8,8 +8,8 @@ from torch.nn import functional
 
 from holotorch.core import checks
 from holotorch.core.fourier import fft2, ifft2, multiplied
-from holotorch.core.grid import Grid
-from holotorch.core.operator import FieldOperator
+from holotorch.core.grid import Grid, Pair
+from holotorch.core.operator import FieldOperator, Wavelengths
 from holotorch.core.quantities import DISTANCE
 from holotorch.optics.free_space.impulse_response import fresnel_taps, levelling_shift, remainder_kernel, tilted_turns
 from holotorch.optics.free_space.kernels import carrier, turns_phasor
@@ -101,10 +101,8 @@ class ResampledKernel(FieldOperator):
     The accuracy is that of ``CroppedKernel``; the cost is H' H W + H' W W' products instead of two FFTs.
 
     Args:
-        grid: Sampling of the field.
-        wavelengths: In metres, one per channel.
+        grid, wavelengths, out_grid: As for :class:`FieldOperator`.
         distance: In metres, not 0, negative for backward propagation.
-        out_grid: Sampling of the result.
         offset: Position (y, x) in metres of the axis of the result relative to the axis of the field.
         tilt: Sines (y, x) of the direction of a carrier wave that is divided out, as in ``propagate``.
         paraxial: Leave out the factor beyond Fresnel.
@@ -121,12 +119,12 @@ class ResampledKernel(FieldOperator):
     def __init__(
         self,
         grid: Grid,
-        wavelengths: float | Sequence[float],
+        wavelengths: Wavelengths,
         distance: float,
         out_grid: Grid,
         *,
-        offset: tuple[float, float] = (0.0, 0.0),
-        tilt: tuple[float, float] = (0.0, 0.0),
+        offset: Pair = (0.0, 0.0),
+        tilt: Pair = (0.0, 0.0),
         paraxial: bool = False,
         padded: tuple[int, int] | None = None,
     ):
@@ -147,14 +145,10 @@ class ResampledKernel(FieldOperator):
         for name, values in zip(("columns", "rows", "beyond"), factors, strict=True):
             self.register_complex(name, values)
 
-    def forward(self, field: Tensor) -> Tensor:
-        """Propagate ``field``, complex [..., C, H, W], to [..., C, H', W'] of the output grid, same dtype."""
-        self.check_field(field, self.grid)
+    def _forward(self, field: Tensor) -> Tensor:
         return resample(field, self._factors_for(field))
 
-    def adjoint(self, field: Tensor) -> Tensor:
-        """Apply the conjugate transpose to ``field`` [..., C, H', W'] of the output grid."""
-        self.check_field(field, self.out_grid)
+    def _adjoint(self, field: Tensor) -> Tensor:
         columns, rows, remainder = self._factors_for(field)
         (height, width), (top, left) = self.grid.shape, _margins(columns, rows, self.grid.shape)
         spread = columns.transpose(-1, -2).conj() @ field @ rows.conj()

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from holotorch.core.fourier import fft, fft2, good_length, ifft2, ifft_unscaled, multiplied
-from holotorch.core.grid import Grid
-from holotorch.core.operator import FieldOperator
+from holotorch.core.grid import Grid, Pair
+from holotorch.core.operator import FieldOperator, Wavelengths
 from holotorch.optics.free_space.kernels import turns_phasor
 
 Chirp = tuple[Tensor, Tensor, Tensor]
@@ -84,37 +84,23 @@ class ZoomedFilter(FieldOperator):
     ``SpectralFilter``, whereas the cost of ``ResampledKernel`` grows with the cube of the size.
 
     Args:
-        grid: Sampling of the field.
-        wavelengths: In metres, one per channel.
+        grid, wavelengths, out_grid: As for :class:`FieldOperator`.
         kernel: Transfer function, complex128 [C, P, Q] in FFT order; the field is zero-padded to P x Q samples.
-        out_grid: Sampling of the result.
         offset: Position (y, x) in metres of the axis of the result relative to the axis of the field.
     """
 
-    def __init__(
-        self,
-        grid: Grid,
-        wavelengths: float | Sequence[float],
-        kernel: Tensor,
-        out_grid: Grid,
-        *,
-        offset: tuple[float, float] = (0.0, 0.0),
-    ):
+    def __init__(self, grid: Grid, wavelengths: Wavelengths, kernel: Tensor, out_grid: Grid, *, offset: Pair = (0, 0)):
         super().__init__(grid, wavelengths, out_grid)
         padded = Grid((kernel.shape[-2], kernel.shape[-1]), grid.pitch)
         columns, rows = chirps(grid, padded, out_grid, offset)
         for i, part in enumerate((kernel, *columns, *rows)):
             self.register_complex(f"part{i}", part)
 
-    def forward(self, field: Tensor) -> Tensor:
-        """Filter ``field``, complex [..., C, H, W]; returns [..., C, H', W'] of the output grid, same dtype."""
-        self.check_field(field, self.grid)
+    def _forward(self, field: Tensor) -> Tensor:
         kernel, columns, rows = self._parts_for(field)
         return zoomed(field, kernel, (columns, rows))
 
-    def adjoint(self, field: Tensor) -> Tensor:
-        """Apply the conjugate transpose to ``field`` [..., C, H', W'] of the output grid."""
-        self.check_field(field, self.out_grid)
+    def _adjoint(self, field: Tensor) -> Tensor:
         kernel, columns, rows = self._parts_for(field)
         lines = zoom_adjoint(field.transpose(-1, -2), columns).transpose(-1, -2)
         spectrum = multiplied(zoom_adjoint(lines, rows), kernel.conj())

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from holotorch.core import checks
-from holotorch.core.grid import Grid
+from holotorch.core.grid import Grid, Pair
 
 Place = TypeVar("Place")
 
@@ -52,7 +52,7 @@ def incoherent_sum(
     return total
 
 
-def disc_source(radius: float, rings: int = 2) -> tuple[list[tuple[float, float]], Tensor]:
+def disc_source(radius: float, rings: int = 2) -> tuple[list[Pair], Tensor]:
     """Points of a uniform disc and their weights: an extended source for :func:`incoherent_sum`.
 
     The radii are nodes of Gauss's rule in the squared radius, with 4 ``rings`` equally spaced points on each ring. The
@@ -76,7 +76,7 @@ def disc_source(radius: float, rings: int = 2) -> tuple[list[tuple[float, float]
     return points, torch.from_numpy(np.repeat(weights / (2 * around), around))
 
 
-def tilted_wave(grid: Grid, wavelength: float, direction: tuple[float, float]) -> Tensor:
+def tilted_wave(grid: Grid, wavelength: float, direction: Pair) -> Tensor:
     """Plane wave exp(2 pi i (y sy + x sx) / wavelength), complex128 [H, W]: illumination from one distant point.
 
     Args:
