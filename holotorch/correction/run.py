@@ -21,6 +21,7 @@ Objective = Callable[[Tensor], Tensor]
 Projection = Callable[[Tensor], Tensor]
 Callback = Callable[["Solution"], None]
 State = dict[str, Tensor]
+_STATE = ("x", "active", "steps", "calm", "stalled")  # attributes of a Run to resume from
 
 
 @dataclass(frozen=True)
@@ -163,31 +164,21 @@ class Run:
     def solution(self, **extra: Tensor) -> Solution:
         """The result so far; ``extra`` holds the tensors that only this solver needs to resume."""
         losses = self.losses[: self.step + 1]
-        state = {
-            **extra,
-            "x": self.x,
-            "active": self.active,
-            "steps": self.steps,
-            "calm": self.calm,
-            "stalled": self.stalled,
-            "losses": losses,
-            "counts": torch.tensor([self.step, self.evaluations]),
-        }
+        state = extra | {name: getattr(self, name) for name in _STATE} | {"losses": losses}
+        state["counts"] = torch.tensor([self.step, self.evaluations])
         return Solution(self.x, losses, self.steps, ~self.active & ~self.stalled, self.stalled, self.evaluations, state)
 
     def _restore(self, state: State) -> None:
-        if state["x"].shape != self.x.shape or state["x"].dtype != self.x.dtype:
-            raise ValueError(
-                f"resume holds x of {tuple(state['x'].shape)} {state['x'].dtype}, the start is "
-                f"{tuple(self.x.shape)} {self.x.dtype}"
-            )
+        held, start = ((tuple(x.shape), x.dtype) for x in (state["x"], self.x))
+        if held != start:
+            raise ValueError(f"resume holds x of {held[0]} {held[1]}, the start is {start[0]} {start[1]}")
         state = {name: values.to(self.x.device) for name, values in state.items()}
         self.step, self.evaluations = (int(number) for number in state["counts"])
         if self.step + 1 > len(self.losses):
             raise ValueError(f"resume has taken {self.step} steps already, more than max_steps {len(self.losses) - 1}")
         self.losses[: self.step + 1] = state["losses"]
-        self.x, self.active, self.steps = state["x"], state["active"], state["steps"]
-        self.calm, self.stalled = state["calm"], state["stalled"]
+        for name in _STATE:
+            setattr(self, name, state[name])
         self.resumed = state
 
 
