@@ -90,7 +90,7 @@ BANDWIDTH = Quantity("fwhm", "m", 1e-15, 100e-6, (0.1e-9, 500e-9))
 WAVELENGTH_CHANGE = Quantity("change", "m", 0.0, 100e-6, (0.1e-9, 500e-9), zero=True, negative=True)
 # Sample pitches, from fine detail of a wave to a distant wall; the range excludes pixels given in millimetres (8e-3).
 PITCH = Quantity("pitch", "m", 1e-9, 2e-3, (100e-9, 200e-6))
-# Lengths along the optical axis: a propagation, an image plane of an experiment, an object in front of a hologram or eye.
+# Lengths along the optical axis: of a propagation, to an image plane, to an object in front of a hologram or an eye.
 DISTANCE = Quantity("distance", "m", 0.0, 1e3, (1e-3, 3.0), zero=True, negative=True)
 PLANE = Quantity("distance", "m", 0.0, 10.0, (1e-3, 3.0), zero=True, negative=True)
 DEPTH = Quantity("depth", "m", 1e-9, 100.0, (1e-3, 3.0))
@@ -98,7 +98,7 @@ DEPTH = Quantity("depth", "m", 1e-9, 100.0, (1e-3, 3.0))
 WIDTH = Quantity("width", "m", 1e-9, 10.0, (1e-3, 0.5))
 SPREAD = Quantity("spread", "m", 1e-9, 1e3, (1e-6, 0.1))
 OFFSET = Quantity("offset", "m", 0.0, 10.0, (1e-6, 0.1), zero=True, negative=True)
-# Optical elements, from a microlens to a weak spectacle lens, and the distances between them in a headset or on a bench.
+# Optical elements, from a microlens to a weak spectacle lens, and the distances between them.
 FOCAL_LENGTH = Quantity("focal_length", "m", 1e-6, 100.0, (1e-3, 1.0), negative=True, infinite=True)
 APERTURE_RADIUS = Quantity("aperture radius", "m", 10e-9, 0.5, (10e-6, 50e-3))
 SPACING = Quantity("distance", "m", 0.0, 10.0, (1e-3, 0.5), zero=True)

@@ -123,8 +123,7 @@ class ConvergingFresnel(FieldOperator):
         if self.distance == 0:
             raise ValueError("distance must not be 0; at 0 multiply the field by the phase of the lens")
         self.magnification = 1.0 if math.isinf(self.focus) else (self.focus - self.distance) / self.focus
-        self.out_grid = out_grid or self._default_grid()
-        self.scaled = self._is_scaled()
+        self.out_grid, self.scaled = self._choose_grid(out_grid)
         wavelength, z, f = (
             torch.tensor(value, dtype=torch.float64) for value in (self.wavelengths, self.distance, self.focus)
         )
@@ -183,40 +182,29 @@ class ConvergingFresnel(FieldOperator):
         columns, rows = (self.complex_buffer(name, field) for name in ("column_curvature", "row_curvature"))
         return columns[..., :, None] * rows[..., None, :]
 
-    def _near_focus(self) -> bool:
-        """Whether the scaled window is smaller than a sample of the field and than a focal spot, on both axes."""
-        spread = max(self.wavelengths) * abs(self.distance)
-        return all(
-            abs(self.magnification) * extent < min(pitch, spread / extent)
-            for extent, pitch in zip(self.grid.extent, self.grid.pitch, strict=True)
-        )
-
-    def _default_grid(self) -> Grid:
-        size = abs(self.magnification)
-        if self._near_focus():
-            y, x = (max(self.wavelengths) * abs(self.distance) / extent for extent in self.grid.extent)
+    def _choose_grid(self, out_grid: Grid | None) -> tuple[Grid, bool]:
+        """``out_grid`` or by default the scaled grid, and whether FFTs compute the result on it."""
+        grid, size = self.grid, abs(self.magnification)
+        y, x = spots = [max(self.wavelengths) * abs(self.distance) / extent for extent in grid.extent]
+        windows = zip(grid.extent, grid.pitch, spots, strict=True)
+        near_focus = all(size * extent < min(pitch, spot) for extent, pitch, spot in windows)
+        if out_grid is None and near_focus:
             raise ValueError(
                 f"distance {self.distance:g} m is so near to the focus, {self.focus:g} m, that the grid scaled by "
                 f"{size:.1e} would be smaller than a single spot of light; pass out_grid, for instance "
-                f"Grid({self.grid.shape}, ({y:.4g}, {x:.4g})), which holds all light at one sample per spot"
+                f"Grid({grid.shape}, ({y:.4g}, {x:.4g})), which holds all light at one sample per spot"
             )
-        return Grid(self.grid.shape, (self.grid.pitch[0] * size, self.grid.pitch[1] * size))
-
-    def _is_scaled(self) -> bool:
-        size = abs(self.magnification)
-        same = all(
-            math.isclose(step, size * pitch, rel_tol=1e-13)
-            for step, pitch in zip(self.out_grid.pitch, self.grid.pitch, strict=True)
-        )
-        return same and self.out_grid.shape == self.grid.shape and not self._near_focus()
+        scaled = grid.pitch[0] * size, grid.pitch[1] * size
+        out_grid = out_grid or Grid(grid.shape, scaled)
+        same_pitch = all(math.isclose(*pitches, rel_tol=1e-13) for pitches in zip(out_grid.pitch, scaled, strict=True))
+        return out_grid, same_pitch and out_grid.shape == grid.shape and not near_focus
 
     def _spectrum(self, axis: int, wavelength: Tensor) -> Tensor:
         """DFT of the taps of a propagation over distance / m, complex128 [C, padded]."""
         size, pitch = self.grid.shape[axis], self.grid.pitch[axis]
         shift = self.offset[axis] / (self.magnification * pitch)
         if self.magnification < 0 and size % 2 == 0:
-            # Reversing an even axis moves its origin from sample n/2 to n/2 - 1.
-            shift += 1
+            shift += 1  # the reversal of an even axis moves the origin from sample n/2 to n/2 - 1
         position = tap_indices(good_length(2 * size - 1), size, size) + shift
         distance = torch.tensor(self.distance / self.magnification, dtype=torch.float64)
         return torch.fft.fft(fresnel_taps(position, pitch, wavelength, distance))
