@@ -5,7 +5,6 @@ torch's scaled transform of 2048 x 2048 complex64 samples is wrong on Intel CPUs
 about the size (pytorch/pytorch#169670). Unscaled transforms and their gradients are right.
 """
 
-import itertools
 import math
 
 import torch
@@ -54,20 +53,10 @@ def good_length(minimum: int, *, odd: bool = False) -> int:
     """
     if minimum < 1:
         raise ValueError(f"an FFT length must be at least 1, got {minimum}")
-    best = 3 ** math.ceil(math.log(minimum, 3) + 1e-9) if odd else 1 << (minimum - 1).bit_length()
-    for bases in itertools.product(_powers(7 if odd else 1, best), _powers(5, best)):
-        product = math.prod(bases)
-        while product < best:
-            # Multiply by the least power of two that reaches the minimum.
-            twos = 0 if odd else max(0, (-(-minimum // product) - 1).bit_length())
-            if product << twos >= minimum:
-                best = min(best, product << twos)
-            product *= 3
-    return best
-
-
-def _powers(base: int, top: int) -> list[int]:
-    return [1] if base == 1 else [base**k for k in range(math.ceil(math.log(top, base)) + 1)]
+    length, primes = (minimum | 1, 3 * 5 * 7) if odd else (minimum, 2 * 3 * 5)
+    while pow(primes, 40, length):  # the remainder is 0 only if ``length`` has no other prime factors
+        length += 1 + odd
+    return length
 
 
 def centred_fft2(field: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from holotorch.core import checks
 
@@ -95,17 +96,14 @@ def _axis_matrices(crosstalk: Crosstalk, phase: Tensor) -> tuple[Tensor, Tensor]
     """Convolution matrices [H, H] and [W, W] of a separable and symmetric kernel, float64."""
     checks.real("phase", phase)
     kernel = crosstalk.kernel
-    middle = kernel.shape[0] // 2, kernel.shape[1] // 2
-    columns, rows = kernel[:, middle[1]], kernel[middle[0], :]
-    if not torch.allclose(columns[:, None] * rows, kernel, rtol=0, atol=1e-12) or not (
-        torch.equal(columns, columns.flip(0)) and torch.equal(rows, rows.flip(0))
-    ):
+    columns, rows = kernel[:, kernel.shape[1] // 2], kernel[kernel.shape[0] // 2, :]
+    separable = torch.allclose(columns[:, None] * rows, kernel, rtol=0, atol=1e-12)
+    if not separable or not all(torch.equal(taps, taps.flip(0)) for taps in (columns, rows)):
         raise ValueError("the crosstalk must be separable and symmetric for a matrix inverse; use deconvolve")
     return _toeplitz(columns, phase.shape[-2], phase.device), _toeplitz(rows, phase.shape[-1], phase.device)
 
 
 def _toeplitz(taps: Tensor, size: int, device: torch.device) -> Tensor:
-    """Matrix [size, size] of the convolution of ``size`` samples with ``taps`` and zero padding."""
-    offsets = torch.arange(size)[:, None] - torch.arange(size) + len(taps) // 2
-    inside = (offsets >= 0) & (offsets < len(taps))
-    return torch.where(inside, taps[offsets.clamp(0, len(taps) - 1)], 0.0).to(device)
+    """Matrix [size, size] of the convolution of ``size`` samples with symmetric ``taps`` and zero padding."""
+    half = functional.pad(taps[len(taps) // 2 :], (0, size))
+    return half[(torch.arange(size)[:, None] - torch.arange(size)).abs()].to(device)

@@ -31,8 +31,8 @@ class LBFGS(Solver):
         precondition: Symmetric positive linear operator on x, such as :func:`spread_preconditioner`; identity if None.
         first: Largest change of an element in the first step, in the unit of x.
 
-    The other attributes, the call and the errors are those of :class:`Solver`. Source: Nocedal and Wright, Algorithm
-    7.4.
+    The other attributes, the call and the errors are those of :class:`Solver`.
+    Source: Nocedal and Wright, Algorithm 7.4.
     """
 
     memory: int = 3
@@ -191,8 +191,7 @@ def spread_preconditioner(kernel: Tensor, floor: float = 0.1) -> Callable[[Tenso
     """Approximate inverse Hessian for unknowns that a ``kernel`` spreads: 1 / (|K|^2 / max |K|^2 + floor) in frequency.
 
     K is the transform of the kernel. The kernel attenuates high frequencies of the unknown and thus of the gradient;
-    this operator amplifies them again. It assumes a periodic convolution, which suffices for an initial inverse
-    Hessian.
+    this operator amplifies them again. It assumes a periodic convolution, which suffices for an initial estimate.
 
     Args:
         kernel: Real, [h, w], such as ``ThermalCrosstalk.kernel``.
@@ -206,12 +205,11 @@ def spread_preconditioner(kernel: Tensor, floor: float = 0.1) -> Callable[[Tenso
         height, width = x.shape[-2:]
         key = (height, width, x.dtype, x.device)
         if key not in factors:
-            taps = torch.zeros(height, width, dtype=torch.float64)
-            for i, row in enumerate(kernel.tolist()):
-                for j, tap in enumerate(row):
-                    # Taps wrap around if the kernel is larger than the array.
-                    taps[(i - kernel.shape[0] // 2) % height, (j - kernel.shape[1] // 2) % width] += tap
-            power = fft2(taps.to(torch.complex128))[:, : width // 2 + 1].abs().square()
+            # Taps wrap around if the kernel is larger than the array.
+            i, j = ((torch.arange(n) - n // 2) % size for n, size in zip(kernel.shape, x.shape[-2:], strict=True))
+            taps = torch.zeros(height, width, dtype=torch.complex128)
+            taps = taps.index_put((i[:, None], j), kernel.detach().cpu().to(taps.dtype), accumulate=True)
+            power = fft2(taps)[:, : width // 2 + 1].abs().square()
             factors.clear()
             factors[key] = (1 / (power / power.max() + floor)).to(x.device, x.dtype)
         return filter_real(x, factors[key])

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -76,8 +77,8 @@ def penalty_schedule(
         limit = checks.positive("limit", limit, "rad")
         first = total // 3
         parts = [({"amplitude": amplitude}, Box(0.0, limit / spread), first)]
-        ends = [first + round((total - first) * share) for share in (0.0, 0.3, 0.6, 0.85, 1.0)]
-        for weight, begin, end in zip((1.0, 10.0, 100.0, 1000.0), ends, ends[1:], strict=False):
+        ends = [first + round((total - first) * fraction) for fraction in (0.0, 0.3, 0.6, 0.85, 1.0)]
+        for weight, (begin, end) in zip((1.0, 10.0, 100.0, 1000.0), pairwise(ends), strict=True):
             parts.append(({"limit": 0.985 * limit, "limit_weight": weight}, nonnegative, end - begin))
     return [
         Stage(make(**keywords), replace(solver, max_steps=steps), box) for keywords, box, steps in parts if steps > 0
