@@ -18,8 +18,9 @@ class CroppedKernel(SpectralFilter):
 
     The paraxial kernel in space is known exactly on every sample (:func:`fresnel_taps` per axis). Cropped to the
     displacements that occur inside the window, it is a linear convolution with transforms of twice the window; a
-    sampled transfer function would wrap the light that leaves the window or lose it. The factor beyond Fresnel is
-    applied in frequency. It moves light by z (tan - sin) of its angle, a few samples, for which the padding has room.
+    sampled transfer function would wrap the light that leaves the window or lose it. The factor beyond Fresnel, the
+    exact transfer function divided by the paraxial one, is applied in frequency. It moves light by z (tan - sin) of its
+    angle, a few samples, for which the padding has room.
 
     For fields of random phase the error relative to the field is at most about 2 s^2 / sqrt(N) at every distance, with
     s the sine of the steepest angle, wavelength / (2 pitch), and N the samples of an axis: with 512 samples, 1e-4 for a

@@ -11,7 +11,7 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.core.complex import phasor
 from holotorch.core.grid import Grid, Pair
-from holotorch.core.quantities import DISTANCE, WAVELENGTH
+from holotorch.core.quantities import DISTANCE, WAVELENGTH, Quantity
 
 
 def carrier(wavelength: Tensor | float, distance: Tensor | float) -> Tensor:
@@ -20,7 +20,7 @@ def carrier(wavelength: Tensor | float, distance: Tensor | float) -> Tensor:
     k z exceeds 1e6 rad, where float32 numbers are 0.1 rad apart, so whole cycles are subtracted in float64. Emits a
     PrecisionWarning if the rounding of a float32 argument changes the phase by 0.01 rad or more.
     """
-    cycles = _distance(distance) / _wavelength(wavelength)
+    cycles = _float64(DISTANCE, distance) / _float64(WAVELENGTH, wavelength)
     checks.precise(wavelength, distance)
     return turns_phasor(cycles)
 
@@ -45,7 +45,8 @@ def angular_spectrum_kernel(
     k_z - k is computed as -k s^2 / (1 + cos), with the sine s and cosine of the angle, to avoid cancellation.
     Source: Goodman, Sec. 3.10.
     """
-    wavelength, distance = _wavelength(wavelength)[..., None, None], _distance(distance)[..., None, None]
+    wavelength, distance = _float64(WAVELENGTH, wavelength), _float64(DISTANCE, distance)
+    wavelength, distance = wavelength[..., None, None], distance[..., None, None]
     fy, fx = grid.frequencies(distance.device)
     sine2 = (wavelength * fy).square() + (wavelength * fx).square()
     travels, decays = sine2 < 1, sine2 > 1
@@ -72,7 +73,7 @@ def fresnel_kernel(grid: Grid, wavelength: Tensor | float, distance: Tensor | fl
     The arguments are those of :func:`angular_spectrum_kernel`. The phase differs from the exact one by about
     k z (wavelength f)^4 / 8. Source: thesis Eq. 4.49; Goodman, Sec. 4.2.
     """
-    product = (_wavelength(wavelength) * _distance(distance))[..., None, None]
+    product = (_float64(WAVELENGTH, wavelength) * _float64(DISTANCE, distance))[..., None, None]
     fy, fx = grid.frequencies(product.device)
     return turns_phasor(-product / 2 * fy.square()) * turns_phasor(-product / 2 * fx.square())
 
@@ -105,11 +106,10 @@ def window_taper(grid: Grid, wavelength: float, distance: float, reach: Pair, *,
         other = other if float(other.max()) > 0.01 else 0.0
         cosine = 1.0 if paraxial else (1 - sine.square() - other).clamp_min(1e-12).sqrt()
         if extent < 2 * start * (1 - 1e-9):
-            raise ValueError(
-                f"a window of {start:.3g} m to either side needs {2 * start:.3g} m, padded are {extent:.3g}"
-            )
-        part = ((abs(distance) * sine.abs() / cosine - start) / max(extent - 2 * start, 1e-9 * extent)).clamp(0, 1)
-        weights = weights * torch.cos(math.pi / 2 * part).square()
+            needed = f"a window of {start:.3g} m to either side needs {2 * start:.3g} m"
+            raise ValueError(f"{needed}, padded are {extent:.3g}")
+        fall = ((abs(distance) * sine.abs() / cosine - start) / max(extent - 2 * start, 1e-9 * extent)).clamp(0, 1)
+        weights = weights * torch.cos(math.pi / 2 * fall).square()
     return weights
 
 
@@ -118,11 +118,6 @@ def turns_phasor(cycles: Tensor) -> Tensor:
     return phasor(2 * math.pi * (cycles - cycles.detach().round()))
 
 
-def _wavelength(value: Tensor | float) -> Tensor:
-    checks.meant(WAVELENGTH, value)
-    return torch.as_tensor(value, dtype=torch.float64)
-
-
-def _distance(value: Tensor | float) -> Tensor:
-    checks.meant(DISTANCE, value)
+def _float64(kind: Quantity, value: Tensor | float) -> Tensor:
+    checks.meant(kind, value)
     return torch.as_tensor(value, dtype=torch.float64)

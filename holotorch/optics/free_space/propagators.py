@@ -111,7 +111,7 @@ class AngularSpectrum(_PaddedKernel):
         band_limit: Drop frequencies that the padded grid undersamples, as :func:`angular_spectrum_kernel` explains.
 
     Raises:
-        ValueError: A wavelength that is not positive, a distance that is not finite, ``pad`` below 1.
+        ValueError: A number outside its range, or ``pad`` below 1.
         MemoryError: The padded kernel needs more memory than is available.
 
     Warns:

@@ -97,8 +97,8 @@ class ResampledKernel(FieldOperator):
 
     The paraxial kernel is known at every position (:func:`fresnel_taps`), so each axis is one product with a dense
     matrix of H' x H or W' x W weights. The pitch and the centre of the result are arbitrary and nothing is
-    interpolated. The factor beyond Fresnel, which moves light by a few samples, is applied to the padded field first.
-    The accuracy is that of ``CroppedKernel``; the cost is H' H W + H' W W' products instead of two FFTs.
+    interpolated. The factor beyond Fresnel (see ``CroppedKernel``) is applied to the padded field first. The accuracy
+    is that of ``CroppedKernel``; the cost is H' H W + H' W W' products instead of two FFTs.
 
     Args:
         grid, wavelengths, out_grid: As for :class:`FieldOperator`.
@@ -110,8 +110,8 @@ class ResampledKernel(FieldOperator):
             of its size and the distance by which the factor moves light.
 
     Raises:
-        ValueError: A wavelength that is not positive, a distance that is 0 or not finite, a pitch below 0.9
-            wavelengths; in a call: a field of another shape.
+        ValueError: A number outside its range, a distance of 0, or a pitch below 0.9 wavelengths; in a call: a field of
+            another shape.
     """
 
     beyond: Tensor | None
@@ -137,11 +137,9 @@ class ResampledKernel(FieldOperator):
         longest = max(self.wavelengths)
         if min(grid.pitch) < FINEST * longest:
             raise ValueError(f"pitch must be at least {FINEST} wavelengths of {longest:g} m, got {min(grid.pitch):g} m")
-        wavelength_tensor = torch.tensor(self.wavelengths, dtype=torch.float64)
-        distance_tensor = torch.tensor(self.distance, dtype=torch.float64)
-        if padded is None and not paraxial:
-            padded = resampled_padding(planes, longest, abs(self.distance))
-        factors = resampling_factors(planes, wavelength_tensor, distance_tensor, padded=None if paraxial else padded)
+        wavelength, z = (torch.tensor(value, dtype=torch.float64) for value in (self.wavelengths, self.distance))
+        padded = None if paraxial else padded or resampled_padding(planes, longest, abs(self.distance))
+        factors = resampling_factors(planes, wavelength, z, padded=padded)
         for name, values in zip(("columns", "rows", "beyond"), factors, strict=True):
             self.register_complex(name, values)
 

@@ -1,4 +1,7 @@
-"""Transfer functions as products of a paraxial factor per axis and the factor beyond Fresnel."""
+"""Transfer functions as products of a paraxial factor per axis and the factor beyond Fresnel.
+
+The factor beyond Fresnel is the exact transfer function divided by the paraxial one.
+"""
 
 import torch
 from torch import Tensor
@@ -63,16 +66,15 @@ def transfer_function(
             shift = levelling_shift(nyquist, wavelength, distance, tilt, axis) / padded.pitch[axis]
             shifts_beyond.append(shift)
             positions[axis] = positions[axis] + shift
+    equal_axes = planes.straight and sampled[0] == sampled[1]
+    equal_axes &= all(len({*zip(grid.shape, grid.pitch, strict=True)}) == 1 for grid in (planes.grid, padded))
     factors = []
-    for axis in (0, 1):
+    for axis in (0,) if equal_axes else (0, 1):
         curvature_distance = distance * (1 - tilt[1 - axis].square()) / cosine2**1.5
         factors.append(
             _axis_factor(planes, axis, padded, wavelength, curvature_distance, positions[axis], sampled=sampled[axis])
         )
-        if planes.straight and _equal_axes(planes.grid) and _equal_axes(padded) and sampled[0] == sampled[1]:
-            factors *= 2  # one computation serves both axes
-            break
-    columns, rows = (factor.to(dtype) for factor in factors)
+    columns, rows = factors[0].to(dtype), factors[-1].to(dtype)
     kernel = columns[..., :, None] * (rows * carrier_factor[..., None])[..., None, :]
     if paraxial:
         return kernel
@@ -101,16 +103,11 @@ def wide_transfer_function(
     kernel = angular_spectrum_kernel(padded, wavelength, distance)
     kernel = kernel * carrier(wavelength, distance)[..., None, None]
     no_tilt = torch.zeros(2, dtype=torch.float64, device=distance.device)
-    for frequency, pitch, position in zip(
-        padded.frequencies(distance.device), padded.pitch, shifts(planes, distance, no_tilt), strict=True
-    ):
+    positions = shifts(planes, distance, no_tilt)
+    for frequency, pitch, position in zip(padded.frequencies(distance.device), padded.pitch, positions, strict=True):
         if bool((position != 0).any()):
             kernel = kernel * turns_phasor(frequency * pitch * position[..., None, None])
     return kernel.to(dtype)
-
-
-def _equal_axes(grid: Grid) -> bool:
-    return grid.shape[0] == grid.shape[1] and grid.pitch[0] == grid.pitch[1]
 
 
 def _axis_factor(
