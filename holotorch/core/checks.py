@@ -84,13 +84,10 @@ def meant(kind: Quantity, value: Tensor | float, name: str = "") -> None:
 
 def precise(wavelength: Tensor | float, distance: Tensor | float) -> None:
     """Warn if the rounding of a tensor of lower precision than float64 changes the phase of exp(ikz) by 0.01 rad."""
-    coarse = {
-        name: value.dtype
-        for name, value in (("wavelength", wavelength), ("distance", distance))
-        if isinstance(value, Tensor) and value.is_floating_point() and value.dtype != torch.float64
-    }
-    given = [value for value in (wavelength, distance) if isinstance(value, Tensor)]
-    if not coarse or torch.compiler.is_compiling() or any(value.device.type != "cpu" for value in given):
+    given = {"wavelength": wavelength, "distance": distance}
+    tensors = {name: value for name, value in given.items() if isinstance(value, Tensor)}
+    coarse = {name: t.dtype for name, t in tensors.items() if t.is_floating_point() and t.dtype != torch.float64}
+    if not coarse or torch.compiler.is_compiling() or any(t.device.type != "cpu" for t in tensors.values()):
         return
     rounding = sum(torch.finfo(dtype).eps / 2 for dtype in coarse.values())
     with contextlib.suppress(RuntimeError):
@@ -181,10 +178,8 @@ def all_finite(name: str, value: Tensor) -> None:
     """Raise ValueError, naming the first NaN or infinite element, unless all elements are finite."""
     bad = ~torch.isfinite(value)
     if bad.any():
-        index = tuple(bad.nonzero()[0].tolist())
-        raise ValueError(
-            f"{name} must be finite, but element {index} is {value[index].item()} ({int(bad.sum())} in all)"
-        )
+        index, count = tuple(bad.nonzero()[0].tolist()), int(bad.sum())
+        raise ValueError(f"{name} must be finite, but element {index} is {value[index].item()} ({count} in all)")
 
 
 def affordable(needed: float, what: str, cure: str, device: torch.device | str = "cpu") -> None:

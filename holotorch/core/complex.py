@@ -21,4 +21,4 @@ def wrapped(phase: Tensor) -> Tensor:
     turn = 2 * math.pi
     reduced = torch.remainder(phase, turn)
     # For a phase just below a multiple of 2 pi, remainder rounds up to 2 pi.
-    return torch.where(reduced >= turn, torch.zeros_like(reduced), reduced)
+    return reduced.masked_fill(reduced >= turn, 0)

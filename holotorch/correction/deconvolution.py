@@ -7,22 +7,15 @@ from torch import Tensor
 from torch.nn import functional
 
 from holotorch.core import checks
+from holotorch.core.operator import LinearOperator
 
 
-class Crosstalk(Protocol):
+class Crosstalk(LinearOperator, Protocol):
     """A convolution of phases [..., H, W] with a kernel and zero padding, such as ``ThermalCrosstalk``."""
 
     @property
     def kernel(self) -> Tensor:
         """Real [h, w], of odd sizes."""
-        ...
-
-    def __call__(self, phase: Tensor) -> Tensor:
-        """The convolution."""
-        ...
-
-    def adjoint(self, phase: Tensor) -> Tensor:
-        """The transpose of the convolution."""
         ...
 
 

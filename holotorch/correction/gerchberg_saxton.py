@@ -12,8 +12,6 @@ from holotorch.correction.deconvolution import Crosstalk, deconvolve
 from holotorch.correction.problem import check_target
 from holotorch.correction.run import Callback, Solution
 
-Deconvolution = Callable[[Tensor, Tensor | None], Tensor]
-
 
 def gerchberg_saxton(
     propagator: LinearOperator,
@@ -22,7 +20,7 @@ def gerchberg_saxton(
     *,
     max_steps: int = 100,
     crosstalk: Callable[[Tensor], Tensor] | None = None,
-    deconvolution: Deconvolution | None = None,
+    deconvolution: Callable[[Tensor, Tensor | None], Tensor] | None = None,
     mask: Tensor | None = None,
     callback: Callback | None = None,
 ) -> Solution:

@@ -11,6 +11,7 @@ x: losses [...] for x [..., *unknown].
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -248,6 +249,6 @@ class Solver:
         """Tensors that the first step needs besides ``run``."""
         raise NotImplementedError
 
-    def _advance(self, run: Run, **extra: Tensor) -> State:
-        """Take one step, and return the tensors that the next step needs besides ``run``."""
+    def _advance(self, run: Run, *_: Any, **extra: Any) -> State:
+        """Take one step with the tensors ``extra``, and return those that the next step needs besides ``run``."""
         raise NotImplementedError

@@ -72,9 +72,9 @@ def converging_fresnel(
 class ConvergingFresnel(FieldOperator):
     """Paraxial propagation of a field behind a thin lens; includes the carrier exp(ikz).
 
-    Only the field v in front of the lens is sampled and band-limited. The phase in v exp(-i k r^2 / (2 focus)), the
-    light that is propagated, is continuous, so the focus may be much shorter than the grid could sample. By the scaling
-    theorem, with m = 1 - distance / focus and V the field v propagated over distance / m, the result is
+    The field v in front of the lens is sampled and band-limited, but the phase of the lens, exp(-i k r^2 / (2 focus)),
+    is taken as continuous, so the focus may be much shorter than the grid could sample. By the scaling theorem, with
+    m = 1 - distance / focus and V the field v propagated over distance / m, the result is
     U(x) = exp(-i pi x^2 / (wavelength (focus - distance))) V(x / m) / m.
 
     On the grid scaled by m this is a linear convolution by FFTs of twice the window. On any other grid each axis is one
@@ -84,8 +84,7 @@ class ConvergingFresnel(FieldOperator):
     Args:
         grid, wavelengths: As for :class:`FieldOperator`.
         distance: In metres, not 0, negative for backward propagation.
-        focus: Focal length in metres, not 0, positive for a converging and negative for a diverging lens, infinite for
-            no lens.
+        focus: Focal length in metres, not 0; positive converges, negative diverges, infinite is no lens.
         out_grid: Sampling of the result, with any shape and pitch; by default ``grid`` with its pitch times abs(m).
         offset: Position (y, x) in metres of the axis of the result relative to the axis of the lens.
 
@@ -93,17 +92,15 @@ class ConvergingFresnel(FieldOperator):
         magnification: m; negative beyond the focus, where the picture is inverted.
         scaled: Whether ``out_grid`` is the scaled grid, so that the result is computed by FFTs.
         beyond_fresnel: Phase in radians that the paraxial model neglects, pi |z| s^4 / (4 wavelength), where s is the
-            largest slope of a ray from the window of the field to the window of the result, among the directions in
-            which the field and the lens send light; 0 if there is no such ray. For most light it is smaller.
+            largest slope of a ray that the field and the lens send from the window of the field to the window of the
+            result; 0 if there is no such ray.
 
     Raises:
         ValueError: A number outside its range, or no ``out_grid`` so close to the focus that the scaled window is
-            smaller than a sample of the field and than a diffraction-limited spot; in a call: a field of another shape.
+            smaller than a sample of the field and than a diffraction-limited spot.
         MemoryError: An ``out_grid`` whose matrices need more memory than is available.
 
-    Warns:
-        SamplingWarning: ``beyond_fresnel`` exceeds 0.1 rad.
-
+    Warns SamplingWarning if ``beyond_fresnel`` exceeds 0.1 rad.
     Source: Goodman, Sec. 4.2; Sziklas and Siegman (1975) for the scaling.
     """
 

@@ -37,8 +37,8 @@ class PixelShape(FieldOperator):
         orders: Highest diffraction order to keep, 0 for the zero order alone.
 
     Raises:
-        TypeError: ``orders`` is not an integer or ``fill`` not a number; in a call: a real field.
-        ValueError: ``orders`` below 0 or ``fill`` outside its range; in a call: a field of another shape.
+        TypeError: ``orders`` is not an integer or ``fill`` not a number.
+        ValueError: ``orders`` below 0 or ``fill`` outside its range.
         MemoryError: In a call: the result needs more memory than is available.
 
     Source: Goodman, Sec. 2.4 (sampled functions) and 4.4 (rectangular aperture).
@@ -109,20 +109,15 @@ def _fill_pair(fill: float | Pair) -> Pair:
 def _pixel_taps(position: Tensor, fill: float, finer: int) -> Tensor:
     """Field of a single pixel of value 1 at ``position``, in pitches from its centre, float64 of any shape.
 
-    It is int_{-s/2}^{s/2} sinc(fill u) exp(2 pi i u position) du with s = ``finer`` and u in cycles per pitch, or the
-    mean of s sinc(s t) over the bright width around ``position``. Gauss's rule computes the mean to rounding error if
-    twice the number of nodes exceeds pi s fill / 2; a difference of sine integrals would cancel for a small ``fill``.
+    It is int_{-s/2}^{s/2} sinc(fill u) exp(2 pi i u position) du with s = ``finer`` and u in cycles per pitch: the mean
+    of s sinc(s t) over the bright width around ``position``, computed by Gauss's rule to rounding error.
     """
     nodes, weights = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(16 + 2 * finer))
     return torch.sinc(finer * (position[..., None] + nodes * (fill / 2))) @ weights * (finer / 2)
 
 
 def _axis_kernel(size: int, fill: float, finer: int) -> Tensor:
-    """DFT of the taps for each of the ``finer`` output samples of a pixel, complex128 [finer, padded].
-
-    Padded to twice the window, so that no displacement wraps around. Divided by the padded length, because the inverse
-    transforms in :func:`_spread` and :func:`_gather` are not scaled (see ``core.fourier``).
-    """
+    """DFT of the taps for each of the ``finer`` output samples of a pixel, divided by its length, [finer, padded]."""
     padded = good_length(2 * size - 1)
     centre = finer * size // 2 - finer * (size // 2)  # index of the output sample at the centre of a pixel
     position = tap_indices(padded, size, size) + (torch.arange(finer, dtype=torch.float64)[:, None] - centre) / finer

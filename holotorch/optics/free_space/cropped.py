@@ -41,7 +41,7 @@ class CroppedKernel(SpectralFilter):
     def __init__(
         self, grid: Grid, wavelengths: Wavelengths, distance: float, *, paraxial: bool = False, offset: Pair = (0, 0)
     ):
-        distance = torch.tensor(checks.quantity(DISTANCE, distance), dtype=torch.float64)
+        z = torch.tensor(checks.quantity(DISTANCE, distance), dtype=torch.float64)
         wavelength = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
         longest = wavelength.max().item()
         planes = PlanePair(grid, grid, checks.offset(offset))
@@ -51,10 +51,10 @@ class CroppedKernel(SpectralFilter):
                 f"{longest:g} m; use AngularSpectrum"
             )
         lengths = [
-            2 * size - 1 if paraxial else crop_length(size, size, pitch, longest, abs(distance.item()), shift / pitch)
+            2 * size - 1 if paraxial else crop_length(size, size, pitch, longest, abs(z.item()), shift / pitch)
             for size, pitch, shift in zip(grid.shape, grid.pitch, planes.offset, strict=True)
         ]
         padded = Grid((good_length(lengths[0]), good_length(lengths[1])), grid.pitch)
-        kernel = transfer_function(planes, padded, wavelength, distance, sampled=(False, False), paraxial=paraxial)
+        kernel = transfer_function(planes, padded, wavelength, z, sampled=(False, False), paraxial=paraxial)
         super().__init__(grid, wavelengths, kernel)
-        self.distance, self.offset = distance.item(), planes.offset
+        self.distance, self.offset = z.item(), planes.offset

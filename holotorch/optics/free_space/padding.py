@@ -19,8 +19,7 @@ def resampled_padding(planes: PlanePair, wavelength: float, distance: float, tai
     sizes = []
     for axis, size in enumerate(planes.grid.shape):
         lateral = planes.grid.extent[axis] + planes.out.extent[axis] + 2 * abs(planes.offset[axis])
-        sine = min(steepest, 0.99, lateral / math.hypot(lateral, distance))
-        moved = distance * (sine / math.sqrt(1 - sine * sine) - sine) / planes.grid.pitch[axis]
+        moved = _shift_beyond_fresnel(steepest, lateral, distance) / planes.grid.pitch[axis]
         sizes.append(good_length(size + 2 * math.ceil(size * tails + moved)))
     return sizes[0], sizes[1]
 
@@ -39,8 +38,13 @@ def crop_length(
         shift: Position of sample 0 of the result relative to sample 0 of the source, in samples.
         pad: Length as a multiple of half the samples of source and result together. With 2 it holds the taps alone.
     """
-    # The steepest light that arrives in the window; sqrt(2) accounts for the corner of the band.
     lateral = (size + window) * pitch + abs(shift) * pitch
-    sine = min(math.sqrt(2) * wavelength * 0.5 / pitch, lateral / math.hypot(lateral, distance), 0.99)
-    moved = distance * (sine / math.sqrt(1 - sine * sine) - sine) if pad > 2 else 0.0
+    steepest = math.sqrt(2) * wavelength * 0.5 / pitch  # in the corner of the band
+    moved = _shift_beyond_fresnel(steepest, lateral, distance) if pad > 2 else 0.0
     return math.ceil(pad * (size + window) / 2 + 2 * moved / pitch) - 1
+
+
+def _shift_beyond_fresnel(steepest: float, lateral: float, distance: float) -> float:
+    """Shift in metres by the factor beyond Fresnel, for sines up to ``steepest`` and rays that move by ``lateral``."""
+    sine = min(steepest, lateral / math.hypot(lateral, distance), 0.99)
+    return distance * (sine / math.sqrt(1 - sine * sine) - sine)

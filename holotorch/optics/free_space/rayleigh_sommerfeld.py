@@ -31,13 +31,8 @@ class RayleighSommerfeld(FieldOperator):
         distance: In metres, not 0.
         offset: Position (y, x) in metres of the axis of the result relative to the axis of the field.
 
-    Raises:
-        ValueError: A number outside its range; in a call: a field of another shape.
-
-    Warns:
-        SamplingWarning: The kernel is undersampled for any field.
-
-    Source: Goodman, Eq. 3-36.
+    Raises ValueError for a number outside its range, and warns with SamplingWarning if the kernel is undersampled for
+    any field. Source: Goodman, Eq. 3-36.
     """
 
     def __init__(

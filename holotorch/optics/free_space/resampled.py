@@ -110,8 +110,7 @@ class ResampledKernel(FieldOperator):
             of its size and the distance by which the factor moves light.
 
     Raises:
-        ValueError: A number outside its range, a distance of 0, or a pitch below 0.9 wavelengths; in a call: a field of
-            another shape.
+        ValueError: A number outside its range, a distance of 0, or a pitch below 0.9 wavelengths.
     """
 
     beyond: Tensor | None

@@ -251,10 +251,10 @@ class Spectrum:
             return middle + nodes, weights
         beat = checks.positive("path_difference", path_difference, "metres") / middle**2
         integral = SpeckleIntegral(offsets, weights, beat, iris / middle)
-        if tolerance is not None:
-            nodes, weights = integral.least_rule(checks.positive("tolerance", tolerance))
+        if count is not None:
+            nodes, weights = integral.rule(checks.whole("count", count, 1))
         else:
-            nodes, weights = integral.rule(checks.whole("count", count or 0, 1))
+            nodes, weights = integral.least_rule(checks.positive("tolerance", tolerance))  # type: ignore[arg-type]
         return middle + nodes, weights
 
     def measure(self) -> tuple[Tensor, Tensor]:
