@@ -70,7 +70,7 @@ def quantity(kind: Quantity, value: float, name: str = "") -> float:
     return number
 
 
-def meant(kind: Quantity, value: Tensor | float, name: str = "") -> None:
+def plausible(kind: Quantity, value: Tensor | float, name: str = "") -> None:
     """Raise as :func:`quantity` for a number and as :func:`quantities` for a tensor, which may require gradients.
 
     Tensors under ``compile`` and ``vmap``, which have no values yet, and tensors on other devices are not checked.
@@ -211,22 +211,6 @@ def _number(name: str, value: Any, unit: str) -> float:
         return math.inf if int(value) > 0 else -math.inf
     except (TypeError, ValueError):
         raise TypeError(f"{name} must be a number{_in(unit)}, got {type(value).__name__} {value!r}") from None
-
-
-def weights(name: str, value: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """Return weights unchanged, or raise ValueError unless they are valid for a target of ``shape`` (C, ...).
-
-    Valid weights are finite, at least 0, broadcast to ``shape``, and are not 0 in all of a channel.
-    """
-    all_finite(name, value)
-    last = shape[len(shape) - value.ndim :]
-    fits = value.ndim <= len(shape) and all(n in (1, size) for n, size in zip(value.shape, last, strict=True))
-    if not fits or (value.numel() and value.min() < 0):
-        raise ValueError(f"{name} must be >= 0 and broadcast to the target {shape}, got {tuple(value.shape)}")
-    empty = ~value.expand(shape).flatten(1).any(1)
-    if bool(empty.any()):
-        raise ValueError(f"{name} is zero everywhere in channel {int(empty.nonzero()[0])}: nothing is left to compare")
-    return value
 
 
 def _in(unit: str) -> str:

@@ -132,13 +132,23 @@ class PECProblem(nn.Module):
 
 
 def check_target(target: Tensor, mask: Tensor | None) -> None:
-    """Raise unless ``target`` is real, finite and >= 0, and ``mask`` holds valid weights for it or is None."""
+    """Raise unless ``target`` is a valid intensity, and ``mask`` None or valid weights for it."""
     checks.real("target", target)
     checks.all_finite("target", target)
     if target.min() < 0:
         raise ValueError(f"target is an intensity and must be >= 0, got a minimum of {target.min().item():g}")
-    if mask is not None:
-        checks.weights("mask", mask, tuple(target.shape))
+    if mask is None:
+        return
+    checks.all_finite("mask", mask)
+    sizes = zip(mask.shape[::-1], target.shape[::-1], strict=False)
+    fits = mask.ndim <= target.ndim and all(n in (1, size) for n, size in sizes)
+    if not fits or (mask.numel() and mask.min() < 0):
+        raise ValueError(
+            f"mask must be >= 0 and broadcast to the target {tuple(target.shape)}, got {tuple(mask.shape)}"
+        )
+    empty = ~mask.expand(target.shape).flatten(1).any(1)
+    if bool(empty.any()):
+        raise ValueError(f"mask is zero everywhere in channel {int(empty.nonzero()[0])}: nothing is left to compare")
 
 
 def best_scale(formed: Tensor, target: Tensor, first: int = -2) -> Tensor:

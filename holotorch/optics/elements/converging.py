@@ -55,7 +55,7 @@ def converging_fresnel(
         (DISTANCE, distance, "distance"),
         (FOCAL_LENGTH, focus, "focus"),
     ):
-        checks.meant(kind, value, name)
+        checks.plausible(kind, value, name)
         if isinstance(value, Tensor) and value.is_cuda and not torch.compiler.is_compiling():
             checks.quantities(kind, value, name)
     offset = checks.offset(offset)

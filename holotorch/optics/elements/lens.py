@@ -34,8 +34,8 @@ def lens_phase(
     Raises:
         ValueError: A length outside its range.
     """
-    checks.meant(WAVELENGTH, wavelength)
-    checks.meant(FOCAL_LENGTH, focal_length)
+    checks.plausible(WAVELENGTH, wavelength)
+    checks.plausible(FOCAL_LENGTH, focal_length)
     return 2 * math.pi * _phase_cycles(grid, wavelength, focal_length, paraxial)
 
 
@@ -52,7 +52,7 @@ def pupil(grid: Grid, radius: Tensor | float, *, softness: float = 0.0) -> Tenso
         ValueError: ``radius`` carries a gradient but the edge is hard, so that the gradient would be 0; or a length
             outside its range.
     """
-    checks.meant(APERTURE_RADIUS, radius, "radius")
+    checks.plausible(APERTURE_RADIUS, radius, "radius")
     checks.quantity(SOFTNESS, softness)
     radius = torch.as_tensor(radius, dtype=torch.float64)
     y, x = grid.coordinates(radius.device)

@@ -119,5 +119,5 @@ def turns_phasor(cycles: Tensor) -> Tensor:
 
 
 def _float64(kind: Quantity, value: Tensor | float) -> Tensor:
-    checks.meant(kind, value)
+    checks.plausible(kind, value)
     return torch.as_tensor(value, dtype=torch.float64)

@@ -1,8 +1,8 @@
 """Images under a spectrum: few wavelengths are propagated, and images at nearby wavelengths are derived from them.
 
-Under light of wavelength lambda a fixed hologram H produces at distance z the field U with (Fresnel,
-without its carrier) FT[U](f) = exp(-i pi lambda z f^2) FT[H](f). Only the product of wavelength and distance enters,
-so a change of wavelength acts like a change of depth:
+In the Fresnel model and without the carrier, a fixed hologram H under light of wavelength lambda produces at distance z
+the field U with FT[U](f) = exp(-i pi lambda z f^2) FT[H](f). Only the product of wavelength and distance enters, so a
+change of wavelength acts like a change of depth:
 
     FT[U'](f) = exp(-i pi (lambda' - lambda) z f^2) FT[U](f).
 
@@ -26,7 +26,7 @@ from holotorch.core.fourier import centred_fft2, centred_ifft2
 from holotorch.core.grid import Grid
 from holotorch.optics.free_space.kernels import turns_phasor
 from holotorch.optics.light.incoherent import incoherent_sum
-from holotorch.optics.light.wavelength_sampling import flawless, followed, least_followed, unseparated
+from holotorch.optics.light.wavelength_sampling import flawless, inseparable, least_followed, select_wavelengths
 from holotorch.optics.viewing.display import Display, number
 from holotorch.optics.viewing.elementwise import propagate_elements
 from holotorch.optics.viewing.eye import Eye
@@ -63,7 +63,7 @@ def neighbours(
         ValueError: An eye with aberrations or colour error whose pupil transmits more than the band of ``grid``.
     """
     centre = checks.wavelengths(wavelength)[0]
-    if unseparated(grid, centre, display, eye):
+    if inseparable(grid, centre, display, eye):
         raise ValueError(
             "the errors of this eye cannot be set anew for another wavelength, since its pupil takes more than the "
             "band of the grid; follow every wavelength, or use a smaller pupil or a finer grid"
@@ -149,7 +149,7 @@ def spectral_image(
     power = shares.detach().reshape(-1, len(lengths)).sum(0)
     if tolerance is not None:
         count = least_followed(lengths, power, tolerance, grid, display, eye, reach=reach)
-    nodes, nearest = followed(lengths, power, count or 0)
+    nodes, nearest = select_wavelengths(lengths, power, count or 0)
     propagate = propagate_elements if elements else propagate_collapsed
     margin = _margin(grid, lengths, nodes, nearest, display, eye)
     wide = Grid((grid.shape[0] + 2 * margin[0], grid.shape[1] + 2 * margin[1]), grid.pitch)

@@ -76,7 +76,7 @@ def seen_light(grid: Grid, wavelength: float, display: Display, eye: Eye, *, rea
     return SeenLight(rim, spread.max().item(), bend)
 
 
-def followed(places: Tensor, weights: Tensor, count: int) -> tuple[list[int], list[int]]:
+def select_wavelengths(places: Tensor, weights: Tensor, count: int) -> tuple[list[int], list[int]]:
     """Select ``count`` wavelengths with equal shares of the power, and assign every wavelength to the nearest of them.
 
     Args:
@@ -105,7 +105,7 @@ def neighbour_error(places: Tensor, weights: Tensor, count: int, light: SeenLigh
     the Fresnel model between neighbours neglects the fourth order of the slopes (``bend`` of ``light``). If the light
     illuminates only small parts of the edge, the true error is only 0.1 to 0.5 times the result.
     """
-    nodes, nearest = followed(places, weights, count)
+    nodes, nearest = select_wavelengths(places, weights, count)
     share = weights / weights.sum()
     offsets = places - places[nodes][nearest]
     walk = 0.0
@@ -137,7 +137,7 @@ def least_followed(
     """
     tolerance = checks.positive("tolerance", tolerance)
     light = seen_light(grid, places.mean().item(), display, eye, reach=reach)
-    if unseparated(grid, places.min().item(), display, eye):
+    if inseparable(grid, places.min().item(), display, eye):
         return len(places)
     counts = range(1, len(places))
     return next((n for n in counts if neighbour_error(places, weights, n, light) <= tolerance), len(places))
@@ -148,7 +148,7 @@ def flawless(eye: Eye) -> bool:
     return not eye.aberrations and eye.chromatic_reference is None
 
 
-def unseparated(grid: Grid, centre: float, display: Display, eye: Eye) -> bool:
+def inseparable(grid: Grid, centre: float, display: Display, eye: Eye) -> bool:
     """Whether the errors of an eye cannot be removed from an image, as its pupil exceeds the band of ``grid``."""
     if flawless(eye):
         return False
