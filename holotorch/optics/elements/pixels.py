@@ -77,10 +77,10 @@ class PixelShape(FieldOperator):
 def order_efficiency(fill: float | Pair, order: Pair) -> float:
     """Fraction of the light on a uniform panel in one diffraction order: the product of (a sinc(m a))^2 over the axes.
 
-    Per axis, a is ``fill`` as in :class:`PixelShape` and m the order in the direction sin(angle) = m wavelength /
-    pitch. Orders (y, x) need not be whole: if the phase rises by 2 pi t from pixel to pixel (a blazed panel), order m
-    lies at m + t, which is the number to pass. All orders together contain fill[0] fill[1] of the light; the rest falls
-    on the gaps between the pixels.
+    Per axis, a is ``fill`` of :class:`PixelShape` and m the order, whose direction has the sine m wavelength / pitch.
+    Orders (y, x) need not be whole: if the phase rises by 2 pi t from pixel to pixel (a blazed panel), order m lies at
+    m + t, which is the number to pass. All orders together contain fill[0] fill[1] of the light; the rest falls on the
+    gaps between the pixels.
 
     Raises:
         TypeError: ``fill`` is not a number.
@@ -106,22 +106,18 @@ def _fill_pair(fill: float | Pair) -> Pair:
     return y, x
 
 
-def _pixel_taps(position: Tensor, fill: float, finer: int) -> Tensor:
-    """Field of a single pixel of value 1 at ``position``, in pitches from its centre, float64 of any shape.
-
-    It is int_{-s/2}^{s/2} sinc(fill u) exp(2 pi i u position) du with s = ``finer`` and u in cycles per pitch: the mean
-    of s sinc(s t) over the bright width around ``position``, computed by Gauss's rule to rounding error.
-    """
-    nodes, weights = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(16 + 2 * finer))
-    return torch.sinc(finer * (position[..., None] + nodes * (fill / 2))) @ weights * (finer / 2)
-
-
 def _axis_kernel(size: int, fill: float, finer: int) -> Tensor:
-    """DFT of the taps for each of the ``finer`` output samples of a pixel, divided by its length, [finer, padded]."""
+    """DFT of the field of a pixel of value 1 at ``finer`` samples per pitch, divided by its length: [finer, padded].
+
+    The field at t pitches from the centre of the pixel is int_{-s/2}^{s/2} sinc(fill u) exp(2 pi i u t) du with
+    s = ``finer``: the mean of s sinc(s x) over the bright width around t, computed by Gauss's rule to rounding error.
+    """
     padded = good_length(2 * size - 1)
     centre = finer * size // 2 - finer * (size // 2)  # index of the output sample at the centre of a pixel
     position = tap_indices(padded, size, size) + (torch.arange(finer, dtype=torch.float64)[:, None] - centre) / finer
-    return torch.fft.fft(_pixel_taps(position, fill, finer)) / padded
+    nodes, weights = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(16 + 2 * finer))
+    taps = torch.sinc(finer * (position[..., None] + nodes * (fill / 2))) @ weights * (finer / 2)
+    return torch.fft.fft(taps) / padded
 
 
 def _spread(lines: Tensor, kernel: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""CroppedKernel: propagation at any distance that neither wraps light around nor limits its band."""
+"""CroppedKernel: propagation at any distance that neither wraps light around nor removes frequencies."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""Lateral spread of light on the way between two planes, and the padding that it needs. Numbers, no tensors."""
+"""Lateral spread of light between two planes and the padding that it needs. Lengths are numbers in metres."""
 
 import math
 

@@ -18,13 +18,13 @@ def fresnel_taps(displacement: Tensor, pitch: float, wavelength: Tensor, distanc
     distances the taps approach a single sample with sinc tails, at long ones the sampled chirp of a point source.
 
     Args:
-        displacement: n in samples, which need not be whole, shape [n].
+        displacement: n in samples, which need not be whole, shape [N].
         pitch: In metres.
         wavelength: In metres, float64, shape [...].
         distance: In metres, float64, shape [...], not 0; negative gives the conjugate.
 
     Returns:
-        complex128 of shape [..., n].
+        complex128 of shape [..., N].
     """
     product = (wavelength * distance.abs())[..., None]
     displacement = displacement.to(torch.float64)
@@ -56,11 +56,12 @@ def tap_indices(padded: int, size: int, out: int) -> Tensor:
 
 
 def remainder_kernel(fy: Tensor, fx: Tensor, wavelength: Tensor, distance: Tensor) -> Tensor:
-    """Exact transfer function divided by the paraxial one: exp(-i pi z s^4 / (wavelength (1 + cos)^2)), complex128.
+    """The factor beyond Fresnel, exp(-i pi z s^4 / (wavelength (1 + cos)^2)), complex128.
 
-    s and cos are the sine and cosine of the angle to the axis. The frequencies in cycles per metre broadcast against
-    wavelength and distance in metres. Evanescent waves decay with abs(distance); their phase is such that the product
-    with the paraxial factor and the carrier is real. :func:`tilted_turns` is the counterpart for a tilted carrier.
+    It is the exact transfer function divided by the paraxial one; s and cos are the sine and cosine of the angle to the
+    axis. The frequencies in cycles per metre broadcast against wavelength and distance in metres. Evanescent waves
+    decay with abs(distance); their phase is such that the product with the paraxial factor and the carrier is real.
+    :func:`tilted_turns` is the counterpart for a tilted carrier.
     """
     sine2 = (wavelength * fy).square() + (wavelength * fx).square()
     travels = sine2 < 1

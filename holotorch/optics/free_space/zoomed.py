@@ -19,7 +19,8 @@ def chirp(size: int, step: float, start: float, count: int, device: torch.device
 
     ``step`` and ``start`` are in samples of the field, which has ``size`` of them. The identity
     k j = (k^2 + j^2 - (j - k)^2) / 2 makes the sum over frequencies k a convolution with a chirp (Rabiner, Schafer and
-    Rader 1969; Bluestein 1970). Returns complex128 of shape [size], [L >= size + count - 1] and [count].
+    Rader 1969; Bluestein 1970). Returns the factor on the spectrum [size], the DFT of the convolving chirp
+    [L >= size + count - 1] and the factor on the result [count], complex128.
     """
     index = torch.arange(size, dtype=torch.float64, device=device)
     index = torch.where(index >= (size + 1) // 2, index - size, index)

@@ -11,7 +11,7 @@ DEFOCUS = 2.3  # focal shift by half the optimum width, in depths of focus; fitt
 
 
 def path_difference(distance: float, aperture: float, *, tilt: float = 0.0) -> float:
-    """Greatest difference in metres between paths from a hologram through a pupil to the depth in focus.
+    """Greatest difference in metres between paths from a hologram to a point in focus that is seen through a pupil.
 
     A hologram diffracts light of spatial frequency f to the sine f lambda. Over ``distance`` the phase of this light
     changes by -pi distance lambda f^2. From the centre to the edge of the pupil, the difference of the phases at two

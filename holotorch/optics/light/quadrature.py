@@ -50,11 +50,10 @@ def correlation(first: Tensor, second: Tensor, beat: float, iris: float = 0.0) -
     0..1 and ``beat`` is the path difference divided by the squared wavelength (see ``coherence``). The correlation of
     the intensities is the squared mean of exp(2 pi i beat t (lambda - lambda')): sinc^2(beat (lambda - lambda')).
 
-    An iris transmits fixed directions, not fixed frequencies: as the wavelength grows, it cuts off a fraction 2
-        ``iris``
-    of the power per metre of wavelength, where ``iris`` is 1 / wavelength, or 0 without an iris. Only light that passes
-    at both wavelengths is correlated. The correlation therefore has a kink at equal wavelengths, and the intensity at a
-    point, as a function of wavelength, is as rough as a random walk.
+    An iris transmits fixed directions, not fixed frequencies. As the wavelength grows, it cuts off a fraction
+    2 ``iris`` of the power per metre of wavelength, where ``iris`` is 1 / wavelength, or 0 without an iris. Only light
+    that passes at both wavelengths is correlated. The correlation therefore has a kink at equal wavelengths, and the
+    intensity at a point, as a function of wavelength, is as rough as a random walk.
     """
     shared = 1 - 2 * iris * torch.maximum(first[:, None], second)
     return (shared * torch.sinc(beat * shared * (first[:, None] - second))).square()

@@ -19,7 +19,7 @@ _NODES = 256  # of integrals over the band; accurate to rounding for phases that
 
 @dataclass(frozen=True)
 class _Line:
-    """A Lorentzian line, or a Gaussian one."""
+    """A Lorentzian or, with ``gaussian``, a Gaussian line; all wavelengths in metres."""
 
     centre: float
     half_width: float
@@ -258,7 +258,7 @@ class Spectrum:
         return middle + nodes, weights
 
     def measure(self) -> tuple[Tensor, Tensor]:
-        """Many wavelengths [M] and weights [M] with a sum of 1, for integrals over the band near rounding error."""
+        """Many wavelengths [M] and weights [M] with a sum of 1, which integrate over the band nearly to rounding error."""
         nodes, steps = self._steps()
         weights = self.profile(nodes) * steps
         return nodes, weights / weights.sum()

@@ -1,4 +1,4 @@
-"""Selection of the wavelengths of a spectrum to propagate; the images at the others are derived from theirs."""
+"""Selection of the wavelengths to propagate, from whose images those at the other wavelengths are derived."""
 
 import math
 from dataclasses import dataclass
