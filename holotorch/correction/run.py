@@ -29,8 +29,7 @@ _STATE = ("x", "active", "steps", "calm", "stalled")  # attributes of a Run to r
 class Box:
     """The set lower <= x <= upper; a call projects onto it. Bounds are numbers or tensors that broadcast against x.
 
-    Raises:
-        ValueError: A bound that is NaN, or a lower bound above the upper bound.
+    Raises ValueError for a bound that is NaN, or a lower bound above the upper bound.
     """
 
     lower: float | Tensor = 0.0

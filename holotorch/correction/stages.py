@@ -106,8 +106,7 @@ def proximal_pec(
 def limit_peak_phase(limit: float, phase: Tensor, crosstalk: Callable[[Tensor], Tensor]) -> Tensor:
     """Scale down each hologram of ``phase`` [..., H, W] whose phase after spreading exceeds ``limit`` in rad.
 
-    Raises:
-        ValueError: A limit that is not finite and above zero, or a phase that is not finite.
+    Raises ValueError for a limit that is not finite and above zero, or a phase that is not finite.
     """
     limit = checks.positive("limit", limit, "rad")
     checks.all_finite("phase", phase)

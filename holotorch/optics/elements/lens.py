@@ -31,8 +31,7 @@ def lens_phase(
     Returns:
         float64, shape [..., H, W], not wrapped.
 
-    Raises:
-        ValueError: A length outside its range.
+    Raises ValueError for a length outside its range.
     """
     checks.plausible(WAVELENGTH, wavelength)
     checks.plausible(FOCAL_LENGTH, focal_length)

@@ -93,8 +93,7 @@ def window_taper(grid: Grid, wavelength: float, distance: float, reach: Pair, *,
         reach: Half the extent of the window plus half the extent of the field, in metres (y, x).
         paraxial: Light moves sideways by the sine of its angle, as in the Fresnel model, instead of the tangent.
 
-    Raises:
-        ValueError: A padded extent below twice ``reach``.
+    Raises ValueError for a padded extent below twice ``reach``.
     """
     weights = torch.ones((), dtype=torch.float64)
     sines = [wavelength * each for each in grid.frequencies()]

@@ -109,8 +109,7 @@ class ResampledKernel(FieldOperator):
         padded: Samples of the transforms that apply this factor. The default adds to each side of the window an eighth
             of its size and the distance by which the factor moves light.
 
-    Raises:
-        ValueError: A number outside its range, a distance of 0, or a pitch below 0.9 wavelengths.
+    Raises ValueError for a number outside its range, a distance of 0, or a pitch below 0.9 wavelengths.
     """
 
     beyond: Tensor | None

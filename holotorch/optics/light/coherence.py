@@ -26,8 +26,7 @@ def path_difference(distance: float, aperture: float, *, tilt: float = 0.0) -> f
         tilt: Sine of the direction from the point in focus to the centre of the pupil, 0 for points on the axis. If
             it exceeds ``aperture``, the difference is 2 distance tilt aperture.
 
-    Raises:
-        ValueError: An aperture that is not above 0, or an aperture and a tilt that add up to more than 1.
+    Raises ValueError for an aperture that is not above 0, or an aperture and a tilt that add up to more than 1.
     """
     distance = abs(checks.quantity(DISTANCE, distance))
     aperture, tilt = checks.positive("aperture", aperture), abs(checks.finite("tilt", tilt))

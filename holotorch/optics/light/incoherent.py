@@ -84,8 +84,7 @@ def tilted_wave(grid: Grid, wavelength: float, direction: Pair) -> Tensor:
         wavelength: In metres.
         direction: Sines (sy, sx) of the direction of the wave.
 
-    Raises:
-        ValueError: A direction that the grid cannot sample.
+    Raises ValueError for a direction that the grid cannot sample.
     """
     wavelength = checks.wavelengths(wavelength)[0]
     sines = checks.pair("direction", direction, "sines")

@@ -19,8 +19,7 @@ def gauss_rule(nodes: Tensor, weights: Tensor, count: int) -> tuple[Tensor, Tens
         weights: Weights of the measure, float64 [M], positive with a sum of 1.
         count: At most M; for M the rule is the measure itself.
 
-    Raises:
-        ValueError: A count above M.
+    Raises ValueError for a count above M.
 
     Source: Golub and Welsch (1969), with Lanczos' recurrence and full orthogonalisation.
     """
@@ -109,8 +108,7 @@ class SpeckleIntegral:
     def least_rule(self, tolerance: float) -> tuple[Tensor, Tensor]:
         """The :meth:`rule` with the fewest nodes whose expected error is within ``tolerance``.
 
-        Raises:
-            ValueError: More than 512 wavelengths would be needed.
+        Raises ValueError if more than 512 wavelengths would be needed.
         """
         # An upper bound is the count that suffices with Gauss's rule, which needs at least 0.75 beat half nodes.
         count = max(1, int(self.beat * float(self.nodes.abs().max()) * 0.75))

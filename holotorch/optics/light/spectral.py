@@ -59,8 +59,7 @@ def neighbours(
         Complex [..., H, W] for each of ``others``, one in memory at a time. Near the edges, light from outside ``grid``
         is missing, and light that leaves ``grid`` wraps around; :func:`spectral_image` therefore adds a margin.
 
-    Raises:
-        ValueError: An eye with aberrations or colour error whose pupil transmits more than the band of ``grid``.
+    Raises ValueError for an eye with aberrations or colour error whose pupil transmits more than the band of ``grid``.
     """
     centre = checks.wavelengths(wavelength)[0]
     if inseparable(grid, centre, display, eye):

@@ -96,8 +96,7 @@ class Spectrum:
         cutoff: Lowest power kept, as a fraction of the peak, above 0 and below 1.
         profile: Power relative to the peak as a function of wavelength.
 
-    Raises:
-        ValueError: A width, wavelength or cutoff outside its range, or a band that would extend to wavelength 0.
+    Raises ValueError for a width, wavelength or cutoff outside its range, or a band that would extend to wavelength 0.
     """
 
     centre: float
@@ -258,7 +257,7 @@ class Spectrum:
         return middle + nodes, weights
 
     def measure(self) -> tuple[Tensor, Tensor]:
-        """Many wavelengths [M] and weights [M] with a sum of 1, which integrate over the band nearly to rounding error."""
+        """Many wavelengths [M] and weights [M] with a sum of 1, which integrate over the band almost exactly."""
         nodes, steps = self._steps()
         weights = self.profile(nodes) * steps
         return nodes, weights / weights.sum()
