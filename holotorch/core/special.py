@@ -38,3 +38,12 @@ def fresnel_auxiliary(u: Tensor) -> tuple[Tensor, Tensor]:
     density = weight / (1 + (t * inverse[..., None]).square().square())
     scale = math.sqrt(2) / math.pi
     return scale * density.sum(-1) * inverse, scale * (density * t.square()).sum(-1) * inverse**3
+
+
+def chirped_fresnel_integral(u: Tensor, chirp: Tensor, end: Tensor, sign: Tensor | float = 1.0) -> Tensor:
+    """``chirp`` times int_0^u exp(-i sign pi t^2 / 2) dt, complex128; ``end`` is chirp exp(-i sign pi u^2 / 2)."""
+    large = u.abs() > FRESNEL_BORDER
+    f, g = fresnel_auxiliary(torch.where(large, u.abs(), 2.0))
+    outside = torch.sign(u) * ((0.5 - 0.5j * sign) * chirp + torch.complex(-g, sign * f) * end)
+    integral = fresnel_integral(torch.where(large, 0.0, u))
+    return torch.where(large, outside, chirp * torch.complex(integral.real, sign * integral.imag))

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core.grid import Grid, Pair
-from holotorch.core.special import FRESNEL_BORDER, fresnel_auxiliary, fresnel_integral
+from holotorch.core.special import chirped_fresnel_integral
 from holotorch.optics.free_space.kernels import carrier, turns_phasor
 
 _CHUNK = 50_000  # weights computed at a time, each by a quadrature of 42 numbers
@@ -68,7 +68,6 @@ def _weights(x: Tensor, q: Tensor, pitch: float, wavelength: Tensor, distance: T
     sign_z_over_m = torch.sign(distance) * (1 - 2 * inverted)
     scale = torch.sqrt(2 * (product / size).abs())
     chirp = turns_phasor(((x - q).square() / distance - q.square() / focus) / (2 * wavelength))
-    half = torch.complex(torch.full_like(sign_z_over_m, 0.5), -sign_z_over_m / 2)
     total = torch.zeros_like(chirp)
     for sign in (1, -1):
         # exp(-+i pi u^2 / 2) times the chirp: the contribution of one end of the band.
@@ -78,12 +77,8 @@ def _weights(x: Tensor, q: Tensor, pitch: float, wavelength: Tensor, distance: T
         u = scale * (edge - sign * (x - m * q) / product)
         # A position on the step, such as the outermost sample of an even DFT, counts as exactly on it despite rounding.
         u = torch.where(sharp & (from_edge.abs() <= 1e-12 * edge), 0.0, u)
-        large = (u.abs() > FRESNEL_BORDER) | sharp
-        f, g = fresnel_auxiliary(torch.where(u.abs() > FRESNEL_BORDER, u.abs(), 2.0))
-        boundary = torch.where(sharp, 0.0, torch.complex(-g, sign_z_over_m * f) * band_end)
-        integral = fresnel_integral(torch.where(large, 0.0, u))
-        small_u = torch.complex(integral.real, sign_z_over_m * integral.imag)
-        total = total + torch.where(large, torch.sign(u) * (half * chirp + boundary), chirp * small_u)
+        step = torch.sign(u) * ((0.5 - 0.5j * sign_z_over_m) * chirp)
+        total = total + torch.where(sharp, step, chirped_fresnel_integral(u, chirp, band_end, sign_z_over_m))
     # The phase of the root of 1 / m, chosen for m < 0 such that the weights are continuous at m = 0.
     root = torch.complex(1 - inverted, -inverted * torch.sign(distance))
     return total * root * (pitch / torch.sqrt(2 * product.abs()))

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from holotorch.core.special import FRESNEL_BORDER, fresnel_auxiliary, fresnel_integral
+from holotorch.core.special import chirped_fresnel_integral
 from holotorch.optics.free_space.kernels import turns_phasor
 
 
@@ -36,11 +36,7 @@ def fresnel_taps(displacement: Tensor, pitch: float, wavelength: Tensor, distanc
         # exp(-i pi u^2 / 2) times the chirp is the integrand at one end of the band.
         band_end = turns_phasor(-product * edge**2 / 2 + sign * displacement / 2)
         u = scale * (edge - sign * x / product)
-        large = u.abs() > FRESNEL_BORDER
-        f, g = fresnel_auxiliary(torch.where(large, u.abs(), 2.0))
-        outside = torch.sign(u) * ((0.5 - 0.5j) * chirp + torch.complex(-g, f) * band_end)
-        inside = chirp * fresnel_integral(torch.where(large, 0.0, u))
-        total = total + torch.where(large, outside, inside)
+        total = total + chirped_fresnel_integral(u, chirp, band_end)
     taps = total * pitch / scale
     return torch.where((distance < 0)[..., None], taps.conj(), taps)
 
