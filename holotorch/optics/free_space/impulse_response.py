@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core.special import chirped_fresnel_integral
-from holotorch.optics.free_space.kernels import turns_phasor
+from holotorch.optics.free_space.kernels import direction_cosine, turns_phasor
 
 
 def fresnel_taps(displacement: Tensor, pitch: float, wavelength: Tensor, distance: Tensor) -> Tensor:
@@ -60,14 +60,11 @@ def remainder_kernel(fy: Tensor, fx: Tensor, wavelength: Tensor, distance: Tenso
     :func:`tilted_turns` is the counterpart for a tilted carrier.
     """
     sine2 = (wavelength * fy).square() + (wavelength * fx).square()
-    travels = sine2 < 1
-    cosine = torch.where(travels, torch.sqrt(torch.where(travels, 1 - sine2, 1)), 0)
-    cycles = -distance / wavelength * torch.where(travels, (sine2 / (1 + cosine)).square() / 2, 1 - sine2 / 2)
+    cosine, imaginary = direction_cosine(sine2)
+    cycles = -distance / wavelength * torch.where(sine2 < 1, (sine2 / (1 + cosine)).square() / 2, 1 - sine2 / 2)
     phase = turns_phasor(cycles)
-    decays = sine2 > 1
-    if not bool(decays.any()):
+    if not bool(imaginary.any()):
         return phase
-    imaginary = torch.where(decays, torch.sqrt(torch.where(decays, sine2 - 1, 1)), 0)
     return phase * torch.exp(-2 * math.pi * distance.abs() / wavelength * imaginary)
 
 

@@ -49,12 +49,8 @@ def angular_spectrum_kernel(
     wavelength, distance = wavelength[..., None, None], distance[..., None, None]
     fy, fx = grid.frequencies(distance.device)
     sine2 = (wavelength * fy).square() + (wavelength * fx).square()
-    travels, decays = sine2 < 1, sine2 > 1
-    # Masked before the root, so that the unused branch has a finite gradient.
-    cosine = torch.where(travels, torch.sqrt(torch.where(travels, 1 - sine2, 1)), 0)
-    imaginary = torch.where(decays, torch.sqrt(torch.where(decays, sine2 - 1, 1)), 0)
-
-    cycles = -distance / wavelength * torch.where(travels, sine2 / (1 + cosine), 1)
+    cosine, imaginary = direction_cosine(sine2)
+    cycles = -distance / wavelength * torch.where(sine2 < 1, sine2 / (1 + cosine), 1)
     kernel = torch.exp(-2 * math.pi * distance.abs() / wavelength * imaginary) * turns_phasor(cycles)
     if not band_limit:
         return kernel
@@ -65,6 +61,15 @@ def angular_spectrum_kernel(
     twice_product = 2 * (distance * wavelength).abs()
     kept = (twice_product * fy.abs() <= height * root) & (twice_product * fx.abs() <= width * root)
     return torch.where(kept, kernel, 0)
+
+
+def direction_cosine(sine2: Tensor) -> tuple[Tensor, Tensor]:
+    """Real and imaginary part of sqrt(1 - sine2); the imaginary part belongs to evanescent waves."""
+    # Masked before the root, so that the unused branch has a finite gradient.
+    real, imaginary = (
+        torch.where(part > 0, torch.sqrt(torch.where(part > 0, part, 1)), 0) for part in (1 - sine2, sine2 - 1)
+    )
+    return real, imaginary
 
 
 def fresnel_kernel(grid: Grid, wavelength: Tensor | float, distance: Tensor | float) -> Tensor:
