@@ -39,8 +39,8 @@ def incoherent_sum(
     items = places.tolist() if isinstance(places, Tensor) else list(places)
     if not items or len(items) != len(weights):
         raise ValueError(f"places and weights must be equally many and at least one, got {len(items)}, {len(weights)}")
-    total = None
     again = recompute and torch.is_grad_enabled()
+    total: Tensor | None = None
     for place, weight in zip(items, weights, strict=True):
         part = checkpoint(intensity_of, place, use_reentrant=False) if again else intensity_of(place)
         assert isinstance(part, Tensor)

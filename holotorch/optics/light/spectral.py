@@ -150,7 +150,8 @@ def spectral_image(
         count = least_followed(lengths, power, tolerance, grid, display, eye, reach=reach)
     nodes, nearest = select_wavelengths(lengths, power, count or 0)
     propagate = propagate_elements if elements else propagate_collapsed
-    margin = _margin(grid, lengths, nodes, nearest, display, eye)
+    largest = (lengths - lengths[nodes][nearest]).abs().max().item()
+    margin = _margin(grid, largest, display, eye)
     wide = Grid((grid.shape[0] + 2 * margin[0], grid.shape[1] + 2 * margin[1]), grid.pitch)
     padded = torch.nn.functional.pad(field, (margin[1], margin[1], margin[0], margin[0]))
 
@@ -161,23 +162,18 @@ def spectral_image(
     def image_near(node: int) -> Tensor:
         centre = lengths[nodes[node]].item()
         image = propagate(padded[..., None, :, :], wide, [centre], display, eye, paraxial=paraxial)[..., 0, :, :]
-        total = weighted(image, nodes[node])
         others = [k for k, owner in enumerate(nearest) if owner == node and k != nodes[node]]
-        if others:
-            images = neighbours(image, wide, centre, lengths[others].tolist(), display, eye, elements=elements)
-            for k, other in zip(others, images, strict=True):
-                total = total + weighted(other, k)
-        return total
+        near = lengths[others].tolist()
+        images = neighbours(image, wide, centre, near, display, eye, elements=elements) if others else ()
+        parts = (weighted(other, k) for k, other in zip(others, images, strict=True))
+        return sum(parts, start=weighted(image, nodes[node]))
 
     total = incoherent_sum(image_near, list(range(len(nodes))), [1.0] * len(nodes), recompute=recompute)
     return total[..., margin[0] : margin[0] + grid.shape[0], margin[1] : margin[1] + grid.shape[1]]
 
 
-def _margin(
-    grid: Grid, places: Tensor, nodes: list[int], nearest: list[int], display: Display, eye: Eye
-) -> tuple[int, int]:
-    """Samples (y, x) by which the steepest light moves sideways for the largest change of wavelength."""
-    largest = max(abs((places[k] - places[nodes[owner]]).item()) for k, owner in enumerate(nearest))
+def _margin(grid: Grid, change: float, display: Display, eye: Eye) -> tuple[int, int]:
+    """Samples (y, x) by which a change of the wavelength in metres moves the steepest light sideways."""
     plane = abs(number(display.focus_plane(eye.accommodation)))
-    y, x = (math.ceil(plane * largest / (2 * p**2)) * (n > 1) for n, p in zip(grid.shape, grid.pitch, strict=True))
+    y, x = (math.ceil(plane * change / (2 * p**2)) * (n > 1) for n, p in zip(grid.shape, grid.pitch, strict=True))
     return y, x
