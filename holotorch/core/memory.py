@@ -35,5 +35,5 @@ def _container_limit(folder: Path = Path("/sys/fs/cgroup")) -> int:
         limit, used = (folder / "memory.max").read_text().strip(), (folder / "memory.current").read_text()
         cache = re.search(r"^inactive_file (\d+)", (folder / "memory.stat").read_text(), re.MULTILINE)
         return int(limit) - int(used) + (int(cache[1]) if cache else 0)
-    except (OSError, ValueError):  # no control group, or "max"
+    except (OSError, ValueError):  # no control group, or no limit ("max")
         return 1 << 62

@@ -110,7 +110,7 @@ WAVEFRONT_ERROR = Quantity("wavefront error", "m", 0.0, 1e-3, (1e-9, 10e-6), zer
 SOFTNESS = Quantity("softness", "m", 0.0, 10e-3, (1e-6, 1e-3), zero=True)
 VOXEL = Quantity("volume spacing", "m", 1e-12, 0.1, (1e-6, 5e-3))  # from atoms to rooms
 CAUCHY_B = Quantity("b", "square metres", 0.0, 1e-12, (1e-16, 1e-13), zero=True, negative=True)  # of a birefringence
-SIGMA_PX = Quantity("sigma_px", "pixels", 0.0, 100.0, (0.1, 5.0), zero=True)  # heat crosstalk; singular kernel beyond
+SIGMA_PX = Quantity("sigma_px", "pixels", 0.0, 100.0, (0.1, 5.0), zero=True)  # of heat crosstalk; singular above
 # Catheters and other tools that are tracked, and their positions.
 TOOL_RADIUS = Quantity("radius", "m", 10e-6, 50e-3, (0.2e-3, 20e-3))
 TOOL_LENGTH = Quantity("length", "m", 1e-3, 3.0, (10e-3, 2.0))

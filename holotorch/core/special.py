@@ -5,13 +5,13 @@ import math
 import torch
 from torch import Tensor
 
-FRESNEL_BORDER = 1.3  # argument up to which the series, and from which on the quadrature, is exact to rounding
-_TERMS = 34  # of the series
+FRESNEL_BORDER = 1.3  # the power series is exact to rounding for arguments up to this, the quadrature from this on
+_TERMS = 34  # number of terms of the series
 _SERIES = [
     [sign / (math.factorial(n) * (2 * n + 1)) if n % 2 == part else 0.0 for part in (0, 1)]
     for n, sign in zip(range(_TERMS), [1, 1, -1, -1] * 9, strict=False)
 ]
-_STEP, _NODES = 0.13, 42  # of the quadrature
+_STEP, _NODES = 0.13, 42  # step and number of nodes of the quadrature
 
 
 def fresnel_integral(u: Tensor) -> Tensor:

@@ -48,7 +48,7 @@ def resampling_factors(
         tilt = torch.tensor(planes.tilt, dtype=torch.float64, device=distance.device)
     cosine2 = 1 - tilt.square().sum()
     nyquist = 0.5 / planes.grid.pitch[0], 0.5 / planes.grid.pitch[1]
-    # Linear phase that the taps take over from the factor beyond Fresnel, as a shift in metres.
+    # Linear phase, as a shift in metres, that is moved from the factor beyond Fresnel into the taps.
     shifts = [torch.zeros_like(distance)] * 2
     if padded is not None and any(planes.tilt):
         shifts = [levelling_shift(nyquist, wavelength, distance, tilt, axis) for axis in (0, 1)]

@@ -110,7 +110,7 @@ class SpeckleIntegral:
 
         Raises ValueError if more than 512 wavelengths would be needed.
         """
-        # An upper bound is the count that suffices with Gauss's rule, which needs at least 0.75 beat half nodes.
+        # The count that suffices with Gauss's rule is an upper bound. Fewer nodes than this start have large errors.
         count = max(1, int(self.beat * float(self.nodes.abs().max()) * 0.75))
         most = min(_MOST, len(self.nodes))
         while count <= most:

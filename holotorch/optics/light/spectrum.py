@@ -14,7 +14,7 @@ from holotorch.core.quantities import BANDWIDTH
 from holotorch.optics.light.quadrature import SpeckleIntegral, gauss_rule
 
 CUTOFF = 0.1  # fraction of the peak below which the thesis drops the power (Sec. 5.5.2.2)
-_NODES = 256  # of integrals over the band; accurate to rounding for phases that change by up to 200 rad
+_NODES = 256  # nodes of integrals over the band; exact to rounding for phases that vary by up to 200 rad
 
 
 @dataclass(frozen=True)
