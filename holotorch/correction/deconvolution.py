@@ -20,7 +20,7 @@ class Crosstalk(LinearOperator, Protocol):
 
 
 def inverse(crosstalk: Crosstalk, phase: Tensor) -> Tensor:
-    """The exact solution X of P(X) = ``phase``, real [..., H, W], computed in float64.
+    """The exact solution X of P(X) = ``phase``, real [..., H, W], where P is the crosstalk; computed in float64.
 
     X may be negative or very large. Marrian et al. (1987) make it positive by "chopping", which sets negative entries
     to 0, or by "shifting", which adds the magnitude of the smallest entry.

@@ -26,8 +26,8 @@ class LBFGS(Solver):
     stored vectors, so that a step needs only a few passes over these vectors, whatever the number of items.
 
     Attributes:
-        memory: Number of stored pairs of a step and its change of gradient. For holograms more than 3 do not help, and
-            at strong crosstalk they converge more slowly (``holotorch chart pec``).
+        memory: Number of stored pairs of a step and its change of gradient. For holograms a larger memory does not help,
+            and at strong crosstalk it slows the convergence (``holotorch chart pec``).
         precondition: Symmetric positive linear operator on x, such as :func:`spread_preconditioner`; identity if None.
         first: Largest change of an element in the first step, in the unit of x.
 
@@ -117,10 +117,10 @@ class LBFGS(Solver):
 
 
 class _Memory:
-    """The last m steps s, changes of gradient y, and z = H0 y of every item, oldest first; tensors are never modified.
+    """The last m steps s, changes of gradient y, and z = H0 y of every item, oldest first, H0 being the preconditioner.
 
     The inner products sy = s_i y_j and yz = y_i z_j are float64, since triangular systems are solved with them. A pair
-    without positive curvature along s is stored as zeros for that item, and has no effect.
+    without positive curvature along s is stored as zeros for that item, and has no effect. Tensors are not modified.
     """
 
     def __init__(self, state: State):

@@ -1,5 +1,6 @@
 """PixelShape: what a panel of pixels of finite size emits, higher diffraction orders included."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -90,10 +91,8 @@ def order_efficiency(fill: float | Pair, order: Pair) -> float:
     """
     if not isinstance(order, Sequence) or len(order) != 2:
         raise ValueError(f"order must be a pair (y, x), got {order!r}")
-    efficiency = 1.0
-    for part, number in zip(_fill_pair(fill), order, strict=True):
-        efficiency *= (part * float(np.sinc(checks.finite("order", number) * part))) ** 2
-    return efficiency
+    parts = zip(_fill_pair(fill), order, strict=True)
+    return math.prod((part * float(np.sinc(checks.finite("order", number) * part))) ** 2 for part, number in parts)
 
 
 def _fill_pair(fill: float | Pair) -> Pair:
