@@ -26,8 +26,8 @@ class LBFGS(Solver):
     stored vectors, so that a step needs only a few passes over these vectors, whatever the number of items.
 
     Attributes:
-        memory: Number of stored pairs of a step and its change of gradient. For holograms a larger memory does not help,
-            and at strong crosstalk it slows the convergence (``holotorch chart pec``).
+        memory: Number of stored pairs of a step and its change of gradient. A larger memory does not help for holograms
+            and slows the convergence at strong crosstalk (``holotorch chart pec``).
         precondition: Symmetric positive linear operator on x, such as :func:`spread_preconditioner`; identity if None.
         first: Largest change of an element in the first step, in the unit of x.
 
