@@ -133,22 +133,21 @@ class Lens(Transmission):
         radius: float | None = None,
         paraxial: bool = True,
     ):
-        wavelength_values = checks.wavelengths(wavelengths)
-        given = list(focal_length) if isinstance(focal_length, Sequence) else [focal_length] * len(wavelength_values)
-        if len(given) != len(wavelength_values):
-            raise ValueError(
-                f"focal_length must be one number or one per wavelength ({len(wavelength_values)}), got {len(given)}"
-            )
+        wavelengths = checks.wavelengths(wavelengths)
+        given = list(focal_length) if isinstance(focal_length, Sequence) else [focal_length] * len(wavelengths)
+        if len(given) != len(wavelengths):
+            wanted = f"one number or one per wavelength ({len(wavelengths)})"
+            raise ValueError(f"focal_length must be {wanted}, got {len(given)}")
         lengths = [checks.quantity(FOCAL_LENGTH, each) for each in given]
         edge = None if radius is None else checks.quantity(APERTURE_RADIUS, radius, "radius")
-        affordable("a lens", grid, len(wavelength_values))
-        wavelength, length = (torch.tensor(each, dtype=torch.float64) for each in (wavelength_values, lengths))
+        affordable("a lens", grid, len(wavelengths))
+        wavelength, length = (torch.tensor(each, dtype=torch.float64) for each in (wavelengths, lengths))
         values = turns_phasor(_phase_cycles(grid, wavelength, length, paraxial))
         if edge is not None:
             values = values * pupil(grid, edge)
-        super().__init__(grid, wavelength_values, values)
+        super().__init__(grid, wavelengths, values)
         self.focal_length, self.radius, self.paraxial = tuple(lengths), edge, paraxial
-        warn_if_coarse(grid, wavelength_values, lengths, edge, paraxial=paraxial)
+        warn_if_coarse(grid, wavelengths, lengths, edge, paraxial=paraxial)
 
     def extra_repr(self) -> str:
         """Sampling, wavelengths and lens, for ``print(module)``."""
@@ -208,19 +207,17 @@ def warn_if_coarse(
 ) -> None:
     """SamplingWarning if ``grid`` is too coarse for lenses of these focal lengths within ``radius``."""
     for wavelength, length in zip(wavelengths, lengths, strict=True):
-        if math.isinf(length):
-            continue
         for size, pitch in zip(grid.shape, grid.pitch, strict=True):
             outermost = min(size // 2 * pitch, radius or math.inf)
             limit = lens_limit(pitch, wavelength, length, paraxial=paraxial)
-            if outermost <= limit * (1 + 1e-9):
-                continue
-            slope = outermost / (abs(length) if paraxial else math.hypot(outermost, length))
-            warnings.warn(
-                f"Lens of focal length {length:g} m at {wavelength:g} m wavelength: samples {pitch:g} m apart hold its "
-                f"phase only up to {limit * 1e3:.3g} mm from the axis, but it reaches {outermost * 1e3:.3g} mm; a "
-                f"pitch of {wavelength / 2 / slope:.3g} m or less would do for flat light, a smaller radius too",
-                SamplingWarning,
-                stacklevel=3,
-            )
-            return
+            if outermost > limit * (1 + 1e-9):
+                slope = outermost / (abs(length) if paraxial else math.hypot(outermost, length))
+                warnings.warn(
+                    f"Lens of focal length {length:g} m at {wavelength:g} m wavelength: samples {pitch:g} m apart hold "
+                    f"its phase only up to {limit * 1e3:.3g} mm from the axis, but it reaches "
+                    f"{outermost * 1e3:.3g} mm; a pitch of {wavelength / 2 / slope:.3g} m or less would do for flat "
+                    "light, a smaller radius too",
+                    SamplingWarning,
+                    stacklevel=3,
+                )
+                return
