@@ -1,1 +1,1 @@
-"""Sampling grids, Fourier transforms, complex helpers and argument checks that every other part stands on."""
+"""Sampling grids, Fourier transforms, linear operators and argument checks, on which all other packages depend."""

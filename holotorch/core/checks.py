@@ -1,4 +1,4 @@
-"""Argument checks with uniform messages: the expected value, the given value, and what to change."""
+"""Argument checks. Their messages name the expected value, the given value, and often what to change."""
 
 import contextlib
 import math
@@ -11,18 +11,18 @@ import torch
 from torch import Tensor
 
 from holotorch.core import memory
-from holotorch.core.quantities import WAVELENGTH, Quantity
+from holotorch.core.quantities import OFFSET, WAVELENGTH, Quantity
 
-_UNASKED = 64 << 20  # bytes up to which the available memory is not read, which takes 0.1 ms
-_TURNED = 0.01  # rad: phase error above which rounding is reported, 1 % of a field
+_SMALL = 64 << 20  # bytes that are assumed to be available; reading the available memory takes 0.1 ms
+_PHASE_ERROR = 0.01  # rad: error of the phase by rounding above which a warning is due; changes a field by 1 %
 
 
 class SamplingWarning(UserWarning):
-    """A grid is too coarse or too small for its light; the message names a sufficient sampling."""
+    """A grid is too coarse or too small for the light on it; the message names a sufficient sampling."""
 
 
 class PrecisionWarning(UserWarning):
-    """A number has fewer digits than the phase of light needs; the message names a sufficient type."""
+    """A number has too few digits for the phase of light; the message names a sufficient dtype."""
 
 
 def positive(name: str, value: float, unit: str = "") -> float:
@@ -42,7 +42,7 @@ def nonnegative(name: str, value: float, unit: str = "") -> float:
 
 
 def finite(name: str, value: float, unit: str = "") -> float:
-    """Return ``value`` as float, or raise TypeError for what is no number and ValueError for NaN and infinity."""
+    """Return ``value`` as float, or raise TypeError unless it is a number and ValueError for NaN and infinity."""
     number = _number(name, value, unit)
     if not math.isfinite(number):
         raise ValueError(f"{name} must be finite{_in(unit)}, got {value!r}")
@@ -50,16 +50,17 @@ def finite(name: str, value: float, unit: str = "") -> float:
 
 
 def quantity(kind: Quantity, value: float, name: str = "") -> float:
-    """Return a physical quantity as float, or raise unless it can be meant: see :mod:`holotorch.core.quantities`.
+    """Return a physical quantity as float, or raise unless it is plausible.
 
     Args:
-        kind: Which quantity, with its unit and range.
-        value: A number, or a tensor of one element that carries no gradient.
-        name: Of the argument; that of the quantity by default.
+        kind: The quantity, with its unit and plausible range.
+        value: A number, or a tensor of one element without gradient.
+        name: Name of the argument; by default that of the quantity.
 
     Raises:
-        TypeError: No number.
-        ValueError: NaN, or outside the range; the message names the unit, and the prefix that was forgotten.
+        TypeError: The value is not a number.
+        ValueError: NaN, or a value outside the range. The message names the unit and, for lengths, the SI prefix that
+            was probably forgotten.
     """
     name = name or kind.name
     number = _number(name, value, kind.words)
@@ -69,46 +70,43 @@ def quantity(kind: Quantity, value: float, name: str = "") -> float:
     return number
 
 
-def meant(kind: Quantity, value: Tensor | float, name: str = "") -> None:
-    """Raise as :func:`quantity` for a number and as :func:`quantities` for a tensor, which may be learned.
+def plausible(kind: Quantity, value: Tensor | float, name: str = "") -> None:
+    """Raise as :func:`quantity` for a number and as :func:`quantities` for a tensor, which may require gradients.
 
-    Tensors that are compiled or mapped over hold no values yet, and those on another device are not waited for.
+    Tensors under ``compile`` and ``vmap``, which have no values yet, and tensors on other devices are not checked.
     """
     if not isinstance(value, Tensor):
         quantity(kind, value, name)
     elif value.device.type == "cpu" and not torch.compiler.is_compiling():
-        with contextlib.suppress(RuntimeError):  # of vmap and of fake tensors, where a value would decide
+        with contextlib.suppress(RuntimeError):  # vmapped and fake tensors have no values
             quantities(kind, value, name)
 
 
 def precise(wavelength: Tensor | float, distance: Tensor | float) -> None:
-    """PrecisionWarning where the rounding of a tensor below float64 turns the phase of exp(ikz) by 0.01 rad or more."""
-    coarse = {
-        name: value.dtype
-        for name, value in (("wavelength", wavelength), ("distance", distance))
-        if isinstance(value, Tensor) and value.is_floating_point() and value.dtype != torch.float64
-    }
-    given = [value for value in (wavelength, distance) if isinstance(value, Tensor)]
-    if not coarse or torch.compiler.is_compiling() or any(value.device.type != "cpu" for value in given):
+    """Warn if the rounding of a tensor of lower precision than float64 changes the phase of exp(ikz) by 0.01 rad."""
+    given = {"wavelength": wavelength, "distance": distance}
+    tensors = {name: value for name, value in given.items() if isinstance(value, Tensor)}
+    coarse = {name: t.dtype for name, t in tensors.items() if t.is_floating_point() and t.dtype != torch.float64}
+    if not coarse or torch.compiler.is_compiling() or any(t.device.type != "cpu" for t in tensors.values()):
         return
     rounding = sum(torch.finfo(dtype).eps / 2 for dtype in coarse.values())
     with contextlib.suppress(RuntimeError):
         cycles = torch.as_tensor(distance).detach().double() / torch.as_tensor(wavelength).detach().double()
-        turned = 2 * math.pi * rounding * float(cycles.abs().max()) if cycles.numel() else 0.0
-        if turned >= _TURNED:
+        error = 2 * math.pi * rounding * float(cycles.abs().max()) if cycles.numel() else 0.0
+        if error >= _PHASE_ERROR:
             which = " and ".join(f"{name} is {str(dtype).removeprefix('torch.')}" for name, dtype in coarse.items())
             warnings.warn(
-                f"{which}, whose rounding turns the phase of exp(ikz) by up to {turned:.2g} rad here; pass float64",
+                f"{which}, whose rounding turns the phase of exp(ikz) by up to {error:.2g} rad here; pass float64",
                 PrecisionWarning,
                 stacklevel=3,
             )
 
 
 def quantities(kind: Quantity, values: Tensor, name: str = "") -> None:
-    """Raise ValueError for an element of ``values``, of any shape and with or without gradient, as :func:`quantity`."""
+    """Raise ValueError as :func:`quantity` for the first implausible element of ``values``, of any shape."""
     size = values.detach().abs() if kind.negative else values.detach()
     if bool(((size >= kind.low) & (size <= kind.high)).all()):
-        return  # most calls end here, without a loop over all elements
+        return  # the usual case, without a loop over all elements
     for value in values.detach().reshape(-1).tolist():
         problem = kind.problem(value)
         if problem:
@@ -125,41 +123,49 @@ def whole(name: str, value: int, least: int) -> int:
 
 
 def port(value: int, least: int = 0) -> int:
-    """Return a port of TCP or UDP as int, or raise as :func:`whole`, also above 65535; ``least`` 0 picks a free one."""
+    """Return the number of a TCP or UDP port as int, or raise unless it lies in ``least`` .. 65535."""
     if whole("port", value, least) > 65535:
         raise ValueError(f"port must be at most 65535, got {value!r}")
     return int(value)
 
 
 def pair(name: str, values: Sequence[float], unit: str = "") -> tuple[float, float]:
-    """Return two finite numbers (y, x) as floats, or raise TypeError for what is no pair of numbers."""
+    """Return two numbers (y, x) as floats, or raise TypeError unless it is a pair, and ValueError unless finite."""
     items = values if isinstance(values, Sequence) and not isinstance(values, str) else ()
     if len(items) != 2:
         raise TypeError(f"{name} must be two numbers (y, x){_in(unit)}, got {values!r}")
     return finite(name, items[0], unit), finite(name, items[1], unit)
 
 
+def offset(values: Sequence[float]) -> tuple[float, float]:
+    """Return a position (y, x) in metres on a plane as floats, or raise as :func:`pair` and :func:`quantity`."""
+    y, x = pair("offset", values, "metres")
+    return quantity(OFFSET, y), quantity(OFFSET, x)
+
+
 def wavelengths(values: float | Sequence[float]) -> tuple[float, ...]:
-    """Return wavelengths in metres as a tuple, one per channel; a single number means one channel."""
-    items: list[Any] = [values] if _scalar(values) else list(values)  # type: ignore[arg-type]
+    """Return wavelengths in metres as a tuple, one per channel, or raise; a number is a single channel."""
+    single = isinstance(values, str | numbers.Real) or (isinstance(values, Tensor) and values.ndim == 0)
+    items: list[Any] = [values] if single else list(values)  # type: ignore[arg-type]
     if not items:
         raise ValueError("wavelengths must hold at least one value in metres, got none")
     return tuple(quantity(WAVELENGTH, item) for item in items)
 
 
 def field(name: str, value: Tensor, shape: tuple[int, ...], *, complex_valued: bool = True) -> None:
-    """Raise unless ``value`` is a tensor of the wanted kind whose last axes are ``shape``.
+    """Raise TypeError unless ``value`` is a complex (or real) tensor, and ValueError unless it ends in ``shape``.
 
-    Raises:
-        TypeError: It is no tensor, or real where complex is needed, or the other way round.
-        ValueError: Its trailing axes differ from ``shape``, which is (C, H, W) or (H, W).
+    ``shape`` is (C, H, W) or (H, W).
     """
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
     axes = "(C, H, W)" if len(shape) == 3 else "(H, W)"
     if tuple(value.shape[-len(shape) :]) != shape:
         raise ValueError(f"{name} must end in {axes} = {shape}, got {tuple(value.shape)}")
-    real(name, value) if not complex_valued else _complex(name, value)
+    if not complex_valued:
+        real(name, value)
+    elif not value.is_complex():
+        raise TypeError(f"{name} must be complex (complex64 or complex128), got {value.dtype}; use torch.complex")
 
 
 def real(name: str, value: Tensor) -> None:
@@ -169,24 +175,23 @@ def real(name: str, value: Tensor) -> None:
 
 
 def all_finite(name: str, value: Tensor) -> None:
-    """Raise ValueError naming the first NaN or infinite element, if any."""
+    """Raise ValueError, naming the first NaN or infinite element, unless all elements are finite."""
     bad = ~torch.isfinite(value)
     if bad.any():
-        index = tuple(int(i) for i in bad.nonzero()[0])
-        count = int(bad.sum())
+        index, count = tuple(bad.nonzero()[0].tolist()), int(bad.sum())
         raise ValueError(f"{name} must be finite, but element {index} is {value[index].item()} ({count} in all)")
 
 
 def affordable(needed: float, what: str, cure: str, device: torch.device | str = "cpu") -> None:
-    """Raise MemoryError before an operation that needs more memory than is available.
+    """Raise MemoryError if an operation would need more memory than is available.
 
     Args:
         needed: Largest extra memory of the operation, in bytes.
-        what: What needs it, with the sizes that decide it.
-        cure: What to change, as an imperative.
-        device: Where it is allocated.
+        what: The operation and its size, as the beginning of the message.
+        cure: What to change, as an imperative, for the end of the message.
+        device: Where the memory is allocated.
     """
-    if needed <= _UNASKED or torch.compiler.is_compiling():
+    if needed <= _SMALL or torch.compiler.is_compiling():
         return
     available = memory.available_memory(device)
     if available is not None and needed > available:
@@ -206,33 +211,6 @@ def _number(name: str, value: Any, unit: str) -> float:
         return math.inf if int(value) > 0 else -math.inf
     except (TypeError, ValueError):
         raise TypeError(f"{name} must be a number{_in(unit)}, got {type(value).__name__} {value!r}") from None
-
-
-def weights(name: str, value: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """Return weights as they are, or raise unless they broadcast to ``shape`` = (C, ...) and leave something of each C.
-
-    Raises:
-        ValueError: NaN, infinity, a weight below zero, another shape, or a channel in which all are zero: whatever is
-            compared there is equal.
-    """
-    all_finite(name, value)
-    behind = shape[len(shape) - value.ndim :]
-    fits = value.ndim <= len(shape) and all(n in (1, whole) for n, whole in zip(value.shape, behind, strict=True))
-    if not fits or (value.numel() and value.min() < 0):
-        raise ValueError(f"{name} must be >= 0 and broadcast to the target {shape}, got {tuple(value.shape)}")
-    empty = ~value.expand(shape).flatten(1).any(1)
-    if bool(empty.any()):
-        raise ValueError(f"{name} is zero everywhere in channel {int(empty.nonzero()[0])}: nothing is left to compare")
-    return value
-
-
-def _complex(name: str, value: Tensor) -> None:
-    if not value.is_complex():
-        raise TypeError(f"{name} must be complex (complex64 or complex128), got {value.dtype}; use torch.complex")
-
-
-def _scalar(value: Any) -> bool:
-    return isinstance(value, str | numbers.Real) or (isinstance(value, Tensor) and value.ndim == 0)
 
 
 def _in(unit: str) -> str:

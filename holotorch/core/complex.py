@@ -1,4 +1,4 @@
-"""Phase to field and field to intensity, without detours that cost precision or gradients."""
+"""Conversions between phase, field and intensity that keep precision and gradients."""
 
 import math
 
@@ -12,13 +12,13 @@ def phasor(phase: Tensor) -> Tensor:
 
 
 def intensity(field: Tensor) -> Tensor:
-    """Squared magnitude, real. Unlike ``abs() ** 2`` its gradient needs no root, so it is exact at zero too."""
+    """Squared magnitude, real. Unlike that of ``abs() ** 2``, the gradient is exact at zero too."""
     return field.real.square() + field.imag.square()
 
 
 def wrapped(phase: Tensor) -> Tensor:
-    """Phase reduced to [0, 2 pi): heaters cannot cool, so the principal value must not be negative."""
+    """Phase in rad reduced to [0, 2 pi); heaters cannot produce negative phases."""
     turn = 2 * math.pi
     reduced = torch.remainder(phase, turn)
-    # remainder rounds up to 2 pi itself for a phase just below a multiple of it.
-    return torch.where(reduced >= turn, torch.zeros_like(reduced), reduced)
+    # For a phase just below a multiple of 2 pi, remainder rounds up to 2 pi.
+    return reduced.masked_fill(reduced >= turn, 0)

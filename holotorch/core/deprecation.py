@@ -1,4 +1,4 @@
-"""Old names of public functions, which keep working for the code of users and warn."""
+"""Old names of public functions, which still work but warn."""
 
 import sys
 import warnings
@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping
 
 
 def renamed(module: str, names: Mapping[str, str]) -> Callable[[str], object]:
-    """Module-level ``__getattr__`` that resolves old names of ``module`` to new ones with a DeprecationWarning.
+    """Module-level ``__getattr__`` that resolves old names of ``module`` with a DeprecationWarning.
 
     Args:
         module: ``__name__`` of the module, which defines the new names.
-        names: Old name to new name.
+        names: Mapping from old to new names.
     """
 
     def resolve(name: str) -> object:

@@ -1,11 +1,10 @@
-"""Transforms, centred and unitary ones, zero-padded spectral filtering, linear convolution.
+"""Discrete Fourier transforms, zero-padded spectral filtering and linear convolution.
 
-All two-dimensional transforms of the library go through here, and leave scaling to a product of their own: with a scale
-of its own, torch's transform of 2048 x 2048 complex64 samples is wrong on Intel CPUs with several threads, by a factor
-of about the size (pytorch/pytorch#169670). Unscaled ones are right, and so are their gradients.
+The two-dimensional transforms here call torch without scaling and multiply by the scale afterwards. The reason is that
+torch's scaled transform of 2048 x 2048 complex64 samples is wrong on Intel CPUs with several threads, by a factor of
+about the size (pytorch/pytorch#169670). Unscaled transforms and their gradients are right.
 """
 
-import itertools
 import math
 
 import torch
@@ -14,14 +13,14 @@ from torch.nn import functional
 
 
 def fft2(field: Tensor, size: tuple[int, int] | None = None) -> Tensor:
-    """DFT over the last two axes, not scaled, of ``field`` padded with zeros at the end to ``size``."""
+    """Unscaled DFT over the last two axes of ``field``, zero-padded at the end to ``size``."""
     if 0 in field.shape[:-2]:
         return _resized(field, size)
     return torch.fft.fft2(field, s=size)
 
 
 def ifft2(spectrum: Tensor, size: tuple[int, int] | None = None, first: tuple[int, int] = (0, 0)) -> Tensor:
-    """Inverse of :func:`fft2`, cropped to ``size`` samples from ``first`` on; it is periodic."""
+    """Inverse of :func:`fft2`; with ``size``, the samples from ``first`` on of the periodically continued field."""
     if 0 in spectrum.shape[:-2]:
         return _resized(spectrum, size)
     field = torch.fft.ifft2(spectrum, norm="forward")
@@ -35,47 +34,38 @@ def ifft2(spectrum: Tensor, size: tuple[int, int] | None = None, first: tuple[in
 
 
 def fft(lines: Tensor, length: int | None = None) -> Tensor:
-    """DFT over the last axis, not scaled, of ``lines`` [..., n] padded with zeros at the end to ``length``."""
+    """Unscaled DFT over the last axis of ``lines`` [..., n], zero-padded at the end to ``length``."""
     if 0 in lines.shape[:-1]:
         return _resized(lines[..., None, :], None if length is None else (1, length))[..., 0, :]
     return torch.fft.fft(lines, length)
 
 
 def ifft_unscaled(lines: Tensor) -> Tensor:
-    """Inverse DFT over the last axis of ``lines`` [..., n] without its factor 1 / n."""
+    """Inverse DFT over the last axis of ``lines`` [..., n] without the factor 1 / n."""
     return lines if 0 in lines.shape[:-1] else torch.fft.ifft(lines, norm="forward")
 
 
 def good_length(minimum: int, *, odd: bool = False) -> int:
     """Smallest length >= ``minimum`` with no prime factor above 5; FFTs of such lengths are up to twice as fast.
 
-    ``odd`` ones may have factors of 7 as well. They have no highest frequency that stands for both ends of the band.
+    With ``odd`` it is the smallest odd length with no prime factor above 7. Odd lengths have no frequency that
+    represents both ends of the band.
     """
     if minimum < 1:
         raise ValueError(f"an FFT length must be at least 1, got {minimum}")
-    best = 3 ** math.ceil(math.log(minimum, 3) + 1e-9) if odd else 1 << (minimum - 1).bit_length()
-    for bases in itertools.product(_powers(7 if odd else 1, best), _powers(5, best)):
-        product = math.prod(bases)
-        while product < best:
-            # Multiplied by the least power of two that reaches the minimum.
-            twos = 0 if odd else max(0, (-(-minimum // product) - 1).bit_length())
-            if product << twos >= minimum:
-                best = min(best, product << twos)
-            product *= 3
-    return best
-
-
-def _powers(base: int, top: int) -> list[int]:
-    return [1] if base == 1 else [base**k for k in range(math.ceil(math.log(top, base)) + 1)]
+    length, primes = (minimum | 1, 3 * 5 * 7) if odd else (minimum, 2 * 3 * 5)
+    while pow(primes, 40, length):  # the remainder is 0 only if ``length`` has no other prime factors
+        length += 1 + odd
+    return length
 
 
 def centred_fft2(field: Tensor) -> Tensor:
-    """Unitary DFT over the last two axes with the origin of both sides on sample ``n // 2``; keeps the power."""
+    """Unitary DFT over the last two axes with the origin of field and spectrum on sample ``n // 2``."""
     return _centred(fft2(_uncentred(field)))
 
 
 def centred_ifft2(field: Tensor) -> Tensor:
-    """Inverse, and adjoint, of :func:`centred_fft2`."""
+    """Inverse and adjoint of :func:`centred_fft2`."""
     if 0 in field.shape[:-2]:
         return _resized(field, None)
     return _centred(torch.fft.ifft2(_uncentred(field), norm="forward"))
@@ -84,31 +74,30 @@ def centred_ifft2(field: Tensor) -> Tensor:
 def filter_spectrum(field: Tensor, kernel: Tensor, out: tuple[int, int] | None = None) -> Tensor:
     """Multiply the spectrum of ``field`` [..., h, w] by ``kernel`` [..., H, W], H >= h and W >= w, in FFT order.
 
-    Zeros are appended up to the kernel's size and cropped afterwards to ``out`` (h, w by default), so what is kept has
-    not wrapped around as long as the kernel moves light by no more than H - h (W - w) samples. The adjoint is the same
-    call with ``kernel.conj()``.
+    The field is zero-padded to the size of the kernel, and the result is cropped to ``out``, (h, w) by default. Light
+    does not wrap around into the result as long as the kernel moves it by at most H - h and W - w samples. The adjoint
+    is the same call with ``kernel.conj()``.
     """
     out = out or (field.shape[-2], field.shape[-1])
     return ifft2(multiplied(fft2(field, (kernel.shape[-2], kernel.shape[-1])), kernel), out)
 
 
 def multiplied(spectrum: Tensor, kernel: Tensor) -> Tensor:
-    """Product of a spectrum that nobody needs afterwards and a kernel, in the spectrum's memory where that is possible.
+    """Product of ``spectrum`` and ``kernel``, which overwrites ``spectrum`` if dtype, shape and gradients allow it.
 
-    A new array would cost a tenth to a fifth of a propagation. A kernel that carries gradients needs the old spectrum.
+    A new array would take 10 to 20 % of the time of a propagation.
     """
     fits = spectrum.dtype == kernel.dtype and torch.broadcast_shapes(spectrum.shape, kernel.shape) == spectrum.shape
     return spectrum.mul_(kernel) if fits and not kernel.requires_grad else spectrum * kernel
 
 
 def even_fft2(quadrant: Tensor, size: tuple[int, int]) -> Tensor:
-    """One quadrant [H // 2 + 1, W // 2 + 1] of the transform of an array of ``size`` (H, W) that is even in both axes.
+    """First quadrant [H // 2 + 1, W // 2 + 1] of the DFT of an array of ``size`` (H, W) that is even along both axes.
 
-    ``quadrant`` [h, w] holds the array's own first quadrant, h <= H // 2 + 1 and w <= W // 2 + 1; it is zero beyond.
-    Half the work of the whole transform.
+    ``quadrant`` [h, w], h <= H // 2 + 1 and w <= W // 2 + 1, is the part of the first quadrant of the array that is not
+    zero. This takes half the time of the whole transform.
     """
     (height, width), (rows, columns) = size, quadrant.shape[-2:]
-    # Along x on the rows that are not zero, then along y on the columns that are asked for.
     whole = quadrant.new_zeros(*quadrant.shape[:-1], width)
     whole[..., :columns] = quadrant
     mirrored = min(columns, (width + 1) // 2)
@@ -122,7 +111,7 @@ def even_fft2(quadrant: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def multiply_even(spectrum: Tensor, quadrant: Tensor) -> Tensor:
-    """``spectrum`` [..., H, W] times an even array given by its first quadrant, in the spectrum's memory."""
+    """Multiply ``spectrum`` [..., H, W] in place by an even array, given by its first ``quadrant``."""
     height, width = spectrum.shape[-2:]
     right = quadrant[..., 1 : (width + 1) // 2].flip(-1)
     for part, columns in ((quadrant, slice(0, width // 2 + 1)), (right, slice(width // 2 + 1, width))):
@@ -132,11 +121,11 @@ def multiply_even(spectrum: Tensor, quadrant: Tensor) -> Tensor:
 
 
 def convolve(image: Tensor, kernel: Tensor) -> Tensor:
-    """Linear convolution, zero outside ``image``, cropped to its size; the kernel's origin is its sample ``n // 2``.
+    """Linear convolution with zero padding, cropped to the size of ``image``.
 
     Args:
         image: Real or complex, shape [..., h, w].
-        kernel: Real or complex, shape [..., kh, kw], of any parity.
+        kernel: Real or complex, shape [..., kh, kw], with the origin on sample ``n // 2`` of each axis.
 
     Returns:
         Shape [..., h, w], in the promoted dtype.
@@ -157,9 +146,9 @@ def convolve(image: Tensor, kernel: Tensor) -> Tensor:
 
 
 def filter_real(image: Tensor, kernel: Tensor) -> Tensor:
-    """Multiply the spectrum of a real ``image`` [..., H, W], taken as periodic, by a real even ``kernel``.
+    """Multiply the spectrum of a real periodic ``image`` [..., H, W] by a real even ``kernel`` [H, W // 2 + 1].
 
-    ``kernel`` holds the frequencies of a real transform, [H, W // 2 + 1].
+    The kernel has the frequencies of ``torch.fft.rfft2``.
     """
     if 0 in image.shape[:-2]:
         return image
@@ -169,7 +158,7 @@ def filter_real(image: Tensor, kernel: Tensor) -> Tensor:
 
 
 def _resized(batch: Tensor, size: tuple[int, int] | None) -> Tensor:
-    """The transform of a batch of no fields, of which MKL makes an error: complex, padded or cropped to ``size``."""
+    """The transform of an empty batch, for which MKL fails: complex, padded or cropped to ``size``."""
     height, width = batch.shape[-2:]
     to = size or (height, width)
     values = batch if batch.is_complex() else torch.complex(batch, torch.zeros_like(batch))

@@ -11,16 +11,18 @@ from holotorch.core import checks
 from holotorch.core.fourier import good_length
 from holotorch.core.quantities import PITCH
 
+Pair = tuple[float, float]  # (y, x)
+
 
 @dataclass(frozen=True)
 class Grid:
-    """Samples of a plane: ``shape`` = (H, W) samples, ``pitch`` = (y, x) metres apart; one number means both axes.
+    """``shape`` (H, W) samples of a plane that are ``pitch`` (y, x) metres apart; one number serves both axes.
 
-    The optical axis lies on sample ``n // 2`` of each axis, so a grid of even size has one sample more on the negative
-    side than on the positive one.
+    The optical axis is at sample ``n // 2`` of each axis, so a grid of even size has one sample more on the negative
+    side than on the positive side.
 
     Raises:
-        TypeError: A size is not an integer, or a pitch is not a number.
+        TypeError: A size that is not an integer, or a pitch that is not a number.
         ValueError: A size below 1, or a pitch outside 1 nm to 2 mm, such as one in micrometres.
     """
 
@@ -37,7 +39,7 @@ class Grid:
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Height and width in metres: number of samples times pitch."""
+        """Height and width in metres, the number of samples times the pitch."""
         return self.shape[0] * self.pitch[0], self.shape[1] * self.pitch[1]
 
     def coordinates(self, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
@@ -57,9 +59,9 @@ class Grid:
         return fy[:, None], fx[None, :]
 
     def padded(self, factor: float | tuple[float, float]) -> "Grid":
-        """Grid of the same pitch with at least ``factor`` (>= 1, per axis) times as many samples.
+        """Grid of the same pitch with ``factor`` >= 1 times as many samples, one number or one per axis (y, x).
 
-        The number of samples is rounded up to a length with a fast FFT. A factor of exactly 1 keeps the size.
+        The number of samples is rounded up to a length with a fast FFT unless the factor is 1.
         """
         factors = (factor, factor) if isinstance(factor, int | float) else tuple(factor)
         for value in factors:

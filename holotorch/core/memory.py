@@ -1,4 +1,4 @@
-"""Memory that an operation may still take, so that what does not fit is refused before anything is allocated."""
+"""Available memory, so that an operation that needs more is refused before it allocates any."""
 
 import os
 import re
@@ -8,18 +8,15 @@ import torch
 
 
 def available_memory(device: torch.device | str = "cpu") -> int | None:
-    """Bytes that can be allocated on ``device`` without swapping, or None where the system does not say.
+    """Bytes that can be allocated on ``device`` without swapping, or None if the system does not tell.
 
-    On Linux MemAvailable, which counts the cache of files that can be dropped, and no more than the memory limit of a
-    container; elsewhere all memory that the machine has, as an upper bound.
+    On Linux this is MemAvailable, or the rest of the memory limit of a container if that is less. Elsewhere it is the
+    physical memory of the machine, an upper bound.
     """
     device = torch.device(device)
     if device.type == "cuda":
-        return (
-            torch.cuda.mem_get_info(device)[0]
-            + torch.cuda.memory_reserved(device)
-            - torch.cuda.memory_allocated(device)
-        )
+        cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        return torch.cuda.mem_get_info(device)[0] + cached
     if device.type != "cpu":
         return None
     meminfo = Path("/proc/meminfo")
@@ -33,10 +30,10 @@ def available_memory(device: torch.device | str = "cpu") -> int | None:
 
 
 def _container_limit(folder: Path = Path("/sys/fs/cgroup")) -> int:
-    """Bytes that the memory limit of this control group (version 2) leaves; very many without a limit."""
+    """Bytes that the memory limit of this control group (version 2) leaves; 2^62 without a limit."""
     try:
         limit, used = (folder / "memory.max").read_text().strip(), (folder / "memory.current").read_text()
         cache = re.search(r"^inactive_file (\d+)", (folder / "memory.stat").read_text(), re.MULTILINE)
         return int(limit) - int(used) + (int(cache[1]) if cache else 0)
-    except (OSError, ValueError):  # no control group, or "max"
+    except (OSError, ValueError):  # no control group, or no limit ("max")
         return 1 << 62

@@ -1,17 +1,22 @@
-"""LinearOperator: the protocol of linear operators, and a function with a given adjoint as derivative."""
+"""Linear operators: their protocol, the base class of those on fields, and a function with a given derivative."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+
+from holotorch.core import checks
+from holotorch.core.grid import Grid
+
+Wavelengths = float | Sequence[float]  # in metres: one number, or one per channel
 
 
 class LinearOperator(Protocol):
-    """A linear map with its conjugate transpose, which is its inverse where it is unitary."""
+    """A linear map and its conjugate transpose."""
 
     def __call__(self, field: Tensor, /) -> Tensor:
-        """Apply it to ``field`` [..., C, H, W]."""
+        """Apply the operator to ``field`` [..., C, H, W]."""
         ...
 
     def adjoint(self, field: Tensor, /) -> Tensor:
@@ -19,8 +24,72 @@ class LinearOperator(Protocol):
         ...
 
 
+class FieldOperator(nn.Module):
+    """Base class of operators from fields [..., C, H, W] on ``grid`` to fields [..., C, H', W'] on ``out_grid``.
+
+    Fields are complex64 or complex128 and keep their dtype. Kernels are float64 buffers; ``.to`` and ``.float()`` move
+    them to another device but do not round them. Each call converts them to the precision of its field. Subclasses
+    implement ``_forward`` and ``_adjoint``, whose argument is checked already.
+
+    Args:
+        grid: Sampling of the field.
+        wavelengths: In metres, one per channel; None for an operator that takes any number of channels.
+        out_grid: Sampling of the result; ``grid`` by default.
+    """
+
+    wavelengths: tuple[float, ...]
+
+    def __init__(self, grid: Grid, wavelengths: Wavelengths | None, out_grid: Grid | None = None):
+        super().__init__()
+        self.grid, self.out_grid = grid, out_grid or grid
+        if wavelengths is not None:
+            self.wavelengths = checks.wavelengths(wavelengths)
+
+    def forward(self, field: Tensor) -> Tensor:
+        """Apply the operator to ``field`` [..., C, H, W] of ``grid``.
+
+        Returns [..., C, H', W'] of ``out_grid`` in the same dtype. Raises TypeError for a real field and ValueError for
+        a field of another shape.
+        """
+        self.check_field(field, self.grid)
+        return self._forward(field)
+
+    def adjoint(self, field: Tensor) -> Tensor:
+        """Apply the conjugate transpose to ``field`` [..., C, H', W'] of ``out_grid``; otherwise as :meth:`forward`."""
+        self.check_field(field, self.out_grid)
+        return self._adjoint(field)
+
+    def _forward(self, field: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def _adjoint(self, field: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def register_complex(self, name: str, values: Tensor | None) -> None:
+        """Keep a complex tensor as a buffer of real pairs, since ``Module.to(dtype)`` drops imaginary parts."""
+        pairs = None if values is None else torch.view_as_real(values).contiguous()
+        self.register_buffer(name, pairs, persistent=False)
+
+    def complex_buffer(self, name: str, field: Tensor) -> Tensor:
+        """The complex tensor kept as ``name``, in the precision of ``field``."""
+        return torch.view_as_complex(self.get_buffer(name).to(field.real.dtype))
+
+    def check_field(self, field: Tensor, grid: Grid) -> None:
+        """TypeError unless ``field`` is complex, ValueError unless it ends in [C, H, W] of ``grid``."""
+        channels = (len(self.wavelengths),) if hasattr(self, "wavelengths") else ()
+        checks.field("field", field, (*channels, *grid.shape))
+
+    def extra_repr(self) -> str:
+        """Samplings and wavelengths, for ``print(module)``."""
+        names = ["grid"] + ["out_grid"] * (self.out_grid != self.grid) + ["wavelengths"] * hasattr(self, "wavelengths")
+        return ", ".join(f"{name}={getattr(self, name)}" for name in names)
+
+    def _apply(self, fn, recurse=True):
+        return super()._apply(lambda tensor: tensor.to(fn(tensor).device), recurse)
+
+
 def linear(x: Tensor, apply: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor]) -> Tensor:
-    """``apply(x)`` with ``adjoint`` as its derivative, of any order; no tensor is saved for the backward pass.
+    """``apply(x)``, differentiated by ``adjoint``, to any order and without saving a tensor for the backward pass.
 
     Both functions are linear and accept leading batch axes.
     """
@@ -38,7 +107,7 @@ class _Linear(torch.autograd.Function):
 
     @staticmethod
     def vmap(info, in_dims, *args):
-        # Operators accept leading batch axes, so the mapped axis becomes one.
+        # Both maps accept leading batch axes, so the mapped axis becomes a batch axis.
         x, *maps = args
         return _Linear.apply(x.movedim(in_dims[0], 0), *maps), 0
 

@@ -1,24 +1,23 @@
-"""Fresnel integrals in float64, differentiable and on any device; torch has none."""
+"""Fresnel integrals in float64, differentiable and on any device, which torch does not provide."""
 
 import math
 
 import torch
 from torch import Tensor
 
-# Below this argument the power series is exact to rounding, above it the quadrature is.
-FRESNEL_BORDER = 1.3
-_TERMS = 34
+FRESNEL_BORDER = 1.3  # the power series is exact to rounding for arguments up to this, the quadrature from this on
+_TERMS = 34  # number of terms of the series
 _SERIES = [
     [sign / (math.factorial(n) * (2 * n + 1)) if n % 2 == part else 0.0 for part in (0, 1)]
     for n, sign in zip(range(_TERMS), [1, 1, -1, -1] * 9, strict=False)
 ]
-_STEP, _NODES = 0.13, 42
+_STEP, _NODES = 0.13, 42  # step and number of nodes of the quadrature
 
 
 def fresnel_integral(u: Tensor) -> Tensor:
-    """int_0^u exp(-i pi t^2 / 2) dt = C(u) - i S(u) for abs(u) <= 1.3, complex128; a power series, odd in u."""
+    """int_0^u exp(-i pi t^2 / 2) dt = C(u) - i S(u) for abs(u) <= 1.3 by a power series, complex128."""
     factor = math.pi / 2 * u.square()
-    # Terms (-i factor)^n / (n! (2 n + 1)): the even n make C, the odd ones S.
+    # Terms (-i factor)^n / (n! (2 n + 1)): even n contribute to C, odd n to S.
     powers = torch.cat([torch.ones_like(factor)[..., None], factor[..., None].expand(*factor.shape, _TERMS - 1)], -1)
     sums = powers.cumprod(-1) @ torch.tensor(_SERIES, dtype=torch.float64, device=u.device)
     return torch.complex(u * sums[..., 0], -u * sums[..., 1])
@@ -27,9 +26,10 @@ def fresnel_integral(u: Tensor) -> Tensor:
 def fresnel_auxiliary(u: Tensor) -> tuple[Tensor, Tensor]:
     """f(u) and g(u) for u >= 1.3, float64, with C - iS = (1 - i)/2 + (i f - g) exp(-i pi u^2 / 2).
 
-    They vary slowly where C and S oscillate, so that the phase pi u^2 / 2, which may be huge, can be kept exact by the
-    caller. Both are Laplace integrals (Abramowitz and Stegun 7.3.24-25) of exp(-pi t^2 / 2) / (1 + (t/u)^4) after
-    substitution; the trapezoidal rule converges geometrically there, the poles being 0.7 u away from the real axis.
+    f and g vary slowly where C and S oscillate, so that the caller can compute the phase pi u^2 / 2, which may be
+    large, without loss of precision. Both are Laplace integrals (Abramowitz and Stegun 7.3.24-25), here with the
+    integrand exp(-pi t^2 / 2) / (1 + (t/u)^4). Its poles are 0.7 u away from the real axis, so that the trapezoidal
+    rule converges geometrically.
     """
     t = torch.arange(_NODES, dtype=torch.float64, device=u.device) * _STEP
     weight = torch.exp(-math.pi / 2 * t.square()) * _STEP
@@ -38,3 +38,12 @@ def fresnel_auxiliary(u: Tensor) -> tuple[Tensor, Tensor]:
     density = weight / (1 + (t * inverse[..., None]).square().square())
     scale = math.sqrt(2) / math.pi
     return scale * density.sum(-1) * inverse, scale * (density * t.square()).sum(-1) * inverse**3
+
+
+def chirped_fresnel_integral(u: Tensor, chirp: Tensor, end: Tensor, sign: Tensor | float = 1.0) -> Tensor:
+    """``chirp`` times int_0^u exp(-i sign pi t^2 / 2) dt, complex128; ``end`` is chirp exp(-i sign pi u^2 / 2)."""
+    large = u.abs() > FRESNEL_BORDER
+    f, g = fresnel_auxiliary(torch.where(large, u.abs(), 2.0))
+    outside = torch.sign(u) * ((0.5 - 0.5j * sign) * chirp + torch.complex(-g, sign * f) * end)
+    integral = fresnel_integral(torch.where(large, 0.0, u))
+    return torch.where(large, outside, chirp * torch.complex(integral.real, sign * integral.imag))

@@ -1,39 +1,33 @@
-"""Deconvolution of phases: heater phases that give a wanted phase after spreading (thesis Eqs. 4.5, 4.6, 4.32-4.35)."""
+"""Heater phases that give a wanted phase after thermal spreading (thesis Eqs. 4.5, 4.6, 4.32-4.35)."""
 
 from typing import Protocol
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from holotorch.core import checks
+from holotorch.core.operator import LinearOperator
 
 
-class Crosstalk(Protocol):
+class Crosstalk(LinearOperator, Protocol):
     """A convolution of phases [..., H, W] with a kernel and zero padding, such as ``ThermalCrosstalk``."""
 
     @property
     def kernel(self) -> Tensor:
-        """Real [h, w], odd sizes."""
-        ...
-
-    def __call__(self, phase: Tensor) -> Tensor:
-        """The convolution."""
-        ...
-
-    def adjoint(self, phase: Tensor) -> Tensor:
-        """Its transpose."""
+        """Real [h, w], of odd sizes."""
         ...
 
 
 def inverse(crosstalk: Crosstalk, phase: Tensor) -> Tensor:
-    """The exact solution X of P(X) = ``phase``, real [..., H, W], computed in float64.
+    """The exact solution X of P(X) = ``phase``, real [..., H, W], where P is the crosstalk; computed in float64.
 
-    X may be negative or very large. The method "chopping" sets its negative entries to 0; "shifting" adds the magnitude
-    of its smallest entry (Marrian et al. 1987).
+    X may be negative or very large. Marrian et al. (1987) make it positive by "chopping", which sets negative entries
+    to 0, or by "shifting", which adds the magnitude of the smallest entry.
 
     Raises:
-        ValueError: A kernel that is not separable and symmetric, or whose matrix is singular to rounding, as it is near
-            sigma 1.67 px with 7 taps.
+        ValueError: A kernel that is not separable and symmetric, or whose matrix is numerically singular, as for a
+            sigma near 1.67 px with 7 taps.
     """
     columns, rows = _axis_matrices(crosstalk, phase)
     for matrix in (columns, rows):
@@ -48,13 +42,14 @@ def deconvolve(crosstalk: Crosstalk, phase: Tensor, *, max_steps: int = 30, star
     """The X >= 0 that minimises || P(X) - phase ||, by accelerated proximal gradient with a fixed step.
 
     Args:
-        crosstalk: P.
+        crosstalk: P, a convolution with the kernel K.
         phase: Wanted phase after spreading in rad, real [..., H, W], wrapped to [0, 2 pi). Negative phases cannot be
             reached, since X and the kernel are non-negative.
-        max_steps: Iterations.
-        start: X of the first iteration, such as the last result in a loop; ``phase`` by default.
+        max_steps: Number of iterations.
+        start: X of the first iteration; ``phase`` by default.
 
-    Source: thesis Eqs. 4.32-4.35, with M^T phi in the gradient. The step 1 / L needs no search, as L <= (sum K)^2.
+    Source: thesis Eqs. 4.32-4.35, with M^T phi in the gradient. The step length is 1 / (sum K)^2, since (sum K)^2 is an
+    upper bound of the Lipschitz constant of the gradient.
     """
     checks.real("phase", phase)
     checks.all_finite("phase", phase)
@@ -68,10 +63,10 @@ def deconvolve(crosstalk: Crosstalk, phase: Tensor, *, max_steps: int = 30, star
 
 
 def deconvolve_admm(crosstalk: Crosstalk, phase: Tensor, *, max_steps: int = 30, weight: float = 1.0) -> Tensor:
-    """The result of :func:`deconvolve` by ADMM, whose linear system is solved exactly in the eigenvectors of each axis.
+    """The minimiser of :func:`deconvolve` by ADMM, whose linear system is solved in the eigenvectors of each axis.
 
-    ``weight`` is the penalty rho, relative to the mean square of the kernel's eigenvalues. Raises ValueError for a
-    kernel that is not separable and symmetric. Source: Parikh and Boyd (2014), Sec. 4.4 and 5.
+    ``weight`` is the penalty rho relative to the mean square of the eigenvalues of P. Raises ValueError for a kernel
+    that is not separable and symmetric. Source: Parikh and Boyd (2014), Sec. 4.4 and 5.
     """
     checks.all_finite("phase", phase)
     checks.whole("max_steps", max_steps, 1)
@@ -91,20 +86,17 @@ def deconvolve_admm(crosstalk: Crosstalk, phase: Tensor, *, max_steps: int = 30,
 
 
 def _axis_matrices(crosstalk: Crosstalk, phase: Tensor) -> tuple[Tensor, Tensor]:
-    """Convolution matrices [H, H] and [W, W] of a separable kernel, float64."""
+    """Convolution matrices [H, H] and [W, W] of a separable and symmetric kernel, float64."""
     checks.real("phase", phase)
     kernel = crosstalk.kernel
-    middle = kernel.shape[0] // 2, kernel.shape[1] // 2
-    columns, rows = kernel[:, middle[1]], kernel[middle[0], :]
-    if not torch.allclose(columns[:, None] * rows, kernel, rtol=0, atol=1e-12) or not (
-        torch.equal(columns, columns.flip(0)) and torch.equal(rows, rows.flip(0))
-    ):
+    columns, rows = kernel[:, kernel.shape[1] // 2], kernel[kernel.shape[0] // 2, :]
+    separable = torch.allclose(columns[:, None] * rows, kernel, rtol=0, atol=1e-12)
+    if not separable or not all(torch.equal(taps, taps.flip(0)) for taps in (columns, rows)):
         raise ValueError("the crosstalk must be separable and symmetric for a matrix inverse; use deconvolve")
     return _toeplitz(columns, phase.shape[-2], phase.device), _toeplitz(rows, phase.shape[-1], phase.device)
 
 
 def _toeplitz(taps: Tensor, size: int, device: torch.device) -> Tensor:
-    """Matrix [size, size] of the convolution of ``size`` samples with ``taps`` and zero padding."""
-    offsets = torch.arange(size)[:, None] - torch.arange(size) + len(taps) // 2
-    inside = (offsets >= 0) & (offsets < len(taps))
-    return torch.where(inside, taps[offsets.clamp(0, len(taps) - 1)], 0.0).to(device)
+    """Matrix [size, size] of the convolution of ``size`` samples with symmetric ``taps`` and zero padding."""
+    half = functional.pad(taps[len(taps) // 2 :], (0, size))
+    return half[(torch.arange(size)[:, None] - torch.arange(size)).abs()].to(device)

@@ -1,7 +1,4 @@
-"""Gerchberg-Saxton phase retrieval: plain, with the crosstalk in its loop, and with a deconvolution of the phase.
-
-The last one is iterative proximity effect correction (IPEC).
-"""
+"""Gerchberg-Saxton phase retrieval, also with crosstalk and with deconvolution of the phase (iterative PEC)."""
 
 from collections.abc import Callable
 
@@ -12,9 +9,8 @@ from holotorch.core import checks
 from holotorch.core.complex import intensity, phasor, wrapped
 from holotorch.core.operator import LinearOperator
 from holotorch.correction.deconvolution import Crosstalk, deconvolve
+from holotorch.correction.problem import check_target
 from holotorch.correction.run import Callback, Solution
-
-Deconvolution = Callable[[Tensor, Tensor | None], Tensor]
 
 
 def gerchberg_saxton(
@@ -24,23 +20,22 @@ def gerchberg_saxton(
     *,
     max_steps: int = 100,
     crosstalk: Callable[[Tensor], Tensor] | None = None,
-    deconvolution: Deconvolution | None = None,
+    deconvolution: Callable[[Tensor, Tensor | None], Tensor] | None = None,
     mask: Tensor | None = None,
     callback: Callback | None = None,
 ) -> Solution:
     """Phases whose propagated intensity resembles ``target``, by alternating the two amplitude constraints.
 
     Without ``crosstalk`` this is the classical algorithm; its result on an array with crosstalk is the case "no
-    correction". With ``crosstalk``, each pass spreads the phase before it propagates the field. This is the basic
-    iterative PEC of Persson et al. and Gemayel et al., without deconvolution (thesis Sec. 4.4.3.3): the emitted field
-    is S exp(i P(phase of A)), with A the field propagated back from the image, S the amplitude of the source (1 here)
-    and P the crosstalk. With a ``deconvolution`` as well it is the thesis's Algorithm 1, :func:`iterative_pec`.
+    correction". With ``crosstalk`` P, each pass propagates exp(i P(phase of A)), where A is the field propagated back
+    from the image: the basic iterative PEC of Persson et al. and Gemayel et al. (thesis Sec. 4.4.3.3). With a
+    ``deconvolution`` as well it is the thesis's Algorithm 1, :func:`iterative_pec`.
 
     Args:
         propagator: Operator on fields [..., C, H, W] with ``adjoint``.
         target: Wanted intensity, real [C, H, W], mean 1 per channel; its square root is the amplitude constraint.
-        start: Random far-field phase phi_0 in rad, real [..., C, H, W] (Algorithm 1).
-        max_steps: Passes through the loop.
+        start: Random phase phi_0 of the image in rad, real [..., C, H, W] (Algorithm 1).
+        max_steps: Number of passes after the initial one.
         crosstalk: Operator on phases, or None.
         deconvolution: Function of the phase wanted after spreading, in [0, 2 pi), and of the heater phases of the last
             pass (None in the first pass), that returns the new heater phases. If None, the wanted phase is used.
@@ -48,19 +43,14 @@ def gerchberg_saxton(
         callback: Called with the solution so far after every pass.
 
     Returns:
-        Solution whose ``x`` are heater phases, in [0, 2 pi) without a ``deconvolution``. Its losses are
+        Solution whose ``x`` are heater phases, in [0, 2 pi) without a ``deconvolution``. The losses are
         || T - |C| ||^2 of each pass within the mask, where T is the target amplitude and C the propagated field.
         ``converged`` is always False, as there is no stop rule.
     """
-    checks.real("target", target)
-    checks.all_finite("target", target)
+    check_target(target, mask)
     checks.all_finite("start", start)
     checks.whole("max_steps", max_steps, 1)
     checks.field("start", start, tuple(target.shape), complex_valued=False)
-    if target.min() < 0:
-        raise ValueError(f"target is an intensity and must be >= 0, got a minimum of {target.min().item():g}")
-    if mask is not None:
-        checks.weights("mask", mask, tuple(target.shape))
     amplitude = target.to(start.dtype).sqrt()
     image = amplitude * phasor(start)  # field in the image plane
     phase, losses = start, []
@@ -99,11 +89,9 @@ def iterative_pec(
 ) -> Solution:
     """Iterative PEC (IPEC), thesis Algorithm 1: Gerchberg-Saxton that deconvolves the phase in every pass.
 
-    With a Fresnel propagator it is the thesis's iterative Fresnel PEC (IFPEC).
-
-    Arguments and result are those of :func:`gerchberg_saxton`. The deconvolution takes ``inner_steps`` of
-    :func:`deconvolve`, beginning at the wanted phase. Each step costs one application of the crosstalk and one of its
-    transpose.
+    With a Fresnel propagator it is the thesis's iterative Fresnel PEC (IFPEC). Arguments and result are those of
+    :func:`gerchberg_saxton`. The deconvolution is :func:`deconvolve` with ``inner_steps``, starting at the wanted
+    phase.
     """
     return gerchberg_saxton(
         propagator,

@@ -8,32 +8,31 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.fourier import fft2, filter_real
-from holotorch.correction.run import Box, Callback, Objective, Run, Solution, State, check_stop_rule, nonnegative
+from holotorch.correction.run import Box, Projection, Run, Solver, State
 
-# Line search: the least share of the decrease predicted by the slope that a step must give (Armijo's condition, Nocedal
-# and Wright, Eq. 3.4), the factor on the length of a refused step, and the shortest length, relative to the first.
-_ARMIJO, _SHRINK, _SHORTEST = 1e-4, 0.5, 2.0**-12
+_ARMIJO = 1e-4  # least fraction of the decrease predicted by the slope (Nocedal and Wright, Eq. 3.4)
+_SHRINK = 0.5  # factor on the length of a refused step
+_SHORTEST = 2.0**-12  # shortest step relative to the first trial
+_MEMORY = ("s", "y", "z", "sy", "yz", "scale")  # tensors of _Memory
 
 
 @dataclass(frozen=True)
-class LBFGS:
+class LBFGS(Solver):
     """L-BFGS within a box; each item of a batch has a separate memory, step length and stop.
 
     Elements on a bound whose descent direction leaves the box are held. The others take the quasi-Newton step and are
     projected; the step is halved until the loss falls enough (Bertsekas 1982). The initial inverse Hessian is
     ``precondition``, scaled. Products with the memory are computed for all items at once from inner products of the
-    stored vectors, so that a step costs a few passes over them, whatever the number of items.
+    stored vectors, so that a step needs only a few passes over these vectors, whatever the number of items.
 
     Attributes:
-        memory: Number of stored pairs of a step and its change of gradient. For holograms more than 3 do not help, and
-            at strong crosstalk they converge more slowly (``holotorch chart pec``).
+        memory: Number of stored pairs of a step and its change of gradient. A larger memory does not help for holograms
+            and slows the convergence at strong crosstalk (``holotorch chart pec``).
         precondition: Symmetric positive linear operator on x, such as :func:`spread_preconditioner`; identity if None.
         first: Largest change of an element in the first step, in the unit of x.
-        max_steps: Most iterations.
-        tolerance: Stop rule as for ``APG``.
-        patience: Stop rule as for ``APG``.
 
-    Raises as ``APG``. Source: Nocedal and Wright, Algorithm 7.4.
+    The other attributes, the call and the errors are those of :class:`Solver`.
+    Source: Nocedal and Wright, Algorithm 7.4.
     """
 
     memory: int = 3
@@ -44,80 +43,71 @@ class LBFGS:
     patience: int = 10
 
     def __post_init__(self):
+        super().__post_init__()
         checks.whole("memory", self.memory, 1)
         checks.positive("first", self.first)
-        check_stop_rule(self.max_steps, self.tolerance, self.patience)
 
-    def __call__(
-        self,
-        objective: Objective,
-        start: Tensor,
-        project: Box = nonnegative,
-        *,
-        callback: Callback | None = None,
-        resume: State | None = None,
-    ) -> Solution:
-        """Minimise ``objective`` within the box ``project``, from ``start``; otherwise as :meth:`APG.__call__`."""
-        run = Run(objective, start, project, self.max_steps, self.tolerance, self.patience, resume)
-        gradient = run.extra.get("gradient", run.gradient)
-        memory = _Memory(self.memory, run)
+    def _begin(self, run: Run) -> State:
+        return {"gradient": run.gradient, **_Memory.empty_state(self.memory, run)}
+
+    def _advance(self, run: Run, *, gradient: Tensor, **stored: Tensor) -> State:
+        memory = _Memory(stored)
         flat = (*memory.s.shape[:1], -1)
-        while run.step < self.max_steps and run.active.any():
-            free = self._free(run.x, gradient, project)
-            steepest = free * gradient
-            guess = self._preconditioned(steepest)
-            rows = memory.direction(*(run.rows(part).reshape(flat) for part in (steepest, guess)))
-            direction = free * run.from_rows(rows)
-            ascending = ~(run.total(direction * gradient) < 0)
-            if ascending.any():
-                # The memory no longer describes the loss, for example after a change of the held elements: forget it.
-                memory.forget(ascending.reshape(-1))
-                direction = torch.where(run.each(ascending), -free * guess, direction)
-            largest = run.rows(direction.abs()).amax(-1)
-            first_length = self.first / largest.clamp(min=torch.finfo(largest.dtype).tiny)
-            length = torch.where(memory.empty.reshape(run.loss.shape), first_length, 1.0)
-            x, loss, after, failed = self._search(run, project, direction, gradient, length)
-            # A step that fails with a memory may succeed without it; a step that fails without a memory has stalled.
-            stalled = failed & memory.empty.reshape(run.loss.shape)
-            change = after - gradient
-            if failed.any():
-                memory.forget(failed.reshape(-1))
-            pair = x - run.x, change, self._preconditioned(change)
-            memory.add(*(run.rows(part).reshape(flat) for part in pair))
-            run.advance(x, loss, stalled)
-            gradient = after if run.active.all() else torch.where(run.each(run.active), after, gradient)
-            if callback:
-                callback(run.solution(gradient=gradient, **memory.state()))
-        return run.solution(gradient=gradient, **memory.state())
+        free = self._free(run.x, gradient, run.project)
+        steepest = free * gradient
+        guess = self._preconditioned(steepest)
+        rows = memory.direction(*(run.rows(part).reshape(flat) for part in (steepest, guess)))
+        direction = free * run.from_rows(rows)
+        ascending = ~(run.total(direction * gradient) < 0)
+        if ascending.any():
+            # The memory no longer describes the loss, for example after a change of the held elements: forget it.
+            memory.forget(ascending.reshape(-1))
+            direction = torch.where(run.each(ascending), -free * guess, direction)
+        largest = run.rows(direction.abs()).amax(-1)
+        first_length = self.first / largest.clamp(min=torch.finfo(largest.dtype).tiny)
+        length = torch.where(memory.empty.reshape(run.loss.shape), first_length, 1.0)
+        x, loss, after, failed = self._search(run, direction, gradient, length)
+        # A step that fails with a memory may succeed without it; a step that fails without a memory has stalled.
+        stalled = failed & memory.empty.reshape(run.loss.shape)
+        if failed.any():
+            memory.forget(failed.reshape(-1))
+        change = after - gradient
+        pair = x - run.x, change, self._preconditioned(change)
+        memory.add(*(run.rows(part).reshape(flat) for part in pair))
+        run.advance(x, loss, stalled)
+        gradient = after if run.active.all() else torch.where(run.each(run.active), after, gradient)
+        return {"gradient": gradient, **memory.state()}
 
     def _preconditioned(self, x: Tensor) -> Tensor:
         return x if self.precondition is None else self.precondition(x)
 
     @staticmethod
-    def _free(x: Tensor, gradient: Tensor, box: Box) -> Tensor:
-        """1 where an element may move, 0 where it lies on a bound that a step downhill would cross."""
+    def _free(x: Tensor, gradient: Tensor, box: Projection) -> Tensor:
+        """1 where an element may move, 0 where it lies on a bound that a step along -gradient would cross."""
+        if not isinstance(box, Box):
+            raise TypeError(f"LBFGS needs a Box as project, got {type(box).__name__}")
         lower, upper = (torch.as_tensor(bound, dtype=x.dtype, device=x.device) for bound in (box.lower, box.upper))
         held = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
         return (~held).to(x.dtype)
 
-    def _search(self, run: Run, project: Box, direction: Tensor, gradient: Tensor, length: Tensor):
-        """Halve the step of each item until its loss falls enough.
+    def _search(self, run: Run, direction: Tensor, gradient: Tensor, length: Tensor):
+        """Halve the step of each item until its loss falls enough; returns x, losses, gradient and which items failed.
 
-        Every trial computes the gradient too, as most first trials are accepted.
+        Every trial computes the gradient too, because most first trials are accepted.
         """
         slack = 8 * torch.finfo(run.x.dtype).eps * run.loss
         accepted, failed = ~run.active, torch.zeros_like(run.active)
         shortest = length * _SHORTEST
         best, best_loss, best_gradient = run.x, run.loss, gradient
         while True:
-            x = project(run.x + run.each(length) * direction)
+            x = run.project(run.x + run.each(length) * direction)
             loss, after = run.value_and_gradient(x)
-            wanted = _ARMIJO * run.total(gradient * (x - run.x))
-            enough = ~accepted & (loss <= run.loss + wanted + slack)
-            if enough.all():  # the most common case: all items accept the first trial
+            decrease = _ARMIJO * run.total(gradient * (x - run.x))
+            enough = ~accepted & (loss <= run.loss + decrease + slack)
+            if enough.all():  # usually in the first trial
                 return x, loss, after, failed
-            taken = run.each(enough)
-            best, best_gradient = torch.where(taken, x, best), torch.where(taken, after, best_gradient)
+            moved = run.each(enough)
+            best, best_gradient = torch.where(moved, x, best), torch.where(moved, after, best_gradient)
             best_loss = torch.where(enough, loss, best_loss)
             accepted = accepted | enough
             failed = ~accepted & (length <= shortest)
@@ -127,20 +117,24 @@ class LBFGS:
 
 
 class _Memory:
-    """The last m steps s, changes of gradient y, and z = H0 y of every item, oldest first; never changed in place.
+    """The last m steps s, changes of gradient y, and z = H0 y of every item, oldest first, H0 being the preconditioner.
 
-    A pair without positive curvature along s is stored as zeros for that item, and has no effect.
+    The inner products sy = s_i y_j and yz = y_i z_j are float64, since triangular systems are solved with them. A pair
+    without positive curvature along s is stored as zeros for that item, and has no effect. Tensors are not modified.
     """
 
-    def __init__(self, size: int, run: Run):
-        items = max(1, run.loss.numel())
-        make = run.x.new_zeros
-        self.s = self.y = self.z = make(items, size, run.x.numel() // items)
-        # Inner products s_i y_j and y_i z_j, in float64: triangular systems are solved with them.
-        self.sy = self.yz = make(items, size, size, dtype=torch.float64)
-        self.scale = make(items, dtype=torch.float64) + 1
-        for name in _MEMORY if "memory_s" in run.extra else ():
-            setattr(self, name, run.extra[f"memory_{name}"])
+    def __init__(self, state: State):
+        self.s, self.y, self.z, self.sy, self.yz, self.scale = (state[f"memory_{name}"] for name in _MEMORY)
+
+    @staticmethod
+    def empty_state(size: int, run: Run) -> State:
+        """State of a memory for ``size`` pairs that has none yet."""
+        items, make = max(1, run.loss.numel()), run.x.new_zeros
+        vectors = make(items, size, run.x.numel() // items)
+        products = make(items, size, size, dtype=torch.float64)
+        scale = make(items, dtype=torch.float64) + 1
+        values = vectors, vectors, vectors, products, products, scale
+        return {f"memory_{name}": value for name, value in zip(_MEMORY, values, strict=True)}
 
     def state(self) -> State:
         """Tensors by name, for ``Solution.state``."""
@@ -148,17 +142,17 @@ class _Memory:
 
     @property
     def empty(self) -> Tensor:
-        """Whether an item has no pair, [items]."""
+        """Whether each item has no pair, [items]."""
         return (self.sy.diagonal(dim1=-2, dim2=-1) == 0).all(-1)
 
     def forget(self, which: Tensor) -> None:
-        """Drop all pairs of the items [items]."""
-        for name in ("s", "y", "z", "sy", "yz"):
+        """Drop all pairs of the items selected by ``which`` [items]."""
+        for name in _MEMORY[:-1]:
             setattr(self, name, torch.where(which[:, None, None], 0, getattr(self, name)))
         self.scale = torch.where(which, 1, self.scale)
 
     def add(self, step: Tensor, change: Tensor, preconditioned: Tensor) -> None:
-        """Keep one more pair, all [items, length], and drop the oldest."""
+        """Add a pair with its preconditioned change, each [items, length], and drop the oldest pair."""
         curvature = (step * change).sum(-1)
         # Below 1e-8 of the product of their lengths, float32 rounding decides the sign of the inner product.
         convex = curvature > 1e-8 * (step.square().sum(-1) * change.square().sum(-1)).sqrt()
@@ -187,11 +181,8 @@ class _Memory:
         return (of_z @ self.z - of_s @ self.s)[:, 0] - scale * preconditioned
 
 
-_MEMORY = ("s", "y", "z", "sy", "yz", "scale")
-
-
 def _bordered(square: Tensor, column: Tensor, row: Tensor) -> Tensor:
-    """Matrices [items, m, m] that lose their first row and column and gain a last column and row, [m] each."""
+    """Drop the first row and column of ``square`` [items, m, m]; append ``column`` [items, m, 1] and ``row``."""
     inner = torch.cat([square[:, 1:, 1:], column[:, :-1]], -1)
     return torch.cat([inner, row], -2)
 
@@ -199,12 +190,13 @@ def _bordered(square: Tensor, column: Tensor, row: Tensor) -> Tensor:
 def spread_preconditioner(kernel: Tensor, floor: float = 0.1) -> Callable[[Tensor], Tensor]:
     """Approximate inverse Hessian for unknowns that a ``kernel`` spreads: 1 / (|K|^2 / max |K|^2 + floor) in frequency.
 
-    The kernel attenuates high frequencies of the unknown, and with them the gradient; this operator restores the step
-    there. The convolution is taken as periodic, which is accurate enough for an initial inverse Hessian.
+    K is the transform of the kernel. The kernel attenuates high frequencies of the unknown and thus of the gradient;
+    this operator amplifies them again. It assumes a periodic convolution, which suffices for an initial estimate.
 
     Args:
         kernel: Real, [h, w], such as ``ThermalCrosstalk.kernel``.
-        floor: Above 0; the ratio of the strongest to the weakest correction is (1 + floor) / floor at most.
+        floor: Above 0; the amplification of the highest relative to the lowest frequency is at most
+            (1 + floor) / floor.
     """
     checks.positive("floor", floor)
     factors: dict[tuple, Tensor] = {}
@@ -213,12 +205,11 @@ def spread_preconditioner(kernel: Tensor, floor: float = 0.1) -> Callable[[Tenso
         height, width = x.shape[-2:]
         key = (height, width, x.dtype, x.device)
         if key not in factors:
-            # Taps beyond the edge of a small array wrap around.
-            taps = torch.zeros(height, width, dtype=torch.float64)
-            for i, row in enumerate(kernel.tolist()):
-                for j, tap in enumerate(row):
-                    taps[(i - kernel.shape[0] // 2) % height, (j - kernel.shape[1] // 2) % width] += tap
-            power = fft2(taps.to(torch.complex128))[:, : width // 2 + 1].abs().square()
+            # Taps wrap around if the kernel is larger than the array.
+            i, j = ((torch.arange(n) - n // 2) % size for n, size in zip(kernel.shape, x.shape[-2:], strict=True))
+            taps = torch.zeros(height, width, dtype=torch.complex128)
+            taps = taps.index_put((i[:, None], j), kernel.detach().cpu().to(taps.dtype), accumulate=True)
+            power = fft2(taps)[:, : width // 2 + 1].abs().square()
             factors.clear()
             factors[key] = (1 / (power / power.max() + floor)).to(x.device, x.dtype)
         return filter_real(x, factors[key])

@@ -1,17 +1,17 @@
-"""What the solvers share: the result they return, the set they project onto, and the bookkeeping of a run.
+"""Base class of the solvers, the result they return, the set they project onto, and the bookkeeping of a run.
 
-An objective maps the unknown x to one loss per item. The items are independent: each has its own step length and its
-own stop, so a batch gives the same results as its items alone. A loss is never negative, and 0 for a perfect fit, as
-sums of squares are.
+An objective maps the unknown x to one loss per item, which is at least 0, as a sum of squares is. The items are
+independent: each has a separate step length and stop, so a batch gives the same results as its items alone.
 
-An objective may have an attribute ``unknown_axes``: the axes of x, counted from its end, that hold the elements of one
-item. They are (-2, -1) where each hologram [H, W] has a loss, and (-4, -2, -1) for frames [F, C, H, W] of which each
-colour has one loss. The losses have the other axes of x. Without that attribute the axes of the losses are the first
-ones of x: losses [...] for x [..., *unknown].
+An objective may have an attribute ``unknown_axes``: the axes of x, counted from the end, that hold the elements of one
+item. They are (-2, -1) where each hologram [H, W] has a loss, and (-4, -2, -1) where all frames of each colour of
+[F, C, H, W] have one. The losses have the remaining axes of x. Without the attribute the losses have the first axes of
+x: losses [...] for x [..., *unknown].
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,14 +22,14 @@ Objective = Callable[[Tensor], Tensor]
 Projection = Callable[[Tensor], Tensor]
 Callback = Callable[["Solution"], None]
 State = dict[str, Tensor]
+_STATE = ("x", "active", "steps", "calm", "stalled")  # attributes of a Run to resume from
 
 
 @dataclass(frozen=True)
 class Box:
-    """The set lower <= x <= upper, called to project onto it; bounds are numbers or tensors that broadcast.
+    """The set lower <= x <= upper; a call projects onto it. Bounds are numbers or tensors that broadcast against x.
 
-    Raises:
-        ValueError: A bound that is NaN, or a lower one above the upper one.
+    Raises ValueError for a bound that is NaN, or a lower bound above the upper bound.
     """
 
     lower: float | Tensor = 0.0
@@ -47,13 +47,12 @@ class Box:
         return torch.minimum(torch.maximum(x, lower), upper)
 
 
-# X >= 0, since heaters cannot cool: the proximal operator of Eq. 4.13.
-nonnegative = Box()
+nonnegative = Box()  # x >= 0, since heaters cannot cool: the proximal operator of Eq. 4.13
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Result of a solver, final or so far.
+    """Result of a solver, final or intermediate.
 
     Attributes:
         x: The unknown, shaped as the start.
@@ -61,9 +60,9 @@ class Solution:
         steps: Steps that each item took, integer [...].
         converged: Whether each item met the stop rule, [...]; False where it ran out of steps or stalled.
         stalled: Whether each item stopped because no step, however short, was accepted, [...].
-        evaluations: How often the objective was evaluated, with or without its gradient.
-        state: Tensors by name. The same solver continues from them when they are passed as ``resume``, on a CPU with
-            the same bits as an uninterrupted run.
+        evaluations: Number of evaluations of the objective, with or without gradient.
+        state: Tensors by name. If they are passed as ``resume``, the same solver continues from them; on a CPU the
+            result is identical to that of an uninterrupted run.
     """
 
     x: Tensor
@@ -76,31 +75,23 @@ class Solution:
 
 
 class Run:
-    """Bookkeeping of a solver: evaluations, losses, which items are still active, and the state to resume from."""
+    """State of a solver at work: the unknown, the losses, which items are still active, and the evaluations so far."""
 
     def __init__(
-        self,
-        objective: Objective,
-        start: Tensor,
-        project: Projection,
-        max_steps: int,
-        tolerance: float,
-        patience: int,
-        resume: State | None,
+        self, solver: "Solver", objective: Objective, start: Tensor, project: Projection, resume: State | None
     ):
         checks.real("start", start)
         checks.all_finite("start", start)
-        self.objective, self.tolerance, self.patience = objective, tolerance, patience
+        self.solver, self.objective, self.project = solver, objective, project
         self.x, self.evaluations = project(start.detach()), 0
         loss, self.gradient = self.value_and_gradient(self.x)
         items, unknown = _split_axes(objective, self.x, loss)
-        # The axes of x with those of the items first, and the shape of a value per item that broadcasts against x.
-        self.items, self.axes = loss.ndim, items + unknown
+        self.items, self.axes = loss.ndim, items + unknown  # all axes of x, those of the items first
         self.broadcast = [size if axis in items else 1 for axis, size in enumerate(self.x.shape)]
         checks.all_finite("loss at the start", loss)
         if loss.numel() and loss.min() < 0:
             raise ValueError(f"the objective must not be negative, got {loss.min().item():g} at the start")
-        # To first order, moving every element by one unit (a radian) would change the loss by less than its rounding.
+        # Stuck: to first order, a change of every element by 1 rad changes the loss by less than its rounding error.
         rounding = 1e3 * torch.finfo(loss.dtype).eps * loss
         stuck = (self.total(self.gradient.abs()) <= rounding) & (loss > 0)
         if stuck.any():
@@ -109,27 +100,27 @@ class Run:
                 f"the gradient vanishes at the start of item {item}, so no step can leave it; "
                 "start elsewhere, for example from random phases"
             )
-        self.losses = loss.new_empty(max_steps + 1, *loss.shape)
+        self.losses = loss.new_empty(solver.max_steps + 1, *loss.shape)
         self.losses[0], self.step = loss, 0
         self.active = loss > 0
         self.steps = torch.zeros_like(loss, dtype=torch.int64)
-        self.calm = torch.zeros_like(self.steps)
+        self.calm = torch.zeros_like(self.steps)  # steps in a row whose change of loss was within the tolerance
         self.stalled = torch.zeros_like(self.active)
-        self.extra: State = {}
+        self.resumed: State = {}
         if resume:
             self._restore(resume)
 
     @property
     def loss(self) -> Tensor:
-        """Of the point ``x``, [...]."""
+        """Losses [...] at ``x``."""
         return self.losses[self.step]
 
     def rows(self, values: Tensor) -> Tensor:
-        """Values shaped as x, as one row of elements for each item, [..., N]."""
+        """Reshape values shaped as x to one row of elements per item, [..., N]."""
         return values.permute(self.axes).flatten(self.items)
 
     def from_rows(self, rows: Tensor) -> Tensor:
-        """Inverse of :meth:`rows`; all axes of the items may be one."""
+        """Inverse of :meth:`rows`; the axes of the items may be flattened."""
         shape = [self.x.shape[axis] for axis in self.axes]
         return rows.reshape(shape).permute([self.axes.index(axis) for axis in range(len(shape))])
 
@@ -138,17 +129,17 @@ class Run:
         return self.rows(values).sum(-1)
 
     def each(self, values: Tensor) -> Tensor:
-        """One value per item, [...], in a shape that broadcasts against x."""
+        """Reshape one value per item, [...], so that it broadcasts against x."""
         return values.reshape(self.broadcast)
 
     def value(self, x: Tensor) -> Tensor:
-        """Losses at ``x``."""
+        """Losses [...] at ``x``."""
         self.evaluations += 1
         with torch.no_grad():
             return self.objective(x)
 
     def value_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Losses at ``x`` and their gradient."""
+        """Losses [...] at ``x`` and the gradient of each, shaped as x."""
         self.evaluations += 1
         with torch.enable_grad():
             x = x.detach().requires_grad_(True)
@@ -166,39 +157,29 @@ class Run:
         self.step += 1
         self.losses[self.step] = loss
         self.steps = self.steps + self.active
-        settled = (loss - last).abs() < self.tolerance * last
+        settled = (loss - last).abs() < self.solver.tolerance * last
         self.calm = torch.where(settled, self.calm + 1, 0)
-        self.active = self.active & (self.calm < self.patience) & (loss > 0)
+        self.active = self.active & (self.calm < self.solver.patience) & (loss > 0)
 
     def solution(self, **extra: Tensor) -> Solution:
-        """The result so far; ``extra`` holds the tensors that the solver itself needs to resume."""
+        """The result so far; ``extra`` holds the tensors that only this solver needs to resume."""
         losses = self.losses[: self.step + 1]
-        state = {
-            **extra,
-            "x": self.x,
-            "active": self.active,
-            "steps": self.steps,
-            "calm": self.calm,
-            "stalled": self.stalled,
-            "losses": losses,
-            "counts": torch.tensor([self.step, self.evaluations]),
-        }
+        state = extra | {name: getattr(self, name) for name in _STATE} | {"losses": losses}
+        state["counts"] = torch.tensor([self.step, self.evaluations])
         return Solution(self.x, losses, self.steps, ~self.active & ~self.stalled, self.stalled, self.evaluations, state)
 
     def _restore(self, state: State) -> None:
-        if state["x"].shape != self.x.shape or state["x"].dtype != self.x.dtype:
-            raise ValueError(
-                f"resume holds x of {tuple(state['x'].shape)} {state['x'].dtype}, the start is "
-                f"{tuple(self.x.shape)} {self.x.dtype}"
-            )
+        held, start = ((tuple(x.shape), x.dtype) for x in (state["x"], self.x))
+        if held != start:
+            raise ValueError(f"resume holds x of {held[0]} {held[1]}, the start is {start[0]} {start[1]}")
         state = {name: values.to(self.x.device) for name, values in state.items()}
         self.step, self.evaluations = (int(number) for number in state["counts"])
         if self.step + 1 > len(self.losses):
             raise ValueError(f"resume has taken {self.step} steps already, more than max_steps {len(self.losses) - 1}")
         self.losses[: self.step + 1] = state["losses"]
-        self.x, self.active, self.steps = state["x"], state["active"], state["steps"]
-        self.calm, self.stalled = state["calm"], state["stalled"]
-        self.extra = state
+        for name in _STATE:
+            setattr(self, name, state[name])
+        self.resumed = state
 
 
 def _split_axes(objective: Objective, x: Tensor, loss: Tensor) -> tuple[list[int], list[int]]:
@@ -215,8 +196,58 @@ def _split_axes(objective: Objective, x: Tensor, loss: Tensor) -> tuple[list[int
     return items, unknown
 
 
-def check_stop_rule(max_steps: int, tolerance: float, patience: int) -> None:
-    """ValueError unless the fields of a solver's stop rule are in range."""
-    checks.whole("max_steps", max_steps, 1)
-    checks.whole("patience", patience, 1)
-    checks.nonnegative("tolerance", tolerance)
+class Solver:
+    """Base class of the solvers: frozen dataclasses that are called with an objective, a start and a projection.
+
+    Attributes:
+        max_steps: Largest number of steps.
+        tolerance: An item stops once its relative change of loss (Eq. 4.36) has stayed below this ...
+        patience: ... for this number of steps in a row.
+
+    Raises:
+        ValueError: A field out of range; in a call: a start that is not finite, or at which a loss is negative or not
+            finite, or at which a gradient vanishes although its loss does not, as at X = 0 for a Fourier hologram.
+    """
+
+    max_steps: int
+    tolerance: float
+    patience: int
+
+    def __post_init__(self):
+        checks.whole("max_steps", self.max_steps, 1)
+        checks.whole("patience", self.patience, 1)
+        checks.nonnegative("tolerance", self.tolerance)
+
+    def __call__(
+        self,
+        objective: Objective,
+        start: Tensor,
+        project: Projection = nonnegative,
+        *,
+        callback: Callback | None = None,
+        resume: State | None = None,
+    ) -> Solution:
+        """Minimise ``objective`` over the set that ``project`` projects onto, beginning at ``start``.
+
+        Args:
+            objective: Function from the unknown to one loss per item, see ``holotorch.correction.run``.
+            start: The unknown at the start, real and finite.
+            project: Function to the nearest point of the allowed set; :class:`LBFGS` needs a :class:`Box`.
+            callback: Called with the solution so far after every step.
+            resume: The ``state`` of an earlier solution of the same problem.
+        """
+        run = Run(self, objective, start, project, resume)
+        extra = {name: run.resumed.get(name, value) for name, value in self._begin(run).items()}
+        while run.step < self.max_steps and run.active.any():
+            extra = self._advance(run, **extra)
+            if callback:
+                callback(run.solution(**extra))
+        return run.solution(**extra)
+
+    def _begin(self, run: Run) -> State:
+        """Tensors that the first step needs besides ``run``."""
+        raise NotImplementedError
+
+    def _advance(self, run: Run, *_: Any, **extra: Any) -> State:
+        """Take one step with the tensors ``extra``, and return those that the next step needs besides ``run``."""
+        raise NotImplementedError

@@ -1,8 +1,9 @@
-"""Stages: several solver runs in a row, each starting from the result of the one before, as one solution."""
+"""Solver runs in sequence, each of which starts from the result of the previous one."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -10,29 +11,13 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.correction.lbfgs import LBFGS
 from holotorch.correction.problem import PECProblem
-from holotorch.correction.run import Box, Callback, Objective, Solution, State, nonnegative
+from holotorch.correction.run import Box, Callback, Objective, Solution, Solver, State, nonnegative
 from holotorch.correction.solvers import APG
-
-
-class Solver(Protocol):
-    """Interface of ``APG``, ``ProjectedAdam`` and ``LBFGS``."""
-
-    def __call__(
-        self,
-        objective: Objective,
-        start: Tensor,
-        project: Box = nonnegative,
-        *,
-        callback: Callback | None = None,
-        resume: State | None = None,
-    ) -> Solution:
-        """Minimise ``objective`` over the set that ``project`` projects onto."""
-        ...
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One run: the objective, the solver that minimises it, and the box that bounds the unknown."""
+    """One run: the objective, its solver, and the box that bounds the unknown."""
 
     objective: Objective
     solver: Solver
@@ -42,14 +27,14 @@ class Stage:
 def run_stages(
     stages: Sequence[Stage], start: Tensor, *, callback: Callback | None = None, resume: State | None = None
 ) -> Solution:
-    """Run ``stages`` one after another from ``start``; ``callback`` and ``resume`` as for a single solver.
+    """Run ``stages`` one after another from ``start``; ``callback`` and ``resume`` as for :class:`Solver`.
 
-    The losses of all stages are in a row, each computed by the objective of its stage; ``converged`` and ``stalled``
-    are those of the last stage.
+    The losses of the solution are those of all stages in sequence, each computed by the objective of its stage;
+    ``converged`` and ``stalled`` are those of the last stage.
     """
     first, before, inner = 0, None, None
     if resume:
-        first, before = int(resume["stage"]), _from_state(resume)
+        first, before = int(resume["stage"]), _previous_stages(resume)
         inner = {name.removeprefix("inner_"): resume[name] for name in resume if name.startswith("inner_")}
         start = before.x if before else start
     for k, stage in enumerate(stages[first:], first):
@@ -69,33 +54,31 @@ def run_stages(
 def penalty_schedule(
     make: Callable[..., PECProblem], solver: LBFGS, spread: float, limit: float | None, *, amplitude: bool = True
 ) -> list[Stage]:
-    """Stages in which L-BFGS computes a hologram, under a limit on the phase after spreading if one is given.
+    """Stages of L-BFGS that compute a hologram, with or without a ``limit`` on the phase P(X) after spreading.
 
     The first stage minimises the loss of the amplitude, whose gradient does not vanish in dark pixels. Without a limit,
-    the second and last stage minimises the loss of the intensity. With a limit, the first stage stays in the box
-    X <= limit / sum K, in which no P(X) exceeds the limit; the stages after it have no such box, but a penalty with
-    growing weight on P(X) above 98.5 % of the limit. The margin of 1.5 % leaves little for ``limit_peak_phase`` to
-    scale down.
+    the second and last stage minimises the loss of the intensity. With a limit, the first stage is confined to the box
+    X <= limit / sum K, in which no P(X) exceeds the limit. The later stages have no upper bound but a penalty with
+    growing weight on P(X) above 98.5 % of the limit, so that ``limit_peak_phase`` has to scale down little afterwards.
 
     Args:
-        make: Builds the problem from ``amplitude``, ``limit`` and ``limit_weight``, as keywords of ``PECProblem``.
-        solver: Its ``max_steps`` is the sum over all stages.
-        spread: Sum of the kernel.
-        limit: On P(X), in rad.
-        amplitude: Whether the first stage minimises the loss of the amplitude.
+        make: Function of the keywords ``amplitude``, ``limit`` and ``limit_weight`` of ``PECProblem`` to a problem.
+        solver: L-BFGS, whose ``max_steps`` is the sum over all stages.
+        spread: Sum of the kernel K.
+        limit: Largest P(X) in rad, or None.
+        amplitude: Whether to begin with the loss of the amplitude.
     """
-    total = solver.max_steps
-    spread = checks.positive("spread", spread)
+    total, spread = solver.max_steps, checks.positive("spread", spread)
+    parts: list[tuple[dict[str, Any], Box, int]]
     if limit is None:
         first = total // 6 if amplitude else 0
-        parts: list[tuple[dict[str, Any], Box, int]] = [({"amplitude": True}, nonnegative, first)]
-        parts.append(({}, nonnegative, total - first))
+        parts = [({"amplitude": True}, nonnegative, first), ({}, nonnegative, total - first)]
     else:
         limit = checks.positive("limit", limit, "rad")
         first = total // 3
         parts = [({"amplitude": amplitude}, Box(0.0, limit / spread), first)]
-        ends = [first + round((total - first) * share) for share in (0.0, 0.3, 0.6, 0.85, 1.0)]
-        for weight, begin, end in zip((1.0, 10.0, 100.0, 1000.0), ends, ends[1:], strict=False):
+        ends = [first + round((total - first) * fraction) for fraction in (0.0, 0.3, 0.6, 0.85, 1.0)]
+        for weight, (begin, end) in zip((1.0, 10.0, 100.0, 1000.0), pairwise(ends), strict=True):
             parts.append(({"limit": 0.985 * limit, "limit_weight": weight}, nonnegative, end - begin))
     return [
         Stage(make(**keywords), replace(solver, max_steps=steps), box) for keywords, box, steps in parts if steps > 0
@@ -112,18 +95,10 @@ def proximal_pec(
     callback: Callback | None = None,
     **options: Any,
 ) -> Solution:
-    """Proximal PEC (PPEC), thesis Algorithm 2: minimise ``PECProblem`` from ``start``.
+    """Proximal PEC (PPEC), thesis Algorithm 2: minimise ``PECProblem`` from the heater phases ``start`` in rad.
 
-    With a Fresnel propagator it is the thesis's Fresnel PEC (FPEC).
-
-    Args:
-        crosstalk: P.
-        propagator: F, as for ``PECProblem``.
-        target: Wanted intensity.
-        start: Heater phases in rad, real [..., C, H, W], or [..., F, C, H, W] with ``frames=True``.
-        solver: ``APG()`` by default.
-        callback: Called with the solution so far after every step.
-        options: Further keywords of ``PECProblem``.
+    With a Fresnel propagator it is the thesis's Fresnel PEC (FPEC). The other arguments are those of ``PECProblem``,
+    including ``options``, and of :class:`Solver`; ``solver`` is ``APG()`` by default.
     """
     return (solver or APG())(PECProblem(crosstalk, propagator, target, **options), start, callback=callback)
 
@@ -131,18 +106,17 @@ def proximal_pec(
 def limit_peak_phase(limit: float, phase: Tensor, crosstalk: Callable[[Tensor], Tensor]) -> Tensor:
     """Scale down each hologram of ``phase`` [..., H, W] whose phase after spreading exceeds ``limit`` in rad.
 
-    Raises:
-        ValueError: A limit that is not finite and above zero, or a phase that is not finite.
+    Raises ValueError for a limit that is not finite and above zero, or a phase that is not finite.
     """
     limit = checks.positive("limit", limit, "rad")
     checks.all_finite("phase", phase)
     peak = crosstalk(phase).amax((-2, -1), keepdim=True)
-    allowed = limit * (1 - 1e-6)  # the margin is the rounding of float32: in float64 the limit must hold too
+    allowed = limit * (1 - 1e-6)  # with a margin for the rounding of float32
     return torch.where(peak > allowed, phase * (allowed / peak.clamp(min=allowed)), phase)
 
 
 def _joined(before: Solution | None, now: Solution, k: int) -> Solution:
-    """Solution ``now`` of stage k behind that of all stages before it, with the state to resume from."""
+    """Solution of the stages before k and of stage k, ``now``, with the state to resume from."""
     state = {f"inner_{name}": values for name, values in now.state.items()} | {"stage": torch.tensor(k)}
     if before is None:
         return replace(now, state=state)
@@ -152,8 +126,8 @@ def _joined(before: Solution | None, now: Solution, k: int) -> Solution:
     return replace(now, losses=losses, steps=steps, evaluations=before.evaluations + now.evaluations, state=state)
 
 
-def _from_state(state: State) -> Solution | None:
-    """Solution of all stages before the interrupted one; None in the first stage."""
+def _previous_stages(state: State) -> Solution | None:
+    """Solution of all stages before the interrupted one; None if this is the first stage."""
     if "before_x" not in state:
         return None
     x, losses, steps = (state[f"before_{name}"] for name in ("x", "losses", "steps"))

@@ -1,4 +1,4 @@
-"""Pictures from intensities at several wavelengths: linear sRGB, gamut mapping, equal power, tone curve of Eq. 5.16."""
+"""Images from intensities at several wavelengths: linear sRGB, gamut mapping, equal power, tone mapping."""
 
 import torch
 from torch import Tensor
@@ -7,19 +7,16 @@ from holotorch.core import checks
 from holotorch.core.deprecation import renamed
 from holotorch.core.precision import at_least_single
 
-# Luminance of the primaries of linear sRGB (IEC 61966-2-1): the Y row of the matrix to CIE XYZ.
+# Luminance of the primaries of linear sRGB (IEC 61966-2-1), the Y row of the matrix to CIE XYZ.
 _LUMINANCE = (0.2126390058715103, 0.7151686787677559, 0.0721923153607337)
 GAMMA = 0.5  # exponent of Eq. 5.16
 
 
 def linear_srgb(intensity: Tensor, matrix: Tensor) -> Tensor:
-    """One matrix product: linear sRGB [..., 3, H, W] of ``intensity`` [..., K, H, W], with ``matrix`` [3, K].
+    """Linear sRGB [..., 3, H, W] of ``intensity`` [..., K, H, W]: the product with ``matrix`` [3, K].
 
-    ``io.colour_tables.srgb_matrix`` makes the matrix from wavelengths. Differentiable. Pure colours lie outside sRGB
-    and come out with negative components, to be brought in by :func:`gamut_map`; nothing is clipped here.
-
-    Raises:
-        ValueError: Shapes that do not match.
+    ``io.colour_tables.srgb_matrix`` computes the matrix from wavelengths. Spectral colours lie outside the gamut of
+    sRGB and have negative components, which :func:`gamut_map` removes. Raises ValueError for shapes that do not match.
     """
     checks.real("intensity", intensity)
     checks.real("matrix", matrix)
@@ -31,17 +28,15 @@ def linear_srgb(intensity: Tensor, matrix: Tensor) -> Tensor:
 
 
 def gamut_map(colour: Tensor) -> Tensor:
-    """Map linear sRGB [..., 3, H, W] into its gamut: mix it with grey of equal luminance until nothing is negative.
+    """Map linear sRGB [..., 3, H, W] into the gamut: mix it with grey of equal luminance until nothing is negative.
 
-    It keeps luminance, and the hue in the chromaticity diagram, where clipping changes
-    both: pure 455 nm would turn 3.2 times as bright. Values above 1 are left for the exposure. Black where the
-    luminance is not positive. Differentiable but on the gamut's border.
+    This keeps the luminance and the hue in the chromaticity diagram. Clipping would change both: light of 455 nm would
+    become 3.2 times as bright. Values above 1 are kept. The result is black where the luminance is not positive.
     """
     checks.real("colour", colour)
     if colour.ndim < 3 or colour.shape[-3] != 3:
         raise ValueError(f"colour must be linear red, green, blue, [..., 3, H, W], got {tuple(colour.shape)}")
-    share = colour.new_tensor(_LUMINANCE)[:, None, None]
-    grey = (colour * share).sum(-3, keepdim=True)
+    grey = (colour * colour.new_tensor(_LUMINANCE)[:, None, None]).sum(-3, keepdim=True)
     least = colour.amin(-3, keepdim=True)
     outside = least < 0
     mix = torch.where(outside, grey / torch.where(outside, grey - least, 1.0), 1.0)
@@ -51,9 +46,9 @@ def gamut_map(colour: Tensor) -> Tensor:
 def equal_power(intensity: Tensor, reference: Tensor) -> Tensor:
     """Scale each channel of ``intensity`` [..., C, H, W] to the total of the same channel of ``reference``.
 
-    The text below Eq. 5.16: what may enter the eye limits the source, so pictures under different sources compare at
-    equal power. Black channels stay black. ``reference`` may have another H and W on an equal extent: then its mean
-    counts. ValueError for other leading axes.
+    Images under different sources are compared at equal power, because the power that may enter the eye is limited
+    (text below Eq. 5.16). Black channels stay black. ``reference`` may have another H and W on an equal extent, since
+    the means are made equal. Raises ValueError if the leading axes differ.
     """
     for name, part in (("intensity", intensity), ("reference", reference)):
         checks.real(name, part)
@@ -61,33 +56,32 @@ def equal_power(intensity: Tensor, reference: Tensor) -> Tensor:
             raise ValueError(f"{name} must be [..., H, W], got {tuple(part.shape)}")
     if intensity.shape[:-2] != reference.shape[:-2]:
         raise ValueError(f"channels must match, got {tuple(intensity.shape)} and {tuple(reference.shape)}")
-    ours, wanted = (at_least_single(part).mean((-2, -1), keepdim=True) for part in (intensity, reference))
-    black = ours == 0
-    return intensity * torch.where(black, 0.0, wanted / torch.where(black, 1.0, ours)).to(intensity.dtype)
+    mean, wanted = (at_least_single(part).mean((-2, -1), keepdim=True) for part in (intensity, reference))
+    black = mean == 0
+    return intensity * torch.where(black, 0.0, wanted / torch.where(black, 1.0, mean)).to(intensity.dtype)
 
 
 def tone_map(intensity: Tensor, *, peak: Tensor | None = None, gamma: float = GAMMA) -> Tensor:
-    """Picture (intensity / peak)^gamma in 0..1, Eq. 5.16; what exceeds the peak is cut to 1, an empty one is black.
+    """Image (intensity / peak)^gamma in 0..1, Eq. 5.16. Values above the peak become 1; a black image stays black.
 
     Args:
-        intensity: [..., C, H, W], not negative; a tiny negative from rounding counts as 0.
-        peak: Intensity that becomes 1, which broadcasts against ``intensity``; to compare sources, that of one of them.
-            By default the largest value of each picture over C, H and W: Eq. 5.16 is printed for one channel, and one
-            peak per channel would change the colours.
+        intensity: Real [..., C, H, W]; values below 0 count as 0.
+        peak: Intensity that becomes 1, which broadcasts against ``intensity``. By default the largest value of each
+            image over C, H and W; Eq. 5.16 is printed for one channel, and one peak per channel would change colours.
+            Pass the same peak for images that are to be compared.
         gamma: Exponent, above 0.
 
     Returns:
-        Same shape and dtype. Differentiable; the gradient where the intensity is 0 is 0, not the curve's infinity.
+        Same shape and dtype. The gradient where the intensity is 0 is 0 instead of infinite.
     """
     checks.real("intensity", intensity)
     if intensity.ndim < 3:
         raise ValueError(f"intensity must be [..., C, H, W], got {tuple(intensity.shape)}")
     gamma = checks.positive("gamma", gamma)
-    if peak is None:
-        peak = intensity.amax((-3, -2, -1), keepdim=True)
+    peak = intensity.amax((-3, -2, -1), keepdim=True) if peak is None else peak
     lit = (intensity > 0) & (peak > 0)
-    part = torch.where(lit, intensity, 1.0) / torch.where(peak > 0, peak, 1.0)
-    return torch.where(lit, part.clamp(max=1).pow(gamma), 0.0)
+    relative = torch.where(lit, intensity, 1.0) / torch.where(peak > 0, peak, 1.0)
+    return torch.where(lit, relative.clamp(max=1).pow(gamma), 0.0)
 
 
 __getattr__ = renamed(__name__, {"exposed": "tone_map", "desaturated": "gamut_map"})

@@ -94,7 +94,7 @@ def test_other_layouts_are_refused():
 
 @pytest.mark.parametrize(("old", "new"), [("limited", "penalty_schedule"), ("below", "limit_peak_phase")])
 def test_old_names_still_work_and_warn(old, new):
-    with pytest.warns(DeprecationWarning, match=f"holotorch.correction.{old} is now {new}"):
+    with pytest.warns(DeprecationWarning, match=f"holotorch.correction.{old} is now called {new}"):
         assert getattr(correction, old) is getattr(correction, new)
     with pytest.raises(AttributeError, match="has no attribute 'belows'"):
         _ = correction.belows

@@ -22,7 +22,7 @@ from holotorch.experiments.timing import timed
 from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.io.bundled import find_config
 from holotorch.optics.light.spectral import spectral_image
-from holotorch.optics.light.wavelength_sampling import followed, neighbour_error, seen_light
+from holotorch.optics.light.wavelength_sampling import neighbour_error, seen_light, select_wavelengths
 from holotorch.optics.viewing.elementwise import ElementSampling, least_oversampling, propagate_elements
 from holotorch.optics.viewing.imaging import propagate_collapsed
 from holotorch.optics.viewing.retina import plan_retina
@@ -135,7 +135,7 @@ def _counts(observer: Observer) -> list[dict]:
         most = total // 4
         # Fewer wavelengths than requested are propagated if few of them carry most of the power.
         asked = [count for count in (1, 2, 3, 7, 15, most) if count <= max(3, most)]
-        for count in sorted({len(followed(wavelengths, weights, count)[0]) for count in asked}):
+        for count in sorted({len(select_wavelengths(wavelengths, weights, count)[0]) for count in asked}):
             picture, seconds = timed(partial(image, wavelengths, weights, count))
             predicted = f"{neighbour_error(wavelengths, weights, count, light):.1e}"
             rows.append(_row(source, f"{count} of {total} followed", seconds, _error(picture, reference), predicted))

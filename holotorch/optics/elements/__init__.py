@@ -1,1 +1,1 @@
-"""Lenses, apertures, pixels of finite size, and elements in a row."""
+"""Lenses, apertures, pixels of finite size, and sequences of elements."""

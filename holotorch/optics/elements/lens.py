@@ -5,11 +5,12 @@ import warnings
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.grid import Grid
+from holotorch.core.operator import FieldOperator, Wavelengths
 from holotorch.core.quantities import APERTURE_RADIUS, FOCAL_LENGTH, PITCH, SOFTNESS, WAVELENGTH
 from holotorch.optics.free_space.kernels import turns_phasor
 
@@ -22,19 +23,18 @@ def lens_phase(
     Args:
         grid: Sampling of the plane of the lens.
         wavelength: In metres, shape [...]; broadcasts against ``focal_length``.
-        focal_length: In metres, positive converges, negative diverges, infinite is no lens; not 0.
-        paraxial: The parabola -k r^2 / (2 f) of Goodman, Eq. 5-10, and of the thesis (after Voelz). Otherwise the
-            spherical phase -k (sqrt(r^2 + f^2) - |f|) with the sign of f, which focuses a plane wave without spherical
-            aberration; the two differ by k r^4 / (8 f^3).
+        focal_length: In metres, not 0; positive converges, negative diverges, infinite is no lens.
+        paraxial: Use the parabola -k r^2 / (2 f) of Goodman, Eq. 5-10, and of the thesis (after Voelz). Otherwise use
+            the spherical phase -k (sqrt(r^2 + f^2) - |f|) with the sign of f, which focuses a plane wave without
+            spherical aberration. The two differ by k r^4 / (8 f^3).
 
     Returns:
         float64, shape [..., H, W], not wrapped.
 
-    Raises:
-        ValueError: A length that cannot be meant.
+    Raises ValueError for a length outside its range.
     """
-    checks.meant(WAVELENGTH, wavelength)
-    checks.meant(FOCAL_LENGTH, focal_length)
+    checks.plausible(WAVELENGTH, wavelength)
+    checks.plausible(FOCAL_LENGTH, focal_length)
     return 2 * math.pi * _phase_cycles(grid, wavelength, focal_length, paraxial)
 
 
@@ -42,16 +42,16 @@ def pupil(grid: Grid, radius: Tensor | float, *, softness: float = 0.0) -> Tenso
     """Circular opening around the axis: 1 inside ``radius`` and 0 outside, float64 [..., H, W].
 
     Args:
-        grid: Sampling of its plane.
+        grid: Sampling of the plane of the pupil.
         radius: In metres, shape [...].
-        softness: Width in metres over which the amplitude falls, as 1 / (1 + exp((r - radius) / softness)). Only a soft
-            edge has a gradient in the radius; about a pitch is enough.
+        softness: Width in metres of the edge, where the amplitude falls as 1 / (1 + exp((r - radius) / softness)); 0 is
+            a hard edge. Only a soft edge has a gradient in the radius; about one pitch is enough.
 
     Raises:
         ValueError: ``radius`` carries a gradient but the edge is hard, so that the gradient would be 0; or a length
-            that cannot be meant.
+            outside its range.
     """
-    checks.meant(APERTURE_RADIUS, radius, "radius")
+    checks.plausible(APERTURE_RADIUS, radius, "radius")
     checks.quantity(SOFTNESS, softness)
     radius = torch.as_tensor(radius, dtype=torch.float64)
     y, x = grid.coordinates(radius.device)
@@ -61,7 +61,7 @@ def pupil(grid: Grid, radius: Tensor | float, *, softness: float = 0.0) -> Tenso
 def opening(square: Tensor, radius: Tensor, softness: float) -> Tensor:
     """:func:`pupil` at given squared distances from the axis."""
     if softness > 0:
-        # The root's gradient at the axis is infinite; nothing there depends on 1e-30.
+        # The addend keeps the gradient of the root finite on the axis.
         return torch.sigmoid((radius - torch.sqrt(square + 1e-30)) / softness)
     if radius.requires_grad:
         raise ValueError("a hard edge has no gradient in its radius; give softness, for instance one pitch")
@@ -71,9 +71,9 @@ def opening(square: Tensor, radius: Tensor, softness: float) -> Tensor:
 def lens_limit(pitch: float, wavelength: float, focal_length: float, *, paraxial: bool = True) -> float:
     """Distance in metres from the axis up to which samples ``pitch`` apart hold the phase of a lens.
 
-    There its slope reaches half a turn per sample: x = wavelength f / (2 pitch), or f tan(asin(wavelength / (2 pitch)))
-    for the spherical phase. Light that is tilted, or not flat, brings a slope of its own that adds to the lens's: a
-    band of sine s leaves (wavelength / (2 pitch) - s) f.
+    There the phase changes by pi per sample: at wavelength f / (2 pitch) for the parabola, and at
+    f tan(asin(wavelength / (2 pitch))) for the spherical phase. Light that arrives at angles with sines up to s adds a
+    slope of its own, which reduces the paraxial limit to (wavelength / (2 pitch) - s) f.
     """
     sine = checks.quantity(WAVELENGTH, wavelength) / (2 * checks.quantity(PITCH, pitch))
     checks.quantity(FOCAL_LENGTH, focal_length)
@@ -82,62 +82,44 @@ def lens_limit(pitch: float, wavelength: float, focal_length: float, *, paraxial
     return abs(focal_length) * sine / math.sqrt(1 - sine**2) if sine < 1 else math.inf
 
 
-class Transmission(nn.Module):
-    """A thin element, which multiplies complex fields [..., C, H, W] by one complex number per sample.
+class Transmission(FieldOperator):
+    """A thin element, which multiplies fields by one complex number per sample.
 
     Args:
-        grid: Sampling of the field, also that of the result.
-        wavelengths: In metres, one per channel.
+        grid, wavelengths: As for :class:`FieldOperator`.
         values: complex128, shape [C, H, W], or [1, H, W] for all channels.
     """
 
-    values: Tensor
+    def __init__(self, grid: Grid, wavelengths: Wavelengths, values: Tensor):
+        super().__init__(grid, wavelengths)
+        self.register_complex("values", values)
 
-    def __init__(self, grid: Grid, wavelengths: float | Sequence[float], values: Tensor):
-        super().__init__()
-        self.grid, self.out_grid, self.wavelengths = grid, grid, checks.wavelengths(wavelengths)
-        # A real pair: Module.to(dtype) would drop the imaginary part of a complex buffer.
-        self.register_buffer("values", torch.view_as_real(values).contiguous(), persistent=False)
+    def _forward(self, field: Tensor) -> Tensor:
+        return field * self.complex_buffer("values", field)
 
-    def forward(self, field: Tensor) -> Tensor:
-        """Pass ``field`` through; TypeError if it is real, ValueError if its shape differs."""
-        return field * self._values_for(field)
-
-    def adjoint(self, field: Tensor) -> Tensor:
-        """Multiply by the conjugate numbers."""
-        return field * self._values_for(field).conj()
-
-    def _values_for(self, field: Tensor) -> Tensor:
-        checks.field("field", field, (len(self.wavelengths), *self.grid.shape))
-        return torch.view_as_complex(self.values.to(field.real.dtype))
-
-    def _apply(self, fn, recurse=True):
-        return super()._apply(lambda tensor: tensor.to(fn(tensor).device), recurse)
-
-    def extra_repr(self) -> str:
-        """Sampling and wavelengths, for ``print(module)``."""
-        return f"grid={self.grid}, wavelengths={self.wavelengths}"
+    def _adjoint(self, field: Tensor) -> Tensor:
+        return field * self.complex_buffer("values", field).conj()
 
 
 class Lens(Transmission):
     """Thin lens with a circular edge: :func:`lens_phase` inside ``radius``, opaque outside.
 
     Args:
-        grid: Sampling of the field.
-        wavelengths: In metres, one per channel.
-        focal_length: In metres, not 0; positive converges. One for all channels (a refractive or achromatic lens) or
-            one per channel (a holographic optical element, whose focal length goes as 1 / wavelength).
+        grid, wavelengths: As for :class:`FieldOperator`.
+        focal_length: In metres, not 0, positive for a converging lens. One number for all channels (a refractive or
+            achromatic lens) or one per channel (a holographic optical element, whose focal length is proportional to
+            1 / wavelength).
         radius: Radius of the clear aperture in metres; None for a lens that covers the whole window.
-        paraxial: Parabola, or the spherical wave.
+        paraxial: As in :func:`lens_phase`.
 
     Raises:
-        ValueError: A focal length of 0, or a length that cannot be meant, such as one in millimetres.
+        ValueError: A length outside its range, such as 0 or one in millimetres.
         MemoryError: The grid has more samples than memory is available for.
 
     Warns:
-        SamplingWarning: The grid is too coarse for the phase at the edge of the lens, or of a window that it
-            covers; the message names the limit (:func:`lens_limit`) and a sufficient pitch. Light that is not flat
-            needs a finer one.
+        SamplingWarning: The grid is too coarse for the phase at the edge of the lens or of the window, whichever is
+            nearer to the axis. The message names the limit (:func:`lens_limit`) and a pitch that suffices for a plane
+            wave on the axis; other light needs a finer pitch.
 
     Source: Goodman, Sec. 5.1; thesis Algorithm 6.
     """
@@ -145,27 +127,27 @@ class Lens(Transmission):
     def __init__(
         self,
         grid: Grid,
-        wavelengths: float | Sequence[float],
+        wavelengths: Wavelengths,
         focal_length: float | Sequence[float],
         *,
         radius: float | None = None,
         paraxial: bool = True,
     ):
-        wavelength_values = checks.wavelengths(wavelengths)
-        given = list(focal_length) if isinstance(focal_length, Sequence) else [focal_length] * len(wavelength_values)
-        if len(given) != len(wavelength_values):
-            raise ValueError(
-                f"focal_length must be one number or one per wavelength ({len(wavelength_values)}), got {len(given)}"
-            )
+        wavelengths = checks.wavelengths(wavelengths)
+        given = list(focal_length) if isinstance(focal_length, Sequence) else [focal_length] * len(wavelengths)
+        if len(given) != len(wavelengths):
+            wanted = f"one number or one per wavelength ({len(wavelengths)})"
+            raise ValueError(f"focal_length must be {wanted}, got {len(given)}")
         lengths = [checks.quantity(FOCAL_LENGTH, each) for each in given]
         edge = None if radius is None else checks.quantity(APERTURE_RADIUS, radius, "radius")
-        affordable("a lens", grid, len(wavelength_values))
-        values = turns_phasor(_phase_cycles(grid, _doubles(wavelength_values), _doubles(lengths), paraxial))
+        affordable("a lens", grid, len(wavelengths))
+        wavelength, length = (torch.tensor(each, dtype=torch.float64) for each in (wavelengths, lengths))
+        values = turns_phasor(_phase_cycles(grid, wavelength, length, paraxial))
         if edge is not None:
             values = values * pupil(grid, edge)
-        super().__init__(grid, wavelength_values, values)
+        super().__init__(grid, wavelengths, values)
         self.focal_length, self.radius, self.paraxial = tuple(lengths), edge, paraxial
-        warn_if_coarse(grid, wavelength_values, lengths, edge, paraxial=paraxial)
+        warn_if_coarse(grid, wavelengths, lengths, edge, paraxial=paraxial)
 
     def extra_repr(self) -> str:
         """Sampling, wavelengths and lens, for ``print(module)``."""
@@ -176,16 +158,15 @@ class Aperture(Transmission):
     """Opening in an opaque screen.
 
     Args:
-        grid: Sampling of the field.
-        wavelengths: In metres, one per channel.
-        shape: Radius in metres of a circle around the axis, or the amplitude that passes, real [H, W] within 0 .. 1.
+        grid, wavelengths: As for :class:`FieldOperator`.
+        shape: Radius in metres of a circle around the axis, or the amplitude transmission, real [H, W] within 0 .. 1.
 
     Raises:
-        ValueError: A radius that cannot be meant, a mask of another shape or with values outside 0 .. 1.
+        ValueError: A radius outside its range, or a transmission of another shape or with values outside 0 .. 1.
         MemoryError: The grid has more samples than memory is available for.
     """
 
-    def __init__(self, grid: Grid, wavelengths: float | Sequence[float], shape: float | Tensor):
+    def __init__(self, grid: Grid, wavelengths: Wavelengths, shape: float | Tensor):
         if isinstance(shape, Tensor) and shape.ndim:
             mask = shape.to(torch.float64) if shape.dtype == torch.bool else shape
             checks.field("aperture", mask, grid.shape, complex_valued=False)
@@ -199,7 +180,7 @@ class Aperture(Transmission):
 
 
 def affordable(what: str, grid: Grid, channels: int) -> None:
-    """MemoryError if memory for a thin element on ``grid``, 48 bytes per sample and channel (measured), is lacking."""
+    """MemoryError unless memory suffices for a thin element: 48 bytes per sample and channel (measured)."""
     height, width = grid.shape
     checks.affordable(
         48 * channels * height * width,
@@ -209,6 +190,7 @@ def affordable(what: str, grid: Grid, channels: int) -> None:
 
 
 def _phase_cycles(grid: Grid, wavelength: Tensor | float, focal_length: Tensor | float, paraxial: bool) -> Tensor:
+    """:func:`lens_phase` in cycles."""
     wavelength_values, length = (
         torch.as_tensor(v, dtype=torch.float64)[..., None, None] for v in (wavelength, focal_length)
     )
@@ -216,12 +198,8 @@ def _phase_cycles(grid: Grid, wavelength: Tensor | float, focal_length: Tensor |
     square = y.square() + x.square()
     if paraxial:
         return -square / (2 * wavelength_values * length)
-    # sqrt(r^2 + f^2) - |f| without cancelling, and finite for an infinite f.
+    # sqrt(r^2 + f^2) - |f| without cancellation, and finite for an infinite f.
     return -square / (wavelength_values * length * (1 + torch.sqrt(1 + square / length.square())))
-
-
-def _doubles(values: Sequence[float]) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def warn_if_coarse(
@@ -229,19 +207,17 @@ def warn_if_coarse(
 ) -> None:
     """SamplingWarning if ``grid`` is too coarse for lenses of these focal lengths within ``radius``."""
     for wavelength, length in zip(wavelengths, lengths, strict=True):
-        if math.isinf(length):
-            continue
         for size, pitch in zip(grid.shape, grid.pitch, strict=True):
             outermost = min(size // 2 * pitch, radius or math.inf)
             limit = lens_limit(pitch, wavelength, length, paraxial=paraxial)
-            if outermost <= limit * (1 + 1e-9):
-                continue
-            slope = outermost / (abs(length) if paraxial else math.hypot(outermost, length))
-            warnings.warn(
-                f"Lens of focal length {length:g} m at {wavelength:g} m wavelength: samples {pitch:g} m apart hold its "
-                f"phase only up to {limit * 1e3:.3g} mm from the axis, but it reaches {outermost * 1e3:.3g} mm; a "
-                f"pitch of {wavelength / 2 / slope:.3g} m or less would do for flat light, a smaller radius too",
-                SamplingWarning,
-                stacklevel=3,
-            )
-            return
+            if outermost > limit * (1 + 1e-9):
+                slope = outermost / (abs(length) if paraxial else math.hypot(outermost, length))
+                warnings.warn(
+                    f"Lens of focal length {length:g} m at {wavelength:g} m wavelength: samples {pitch:g} m apart hold "
+                    f"its phase only up to {limit * 1e3:.3g} mm from the axis, but it reaches "
+                    f"{outermost * 1e3:.3g} mm; a pitch of {wavelength / 2 / slope:.3g} m or less would do for flat "
+                    "light, a smaller radius too",
+                    SamplingWarning,
+                    stacklevel=3,
+                )
+                return

@@ -3,35 +3,35 @@
 import torch
 from torch import Tensor
 
-from holotorch.core.grid import Grid
-from holotorch.core.special import FRESNEL_BORDER, fresnel_auxiliary, fresnel_integral
+from holotorch.core.grid import Grid, Pair
+from holotorch.core.special import chirped_fresnel_integral
 from holotorch.optics.free_space.kernels import carrier, turns_phasor
 
-_CHUNK = 50_000  # weights at a time: the quadrature behind each holds 42 numbers
+_CHUNK = 50_000  # weights computed at a time, each by a quadrature of 42 numbers
 
 
 def lens_taps(
     targets: Tensor, source: Tensor, pitch: float, wavelength: Tensor, distance: Tensor, focus: Tensor
 ) -> Tensor:
-    """Weights of one axis from samples, through a lens, to positions behind it, without the carrier.
+    """Weights of one axis from samples q in front of a lens to positions x behind it, without the carrier.
 
     w(x, q) = int dx' sinc((x' - q) / pitch) exp(-i pi x'^2 / (wavelength focus)) g(x - x'), with the Fresnel kernel
-    g(x) = exp(i pi x^2 / (wavelength z)) / sqrt(i wavelength z). With m = 1 - z / focus it is a point source seen
-    through the lens, of frequency f0 = (x - m q) / (wavelength z), cut at the ends +-B = +-1 / (2 pitch) of the band:
+    g(x) = exp(i pi x^2 / (wavelength z)) / sqrt(i wavelength z). With m = 1 - z / focus, the highest frequency
+    B = 1 / (2 pitch) of the samples and the frequency f0 = (x - m q) / (wavelength z) of the ray from q to x,
 
     w = pitch / sqrt(2 wavelength |z|) exp(i pi ((x - q)^2 / z - q^2 / focus) / wavelength) (F(u+) + F(u-)),
 
-    u+- = sqrt(2 wavelength |z / m|) (B -+ f0), F = C - iS for z / m > 0, else C + iS, and times -i sign(z) for m < 0.
-    This is ``fresnel_taps`` over z / m at the scaled position x / m, arranged so that no term grows without bound as
-    m -> 0. At m = 0 the cut is a sharp edge at abs(x) = wavelength |z| B, half as high on the edge itself. Gradients
-    close to m = 0 are those of a nearly sharp edge, and large; at m = 0 they leave the edge out.
+    u+- = sqrt(2 wavelength |z / m|) (B -+ f0). F = C - iS for z / m > 0 and C + iS otherwise, times -i sign(z) for
+    m < 0, with the Fresnel integrals C and S. This is ``fresnel_taps`` over z / m at the position x / m, arranged so
+    that all terms are bounded as m -> 0. At m = 0 the weights have a step at abs(x) = wavelength |z| B, with the mean
+    value on the step. Gradients near m = 0 are those of a steep edge and large; at m = 0 they omit the step.
 
     Args:
         targets: Positions x in metres from the axis of the lens, float64, shape [n'].
-        source: Positions q of the samples, likewise, shape [n].
+        source: Positions q of the samples in metres from the axis of the lens, float64, shape [n].
         pitch: Of the samples, in metres.
         wavelength: In metres, float64, shape [...].
-        distance: In metres, float64, shape [...], not 0.
+        distance: z in metres, float64, shape [...], not 0.
         focus: Focal length in metres, float64, shape [...], not 0; may be infinite.
 
     Returns:
@@ -44,9 +44,9 @@ def lens_taps(
 
 
 def lens_matrices(
-    grid: Grid, wavelength: Tensor, distance: Tensor, focus: Tensor, out_grid: Grid, offset: tuple[float, float]
+    grid: Grid, wavelength: Tensor, distance: Tensor, focus: Tensor, out_grid: Grid, offset: Pair
 ) -> tuple[Tensor, Tensor]:
-    """Weights of both axes, complex128 [..., H', H] and [..., W', W], the carrier in the first."""
+    """Weights of both axes, complex128 [..., H', H] with the carrier exp(ikz), and [..., W', W]."""
     columns, rows = (
         lens_taps(targets.reshape(-1) + shift, source.reshape(-1), pitch, wavelength, distance, focus)
         for targets, source, pitch, shift in zip(
@@ -57,32 +57,28 @@ def lens_matrices(
 
 
 def _weights(x: Tensor, q: Tensor, pitch: float, wavelength: Tensor, distance: Tensor, focus: Tensor) -> Tensor:
-    """complex128 [..., n', n] of lengths [..., 1, 1]; see :func:`lens_taps`."""
+    """Weights of :func:`lens_taps`, complex128 [..., n', n], for lengths of shape [..., 1, 1]."""
     x, edge, product = x[:, None], 0.5 / pitch, wavelength * distance
     bounded = focus.isfinite()
     lens = torch.where(bounded, focus, 1.0)
-    m = torch.where(bounded, (lens - distance) / lens, 1.0)  # 1 - z / focus would round to 1e-16 of 1
+    m = torch.where(bounded, (lens - distance) / lens, 1.0)  # 1 - z / focus would have an absolute error of 1e-16
     sharp = m == 0
     size = torch.where(sharp, 1.0, m)
     inverted = (m < 0).to(torch.float64)
     sign_z_over_m = torch.sign(distance) * (1 - 2 * inverted)
     scale = torch.sqrt(2 * (product / size).abs())
     chirp = turns_phasor(((x - q).square() / distance - q.square() / focus) / (2 * wavelength))
-    half = torch.complex(torch.full_like(sign_z_over_m, 0.5), -sign_z_over_m / 2)
     total = torch.zeros_like(chirp)
     for sign in (1, -1):
-        # exp(-+i pi u^2 / 2) times the chirp: one end of the band, where it lands.
-        beside = edge - sign * x / product
-        band_end = turns_phasor(x.square() / (2 * product) - product / (2 * size) * beside.square() - sign * edge * q)
+        # exp(-+i pi u^2 / 2) times the chirp: the contribution of one end of the band.
+        from_edge = edge - sign * x / product
+        cycles = x.square() / (2 * product) - product / (2 * size) * from_edge.square() - sign * edge * q
+        band_end = turns_phasor(cycles)
         u = scale * (edge - sign * (x - m * q) / product)
-        # A place on the sharp edge, as the outermost of an even DFT is, shall not fall to one side by rounding.
-        u = torch.where(sharp & (beside.abs() <= 1e-12 * edge), 0.0, u)
-        far = (u.abs() > FRESNEL_BORDER) | sharp
-        f, g = fresnel_auxiliary(torch.where(u.abs() > FRESNEL_BORDER, u.abs(), 2.0))
-        boundary = torch.where(sharp, 0.0, torch.complex(-g, sign_z_over_m * f) * band_end)
-        integral = fresnel_integral(torch.where(far, 0.0, u))
-        small_u = torch.complex(integral.real, sign_z_over_m * integral.imag)
-        total = total + torch.where(far, torch.sign(u) * (half * chirp + boundary), chirp * small_u)
-    # The root of 1 / m, whose two values for negative m are told apart by continuity at m = 0.
+        # A position on the step, such as the outermost sample of an even DFT, counts as exactly on it despite rounding.
+        u = torch.where(sharp & (from_edge.abs() <= 1e-12 * edge), 0.0, u)
+        step = torch.sign(u) * ((0.5 - 0.5j * sign_z_over_m) * chirp)
+        total = total + torch.where(sharp, step, chirped_fresnel_integral(u, chirp, band_end, sign_z_over_m))
+    # The phase of the root of 1 / m, chosen for m < 0 such that the weights are continuous at m = 0.
     root = torch.complex(1 - inverted, -inverted * torch.sign(distance))
     return total * root * (pitch / torch.sqrt(2 * product.abs()))

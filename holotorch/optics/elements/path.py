@@ -1,4 +1,4 @@
-"""OpticalPath: elements and free space in a row, checked against each other once."""
+"""OpticalPath: a sequence of elements and propagations."""
 
 from collections.abc import Sequence
 
@@ -9,19 +9,19 @@ from holotorch.optics.free_space.propagators import Fraunhofer
 
 
 class OpticalPath(nn.Sequential):
-    """Linear operators one after the other: propagators, lenses, apertures, and other paths.
+    """Linear operators applied one after the other: propagators, lenses, apertures, and other paths.
 
     Args:
         elements: In the order in which light meets them. Each has ``grid`` and ``wavelengths``, ``out_grid`` if its
             result is sampled differently, and ``adjoint``.
 
     Attributes:
-        grid: Sampling of what enters.
-        out_grid: Sampling of what leaves.
+        grid: Sampling of the field that enters.
+        out_grid: Sampling of the field that leaves.
         wavelengths: In metres, one per channel.
 
     Raises:
-        TypeError: Something that is no such operator.
+        TypeError: An element that is not such an operator.
         ValueError: No element at all, or neighbours that disagree in sampling or wavelengths; the message names them.
     """
 
@@ -41,20 +41,20 @@ class OpticalPath(nn.Sequential):
             pair = f"elements {i} ({type(one).__name__}) and {i + 1} ({type(two).__name__}) of an optical path"
             if isinstance(one, Fraunhofer):
                 raise ValueError(f"{pair}: the far field consists of directions, so nothing can follow it")
-            if _leaving(one) != two.grid:
-                raise ValueError(f"{pair} must share their sampling, got {_leaving(one)} and then {two.grid}")
+            if _out_grid(one) != two.grid:
+                raise ValueError(f"{pair} must share their sampling, got {_out_grid(one)} and then {two.grid}")
             if one.wavelengths != two.wavelengths:
                 raise ValueError(f"{pair} must share wavelengths, got {one.wavelengths} and then {two.wavelengths}")
         super().__init__(*elements)
-        self.grid, self.out_grid, self.wavelengths = elements[0].grid, _leaving(elements[-1]), elements[0].wavelengths
+        self.grid, self.out_grid, self.wavelengths = elements[0].grid, _out_grid(elements[-1]), elements[0].wavelengths
 
     def adjoint(self, field: Tensor) -> Tensor:
-        """Apply the conjugate transpose: those of the elements, last first."""
+        """Apply the conjugate transposes of the elements in reverse order."""
         for element in reversed(list(self)):
             field = element.adjoint(field)  # type: ignore[operator]
         return field
 
 
-def _leaving(element: nn.Module) -> Grid:
+def _out_grid(element: nn.Module) -> Grid:
     grid = getattr(element, "out_grid", None)
     return grid if isinstance(grid, Grid) else element.grid  # type: ignore[return-value]

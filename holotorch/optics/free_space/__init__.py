@@ -1,1 +1,1 @@
-"""Free space: transfer functions, impulse responses, and one class per way to propagate."""
+"""Free space: transfer functions, impulse responses, and one class per propagation method."""

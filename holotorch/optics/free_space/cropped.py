@@ -1,15 +1,14 @@
-"""CroppedKernel: propagation that neither wraps light around nor cuts its band, at any distance."""
-
-from collections.abc import Sequence
+"""CroppedKernel: propagation at any distance that neither wraps light around nor removes frequencies."""
 
 import torch
 
 from holotorch.core import checks
 from holotorch.core.fourier import good_length
-from holotorch.core.grid import Grid
+from holotorch.core.grid import Grid, Pair
+from holotorch.core.operator import Wavelengths
 from holotorch.core.quantities import DISTANCE
 from holotorch.optics.free_space.padding import FINEST, crop_length
-from holotorch.optics.free_space.plane_pair import plane_pair, shifts
+from holotorch.optics.free_space.plane_pair import PlanePair
 from holotorch.optics.free_space.propagators import SpectralFilter
 from holotorch.optics.free_space.transfer import transfer_function
 
@@ -17,56 +16,45 @@ from holotorch.optics.free_space.transfer import transfer_function
 class CroppedKernel(SpectralFilter):
     """Exact scalar propagation of band-limited samples over ``distance``; includes the carrier exp(ikz).
 
-    The kernel in space is known exactly on every sample (:func:`fresnel_taps` per axis); cropped to the displacements
-    that occur inside the window and transformed, it is a linear convolution at twice the window, where a sampled
-    transfer function would wrap the light beyond the window or lose it. What the exact kernel has on top of the
-    paraxial one moves light by z (tan - sin) of its angle only, a few samples; it multiplies in frequency, and the
-    padding leaves room for it. For white phases the error is about 2 s^2 / sqrt(N) of the field or less, s the sine of
-    the steepest angle (wavelength / 2 pitch) and N the samples of an axis: 1e-4 at 8 um, 5e-4 at 3.74 um for 512 px, at
-    every distance. For smooth fields, and with ``paraxial``, it is rounding.
+    The paraxial kernel in space is known exactly on every sample (:func:`fresnel_taps` per axis). Cropped to the
+    displacements that occur inside the window, it is a linear convolution with transforms of twice the window; a
+    sampled transfer function would wrap the light that leaves the window or lose it. The factor beyond Fresnel, the
+    exact transfer function divided by the paraxial one, is applied in frequency. It moves light by z (tan - sin) of its
+    angle, a few samples, for which the padding has room.
+
+    For fields of random phase the error relative to the field is at most about 2 s^2 / sqrt(N) at every distance, with
+    s the sine of the steepest angle, wavelength / (2 pitch), and N the samples of an axis: with 512 samples, 1e-4 for a
+    pitch of 8 um and 5e-4 for 3.74 um. For smooth fields, and with ``paraxial``, there is only rounding error.
 
     Args:
-        grid: Sampling of the field, which is also that of the result.
-        wavelengths: In metres, one per channel.
-        distance: In metres, negative to travel back.
-        paraxial: Leave out the correction beyond the Fresnel approximation.
-        offset: Position (y, x) in metres of the axis of the result relative to the axis of the field: a
-            window off the axis, or one between the samples, at the same cost.
+        grid, wavelengths: As for :class:`FieldOperator`.
+        distance: In metres, negative for backward propagation.
+        paraxial: Leave out the factor beyond Fresnel.
+        offset: Position (y, x) in metres of the axis of the result relative to the axis of the field, which need not be
+            a whole number of samples.
 
     Raises:
-        ValueError: A wavelength that is not positive, a distance that is not finite, or a pitch below 0.9 wavelengths,
-            where the two factors no longer separate; use ``AngularSpectrum`` there.
+        ValueError: A number outside its range, or a pitch below 0.9 wavelengths, where the factor beyond Fresnel can no
+            longer be applied separately; use ``AngularSpectrum`` there.
     """
 
     def __init__(
-        self,
-        grid: Grid,
-        wavelengths: float | Sequence[float],
-        distance: float,
-        *,
-        paraxial: bool = False,
-        offset: tuple[float, float] = (0.0, 0.0),
+        self, grid: Grid, wavelengths: Wavelengths, distance: float, *, paraxial: bool = False, offset: Pair = (0, 0)
     ):
-        distance = checks.quantity(DISTANCE, distance)
-        channel_wavelengths = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
-        longest = channel_wavelengths.max().item()
-        planes = plane_pair(grid, None, offset, (0.0, 0.0), channel_wavelengths.tolist())
+        z = torch.tensor(checks.quantity(DISTANCE, distance), dtype=torch.float64)
+        wavelength = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
+        longest = wavelength.max().item()
+        planes = PlanePair(grid, grid, checks.offset(offset))
         if min(grid.pitch) < FINEST * longest and not paraxial:
             raise ValueError(
                 f"CroppedKernel needs a pitch of at least {FINEST} wavelengths, got {min(grid.pitch):g} m at "
                 f"{longest:g} m; use AngularSpectrum"
             )
-        distance_tensor = torch.tensor(distance, dtype=torch.float64)
-        positions = [
-            position.item() for position in shifts(planes, distance_tensor, torch.zeros(2, dtype=torch.float64))
+        lengths = [
+            2 * size - 1 if paraxial else crop_length(size, size, pitch, longest, abs(z.item()), shift / pitch)
+            for size, pitch, shift in zip(grid.shape, grid.pitch, planes.offset, strict=True)
         ]
-        height, width = (
-            good_length(2 * size - 1 if paraxial else crop_length(size, size, pitch, longest, abs(distance), position))
-            for size, pitch, position in zip(grid.shape, grid.pitch, positions, strict=True)
-        )
-        padded = Grid((height, width), grid.pitch)
-        kernel = transfer_function(
-            planes, padded, channel_wavelengths, distance_tensor, sampled=(False, False), paraxial=paraxial
-        )
+        padded = Grid((good_length(lengths[0]), good_length(lengths[1])), grid.pitch)
+        kernel = transfer_function(planes, padded, wavelength, z, sampled=(False, False), paraxial=paraxial)
         super().__init__(grid, wavelengths, kernel)
-        self.distance, self.offset = distance, planes.offset
+        self.distance, self.offset = z.item(), planes.offset

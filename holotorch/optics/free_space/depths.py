@@ -1,4 +1,4 @@
-"""DepthStack: one hologram to several depths, from one forward transform."""
+"""DepthStack: propagation of one hologram to several depths with one forward transform."""
 
 from collections.abc import Sequence
 
@@ -11,14 +11,15 @@ from holotorch.optics.free_space.propagators import SpectralFilter
 
 
 class DepthStack(nn.Module):
-    """Fields complex [..., C, H, W] to their propagations to D depths, [..., C, D, H, W].
+    """Propagation of fields, complex [..., C, H, W], to D depths at once, [..., C, D, H, W].
 
     Args:
-        filters: Propagators to each depth, of one grid, one set of wavelengths and one padded size.
+        filters: D propagators with the same grid, wavelengths and padded size.
 
     Raises:
-        TypeError: A propagator that is no ``SpectralFilter``.
-        ValueError: No filters, ones that differ in these, or whose result has another grid than the field.
+        TypeError: A propagator that is not a ``SpectralFilter``.
+        ValueError: No filters, filters of different grids, wavelengths or padded sizes, or a filter whose result has
+            another grid than the field.
     """
 
     def __init__(self, filters: Sequence[SpectralFilter]):
@@ -30,15 +31,15 @@ class DepthStack(nn.Module):
         first = filters[0]
         if first.out_grid != first.grid:
             raise ValueError("DepthStack needs propagators whose result has the grid of the field")
-        for each in filters[1:]:
-            if _kind(each) != _kind(first):
-                raise ValueError("DepthStack needs propagators of one grid, one set of wavelengths and one padded size")
+        if len({(each.grid, each.out_grid, each.wavelengths, each.kernel.shape) for each in filters}) > 1:
+            raise ValueError("DepthStack needs propagators of one grid, one set of wavelengths and one padded size")
         self.filters = nn.ModuleList(filters)
         self.grid, self.wavelengths = first.grid, first.wavelengths
 
     def forward(self, field: Tensor) -> Tensor:
         """Propagate ``field`` [..., C, H, W] to all depths, [..., C, D, H, W], same dtype."""
-        kernels = self._kernels_for(field)
+        checks.field("field", field, (len(self.wavelengths), *self.grid.shape))
+        kernels = [each.kernel_for(field) for each in self._filters()]
         spectrum = fft2(field, (kernels[0].shape[-2], kernels[0].shape[-1]))
         return torch.stack([ifft2(spectrum * kernel, self.grid.shape) for kernel in kernels], -3)
 
@@ -47,17 +48,8 @@ class DepthStack(nn.Module):
         expected = len(self.wavelengths), len(self.filters), *self.grid.shape
         if tuple(field.shape[-4:]) != expected:
             raise ValueError(f"field must end in (C, D, H, W) = {expected}, got {tuple(field.shape)}")
-        parts = zip(self._each(), field.unbind(-3), strict=True)
+        parts = zip(self._filters(), field.unbind(-3), strict=True)
         return torch.stack([each.adjoint(part) for each, part in parts]).sum(0)
 
-    def _kernels_for(self, field: Tensor) -> list[Tensor]:
-        checks.field("field", field, (len(self.wavelengths), *self.grid.shape))
-        single = field.dtype == torch.complex64
-        return [torch.view_as_complex(each.single if single else each.kernel) for each in self._each()]
-
-    def _each(self) -> list[SpectralFilter]:
-        return [each for each in self.filters if isinstance(each, SpectralFilter)]
-
-
-def _kind(each: SpectralFilter) -> tuple:
-    return each.grid, each.out_grid, each.wavelengths, each.kernel.shape
+    def _filters(self) -> list[SpectralFilter]:
+        return [each for each in self.filters if isinstance(each, SpectralFilter)]  # typed, unlike a ModuleList

@@ -1,27 +1,27 @@
-"""How far light spreads, and how much padding that asks for. Plain numbers, no tensors."""
+"""Lateral spread of light between two planes and the padding that it needs. Lengths are numbers in metres."""
 
 import math
 
 from holotorch.core import checks
-from holotorch.core.grid import Grid
+from holotorch.core.grid import Grid, Pair
 from holotorch.core.quantities import DISTANCE, WAVELENGTH
 
 
-def diffraction_angle(grid: Grid, wavelength: float) -> tuple[float, float]:
-    """Largest angle (y, x) from the axis, in radians, that the pitch can carry: sin = wavelength / (2 pitch).
+def diffraction_angle(grid: Grid, wavelength: float) -> Pair:
+    """Largest angle (y, x) from the axis, in radians, that the pitch can sample: its sine is wavelength / (2 pitch).
 
-    pi / 2 where the pitch is at or below half a wavelength: light then leaves in every direction.
+    It is pi / 2 where the pitch is at most half a wavelength.
     """
     wavelength = checks.quantity(WAVELENGTH, wavelength)
     y, x = (math.asin(min(1.0, wavelength / (2 * pitch))) for pitch in grid.pitch)
     return y, x
 
 
-def lateral_spread(grid: Grid, wavelength: float, distance: float, *, paraxial: bool = False) -> tuple[float, float]:
-    """Sideways travel (y, x) in metres of the steepest light that the grid carries: z tan(angle).
+def lateral_spread(grid: Grid, wavelength: float, distance: float, *, paraxial: bool = False) -> Pair:
+    """Lateral shift (y, x) in metres of light at the angle of :func:`diffraction_angle`: abs(distance) tan(angle).
 
-    Infinite where the pitch is at or below half a wavelength. ``paraxial`` gives z sin(angle), which is what a Fresnel
-    kernel does with that light.
+    It is infinite where the pitch is at most half a wavelength. With ``paraxial`` it is abs(distance) sin(angle), the
+    shift by a Fresnel kernel.
     """
     wavelength, distance = checks.quantity(WAVELENGTH, wavelength), checks.quantity(DISTANCE, distance)
     if distance == 0:
@@ -32,26 +32,26 @@ def lateral_spread(grid: Grid, wavelength: float, distance: float, *, paraxial: 
     return y, x
 
 
-def least_padding(grid: Grid, wavelength: float, distance: float, *, paraxial: bool = False) -> tuple[float, float]:
-    """Least padding factor (y, x) for which no light of the grid's full band wraps around into the kept window.
+def least_padding(grid: Grid, wavelength: float, distance: float, *, paraxial: bool = False) -> Pair:
+    """Least padding factor (y, x) for which light of any frequency of the grid does not wrap around into the window.
 
-    Padding by P leaves (P - 1) times the extent for light to leave through, so P = 1 + reach / extent, where reach is
-    the geometric spread plus 3 sqrt(wavelength z) for the diffraction at the edges of the window. Where P >= 2 the
-    kernel's phase is then sampled finely enough as well, since that needs reach <= P extent / 2. About 1 % of a
-    full-band field still wraps, in the tails of its samples; ``CroppedKernel`` has none of that. Infinite where light
-    can travel at 90 degrees (a pitch of half a wavelength or less); 1 at distance 0.
+    Padding by P leaves (P - 1) times the extent for light that leaves the window. So P = 1 + shift / extent, where the
+    shift is :func:`lateral_spread` plus 3 sqrt(wavelength distance) for diffraction at the edges of the window. For
+    P >= 2 the phase of the kernel is also sampled finely enough, which requires shift <= P extent / 2. About 1 % of a
+    field that contains all frequencies still wraps, in the tails of its samples; ``CroppedKernel`` avoids that. The
+    factor is infinite where the pitch is at most half a wavelength, and 1 at distance 0.
     """
     spread = lateral_spread(grid, wavelength, distance, paraxial=paraxial)
     edge = 3 * math.sqrt(wavelength * abs(distance))
-    y, x = (1 + (sideways + edge) / extent for sideways, extent in zip(spread, grid.extent, strict=True))
+    y, x = (1 + (shift + edge) / extent for shift, extent in zip(spread, grid.extent, strict=True))
     return y, x
 
 
 def unaliased_distance(grid: Grid, wavelength: float, pad: float) -> float:
-    """Largest distance in metres up to which padding by ``pad`` serves the full band (paraxial) on both axes.
+    """Largest distance in metres at which padding by ``pad`` suffices for all frequencies of both axes (paraxial).
 
-    It is 2 (pad - 1) L pitch / wavelength for isolated light, and for ``pad`` = 1, the periodic model, the distance
-    L pitch / wavelength up to which the kernel's phase is sampled.
+    With the extent L it is 2 (pad - 1) L pitch / wavelength, up to which no light wraps around. For ``pad`` = 1, the
+    periodic model, it is L pitch / wavelength, up to which the phase of the kernel is sampled without aliasing.
     """
     wavelength = checks.quantity(WAVELENGTH, wavelength)
     windows = 1 if pad == 1 else 2 * (pad - 1)

@@ -1,75 +1,70 @@
-"""The impulse response of free space, exact for band-limited samples, which a sampled transfer function is not."""
+"""The impulse response of free space, exact for band-limited samples, unlike that of a sampled transfer function."""
 
 import math
 
 import torch
 from torch import Tensor
 
-from holotorch.core.special import FRESNEL_BORDER, fresnel_auxiliary, fresnel_integral
-from holotorch.optics.free_space.kernels import turns_phasor
+from holotorch.core.special import chirped_fresnel_integral
+from holotorch.optics.free_space.kernels import direction_cosine, turns_phasor
 
 
-def fresnel_taps(place: Tensor, pitch: float, wavelength: Tensor, distance: Tensor) -> Tensor:
+def fresnel_taps(displacement: Tensor, pitch: float, wavelength: Tensor, distance: Tensor) -> Tensor:
     """Weights of the paraxial propagation from a sample to displaced positions on one axis, without the carrier.
 
-    t(n) = pitch * int_{-B}^{B} exp(-i pi wavelength z f^2) exp(2 pi i f n pitch) df with B = 1 / (2 pitch): the band
-    is cut exactly where the samples cut it. Completing the square turns it into two Fresnel integrals with arguments
-    u = sqrt(2 wavelength |z|) (B -+ x / (wavelength |z|)), valid at every distance: at small ones the taps approach a
-    single one with sinc tails, at large ones the sampled chirp of the point source. Every phase is reduced in cycles.
+    t(n) = pitch * int_{-B}^{B} exp(-i pi wavelength z f^2) exp(2 pi i f n pitch) df with the highest frequency
+    B = 1 / (2 pitch) of the samples. Completing the square gives two Fresnel integrals with the arguments
+    u = sqrt(2 wavelength |z|) (B -+ x / (wavelength |z|)), where x = n pitch. They hold at every distance: at short
+    distances the taps approach a single sample with sinc tails, at long ones the sampled chirp of a point source.
 
     Args:
-        place: Displacement n in samples, which need not be whole, shape [n].
+        displacement: n in samples, which need not be whole, shape [N].
         pitch: In metres.
         wavelength: In metres, float64, shape [...].
         distance: In metres, float64, shape [...], not 0; negative gives the conjugate.
 
     Returns:
-        complex128 of shape [..., n].
+        complex128 of shape [..., N].
     """
     product = (wavelength * distance.abs())[..., None]
-    place = place.to(torch.float64)
-    x, edge = place * pitch, 0.5 / pitch
+    displacement = displacement.to(torch.float64)
+    x, edge = displacement * pitch, 0.5 / pitch
     scale = torch.sqrt(2 * product)
     chirp = turns_phasor(x.square() / (2 * product))
     total = torch.zeros_like(chirp)
     for sign in (1, -1):
-        # exp(-i pi u^2 / 2) times the chirp: an end of the band, exp(-i pi product B^2) exp(+-2 pi i B x).
-        band_end = turns_phasor(-product * edge**2 / 2 + sign * place / 2)
+        # exp(-i pi u^2 / 2) times the chirp is the integrand at one end of the band.
+        band_end = turns_phasor(-product * edge**2 / 2 + sign * displacement / 2)
         u = scale * (edge - sign * x / product)
-        large = u.abs() > FRESNEL_BORDER
-        f, g = fresnel_auxiliary(torch.where(large, u.abs(), 2.0))
-        outside = torch.sign(u) * ((0.5 - 0.5j) * chirp + torch.complex(-g, f) * band_end)
-        inside = chirp * fresnel_integral(torch.where(large, 0.0, u))
-        total = total + torch.where(large, outside, inside)
+        total = total + chirped_fresnel_integral(u, chirp, band_end)
     taps = total * pitch / scale
     return torch.where((distance < 0)[..., None], taps.conj(), taps)
 
 
 def tap_indices(padded: int, size: int, out: int) -> Tensor:
-    """Displacements from n source samples to m samples of the result, 0 .. m - 1, ..., -(n - 1) .. -1, in FFT order.
+    """Displacements from ``size`` source samples to ``out`` samples of the result, float64 [padded], in FFT order.
 
-    ``padded`` >= n + m - 1 of them, float64; the excess is divided between the two ends.
+    From 0 to out - 1 and then from -(size - 1) to -1. If ``padded`` exceeds their number, size + out - 1, both ranges
+    are extended equally.
     """
     index = torch.arange(padded, dtype=torch.float64)
     return torch.where(index > out - 1 + (padded - (size + out - 1)) // 2, index - padded, index)
 
 
 def remainder_kernel(fy: Tensor, fx: Tensor, wavelength: Tensor, distance: Tensor) -> Tensor:
-    """Factor of the exact transfer function beyond the paraxial one: exp(-i pi z s^4 / (wavelength (1 + cos)^2)).
+    """The factor beyond Fresnel, exp(-i pi z s^4 / (wavelength (1 + cos)^2)), complex128.
 
-    s is the sine of the angle, frequencies in cycles per metre broadcast against wavelength and distance; complex128.
-    Evanescent waves decay with abs(distance), and their paraxial phase is removed. :func:`tilted_turns` is the
-    counterpart for a tilted carrier.
+    It is the exact transfer function divided by the paraxial one; s and cos are the sine and cosine of the angle to the
+    axis. The frequencies in cycles per metre broadcast against wavelength and distance in metres. Evanescent waves
+    decay with abs(distance); their phase is such that the product with the paraxial factor and the carrier is real.
+    :func:`tilted_turns` is the counterpart for a tilted carrier.
     """
     sine2 = (wavelength * fy).square() + (wavelength * fx).square()
-    travels = sine2 < 1
-    cosine = torch.where(travels, torch.sqrt(torch.where(travels, 1 - sine2, 1)), 0)
-    cycles = -distance / wavelength * torch.where(travels, (sine2 / (1 + cosine)).square() / 2, 1 - sine2 / 2)
+    cosine, imaginary = direction_cosine(sine2)
+    cycles = -distance / wavelength * torch.where(sine2 < 1, (sine2 / (1 + cosine)).square() / 2, 1 - sine2 / 2)
     phase = turns_phasor(cycles)
-    decays = sine2 > 1
-    if not bool(decays.any()):
+    if not bool(imaginary.any()):
         return phase
-    imaginary = torch.where(decays, torch.sqrt(torch.where(decays, sine2 - 1, 1)), 0)
     return phase * torch.exp(-2 * math.pi * distance.abs() / wavelength * imaginary)
 
 
@@ -78,15 +73,15 @@ def tilted_turns(
 ) -> Tensor:
     """Phase in cycles that free space adds to frequencies (fy, fx) about a carrier with the sines ``tilt`` (y, x) [2].
 
-    z (k_z(f + f_0) - k_z(f_0)) / 2 pi less its linear part, which is the sideways travel z s_0 / cos_0 of the carrier.
-    Without ``squares`` also less -wavelength z / 2 (f_y^2 (1 - s_x^2) + f_x^2 (1 - s_y^2)) / cos_0^3: the cross term
-    and everything of third order and beyond remain. The difference of two roots z / wavelength large loses 1e-16 of
-    that: 1e-9 cycles at 2 m.
+    It is z (k_z(f + f_0) - k_z(f_0)) / 2 pi minus the part linear in f, which is the lateral shift z s_0 / cos_0 of the
+    carrier; s_0 and cos_0 are its sine and cosine and f_0 its frequency. Without ``squares`` the term
+    -wavelength z / 2 (f_y^2 (1 - s_x^2) + f_x^2 (1 - s_y^2)) / cos_0^3 is subtracted too, so that the cross term and
+    the terms of third and higher order remain. The rounding error is 1e-16 of z / wavelength: 1e-9 cycles at 2 m.
     """
     sy, sx = tilt[0], tilt[1]
     cosine = torch.sqrt(1 - sy.square() - sx.square())
     y, x = wavelength * fy, wavelength * fx
-    # cos^2 - cos_0^2 = -(2 s_0 f + f^2) with f in sines; divided by cos + cos_0 it does not cancel.
+    # cos - cos_0 = -(2 s_0 f + f^2) / (cos + cos_0), with f times the wavelength; this form has no cancellation.
     change = -(2 * (sy * y + sx * x) + y.square() + x.square())
     root = torch.sqrt((cosine.square() + change).clamp(min=0))
     curved = change / (root + cosine) + (sy * y + sx * x) / cosine
@@ -95,16 +90,18 @@ def tilted_turns(
     return distance / wavelength * curved
 
 
-def levelling_shift(top: tuple[float, float], wavelength: Tensor, distance: Tensor, tilt: Tensor, axis: int) -> Tensor:
-    """Shift in metres, shape [...], moved from the factor beyond Fresnel into the taps of a tilted axis.
+def levelling_shift(
+    nyquist: tuple[float, float], wavelength: Tensor, distance: Tensor, tilt: Tensor, axis: int
+) -> Tensor:
+    """Shift along ``axis`` in metres, shape [...], moved from the factor beyond Fresnel into the taps of that axis.
 
-    That factor has an odd part, which is discontinuous between the two ends of the band. The shift that equalises both
-    ends, at the rms frequency of the other axis, leaves a fifth of the discontinuity. ``top`` is the upper end (y, x)
-    of the band, in cycles per metre.
+    About a tilted carrier this factor has an odd part, which is discontinuous between the two ends of the periodic
+    band. The shift makes the phase at both ends equal for the rms frequency of the other axis, which leaves a fifth of
+    the discontinuity. ``nyquist`` is the highest frequency (y, x) of the samples, in cycles per metre.
     """
-    ends = [torch.full((), limit / 3**0.5, dtype=torch.float64, device=tilt.device) for limit in top]
+    ends = [torch.full((), limit / 3**0.5, dtype=torch.float64, device=tilt.device) for limit in nyquist]
     cycles = []
     for sign in (1, -1):
-        ends[axis] = torch.full((), sign * top[axis], dtype=torch.float64, device=tilt.device)
+        ends[axis] = torch.full((), sign * nyquist[axis], dtype=torch.float64, device=tilt.device)
         cycles.append(tilted_turns(ends[0], ends[1], wavelength, distance, tilt, squares=False))
-    return (cycles[0] - cycles[1]) / (2 * top[axis])
+    return (cycles[0] - cycles[1]) / (2 * nyquist[axis])

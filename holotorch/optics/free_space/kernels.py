@@ -1,6 +1,6 @@
 """Transfer functions of free space: pure functions, float64 inside, differentiable in wavelength and distance.
 
-Numbers and tensors outside the range of their quantity are refused; values are not checked under compile and vmap.
+Numbers and tensors outside the range of their quantity raise ValueError, except under ``compile`` and ``vmap``.
 """
 
 import math
@@ -9,17 +9,18 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
-from holotorch.core.grid import Grid
-from holotorch.core.quantities import DISTANCE, WAVELENGTH
+from holotorch.core.complex import phasor
+from holotorch.core.grid import Grid, Pair
+from holotorch.core.quantities import DISTANCE, WAVELENGTH, Quantity
 
 
 def carrier(wavelength: Tensor | float, distance: Tensor | float) -> Tensor:
-    """exp(i k z), complex128 of the broadcast shape.
+    """exp(i k z), complex128 of the broadcast shape of ``wavelength`` and ``distance``, in metres.
 
-    k z reaches 1e6 rad and more, where float32 steps by 0.1 rad; whole cycles are subtracted in float64 first. A tensor
-    of float32 is already rounded: PrecisionWarning if that changes the phase by 0.01 rad or more.
+    k z exceeds 1e6 rad, where float32 numbers are 0.1 rad apart, so whole cycles are subtracted in float64. Emits a
+    PrecisionWarning if the rounding of a float32 argument changes the phase by 0.01 rad or more.
     """
-    cycles = _distance(distance) / _wavelength(wavelength)
+    cycles = _float64(DISTANCE, distance) / _float64(WAVELENGTH, wavelength)
     checks.precise(wavelength, distance)
     return turns_phasor(cycles)
 
@@ -32,99 +33,95 @@ def angular_spectrum_kernel(
     Args:
         grid: Sampling of the padded field.
         wavelength: In metres, shape [...]; broadcasts against ``distance``.
-        distance: In metres, negative to travel back.
-        band_limit: Drop frequencies that the grid undersamples at this distance: those whose light would move
-            sideways by more than half the padded extent. This is the rule of Matsushima and Shimobaba (2009) for both
-            axes at once instead of one by one. It removes aliasing noise; the light it drops is missing.
+        distance: In metres, shape [...], negative for backward propagation.
+        band_limit: Drop frequencies at which the grid undersamples the kernel: those whose light moves sideways by more
+            than half the padded extent. This is the rule of Matsushima and Shimobaba (2009), here with the exact angle
+            in two dimensions. It removes aliasing noise; the dropped light is missing in the result.
 
     Returns:
         complex128 of shape [..., H, W], frequencies in FFT order. Evanescent waves decay with abs(distance), so that
-        propagation backward does not amplify them; distance 0 gives ones.
+        backward propagation does not amplify them; distance 0 gives ones.
 
-    k_z - k is written -k s^2 / (1 + cos), s the sine of the angle, which does not cancel. Source: Goodman, Sec. 3.10.
+    k_z - k is computed as -k s^2 / (1 + cos), with the sine s and cosine of the angle, to avoid cancellation.
+    Source: Goodman, Sec. 3.10.
     """
-    wavelength, distance = _wavelength(wavelength)[..., None, None], _distance(distance)[..., None, None]
+    wavelength, distance = _float64(WAVELENGTH, wavelength), _float64(DISTANCE, distance)
+    wavelength, distance = wavelength[..., None, None], distance[..., None, None]
     fy, fx = grid.frequencies(distance.device)
     sine2 = (wavelength * fy).square() + (wavelength * fx).square()
-    travels, decays = sine2 < 1, sine2 > 1
-    # Masked before the root, so that the unused branch has a finite gradient.
-    cosine = torch.where(travels, torch.sqrt(torch.where(travels, 1 - sine2, 1)), 0)
-    imaginary = torch.where(decays, torch.sqrt(torch.where(decays, sine2 - 1, 1)), 0)
-
-    cycles = -distance / wavelength * torch.where(travels, sine2 / (1 + cosine), 1)
+    cosine, imaginary = direction_cosine(sine2)
+    cycles = -distance / wavelength * torch.where(sine2 < 1, sine2 / (1 + cosine), 1)
     kernel = torch.exp(-2 * math.pi * distance.abs() / wavelength * imaginary) * turns_phasor(cycles)
     if not band_limit:
         return kernel
-    # tan(angle) = wavelength f / cos. The same limit on the evanescent side drops the slow decays next to the cut-off,
-    # which vary too fast to be sampled, and keeps the rest.
+    # tan(angle) = wavelength f / cos. Of the evanescent waves, the same limit drops those next to the cut-off, which
+    # decay slowly but vary too fast with frequency to be sampled.
     root = cosine + imaginary
     height, width = grid.extent
-    reach = 2 * (distance * wavelength).abs()
-    kept = (reach * fy.abs() <= height * root) & (reach * fx.abs() <= width * root)
+    twice_product = 2 * (distance * wavelength).abs()
+    kept = (twice_product * fy.abs() <= height * root) & (twice_product * fx.abs() <= width * root)
     return torch.where(kept, kernel, 0)
+
+
+def direction_cosine(sine2: Tensor) -> tuple[Tensor, Tensor]:
+    """Real and imaginary part of sqrt(1 - sine2); the imaginary part belongs to evanescent waves."""
+    # Masked before the root, so that the unused branch has a finite gradient.
+    real, imaginary = (
+        torch.where(part > 0, torch.sqrt(torch.where(part > 0, part, 1)), 0) for part in (1 - sine2, sine2 - 1)
+    )
+    return real, imaginary
 
 
 def fresnel_kernel(grid: Grid, wavelength: Tensor | float, distance: Tensor | float) -> Tensor:
     """Paraxial transfer function without its carrier: exp(-i pi wavelength z (fx^2 + fy^2)), complex128 [..., H, W].
 
-    Arguments as in :func:`angular_spectrum_kernel`. The phase is wrong by about k z (wavelength f)^4 / 8 against the
-    exact one. Built from one exponential per axis. Source: thesis Eq. 4.49;
-    Goodman, Sec. 4.2.
+    The arguments are those of :func:`angular_spectrum_kernel`. The phase differs from the exact one by about
+    k z (wavelength f)^4 / 8. Source: thesis Eq. 4.49; Goodman, Sec. 4.2.
     """
-    product = (_wavelength(wavelength) * _distance(distance))[..., None, None]
+    product = (_float64(WAVELENGTH, wavelength) * _float64(DISTANCE, distance))[..., None, None]
     fy, fx = grid.frequencies(product.device)
     return turns_phasor(-product / 2 * fy.square()) * turns_phasor(-product / 2 * fx.square())
 
 
-def window_taper(
-    grid: Grid, wavelength: float, distance: float, reach: tuple[float, float], *, paraxial: bool = False
-) -> Tensor:
+def window_taper(grid: Grid, wavelength: float, distance: float, reach: Pair, *, paraxial: bool = False) -> Tensor:
     """Weights, float64 [H, W] in FFT order, that remove light which would wrap around into a window.
 
-    Light that moves sideways by at most ``reach`` metres (y, x) keeps weight 1. Light that moves by the padded extent
-    minus ``reach`` or more re-enters the window and gets weight 0; between the two the weight falls as cos^2. A step
-    instead would diffract light over the window: 10 % of the intensity for a hologram of random phase, of which a fall
-    over two sqrt(wavelength distance) leaves 1e-4.
+    Light that moves sideways by at most ``reach`` keeps weight 1. Light that moves by the padded extent minus ``reach``
+    or more re-enters the window and gets weight 0; between the two limits the weight falls as cos^2. A step would
+    diffract light over the window: 10 % of the intensity for a hologram of random phase. A transition that is
+    2 sqrt(wavelength distance) wide reduces this to 1e-4.
 
     Args:
         grid: Sampling of the padded field.
         wavelength: In metres.
         distance: In metres.
-        reach: Half of the window and half of the field, per axis.
+        reach: Half the extent of the window plus half the extent of the field, in metres (y, x).
         paraxial: Light moves sideways by the sine of its angle, as in the Fresnel model, instead of the tangent.
 
-    Raises:
-        ValueError: A padded extent below twice ``reach``.
+    Raises ValueError for a padded extent below twice ``reach``.
     """
     weights = torch.ones((), dtype=torch.float64)
     sines = [wavelength * each for each in grid.frequencies()]
     for axis, (extent, start, size) in enumerate(zip(grid.extent, reach, grid.shape, strict=True)):
         if size == 1:
             continue
-        sine, aside = sines[axis], sines[1 - axis].square()
-        # The other axis changes the angle by at most half a percent unless its light is steep.
-        aside = aside if float(aside.max()) > 0.01 else 0.0
-        cosine = 1.0 if paraxial else (1 - sine.square() - aside).clamp_min(1e-12).sqrt()
+        sine, other = sines[axis], sines[1 - axis].square()
+        # For sines up to 0.1 on the other axis, its effect on the tangent is at most half a percent and is neglected.
+        other = other if float(other.max()) > 0.01 else 0.0
+        cosine = 1.0 if paraxial else (1 - sine.square() - other).clamp_min(1e-12).sqrt()
         if extent < 2 * start * (1 - 1e-9):
-            raise ValueError(
-                f"a window of {start:.3g} m to either side needs {2 * start:.3g} m, padded are {extent:.3g}"
-            )
-        part = ((abs(distance) * sine.abs() / cosine - start) / max(extent - 2 * start, 1e-9 * extent)).clamp(0, 1)
-        weights = weights * torch.cos(math.pi / 2 * part).square()
+            needed = f"a window of {start:.3g} m to either side needs {2 * start:.3g} m"
+            raise ValueError(f"{needed}, padded are {extent:.3g}")
+        fall = ((abs(distance) * sine.abs() / cosine - start) / max(extent - 2 * start, 1e-9 * extent)).clamp(0, 1)
+        weights = weights * torch.cos(math.pi / 2 * fall).square()
     return weights
 
 
 def turns_phasor(cycles: Tensor) -> Tensor:
     """exp(2 pi i cycles), with whole cycles subtracted in float64; the gradient is that of the unreduced phase."""
-    phase = 2 * math.pi * (cycles - cycles.detach().round())
-    return torch.complex(torch.cos(phase), torch.sin(phase))
+    return phasor(2 * math.pi * (cycles - cycles.detach().round()))
 
 
-def _wavelength(value: Tensor | float) -> Tensor:
-    checks.meant(WAVELENGTH, value)
-    return torch.as_tensor(value, dtype=torch.float64)
-
-
-def _distance(value: Tensor | float) -> Tensor:
-    checks.meant(DISTANCE, value)
+def _float64(kind: Quantity, value: Tensor | float) -> Tensor:
+    checks.plausible(kind, value)
     return torch.as_tensor(value, dtype=torch.float64)

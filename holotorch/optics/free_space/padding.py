@@ -1,4 +1,4 @@
-"""Number of samples of the transforms by which kernels of short extent are applied."""
+"""Lengths of the transforms that apply cropped taps and the factor beyond Fresnel."""
 
 import math
 
@@ -10,30 +10,24 @@ CROP_PAD = 2.25  # padding of CroppedKernel, as a multiple of half the samples o
 
 
 def resampled_padding(planes: PlanePair, wavelength: float, distance: float, tails: float = 0.125) -> tuple[int, int]:
-    """Samples that hold the window and, on each side, the shift by the factor beyond Fresnel and its tails.
+    """Samples (y, x) of the transforms that apply the factor beyond Fresnel before resampling.
 
-    ``tails`` is the room on each side for the tails, as a fraction of the window.
+    They hold the source window and, on each side, the lateral shift by the factor and the tails of its impulse
+    response, for which ``tails`` times the window is reserved.
     """
     steepest = wavelength * math.hypot(*(0.5 / step for step in planes.grid.pitch))
     sizes = []
     for axis, size in enumerate(planes.grid.shape):
         lateral = planes.grid.extent[axis] + planes.out.extent[axis] + 2 * abs(planes.offset[axis])
-        sine = min(steepest, 0.99, lateral / math.hypot(lateral, distance))
-        moved = distance * (sine / math.sqrt(1 - sine * sine) - sine) / planes.grid.pitch[axis]
+        moved = _shift_beyond_fresnel(steepest, lateral, distance) / planes.grid.pitch[axis]
         sizes.append(good_length(size + 2 * math.ceil(size * tails + moved)))
     return sizes[0], sizes[1]
 
 
 def crop_length(
-    size: int,
-    window: int,
-    pitch: float,
-    wavelength: float,
-    distance: float,
-    shift: float = 0.0,
-    pad: float = CROP_PAD,
+    size: int, window: int, pitch: float, wavelength: float, distance: float, shift: float = 0.0, pad: float = CROP_PAD
 ) -> int:
-    """Samples of a transform that holds the taps of one axis, and twice the extent that the factor beyond Fresnel adds.
+    """Samples of a transform that holds the taps of one axis and the lateral shift by the factor beyond Fresnel.
 
     Args:
         size: Samples of the source.
@@ -42,10 +36,15 @@ def crop_length(
         wavelength: In metres.
         distance: In metres, >= 0.
         shift: Position of sample 0 of the result relative to sample 0 of the source, in samples.
-        pad: Length as a multiple of half the samples of source and result together; 2 holds the taps alone.
+        pad: Length as a multiple of half the samples of source and result together. With 2 it holds the taps alone.
     """
-    # Light too steep to arrive in the window does not matter; sqrt(2) for the corner of the band.
     lateral = (size + window) * pitch + abs(shift) * pitch
-    sine = min(math.sqrt(2) * wavelength * 0.5 / pitch, lateral / math.hypot(lateral, distance), 0.99)
-    moved = distance * (sine / math.sqrt(1 - sine * sine) - sine) if pad > 2 else 0.0
+    steepest = math.sqrt(2) * wavelength * 0.5 / pitch  # in the corner of the band
+    moved = _shift_beyond_fresnel(steepest, lateral, distance) if pad > 2 else 0.0
     return math.ceil(pad * (size + window) / 2 + 2 * moved / pitch) - 1
+
+
+def _shift_beyond_fresnel(steepest: float, lateral: float, distance: float) -> float:
+    """Shift in metres by the factor beyond Fresnel, for sines up to ``steepest`` and rays that move by ``lateral``."""
+    sine = min(steepest, lateral / math.hypot(lateral, distance), 0.99)
+    return distance * (sine / math.sqrt(1 - sine * sine) - sine)

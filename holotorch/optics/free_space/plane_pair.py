@@ -8,13 +8,12 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
-from holotorch.core.grid import Grid
-from holotorch.core.quantities import OFFSET
+from holotorch.core.grid import Grid, Pair
 
 
 @dataclass(frozen=True)
 class PlanePair:
-    """Source grid, grid of the result, and the carrier wave by which both fields are divided.
+    """Source grid, result grid, and the direction of the carrier wave by which the fields on both are divided.
 
     Attributes:
         grid: Sampling of the source.
@@ -25,8 +24,8 @@ class PlanePair:
 
     grid: Grid
     out: Grid
-    offset: tuple[float, float] = (0.0, 0.0)
-    tilt: tuple[float, float] = (0.0, 0.0)
+    offset: Pair = (0.0, 0.0)
+    tilt: Pair = (0.0, 0.0)
 
     @property
     def straight(self) -> bool:
@@ -40,19 +39,17 @@ class PlanePair:
 
 
 def plane_pair(
-    grid: Grid,
-    out: Grid | None,
-    offset: Sequence[float],
-    tilt: Sequence[float] | Tensor,
-    wavelengths: Sequence[float],
+    grid: Grid, out: Grid | None, offset: Sequence[float], tilt: Sequence[float] | Tensor, wavelengths: Sequence[float]
 ) -> PlanePair:
-    """PlanePair after checking the arguments.
+    """PlanePair of checked arguments; ``out`` is ``grid`` by default.
 
-    Raises TypeError for arguments of a wrong type, and ValueError for a tilt at which part of the band is evanescent.
+    Raises:
+        TypeError: An argument of a wrong type.
+        ValueError: A tilt that brings part of the band to a sine of 0.98 or more.
     """
     if out is not None and not isinstance(out, Grid):
         raise TypeError(f"out_grid must be a Grid, such as Grid((256, 256), pitch=8e-6), got {out!r}")
-    y, x = (checks.quantity(OFFSET, each) for each in checks.pair("offset", offset, "metres"))
+    position = checks.offset(offset)
     sines = tilt.detach().reshape(-1).tolist() if isinstance(tilt, Tensor) else tilt
     sy, sx = checks.pair("tilt", sines, "sines of the carrier's direction")
     if sy or sx:
@@ -62,19 +59,19 @@ def plane_pair(
                 f"tilt of sines ({sy:g}, {sx:g}) brings part of the grid's band to a sine of {steepest:.3g}, beyond "
                 "0.98, where light hardly travels forward; use a coarser pitch or a smaller tilt"
             )
-    return PlanePair(grid, out or grid, (y, x), (sy, sx))
+    return PlanePair(grid, out or grid, position, (sy, sx))
 
 
 def shifts(planes: PlanePair, distance: Tensor, tilt: Tensor) -> list[Tensor]:
-    """Per axis, the position of sample 0 of the result relative to that of the source projected along the carrier.
+    """Per axis (y, x), the position of sample 0 of the result relative to the projection of sample 0 of the source.
 
-    The projection is the point where the carrier ray from sample 0 of the source meets the plane of the result. In
-    samples of the source, float64 of the shape of ``distance``; differentiable in distance and tilt.
+    The projection is the point where the carrier ray from that sample meets the plane of the result. Positions are in
+    samples of the source, float64 of the shape of ``distance``, and differentiable in distance and tilt.
     """
     tangents = tilt / torch.sqrt(1 - tilt.square().sum())
     return [
-        source // 2 - result // 2 + (aside - distance * tangent) / pitch
-        for source, result, aside, tangent, pitch in zip(
+        source // 2 - result // 2 + (offset - distance * tangent) / pitch
+        for source, result, offset, tangent, pitch in zip(
             planes.grid.shape, planes.out.shape, planes.offset, tangents, planes.grid.pitch, strict=True
         )
     ]

@@ -1,83 +1,71 @@
-"""RayleighSommerfeld: the diffraction integral as a plain double sum, the reference that everything else is held to."""
+"""RayleighSommerfeld: the diffraction integral as a double sum, the reference for all other propagators."""
 
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
-from holotorch.core.grid import Grid
-from holotorch.core.quantities import DISTANCE, OFFSET
+from holotorch.core.grid import Grid, Pair
+from holotorch.core.operator import FieldOperator, Wavelengths
+from holotorch.core.quantities import DISTANCE
+from holotorch.optics.free_space.kernels import turns_phasor
 
 _CHUNK = 4_000_000  # kernel values at a time: 64 MB of complex128
 
 
-class RayleighSommerfeld(nn.Module):
-    """First Rayleigh-Sommerfeld integral over point samples, summed pair by pair in float64. Slow: H W H' W' terms.
+class RayleighSommerfeld(FieldOperator):
+    """First Rayleigh-Sommerfeld integral over point samples, summed pair by pair in float64: H W H' W' terms, slow.
 
-    u(p) = sum_q u(q) dA z / (2 pi r^2) (1 / r - i k) exp(i k r), r the distance from q to p; for a negative distance
-    its complex conjugate, which is time reversal. It reads samples as points, which agrees with band-limited
-    propagation for content well below the grid's highest frequency, and is meaningless where the kernel is
-    undersampled (distances below about 2 L pitch / wavelength for content at that frequency).
+    u(p) = sum_q u(q) dA z / (2 pi r^2) (1 / r - i k) exp(i k r), where r is the distance from q to p and dA the area of
+    a sample. For a negative distance the kernel is the complex conjugate, which is time reversal. The sum over point
+    samples agrees with band-limited propagation for fields well below the highest frequency of the grid. The result is
+    meaningless where the kernel is undersampled: for fields at that frequency, at distances below about
+    2 L pitch / wavelength, with L the extent of the grid.
 
     Args:
-        grid: Sampling of the field.
-        wavelengths: In metres, one per channel.
+        grid, wavelengths, out_grid: As for :class:`FieldOperator`.
         distance: In metres, not 0.
-        out_grid: Sampling of the result, with any shape and pitch; ``grid`` by default.
-        offset: Position (y, x) in metres of the result's axis.
+        offset: Position (y, x) in metres of the axis of the result relative to the axis of the field.
 
-    Raises:
-        ValueError: Impossible numbers; in a call: a field of another shape.
-
-    Source: Goodman, Eq. 3-36.
+    Raises ValueError for a number outside its range, and warns with SamplingWarning if the kernel is undersampled for
+    any field. Source: Goodman, Eq. 3-36.
     """
 
     def __init__(
         self,
         grid: Grid,
-        wavelengths: float | Sequence[float],
+        wavelengths: Wavelengths,
         distance: float,
         *,
         out_grid: Grid | None = None,
-        offset: tuple[float, float] = (0.0, 0.0),
+        offset: Pair = (0, 0),
     ):
-        super().__init__()
-        self.grid, self.out_grid = grid, out_grid or grid
-        self.wavelengths = checks.wavelengths(wavelengths)
-        self.distance = checks.quantity(DISTANCE, distance)
-        y, x = checks.pair("offset", offset, "metres")
-        self.offset = checks.quantity(OFFSET, y), checks.quantity(OFFSET, x)
+        super().__init__(grid, wavelengths, out_grid)
+        self.distance, self.offset = checks.quantity(DISTANCE, distance), checks.offset(offset)
         if self.distance == 0:
             raise ValueError("distance must not be 0 for a sum over point sources")
-        self._check_sampling()
-
-    def _check_sampling(self) -> None:
         for axis in range(2):
-            aside = abs(self.offset[axis]) + (self.grid.extent[axis] + self.out_grid.extent[axis]) / 2
-            step = self.grid.pitch[axis] / min(self.wavelengths) * aside / math.hypot(aside, self.distance)
+            lateral = abs(self.offset[axis]) + (grid.extent[axis] + self.out_grid.extent[axis]) / 2
+            step = grid.pitch[axis] / min(self.wavelengths) * lateral / math.hypot(lateral, self.distance)
             if step > 1.01:
                 warnings.warn(
                     f"between neighbouring points of the {'yx'[axis]} axis the farthest path changes by {step:.3g} "
                     "wavelengths, more than one: the sum aliases whatever the field; use a finer pitch, a smaller "
                     "window, a longer distance, or AngularSpectrum",
                     SamplingWarning,
-                    stacklevel=3,
+                    stacklevel=2,
                 )
 
-    def forward(self, field: Tensor) -> Tensor:
-        """Propagate ``field``, complex [..., C, H, W], to [..., C, H', W'] of the output grid, same dtype."""
-        checks.field("field", field, (len(self.wavelengths), *self.grid.shape))
+    def _forward(self, field: Tensor) -> Tensor:
         flat = field.to(torch.complex128).flatten(-2)
         parts = [torch.einsum("...cq,cpq->...cp", flat, kernel) for kernel in self._kernels(field.device)]
         return torch.cat(parts, -1).unflatten(-1, self.out_grid.shape).to(field.dtype)
 
-    def adjoint(self, field: Tensor) -> Tensor:
-        """Apply the conjugate transpose to ``field`` [..., C, H', W'] of the output grid."""
-        checks.field("field", field, (len(self.wavelengths), *self.out_grid.shape))
+    def _adjoint(self, field: Tensor) -> Tensor:
         flat = field.to(torch.complex128).flatten(-2)
         total, begin = torch.zeros(1, dtype=torch.complex128, device=field.device), 0
         for kernel in self._kernels(field.device):
@@ -86,7 +74,7 @@ class RayleighSommerfeld(nn.Module):
         return total.unflatten(-1, self.grid.shape).to(field.dtype)
 
     def _kernels(self, device: torch.device) -> Iterator[Tensor]:
-        """complex128 [C, points, H W] for one chunk of output points after the other."""
+        """Yield the kernel, complex128 [C, points, H W], for successive chunks of output points."""
         y, x = self.grid.coordinates(device)
         rows, columns = self.out_grid.coordinates(device)
         points = torch.cartesian_prod(rows[:, 0] + self.offset[0], columns[0] + self.offset[1])
@@ -96,10 +84,7 @@ class RayleighSommerfeld(nn.Module):
             dy, dx = chunk[:, 0, None, None] - y, chunk[:, 1, None, None] - x
             r = torch.sqrt(dy.square() + dx.square() + z * z).flatten(1)
             weight = area * z / (2 * math.pi * r.square())
-            cycles = r / wavelengths
-            phase = 2 * math.pi * (cycles - cycles.round())
-            phasor = torch.polar(torch.ones_like(phase), phase)
-            kernel = (
-                weight * torch.complex(1 / r.expand_as(phase), -2 * math.pi / wavelengths.expand_as(phase)) * phasor
-            )
+            phasor = turns_phasor(r / wavelengths)
+            factor = torch.complex(1 / r.expand(phasor.shape), -2 * math.pi / wavelengths.expand(phasor.shape))
+            kernel = weight * factor * phasor
             yield kernel if self.distance > 0 else kernel.conj()

@@ -1,13 +1,15 @@
-"""ResampledKernel: exact propagation onto another grid, with a pitch, size and centre of its own."""
+"""ResampledKernel: exact propagation onto a grid of another pitch, size and centre."""
 
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
+from torch.nn import functional
 
 from holotorch.core import checks
 from holotorch.core.fourier import fft2, ifft2, multiplied
-from holotorch.core.grid import Grid
+from holotorch.core.grid import Grid, Pair
+from holotorch.core.operator import FieldOperator, Wavelengths
 from holotorch.core.quantities import DISTANCE
 from holotorch.optics.free_space.impulse_response import fresnel_taps, levelling_shift, remainder_kernel, tilted_turns
 from holotorch.optics.free_space.kernels import carrier, turns_phasor
@@ -26,29 +28,37 @@ def resampling_factors(
     tilt: Tensor | None = None,
     dtype: torch.dtype = torch.complex128,
 ) -> Factors:
-    """Dense weights of both axes and the factor beyond Fresnel, differentiable in all tensors.
+    """Dense matrices of the paraxial weights of both axes and the factor beyond Fresnel, differentiable in all tensors.
 
-    That factor is applied on ``padded`` samples, whose excess is shared between both ends of the window; None leaves it
-    out. Wavelength and distance are float64 of shape [...] that broadcast, the distance nowhere 0. Returns columns
-    [..., H', H + rims] with the carrier, rows [..., W', W + rims] and the factor [..., P, Q] in FFT order.
+    Args:
+        planes: Samples of source and result, and the carrier.
+        wavelength: In metres, float64, shape [...].
+        distance: In metres, float64, shape [...] that broadcasts, not 0.
+        padded: Samples (P, Q) on which the factor beyond Fresnel is applied, with equal margins on both sides of the
+            source window; None leaves the factor out.
+        tilt: Sines (y, x) of the carrier, float64 [2], for gradients; those of ``planes`` by default.
+        dtype: Of the result.
+
+    Returns:
+        Columns [..., H', H + margins] with the carrier exp(ikz), rows [..., W', W + margins], and the factor
+        [..., P, Q] in FFT order or None.
     """
     wavelength, distance = torch.broadcast_tensors(wavelength, distance)
     if tilt is None:
         tilt = torch.tensor(planes.tilt, dtype=torch.float64, device=distance.device)
     cosine2 = 1 - tilt.square().sum()
-    extra = [(room - size) // 2 for room, size in zip(padded or planes.grid.shape, planes.grid.shape, strict=True)]
-    # What the taps take over from the factor beyond Fresnel.
-    top = 0.5 / planes.grid.pitch[0], 0.5 / planes.grid.pitch[1]
-    levels = [torch.zeros_like(distance)] * 2
+    nyquist = 0.5 / planes.grid.pitch[0], 0.5 / planes.grid.pitch[1]
+    # Linear phase, as a shift in metres, that is moved from the factor beyond Fresnel into the taps.
+    shifts = [torch.zeros_like(distance)] * 2
     if padded is not None and any(planes.tilt):
-        levels = [levelling_shift(top, wavelength, distance, tilt, axis) for axis in (0, 1)]
+        shifts = [levelling_shift(nyquist, wavelength, distance, tilt, axis) for axis in (0, 1)]
     matrices = []
-    for axis, margin in enumerate(extra):
-        pitch, size = planes.grid.pitch[axis], planes.grid.shape[axis]
+    for axis, (size, pitch) in enumerate(zip(planes.grid.shape, planes.grid.pitch, strict=True)):
+        margin = (padded[axis] - size) // 2 if padded else 0
         source = torch.arange(-margin, size + margin, dtype=torch.float64, device=distance.device) - size // 2
         targets = planes.out.coordinates(distance.device)[axis].reshape(-1) + planes.offset[axis]
-        aside = distance * tilt[axis] / torch.sqrt(cosine2) - levels[axis]
-        position = (targets[:, None] - aside[..., None, None]) / pitch - source
+        lateral = distance * tilt[axis] / torch.sqrt(cosine2) - shifts[axis]
+        position = (targets[:, None] - lateral[..., None, None]) / pitch - source
         curvature_distance = distance * (1 - tilt[1 - axis].square()) / cosine2**1.5
         weights = fresnel_taps(position.flatten(-2), pitch, wavelength, curvature_distance)
         matrices.append(weights.unflatten(-1, position.shape[-2:]))
@@ -59,7 +69,7 @@ def resampling_factors(
         wavelength, distance = wavelength[..., None, None], distance[..., None, None]
         if any(planes.tilt):
             cycles = tilted_turns(fy, fx, wavelength, distance, tilt, squares=False)
-            cycles = cycles - fy * levels[0][..., None, None] - fx * levels[1][..., None, None]
+            cycles = cycles - fy * shifts[0][..., None, None] - fx * shifts[1][..., None, None]
             remainder = turns_phasor(cycles).to(dtype)
         else:
             remainder = remainder_kernel(fy, fx, wavelength, distance).to(dtype)
@@ -67,62 +77,56 @@ def resampling_factors(
 
 
 def resample(field: Tensor, factors: Factors) -> Tensor:
-    """Apply :func:`resampling_factors` to a field [..., H, W]."""
+    """Apply the result of :func:`resampling_factors` to a field [..., H, W]; returns [..., H', W']."""
     columns, rows, remainder = factors
     if remainder is not None:
         top, left = _margins(columns, rows, field.shape)
         height, width = field.shape[-2] + 2 * top, field.shape[-1] + 2 * left
-        field = nn.functional.pad(field, (left, left, top, top))
+        field = functional.pad(field, (left, left, top, top))
         field = ifft2(multiplied(fft2(field, (remainder.shape[-2], remainder.shape[-1])), remainder), (height, width))
     return columns @ field @ rows.transpose(-1, -2)
 
 
 def _margins(columns: Tensor, rows: Tensor, shape: Sequence[int]) -> tuple[int, int]:
+    """Samples (y, x) by which the matrices exceed a window of ``shape`` [..., H, W] on each side."""
     return (columns.shape[-1] - shape[-2]) // 2, (rows.shape[-1] - shape[-1]) // 2
 
 
-class ResampledKernel(nn.Module):
+class ResampledKernel(FieldOperator):
     """Exact scalar propagation of band-limited samples to the points of another grid; includes the carrier exp(ikz).
 
-    The paraxial kernel is known at every place (:func:`fresnel_taps`), so each axis is one product with a dense matrix
-    of H' x H or W' x W weights: any output pitch, coarser or finer, and any centre, without interpolation. What lies
-    beyond Fresnel is applied to the field first, on a window that holds its short reach. Same accuracy as
-    ``CroppedKernel``; the cost is H' H W + H' W W' products instead of two FFTs.
+    The paraxial kernel is known at every position (:func:`fresnel_taps`), so each axis is one product with a dense
+    matrix of H' x H or W' x W weights. The pitch and the centre of the result are arbitrary and nothing is
+    interpolated. The factor beyond Fresnel (see ``CroppedKernel``) is applied to the padded field first. The accuracy
+    is that of ``CroppedKernel``; the cost is H' H W + H' W W' products instead of two FFTs.
 
     Args:
-        grid: Sampling of the field.
-        wavelengths: In metres, one per channel.
-        distance: In metres, not 0, negative to travel back.
-        out_grid: Sampling of the result.
+        grid, wavelengths, out_grid: As for :class:`FieldOperator`.
+        distance: In metres, not 0, negative for backward propagation.
         offset: Position (y, x) in metres of the axis of the result relative to the axis of the field.
-        tilt: Sines (y, x) of the direction of a carrier that is taken out, as in ``propagate``.
-        paraxial: Leave out the correction beyond the Fresnel approximation.
-        padded: Samples of the transforms that apply that correction; by default the window, an eighth on each side and
-            room for what the correction moves.
+        tilt: Sines (y, x) of the direction of a carrier wave that is divided out, as in ``propagate``.
+        paraxial: Leave out the factor beyond Fresnel.
+        padded: Samples of the transforms that apply this factor. The default adds to each side of the window an eighth
+            of its size and the distance by which the factor moves light.
 
-    Raises:
-        ValueError: A wavelength that is not positive, a distance that is 0 or not finite, a pitch below 0.9
-            wavelengths; in a call: a field of another shape.
+    Raises ValueError for a number outside its range, a distance of 0, or a pitch below 0.9 wavelengths.
     """
 
-    rows: Tensor
-    columns: Tensor
     beyond: Tensor | None
 
     def __init__(
         self,
         grid: Grid,
-        wavelengths: float | Sequence[float],
+        wavelengths: Wavelengths,
         distance: float,
         out_grid: Grid,
         *,
-        offset: tuple[float, float] = (0.0, 0.0),
-        tilt: tuple[float, float] = (0.0, 0.0),
+        offset: Pair = (0.0, 0.0),
+        tilt: Pair = (0.0, 0.0),
         paraxial: bool = False,
         padded: tuple[int, int] | None = None,
     ):
-        super().__init__()
-        self.grid, self.out_grid, self.wavelengths = grid, out_grid, checks.wavelengths(wavelengths)
+        super().__init__(grid, wavelengths, out_grid)
         self.distance = checks.quantity(DISTANCE, distance)
         planes = plane_pair(grid, out_grid, offset, tilt, self.wavelengths)
         self.offset = planes.offset
@@ -131,24 +135,17 @@ class ResampledKernel(nn.Module):
         longest = max(self.wavelengths)
         if min(grid.pitch) < FINEST * longest:
             raise ValueError(f"pitch must be at least {FINEST} wavelengths of {longest:g} m, got {min(grid.pitch):g} m")
-        wavelength_tensor = torch.tensor(self.wavelengths, dtype=torch.float64)
-        distance_tensor = torch.tensor(self.distance, dtype=torch.float64)
-        if padded is None and not paraxial:
-            padded = resampled_padding(planes, longest, abs(self.distance))
-        factors = resampling_factors(planes, wavelength_tensor, distance_tensor, padded=None if paraxial else padded)
+        wavelength, z = (torch.tensor(value, dtype=torch.float64) for value in (self.wavelengths, self.distance))
+        padded = None if paraxial else padded or resampled_padding(planes, longest, abs(self.distance))
+        factors = resampling_factors(planes, wavelength, z, padded=padded)
         for name, values in zip(("columns", "rows", "beyond"), factors, strict=True):
-            pair = None if values is None else torch.view_as_real(values).contiguous()
-            self.register_buffer(name, pair, persistent=False)
+            self.register_complex(name, values)
 
-    def forward(self, field: Tensor) -> Tensor:
-        """Propagate ``field``, complex [..., C, H, W], to [..., C, H', W'] of the output grid, same dtype."""
-        checks.field("field", field, (len(self.wavelengths), *self.grid.shape))
-        return resample(field, self._buffers_for(field))
+    def _forward(self, field: Tensor) -> Tensor:
+        return resample(field, self._factors_for(field))
 
-    def adjoint(self, field: Tensor) -> Tensor:
-        """Apply the conjugate transpose to ``field`` [..., C, H', W'] of the output grid."""
-        checks.field("field", field, (len(self.wavelengths), *self.out_grid.shape))
-        columns, rows, remainder = self._buffers_for(field)
+    def _adjoint(self, field: Tensor) -> Tensor:
+        columns, rows, remainder = self._factors_for(field)
         (height, width), (top, left) = self.grid.shape, _margins(columns, rows, self.grid.shape)
         spread = columns.transpose(-1, -2).conj() @ field @ rows.conj()
         if remainder is None:
@@ -156,14 +153,6 @@ class ResampledKernel(nn.Module):
         back = ifft2(fft2(spread, (remainder.shape[-2], remainder.shape[-1])) * remainder.conj())
         return back[..., top : top + height, left : left + width]
 
-    def extra_repr(self) -> str:
-        """Samplings and wavelengths, for ``print(module)``."""
-        return f"grid={self.grid}, out_grid={self.out_grid}, wavelengths={self.wavelengths}"
-
-    def _buffers_for(self, field: Tensor) -> Factors:
-        dtype = field.real.dtype
-        columns, rows = (torch.view_as_complex(values.to(dtype)) for values in (self.columns, self.rows))
-        return columns, rows, None if self.beyond is None else torch.view_as_complex(self.beyond.to(dtype))
-
-    def _apply(self, fn, recurse=True):
-        return super()._apply(lambda tensor: tensor.to(fn(tensor).device), recurse)
+    def _factors_for(self, field: Tensor) -> Factors:
+        columns, rows = (self.complex_buffer(name, field) for name in ("columns", "rows"))
+        return columns, rows, None if self.beyond is None else self.complex_buffer("beyond", field)

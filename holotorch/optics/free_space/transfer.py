@@ -1,4 +1,7 @@
-"""Transfer functions as products of a paraxial factor per axis and the factor beyond Fresnel."""
+"""Transfer functions as products of a paraxial factor per axis and the factor beyond Fresnel.
+
+The factor beyond Fresnel is the exact transfer function divided by the paraxial one.
+"""
 
 import torch
 from torch import Tensor
@@ -27,18 +30,18 @@ def transfer_function(
     tilt: Tensor | None = None,
     dtype: torch.dtype = torch.complex128,
 ) -> Tensor:
-    """Kernel of a linear convolution on the padded grid, carrier included, differentiable in all tensors.
+    """Kernel of a linear convolution on the padded grid, with the carrier exp(ikz), differentiable in all tensors.
 
     Args:
         planes: Samples of source and result, of equal pitch.
         padded: Grid of the transforms. The first samples of the result are those of ``planes.out``.
         wavelength: In metres, float64, shape [...].
-        distance: In metres, float64, shape [...] that broadcasts; zeros give the identity.
-        sampled: Per axis (y, x), whether the paraxial factor is sampled in frequency, or its exact taps are cropped to
-            the transform's length and transformed.
+        distance: In metres, float64, shape [...] that broadcasts; 0 gives the identity.
+        sampled: Per axis (y, x): True to sample the paraxial factor in frequency, False to transform its exact taps,
+            cropped to the length of the transform.
         paraxial: Leave out the factor beyond Fresnel.
         tilt: Sines (y, x) of the carrier, float64 [2], for gradients; those of ``planes`` by default.
-        dtype: Of the result. Phases are reduced in float64 and cast last.
+        dtype: Of the result; phases are computed in float64 in any case.
 
     Returns:
         Shape [..., H, W], frequencies in FFT order.
@@ -51,24 +54,27 @@ def transfer_function(
     cosine2 = 1 - tilt.square().sum()
     carrier_factor = carrier(wavelength, distance * torch.sqrt(cosine2)).to(dtype)
     if tilted and all(sampled):
-        return (
-            _sampled_tilted(padded, wavelength, distance, tilt, positions).to(dtype) * carrier_factor[..., None, None]
-        )
+        fy, fx = padded.frequencies(distance.device)
+        cycles = tilted_turns(fy, fx, wavelength[..., None, None], distance[..., None, None], tilt)
+        for frequency, pitch, position in zip((fy, fx), padded.pitch, positions, strict=True):
+            cycles = cycles + frequency * pitch * position[..., None, None]
+        return turns_phasor(cycles).to(dtype) * carrier_factor[..., None, None]
+    shifts_beyond = []  # shifts in samples that are moved from the factor beyond Fresnel into the taps
     if tilted:
-        positions = [
-            position + _levelling_samples(axis, padded, wavelength, distance, tilt)
-            for axis, position in enumerate(positions)
-        ]
+        nyquist = 0.5 / padded.pitch[0], 0.5 / padded.pitch[1]
+        for axis in (0, 1):
+            shift = levelling_shift(nyquist, wavelength, distance, tilt, axis) / padded.pitch[axis]
+            shifts_beyond.append(shift)
+            positions[axis] = positions[axis] + shift
+    equal_axes = planes.straight and sampled[0] == sampled[1]
+    equal_axes &= all(len({*zip(grid.shape, grid.pitch, strict=True)}) == 1 for grid in (planes.grid, padded))
     factors = []
-    for axis in (0, 1):
+    for axis in (0,) if equal_axes else (0, 1):
         curvature_distance = distance * (1 - tilt[1 - axis].square()) / cosine2**1.5
         factors.append(
             _axis_factor(planes, axis, padded, wavelength, curvature_distance, positions[axis], sampled=sampled[axis])
         )
-        if planes.straight and _equal_axes(planes.grid) and _equal_axes(padded) and sampled[0] == sampled[1]:
-            factors *= 2  # one computation serves both axes
-            break
-    columns, rows = (factor.to(dtype) for factor in factors)
+    columns, rows = factors[0].to(dtype), factors[-1].to(dtype)
     kernel = columns[..., :, None] * (rows * carrier_factor[..., None])[..., None, :]
     if paraxial:
         return kernel
@@ -76,11 +82,10 @@ def transfer_function(
     if tilted:
         fy, fx = padded.frequencies(distance.device)
         cycles = tilted_turns(fy, fx, wavelength, distance, tilt, squares=False)
-        for axis, frequency in ((0, fy), (1, fx)):
-            shift = _levelling_samples(axis, padded, wavelength[..., 0, 0], distance[..., 0, 0], tilt)
-            cycles = cycles - frequency * padded.pitch[axis] * shift[..., None, None]
+        for frequency, pitch, shift in zip((fy, fx), padded.pitch, shifts_beyond, strict=True):
+            cycles = cycles - frequency * pitch * shift[..., None, None]
         return kernel * turns_phasor(cycles).to(dtype)
-    # The factor beyond Fresnel is even in both frequencies: one quadrant is computed and mirrored.
+    # The factor beyond Fresnel is even in both frequencies, so that one quadrant determines it.
     (height, width), (py, px) = padded.shape, padded.pitch
     fy = torch.arange(height // 2 + 1, dtype=torch.float64, device=distance.device)[:, None] / (height * py)
     fx = torch.arange(width // 2 + 1, dtype=torch.float64, device=distance.device)[None, :] / (width * px)
@@ -94,42 +99,21 @@ def transfer_function(
 def wide_transfer_function(
     planes: PlanePair, padded: Grid, wavelength: Tensor, distance: Tensor, *, dtype: torch.dtype
 ) -> Tensor:
-    """Band-limited angular spectrum with its carrier, for pitches too fine for :func:`transfer_function`."""
+    """Band-limited angular spectrum with its carrier, [..., H, W]: for pitches below 0.9 wavelengths."""
     kernel = angular_spectrum_kernel(padded, wavelength, distance)
     kernel = kernel * carrier(wavelength, distance)[..., None, None]
-    straight = torch.zeros(2, dtype=torch.float64, device=distance.device)
-    for frequency, pitch, position in zip(
-        padded.frequencies(distance.device), padded.pitch, shifts(planes, distance, straight), strict=True
-    ):
+    no_tilt = torch.zeros(2, dtype=torch.float64, device=distance.device)
+    positions = shifts(planes, distance, no_tilt)
+    for frequency, pitch, position in zip(padded.frequencies(distance.device), padded.pitch, positions, strict=True):
         if bool((position != 0).any()):
             kernel = kernel * turns_phasor(frequency * pitch * position[..., None, None])
     return kernel.to(dtype)
 
 
-def _equal_axes(grid: Grid) -> bool:
-    return grid.shape[0] == grid.shape[1] and grid.pitch[0] == grid.pitch[1]
-
-
-def _sampled_tilted(
-    padded: Grid, wavelength: Tensor, distance: Tensor, tilt: Tensor, positions: list[Tensor]
-) -> Tensor:
-    fy, fx = padded.frequencies(distance.device)
-    cycles = tilted_turns(fy, fx, wavelength[..., None, None], distance[..., None, None], tilt)
-    for frequency, pitch, position in zip((fy, fx), padded.pitch, positions, strict=True):
-        cycles = cycles + frequency * pitch * position[..., None, None]
-    return turns_phasor(cycles)
-
-
-def _levelling_samples(axis: int, padded: Grid, wavelength: Tensor, distance: Tensor, tilt: Tensor) -> Tensor:
-    """:func:`levelling_shift` in samples."""
-    top = 0.5 / padded.pitch[0], 0.5 / padded.pitch[1]
-    return levelling_shift(top, wavelength, distance, tilt, axis) / padded.pitch[axis]
-
-
 def _axis_factor(
     planes: PlanePair, axis: int, padded: Grid, wavelength: Tensor, distance: Tensor, position: Tensor, *, sampled: bool
 ) -> Tensor:
-    """Paraxial factor of one axis in frequency, complex128 [..., size]; ``place`` as from :func:`shifts`."""
+    """Paraxial factor of one axis in frequency, complex128 [..., size]; ``position`` is a result of :func:`shifts`."""
     size, pitch = padded.shape[axis], padded.pitch[axis]
     if sampled:
         frequency = torch.fft.fftfreq(size, pitch, dtype=torch.float64, device=distance.device)

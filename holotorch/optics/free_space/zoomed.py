@@ -1,31 +1,33 @@
-"""ZoomedFilter: a spectral filter whose result is computed at the points of another grid by the chirp-z transform."""
+"""ZoomedFilter: a spectral filter whose result is computed on another grid by the chirp-z transform."""
 
 import math
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from holotorch.core import checks
 from holotorch.core.fourier import fft, fft2, good_length, ifft2, ifft_unscaled, multiplied
-from holotorch.core.grid import Grid
+from holotorch.core.grid import Grid, Pair
+from holotorch.core.operator import FieldOperator, Wavelengths
 from holotorch.optics.free_space.kernels import turns_phasor
 
 Chirp = tuple[Tensor, Tensor, Tensor]
 
 
 def chirp(size: int, step: float, start: float, count: int, device: torch.device | None = None) -> Chirp:
-    """Factors by which :func:`zoom` reads ``count`` points ``step`` samples apart, from ``start`` samples on.
+    """Factors with which :func:`zoom` evaluates a field at ``count`` points, the first at ``start``, ``step`` apart.
 
-    k j = (k^2 + j^2 - (j - k)^2) / 2 makes the sum over frequencies a convolution with a chirp (Rabiner, Schafer and
-    Rader 1969; Bluestein 1970). complex128 of [size], [L >= size + count - 1] and [count].
+    ``step`` and ``start`` are in samples of the field, which has ``size`` of them. The identity
+    k j = (k^2 + j^2 - (j - k)^2) / 2 makes the sum over frequencies k a convolution with a chirp (Rabiner, Schafer and
+    Rader 1969; Bluestein 1970). Returns the factor on the spectrum [size], the DFT of the convolving chirp
+    [L >= size + count - 1] and the factor on the result [count], complex128.
     """
     index = torch.arange(size, dtype=torch.float64, device=device)
     index = torch.where(index >= (size + 1) // 2, index - size, index)
     target = torch.arange(count, dtype=torch.float64, device=device)
     length = good_length(size + count - 1)
     between = torch.arange(length, dtype=torch.float64, device=device)
-    # In FFT order: from 0 to the largest j - k, and then from the smallest, negative one.
+    # Differences j - k in FFT order: from 0 to the largest, then from the most negative to -1.
     between = torch.where(between >= count + size // 2, between - length, between)
     rate = step / size
     pre_chirp = turns_phasor(rate / 2 * index.square() + index * (start / size))
@@ -34,7 +36,7 @@ def chirp(size: int, step: float, start: float, count: int, device: torch.device
 
 
 def zoom(spectrum: Tensor, factors: Chirp) -> Tensor:
-    """Inverse DFT over the last axis, [..., P] in FFT order, read at the points of :func:`chirp`: [..., count]."""
+    """Inverse DFT of ``spectrum`` [..., size], in FFT order, at the points of :func:`chirp`: [..., count]."""
     pre_chirp, kernel, post_chirp = factors
     size, half = len(pre_chirp), (len(pre_chirp) + 1) // 2
     lines = spectrum * pre_chirp
@@ -44,7 +46,7 @@ def zoom(spectrum: Tensor, factors: Chirp) -> Tensor:
 
 
 def zoom_adjoint(values: Tensor, factors: Chirp) -> Tensor:
-    """Conjugate transpose of :func:`zoom`."""
+    """Conjugate transpose of :func:`zoom`: ``values`` [..., count] to [..., size]."""
     pre_chirp, kernel, post_chirp = factors
     size, half = len(pre_chirp), (len(pre_chirp) + 1) // 2
     lines = fft(values * post_chirp.conj(), len(kernel))
@@ -55,7 +57,10 @@ def zoom_adjoint(values: Tensor, factors: Chirp) -> Tensor:
 def chirps(
     grid: Grid, padded: Grid, out: Grid, offset: Sequence[float], device: torch.device | None = None
 ) -> list[Chirp]:
-    """Factors per axis (y, x) to read a field of ``grid``, padded, on ``out`` whose axis lies at ``offset`` metres."""
+    """:func:`chirp` per axis (y, x) to evaluate a field of ``grid``, zero-padded to ``padded``, on the grid ``out``.
+
+    ``offset`` is the position (y, x) in metres of the axis of ``out`` relative to the axis of ``grid``.
+    """
     factors = []
     for axis in (0, 1):
         pitch, step, count = grid.pitch[axis], out.pitch[axis], out.shape[axis]
@@ -65,67 +70,44 @@ def chirps(
 
 
 def zoomed(field: Tensor, kernel: Tensor, factors: Sequence[Chirp]) -> Tensor:
-    """Multiply the spectrum of ``field`` [..., h, w] by ``kernel`` [..., P, Q], and read the result at other points."""
+    """Filter ``field`` [..., h, w] with ``kernel`` [..., P, Q] and evaluate it at the points of :func:`chirps`."""
     spectrum = multiplied(fft2(field, (kernel.shape[-2], kernel.shape[-1])), kernel)
     columns, rows = ([part.to(spectrum.dtype) for part in chirp] for chirp in factors)
     lines = zoom(spectrum, (rows[0], rows[1], rows[2])).transpose(-1, -2)
     return zoom(lines, (columns[0], columns[1], columns[2])).transpose(-1, -2)
 
 
-class ZoomedFilter(nn.Module):
-    """A filter that is diagonal in frequency, read on a grid of any pitch: complex [..., C, H, W] to [..., C, H', W'].
+class ZoomedFilter(FieldOperator):
+    """A filter that is diagonal in frequency and evaluated on a grid of any pitch.
 
-    The padded result is a band-limited periodic field, which is summed from its spectrum at the points of ``out_grid``;
-    exact as long as the kernel does not wrap light around into them. It takes two to four times as long as a
-    :class:`SpectralFilter`, whereas the cost of ``ResampledKernel`` grows with the cube of the size.
+    The padded result is a band-limited periodic field. It is summed from its spectrum at the points of ``out_grid``,
+    which is exact as long as the kernel does not wrap light around into them. It takes two to four times as long as a
+    ``SpectralFilter``, whereas the cost of ``ResampledKernel`` grows with the cube of the size.
 
     Args:
-        grid: Sampling of the field.
-        wavelengths: In metres, one per channel.
-        kernel: complex128, shape [C, P, Q], FFT order.
-        out_grid: Sampling of the result.
+        grid, wavelengths, out_grid: As for :class:`FieldOperator`.
+        kernel: Transfer function, complex128 [C, P, Q] in FFT order; the field is zero-padded to P x Q samples.
         offset: Position (y, x) in metres of the axis of the result relative to the axis of the field.
     """
 
-    def __init__(
-        self,
-        grid: Grid,
-        wavelengths: float | Sequence[float],
-        kernel: Tensor,
-        out_grid: Grid,
-        *,
-        offset: tuple[float, float] = (0.0, 0.0),
-    ):
-        super().__init__()
-        self.grid, self.out_grid, self.wavelengths = grid, out_grid, checks.wavelengths(wavelengths)
+    def __init__(self, grid: Grid, wavelengths: Wavelengths, kernel: Tensor, out_grid: Grid, *, offset: Pair = (0, 0)):
+        super().__init__(grid, wavelengths, out_grid)
         padded = Grid((kernel.shape[-2], kernel.shape[-1]), grid.pitch)
-        parts = [kernel, *(part for factors in chirps(grid, padded, out_grid, offset) for part in factors)]
-        for i, part in enumerate(parts):
-            self.register_buffer(f"part{i}", torch.view_as_real(part).contiguous(), persistent=False)
+        columns, rows = chirps(grid, padded, out_grid, offset)
+        for i, part in enumerate((kernel, *columns, *rows)):
+            self.register_complex(f"part{i}", part)
 
-    def forward(self, field: Tensor) -> Tensor:
-        """Filter ``field``, complex [..., C, H, W], and read it on the output grid, same dtype."""
-        checks.field("field", field, (len(self.wavelengths), *self.grid.shape))
+    def _forward(self, field: Tensor) -> Tensor:
         kernel, columns, rows = self._parts_for(field)
         return zoomed(field, kernel, (columns, rows))
 
-    def adjoint(self, field: Tensor) -> Tensor:
-        """Apply the conjugate transpose to ``field`` [..., C, H', W'] of the output grid."""
-        checks.field("field", field, (len(self.wavelengths), *self.out_grid.shape))
+    def _adjoint(self, field: Tensor) -> Tensor:
         kernel, columns, rows = self._parts_for(field)
         lines = zoom_adjoint(field.transpose(-1, -2), columns).transpose(-1, -2)
         spectrum = multiplied(zoom_adjoint(lines, rows), kernel.conj())
-        # The adjoint of the unscaled transform: the inverse without its scale.
+        # The adjoint of the unscaled transform is the inverse transform without its scale.
         return ifft2(spectrum, self.grid.shape) * math.prod(kernel.shape[-2:])
 
-    def extra_repr(self) -> str:
-        """Samplings and wavelengths, for ``print(module)``."""
-        return f"grid={self.grid}, out_grid={self.out_grid}, wavelengths={self.wavelengths}"
-
     def _parts_for(self, field: Tensor) -> tuple[Tensor, Chirp, Chirp]:
-        dtype = field.real.dtype
-        parts = [torch.view_as_complex(self.get_buffer(f"part{i}").to(dtype)) for i in range(7)]
+        parts = [self.complex_buffer(f"part{i}", field) for i in range(7)]
         return parts[0], (parts[1], parts[2], parts[3]), (parts[4], parts[5], parts[6])
-
-    def _apply(self, fn, recurse=True):
-        return super()._apply(lambda tensor: tensor.to(fn(tensor).device), recurse)

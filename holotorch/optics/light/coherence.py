@@ -1,4 +1,4 @@
-"""Effects of a spectrum on a holographic picture in closed form: speckle contrast, defocus, optimum width."""
+"""Closed formulas for the effect of a spectrum on a holographic image: speckle contrast, defocus, optimum width."""
 
 import math
 
@@ -7,28 +7,26 @@ from holotorch.core.quantities import DEPTH, DISTANCE, WAVELENGTH_CHANGE
 from holotorch.optics.light.quadrature import correlation
 from holotorch.optics.light.spectrum import Spectrum
 
-DEFOCUS = 2.3  # shift of the focus, in depths of focus, at the optimum width; fitted over three colours of one volume
+DEFOCUS = 2.3  # focal shift by half the optimum width, in depths of focus; fitted to three colours of one volume
 
 
 def path_difference(distance: float, aperture: float, *, tilt: float = 0.0) -> float:
-    """Greatest difference in metres between paths from a hologram through a pupil to the depth in focus.
+    """Greatest difference in metres between paths from a hologram to a point in focus that is seen through a pupil.
 
-    A fixed hologram diffracts light of spatial frequency f to the sine f lambda. Over ``distance`` the phase of this
-    light changes by -pi distance lambda f^2. From the centre to the edge of the pupil, the phases at two wavelengths
-    therefore come to differ by 2 pi (distance aperture^2 / 2) (lambda - lambda') / lambda^2. The depth of the object
-    points does not matter, because the phase of the hologram is the same at all wavelengths.
-
-    The result is paraxial; at a sine of 0.1 it is 1 % too small.
+    A hologram diffracts light of spatial frequency f to the sine f lambda. Over ``distance`` the phase of this light
+    changes by -pi distance lambda f^2. From the centre to the edge of the pupil, the difference of the phases at two
+    wavelengths therefore changes by 2 pi (distance aperture^2 / 2) (lambda - lambda') / lambda^2. The depth of the
+    object points has no effect, since the hologram does not depend on the wavelength. The result is paraxial; at a sine
+    of 0.1 it is 1 % too small.
 
     Args:
         distance: From the hologram to the depth in focus, in metres; its sign does not matter.
-        aperture: Sine of the half angle of the light that a point in focus sends into the pupil: the smaller of that of
-            the eye's pupil and that of the hologram's window.
+        aperture: Sine of half the angle of the light cone from a point in focus into the pupil, which the pupil of the
+            eye or the window of the hologram limits.
         tilt: Sine of the direction from the point in focus to the centre of the pupil, 0 for points on the axis. If
-            it is above ``aperture``, the difference is 2 distance tilt aperture.
+            it exceeds ``aperture``, the difference is 2 distance tilt aperture.
 
-    Raises:
-        ValueError: An aperture that is not above 0, or an edge of the pupil at a sine above 1.
+    Raises ValueError for an aperture that is not above 0, or an aperture and a tilt that add up to more than 1.
     """
     distance = abs(checks.quantity(DISTANCE, distance))
     aperture, tilt = checks.positive("aperture", aperture), abs(checks.finite("tilt", tilt))
@@ -39,33 +37,31 @@ def path_difference(distance: float, aperture: float, *, tilt: float = 0.0) -> f
 
 
 def predicted_contrast(spectrum: Spectrum, path_difference: float) -> float:
-    """Speckle contrast of an evenly filled round pupil under ``spectrum``, between 0 and 1.
+    """Speckle contrast of a uniformly illuminated round pupil under ``spectrum``, between 0 and 1.
 
-    C^2 is the double integral of S(l) S(l') sinc^2(path_difference (l - l') / lambda^2) over the wavelengths l and l',
-    where S is the power density, normalized over the band, and lambda the centre. For a Lorentzian that is not cut off,
-    C^2 = 2 (b - 1 + exp(-b)) / b^2 with b = 2 pi path_difference fwhm / lambda^2; the cut-off at 10 % raises C. For a
-    path difference of 0, C is 1.
+    The squared contrast C^2 is the double integral of S(l) S(l') sinc^2(path_difference (l - l') / lambda^2) over the
+    wavelengths l and l', where S is the power density, normalized over the band, and lambda the central wavelength. For
+    a Lorentzian without cut-off, C^2 = 2 (b - 1 + exp(-b)) / b^2 with b = 2 pi path_difference fwhm / lambda^2; the
+    cut-off at 10 % raises C. For a path difference of 0, C is 1.
 
-    Compared with contrasts measured on simulated holograms of a CT volume at 30 mm with an aperture of 0.056, in three
-    colours, the prediction is within 5 % for half widths of 5 to 10 nm, 8 % too low at 20 nm, 7 % too high for a laser.
+    The contrast of simulated holograms of a CT volume at 30 mm with an aperture of 0.056, in three colours, was
+    predicted within 5 % for half widths of 5 to 10 nm, 8 % too low at 20 nm, and 7 % too high for a laser.
 
     Source: Goodman, Speckle Phenomena in Optics, Sec. 6.5.
     """
-    difference = checks.finite("path_difference", path_difference, "metres")
-    if difference < 0:
-        raise ValueError(f"path_difference must not be below 0, got {path_difference!r}")
-    places, weights = spectrum.measure()
-    return math.sqrt(float(weights @ correlation(places, places, difference / spectrum.centre**2) @ weights))
+    difference = checks.nonnegative("path_difference", path_difference, "metres")
+    nodes, weights = spectrum.measure()
+    return math.sqrt(float(weights @ correlation(nodes, nodes, difference / spectrum.centre**2) @ weights))
 
 
 def samples_needed(spectrum: Spectrum, path_difference: float, tolerance: float = 0.01, *, iris: bool = True) -> int:
-    """Number of wavelengths that keep the expected rms error of a picture, relative to its rms, within ``tolerance``.
+    """Number of wavelengths that keep the expected rms error of an image, relative to its rms, within ``tolerance``.
 
     The arguments are those of :meth:`Spectrum.samples`. For 1 % without an iris the number is about
-    bandwidth path_difference / lambda^2 + 2. Example: a hologram at 30 mm with an aperture of 0.056 needs, at 636, 520
-    and 455 nm, 2, 2, 2 wavelengths for the laser, 3, 4, 5 for the narrow SLED, 5, 6, 8 for the SLED and 8, 11, 14 for
-    the LED. With an iris these numbers give an error of 2 to 3 %, and 1 % takes about twice as many; the sum over every
-    nanometre then has an error of 0.4 to 1.4 % itself.
+    bandwidth path_difference / lambda^2 + 2. For a hologram at 30 mm with an aperture of 0.056 it is at 636, 520 and
+    455 nm: 2, 2, 2 for the laser, 3, 4, 5 for the narrow SLED, 5, 6, 8 for the SLED and 8, 11, 14 for the LED. With an
+    iris these numbers give an error of 2 to 3 %, and 1 % needs about twice as many. For comparison, the sum over every
+    nanometre has an error of 0.4 to 1.4 % with an iris.
     """
     return len(spectrum.samples(tolerance=tolerance, path_difference=path_difference, iris=iris)[0])
 
@@ -73,16 +69,16 @@ def samples_needed(spectrum: Spectrum, path_difference: float, tolerance: float 
 def chromatic_defocus(distance: float, wavelength: float, change: float) -> float:
     """Shift in metres of the depth in focus when the wavelength rises by ``change``: -distance change / wavelength.
 
-    A hologram is a diffractive lens, whose power is proportional to the wavelength.
+    All arguments are in metres. A hologram is a diffractive lens, whose power is proportional to the wavelength.
     """
     wavelength = checks.wavelengths(wavelength)[0]
     return -checks.quantity(DISTANCE, distance) * checks.quantity(WAVELENGTH_CHANGE, change) / wavelength
 
 
 def depth_of_focus(wavelength: float, aperture: float) -> float:
-    """Range of depths in focus in metres, wavelength / aperture^2.
+    """Depth of focus in metres, wavelength / aperture^2; ``aperture`` is the one of :func:`path_difference`.
 
-    At either end of the range the defocus is a quarter of a wavelength at the edge of the aperture.
+    At both ends of this range the defocus is a quarter of a wavelength at the edge of the aperture.
     """
     return checks.wavelengths(wavelength)[0] / checks.positive("aperture", aperture) ** 2
 
@@ -90,18 +86,18 @@ def depth_of_focus(wavelength: float, aperture: float) -> float:
 def optimum_fwhm(wavelength: float, aperture: float, distance: float, *, defocus: float = DEFOCUS) -> float:
     """Full width at half maximum in metres that balances speckle and blur.
 
-    The result is 2 defocus wavelength^2 / (aperture^2 distance): half of this width moves the focus by ``defocus``
-    times the depth of focus. The formula follows from chromatic defocus and holds for all colours and depths; the
-    value of ``defocus`` depends on the scene and is fitted. The value 2.3 maximizes, for a CT volume (the teapot)
-    and Lorentzian spectra cut off at 10 %, the SSIM against the mean picture of other random seeds: half widths of
-    9.8, 6.6, 5.0 nm at 636, 520, 455 nm, at 30 mm with an aperture of 0.056. By PSNR the best value is 1.5 to 2
-    times as large. For a photograph with much fine texture it is smaller: 1.4 to 1.6 by SSIM at 20 to 60 mm.
+    The result is 2 defocus wavelength^2 / (aperture^2 distance): a change of the wavelength by half of this width moves
+    the focus by ``defocus`` times the depth of focus. The formula holds for all colours and depths, but the best value
+    of ``defocus`` depends on the scene. For a CT volume (the teapot) at 30 mm with an aperture of 0.056 and Lorentzian
+    spectra cut off at 10 %, 2.3 maximizes the SSIM against the mean image over other random seeds; the half widths are
+    9.8, 6.6 and 5.0 nm at 636, 520 and 455 nm. The best value by PSNR is 1.5 to 2 times as large. For a photograph with
+    much fine texture the best value by SSIM is 1.4 to 1.6 at 20 to 60 mm.
 
     Args:
         wavelength: In metres.
         aperture: As in :func:`path_difference`.
         distance: From the hologram to the depth in focus, in metres, above 0.
-        defocus: Depths of focus by which the half width may move the focus.
+        defocus: Shift of the focus by half the width, in depths of focus.
     """
     distance, defocus = checks.quantity(DEPTH, distance, "distance"), checks.positive("defocus", defocus)
     return 2 * defocus * depth_of_focus(wavelength, aperture) * checks.wavelengths(wavelength)[0] / distance

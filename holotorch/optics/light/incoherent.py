@@ -1,4 +1,4 @@
-"""Sums of intensities over light that does not interfere: wavelengths, and points of an extended source."""
+"""Sums of intensities over mutually incoherent light: wavelengths, and points of an extended source."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from holotorch.core import checks
-from holotorch.core.grid import Grid
+from holotorch.core.grid import Grid, Pair
 
 Place = TypeVar("Place")
 
@@ -22,30 +22,27 @@ def incoherent_sum(
     *,
     recompute: bool = False,
 ) -> Tensor:
-    """Sum of ``weights[k] * intensity_of(places[k])``, computed one by one, so that memory holds one intensity.
+    """Sum of ``weights[k] * intensity_of(places[k])``, with one intensity in memory at a time.
 
     Args:
-        intensity_of: Function that returns the intensity [...] for one wavelength in metres, or for one direction of
-            the illumination.
-        places: Wavelengths [K], passed on as floats, or any sequence of arguments for ``intensity_of``.
+        intensity_of: Function that returns the intensity [...] for one item of ``places``, such as a wavelength in
+            metres or a direction of the illumination.
+        places: A tensor [K] of wavelengths, passed on as floats, or a sequence of K arguments for ``intensity_of``.
         weights: [K], such as those of ``Spectrum.samples``; a tensor may require gradients.
         recompute: If gradients are enabled, compute each intensity again in the backward pass instead of keeping its
-            intermediate results. Memory is then that of one intensity, and the time a third longer.
+            intermediate results. This takes a third more time and the memory of a single intensity.
 
     Raises:
-        TypeError: ``intensity_of`` returns a complex tensor, that is a field instead of an intensity.
+        TypeError: ``intensity_of`` returns a complex tensor, a field instead of an intensity.
         ValueError: ``places`` is empty, or the number of weights differs from that of places.
     """
     items = places.tolist() if isinstance(places, Tensor) else list(places)
     if not items or len(items) != len(weights):
         raise ValueError(f"places and weights must be equally many and at least one, got {len(items)}, {len(weights)}")
-    total = None
+    again = recompute and torch.is_grad_enabled()
+    total: Tensor | None = None
     for place, weight in zip(items, weights, strict=True):
-        part = (
-            checkpoint(intensity_of, place, use_reentrant=False)
-            if recompute and torch.is_grad_enabled()
-            else intensity_of(place)
-        )
+        part = checkpoint(intensity_of, place, use_reentrant=False) if again else intensity_of(place)
         assert isinstance(part, Tensor)
         checks.real("intensity", part)
         # A float or a scalar float64 tensor does not change the dtype of the intensity.
@@ -55,11 +52,11 @@ def incoherent_sum(
     return total
 
 
-def disc_source(radius: float, rings: int = 2) -> tuple[list[tuple[float, float]], Tensor]:
+def disc_source(radius: float, rings: int = 2) -> tuple[list[Pair], Tensor]:
     """Points of a uniform disc and their weights: an extended source for :func:`incoherent_sum`.
 
-    The points are those of Gauss's rule in the squared radius: ``rings`` rings with 4 ``rings`` equally spaced points
-    each. The rule is exact for polynomials of the two sines up to degree 4 rings - 1.
+    The radii are nodes of Gauss's rule in the squared radius, with 4 ``rings`` equally spaced points on each ring. The
+    sum is exact for polynomials of the two sines up to degree 4 rings - 1.
 
     Args:
         radius: Sine of half the angle that the source subtends at the hologram, above 0 and below 1.
@@ -73,24 +70,21 @@ def disc_source(radius: float, rings: int = 2) -> tuple[list[tuple[float, float]
         raise ValueError(f"radius is a sine and must be below 1, got {radius:g}")
     nodes, weights = np.polynomial.legendre.leggauss(rings)
     around = 4 * rings
-    points = [
-        (radius * math.sqrt((1 + node) / 2) * math.sin(angle), radius * math.sqrt((1 + node) / 2) * math.cos(angle))
-        for node in nodes.tolist()
-        for angle in (2 * math.pi * (k + 0.5) / around for k in range(around))
-    ]
+    radii = [radius * math.sqrt((1 + node) / 2) for node in nodes.tolist()]
+    angles = [2 * math.pi * (k + 0.5) / around for k in range(around)]
+    points = [(ring * math.sin(angle), ring * math.cos(angle)) for ring in radii for angle in angles]
     return points, torch.from_numpy(np.repeat(weights / (2 * around), around))
 
 
-def tilted_wave(grid: Grid, wavelength: float, direction: tuple[float, float]) -> Tensor:
-    """Plane wave exp(2 pi i (y sy + x sx) / wavelength) on ``grid``, complex128 [H, W]: illumination from one point.
+def tilted_wave(grid: Grid, wavelength: float, direction: Pair) -> Tensor:
+    """Plane wave exp(2 pi i (y sy + x sx) / wavelength), complex128 [H, W]: illumination from one distant point.
 
     Args:
-        grid: Sampling of the hologram, whose field is multiplied by the wave.
+        grid: Sampling of the hologram.
         wavelength: In metres.
-        direction: Sines (y, x) of the direction of the wave.
+        direction: Sines (sy, sx) of the direction of the wave.
 
-    Raises:
-        ValueError: A direction that the grid cannot sample.
+    Raises ValueError for a direction that the grid cannot sample.
     """
     wavelength = checks.wavelengths(wavelength)[0]
     sines = checks.pair("direction", direction, "sines")

@@ -1,17 +1,17 @@
-"""Pictures under a spectrum: few wavelengths are propagated, and pictures at nearby wavelengths are derived from them.
+"""Images under a spectrum: few wavelengths are propagated, and images at nearby wavelengths are derived from them.
 
-Derivation. Under light of wavelength lambda a fixed hologram H produces at distance z the field U with (Fresnel,
-without its carrier) FT[U](f) = exp(-i pi lambda z f^2) FT[H](f). Only the product of wavelength and distance matters,
-so a change of wavelength acts like a change of depth:
+In the Fresnel model and without the carrier, a fixed hologram H under light of wavelength lambda produces at distance z
+the field U with FT[U](f) = exp(-i pi lambda z f^2) FT[H](f). Only the product of wavelength and distance enters, so a
+change of wavelength acts like a change of depth:
 
     FT[U'](f) = exp(-i pi (lambda' - lambda) z f^2) FT[U](f).
 
-The retina shows g, the part of U exp(i pi A x^2 / (lambda B)) that the pupil passes
-(:mod:`holotorch.optics.viewing.imaging`). Divided by this parabolic phase, g is U as limited by the pupil, and the
-equation gives the field at the neighbouring wavelength. Only the pupil remains that of the propagated wavelength: as a
-stop of fixed directions it would cut off a fraction 2 |lambda' - lambda| / lambda more, or less, of the light at its
-edge. This error, not the speckle, limits the distance of a neighbour in wavelength. Speckle changes about every
-nanometre, but a neighbour costs only two transforms of the picture.
+The field on the retina is the part of U exp(i pi A x^2 / (lambda B)) that the pupil transmits, where A and B are
+elements of the ray transfer matrix (:mod:`holotorch.optics.viewing.imaging`). Divided by this parabolic phase, it is U
+as limited by the pupil, and the equation above gives the field at the neighbouring wavelength for two transforms. An
+error remains, because the result has the pupil of the propagated wavelength. The true pupil transmits fixed directions
+and therefore cuts off a fraction 2 |lambda' - lambda| / lambda more, or less, of the light at its edge. This error
+limits the distance between neighbours in wavelength; speckle, which changes about every nanometre, does not.
 """
 
 import math
@@ -26,7 +26,7 @@ from holotorch.core.fourier import centred_fft2, centred_ifft2
 from holotorch.core.grid import Grid
 from holotorch.optics.free_space.kernels import turns_phasor
 from holotorch.optics.light.incoherent import incoherent_sum
-from holotorch.optics.light.wavelength_sampling import flawless, followed, least_followed, unseparated
+from holotorch.optics.light.wavelength_sampling import flawless, inseparable, least_followed, select_wavelengths
 from holotorch.optics.viewing.display import Display, number
 from holotorch.optics.viewing.elementwise import propagate_elements
 from holotorch.optics.viewing.eye import Eye
@@ -43,7 +43,7 @@ def neighbours(
     *,
     elements: bool = False,
 ) -> Iterator[Tensor]:
-    """Fields on the retina at wavelengths near the one that was propagated there.
+    """Fields on the retina at wavelengths near that of ``image``, which was propagated there.
 
     Args:
         image: Field on the retina, complex [..., H, W], from :func:`propagate_collapsed` or
@@ -52,18 +52,17 @@ def neighbours(
         wavelength: Wavelength of ``image`` in metres.
         others: Wavelengths of the results in metres.
         display: The display with which ``image`` was computed.
-        eye: The eye with which ``image`` was computed. Its aberrations and colour error are set for each wavelength.
-        elements: ``image`` comes from :func:`propagate_elements`, whose result includes the curvature of its phase.
+        eye: The eye with which ``image`` was computed. Its aberrations and colour error are applied at each wavelength.
+        elements: Whether ``image`` comes from :func:`propagate_elements`, which keeps the curvature of the phase.
 
     Yields:
-        Complex [..., H, W] for each of ``others``, one in memory at a time. Light that was outside ``grid`` is missing
-        near the edges, and light that leaves it wraps to the opposite edge; :func:`spectral_image` adds a margin.
+        Complex [..., H, W] for each of ``others``, one in memory at a time. Near the edges, light from outside ``grid``
+        is missing, and light that leaves ``grid`` wraps around; :func:`spectral_image` therefore adds a margin.
 
-    Raises:
-        ValueError: An eye with aberrations or colour error whose pupil transmits more than the band of ``grid``.
+    Raises ValueError for an eye with aberrations or colour error whose pupil transmits more than the band of ``grid``.
     """
     centre = checks.wavelengths(wavelength)[0]
-    if unseparated(grid, centre, display, eye):
+    if inseparable(grid, centre, display, eye):
         raise ValueError(
             "the errors of this eye cannot be set anew for another wavelength, since its pupil takes more than the "
             "band of the grid; follow every wavelength, or use a smaller pupil or a finer grid"
@@ -72,9 +71,7 @@ def neighbours(
     first, second, _, _ = display.matrix(plane)
     curvature = first / second + (eye.axial_length / second**2 if elements else 0.0)
     y, x = grid.coordinates(image.device)
-    fy, fx = ((torch.arange(n, dtype=torch.float64, device=image.device) - n // 2) / (n * p)
-              for n, p in zip(grid.shape, grid.pitch, strict=True))  # fmt: skip
-    fy, fx = fy[:, None], fx[None, :]
+    fy, fx = (torch.fft.fftshift(frequencies) for frequencies in grid.frequencies(image.device))
 
     def parabola(values: Tensor, rate, rows: Tensor, columns: Tensor) -> Tensor:
         rate = torch.as_tensor(rate, dtype=torch.float64, device=values.device)
@@ -82,7 +79,7 @@ def neighbours(
         return values * by_row.to(values.dtype) * by_column.to(values.dtype)
 
     def with_errors(values: Tensor, length: float, sign: int) -> Tensor:
-        # The errors of the eye are applied in its pupil; a sign of -1 removes them.
+        # Applies the errors of the eye in the plane of its pupil, or removes them with a sign of -1.
         path = eye.path(fy * (length * second), fx * (length * second), length)
         return centred_ifft2(centred_fft2(values) * turns_phasor(path * (sign / length)).to(values.dtype))
 
@@ -112,7 +109,7 @@ def spectral_image(
     paraxial: bool = False,
     recompute: bool = False,
 ) -> Tensor:
-    """Picture of one hologram on the retina under light of many wavelengths, few of which are propagated.
+    """Image of one hologram on the retina under light of many wavelengths, few of which are propagated.
 
     Args:
         field: Field of the hologram, complex [..., H, W], the same for all wavelengths.
@@ -120,21 +117,21 @@ def spectral_image(
         places: Wavelengths [K] in metres, increasing, such as those of ``Spectrum.every`` or ``Spectrum.samples``.
         weights: Weights of the wavelengths, at least 0, [K] or [S, K] for S spectra; a tensor may require gradients.
         display: Positions of hologram, eyepiece and eye.
-        eye: Pupil, retina, accommodation; the picture is of the plane in focus.
+        eye: Pupil, retina and accommodation; the image is that of the plane in focus.
         count: Number of wavelengths to propagate, with equal shares of the power; the others are :func:`neighbours`.
-        tolerance: In place of ``count``: accepted error of the picture that results from propagating few wavelengths
-            (:func:`neighbour_error`), relative to the mean picture.
-        reach: Half width in metres of the scene, used with ``tolerance``.
+        tolerance: In place of ``count``: accepted error of deriving images instead of propagating each wavelength
+            (:func:`neighbour_error`), relative to the mean image.
+        reach: Half width in metres of the scene, used with ``tolerance``; that of the hologram by default.
         elements: Use :func:`propagate_elements` instead of :func:`propagate_collapsed`.
-        paraxial: Argument of that function.
+        paraxial: Passed to the propagation function.
         recompute: As in :func:`incoherent_sum`, for each propagated wavelength.
 
     Returns:
-        Intensity [..., H, W] or [S, ..., H, W], real, referred back to the plane in focus like ``retinal_image``.
+        Intensity [..., H, W] or [S, ..., H, W], real, on the coordinates of the plane in focus like ``retinal_image``.
 
     Raises:
-        ValueError: Neither or both of count and tolerance, places that do not increase, invalid weights, or an error
-            of :func:`neighbours` or of the propagation to the retina.
+        ValueError: Neither or both of count and tolerance, places that do not increase, or invalid weights; the errors
+            of :func:`neighbours` and of the propagation to the retina.
     """
     checks.field("field", field, grid.shape)
     if (count is None) == (tolerance is None):
@@ -151,9 +148,10 @@ def spectral_image(
     power = shares.detach().reshape(-1, len(lengths)).sum(0)
     if tolerance is not None:
         count = least_followed(lengths, power, tolerance, grid, display, eye, reach=reach)
-    nodes, nearest = followed(lengths, power, count or 0)
+    nodes, nearest = select_wavelengths(lengths, power, count or 0)
     propagate = propagate_elements if elements else propagate_collapsed
-    margin = _margin(grid, lengths, nodes, nearest, display, eye)
+    largest = (lengths - lengths[nodes][nearest]).abs().max().item()
+    margin = _margin(grid, largest, display, eye)
     wide = Grid((grid.shape[0] + 2 * margin[0], grid.shape[1] + 2 * margin[1]), grid.pitch)
     padded = torch.nn.functional.pad(field, (margin[1], margin[1], margin[0], margin[0]))
 
@@ -164,25 +162,18 @@ def spectral_image(
     def image_near(node: int) -> Tensor:
         centre = lengths[nodes[node]].item()
         image = propagate(padded[..., None, :, :], wide, [centre], display, eye, paraxial=paraxial)[..., 0, :, :]
-        total = weighted(image, nodes[node])
         others = [k for k, owner in enumerate(nearest) if owner == node and k != nodes[node]]
-        if others:
-            images = neighbours(image, wide, centre, lengths[others].tolist(), display, eye, elements=elements)
-            for k, other in zip(others, images, strict=True):
-                total = total + weighted(other, k)
-        return total
+        near = lengths[others].tolist()
+        images = neighbours(image, wide, centre, near, display, eye, elements=elements) if others else ()
+        parts = (weighted(other, k) for k, other in zip(others, images, strict=True))
+        return sum(parts, start=weighted(image, nodes[node]))
 
     total = incoherent_sum(image_near, list(range(len(nodes))), [1.0] * len(nodes), recompute=recompute)
     return total[..., margin[0] : margin[0] + grid.shape[0], margin[1] : margin[1] + grid.shape[1]]
 
 
-def _margin(
-    grid: Grid, places: Tensor, nodes: list[int], nearest: list[int], display: Display, eye: Eye
-) -> tuple[int, int]:
-    """Samples (y, x) by which the steepest light of the farthest neighbour moves sideways."""
-    largest = max(abs((places[k] - places[nodes[owner]]).item()) for k, owner in enumerate(nearest))
+def _margin(grid: Grid, change: float, display: Display, eye: Eye) -> tuple[int, int]:
+    """Samples (y, x) by which a change of the wavelength in metres moves the steepest light sideways."""
     plane = abs(number(display.focus_plane(eye.accommodation)))
-    margins = [
-        math.ceil(plane * largest / (2 * p**2)) if n > 1 else 0 for n, p in zip(grid.shape, grid.pitch, strict=True)
-    ]
-    return margins[0], margins[1]
+    y, x = (math.ceil(plane * change / (2 * p**2)) * (n > 1) for n, p in zip(grid.shape, grid.pitch, strict=True))
+    return y, x

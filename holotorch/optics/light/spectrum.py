@@ -1,5 +1,6 @@
 """Spectrum: distribution of the power of a light source over wavelength."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,65 +11,102 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.quantities import BANDWIDTH
-from holotorch.optics.light.quadrature import gauss_rule, least_rule, speckle_rule
+from holotorch.optics.light.quadrature import SpeckleIntegral, gauss_rule
 
 CUTOFF = 0.1  # fraction of the peak below which the thesis drops the power (Sec. 5.5.2.2)
-# Nodes of the integral over the band from which rules are derived; accurate to rounding for up to 200 rad of phase.
-_NODES = 256
+_NODES = 256  # nodes of integrals over the band; exact to rounding for phases that vary by up to 200 rad
 
 
 @dataclass(frozen=True)
-class _Lorentzian:
+class _Line:
+    """A Lorentzian or, with ``gaussian``, a Gaussian line; all wavelengths in metres."""
+
+    centre: float
     half_width: float
+    gaussian: bool = False
 
-    def __call__(self, offsets: Tensor) -> Tensor:
-        return 1 / (1 + (offsets / self.half_width).square())
+    def __call__(self, wavelengths: Tensor) -> Tensor:
+        """Power relative to the peak."""
+        squares = ((wavelengths - self.centre) / self.half_width).square()
+        return torch.exp2(-squares) if self.gaussian else 1 / (1 + squares)
 
-    def reach(self, level: float) -> float:
-        return self.half_width * math.sqrt(1 / level - 1)
+    def band(self, level: float) -> tuple[float, float]:
+        """Outermost wavelengths with at least ``level`` of the peak."""
+        half = self.half_width * math.sqrt(-math.log2(level) if self.gaussian else 1 / level - 1)
+        return self.centre - half, self.centre + half
+
+    @property
+    def joints(self) -> list[float]:
+        """Wavelengths 4, 16, ... half widths from the centre. Integrals between them sample the peak well."""
+        offset, joints = 4 * self.half_width, []
+        while offset < self.centre:
+            joints = [self.centre - offset, *joints, self.centre + offset]
+            offset *= 4
+        return joints
 
 
 @dataclass(frozen=True)
-class _Gaussian:
-    half_width: float
+class _Table:
+    """Measured power at increasing wavelengths, linearly interpolated."""
 
-    def __call__(self, offsets: Tensor) -> Tensor:
-        return torch.exp2(-(offsets / self.half_width).square())
+    wavelengths: tuple[float, ...]
+    powers: tuple[float, ...]
 
-    def reach(self, level: float) -> float:
-        return self.half_width * math.sqrt(-math.log2(level))
+    def __call__(self, wavelengths: Tensor) -> Tensor:
+        """Power relative to the peak; ValueError for wavelengths outside the table."""
+        first, last = self.wavelengths[0], self.wavelengths[-1]
+        outside = (wavelengths < first) | (wavelengths > last)
+        if outside.any():
+            wrong = wavelengths[outside].flatten()[0].item()
+            raise ValueError(f"wavelength {wrong:g} m lies outside the table, which covers {first:g} to {last:g} m")
+        power = np.interp(wavelengths.cpu().numpy(), self.wavelengths, self.powers) / max(self.powers)
+        return torch.as_tensor(power, device=wavelengths.device)
+
+    def band(self, level: float) -> tuple[float, float]:
+        """Outermost wavelengths with at least ``level`` of the peak."""
+        power = np.array(self.powers) / max(self.powers)
+        strong = np.flatnonzero(power >= level)
+        first, last = int(strong[0]), int(strong[-1])
+        low, high = self.wavelengths[first], self.wavelengths[last]
+        if first > 0:
+            low = float(np.interp(level, power[first - 1 : first + 1], self.wavelengths[first - 1 : first + 1]))
+        if last < len(power) - 1:
+            high = float(np.interp(level, power[last : last + 2][::-1], self.wavelengths[last : last + 2][::-1]))
+        return low, high
+
+    @property
+    def joints(self) -> list[float]:
+        """Wavelengths at which the power has a kink."""
+        return list(self.wavelengths)
 
 
 @dataclass(frozen=True)
 class Spectrum:
     """Power of a source against wavelength, from :meth:`lorentzian`, :meth:`gaussian`, :meth:`table` or a preset.
 
-    Power below ``cutoff`` times the peak is dropped, and the remaining band is normalized to unit power, so that
-    pictures under different sources are compared at equal power (text below Eq. 5.16).
+    Power below ``cutoff`` times the peak is dropped, and the remaining band is normalized to unit power, so that images
+    under different sources are compared at equal power (text below Eq. 5.16).
 
-    The presets, such as ``Spectrum.laser(636e-9)``, have the widths of Table 5.1 as true full widths at half maximum.
-    Eq. 5.15 as printed uses them as half widths; :meth:`lorentzian_as_printed` reproduces the results printed with it.
+    The presets, such as ``Spectrum.laser(636e-9)``, are Lorentzian with the full widths at half maximum of Table 5.1.
+    Eq. 5.15 as printed uses these numbers as half widths, which :meth:`lorentzian_as_printed` reproduces.
 
     Attributes:
         centre: Wavelength of the peak, in metres.
         fwhm: Full width at half maximum in metres.
         cutoff: Lowest power kept, as a fraction of the peak, above 0 and below 1.
-        profile: Shape of the spectrum; for a table its wavelengths and powers.
+        profile: Power relative to the peak as a function of wavelength.
 
-    Raises:
-        ValueError: A width, wavelength or cutoff outside its range, or a band that would extend to wavelength 0.
+    Raises ValueError for a width, wavelength or cutoff outside its range, or a band that would extend to wavelength 0.
     """
 
     centre: float
     fwhm: float
-    profile: "_Lorentzian | _Gaussian | _Table"
+    profile: _Line | _Table
     cutoff: float = CUTOFF
 
     def __post_init__(self):
         checks.wavelengths(self.centre)
         checks.quantity(BANDWIDTH, self.fwhm)
-        if not 0 < checks.finite("cutoff", self.cutoff) < 1:
-            raise ValueError(f"cutoff must lie between 0 and 1, a part of the peak, got {self.cutoff!r}")
         if self.band()[0] <= 0:
             raise ValueError(
                 f"a width of {self.fwhm:g} m at {self.centre:g} m, cut off at {self.cutoff:g} of the peak, reaches "
@@ -77,47 +115,45 @@ class Spectrum:
 
     @classmethod
     def lorentzian(cls, centre: float, fwhm: float, *, cutoff: float = CUTOFF) -> "Spectrum":
-        """1 / (1 + (2 (lambda - centre) / fwhm)^2): Eq. 5.15, whose gamma, the half width, is fwhm / 2."""
-        return cls(centre, fwhm, _Lorentzian(checks.quantity(BANDWIDTH, fwhm) / 2), cutoff)
+        """1 / (1 + (2 (lambda - centre) / fwhm)^2): Eq. 5.15 with gamma = fwhm / 2, the half width."""
+        return cls(centre, fwhm, _Line(centre, checks.quantity(BANDWIDTH, fwhm) / 2), cutoff)
 
     @classmethod
     def lorentzian_as_printed(cls, centre: float, gamma: float, *, cutoff: float = CUTOFF) -> "Spectrum":
-        """Eq. 5.15 as printed. The thesis calls ``gamma`` the FWHM, but it is half of the FWHM of this source."""
+        """Eq. 5.15 as printed. The thesis calls ``gamma`` the FWHM, but in the equation it is half of the FWHM."""
         return cls.lorentzian(centre, 2 * checks.quantity(BANDWIDTH, gamma, "gamma"), cutoff=cutoff)
 
     @classmethod
     def gaussian(cls, centre: float, fwhm: float, *, cutoff: float = CUTOFF) -> "Spectrum":
         """2^(-(2 (lambda - centre) / fwhm)^2)."""
-        return cls(centre, fwhm, _Gaussian(checks.quantity(BANDWIDTH, fwhm) / 2), cutoff)
+        return cls(centre, fwhm, _Line(centre, checks.quantity(BANDWIDTH, fwhm) / 2, gaussian=True), cutoff)
 
     @classmethod
     def table(cls, wavelengths: Sequence[float], power: Sequence[float], *, cutoff: float = CUTOFF) -> "Spectrum":
         """Measured ``power``, in any unit, at increasing ``wavelengths`` in metres; linearly interpolated.
 
-        If the power at an end of the table exceeds the cutoff, the band ends there. Likewise the width at half maximum
-        is limited by the table.
+        Where the power at an end of the table exceeds the cutoff or half the maximum, the band or the full width at
+        half maximum ends with the table.
 
         Raises:
-            ValueError: Fewer than two rows, unequal lengths, wavelengths that do not increase, negative or no power.
+            ValueError: Fewer than two rows, unequal lengths, wavelengths that do not increase, a power below 0, or no
+                power.
         """
-        places = checks.wavelengths(list(wavelengths))
-        values = tuple(checks.finite("power", value) for value in power)
-        if len(places) != len(values) or len(places) < 2:
+        rows = checks.wavelengths(list(wavelengths))
+        powers = tuple(checks.finite("power", value) for value in power)
+        if len(rows) != len(powers) or len(rows) < 2:
             raise ValueError(
-                f"a table needs two or more wavelengths and as many powers, got {len(places)}, {len(values)}"
+                f"a table needs two or more wavelengths and as many powers, got {len(rows)}, {len(powers)}"
             )
-        for i, (here, there) in enumerate(zip(places, places[1:], strict=False)):
-            if there <= here:
-                raise ValueError(
-                    f"wavelengths must increase, but number {i + 1} is {there:g} after {here:g}; sort the rows"
-                )
-        if min(values) < 0 or max(values) == 0:
-            raise ValueError(
-                f"power must be nonnegative, and positive somewhere, got {min(values):g} to {max(values):g}"
-            )
-        profile = _Table(places, values)
+        for i, (one, two) in enumerate(itertools.pairwise(rows), 1):
+            if two <= one:
+                raise ValueError(f"wavelengths must increase, but number {i} is {two:g} after {one:g}; sort the rows")
+        least, peak = min(powers), max(powers)
+        if least < 0 or peak == 0:
+            raise ValueError(f"power must be nonnegative, and positive somewhere, got {least:g} to {peak:g}")
+        profile = _Table(rows, powers)
         low, high = profile.band(0.5)
-        return cls(places[values.index(max(values))], high - low, profile, cutoff)
+        return cls(rows[powers.index(peak)], high - low, profile, cutoff)
 
     @classmethod
     def laser(cls, centre: float) -> "Spectrum":
@@ -140,39 +176,36 @@ class Spectrum:
         return cls.lorentzian(centre, 20e-9)
 
     def band(self, cutoff: float | None = None) -> tuple[float, float]:
-        """Least and greatest wavelength in metres with at least ``cutoff`` of the peak, by default the spectrum's."""
+        """Outermost wavelengths in metres with at least ``cutoff`` of the peak; that of the spectrum by default."""
         level = self.cutoff if cutoff is None else cutoff
         if not 0 < checks.finite("cutoff", level) < 1:
             raise ValueError(f"cutoff must lie between 0 and 1, a part of the peak, got {level!r}")
-        if isinstance(self.profile, _Table):
-            return self.profile.band(level)
-        reach = self.profile.reach(level)
-        return self.centre - reach, self.centre + reach
+        return self.profile.band(level)
 
     def power(self, wavelengths: float | Sequence[float] | np.ndarray | Tensor) -> Tensor:
         """Power per metre of wavelength, float64 of the same shape: 0 outside the band, with an integral of 1.
 
-        Raises ValueError for wavelengths outside a table.
+        Raises ValueError for wavelengths outside the table of a measured spectrum.
         """
-        places = torch.as_tensor(wavelengths, dtype=torch.float64)
-        checks.all_finite("wavelengths", places)
+        points = torch.as_tensor(wavelengths, dtype=torch.float64)
+        checks.all_finite("wavelengths", points)
         nodes, steps = self._steps()
-        total = (self._shape(nodes) * steps).sum()
+        total = (self.profile(nodes) * steps).sum()
         low, high = self.band()
-        return torch.where((places >= low) & (places <= high), self._shape(places) / total, 0.0)
+        return torch.where((points >= low) & (points <= high), self.profile(points) / total, 0.0)
 
     def every(self, step: float = 1e-9) -> tuple[Tensor, Tensor]:
-        """Wavelengths [K] ``step`` metres apart, one at the centre, and weights [K] in proportion to the power.
+        """Wavelengths [K] in the band ``step`` metres apart, including the centre, and weights [K] with a sum of 1.
 
-        This is the thesis's sampling at 1 nm (Sec. 5.5.2.2). The sum covers whole steps within the band only;
+        The weights are proportional to the power. This is the thesis's sampling with a step of 1 nm (Sec. 5.5.2.2);
         :meth:`samples` is more accurate with fewer wavelengths.
         """
         low, high = self.band()
-        step, slack = checks.quantity(BANDWIDTH, step, "step"), 1e-9  # rounding must not drop the last one
+        step, slack = checks.quantity(BANDWIDTH, step, "step"), 1e-9  # keeps the outermost steps despite rounding
         first, last = math.ceil((low - self.centre) / step - slack), math.floor((high - self.centre) / step + slack)
-        places = self.centre + step * torch.arange(first, last + 1, dtype=torch.float64)
-        shape = self._shape(places.clamp(low, high))
-        return places, shape / shape.sum()
+        wavelengths = self.centre + step * torch.arange(first, last + 1, dtype=torch.float64)
+        power = self.profile(wavelengths.clamp(low, high))
+        return wavelengths, power / power.sum()
 
     def samples(
         self,
@@ -186,97 +219,55 @@ class Spectrum:
         """Few wavelengths [K] in metres and weights [K], float64, whose weighted sum approximates the integral.
 
         With ``count`` alone the result is Gauss's rule for the power over the band, exact for intensities that are
-        polynomials of the wavelength up to degree 2 K - 1. With ``path_difference``, nodes and weights minimize the
-        expected error; where many wavelengths are needed, this takes a third fewer. Then ``tolerance`` may replace
-        ``count``, and the smallest sufficient number of wavelengths is used.
+        polynomials of the wavelength up to degree 2 K - 1. With ``path_difference``, wavelengths and weights minimize
+        the expected error; where many wavelengths are needed, this takes a third fewer than Gauss's rule.
 
         Args:
             count: Number of wavelengths, at least 1.
-            tolerance: Accepted rms error of a picture relative to its rms brightness, above 0.
+            tolerance: Accepted rms error of an image relative to its rms brightness, above 0. It replaces ``count`` by
+                the smallest sufficient number of wavelengths and needs ``path_difference``.
             path_difference: Greatest path difference in metres of the light that interferes
                 (``coherence.path_difference``), above 0.
-            iris: True if the light passes a sharp pupil of fixed size. A hologram diffracts longer wavelengths more, so
-                the pupil cuts off more of their light. This makes intensity a rough function of wavelength, and errors
-                below 2 % need many wavelengths. False if the hologram's band, its window or a soft pupil is the limit.
-            step: Approximate the sum over :meth:`every` ``step`` instead of the integral; the thesis's step is 1e-9.
+            iris: Whether the light passes a sharp pupil of fixed size. A hologram diffracts longer wavelengths to
+                larger angles, so such a pupil cuts off more of their light. The intensity is then a rough function of
+                wavelength, and errors below 2 % need many wavelengths. Pass False if a soft pupil or the highest
+                frequency or the window of the hologram limits the light.
+            step: Approximate the sum of :meth:`every` with this step in metres instead of the integral.
 
         Raises:
             ValueError: Neither or both of count and tolerance, a tolerance without a path difference, or a count above
-                the 256 wavelengths of the integral, or those of the sum.
+                the number of wavelengths of :meth:`every`, or above 256 without ``step``.
         """
         if (count is None) == (tolerance is None):
             raise ValueError(f"give either count or tolerance, got {count!r} and {tolerance!r}")
-        places, weights = self.measure() if step is None else self.every(step)
-        low, high = self.band()
-        middle = (low + high) / 2
-        offsets = places - middle
+        wavelengths, weights = self.measure() if step is None else self.every(step)
+        middle = sum(self.band()) / 2
+        offsets = wavelengths - middle
         if path_difference is None:
             if count is None:
                 raise ValueError("a tolerance needs path_difference, in metres, of the light that interferes")
             nodes, weights = gauss_rule(offsets, weights, checks.whole("count", count, 1))
             return middle + nodes, weights
-        beat, rim = checks.positive("path_difference", path_difference, "metres") / middle**2, iris / middle
-        if tolerance is not None:
-            nodes, weights = least_rule(offsets, weights, beat, checks.positive("tolerance", tolerance), rim)
+        beat = checks.positive("path_difference", path_difference, "metres") / middle**2
+        integral = SpeckleIntegral(offsets, weights, beat, iris / middle)
+        if count is not None:
+            nodes, weights = integral.rule(checks.whole("count", count, 1))
         else:
-            nodes, weights = speckle_rule(offsets, weights, beat, checks.whole("count", count or 0, 1), rim)
+            nodes, weights = integral.least_rule(checks.positive("tolerance", tolerance))  # type: ignore[arg-type]
         return middle + nodes, weights
 
     def measure(self) -> tuple[Tensor, Tensor]:
-        """Many wavelengths [M] in the band and weights [M] with sum 1; they integrate nearly to rounding error."""
+        """Many wavelengths [M] and weights [M] with a sum of 1, which integrate over the band almost exactly."""
         nodes, steps = self._steps()
-        weights = self._shape(nodes) * steps
+        weights = self.profile(nodes) * steps
         return nodes, weights / weights.sum()
 
     def _steps(self) -> tuple[Tensor, Tensor]:
-        """Gauss-Legendre nodes and weights of the band, composed of a rule for each piece between joints."""
+        """Nodes and weights of a composite Gauss-Legendre rule for the band, with one rule between any two joints."""
         low, high = self.band()
-        ends = np.array([low, *(place for place in self._joints() if low < place < high), high])
+        ends = np.array([low, *(joint for joint in self.profile.joints if low < joint < high), high])
         count = max(2, math.ceil(_NODES / (len(ends) - 1)))
         t, weight = np.polynomial.legendre.leggauss(count)
         half = np.diff(ends)[:, None] / 2
         nodes = ends[:-1, None] + half * (1 + t)
         return torch.from_numpy(nodes.ravel()), torch.from_numpy((half * weight).ravel())
-
-    def _joints(self) -> list[float]:
-        """Wavelengths that divide the band into pieces: the rows of a table, or distances of 4, 16, ... half widths.
-
-        Separate pieces keep the peak well sampled if a low cutoff includes wide wings.
-        """
-        if isinstance(self.profile, _Table):
-            return list(self.profile.wavelengths)
-        offsets, joints = 4 * self.profile.half_width, []
-        while offsets < self.centre:
-            joints = [self.centre - offsets, *joints, self.centre + offsets]
-            offsets *= 4
-        return joints
-
-    def _shape(self, places: Tensor) -> Tensor:
-        return self.profile(places if isinstance(self.profile, _Table) else places - self.centre)
-
-
-@dataclass(frozen=True)
-class _Table:
-    wavelengths: tuple[float, ...]
-    powers: tuple[float, ...]
-
-    def __call__(self, places: Tensor) -> Tensor:
-        first, last = self.wavelengths[0], self.wavelengths[-1]
-        outside = (places < first) | (places > last)
-        if outside.any():
-            wrong = places[outside].flatten()[0].item()
-            raise ValueError(f"wavelength {wrong:g} m lies outside the table, which covers {first:g} to {last:g} m")
-        power = np.interp(places.cpu().numpy(), self.wavelengths, self.powers) / max(self.powers)
-        return torch.as_tensor(power, device=places.device)
-
-    def band(self, level: float) -> tuple[float, float]:
-        """Outermost wavelengths with at least ``level`` of the peak."""
-        power = np.array(self.powers) / max(self.powers)
-        strong = np.flatnonzero(power >= level)
-        first, last = int(strong[0]), int(strong[-1])
-        low, high = self.wavelengths[first], self.wavelengths[last]
-        if first > 0:
-            low = float(np.interp(level, power[first - 1 : first + 1], self.wavelengths[first - 1 : first + 1]))
-        if last < len(power) - 1:
-            high = float(np.interp(level, power[last : last + 2][::-1], self.wavelengths[last : last + 2][::-1]))
-        return low, high

@@ -1,4 +1,4 @@
-"""Selection of the wavelengths of a spectrum that are propagated; the pictures at the others are derived from them."""
+"""Selection of the wavelengths to propagate, from whose images those at the other wavelengths are derived."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from holotorch.core.grid import Grid
 from holotorch.optics.viewing.display import Display, number
 from holotorch.optics.viewing.eye import Eye
 
-_POINTS, _RINGS, _SPOKES = 9, 16, 64  # points per axis of the scene; rings of the pupil; rays per ring
+_POINTS, _RINGS, _RAYS = 9, 16, 64  # points per axis of the scene; rings of the pupil; rays per ring
 
 
 @dataclass(frozen=True)
@@ -19,12 +19,11 @@ class SeenLight:
     """Light of a hologram that enters an eye, from geometrical optics.
 
     Attributes:
-        rim: Fraction of the pupil's edge that the light illuminates, 0 to 1; 0 if the hologram's window or band limits
-            the light everywhere.
-        path_difference: Greatest difference in metres between paths from the hologram to one point of the scene, as
-            defined by ``coherence.path_difference``, over points on and off the axis.
-        bend: Standard deviation in metres, over the rays of a point, of the part z (slope)^4 / 8 of these paths that
-            the Fresnel model neglects.
+        rim: Fraction of the edge of the pupil that is illuminated, 0 to 1; 0 if only the window or the highest
+            frequency of the hologram limits the light.
+        path_difference: ``coherence.path_difference`` in metres, the maximum over points on and off the axis.
+        bend: Standard deviation in metres, over the rays of a point, of the part z slope^4 / 8 of their paths that the
+            Fresnel model neglects.
     """
 
     rim: float
@@ -36,7 +35,7 @@ def seen_light(grid: Grid, wavelength: float, display: Display, eye: Eye, *, rea
     """Trace rays from points of the plane in focus forward to the pupil and back to the hologram.
 
     Args:
-        grid: Sampling of the hologram: its extent is the window, its pitch the band.
+        grid: Sampling of the hologram.
         wavelength: In metres.
         display: Positions of hologram, eyepiece and eye.
         eye: Pupil and accommodation.
@@ -46,7 +45,7 @@ def seen_light(grid: Grid, wavelength: float, display: Display, eye: Eye, *, rea
     first, second, _, _ = (number(value) for value in display.matrix(plane))
     sides = [n * p / 2 if n > 1 else 0.0 for n, p in zip(grid.shape, grid.pitch, strict=True)]
     ends = sides if reach is None else [checks.positive("reach", reach, "metres") * (side > 0) for side in sides]
-    # The rings cover only the part of the pupil that can be illuminated; rings over a much wider pupil would be dark.
+    # The rings cover only the part of the pupil that can be illuminated.
     steepest = [
         min(centre / (2 * p), (s + e) / max(abs(plane), 1e-30)) for p, s, e in zip(grid.pitch, sides, ends, strict=True)
     ]
@@ -55,40 +54,39 @@ def seen_light(grid: Grid, wavelength: float, display: Display, eye: Eye, *, rea
     )
     radius = number(eye.pupil_radius)
     radii = torch.linspace(0, 1, _RINGS + 1, dtype=torch.float64)[1:] * min(radius, illuminated)
-    angle = torch.arange(_SPOKES, dtype=torch.float64) * (2 * math.pi / _SPOKES)
+    angle = torch.arange(_RAYS, dtype=torch.float64) * (2 * math.pi / _RAYS)
     along = torch.linspace(-1, 1, _POINTS, dtype=torch.float64)
-    inside = torch.ones(_POINTS, _POINTS, _RINGS, _SPOKES, dtype=torch.bool)
+    inside = torch.ones(_POINTS, _POINTS, _RINGS, _RAYS, dtype=torch.bool)
     path = torch.zeros(inside.shape, dtype=torch.float64)
-    for axis, spoke in enumerate((torch.sin(angle), torch.cos(angle))):
+    for axis, direction in enumerate((torch.sin(angle), torch.cos(angle))):
         if sides[axis] == 0:
             continue
         shape = (-1, 1, 1, 1) if axis == 0 else (1, -1, 1, 1)
         point = (ends[axis] * along).reshape(shape)
-        slope = (radii[:, None] * spoke - first * point) / second
+        slope = (radii[:, None] * direction - first * point) / second
         inside = inside & (slope.abs() <= centre / (2 * grid.pitch[axis]))
         inside = inside & ((point - plane * slope).abs() <= sides[axis])
         path = path + abs(plane) / 2 * slope.square()
     spread = (path.where(inside, -math.inf).amax((-2, -1)) - path.where(inside, math.inf).amin((-2, -1))).clamp_min(0)
-    # Each ring is weighted with its area. z s^4 / 8 = (z s^2 / 2)^2 / (2 z).
-    shares = inside * radii[:, None]
-    left_out = path.square() / max(2 * abs(plane), 1e-30)
-    mean = (shares * left_out).sum((-2, -1), keepdim=True) / shares.sum((-2, -1), keepdim=True).clamp_min(1e-30)
-    bend = ((shares * (left_out - mean).square()).sum() / shares.sum().clamp_min(1e-30)).sqrt().item()
+    shares = inside * radii[:, None]  # weight of each ring: its area
+    neglected = path.square() / max(2 * abs(plane), 1e-30)  # z s^4 / 8 = (z s^2 / 2)^2 / (2 z)
+    mean = (shares * neglected).sum((-2, -1), keepdim=True) / shares.sum((-2, -1), keepdim=True).clamp_min(1e-30)
+    bend = ((shares * (neglected - mean).square()).sum() / shares.sum().clamp_min(1e-30)).sqrt().item()
     rim = inside[..., -1, :].double().mean().item() if radius <= illuminated else 0.0
     return SeenLight(rim, spread.max().item(), bend)
 
 
-def followed(places: Tensor, weights: Tensor, count: int) -> tuple[list[int], list[int]]:
-    """Select ``count`` wavelengths with equal shares of the power, and for every wavelength the nearest selected one.
+def select_wavelengths(places: Tensor, weights: Tensor, count: int) -> tuple[list[int], list[int]]:
+    """Select ``count`` wavelengths with equal shares of the power, and assign every wavelength to the nearest of them.
 
     Args:
         places: Wavelengths [K] in metres, increasing.
-        weights: Positive, [K].
+        weights: Power at these wavelengths, positive, [K].
         count: Between 1 and K.
 
     Returns:
-        Indices into ``places`` of the selected wavelengths (fewer than ``count`` if few wavelengths hold the power),
-        and for each of ``places`` the index into this list of the nearest selected wavelength.
+        Indices into ``places`` of the selected wavelengths, and for each of ``places`` the index into that list of the
+        nearest selected wavelength. If few wavelengths contain most of the power, fewer than ``count`` are selected.
     """
     if not 1 <= checks.whole("count", count, 1) <= len(places):
         raise ValueError(f"count must be at most {len(places)}, the number of wavelengths given, got {count}")
@@ -99,15 +97,15 @@ def followed(places: Tensor, weights: Tensor, count: int) -> tuple[list[int], li
 
 
 def neighbour_error(places: Tensor, weights: Tensor, count: int, light: SeenLight) -> float:
-    """Expected error of ``spectral_image`` that propagates ``count`` of ``places``, relative to the mean picture.
+    """Expected error of ``spectral_image`` that propagates ``count`` of ``places``, relative to the mean image.
 
-    The light at the edge of the pupil changes with wavelength like a random walk, by a fraction 2 rim / wavelength of
-    the power per metre of wavelength, with the ``rim`` of ``light``. Every step of the walk is weighted with the power
-    of all wavelengths beyond it that are derived from the same propagated one. The fourth order of the slopes, which
-    the Fresnel model between neighbours neglects, is added. The error measured against propagation of every wavelength
-    is only 0.1 to 0.5 times this value if the light illuminates only small parts of the edge.
+    The error has two parts. First, the light at the edge of the pupil changes with wavelength like a random walk, by a
+    fraction 2 rim / wavelength of the power per metre of wavelength (``rim`` of ``light``). Every step of the walk is
+    weighted with the power of the wavelengths beyond it that are derived from the same propagated wavelength. Second,
+    the Fresnel model between neighbours neglects the fourth order of the slopes (``bend`` of ``light``). If the light
+    illuminates only small parts of the edge, the true error is only 0.1 to 0.5 times the result.
     """
-    nodes, nearest = followed(places, weights, count)
+    nodes, nearest = select_wavelengths(places, weights, count)
     share = weights / weights.sum()
     offsets = places - places[nodes][nearest]
     walk = 0.0
@@ -118,7 +116,7 @@ def neighbour_error(places: Tensor, weights: Tensor, count: int, light: SeenLigh
             beyond = share[side][order].flip(0).cumsum(0).flip(0)
             walk += (beyond[1:].square() * distances.diff()).sum().item()
     middle = places.mean().item()
-    # The phase of the fourth order is proportional to wavelength^3: it changes 3 times as fast as that of the second.
+    # The fourth-order phase is proportional to wavelength^3, so its relative change is 3 times that of the wavelength.
     bent = math.sqrt(2) * 2 * math.pi * 3 * light.bend / middle * (share * offsets.abs()).sum().item() / middle
     return math.hypot(math.sqrt(4 * light.rim * walk / middle), bent)
 
@@ -133,22 +131,16 @@ def least_followed(
     *,
     reach: float | None = None,
 ) -> int:
-    """Smallest ``count`` for ``spectral_image`` whose :func:`neighbour_error` is within ``tolerance``.
+    """Smallest ``count`` for ``spectral_image`` whose :func:`neighbour_error` is within ``tolerance``, above 0.
 
-    If the eye has errors and its pupil transmits more than the band of ``grid``, the result is the number of all
-    wavelengths, because ``neighbours`` cannot derive any.
-
-    Raises:
-        ValueError: A tolerance that is not above 0.
+    The result is the number of all wavelengths if the eye is one for which ``neighbours`` raises ValueError.
     """
     tolerance = checks.positive("tolerance", tolerance)
     light = seen_light(grid, places.mean().item(), display, eye, reach=reach)
-    if unseparated(grid, places.min().item(), display, eye):
+    if inseparable(grid, places.min().item(), display, eye):
         return len(places)
-    for count in range(1, len(places)):
-        if neighbour_error(places, weights, count, light) <= tolerance:
-            return count
-    return len(places)
+    counts = range(1, len(places))
+    return next((n for n in counts if neighbour_error(places, weights, n, light) <= tolerance), len(places))
 
 
 def flawless(eye: Eye) -> bool:
@@ -156,10 +148,10 @@ def flawless(eye: Eye) -> bool:
     return not eye.aberrations and eye.chromatic_reference is None
 
 
-def unseparated(grid: Grid, centre: float, display: Display, eye: Eye) -> bool:
-    """Whether the eye has errors that cannot be removed from a picture because its pupil transmits several bands."""
+def inseparable(grid: Grid, centre: float, display: Display, eye: Eye) -> bool:
+    """Whether the errors of an eye cannot be removed from an image, as its pupil exceeds the band of ``grid``."""
     if flawless(eye):
         return False
     second = number(display.matrix(number(display.focus_plane(eye.accommodation)))[1])
-    taken = (number(eye.pupil_radius) + 8 * eye.softness) / (centre * abs(second))
-    return any(taken > 1 / (2 * p) for n, p in zip(grid.shape, grid.pitch, strict=True) if n > 1)
+    highest = (number(eye.pupil_radius) + 8 * eye.softness) / (centre * abs(second))
+    return any(highest > 1 / (2 * p) for n, p in zip(grid.shape, grid.pitch, strict=True) if n > 1)

@@ -16,7 +16,7 @@ from holotorch.optics.light.coherence import (
     predicted_contrast,
     samples_needed,
 )
-from holotorch.optics.light.quadrature import expected_error
+from holotorch.optics.light.quadrature import SpeckleIntegral
 from holotorch.optics.light.spectrum import Spectrum
 
 PITCH, DISTANCE, APERTURE = 3.74e-6, 0.03, 0.056
@@ -81,7 +81,7 @@ def test_few_wavelengths_reach_the_sum_over_every_nanometre(preset, colour, iris
 
 def error_of(rule, dense, centre: float, iris: bool = False) -> float:
     away, there = dense[0] - centre, rule[0] - centre
-    return expected_error(away, dense[1], there, rule[1], PATH / centre**2, iris / centre).item()
+    return SpeckleIntegral(away, dense[1], PATH / centre**2, iris / centre).error(there, rule[1]).item()
 
 
 def test_the_least_error_takes_fewer_wavelengths_than_gauss():
@@ -191,7 +191,7 @@ def test_refusals():
         spectrum.samples(0)
     with pytest.raises(ValueError, match="needs more than 256 wavelengths"):
         spectrum.samples(tolerance=0.01, path_difference=1.0)
-    with pytest.raises(ValueError, match="must not be below 0"):
+    with pytest.raises(ValueError, match="path_difference must be at least zero"):
         predicted_contrast(spectrum, -1e-6)
     with pytest.raises(ValueError, match="sines and must add up to at most 1"):
         path_difference(0.03, 0.7, tilt=0.5)

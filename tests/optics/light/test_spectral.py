@@ -19,7 +19,7 @@ from holotorch.optics import (
     spectral_image,
 )
 from holotorch.optics.light.quadrature import gauss_rule
-from holotorch.optics.light.wavelength_sampling import followed
+from holotorch.optics.light.wavelength_sampling import select_wavelengths
 
 PITCH, GREEN, FAR = 3.74e-6, 520e-9, 30e-3
 GRID = Grid((128, 120), PITCH)
@@ -174,14 +174,14 @@ def test_several_spectra_at_once():
 def test_followed_have_equal_shares_of_the_power():
     places = torch.linspace(500e-9, 540e-9, 41, dtype=torch.float64)
     even = torch.ones(41, dtype=torch.float64)
-    nodes, owners = followed(places, even, 4)
+    nodes, owners = select_wavelengths(places, even, 4)
     assert nodes == [5, 15, 25, 35] and all(9 <= owners.count(k) <= 11 for k in range(4))  # ties
-    assert followed(places, even, 41) == (list(range(41)), list(range(41)))
+    assert select_wavelengths(places, even, 41) == (list(range(41)), list(range(41)))
     peaked = even * 1e-9
     peaked[20] = 1.0
-    assert followed(places, peaked, 3)[0] == [20]  # all three fall on it
+    assert select_wavelengths(places, peaked, 3)[0] == [20]  # all three fall on it
     away, shares = gauss_rule(places - 520e-9, even / 41, 5)
-    assert followed(520e-9 + away, shares, 1)[0] == [2]
+    assert select_wavelengths(520e-9 + away, shares, 1)[0] == [2]
 
 
 def test_gradients_reach_hologram_weights_and_accommodation():
