@@ -4,7 +4,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -59,6 +59,19 @@ class RetinaPlan:
     adequate: bool
 
 
+class _Option(NamedTuple):
+    """Attributes of a :class:`RetinaPlan` for one method; options compare by their flops."""
+
+    flops: float
+    method: str
+    sampling: CollapseSampling | ElementSampling
+    error: float
+    memory: int
+
+    def __str__(self):
+        return f"{self.method}: error {self.error:.2g}, {self.flops:.2g} operations, {self.memory:.2g} bytes"
+
+
 def plan_retina(
     grid: Grid,
     wavelengths: float | Sequence[float],
@@ -101,8 +114,7 @@ def plan_retina(
         reach = max(n * p for n, p in zip(grid.shape, grid.pitch, strict=True) if n > 1) / 2
     heights = [checks.quantity(WIDTH, reach, "reach") * i / (_HEIGHTS - 1) for i in range(_HEIGHTS)]
     diameter = 2 * number(eye.pupil_radius)
-    options: list[tuple[float, str, CollapseSampling | ElementSampling, float, int]] = []
-    refused = ""
+    options, impossible = [], ""
     try:
         collapse = collapse_sampling(grid, wavelengths, display, eye, plane)
         errors = [
@@ -113,34 +125,31 @@ def plan_retina(
         edge = _EDGE_ERROR * max(spot / (n * p) for n, p in zip(collapse.window, grid.pitch, strict=True) if n > 1)
         bands = max(math.prod(pupil_bands(grid, w, display, eye, plane)) for w in wavelengths)
         memory = collapse.memory_bytes(bands * math.prod(collapse.window), dtype.itemsize)
-        options.append((collapse.flops, "collapse", collapse, math.hypot(max(errors), edge), memory))
-    except ValueError as reason:
-        refused = f"collapse is impossible here: {reason}"
+        options.append(_Option(collapse.flops, "collapse", collapse, math.hypot(max(errors), edge), memory))
+    except ValueError as error:
+        impossible = f"collapse is impossible here: {error}"
     elements = least_oversampling(grid, wavelengths, display, eye, plane=plane)
     step = max(p / m for n, p, m in zip(grid.shape, grid.pitch, elements.oversampling, strict=True) if n > 1)
     edge = min(1.0, _EDGE_ERROR * step / diameter)
-    options.append((elements.flops, "elements", elements, edge, elements.memory_bytes(dtype.itemsize)))
+    options.append(_Option(elements.flops, "elements", elements, edge, elements.memory_bytes(dtype.itemsize)))
     limit = math.inf if memory_limit is None else memory_limit
-    fitting = [option for option in options if option[4] <= limit]
+    fitting = [option for option in options if option.memory <= limit]
     if not fitting:
         raise ValueError(f"no way to the retina fits into {limit:.3g} bytes, the smallest takes "
-                         f"{min(o[4] for o in options):.3g}; crop the hologram or raise memory_limit")  # fmt: skip
-    within = [option for option in fitting if option[3] <= tolerance]
-    best = min(within) if within else min(fitting, key=lambda option: option[3])
-    flops, method, sampling, error, memory = best
-    if error > _UNUSABLE:
-        raise ValueError(f"the only way that fits, {method}, has an expected error of {error:.2g}; raise memory_limit, "
-                         "or make the scene smaller (reach)")  # fmt: skip
+                         f"{min(o.memory for o in options):.3g}; crop the hologram or raise memory_limit")  # fmt: skip
+    within = [option for option in fitting if option.error <= tolerance]
+    best = min(within) if within else min(fitting, key=lambda option: option.error)
+    if best.error > _UNUSABLE:
+        raise ValueError(f"the only way that fits, {best.method}, has an expected error of {best.error:.2g}; raise "
+                         "memory_limit, or make the scene smaller (reach)")  # fmt: skip
     reason = (
-        f"{method} at {max(sampling.oversampling):.2f} times the hologram's sampling: error {error:.2g} "
-        f"{'within' if within else 'beyond'} the tolerance {tolerance:g}, {flops:.2g} operations, {memory:.2g} bytes"
+        f"{best.method} at {max(best.sampling.oversampling):.2f} times the hologram's sampling: error {best.error:.2g} "
+        f"{'within' if within else 'beyond'} the tolerance {tolerance:g}, {best.flops:.2g} operations, "
+        f"{best.memory:.2g} bytes"
     )
-    others = [
-        f"{option[1]}: error {option[3]:.2g}, {option[0]:.2g} operations, {option[4]:.2g} bytes"
-        for option in options
-        if option is not best
-    ]
-    return RetinaPlan(method, sampling, error, memory, flops, reason, (others or [refused])[0], bool(within))
+    runner_up = next((str(option) for option in options if option is not best), impossible)
+    sizes = best.sampling, best.error, best.memory, best.flops
+    return RetinaPlan(best.method, *sizes, reason, runner_up, bool(within))
 
 
 def collapse_error(
