@@ -47,11 +47,11 @@ class AxisContent:
         wavelength: In metres.
         distance: In metres, > 0.
         margin: Width in metres over which the content fades to zero at both ends; 0 for a hard edge.
-        out: Samples m of the result; ``size`` if 0.
+        window: Samples m of the result.
         shift: Position, in samples, of sample 0 of the result relative to sample 0 of the source projected along the
             carrier.
         tilt: Sines (this axis, the other) of the carrier's direction.
-        measured: Signals [K, size] that replace the tones: random mixtures of the lines of a field.
+        measured: Signals [K, size] that replace the tones, or None: random mixtures of the lines of a field.
     """
 
     size: int
@@ -59,22 +59,17 @@ class AxisContent:
     band: float
     wavelength: float
     distance: float
-    margin: float = 0.0
-    out: int = 0
-    shift: float = 0.0
-    tilt: tuple[float, float] = (0.0, 0.0)
-    measured: Tensor | None = field(default=None, compare=False)
+    margin: float
+    window: int
+    shift: float
+    tilt: tuple[float, float]
+    measured: Tensor | None = field(compare=False)
     _exact: list[Tensor | None] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
     def nyquist(self) -> float:
         """Highest frequency of the grid, 1 / (2 pitch)."""
         return 0.5 / self.pitch
-
-    @property
-    def window(self) -> int:
-        """Samples of the result."""
-        return self.out or self.size
 
     @property
     def curving_distance(self) -> float:

@@ -3,8 +3,8 @@
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -57,19 +57,6 @@ class RetinaPlan:
     reason: str
     runner_up: str
     adequate: bool
-
-
-class _Option(NamedTuple):
-    """Attributes of a :class:`RetinaPlan` for one method; options compare by their flops."""
-
-    flops: float
-    method: str
-    sampling: CollapseSampling | ElementSampling
-    error: float
-    memory: int
-
-    def __str__(self):
-        return f"{self.method}: error {self.error:.2g}, {self.flops:.2g} operations, {self.memory:.2g} bytes"
 
 
 def plan_retina(
@@ -125,31 +112,39 @@ def plan_retina(
         edge = _EDGE_ERROR * max(spot / (n * p) for n, p in zip(collapse.window, grid.pitch, strict=True) if n > 1)
         bands = max(math.prod(pupil_bands(grid, w, display, eye, plane)) for w in wavelengths)
         memory = collapse.memory_bytes(bands * math.prod(collapse.window), dtype.itemsize)
-        options.append(_Option(collapse.flops, "collapse", collapse, math.hypot(max(errors), edge), memory))
+        options.append(_option("collapse", collapse, math.hypot(max(errors), edge), memory, tolerance))
     except ValueError as error:
         impossible = f"collapse is impossible here: {error}"
     elements = least_oversampling(grid, wavelengths, display, eye, plane=plane)
     step = max(p / m for n, p, m in zip(grid.shape, grid.pitch, elements.oversampling, strict=True) if n > 1)
     edge = min(1.0, _EDGE_ERROR * step / diameter)
-    options.append(_Option(elements.flops, "elements", elements, edge, elements.memory_bytes(dtype.itemsize)))
+    options.append(_option("elements", elements, edge, elements.memory_bytes(dtype.itemsize), tolerance))
     limit = math.inf if memory_limit is None else memory_limit
-    fitting = [option for option in options if option.memory <= limit]
+    fitting = [each for each in options if each.memory_bytes <= limit]
     if not fitting:
         raise ValueError(f"no way to the retina fits into {limit:.3g} bytes, the smallest takes "
-                         f"{min(o.memory for o in options):.3g}; crop the hologram or raise memory_limit")  # fmt: skip
-    within = [option for option in fitting if option.error <= tolerance]
-    best = min(within) if within else min(fitting, key=lambda option: option.error)
-    if best.error > _UNUSABLE:
-        raise ValueError(f"the only way that fits, {best.method}, has an expected error of {best.error:.2g}; raise "
+                         f"{min(each.memory_bytes for each in options):.3g}; crop the hologram or raise "
+                         "memory_limit")  # fmt: skip
+    best = min(fitting, key=lambda each: (not each.adequate, each.flops if each.adequate else each.predicted_error))
+    error = best.predicted_error
+    if error > _UNUSABLE:
+        raise ValueError(f"the only way that fits, {best.method}, has an expected error of {error:.2g}; raise "
                          "memory_limit, or make the scene smaller (reach)")  # fmt: skip
     reason = (
-        f"{best.method} at {max(best.sampling.oversampling):.2f} times the hologram's sampling: error {best.error:.2g} "
-        f"{'within' if within else 'beyond'} the tolerance {tolerance:g}, {best.flops:.2g} operations, "
-        f"{best.memory:.2g} bytes"
+        f"{best.method} at {max(best.sampling.oversampling):.2f} times the hologram's sampling: error {error:.2g} "
+        f"{'within' if best.adequate else 'beyond'} the tolerance {tolerance:g}, {best.flops:.2g} operations, "
+        f"{best.memory_bytes:.2g} bytes"
     )
-    runner_up = next((str(option) for option in options if option is not best), impossible)
-    sizes = best.sampling, best.error, best.memory, best.flops
-    return RetinaPlan(best.method, *sizes, reason, runner_up, bool(within))
+    runner_up = next((each.reason for each in options if each is not best), impossible)
+    return replace(best, reason=reason, runner_up=runner_up)
+
+
+def _option(
+    method: str, sampling: CollapseSampling | ElementSampling, error: float, memory: int, tolerance: float
+) -> RetinaPlan:
+    """Plan for one method, with its error and cost as the reason."""
+    reason = f"{method}: error {error:.2g}, {sampling.flops:.2g} operations, {memory:.2g} bytes"
+    return RetinaPlan(method, sampling, error, memory, sampling.flops, reason, "", error <= tolerance)
 
 
 def collapse_error(
