@@ -20,12 +20,11 @@ from holotorch.optics.planning.content import FieldContent
 from holotorch.optics.planning.predict import AxisContent, rms_beyond_fresnel
 
 ZOOMED = "angular spectrum, zoomed"  # method that reads the result on another grid by chirp-z transforms
-_PADS = (1.0, 1.03125, 1.0625, 1.125, 1.25, 1.5)  # paddings of a sampled transfer function that are tried
-_WIDE_PADS = (2.0, 3.0, 4.0, 6.0, 8.0)  # paddings tried too for steep, tilted or displaced light
+_PADS = (1.0, 1.03125, 1.0625, 1.125, 1.25, 1.5)  # padding factors of a sampled transfer function that are tried
+_WIDE_PADS = (2.0, 3.0, 4.0, 6.0, 8.0)  # further padding factors for steep, tilted or displaced light
 _CROP_PADS = (2.0, CROP_PAD)  # values of ``pad`` in crop_length that are tried
 _TAILS = (0.125, 0.5, 1.5)  # values of ``tails`` in resampled_padding that are tried
 _PRODUCT_SPEED = 4.0  # operations of a dense product in the time of one operation of an FFT
-
 
 Axes = tuple[AxisContent, AxisContent]  # (y, x) at one distance
 
@@ -40,7 +39,7 @@ class Candidate:
             is sampled in space and cropped to the displacements between source and window.
         padded: Samples (y, x) of the transforms.
         paraxial: Whether the factor beyond Fresnel is neglected.
-        scenes: Light at the distances that bound the error, at the longest wavelength.
+        scenes: Light of both axes at each distance that bounds the error, at the longest wavelength.
         predict: Computes the expected relative L2 error of one of the ``scenes``.
         flops: Floating-point operations of one call.
         memory: Largest extra memory of one call, in bytes.
@@ -150,7 +149,7 @@ def _axes(planes: PlanePair, wavelength: float, distance: float, content: FieldC
 
 
 def _lengths(axis: AxisContent, pads: tuple[float, ...]) -> list[int]:
-    """Different lengths of transforms for the paddings ``pads``, in increasing order."""
+    """Different lengths of transforms for the padding factors ``pads``, in increasing order."""
     largest = max(axis.size, axis.window)
     lengths = (largest if pad == 1 else good_length(math.ceil(largest * pad)) for pad in pads)
     return list(dict.fromkeys(lengths))
@@ -213,8 +212,8 @@ def _cropped(scenes: list[Axes], sampled: tuple[bool, bool], crop_pad: float | N
 
     def predict(axes: Axes) -> float:
         if any(axes[0].tilt):
-            # The light of a measured field may lie where both axes crop it. The sum of the errors of the two axes is
-            # then too small and is scaled up.
+            # A measured field may have its light at frequencies where both axes have errors. The sum of the errors of
+            # the two axes is then too small and is scaled up.
             mixing = 1 if axes[0].measured is None else 1 + sum(sine != 0 for sine in axes[0].tilt)
             taps = mixing * math.sqrt(_tilted_taps(axes, lengths, paraxial=False))
             return math.hypot(_rounding(axes, sampled, dtype), taps)

@@ -27,7 +27,7 @@ from holotorch.optics.free_space.kernels import turns_phasor
 _TONES = 17  # tones that represent the band of one axis
 _SLICES = 9  # evenly spaced slices
 _QUANTILES = (0.02, 0.1, 0.25, 0.4, 0.6, 0.75, 0.9, 0.98)  # quantiles of measured energy at which slices are added
-_LONGER = 4  # length of the reference transform over that of source plus window, which makes its wrapping negligible
+_LONGER = 4  # length of the reference transform, in units of source plus window; the wrapping is then negligible
 _LONGEST = 1 << 18  # samples of the longest reference transform; light that needs a longer one counts as lost
 
 
@@ -79,7 +79,7 @@ class AxisContent:
 
     @cached_property
     def captured(self) -> float:
-        """Energy of the content that arrives in the window, which is a fraction for tones without margin."""
+        """Mean energy of the content that arrives in the window; for tones without margin, the arriving fraction."""
         return max(self._energy(self._taps), 1e-300)
 
     def moment(self, power: int, limit: float = math.inf) -> float:

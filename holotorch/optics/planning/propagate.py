@@ -25,8 +25,8 @@ from holotorch.optics.planning.content import field_content
 from holotorch.optics.planning.plan import choose, plan_from
 
 _UNUSABLE = 0.1  # expected relative error above which a propagation is refused
-_DIM = 1e-5  # fraction of the light that arrives, below which measured content, held per axis, cannot predict it
-_DIM_ERROR = 5.0  # error relative to the light that arrives above which a warning is given, in units of the tolerance
+_DIM = 1e-5  # arriving fraction of the light below which measured content, stored per axis, cannot predict it
+_DIM_ERROR = 5.0  # error relative to the arriving light above which a warning is given, in units of the tolerance
 
 
 def propagate(
@@ -78,7 +78,7 @@ def propagate(
     Warns:
         SamplingWarning: No method meets the tolerance: the most accurate one is used, and the message gives its
             expected error. Or so little light arrives in the window of the result that the error is large relative to
-            this light, which is not checked during compilation and by :class:`Propagator`.
+            this light; compiled calls and :class:`Propagator` omit this check.
         PrecisionWarning: A wavelength or distance in float32 whose rounding changes the phase by 0.01 rad or more.
 
     A gradient in a common factor s of both pitches is that of ``propagate(field, grid, wavelength / s, distance / s)``,
@@ -242,7 +242,7 @@ def _norms(field: Tensor) -> Tensor:
 def _finite_norms(field: Tensor) -> Tensor:
     """L2 norms [...] of ``field`` [..., H, W]; ValueError for elements that are not finite."""
     norms = _norms(field)
-    if not bool(torch.isfinite(norms).all()):  # or the squares of finite elements overflow
+    if not bool(torch.isfinite(norms).all()):  # also if squares of finite elements overflow
         checks.all_finite("field", torch.view_as_real(field.detach().resolve_conj()))
     return norms
 
@@ -260,7 +260,7 @@ def _warn_if_dim(
     fractions = torch.where(norms > 0, (_norms(result) / norms).square() * area_ratio, 1.0)
     dimmest = float(torch.where(torch.isfinite(fractions), fractions, 1.0).min())
     allowed = _DIM_ERROR * tolerance
-    # Most calls end here, with all light as a bound of the expected light, which takes longer to compute.
+    # Most calls end here: the expected light is at most all light, and takes longer to compute.
     if best.error <= allowed * math.sqrt(dimmest):
         return
     expected = 1.0 if measured and dimmest < _DIM else best.captured()

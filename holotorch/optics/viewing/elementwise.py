@@ -14,19 +14,10 @@ from holotorch.core.grid import Grid
 from holotorch.optics.elements.lens import pupil
 from holotorch.optics.free_space.kernels import angular_spectrum_kernel, carrier, fresnel_kernel, turns_phasor
 from holotorch.optics.free_space.zoomed import chirp, chirps, zoom, zoomed
+from holotorch.optics.viewing import rays
 from holotorch.optics.viewing.display import Display, Length, inverse, number
 from holotorch.optics.viewing.eye import Eye
 from holotorch.optics.viewing.imaging import fft_flops, retinal_scale, warn_if_coarse, zoom_flops
-from holotorch.optics.viewing.rays import (
-    clipped,
-    fringe_width,
-    largest_height,
-    largest_slope,
-    rays_of_window,
-    refracted,
-    samples_for_all_light,
-    travelled,
-)
 
 _ROOM = 1.05  # factor on the slope of the steepest ray, for light that edges diffract to larger slopes
 
@@ -47,7 +38,8 @@ class ElementSampling:
 
     @property
     def flops(self) -> float:
-        """Floating-point operations for one image of one wavelength: six transforms, the first and last by chirp-z."""
+        """Floating-point operations for one image of one wavelength."""
+        # The first chirp-z transform, three FFTs, and the last chirp-z transform, which counts as a fourth FFT.
         return 4 * fft_flops(math.prod(self.fine)) + zoom_flops(self.padded, self.fine)
 
     def memory_bytes(self, itemsize: int = 8, batch: int = 1) -> int:
@@ -56,7 +48,7 @@ class ElementSampling:
         Arguments as in :meth:`CollapseSampling.memory_bytes`.
         """
         sample = itemsize * batch
-        # The larger one of computing a transfer function and propagating behind the iris.
+        # Either the computation of a transfer function or the propagation behind the iris needs most.
         return max(138 + sample, 60 + 6 * sample) * math.prod(self.fine)
 
 
@@ -140,26 +132,27 @@ def _axis(
     frequency, width = 0.0, scale * size * pitch
     for wavelength in wavelengths:
         slope = wavelength / (2 * pitch)
-        rays = rays_of_window(size * pitch / 2, slope)
+        region = rays.of_window(size * pitch / 2, slope)
         for distance, power, radius in zip((d_el, d_eye), powers, radii, strict=True):
-            start = largest_height(rays)
-            rays = travelled(rays, distance)
+            start, margin = rays.largest_height(region), 2 * rays.fringe_width(wavelength, distance)
+            region = rays.travelled(region, distance)
             # Wrapped light must not reach the opening, and all light that passes must lie within the window.
-            height = largest_height(rays)
+            height = rays.largest_height(region)
             opening = min(height, radius + 8 * eye.softness)
-            width = max(width, start + opening, height + opening, 2 * opening) + 2 * fringe_width(wavelength, distance)
-            rays = clipped(rays, opening)
-            slope = max(slope, abs(power) * largest_height(rays))
-            rays = refracted(rays, power)
-            slope = max(slope, largest_slope(rays))
-        height = largest_height(travelled(rays, d_r))
-        width = max(width, height + scale * size * pitch / 2 + fringe_width(wavelength, d_r))
+            width = max(width, start + opening, height + opening, 2 * opening) + margin
+            region = rays.clipped(region, opening)
+            slope = max(slope, abs(power) * rays.largest_height(region))
+            region = rays.refracted(region, power)
+            slope = max(slope, rays.largest_slope(region))
+        height = rays.largest_height(rays.travelled(region, d_r))
+        width = max(width, height + scale * size * pitch / 2 + rays.fringe_width(wavelength, d_r))
         frequency = max(frequency, _ROOM * slope / wavelength)
     factor = max(1.0, 2 * pitch * frequency)
     fine = good_length(math.ceil(factor * width / pitch))
     window = fine / factor
     padded = max(
-        min(samples_for_all_light(size, window, pitch, wavelength, d_el), size + window) for wavelength in wavelengths
+        min(rays.samples_for_all_light(size, window, pitch, wavelength, d_el), size + window)
+        for wavelength in wavelengths
     )
     return factor, good_length(max(math.ceil(padded), size)), fine
 

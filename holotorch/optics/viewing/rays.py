@@ -5,7 +5,7 @@ import math
 Region = list[tuple[float, float]]  # corners (position in metres, slope) of a convex region of rays
 
 
-def rays_of_window(half_width: float, slope: float) -> Region:
+def of_window(half_width: float, slope: float) -> Region:
     """All rays that start within ``half_width`` of the axis with slopes up to ``slope``."""
     return [(-half_width, -slope), (half_width, -slope), (half_width, slope), (-half_width, slope)]
 

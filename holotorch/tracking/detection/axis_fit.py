@@ -167,11 +167,7 @@ def _station_parts(share: np.ndarray, member: np.ndarray) -> np.ndarray:
     """[S, 4 + K, 6 + bands K]: the parameters of each station as linear functions of ``AxisFit.unknown``.
 
     The parameters of a station are middle, width, blur and K shadings. The last row and column stand for the residual
-    light.
-
-    Args:
-        share: [S] position t / reach of each station, -1 to 1.
-        member: [S, bands] 1 where the station lies on the band, else 0.
+    light. ``share`` [S] are positions t / reach, and ``member`` [S, bands] is 1 where a station lies on a band, else 0.
     """
     kinds = len(_SHADINGS)
     parts = np.zeros((len(share), 4 + kinds, 6 + member.shape[1] * kinds))

@@ -177,9 +177,8 @@ def _gains(bands: tuple[int, ...], colours: int) -> tuple[np.ndarray, np.ndarray
 def _sweep(order: Iterable[np.ndarray]) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
     """Dynamic programming over the cuts between parts of a line, whose cumulative scores [K, T + 1] are in ``order``.
 
-    Returns:
-        Best score [K, T + 1] up to each position; and for each cut the scores of its possible positions and their
-        running maximum, both [K, T + 1].
+    Returns the best score up to each position, and for each cut the scores of its possible positions and their running
+    maximum; all are [K, T + 1].
     """
     value, *rest = order
     cuts = []

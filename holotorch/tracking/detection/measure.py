@@ -251,8 +251,7 @@ def measure_edges(
 def _positions_along(near: np.ndarray, blur: float) -> tuple[np.ndarray, int]:
     """Positions [T] of the samples in a window relative to its edge, and the half-width of the window, in pixels.
 
-    The windows of neighbouring edges, which are at ``near``, do not overlap. Samples far from the edge are two pixels
-    apart.
+    The windows of neighbouring edges ``near`` do not overlap. Samples far from an edge are two pixels apart.
     """
     gap = min((abs(b - a) for a, b in itertools.pairwise(near.tolist())), default=math.inf)
     window = int(min(_WINDOW.half + 2 * blur, max(4.0, 0.45 * gap)))
@@ -323,16 +322,11 @@ def _sides(widths: np.ndarray, blur: float) -> np.ndarray:
 
 
 def _across(light: np.ndarray, along: np.ndarray, fit: EdgeFit) -> tuple[np.ndarray, bool]:
-    """Whether the background changes where the edges are.
+    """Whether the background changes at the edges, from ``fit`` and the background rows ``light`` [E, T, 6, C].
 
-    Args:
-        light: [E, T, 6, C] light of the background rows.
-        along: [E, T] positions of these samples relative to the edges.
-        fit: Of the edges on the tube.
-
-    Returns:
-        [E] whether the background changes on both sides, so that something lies across the tube; and whether on one
-        side the background at all edges changes about as much as the tube.
+    ``along`` [E, T] are the positions of the samples relative to the edges. Returns [E] whether the background changes
+    on both sides, so that something lies across the tube; and whether on one side the background at all edges changes
+    about as much as the tube.
     """
     count, samples, _, colours = light.shape
     light = light.reshape(count, samples, -1).astype(np.float64)

@@ -250,14 +250,10 @@ def _axis(stations: Stations, fit: AxisFit) -> Axis:
 
 
 def _contrast(light: np.ndarray, u: np.ndarray, width: float, band: np.ndarray, samples: int):
-    """One signal from light [3, S, U].
+    """Signal [S, U] from light [3, S, U], its inverse variance, and two levels of each band [bands].
 
     In each band the signal is the linear combination of the channels that has the largest ratio of the contrast between
-    tube and background to the noise.
-
-    Returns:
-        Signal [S, U], its inverse variance [S, U], level of the signal in each band [bands], and the level if the
-        channels are combined with absolute weights [bands].
+    tube and background to the noise. The second level combines the channels with absolute weights.
     """
     away = np.abs(u)
     where = np.empty((len(u), 2), dtype=np.float32)

@@ -185,8 +185,7 @@ class CatheterTracker:
                 half = 0.5 * length + max(40.0, 0.7 * length)
                 shown = self._shown(sampler, line, half, _SEARCH.aside, onward=False)
             except Refusal as refusal:
-                # The refusal of the latest stage is reported. Only its text is stored, because the exception refers to
-                # the frame and would keep it in memory.
+                # The refusal of the latest stage is reported; the exception itself would keep the frame in memory.
                 if refusal.status > furthest[0]:
                     furthest = refusal.status, refusal.reason
             else:  # only the first line with all bands in order is measured, which is almost always the catheter
@@ -194,11 +193,7 @@ class CatheterTracker:
         raise Refusal(*furthest)
 
     def _near(self, sampler: Sampler, line_pose: LinePose) -> tuple[Line, Stretches]:
-        """Line near a previous pose, and the bands on it.
-
-        Raises:
-            Refusal: No bands; the reason names exchanged channels if the bands have the reversed order.
-        """
+        """Line near a previous pose, and the bands on it; a Refusal names exchanged channels for reversed bands."""
         line, half = self._expected(line_pose)
         try:
             return self._shown(sampler, line, half, _SEARCH.motion, onward=True)
@@ -224,10 +219,7 @@ class CatheterTracker:
     ) -> tuple[Line, Stretches]:
         """Line of the tube within ``half`` pixels along ``line`` and ``aside`` across, and the bands on it.
 
-        ``onward``: the tip is known to lie towards smaller t on ``line``.
-
-        Raises:
-            Refusal: Fewer than three band edges are visible.
+        ``onward``: t is known to rise from the tip. Raises a Refusal if fewer than three band edges are visible.
         """
         half = min(half, 1.5 * math.hypot(sampler.height, sampler.width))
         with self._timed("axis"):
@@ -270,8 +262,7 @@ class CatheterTracker:
                 line_pose = self._solved(axis, edges, rough=True)
             plane, wide = axis.line.plane(edges.t), self._wide(line_pose, line)
         with self._timed("axis"):
-            # The axis is fitted with the width that follows from pose and radius; the independently measured width is
-            # for the check.
+            # The axis is fitted with the width from pose and radius; the independent width is for the check.
             if before is None or abs(wide[0] - axis.width) > _CHECK.nearly * wide[0]:
                 rest = axis.blur, axis
                 axis = (
@@ -354,11 +345,7 @@ class CatheterTracker:
         return line_pose
 
     def _checked(self, line_pose: LinePose, axis: Axis, edges: Edges, *, cold: bool) -> Pose:
-        """Pose after all checks; ``cold`` if there is no previous pose, so that ``axis`` has an independent width.
-
-        Raises:
-            Refusal: A check fails.
-        """
+        """Pose after all checks; ``cold`` if there is no previous pose, so that ``axis`` has an independent width."""
         visible = edges.t[np.isfinite(edges.t)]
         count = len(visible)
         freedom = count - 3  # degrees of freedom of positions along the line; the line is fitted separately
