@@ -71,8 +71,7 @@ class Display:
     def focus_plane(self, accommodation: Length) -> Length:
         """Distance in metres from the hologram to the plane that an eye focused at ``accommodation`` sees sharply.
 
-        d_el - s0 with 1 / s0 = 1 / (accommodation - d_eye) + 1 / f. A negative distance lies behind the hologram, on
-        the side away from the eye.
+        d_el - s0 with 1 / s0 = 1 / (accommodation - d_eye) + 1 / f; negative on the side away from the eye.
 
         Raises:
             ValueError: The plane is at infinity.

@@ -73,9 +73,10 @@ def eyepiece_distance(volume_distance: float, focus_distance: float, focal_lengt
 
 
 def scene_fov(size: float, object_distance: float, focal_length: float, eye_distance: float) -> float:
-    """Angle in radians under which the eye sees an object of width ``size``: 2 atan(V / (2 (s0 + d_eye (1 - s0 / f)))).
+    """Angle in radians under which the eye sees an object of width V = ``size``.
 
-    V is ``size``. This equals 2 atan(V f / (2 (f - s0) (s1 + d_eye))) of thesis Sec. 5.6.2, and is finite for s0 = f.
+    2 atan(V / (2 (s0 + d_eye (1 - s0 / f)))), which equals 2 atan(V f / (2 (f - s0) (s1 + d_eye))) of thesis Sec. 5.6.2
+    and is finite for s0 = f.
     """
     image_distance(object_distance, focal_length)
     checks.quantity(SPACING, eye_distance, "eye_distance")
@@ -111,7 +112,7 @@ def accommodation_range(
 
 
 def region_apex(width: float, pitch: float, wavelength: float) -> float:
-    """Distance in metres at which regions I and III of Sec. 5.6.2 touch on the axis: w / (2 tan(theta))."""
+    """Distance in metres at which regions 1 and 3 (:func:`region`) touch on the axis: w / (2 tan(theta))."""
     return checks.quantity(WIDTH, width) / (2 * _tangent(pitch, wavelength))
 
 
@@ -131,7 +132,7 @@ def region(height: float, distance: float, width: float, pitch: float, wavelengt
 
 
 def placement(size: float, width: float, pitch: float, wavelength: float, depth: float | None = None) -> float:
-    """Smallest distance in metres to the centre of a volume whose near face lies in region III.
+    """Smallest distance in metres to the centre of a volume whose near face lies in region 3 (:func:`region`).
 
     The result is (V + w) / (2 tan(theta)) + depth / 2, with V = ``size`` and ``depth`` = V by default. The shortest
     wavelength requires the largest distance; the 157.81 mm of the thesis are for 455 nm.
@@ -205,8 +206,8 @@ def fresnel_number(radius: float, wavelength: float, distance: float) -> float:
 def fresnel_distance(radius: float, wavelength: float, number: float) -> float:
     """Distance in metres at which the Fresnel number of an aperture is ``number``.
 
-    The thesis uses Fresnel's model below 30 and Fraunhofer's far below 1. In its Fig. 4.2 (w = 1 mm, 530 nm) these
-    numbers are at 62.89 mm and 1886.79 mm.
+    The thesis uses Fresnel's model for numbers below 30 and Fraunhofer's far below 1. In its Fig. 4.2 (w = 1 mm,
+    530 nm), 30 and 1 are reached at 62.89 mm and 1886.79 mm.
     """
     square = checks.quantity(WIDTH, radius, "radius") ** 2
     return square / (checks.quantity(WAVELENGTH, wavelength) * checks.positive("number", number))

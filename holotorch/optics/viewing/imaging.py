@@ -124,9 +124,9 @@ def propagate_collapsed(
             retina, and u_i the slopes over these distances of the ray through xi.
 
     Returns:
-        Complex [..., C, H, W] on ``grid``, upright; multiply positions by :func:`retinal_scale` (negative) for those on
-        the retina. The sum of the intensity times both pitches is the power on the retina. The curvature and the
-        carrier are omitted, which do not affect the intensity.
+        Complex [..., C, H, W] on ``grid``, upright: a position times :func:`retinal_scale` (negative) is that on the
+        retina. The sum of the intensity times both pitches is the power on the retina. The curvature and the factor
+        exp(ikz), which do not affect the intensity, are omitted.
 
     Raises:
         ValueError: The pupil is an image of the object plane (B = 0), or the oversampling would exceed 64.
@@ -164,7 +164,7 @@ def retinal_scale(display: Display, eye: Eye, plane: Length | None = None) -> Le
 
 
 def pupil_bands(grid: Grid, wavelength: float, display: Display, eye: Eye, plane: Length) -> tuple[int, int]:
-    """Numbers (y, x), odd, of frequency bands 1 / pitch wide, centred on frequency 0, that cover the pupil's pass-band.
+    """Odd numbers (y, x) of bands of width 1 / pitch that cover the frequencies which the pupil transmits.
 
     The frequencies are those of the field in the object plane times its parabolic phase, which shifts the light of
     points beside the axis beyond 1 / (2 pitch).

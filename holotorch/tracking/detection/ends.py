@@ -27,7 +27,7 @@ class EndCheck:
 
 
 _INSIDE = np.array([-0.3, -0.15, 0.0, 0.15, 0.3])  # samples on the tube: distance from the axis in widths
-_BESIDE = np.array([0.9, 1.2, 1.5, 1.8])  # samples beside the tube on either side
+_BESIDE = np.array([0.9, 1.2, 1.5, 1.8])  # samples on either side of the tube: the same distance
 _ACROSS = np.concatenate([-_BESIDE[::-1], _INSIDE, _BESIDE])
 _SIZES = len(_BESIDE), len(_INSIDE), len(_BESIDE)
 _MEANS = np.repeat(

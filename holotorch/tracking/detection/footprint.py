@@ -1,4 +1,8 @@
-"""Image of a catheter at a given pose: the width of the tube along its image line, and the bulge of its rings."""
+"""Image of a catheter at a given pose: the width of the tube along its image line, and the bulge of its rings.
+
+A ring is the circle around the tube at a band edge. Only its front is visible, displaced from the image of its centre by
+the bulge.
+"""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +17,7 @@ from holotorch.tracking.pose.resection import LinePose
 _INTERPOLATED = 1 / 6  # variance in pixels^2 that bilinear interpolation adds to a blur in any direction
 _NODES = (np.arange(16) + 0.5) / 8 - 1  # midpoints of 16 slices across a tube, whose sides lie at -1 and 1
 _ROUND = np.sqrt(1 - _NODES**2)
-_LIT = np.stack([np.ones_like(_NODES), _NODES, _ROUND], -1)  # shapes in which a step of light varies across a tube
+_LIT = np.stack([np.ones_like(_NODES), _NODES, _ROUND], -1)  # shapes of a step of light across a tube
 _BOTH = np.concatenate([_LIT, _LIT * _ROUND[:, None]], -1)
 _RIDGE = 1e-4 * np.eye(_LIT.shape[1])  # regularises the fit of the shapes
 

@@ -26,11 +26,11 @@ class StationPlan:
 
 @dataclass(frozen=True)
 class AxisLimits:
-    """Limits above or below which the fit of an axis is refused, and an error floor; from synthetic frames."""
+    """Limits for refusing the fit of an axis, and an error floor; determined on synthetic frames."""
 
     one_sided: float = 0.15  # least ratio of the smaller to the larger contrast of the tube to its two sides
     narrowest: float = 2.4  # least width in pixels; in a narrower tube no pixel shows the colour of one band alone
-    moving: float = 3.0  # largest change of the middle in the last step of a fit, in pixels; larger if a fit diverges
+    moving: float = 3.0  # largest change of the middle in the last step of a converged fit, in pixels
     floor: float = 0.002  # error of the axis in widths, from gloss and shadow that are constant along the tube
 
 
@@ -207,7 +207,7 @@ def measure_width(
     elif abs(rough - wide[0]) >= max(_WIDTH.other_px, 0.25 * wide[0]):
         width = measure_axis(stations, (rough, 0.0), THIRD, _WIDTH.blur_px)
     else:
-        # A nearly correct initial width prevents that the width of a highlight is fitted.
+        # From a nearly correct initial width, the fit does not converge to the width of a highlight.
         width = _axis(stations, axis.fit.given(wide, THIRD, known))
         if narrow or abs(width.width - wide[0]) > _WIDTH.linear * wide[0]:
             width = measure_axis(stations, wide, THIRD, axis.blur, axis)

@@ -193,7 +193,7 @@ class CatheterTracker:
         raise Refusal(*furthest)
 
     def _near(self, sampler: Sampler, line_pose: LinePose) -> tuple[Line, Stretches]:
-        """Line near a previous pose, and the bands on it; a Refusal names exchanged channels for reversed bands."""
+        """Line near a previous pose, and the bands on it; for reversed bands the Refusal names exchanged channels."""
         line, half = self._expected(line_pose)
         try:
             return self._shown(sampler, line, half, _SEARCH.motion, onward=True)
