@@ -186,7 +186,8 @@ def _sampled(scenes: list[Axes], padded: tuple[int, ...], dtype: torch.dtype) ->
         ]
         return math.hypot(math.sqrt(sum(energies)), _rounding(axes, (True, True), dtype))
 
-    return _fft_candidate("angular spectrum", (True, True), (padded[0], padded[1]), False, scenes, predict, dtype)
+    sampled, costs = (True, True), _fft_costs(padded, dtype)
+    return Candidate("angular spectrum", sampled, (padded[0], padded[1]), False, scenes, predict, *costs)
 
 
 def _cropped(scenes: list[Axes], sampled: tuple[bool, bool], crop_pad: float | None, dtype: torch.dtype) -> Candidate:
@@ -229,7 +230,7 @@ def _cropped(scenes: list[Axes], sampled: tuple[bool, bool], crop_pad: float | N
         return math.sqrt(sum(energies))
 
     method = ("Fresnel" if crop_pad is None else "cropped kernel") + (", one axis sampled" if any(sampled) else "")
-    return _fft_candidate(method, sampled, lengths, crop_pad is None, scenes, predict, dtype)
+    return Candidate(method, sampled, lengths, crop_pad is None, scenes, predict, *_fft_costs(lengths, dtype))
 
 
 def _resampled(planes: PlanePair, scenes: list[Axes], dtype: torch.dtype, tails: float | None) -> Candidate:
@@ -292,17 +293,10 @@ def _transforms(samples: int) -> float:
     return 10 * samples * math.log2(max(2, samples)) + 6 * samples
 
 
-def _fft_candidate(
-    method: str,
-    sampled: tuple[bool, bool],
-    padded: tuple[int, int],
-    paraxial: bool,
-    scenes: list[Axes],
-    predict: Callable[[Axes], float],
-    dtype: torch.dtype,
-) -> Candidate:
-    flops, memory = _transforms(math.prod(padded)), 4 * math.prod(padded) * dtype.itemsize
-    return Candidate(method, sampled, padded, paraxial, scenes, predict, flops, memory, flops)
+def _fft_costs(padded: tuple[int, ...], dtype: torch.dtype) -> tuple[float, int, float]:
+    """``flops``, ``memory`` and ``cost`` of a candidate that filters a padded field."""
+    flops = _transforms(math.prod(padded))
+    return flops, 4 * math.prod(padded) * dtype.itemsize, flops
 
 
 def _paraxial(axes: Axes) -> float:

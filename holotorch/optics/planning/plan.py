@@ -64,6 +64,13 @@ def plan_from(
             "allowed; propagate tiles of the source, each padded to the whole window, and add their results, or use a "
             "coarser grid"
         )
+    if second is None:
+        runner_up = "no other way was considered"
+    elif second.cost > best.cost:
+        ratio = second.cost / max(best.cost, 1)
+        runner_up = f"{second.label} lost by its cost, {ratio:.2f} times as much arithmetic"
+    else:
+        runner_up = f"{second.label} lost by its predicted error of {second.error:.1e}"
     adequate = best.error <= tolerance
     verdict = "the cheapest adequate" if adequate else "the most accurate, though not adequate,"
     reason = (
@@ -73,7 +80,7 @@ def plan_from(
     pad = best.padded[0] / planes.grid.shape[0], best.padded[1] / planes.grid.shape[1]
     precision, window = str(dtype).removeprefix("torch."), (planes.out.shape, planes.out.pitch, planes.offset)
     costs = best.error, best.memory, best.flops
-    return Plan(best.method, pad, best.padded, precision, window, *costs, reason, _rejection(best, second), adequate)
+    return Plan(best.method, pad, best.padded, precision, window, *costs, reason, runner_up, adequate)
 
 
 def choose(options: list[Candidate], tolerance: float) -> tuple[Candidate, Candidate | None]:
@@ -88,13 +95,3 @@ def choose(options: list[Candidate], tolerance: float) -> tuple[Candidate, Candi
         ranked.sort(key=lambda candidate: candidate.error)
     best = ranked.pop(index)
     return best, ranked[max(index - 1, 0)] if ranked else None
-
-
-def _rejection(best: Candidate, second: Candidate | None) -> str:
-    """One sentence on why the runner-up was not chosen."""
-    if second is None:
-        return "no other way was considered"
-    if second.cost > best.cost:
-        ratio = second.cost / max(best.cost, 1)
-        return f"{second.label} lost by its cost, {ratio:.2f} times as much arithmetic"
-    return f"{second.label} lost by its predicted error of {second.error:.1e}"

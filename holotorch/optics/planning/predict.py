@@ -143,25 +143,21 @@ class AxisContent:
         return lost / max(total, 1e-300)
 
     def _exact_slices(self, other: "AxisContent") -> Tensor | None:
-        """:meth:`_long_slices`, computed once, since the other axis is always the same."""
-        if not self._exact:
-            self._exact.append(self._long_slices(other))
-        return self._exact[0]
-
-    def _long_slices(self, other: "AxisContent") -> Tensor | None:
-        """Taps [K, n + m - 1] of the slices, without wrapping; None if the transform would be too long."""
-        padded = _LONGER * (self.size + self.window)
+        """Taps [K, n + m - 1] of the slices without wrapping, cached; None if the transform would be too long."""
+        if self._exact:
+            return self._exact[0]
+        padded, exact = _LONGER * (self.size + self.window), None
         if not any(self.tilt):
             # 4 times longer, because the transfer function is singular where waves become evanescent.
-            return self._slices(4 * padded, other, math.inf)
-        padded = good_length(max(padded, 2 * self._spread(other)), odd=True)
-        if padded > _LONGEST:
-            return None
-        # Each slice is shifted so that its phase is equal at both ends of the band, which adjoin in the DFT.
-        wavelength, distance, tilt = self._scene
-        ends = torch.tensor((self.nyquist, -self.nyquist), dtype=torch.float64)
-        cycles = tilted_turns(ends, other.slices, wavelength, distance, tilt, squares=False)
-        return self._levelled(padded, other, (cycles[:, :1] - cycles[:, 1:]) / (2 * self.nyquist))
+            exact = self._slices(4 * padded, other, math.inf)
+        elif (padded := good_length(max(padded, 2 * self._spread(other)), odd=True)) <= _LONGEST:
+            # Each slice is shifted so that its phase is equal at both ends of the band, which adjoin in the DFT.
+            wavelength, distance, tilt = self._scene
+            ends = torch.tensor((self.nyquist, -self.nyquist), dtype=torch.float64)
+            cycles = tilted_turns(ends, other.slices, wavelength, distance, tilt, squares=False)
+            exact = self._levelled(padded, other, (cycles[:, :1] - cycles[:, 1:]) / (2 * self.nyquist))
+        self._exact.append(exact)
+        return exact
 
     def _levelled(self, padded: int, other: "AxisContent", shift: Tensor) -> Tensor:
         """Taps [K, n + m - 1]: Fresnel taps moved by ``shift`` [K, 1] metres, times the factor beyond Fresnel."""

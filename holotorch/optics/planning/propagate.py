@@ -85,7 +85,9 @@ def propagate(
     the result on grids of s times the pitch, because scaling all lengths changes nothing.
     """
     checks.field("field", field, grid.shape)
-    norms = None if torch.compiler.is_compiling() else _finite_norms(field)
+    norms = None if torch.compiler.is_compiling() else _norms(field)
+    if norms is not None and not bool(torch.isfinite(norms).all()):  # also if squares of finite elements overflow
+        checks.all_finite("field", torch.view_as_real(field.detach().resolve_conj()))
     wavelengths, distances = _float64(WAVELENGTH, wavelength, field), _float64(DISTANCE, distance, field)
     checks.precise(wavelength, distance)
     every_wavelength, every_distance = (each.detach().reshape(-1).tolist() for each in (wavelengths, distances))
@@ -132,13 +134,9 @@ def _propagate_by(
 
 
 def _one_by_one(
-    field: Tensor,
-    wavelengths: Tensor,
-    distances: Tensor,
-    shape: tuple[int, int],
-    apply: Callable[[Tensor, Tensor, Tensor], Tensor],
+    field: Tensor, wavelengths: Tensor, distances: Tensor, shape: tuple[int, int], apply: Callable[..., Tensor]
 ) -> Tensor:
-    """``apply`` for each wavelength and distance in turn, since all kernels together would not fit into memory."""
+    """``apply(field, wavelength, distance)`` for each pair in turn, since all kernels together need too much memory."""
     wavelengths, distances = torch.broadcast_tensors(wavelengths, distances)
     batch = torch.broadcast_shapes(wavelengths.shape, field.shape[:-2])
     if wavelengths.numel() == 1:
@@ -236,15 +234,8 @@ def _best(options: list[Candidate], tolerance: float) -> Candidate:
 
 
 def _norms(field: Tensor) -> Tensor:
+    """L2 norms [...] of ``field`` [..., H, W]."""
     return torch.linalg.vector_norm(torch.view_as_real(field.detach().resolve_conj()), dim=(-3, -2, -1))
-
-
-def _finite_norms(field: Tensor) -> Tensor:
-    """L2 norms [...] of ``field`` [..., H, W]; ValueError for elements that are not finite."""
-    norms = _norms(field)
-    if not bool(torch.isfinite(norms).all()):  # also if squares of finite elements overflow
-        checks.all_finite("field", torch.view_as_real(field.detach().resolve_conj()))
-    return norms
 
 
 def _warn_if_dim(

@@ -161,16 +161,11 @@ def smallest_spot(wavelength: float, distance: float, section: float) -> float:
 def vignetting(height: float, first: float, second: float, pupil_radius: float, sine: float) -> float:
     """Width of the light of a point within the pupil, divided by the width of the pupil, along one axis: 0 to 1.
 
-    On the pupil's plane the light of a point at height y covers A y +- B sine. With the eye at the focal point of the
+    On the pupil's plane the light of a point at height y covers A y +- B sine. ``first`` and ``second`` are A and B (in
+    metres) of the ray matrix from the point's plane to the pupil (``Display.matrix``); ``sine`` is the largest slope of
+    the light, wavelength / (2 pitch) in regions 1 and 2 (:func:`region`). With the eye at the focal point of the
     eyepiece A is 0, and every height loses the same light. Diffraction is neglected: in the display of the thesis,
     0.5 % of the light arrives where all rays miss the pupil.
-
-    Args:
-        height: Distance y of the point from the axis, in metres.
-        first: A of the ray matrix from the point's plane to the pupil (``Display.matrix``).
-        second: B of that matrix, in metres.
-        pupil_radius: In metres.
-        sine: Largest slope of the light, wavelength / (2 pitch) in regions 1 and 2 (:func:`region`).
     """
     checks.quantity(OFFSET, height, "height")
     checks.finite("first", first)

@@ -14,16 +14,10 @@ from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import intensity
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import WIDTH
+from holotorch.optics.viewing import imaging
 from holotorch.optics.viewing.display import Display, Length, inverse, number
 from holotorch.optics.viewing.elementwise import ElementSampling, least_oversampling, propagate_elements
 from holotorch.optics.viewing.eye import Eye
-from holotorch.optics.viewing.imaging import (
-    CollapseSampling,
-    collapse_sampling,
-    propagate_collapsed,
-    pupil_bands,
-    retinal_scale,
-)
 
 # Relative error of sampling the hard edge of a pupil, times the number of samples across its diameter. Measured by the
 # collapse: 1.1 to 3.2 for points (1360 samples) and 0.6 to 3.4 for noise (42 to 55 samples); measured by
@@ -50,7 +44,7 @@ class RetinaPlan:
     """
 
     method: str
-    sampling: CollapseSampling | ElementSampling
+    sampling: imaging.CollapseSampling | ElementSampling
     predicted_error: float
     memory_bytes: int
     flops: float
@@ -103,14 +97,14 @@ def plan_retina(
     diameter = 2 * number(eye.pupil_radius)
     options, impossible = [], ""
     try:
-        collapse = collapse_sampling(grid, wavelengths, display, eye, plane)
+        collapse = imaging.collapse_sampling(grid, wavelengths, display, eye, plane)
         errors = [
             collapse_error(grid, w, display, eye, plane, heights, paraxial=paraxial, registered=registered)
             for w in wavelengths
         ]
         spot = max(wavelengths) * (abs(number(display.matrix(plane)[1])) / diameter)
         edge = _EDGE_ERROR * max(spot / (n * p) for n, p in zip(collapse.window, grid.pitch, strict=True) if n > 1)
-        bands = max(math.prod(pupil_bands(grid, w, display, eye, plane)) for w in wavelengths)
+        bands = max(math.prod(imaging.pupil_bands(grid, w, display, eye, plane)) for w in wavelengths)
         memory = collapse.memory_bytes(bands * math.prod(collapse.window), dtype.itemsize)
         options.append(_option("collapse", collapse, math.hypot(max(errors), edge), memory, tolerance))
     except ValueError as error:
@@ -140,7 +134,7 @@ def plan_retina(
 
 
 def _option(
-    method: str, sampling: CollapseSampling | ElementSampling, error: float, memory: int, tolerance: float
+    method: str, sampling: imaging.CollapseSampling | ElementSampling, error: float, memory: int, tolerance: float
 ) -> RetinaPlan:
     """Plan for one method, with its error and cost as the reason."""
     reason = f"{method}: error {error:.2g}, {sampling.flops:.2g} operations, {memory:.2g} bytes"
@@ -247,11 +241,12 @@ class Retina(nn.Module):
     @property
     def scale(self) -> Length:
         """Metres on the retina per metre in the object plane, negative."""
-        return retinal_scale(self.display, self.eye, self.plane)
+        return imaging.retinal_scale(self.display, self.eye, self.plane)
 
     def field(self, field: Tensor) -> Tensor:
         """Complex field on the retina, [..., C, H, W], scaled as by :func:`propagate_collapsed`."""
-        propagate: Callable[..., Tensor] = propagate_collapsed if self.plan.method == "collapse" else propagate_elements
+        collapse = self.plan.method == "collapse"
+        propagate: Callable[..., Tensor] = imaging.propagate_collapsed if collapse else propagate_elements
         setup = self.grid, self.wavelengths, self.display, self.eye
         return propagate(field, *setup, plane=self.plane, paraxial=self.paraxial, sampling=self.plan.sampling)
 

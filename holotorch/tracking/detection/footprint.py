@@ -1,7 +1,7 @@
 """Image of a catheter at a given pose: the width of the tube along its image line, and the bulge of its rings.
 
-A ring is the circle around the tube at a band edge. Only its front is visible, displaced from the image of its centre by
-the bulge.
+A ring is the circle around the tube at a band edge. Only its front is visible. The bulge is the distance of this front
+from the image of the ring's centre.
 """
 
 import math
