@@ -87,10 +87,9 @@ def fit_axis(
 ) -> AxisFit:
     """Fit the two straight sides of the tube to all stations at once.
 
-    The model of a station is a blurred box with a free background level on either side. The light of the tube in each
-    band is a sum of four shadings across the tube: constant, linear, round (Lambert's law), and cubic (a partial
-    shadow). Their amplitudes have priors relative to the light of the band, so that the covariance includes the
-    uncertainty of shadings that the samples do not determine.
+    The model of a station is a blurred box with a free background level on either side. The light of each band is a sum
+    of four shadings across the tube: constant, linear, round (Lambert's law), and cubic (a partial shadow). Priors of
+    their amplitudes make the covariance include the uncertainty of shadings that the samples do not determine.
 
     Args:
         light: [S, U] samples across the tube, U odd, of one channel or a linear combination of channels.
@@ -98,8 +97,7 @@ def fit_axis(
         t: [S] positions of the stations along the tube, in samples.
         band: [S] index of the band of each station, from 0.
         level: [bands] light of each band, in the units of ``light``.
-        bright: [bands] light of each band if the channels are combined with absolute weights, which scales the priors
-            of the shadings.
+        bright: [bands] ``level`` if channels are combined with absolute weights; it scales the priors of the shadings.
         width: Expected width of the tube at t = 0 in samples, and its taper per sample.
         blur: Initial standard deviation of the blur, in samples.
         known: Relative standard deviation of the expected width and taper; a smaller one gives a more precise middle.
