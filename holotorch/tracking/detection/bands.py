@@ -102,13 +102,10 @@ def find_stretches(
     Dynamic programming (:func:`_sweep`) finds the best division of the line into "before, band 1, ..., band n, after",
     in both directions. Hidden parts of the line cost little, so that a finger across a band does not divide the band.
 
-    Args:
-        labels: [T, R] colour labels at T positions in the R central rows of the line.
-        drape: [T] whether the surroundings have the same colour, so that the labels do not identify a band.
-        through: [T] whether the surroundings are visible through a transparent part of the tube.
-        table: Labels of colours.
-        middle: Index of the position t = 0.
-        onward: Whether the tip is known to lie towards smaller t; only this direction is then considered.
+    ``labels`` [T, R] are those at T positions in the R central rows of the line, and ``middle`` is the index of t = 0.
+    ``drape`` [T] is True where the surroundings have the same colour, so that the labels do not identify a band, and
+    ``through`` [T] where the surroundings are visible through a transparent part of the tube. ``onward`` states that
+    the tip is known to lie towards smaller t; only this direction is then considered.
     """
     raw = _shares(labels, table)  # [C, T]
     share = raw * ~drape

@@ -85,12 +85,9 @@ class Front:
         return Front(bulge[..., 0] / change[..., 0], change, bulge)
 
     def shift(self, steps: np.ndarray, told: np.ndarray, row: np.ndarray) -> np.ndarray:
-        """Average over the rows of the bulge minus ``mean`` [E], from the steps of light at the edges.
+        """Average [E] over the rows of the bulge minus ``mean``, from the ``steps`` of light [E, U, C] at the edges.
 
-        Args:
-            steps: [E, U, C] steps of light at the edges.
-            told: [E, U, C] inverse variance of the position from a step of 1 in each row and channel.
-            row: [E, U] weights of the rows.
+        ``told`` [E, U, C] are the inverse variances of the position from a step of 1, ``row`` [E, U] weights of rows.
         """
         known = (row[:, None] * (told > 0).swapaxes(1, 2))[..., None]
         weighed = (self.change[:, None] * known).swapaxes(2, 3)  # [E, C, K, U]

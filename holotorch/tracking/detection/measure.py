@@ -99,17 +99,11 @@ def find_bands(
     *,
     onward: bool,
 ) -> tuple[Line, Stretches]:
-    """Search a strip around a line for the tube, and the line of the tube for its bands.
+    """Search a strip around ``line`` for the tube, and the line of the tube for its bands.
 
-    Args:
-        sampler: Reads the frame.
-        lens: Distortion of the camera.
-        line: Axis of the strip.
-        table: Labels of colours.
-        half: Half of the length of the strip, in pixels.
-        aside: Half of the width of the strip, in pixels.
-        reach: Largest slope of the tube relative to ``line``.
-        onward: Whether t on ``line`` is known to rise from the tip to the rear.
+    The strip extends ``half`` pixels from t = 0 in both directions along the line, and ``aside`` pixels to both sides.
+    ``reach`` is the largest slope of the tube relative to the line. ``onward`` states that t on the line is known to
+    rise from the tip to the rear.
 
     Returns:
         Line along the tube, on which t rises from the tip to the rear, and the bands on this line.
@@ -179,15 +173,9 @@ def measure_edges(
     """Measure the positions of the band edges along the axis.
 
     An edge is omitted if it is hidden (the background beside it changes, too), unclear, or close to the frame's border.
-
-    Args:
-        sampler: Reads the frame.
-        lens: Distortion of the camera.
-        axis: Axis and width of the tube's image.
-        guess: [N] expected positions in pixels; NaN for edges to omit.
-        doubtful: Whether each edge may belong to an object that lies across the tube.
-        blur: Expected blur in pixels.
-        curve: [N] bulge of each ring's front along t, in pixels.
+    ``guess`` [N] are the expected positions in pixels, NaN for edges to omit; ``doubtful`` whether each edge may belong
+    to an object that lies across the tube; ``blur`` the expected blur in pixels; and ``curve`` [N] the bulge of each
+    ring's front along t, in pixels.
 
     Raises:
         Refusal: INCONSISTENT if all edges continue beside the tube.

@@ -154,12 +154,9 @@ def measure_axis(
 ) -> Axis:
     """Axis and width from stations.
 
-    Args:
-        stations: Samples to fit.
-        width: Expected width at t = 0 in pixels, and taper per pixel.
-        known: Relative standard deviation of the expected width.
-        blur: Initial standard deviation of the blur, in pixels.
-        before: Earlier axis of the same stations, whose fit gives the initial values.
+    ``width`` is the expected width at t = 0 in pixels and the taper per pixel, with the relative standard deviation
+    ``known``; ``blur`` the initial standard deviation of the blur in pixels. The fit of ``before``, an earlier axis of
+    the same stations, gives the other initial values.
 
     Raises:
         Refusal: NO_AXIS if the sides are unclear or bent, or on one side only; TOO_NARROW for a narrow tube.
@@ -186,14 +183,9 @@ def measure_width(
 ) -> tuple[Stations, Axis, Axis]:
     """Stations, axis with the expected width, and a second axis with an independently measured width, for checks.
 
-    If the tube extends beyond the stations, they are sampled again, before and after the measurement of its width.
-
-    Args:
-        look: Samples stations for a width and a blur in pixels.
-        stations: Stations that gave ``axis``.
-        axis: Axis with the expected width.
-        wide: Expected width at t = 0 in pixels, and taper per pixel.
-        known: Relative standard deviation of the expected width.
+    ``stations`` gave ``axis`` with the expected width ``wide`` (pixels at t = 0, taper per pixel) of relative standard
+    deviation ``known``. If the tube extends beyond them, ``look`` samples stations again for a width and a blur in
+    pixels, before and after the measurement of the width.
 
     Raises:
         Refusal: As :func:`look_across` and :func:`measure_axis`.
