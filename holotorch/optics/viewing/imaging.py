@@ -233,8 +233,8 @@ def _image(
         kernel = angular_spectrum_kernel(padded, wavelength, display.lens_distance, band_limit=False)
         kernel = kernel * fresnel_kernel(padded, wavelength, display.lens_distance - plane).conj()
     if all(p >= n + w or n == 1 for p, n, w in zip(sizes.padded, grid.shape, sizes.window, strict=True)):
-        ey, ex = ((n + w) / 2 * p for n, w, p in zip(grid.shape, sizes.window, grid.pitch, strict=True))
-        kernel = kernel * window_taper(padded, wavelength, number(plane), (ey, ex), paraxial=paraxial)
+        half_y, half_x = ((n + w) / 2 * p for n, w, p in zip(grid.shape, sizes.window, grid.pitch, strict=True))
+        kernel = kernel * window_taper(padded, wavelength, number(plane), (half_y, half_x), paraxial=paraxial)
     kernel = (kernel * carrier(wavelength, plane)).to(field.device, field.dtype)
     light = zoomed(field, kernel, chirps(grid, padded, fine, (0.0, 0.0), field.device))
     y, x = fine.coordinates(field.device)
