@@ -1,7 +1,7 @@
 """Every method of propagation, with its predicted error and its cost.
 
-The factor beyond Fresnel is the exact transfer function divided by Fresnel's. The taps of a method are the samples of
-its impulse response.
+The factor beyond Fresnel is the exact transfer function divided by Fresnel's, both without the factor exp(ikz). The
+taps of a method are the samples of its impulse response.
 """
 
 import itertools
@@ -19,12 +19,14 @@ from holotorch.optics.free_space.plane_pair import PlanePair, shifts
 from holotorch.optics.planning.content import FieldContent
 from holotorch.optics.planning.predict import AxisContent, rms_beyond_fresnel
 
-# Padding factors of a sampled transfer function that are tried, and those tried for steep, tilted or displaced light.
-_PADS = (1.0, 1.03125, 1.0625, 1.125, 1.25, 1.5)
-_WIDE_PADS = (2.0, 3.0, 4.0, 6.0, 8.0)
-_CROP_PADS = (2.0, CROP_PAD)  # values of ``pad`` in crop_length
-_TAILS = (0.125, 0.5, 1.5)  # values of ``tails`` in resampled_padding
+ZOOMED = "angular spectrum, zoomed"  # method that reads the result on another grid by chirp-z transforms
+_PADS = (1.0, 1.03125, 1.0625, 1.125, 1.25, 1.5)  # padding factors of a sampled transfer function that are tried
+_WIDE_PADS = (2.0, 3.0, 4.0, 6.0, 8.0)  # further padding factors for steep, tilted or displaced light
+_CROP_PADS = (2.0, CROP_PAD)  # values of ``pad`` in crop_length that are tried
+_TAILS = (0.125, 0.5, 1.5)  # values of ``tails`` in resampled_padding that are tried
 _PRODUCT_SPEED = 4.0  # operations of a dense product in the time of one operation of an FFT
+
+Axes = tuple[AxisContent, AxisContent]  # (y, x) at one distance
 
 
 @dataclass(frozen=True)
@@ -37,31 +39,36 @@ class Candidate:
             is sampled in space and cropped to the displacements between source and window.
         padded: Samples (y, x) of the transforms.
         paraxial: Whether the factor beyond Fresnel is neglected.
-        predict: Computes the expected relative L2 error.
-        captured: Computes the fraction of the energy that is expected to arrive in the window; the smallest one of
-            several wavelengths and distances.
+        scenes: Light of both axes at each distance that bounds the error, at the longest wavelength.
+        predict: Computes the expected relative L2 error of one of the ``scenes``.
         flops: Floating-point operations of one call.
         memory: Largest extra memory of one call, in bytes.
-        cost: Rank of the candidate: ``flops``, with dense products weighted by their speed.
+        cost: ``flops``, with the operations of dense products divided by their relative speed.
     """
 
     method: str
     sampled: tuple[bool, bool]
     padded: tuple[int, int]
     paraxial: bool
-    predict: Callable[[], float]
-    captured: Callable[[], float]
+    scenes: list[Axes]
+    predict: Callable[[Axes], float]
     flops: float
     memory: int
     cost: float
 
+    @property
+    def label(self) -> str:
+        """Method and samples, for messages."""
+        return f"{self.method} on {self.padded[0]} x {self.padded[1]} samples"
+
     @cached_property
     def error(self) -> float:
-        """Expected relative L2 error."""
-        return self.predict()
+        """Expected relative L2 error, the largest one of the scenes."""
+        return max(map(self.predict, self.scenes))
 
-
-Axes = tuple[AxisContent, AxisContent]
+    def captured(self) -> float:
+        """Product over both axes of :attr:`AxisContent.captured`, the smallest one of the scenes."""
+        return min(math.prod(axis.captured for axis in axes) for axes in self.scenes)
 
 
 def candidates(
@@ -74,57 +81,51 @@ def candidates(
     """Every method for ``planes``; the error of each is the largest one over the wavelengths and distances."""
     if dtype not in (torch.complex64, torch.complex128):
         raise TypeError(f"dtype must be complex64 or complex128, got {dtype}")
-    longest, farthest = max(wavelengths), max(distances, key=abs)
+    longest = max(wavelengths)
     scenes = [_axes(planes, longest, distance, content) for distance in _extremes(planes, distances)]
     options = [_identity(scenes)] if planes.straight else []
-    if farthest == 0 and planes.straight:
+    if planes.straight and not any(distances):
         return options
-    wide = min(planes.grid.pitch) < FINEST * longest
+    wide, tilted = min(planes.grid.pitch) < FINEST * longest, any(planes.tilt)
     if not planes.same_pitch:
         dense = [] if wide else [_resampled(planes, scenes, dtype, tails) for tails in (None, *_TAILS)]
         pairs = zip(*(_lengths(axis, _PADS + _WIDE_PADS) for axis in scenes[0]), strict=False)
         return dense + [_zoomed(planes, scenes, pair, dtype) for pair in pairs]
     symmetric = scenes[0][0] is scenes[0][1]
-    tilted = any(planes.tilt)
     pads = _PADS + (_WIDE_PADS if wide or tilted or planes.out != planes.grid else ())
     lengths = [_lengths(axis, pads) for axis in scenes[0]]
     pairs = zip(*lengths, strict=False) if symmetric or wide or tilted else itertools.product(*lengths)
     options += [_sampled(scenes, pair, dtype) for pair in pairs]
     if wide:
         return options
-    sampled_axes = (
-        [(False, False)]
-        if symmetric or tilted or planes.out != planes.grid
-        else [(False, False), (True, False), (False, True)]
-    )
+    mixed = [] if symmetric or tilted or planes.out != planes.grid else [(True, False), (False, True)]
     crop_pads = [*_CROP_PADS, 3.0, 4.0] if tilted else [None, *_CROP_PADS]
     return options + [
-        _cropped(scenes, sampled_axis, crop_pad, dtype) for sampled_axis in sampled_axes for crop_pad in crop_pads
+        _cropped(scenes, sampled, crop_pad, dtype) for sampled in [(False, False), *mixed] for crop_pad in crop_pads
     ]
 
 
 def _extremes(planes: PlanePair, distances: Sequence[float]) -> list[float]:
-    """Distances that bound the error: the longest one, or both ends of the range if the result is displaced."""
+    """Distances that bound the error: the longest one, or both ends of the range if ``planes`` is not straight."""
     if planes.straight:
         return [max(map(abs, distances)) or 1e-12]
     return list(dict.fromkeys(z or 1e-12 for z in (min(distances), max(distances))))
 
 
 def _axes(planes: PlanePair, wavelength: float, distance: float, content: FieldContent) -> Axes:
-    requested = planes
-    if not planes.same_pitch:
-        # The error is predicted for a window of the source's pitch that covers the result, one sample more on each
-        # side. Its samples are a quarter of a pitch off those of the source. Other positions would underestimate the
-        # error: on the source's samples the tails of the content are zero, and half-way between them the
-        # contributions of the two ends of the band cancel.
+    """Light of both axes for the prediction of errors in a window of the source's pitch."""
+    same_pitch = planes.same_pitch
+    if not same_pitch:
+        # The window covers the result and one sample more on each side. Its samples are a quarter of a pitch off those
+        # of the source. Other positions would underestimate the error: on the source's samples the tails of the content
+        # are zero, and half-way between them the contributions of the two ends of the band cancel.
         height, width = (
             math.ceil(extent / pitch) + 2 for extent, pitch in zip(planes.out.extent, planes.grid.pitch, strict=True)
         )
         planes = PlanePair(planes.grid, Grid((height, width), planes.grid.pitch), planes.offset, planes.tilt)
-    positions = shifts(
-        planes, torch.tensor(distance, dtype=torch.float64), torch.tensor(planes.tilt, dtype=torch.float64)
-    )
-    # Light that travels backward is the conjugate of light that travels forward in the mirrored direction.
+    geometry = (torch.tensor(value, dtype=torch.float64) for value in (distance, planes.tilt))
+    positions = [position.item() for position in shifts(planes, *geometry)]
+    # Light that travels backward is the conjugate of light that travels forward with the opposite tilt.
     backward = distance < 0
     signals = [each.conj() if backward else each for each in content.signals or ()]
     sines = [-sine if backward else sine for sine in planes.tilt]
@@ -137,39 +138,40 @@ def _axes(planes: PlanePair, wavelength: float, distance: float, content: FieldC
             abs(distance),
             content.margin[axis],
             planes.out.shape[axis],
-            positions[axis].item() if planes == requested else round(positions[axis].item()) + 0.25,
+            positions[axis] if same_pitch else round(positions[axis]) + 0.25,
             (sines[axis], sines[1 - axis]),
             signals[axis] if signals else None,
         )
         for axis in (0, 1)
     )
-    # Equal axes share one object, so that cached results are computed once.
+    # Equal axes share one object, so that its cached results are computed once.
     return (y, y) if y == x and content.signals is None else (y, x)
 
 
 def _lengths(axis: AxisContent, pads: tuple[float, ...]) -> list[int]:
+    """Different lengths of transforms for the padding factors ``pads``, in increasing order."""
     largest = max(axis.size, axis.window)
     lengths = (largest if pad == 1 else good_length(math.ceil(largest * pad)) for pad in pads)
     return list(dict.fromkeys(lengths))
 
 
 def _identity(scenes: list[Axes]) -> Candidate:
-    """The unchanged field, times the carrier."""
-    axes = y, x = max(scenes, key=lambda axes: axes[0].distance)
+    """The unchanged field, times exp(ikz)."""
 
-    def predict() -> float:
+    def predict(axes: Axes) -> float:
+        y, x = axes
         if y.distance <= 1e-12:
             return 0.0
         # Rms over the content of the phase pi lambda z f^2, the only change inside the window.
         square = y.moment(4) + x.moment(4) + 2 * y.moment(2) * x.moment(2)
         phase = min(math.pi * y.wavelength * y.distance * math.sqrt(square), 2.0)
-        if phase > 0.1:  # large enough to exclude this method without looking at the edges
+        if phase > 0.1:  # large enough to exclude this method without the error at the edges
             return phase
-        return max(phase, sum(math.sqrt(axis.standing()) for axis in axes))
+        return max(phase, sum(math.sqrt(axis.unchanged()) for axis in axes))
 
-    size = (y.size, x.size)
-    work = float(math.prod(size))
-    return Candidate("identity", (True, True), size, False, predict, lambda: 1.0, work, 0, work)
+    size = (scenes[0][0].size, scenes[0][1].size)
+    flops = float(math.prod(size))
+    return Candidate("identity", (True, True), size, False, scenes, predict, flops, 0, flops)
 
 
 def _sampled(scenes: list[Axes], padded: tuple[int, ...], dtype: torch.dtype) -> Candidate:
@@ -184,42 +186,40 @@ def _sampled(scenes: list[Axes], padded: tuple[int, ...], dtype: torch.dtype) ->
         ]
         return math.hypot(math.sqrt(sum(energies)), _rounding(axes, (True, True), dtype))
 
-    return _fft_candidate("angular spectrum", (True, True), (padded[0], padded[1]), False, scenes, predict, dtype)
+    sampled, costs = (True, True), _fft_costs(padded, dtype)
+    return Candidate("angular spectrum", sampled, (padded[0], padded[1]), False, scenes, predict, *costs)
 
 
-def _cropped(
-    scenes: list[Axes], sampled_axis: tuple[bool, bool], crop_pad: float | None, dtype: torch.dtype
-) -> Candidate:
-    """Cropped taps on the axes where ``sampled_axis`` is False.
+def _cropped(scenes: list[Axes], sampled: tuple[bool, bool], crop_pad: float | None, dtype: torch.dtype) -> Candidate:
+    """Cropped taps on the axes where ``sampled`` is False.
 
-    On the other axes the transfer function is sampled at the largest padding below 2. ``crop_pad`` is the padding for
-    the taps and the factor beyond Fresnel; if it is None, this factor is neglected.
+    On the other axes the transfer function is sampled at the largest one of ``_PADS``. ``crop_pad`` is the padding
+    (``pad`` in ``crop_length``) of the taps times the factor beyond Fresnel; if it is None, this factor is neglected.
     """
 
     def length(axis: int) -> int:
-        along = [axes[axis] for axes in scenes]
-        if sampled_axis[axis]:
-            return _lengths(along[0], _PADS)[-1]
-        return good_length(
-            along[0].size + along[0].window - 1
-            if crop_pad is None
-            else max(_crop_length(each, crop_pad) for each in along),
-            odd=any(along[0].tilt),
-        )
+        first = scenes[0][axis]
+        if sampled[axis]:
+            return _lengths(first, _PADS)[-1]
+        least = first.size + first.window - 1
+        if crop_pad is not None:
+            least = max(
+                crop_length(x.size, x.window, x.pitch, x.wavelength, x.distance, x.shift, crop_pad)
+                for x in (axes[axis] for axes in scenes)
+            )
+        return good_length(least, odd=any(first.tilt))
 
     lengths = length(0), length(1)
 
     def predict(axes: Axes) -> float:
         if any(axes[0].tilt):
-            # A measured field may have its light where both axes crop it. The sum of the errors of the two axes is then
-            # too small, so it is scaled up.
+            # A measured field may have its light at frequencies where both axes have errors. The sum of the errors of
+            # the two axes is then too small and is scaled up.
             mixing = 1 if axes[0].measured is None else 1 + sum(sine != 0 for sine in axes[0].tilt)
             taps = mixing * math.sqrt(_tilted_taps(axes, lengths, paraxial=False))
-            return math.hypot(_rounding(axes, sampled_axis, dtype), taps)
-        energies = [_rounding(axes, sampled_axis, dtype) ** 2, 0.0]
-        if crop_pad is None:
-            energies[1] = max(rms_beyond_fresnel(list(axes)) ** 2, sum(axis.paraxial() for axis in axes))
-        for axis, other, padded, keep in zip(axes, axes[::-1], lengths, sampled_axis, strict=True):
+            return math.hypot(_rounding(axes, sampled, dtype), taps)
+        energies = [_rounding(axes, sampled, dtype) ** 2, _paraxial(axes) if crop_pad is None else 0.0]
+        for axis, other, padded, keep in zip(axes, axes[::-1], lengths, sampled, strict=True):
             if keep:
                 energies.append(axis.wrapped(padded))
             elif crop_pad is not None and other is axis and len(energies) > 2:
@@ -229,8 +229,8 @@ def _cropped(
                 energies.append(axis.cropped(padded, math.sqrt(other.moment(2))))
         return math.sqrt(sum(energies))
 
-    method = ("Fresnel" if crop_pad is None else "cropped kernel") + (", one axis sampled" if any(sampled_axis) else "")
-    return _fft_candidate(method, sampled_axis, lengths, crop_pad is None, scenes, predict, dtype)
+    method = ("Fresnel" if crop_pad is None else "cropped kernel") + (", one axis sampled" if any(sampled) else "")
+    return Candidate(method, sampled, lengths, crop_pad is None, scenes, predict, *_fft_costs(lengths, dtype))
 
 
 def _resampled(planes: PlanePair, scenes: list[Axes], dtype: torch.dtype, tails: float | None) -> Candidate:
@@ -239,111 +239,74 @@ def _resampled(planes: PlanePair, scenes: list[Axes], dtype: torch.dtype, tails:
     The factor beyond Fresnel is applied first, by FFT on a grid padded for its ``tails`` (``resampled_padding``). If
     ``tails`` is None, this factor is neglected.
     """
-    height, width = planes.grid.shape
-    wavelength, farthest = scenes[0][0].wavelength, max(axes[0].distance for axes in scenes)
-    padded = planes.grid.shape if tails is None else resampled_padding(planes, wavelength, farthest, tails)
-    edges = (padded[0] - height) // 2, (padded[1] - width) // 2
+    (height, width), (out_height, out_width) = planes.grid.shape, planes.out.shape
+    wavelength, distance = scenes[0][0].wavelength, max(axes[0].distance for axes in scenes)
+    padded = planes.grid.shape if tails is None else resampled_padding(planes, wavelength, distance, tails)
     paraxial, tilted = tails is None, any(planes.tilt)
 
     def predict(axes: Axes) -> float:
-        error = _rounding(axes, (False, False), dtype) ** 2
+        energy = _rounding(axes, (False, False), dtype) ** 2
         pairs = list(zip(axes, axes[::-1], padded, strict=True))
         if tilted and paraxial:
-            return math.sqrt(error + _tilted_taps(axes, padded, paraxial=True))
-        if tilted:
-            return math.sqrt(error + sum(axis.resampled_slices(length, other) for axis, other, length in pairs))
-        if paraxial:
-            return math.sqrt(error + max(rms_beyond_fresnel(list(axes)) ** 2, sum(axis.paraxial() for axis in axes)))
-        for axis, other, length in pairs:
-            error += axis.resampled(length, math.sqrt(other.moment(2)))
-        return math.sqrt(error)
+            energy += _tilted_taps(axes, padded, paraxial=True)
+        elif tilted:
+            energy += sum(axis.resampled_slices(length, other) for axis, other, length in pairs)
+        elif paraxial:
+            energy += _paraxial(axes)
+        else:
+            for axis, other, length in pairs:
+                energy += axis.resampled(length, math.sqrt(other.moment(2)))
+        return math.sqrt(energy)
 
-    padded_height, padded_width = height + 2 * edges[0], width + 2 * edges[1]
-    products = 8.0 * planes.out.shape[0] * padded_width * (padded_height + planes.out.shape[1])
+    # The products use the source and an equal margin on both sides of it.
+    rows, columns = (n + 2 * ((p - n) // 2) for n, p in zip((height, width), padded, strict=True))
+    products = 8.0 * out_height * columns * (rows + out_width)
     transforms = 0.0 if paraxial else _transforms(math.prod(padded))
-    memory = dtype.itemsize * (
-        planes.out.shape[0] * (padded_height + padded_width)
-        + planes.out.shape[1] * padded_width
-        + 3 * math.prod(padded)
-        + math.prod(planes.out.shape)
-    )
-    method = "resampled Fresnel" if paraxial else "resampled kernel"
-    return Candidate(
-        method,
-        (False, False),
-        padded,
-        paraxial,
-        lambda: max(predict(axes) for axes in scenes),
-        lambda: _captured(scenes),
-        products + transforms,
-        memory,
-        products / _PRODUCT_SPEED + transforms,
-    )
+    samples = out_height * (rows + columns + out_width) + out_width * columns + 3 * math.prod(padded)
+    method, cost = "resampled Fresnel" if paraxial else "resampled kernel", products / _PRODUCT_SPEED + transforms
+    flops, memory = products + transforms, dtype.itemsize * samples
+    return Candidate(method, (False, False), padded, paraxial, scenes, predict, flops, memory, cost)
 
 
 def _zoomed(planes: PlanePair, scenes: list[Axes], padded: tuple[int, ...], dtype: torch.dtype) -> Candidate:
     """The sampled transfer function; a chirp-z transform evaluates the result at the points of the other grid."""
     candidate = _sampled(scenes, padded, dtype)
-    lines = 0.0
-    for size, count, number in zip(padded, planes.out.shape, (planes.out.shape[1], padded[0]), strict=True):
-        length = good_length(size + count - 1)
-        lines += 10 * number * length * math.log2(length)
-    flops = candidate.flops / 2 + lines
-    memory = candidate.memory + 2 * dtype.itemsize * max(padded[0], planes.out.shape[0]) * (
-        padded[1] + planes.out.shape[1]
-    )
-    return replace(candidate, method="angular spectrum, zoomed", flops=flops, cost=flops, memory=memory)
-
-
-def _crop_length(axis: AxisContent, crop_pad: float) -> int:
-    return crop_length(axis.size, axis.window, axis.pitch, axis.wavelength, axis.distance, axis.shift, crop_pad)
+    (rows, columns), (height, width) = padded, planes.out.shape
+    transforms = (width, good_length(rows + height - 1)), (rows, good_length(columns + width - 1))  # lines, samples
+    flops = candidate.flops / 2 + sum(10 * lines * n * math.log2(n) for lines, n in transforms)
+    memory = candidate.memory + 2 * dtype.itemsize * max(rows, height) * (columns + width)
+    return replace(candidate, method=ZOOMED, flops=flops, cost=flops, memory=memory)
 
 
 def _rounding(axes: Axes, sampled: tuple[bool, bool], dtype: torch.dtype) -> float:
     """Rounding error of the transforms, relative to the light that arrives in the window.
 
-    A sampled transfer function keeps all light on the padded grid, and its rounding is relative to all of it; cropped
-    taps keep only the light that arrives.
+    A sampled transfer function keeps all light on the padded grid, and its rounding error is relative to all light;
+    cropped taps keep only the light that arrives.
     """
-    left = math.prod(axis.captured for axis, keep in zip(axes, sampled, strict=True) if keep)
-    return 3 * torch.finfo(dtype).eps / math.sqrt(max(left, 1e-12))
+    arriving = math.prod(axis.captured for axis, keep in zip(axes, sampled, strict=True) if keep)
+    return 3 * torch.finfo(dtype).eps / math.sqrt(max(arriving, 1e-12))
 
 
 def _transforms(samples: int) -> float:
+    """Floating-point operations of a transform, a product with a kernel and the inverse transform."""
     return 10 * samples * math.log2(max(2, samples)) + 6 * samples
 
 
-def _fft_candidate(
-    method: str,
-    sampled: tuple[bool, bool],
-    padded: tuple[int, int],
-    paraxial: bool,
-    scenes: list[Axes],
-    predict: Callable[[Axes], float],
-    dtype: torch.dtype,
-) -> Candidate:
-    samples = math.prod(padded)
-    flops = _transforms(samples)
-    memory = 4 * samples * dtype.itemsize
-    return Candidate(
-        method,
-        sampled,
-        padded,
-        paraxial,
-        lambda: max(predict(axes) for axes in scenes),
-        lambda: _captured(scenes),
-        flops,
-        memory,
-        flops,
-    )
+def _fft_costs(padded: tuple[int, ...], dtype: torch.dtype) -> tuple[float, int, float]:
+    """``flops``, ``memory`` and ``cost`` of a candidate that filters a padded field."""
+    flops = _transforms(math.prod(padded))
+    return flops, 4 * math.prod(padded) * dtype.itemsize, flops
+
+
+def _paraxial(axes: Axes) -> float:
+    """Energy of the error of neglecting the factor beyond Fresnel."""
+    return max(rms_beyond_fresnel(axes) ** 2, sum(axis.paraxial() for axis in axes))
 
 
 def _tilted_taps(axes: Axes, lengths: tuple[int, ...], *, paraxial: bool) -> float:
+    """Sum over both axes of :meth:`AxisContent.tilted_taps` on transforms of ``lengths``."""
     return sum(
         axis.tilted_taps(length, other, paraxial=paraxial)
         for axis, other, length in zip(axes, axes[::-1], lengths, strict=True)
     )
-
-
-def _captured(scenes: list[Axes]) -> float:
-    return min(math.prod(axis.captured for axis in axes) for axes in scenes)

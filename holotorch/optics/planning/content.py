@@ -1,4 +1,4 @@
-"""FieldContent: the light that a plan must serve, as its user describes it or as measured from a field."""
+"""FieldContent: description of the light for which a propagation is planned, given or measured from a field."""
 
 import math
 from collections.abc import Sequence
@@ -11,17 +11,17 @@ from holotorch.core import checks
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import OFFSET, SPREAD
 
-_MIXTURES = 24  # random mixtures per axis; they estimate an energy to about a factor of 1.2
+_MIXTURES = 24  # random mixtures per axis; they estimate an energy within a factor of about 1.2
 
 
 @dataclass(frozen=True)
 class FieldContent:
-    """Band and edges of the light on a grid, and signals that represent the light if it was measured.
+    """Light on a grid, described by band and margin or represented by measured signals.
 
     Attributes:
         band: Highest frequencies (y, x), in cycles per metre.
-        margin: Widths (y, x) in metres over which the content fades smoothly to zero at both ends of each axis.
-        signals: Per axis (y, x) complex128 [K, samples]; None if tones that fill the band represent the content.
+        margin: Widths (y, x) in metres over which the light fades smoothly to zero at both ends of each axis.
+        signals: Per axis (y, x) complex128 [K, samples], or None for tones that fill the band.
     """
 
     band: tuple[float, float]
@@ -39,7 +39,7 @@ def field_content(
     margin: tuple[float, float] = (0.0, 0.0),
     field: Tensor | None = None,
 ) -> FieldContent:
-    """Content measured from ``field``, or without one described by ``band`` or ``spread``, and ``margin``.
+    """Content measured from ``field`` if given, else described by ``band`` or ``spread`` and by ``margin``.
 
     ``spread`` is the distance (y, x) in metres that the light travels sideways over the longest of ``distances``.
     Without ``band`` and ``spread`` the content fills the band of the grid.
@@ -47,10 +47,10 @@ def field_content(
     for width in margin:
         if checks.quantity(OFFSET, width, "margin") < 0:
             raise ValueError(f"margin must be at least 0 metres, got {width!r}")
-    nyquist = 0.5 / grid.pitch[0], 0.5 / grid.pitch[1]
     if band is not None and spread is not None:
         raise ValueError("describe the content by band= or by spread=, not by both")
-    limits = [math.inf, math.inf]
+    nyquist = 0.5 / grid.pitch[0], 0.5 / grid.pitch[1]
+    limits: Sequence[float] = nyquist
     if band is not None:
         limits = [checks.positive("band", limit, "cycles per metre") for limit in band]
     elif spread is not None:
@@ -60,14 +60,15 @@ def field_content(
     if field is not None:
         checks.field("field", field, grid.shape)
         return FieldContent(nyquist, signals=_mixtures(field, grid))
-    return FieldContent((min(limits[0], nyquist[0]), min(limits[1], nyquist[1])), margin)
+    y, x = map(min, limits, nyquist)
+    return FieldContent((y, x), margin)
 
 
 def _mixtures(field: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
-    """Random mixtures of the lines of ``field``, complex [..., H, W], along each axis (y, x), largest value 1.
+    """Random mixtures [K, samples] of the lines of ``field`` [..., H, W] along each axis (y, x), scaled to a peak of 1.
 
-    The energy that a filter of one axis passes has the same expectation for the mixtures as for the field, whatever
-    the field holds: beams, hard edges or noise. The seed is fixed, so that equal fields get equal plans.
+    The fraction of the energy that a filter along one axis transmits has the same expectation for the mixtures as for
+    the field. The seed is fixed, so that equal fields get equal plans.
     """
     lines = field.detach().reshape(-1, *grid.shape)
     generator = torch.Generator().manual_seed(0)

@@ -30,25 +30,12 @@ def plan_propagation(
     dtype: torch.dtype = torch.complex64,
     memory_limit: int | None = None,
 ) -> Plan:
-    """Choose how to propagate a field over ``distance``.
+    """Choose how to propagate a field over ``distance``, without propagating it.
 
-    Args:
-        grid: Sampling of the field.
-        wavelength: In metres. A plan for several wavelengths serves all of them.
-        distance: In metres, of either sign. A plan for several distances serves all of them.
-        tolerance: Largest accepted relative L2 error of the result.
-        band: Highest frequencies (y, x) of the content in cycles per metre; up to the grid's highest frequency by
-            default. The prediction is the expectation for noise that fills this band and the window; smoother content
-            has a smaller error.
-        spread: Alternative to ``band``: distance (y, x) in metres that the content travels sideways on its path.
-        margin: Widths (y, x) in metres over which the content fades smoothly to zero at both ends of each axis. By
-            default the window cuts the content off, and the edges diffract.
-        field: An example of the content, complex [..., H, W], which is measured and replaces the description.
-        out_grid: Sampling of the result; that of the field by default.
-        offset: Position (y, x) in metres of the axis of the result relative to the axis of the field.
-        tilt: Sines (y, x) of the direction of a carrier wave by which the field and the result are divided.
-        dtype: complex64 or complex128, of the field.
-        memory_limit: Refuse a plan that needs more bytes than this per channel.
+    The arguments have the meaning, units and defaults of those of ``propagate``, apart from these. A plan for several
+    wavelengths or distances serves all of them. ``field`` is an example of the content, complex [..., H, W], which is
+    measured and replaces the description by ``band``, ``spread`` and ``margin``. ``dtype``, complex64 or complex128,
+    is that of the fields to propagate. A plan that needs more than ``memory_limit`` bytes per channel is refused.
 
     Raises:
         ValueError: An argument outside its range, or a plan that needs more than ``memory_limit``; the message says
@@ -71,54 +58,40 @@ def plan_from(
 ) -> Plan:
     """The plan for the best of the candidates ``options``."""
     best, second = choose(options, checks.positive("tolerance", tolerance))
-    adequate = best.error <= tolerance
-    size = f"{best.padded[0]} x {best.padded[1]} samples"
     if memory_limit is not None and best.memory > memory_limit:
         raise ValueError(
-            f"{best.method} on {size} needs {best.memory / 1e9:.3g} GB per channel, more than the "
-            f"{memory_limit / 1e9:.3g} GB allowed; propagate tiles of the source, each padded to the whole window, and "
-            "add their results, or use a coarser grid"
+            f"{best.label} needs {best.memory / 1e9:.3g} GB per channel, more than the {memory_limit / 1e9:.3g} GB "
+            "allowed; propagate tiles of the source, each padded to the whole window, and add their results, or use a "
+            "coarser grid"
         )
+    if second is None:
+        runner_up = "no other way was considered"
+    elif second.cost > best.cost:
+        ratio = second.cost / max(best.cost, 1)
+        runner_up = f"{second.label} lost by its cost, {ratio:.2f} times as much arithmetic"
+    else:
+        runner_up = f"{second.label} lost by its predicted error of {second.error:.1e}"
+    adequate = best.error <= tolerance
     verdict = "the cheapest adequate" if adequate else "the most accurate, though not adequate,"
     reason = (
-        f"{best.method} on {size} is {verdict} of {len(options)} ways: predicted error {best.error:.1e} for a "
-        f"tolerance of {tolerance:.1e}"
+        f"{best.label} is {verdict} of {len(options)} ways: predicted error {best.error:.1e} for a tolerance of "
+        f"{tolerance:.1e}"
     )
     pad = best.padded[0] / planes.grid.shape[0], best.padded[1] / planes.grid.shape[1]
     precision, window = str(dtype).removeprefix("torch."), (planes.out.shape, planes.out.pitch, planes.offset)
-    return Plan(
-        best.method,
-        pad,
-        best.padded,
-        precision,
-        window,
-        best.error,
-        best.memory,
-        best.flops,
-        reason,
-        _rejection(best, second),
-        adequate,
-    )
+    costs = best.error, best.memory, best.flops
+    return Plan(best.method, pad, best.padded, precision, window, *costs, reason, runner_up, adequate)
 
 
 def choose(options: list[Candidate], tolerance: float) -> tuple[Candidate, Candidate | None]:
-    """The cheapest adequate candidate, or else the most accurate one, and the runner-up.
+    """The cheapest candidate within the tolerance, or else the most accurate one, and the runner-up.
 
-    Errors are computed in the order of cost, and only up to the first adequate candidate.
+    Errors are computed in the order of cost, and only up to the first candidate within the tolerance.
     """
     ranked = sorted(options, key=lambda candidate: (candidate.cost, not candidate.paraxial))
-    for i, candidate in enumerate(ranked):
-        if candidate.error <= tolerance:
-            return candidate, ranked[i - 1] if i else ranked[1] if len(ranked) > 1 else None
-    ranked.sort(key=lambda candidate: candidate.error)
-    return ranked[0], ranked[1] if len(ranked) > 1 else None
-
-
-def _rejection(best: Candidate, second: Candidate | None) -> str:
-    """One sentence on why the runner-up was not chosen."""
-    if second is None:
-        return "no other way was considered"
-    name = f"{second.method} on {second.padded[0]} x {second.padded[1]} samples"
-    if second.cost > best.cost:
-        return f"{name} lost by its cost, {second.cost / max(best.cost, 1):.2f} times as much arithmetic"
-    return f"{name} lost by its predicted error of {second.error:.1e}"
+    index = next((i for i, candidate in enumerate(ranked) if candidate.error <= tolerance), None)
+    if index is None:
+        index = 0
+        ranked.sort(key=lambda candidate: candidate.error)
+    best = ranked.pop(index)
+    return best, ranked[max(index - 1, 0)] if ranked else None

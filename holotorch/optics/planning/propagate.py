@@ -1,4 +1,4 @@
-"""propagate and Propagator: propagation by the method and padding that a plan chooses."""
+"""propagate and Propagator: propagation by the cheapest method and padding with a small enough predicted error."""
 
 import math
 import warnings
@@ -20,16 +20,13 @@ from holotorch.optics.free_space.propagators import SpectralFilter
 from holotorch.optics.free_space.resampled import ResampledKernel, resample, resampling_factors
 from holotorch.optics.free_space.transfer import transfer_function, wide_transfer_function
 from holotorch.optics.free_space.zoomed import ZoomedFilter, chirps, zoomed
-from holotorch.optics.planning.candidates import Candidate, candidates
+from holotorch.optics.planning.candidates import ZOOMED, Candidate, candidates
 from holotorch.optics.planning.content import field_content
 from holotorch.optics.planning.plan import choose, plan_from
 
-_ZOOMED = "angular spectrum, zoomed"  # Candidate.method that reads the result on another grid by chirp-z transforms
 _UNUSABLE = 0.1  # expected relative error above which a propagation is refused
-# Fraction of the light below which both axes together decide how much arrives. Measured content, which holds each axis
-# by itself, says nothing about such a small fraction.
-_DIM = 1e-5
-_DIM_ERROR = 5.0  # times the tolerance: error relative to the light that arrives above which a dim result is reported
+_DIM = 1e-5  # arriving fraction of the light below which measured content, stored per axis, cannot predict it
+_DIM_ERROR = 5.0  # error relative to the arriving light above which a warning is given, in units of the tolerance
 
 
 def propagate(
@@ -52,24 +49,26 @@ def propagate(
     Args:
         field: complex64 or complex128, shape [..., H, W].
         grid: Sampling of the field.
-        wavelength: In metres: a number, or a tensor whose shape broadcasts against the leading axes of ``field``. In a
-            medium it is the wavelength there: the one in vacuum divided by the refractive index.
-        distance: In metres, a number or a tensor like ``wavelength``; both may carry gradients. A field with an axis
-            of size 1 where the distances have theirs is transformed once for all distances.
-        tolerance: Largest accepted relative L2 error, in expectation over noise that fills ``band`` and the window.
+        wavelength: Wavelength in metres in the medium: a number, or a tensor whose shape broadcasts against the leading
+            axes of ``field``.
+        distance: In metres, a number or a tensor like ``wavelength``; both may carry gradients. A field whose axis has
+            size 1 where ``distance`` has several values is transformed once for all of them.
+        tolerance: Largest accepted relative L2 error, in expectation over noise that fills ``band`` and the window;
+            smoother content has a smaller error.
         band: Highest frequencies (y, x) of the content, in cycles per metre; those of the grid by default.
         spread: Alternative to ``band``: distance (y, x) in metres that the content travels sideways on its path.
-        margin: Widths (y, x) in metres over which the content fades smoothly to zero at both ends of each axis.
+        margin: Widths (y, x) in metres over which the content fades smoothly to zero at both ends of each axis. By
+            default the window cuts the content off, and the edges diffract.
         measure: Plan for this field instead of a description, at the cost of two products with thin matrices.
         out_grid: Sampling of the result, of any shape and pitch; that of the field by default.
         offset: Position (y, x) in metres of the axis of the result relative to the axis of the field.
-        tilt: Sines (y, x) of the direction of a carrier wave that is divided out. The light is
-            ``field`` exp(2 pi i (y s_y + x s_x) / wavelength), and the result times the same carrier is the light that
-            arrives; y and x are relative to the axis of the source in both. May be a tensor [2] with gradients.
+        tilt: Sines (y, x) of the direction of a carrier wave by which both fields are divided: the light at the source
+            is ``field`` exp(2 pi i (y s_y + x s_x) / wavelength), and the light that arrives is the result times the
+            same carrier, with y and x relative to the axis of the source. May be a tensor [2] with gradients.
 
     Returns:
-        Same dtype, shape [..., H', W'] broadcast with the leading axes. The carrier exp(ikz) is included; evanescent
-        waves decay for either sign of the distance.
+        Same dtype, shape [..., H', W'], with leading axes broadcast over ``field``, ``wavelength`` and ``distance``.
+        The factor exp(ikz) is included; evanescent waves decay for either sign of the distance.
 
     Raises:
         TypeError: A field that is not complex.
@@ -79,21 +78,23 @@ def propagate(
     Warns:
         SamplingWarning: No method meets the tolerance: the most accurate one is used, and the message gives its
             expected error. Or so little light arrives in the window of the result that the error is large relative to
-            it; this is neither checked during compilation nor by :class:`Propagator`.
+            this light; compiled calls and :class:`Propagator` omit this check.
         PrecisionWarning: A wavelength or distance in float32 whose rounding changes the phase by 0.01 rad or more.
 
-    For a gradient in the pitch of both grids by a common factor s, use that scaling all lengths changes nothing:
-    ``propagate(field, grid, wavelength / s, distance / s)`` is the field on a grid of s times the pitch.
+    A gradient in a common factor s of both pitches is that of ``propagate(field, grid, wavelength / s, distance / s)``,
+    the result on grids of s times the pitch, because scaling all lengths changes nothing.
     """
     checks.field("field", field, grid.shape)
-    norms = None if torch.compiler.is_compiling() else _finite_norms(field)
+    norms = None if torch.compiler.is_compiling() else _norms(field)
+    if norms is not None and not bool(torch.isfinite(norms).all()):  # also if squares of finite elements overflow
+        checks.all_finite("field", torch.view_as_real(field.detach().resolve_conj()))
     wavelengths, distances = _float64(WAVELENGTH, wavelength, field), _float64(DISTANCE, distance, field)
     checks.precise(wavelength, distance)
     every_wavelength, every_distance = (each.detach().reshape(-1).tolist() for each in (wavelengths, distances))
     planes = plane_pair(grid, out_grid, offset, tilt, every_wavelength)
-    sample = field if measure else None
     scene = every_wavelength, every_distance
-    content = field_content(grid, *scene, band=band, spread=spread, margin=margin, field=sample)
+    example = field if measure else None
+    content = field_content(grid, *scene, band=band, spread=spread, margin=margin, field=example)
     best = _best(candidates(planes, *scene, content, field.dtype), checks.positive("tolerance", tolerance))
     if best.method == "identity":
         return field * carrier(wavelengths, distances)[..., None, None].to(field.dtype)
@@ -107,71 +108,61 @@ def _propagate_by(
     candidate: Candidate, planes: PlanePair, field: Tensor, wavelengths: Tensor, distances: Tensor, tilt: Tensor | None
 ) -> Tensor:
     """Propagate ``field`` by one method, for each wavelength and distance in turn."""
-    dtype, out_shape = field.dtype, planes.out.shape
 
     def filtered(spectrum: Tensor, wavelength: Tensor, distance: Tensor) -> Tensor:
-        kernel = kernel_of(planes, candidate, wavelength, distance, dtype, tilt)
-        # Several distances share the spectrum; the memory of a spectrum that serves one distance is reused.
+        kernel = kernel_of(planes, candidate, wavelength, distance, field.dtype, tilt)
+        # Several distances share the spectrum; for a single one its memory is reused.
         single = wavelengths.numel() * distances.numel() == 1
-        return ifft2(multiplied(spectrum, kernel) if single else spectrum * kernel, out_shape)
+        return ifft2(multiplied(spectrum, kernel) if single else spectrum * kernel, planes.out.shape)
 
-    def zoomed_in(each: Tensor, wavelength: Tensor, distance: Tensor) -> Tensor:
+    def zoomed_in(field: Tensor, wavelength: Tensor, distance: Tensor) -> Tensor:
+        kernel = kernel_of(planes, candidate, wavelength, distance, field.dtype, tilt)
         padded = Grid(candidate.padded, planes.grid.pitch)
-        kernel = kernel_of(_on_source_grid(planes), candidate, wavelength, distance, dtype, tilt)
-        return zoomed(each, kernel, chirps(planes.grid, padded, planes.out, planes.offset, field.device))
+        return zoomed(field, kernel, chirps(planes.grid, padded, planes.out, planes.offset, field.device))
 
-    def resampled(each: Tensor, wavelength: Tensor, distance: Tensor) -> Tensor:
+    def resampled(field: Tensor, wavelength: Tensor, distance: Tensor) -> Tensor:
         padded = None if candidate.paraxial else candidate.padded
-        return resample(each, resampling_factors(planes, wavelength, distance, padded=padded, tilt=tilt, dtype=dtype))
+        factors = resampling_factors(planes, wavelength, distance, padded=padded, tilt=tilt, dtype=field.dtype)
+        return resample(field, factors)
 
     if planes.same_pitch:
-        return _one_by_one(fft2(field, candidate.padded), wavelengths, distances, out_shape, filtered)
+        return _one_by_one(fft2(field, candidate.padded), wavelengths, distances, planes.out.shape, filtered)
     if bool((distances == 0).any()):
         raise ValueError("distance must not be 0 for a propagation onto another grid")
-    apply = zoomed_in if candidate.method == _ZOOMED else resampled
-    return _one_by_one(field, wavelengths, distances, out_shape, apply)
+    apply = zoomed_in if candidate.method == ZOOMED else resampled
+    return _one_by_one(field, wavelengths, distances, planes.out.shape, apply)
 
 
 def _one_by_one(
-    field: Tensor,
-    wavelengths: Tensor,
-    distances: Tensor,
-    shape: tuple[int, int],
-    apply: Callable[[Tensor, Tensor, Tensor], Tensor],
+    field: Tensor, wavelengths: Tensor, distances: Tensor, shape: tuple[int, int], apply: Callable[..., Tensor]
 ) -> Tensor:
-    """``apply`` for each wavelength and distance: the kernels of all of them would not fit into the cache or memory."""
+    """``apply(field, wavelength, distance)`` for each pair in turn, since all kernels together need too much memory."""
     wavelengths, distances = torch.broadcast_tensors(wavelengths, distances)
     batch = torch.broadcast_shapes(wavelengths.shape, field.shape[:-2])
     if wavelengths.numel() == 1:
         return apply(field, wavelengths.reshape(()), distances.reshape(())).expand(*batch, *shape)
-    fields = field.expand(*batch, *field.shape[-2:])
-    fields = fields.flatten(fields.ndim - 2 - wavelengths.ndim, -3)
+    fields = field.expand(*batch, *field.shape[-2:]).flatten(len(batch) - wavelengths.ndim, -3)
     pairs = zip(wavelengths.reshape(-1), distances.reshape(-1), strict=True)
     parts = [apply(fields[..., i, :, :], wavelength, distance) for i, (wavelength, distance) in enumerate(pairs)]
     return torch.stack(parts, -3).reshape(*batch, *shape)
 
 
 class Propagator(nn.Module):
-    """The planned propagation as a module, which plans once and keeps the kernel of the chosen method.
+    """The propagation of :func:`propagate` as a module, which plans once and keeps the kernel of the chosen method.
 
     Args:
         grid: Sampling of the field.
         wavelengths: In metres, one per channel.
         distance: In metres, negative to travel back.
-        tolerance: Largest accepted relative L2 error, in expectation over noise that fills ``band`` and the window.
-        band: Highest frequencies (y, x) of the content, in cycles per metre; those of the grid by default.
-        spread: Alternative to ``band``: distance (y, x) in metres that the content travels sideways on its path.
-        margin: Widths (y, x) in metres over which the content fades smoothly to zero at both ends of each axis.
-        example: A field [..., H, W] like those to be propagated, which is measured and replaces the description.
-        out_grid: Sampling of the result; that of the field by default.
-        offset: Position (y, x) in metres of the axis of the result relative to the axis of the field.
-        tilt: Sines (y, x) of the direction of a carrier wave that is divided out, as in :func:`propagate`.
+        tolerance, band, spread, margin, out_grid, offset, tilt: As in :func:`propagate`; numbers, not tensors.
+        example: A field [..., H, W] like those to be propagated, which is measured and replaces the description of the
+            content by ``band``, ``spread`` and ``margin``.
         memory_limit: Refuse a plan that needs more bytes than this per channel.
 
     Attributes:
-        plan: What was chosen and why.
+        plan: The chosen method and the reason for it.
 
-    Raises and warns like ``propagate``.
+    Raises and warns like :func:`propagate`.
     """
 
     plan: Plan
@@ -202,18 +193,17 @@ class Propagator(nn.Module):
         options = candidates(planes, *scene, content)
         self.plan = plan_from(options, planes, tolerance, memory_limit)
         best = _best(options, tolerance)
-        if not planes.same_pitch and best.method != _ZOOMED:
+        if not planes.same_pitch and best.method != ZOOMED:
             self.operator = ResampledKernel(
                 grid, self.wavelengths, self.distance, planes.out,
                 offset=offset, tilt=tilt, paraxial=best.paraxial, padded=best.padded,
             )  # fmt: skip
             return
-        lengths = _double(self.wavelengths), _double(self.distance)
+        lengths = torch.tensor(self.wavelengths, dtype=torch.float64), torch.tensor(self.distance, dtype=torch.float64)
+        kernel = kernel_of(planes, best, *lengths, torch.complex128)
         if planes.same_pitch:
-            kernel = kernel_of(planes, best, *lengths, torch.complex128)
             self.operator = SpectralFilter(grid, self.wavelengths, kernel, out_grid=planes.out)
         else:
-            kernel = kernel_of(_on_source_grid(planes), best, *lengths, torch.complex128)
             self.operator = ZoomedFilter(grid, self.wavelengths, kernel, planes.out, offset=planes.offset)
 
     def forward(self, field: Tensor) -> Tensor:
@@ -230,13 +220,12 @@ class Propagator(nn.Module):
 
 
 def _best(options: list[Candidate], tolerance: float) -> Candidate:
-    """The candidate to use; refused or warned of, in the name of the calling function, where it is not adequate."""
+    """The best candidate; ValueError or a warning, in the name of the caller's caller, if it exceeds the tolerance."""
     best, _ = choose(options, tolerance)
     if best.error > tolerance:
         text = (
             f"no method reaches a tolerance of {tolerance:.1e} for noise that fills the described band and window; "
-            f"{best.method} on {best.padded[0]} x {best.padded[1]} samples comes to {best.error:.1e}. Describe the "
-            "content by band= and margin=, or ask for less"
+            f"{best.label} comes to {best.error:.1e}. Describe the content by band= and margin=, or ask for less"
         )
         if best.error > _UNUSABLE:
             raise ValueError(text)
@@ -245,48 +234,36 @@ def _best(options: list[Candidate], tolerance: float) -> Candidate:
 
 
 def _norms(field: Tensor) -> Tensor:
+    """L2 norms [...] of ``field`` [..., H, W]."""
     return torch.linalg.vector_norm(torch.view_as_real(field.detach().resolve_conj()), dim=(-3, -2, -1))
-
-
-def _finite_norms(field: Tensor) -> Tensor:
-    """L2 norms [...] of ``field``; ValueError for elements that are not finite."""
-    norms = _norms(field)
-    if not bool(torch.isfinite(norms).all()):  # or squares that overflow
-        checks.all_finite("field", torch.view_as_real(field.detach().resolve_conj()))
-    return norms
 
 
 def _warn_if_dim(
     best: Candidate, tolerance: float, planes: PlanePair, norms: Tensor | None, result: Tensor, *, measured: bool
 ) -> None:
-    """Warn where so much less light arrives than expected that the predicted error is large relative to it.
+    """Warn if less light arrives than expected, and the error relative to this light far exceeds the tolerance.
 
-    ``norms`` are the L2 norms [...] of the fields at the source; without them nothing is checked.
+    ``norms`` are the L2 norms [...] of the fields at the source; if they are None, nothing is checked.
     """
     if norms is None or 0 in result.shape or best.error > tolerance:  # _best has warned of the last case
         return
-    cells = math.prod(planes.out.pitch) / math.prod(planes.grid.pitch)
-    shares = torch.where(norms > 0, (_norms(result) / norms).square() * cells, 1.0)
-    dimmest = float(torch.where(torch.isfinite(shares), shares, 1.0).min())
+    area_ratio = math.prod(planes.out.pitch) / math.prod(planes.grid.pitch)
+    fractions = torch.where(norms > 0, (_norms(result) / norms).square() * area_ratio, 1.0)
+    dimmest = float(torch.where(torch.isfinite(fractions), fractions, 1.0).min())
     allowed = _DIM_ERROR * tolerance
-    # No more than all light can be expected. Most calls end here, before the expectation is computed.
+    # Most calls end here: the expected light is at most all light, and takes longer to compute.
     if best.error <= allowed * math.sqrt(dimmest):
         return
     expected = 1.0 if measured and dimmest < _DIM else best.captured()
-    left = best.error * math.sqrt(expected / max(dimmest, 1e-300))
-    if left > allowed:
+    error = best.error * math.sqrt(expected / max(dimmest, 1e-300))
+    if error > allowed:
         warnings.warn(
             f"only {dimmest:.2g} of the light lands in the window of the result, and the error of {best.method} may be "
-            f"{left:.1e} of what lands, more than the tolerance of {tolerance:.1e}. Move the window to the light, or "
-            f"ask for a tolerance below {tolerance * allowed / left:.1e}",
+            f"{error:.1e} of what lands, more than the tolerance of {tolerance:.1e}. Move the window to the light, or "
+            f"ask for a tolerance below {tolerance * allowed / error:.1e}",
             SamplingWarning,
             stacklevel=3,
         )
-
-
-def _on_source_grid(planes: PlanePair) -> PlanePair:
-    """The planes of the transfer function alone, without the other grid on which chirp-z transforms read the result."""
-    return PlanePair(planes.grid, planes.grid, (0.0, 0.0), planes.tilt)
 
 
 def kernel_of(
@@ -297,35 +274,26 @@ def kernel_of(
     dtype: torch.dtype,
     tilt: Tensor | None = None,
 ) -> Tensor:
-    """Transfer function of a candidate with its carrier, [..., H, W] on its padded grid, in ``dtype``."""
+    """Transfer function of ``candidate`` with the factor exp(ikz), [..., H, W] on the padded grid, in ``dtype``."""
     grid = planes.grid
-    padded = Grid(candidate.padded, grid.pitch)
-    sampled = candidate.method in ("angular spectrum", _ZOOMED)
-    if sampled and not any(planes.tilt) and min(grid.pitch) < FINEST * wavelength.detach().max().item():
-        return wide_transfer_function(planes, padded, wavelength, distance, dtype=dtype)
     if candidate.method == "identity":
         ones = torch.ones(*torch.broadcast_shapes(wavelength.shape, distance.shape), *grid.shape, dtype=dtype)
         return ones * carrier(wavelength, distance)[..., None, None].to(dtype)
+    if candidate.method == ZOOMED:  # the chirp-z transforms alone account for the grid of the result
+        planes = PlanePair(grid, grid, tilt=planes.tilt)
+    padded = Grid(candidate.padded, grid.pitch)
+    if all(candidate.sampled) and not any(planes.tilt) and min(grid.pitch) < FINEST * wavelength.detach().max().item():
+        return wide_transfer_function(planes, padded, wavelength, distance, dtype=dtype)
+    sampled, paraxial = candidate.sampled, candidate.paraxial
     return transfer_function(
-        planes,
-        padded,
-        wavelength,
-        distance,
-        sampled=candidate.sampled,
-        paraxial=candidate.paraxial,
-        tilt=tilt,
-        dtype=dtype,
+        planes, padded, wavelength, distance, sampled=sampled, paraxial=paraxial, tilt=tilt, dtype=dtype
     )
 
 
 def _float64(kind: Quantity, value: float | Tensor, field: Tensor) -> Tensor:
-    """A checked quantity as float64 tensor on the device of ``field``."""
+    """``value`` as float64 tensor on the device of ``field``, checked to be a plausible quantity of this kind."""
     if not isinstance(value, Tensor):
         value = torch.tensor(checks.quantity(kind, value), dtype=torch.float64)
     value = value.to(field.device, torch.float64)
     checks.quantities(kind, value)
     return value
-
-
-def _double(values: float | Sequence[float]) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)

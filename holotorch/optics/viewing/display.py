@@ -20,13 +20,13 @@ class Display:
     All lengths are in metres; each may be a tensor that carries a gradient.
 
     Attributes:
-        lens_distance: d_el from hologram to eyepiece, at least 0; beyond ``focal_length`` it magnifies the volume.
+        lens_distance: d_el from hologram to eyepiece, at least 0; above ``focal_length`` to magnify a volume.
         focal_length: f_el of the eyepiece, infinite without an eyepiece.
         eye_distance: d_eye from eyepiece to the lens of the eye, at least 0.
         lens_radius: r_el, half the clear width of the eyepiece; None for an unlimited width.
 
     Raises:
-        ValueError: A length is implausible: a distance below 0, a focal length of 0, or a value in millimetres.
+        ValueError: An implausible length, such as a distance below 0, a focal length of 0, or one in millimetres.
     """
 
     lens_distance: Length
@@ -43,53 +43,53 @@ class Display:
 
     @classmethod
     def planar(cls, distance: Length) -> "Display":
-        """Hologram under a plane wave with the eye at ``distance`` metres, without an eyepiece (Fig. 5.4 top)."""
+        """Hologram under a plane wave with the eye at ``distance`` metres, no eyepiece (thesis Fig. 5.4 top)."""
         return cls(distance, math.inf, 0.0)
 
     @classmethod
     def spherical(cls, focal_length: Length, lens_radius: Length | None = None) -> "Display":
-        """Spherical illumination: lens at the hologram, eye at the focal point of the lens (Fig. 5.4 bottom)."""
+        """Spherical illumination: lens at the hologram, eye at its focal point (thesis Fig. 5.4 bottom)."""
         return cls(0.0, focal_length, focal_length, lens_radius)
 
     def matrix(self, plane: Length) -> Matrix:
-        """Ray matrix (A, B, C, D) from the plane at distance ``plane`` from the hologram to the pupil of the eye.
+        """Ray matrix (A, B, C, D) from the plane ``plane`` metres from the hologram to the pupil of the eye.
 
-        A = 1 - d_eye / f, B = s0 + d_eye (1 - s0 / f) in metres, C = -1 / f, D = 1 - s0 / f, with s0 = d_el - plane.
+        A = 1 - d_eye / f, B = s0 + d_eye (1 - s0 / f) in metres, C = -1 / f in 1 / metres, D = 1 - s0 / f, with
+        s0 = d_el - plane.
         """
         power, s0 = inverse(self.focal_length), self.lens_distance - plane
         back = 1 - s0 * power
         return 1 - self.eye_distance * power, s0 + self.eye_distance * back, -power, back
 
     def object_plane(self, plane: Length | None, accommodation: Length) -> Length:
-        """``plane`` in metres from the hologram, by default the plane in focus; ValueError if it is implausible."""
+        """``plane`` in metres from the hologram, or :meth:`focus_plane` for None; ValueError if implausible."""
         if plane is None:
             return self.focus_plane(accommodation)
         checks.quantity(PLANE, number(plane), "plane")
         return plane
 
     def focus_plane(self, accommodation: Length) -> Length:
-        """Distance in metres from the hologram of the plane that an eye focused at ``accommodation`` sees sharply.
+        """Distance in metres from the hologram to the plane that an eye focused at ``accommodation`` sees sharply.
 
-        d_el - s0 with 1 / s0 = 1 / (accommodation - d_eye) + 1 / f; negative lies behind the hologram.
+        d_el - s0 with 1 / s0 = 1 / (accommodation - d_eye) + 1 / f; negative on the side away from the eye.
 
         Raises:
             ValueError: The plane is at infinity.
         """
-        ahead = accommodation - self.eye_distance
-        if math.isinf(number(ahead)):
-            power = inverse(self.focal_length)
+        s1, power = accommodation - self.eye_distance, inverse(self.focal_length)
+        if math.isinf(number(s1)):
             if number(power) == 0:
                 raise ValueError("an eye focused at infinity sees no plane of a display without eyepiece; give plane")
             return self.lens_distance - 1 / power
-        share = 1 + ahead * inverse(self.focal_length)
-        if abs(number(share)) < 1e-9:
+        ratio = 1 + s1 * power  # s1 / s0
+        if abs(number(ratio)) < 1e-9:
             raise ValueError(f"an eye focused at {number(accommodation):g} m sees no plane in front of this eyepiece")
-        return self.lens_distance - ahead / share
+        return self.lens_distance - s1 / ratio
 
 
 def number(value: Length) -> float:
     """The value as a float, without gradient."""
-    return float(value.detach()) if isinstance(value, Tensor) else float(value)
+    return float(value.detach() if isinstance(value, Tensor) else value)
 
 
 def inverse(value: Length) -> Length:

@@ -1,4 +1,4 @@
-"""Eye: pupil, lens and retina, with the aberrations and the colour error that human eyes have."""
+"""Eye: pupil, lens and retina, with the aberrations and the longitudinal chromatic aberration of human eyes."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from holotorch.optics.elements.lens import Transmission, affordable, lens_phase,
 from holotorch.optics.free_space.kernels import turns_phasor
 from holotorch.optics.viewing.display import Length, inverse, number
 
-_HIGHEST = 27  # OSA index, sixth order
+_HIGHEST = 27  # largest OSA index of a Zernike polynomial: sixth radial order
 
 
 @dataclass(frozen=True)
@@ -26,14 +26,14 @@ class Eye:
     Attributes:
         pupil_radius: Radius of the opening of the iris; 1 to 4 mm, 1.5 mm in normal light.
         axial_length: d_r from the lens to the retina; 24 mm in the thesis.
-        accommodation: Distance s in front of the lens that is in focus, above 0, infinite for the relaxed eye:
-            1 / f_eye = 1 / s + 1 / d_r.
-        aberrations: Wavefront error over the pupil: OSA/ANSI single index j of normalised Zernike polynomials to
-            coefficient in metres, positive where the light is delayed (longer path). Index 4 is defocus; a coefficient
-            c of it acts as a lens of power -4 sqrt(3) c / pupil_radius^2.
-        chromatic_reference: Wavelength in metres that is in focus at ``accommodation``; the focus of other wavelengths
-            differs by the difference of :func:`chromatic_refraction`. None for an eye without colour error.
-        softness: Width in metres of the pupil's edge, 0 for a hard one. A gradient in the radius needs a soft edge.
+        accommodation: Distance s in front of the lens that is in focus, above 0, infinite for the relaxed eye. The
+            focal length of the lens follows from 1 / f_eye = 1 / s + 1 / d_r.
+        aberrations: Wavefront error over the pupil: coefficients in metres of normalised Zernike polynomials, with
+            their OSA/ANSI single indices j as keys. A positive error is a longer path, that is a delay. A coefficient c
+            of index 4, defocus, acts as a lens of power -4 sqrt(3) c / pupil_radius^2.
+        chromatic_reference: Wavelength in metres that is in focus at ``accommodation``. The refraction at another
+            wavelength differs by the difference of :func:`chromatic_refraction`. None for no chromatic aberration.
+        softness: Width in metres of the pupil's edge, 0 for a hard edge. A gradient in the radius needs a soft edge.
 
     Raises:
         ValueError: A length outside its plausible range, such as one in millimetres, or an unknown Zernike index.
@@ -51,7 +51,7 @@ class Eye:
         checks.quantity(EYE_LENGTH, number(self.axial_length))
         checks.quantity(ACCOMMODATION, number(self.accommodation))
         for index, coefficient in self.aberrations.items():
-            if not 0 <= checks.whole("Zernike index", index, 0) <= _HIGHEST:
+            if checks.whole("Zernike index", index, 0) > _HIGHEST:
                 raise ValueError(f"Zernike index must be an OSA index of 0 .. {_HIGHEST}, got {index}")
             checks.quantity(WAVEFRONT_ERROR, coefficient, f"Zernike coefficient {index}")
         if self.chromatic_reference is not None:
@@ -60,40 +60,34 @@ class Eye:
 
     @property
     def focal_length(self) -> Length:
-        """f_eye in metres at ``accommodation``, for the reference wavelength."""
+        """f_eye in metres at ``accommodation``, at ``chromatic_reference``."""
         return 1 / (inverse(self.accommodation) + inverse(self.axial_length))
 
     def pupil_function(self, y: Tensor, x: Tensor, wavelength: Length) -> Tensor:
-        """Complex transmission of the pupil without the ideal lens: amplitude, aberrations and colour error.
+        """Complex transmission of the pupil without the ideal lens, complex128: opening and phase of :meth:`path`.
 
-        Args:
-            y: Positions in metres on the pupil's plane, float64, broadcasting with ``x``.
-            x: Likewise.
-            wavelength: In metres.
-
-        Returns:
-            complex128 of the broadcast shape.
+        ``y`` and ``x`` are positions on the plane of the pupil, float64, and broadcast; all lengths in metres.
         """
         square = y.square() + x.square()
         radius = torch.as_tensor(self.pupil_radius, dtype=torch.float64, device=square.device)
         return opening(square, radius, self.softness) * turns_phasor(self.path(y, x, wavelength) / wavelength)
 
     def path(self, y: Tensor, x: Tensor, wavelength: Length) -> Tensor:
-        """Path in metres, float64, that aberrations and colour error add; arguments as in :meth:`pupil_function`."""
+        """Path in metres, float64, that all aberrations add; arguments as in :meth:`pupil_function`."""
         square = y.square() + x.square()
         radius = torch.as_tensor(self.pupil_radius, dtype=torch.float64, device=square.device)
         path = torch.zeros_like(square)
         for index, coefficient in self.aberrations.items():
             path = path + coefficient * zernike(index, y / radius, x / radius)
         if self.chromatic_reference is not None:
-            # A myopic (negative) refraction is excess power P, which shortens the path at radius r by P r^2 / 2.
+            # Excess power P, which shortens the path at radius r by P r^2 / 2, is a negative (myopic) refraction.
             excess = chromatic_refraction(self.chromatic_reference) - chromatic_refraction(wavelength)
             path = path - excess * square / 2
         return path
 
 
 class EyeLens(Transmission):
-    """Lens of an :class:`Eye` with its pupil and errors, as an element of an ``OpticalPath``.
+    """Lens of an :class:`Eye` with pupil and aberrations, as an element of an ``OpticalPath``.
 
     Raises:
         MemoryError: The grid has more samples than memory is available for.
@@ -103,24 +97,24 @@ class EyeLens(Transmission):
     """
 
     def __init__(self, grid: Grid, wavelengths: float | Sequence[float], eye: Eye):
-        waves = checks.wavelengths(wavelengths)
-        affordable("the lens of an eye", grid, len(waves))
+        wavelengths = checks.wavelengths(wavelengths)
+        affordable("the lens of an eye", grid, len(wavelengths))
         y, x = grid.coordinates()
         length = number(eye.focal_length)
         values = [
-            turns_phasor(lens_phase(grid, wave, length) / (2 * math.pi)) * eye.pupil_function(y, x, wave).detach()
-            for wave in waves
+            turns_phasor(lens_phase(grid, each, length) / (2 * math.pi)) * eye.pupil_function(y, x, each).detach()
+            for each in wavelengths
         ]
-        super().__init__(grid, waves, torch.stack(values))
-        warn_if_coarse(grid, waves, [length] * len(waves), number(eye.pupil_radius))
+        super().__init__(grid, wavelengths, torch.stack(values))
+        warn_if_coarse(grid, wavelengths, [length] * len(wavelengths), number(eye.pupil_radius))
 
 
 def chromatic_refraction(wavelength: Length) -> Length:
     """Refractive error of the human eye in dioptres at a wavelength in metres, 0 near 590 nm and -1.7 at 400 nm.
 
     1.68524 - 0.63346 / (wavelength in um - 0.21410): Thibos, Ye, Zhang and Bradley (1992), "The chromatic eye: a new
-    reduced-eye model of ocular chromatic aberration in humans", Appl. Opt. 31, 3594. Negative is myopic: the power of
-    the eye is too large for blue, and objects that are sharp in blue are nearer.
+    reduced-eye model of ocular chromatic aberration in humans", Appl. Opt. 31, 3594. Negative values are myopic: the
+    power of the eye is too large, and the objects in focus are nearer.
 
     Raises:
         ValueError: A wavelength outside 380 .. 900 nm, the range of the fit.
@@ -131,11 +125,11 @@ def chromatic_refraction(wavelength: Length) -> Length:
 
 
 def zernike(index: int, y: Tensor, x: Tensor) -> Tensor:
-    """Normalised Zernike polynomial of OSA/ANSI single index j at (y, x) in units of the pupil radius, any shape.
+    """Normalised Zernike polynomial of OSA/ANSI single index j at (y, x) in units of the pupil radius.
 
-    The polynomials are orthogonal with mean square 1 over the disc; the angle is measured from +x towards +y.
-    j = (n (n + 2) + m) / 2 for the radial order n and the angular frequency m. Raises TypeError for an index that is
-    not an integer and ValueError for one below 0. Source: ANSI Z80.28.
+    ``y`` and ``x`` broadcast. The polynomials are orthogonal with mean square 1 over the disc; the angle is measured
+    from +x towards +y. j = (n (n + 2) + m) / 2 for the radial order n and the angular frequency m. Raises TypeError for
+    an index that is not an integer and ValueError for one below 0. Source: ANSI Z80.28.
     """
     checks.whole("Zernike index", index, 0)
     order = math.ceil((-3 + math.sqrt(9 + 8 * index)) / 2)
@@ -144,10 +138,10 @@ def zernike(index: int, y: Tensor, x: Tensor) -> Tensor:
     square = y.square() + x.square()
     radial = torch.zeros_like(square)
     for k in range((order - m) // 2 + 1):
-        ways = math.factorial(order - k) / math.factorial(k)
-        ways /= math.factorial((order + m) // 2 - k) * math.factorial((order - m) // 2 - k)
-        radial = radial + (-1) ** k * ways * square ** ((order - m) // 2 - k)
-    # r^m cos(m t) and r^m sin(m t), polynomials in y and x: no angle is needed at the centre.
+        coefficient = math.factorial(order - k) / math.factorial(k)
+        coefficient /= math.factorial((order + m) // 2 - k) * math.factorial((order - m) // 2 - k)
+        radial = radial + (-1) ** k * coefficient * square ** ((order - m) // 2 - k)
+    # r^m cos(m t) and r^m sin(m t) as polynomials in y and x, since the angle t is undefined at the centre.
     real, imaginary = torch.ones_like(square), torch.zeros_like(square)
     for _ in range(m):
         real, imaginary = real * x - imaginary * y, real * y + imaginary * x

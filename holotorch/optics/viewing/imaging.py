@@ -2,26 +2,26 @@
 
 Derivation. Let (A, B, C, D) be the paraxial ray matrix from an object plane with the field U(x) to the pupil of the
 eye (``Display.matrix``), and L the length of that path. The eye accommodates to the distance s, has the axial length
-d_r and stands d_eye behind the eyepiece, whose focal length is f_el. The object plane lies s0 in front of the eyepiece,
-and its image s1 = s0 / (1 - s0 / f_el). By Collins's integral the field on the pupil is
+d_r and stands d_eye behind the eyepiece, whose focal length is f_el. In front of the eyepiece are the object plane, at
+the distance s0, and its virtual image, at s1 = s0 / (1 - s0 / f_el). By Collins's integral the field on the pupil is
 
-    V(xi) = e^{ikL} / (i lambda B) integral U(x) exp(i pi (A x^2 - 2 x xi + D xi^2) / (lambda B)) dx
+    V(xi) = e^{ikL} / (i lambda B) integral U(x) exp(i pi (A x^2 - 2 x xi + D xi^2) / (lambda B)) dx,
 
-for both axes at once. The eye multiplies V by its pupil function P and by exp(-i pi xi^2 / (lambda f_eye)) with
-1 / f_eye = 1 / s + 1 / d_r. Fresnel's integral over d_r gives the field on the retina:
+where x and xi are two-dimensional. The eye multiplies V by its pupil function P and by exp(-i pi xi^2 / (lambda f_eye))
+with 1 / f_eye = 1 / s + 1 / d_r. Fresnel's integral over d_r gives the field on the retina:
 
     R(u) = e^{ikd_r} / (i lambda d_r) exp(i pi u^2 / (lambda d_r)) integral P V
            exp(i pi xi^2 (1 / d_r - 1 / f_eye) / lambda) exp(-2 pi i u xi / (lambda d_r)) dxi.
 
 The curvatures of the parabolic phases on the pupil add up to D / B + 1 / d_r - 1 / f_eye = D / B - 1 / s, the defocus.
-It vanishes for the plane in focus, since B / D = d_eye + s1 is the distance from the image of the plane to the eye.
-With the spatial frequency f = xi / (lambda B), the two integrals are a Fourier transform and an inverse one,
+The defocus vanishes for the plane in focus, where B / D = d_eye + s1, the distance from the virtual image to the eye,
+equals s. With the spatial frequency f = xi / (lambda B), the integrals are a Fourier transform and its inverse:
 
     g(x) = IFT[ P(lambda B f) exp(i pi lambda B (D - B / s) f^2) FT[ U(x) exp(i pi A x^2 / (lambda B)) ](f) ],
     |R(u)| = |B / d_r| |g(-u B / d_r)|,
 
-so the retina shows |g| scaled by -d_r / B, and sum |g|^2 pitch^2 is the power that arrives. The defocus phase contains
-no division by B; it moves the light that crosses the pupil at xi by (D - B / s) xi in the object plane.
+so the retina shows |g| scaled by -d_r / B, and sum |g|^2 pitch^2 is the power on the retina. The defocus phase moves
+the light that crosses the pupil at xi by (D - B / s) xi in the object plane.
 """
 
 import math
@@ -47,19 +47,19 @@ from holotorch.optics.free_space.kernels import (
 from holotorch.optics.free_space.zoomed import chirps, zoomed
 from holotorch.optics.viewing.display import Display, Length, inverse, number
 from holotorch.optics.viewing.eye import Eye
-from holotorch.optics.viewing.rays import fringe
+from holotorch.optics.viewing.rays import fringe_width, samples_for_all_light
 
-_ROOM = 1.02  # factor on every limit, for light that edges diffract beyond the geometric rays
+_ROOM = 1.02  # factor on frequencies, for light that edges diffract beyond the geometric rays
 _FINEST = 64.0  # largest oversampling
-_SPOTS = 16  # margin around the window in spot sizes lambda |B| / (2 r): the tails of a hard pupil's spot are long
+_SPOTS = 16  # margin around the window in spot sizes lambda |B| / (2 r), for the long tails of a hard pupil's spot
 
 
 @dataclass(frozen=True)
 class CollapseSampling:
-    """Sizes (y, x) of the collapse on one grid.
+    """Sizes (y, x) of the collapsed propagation from one grid.
 
     Attributes:
-        oversampling: How much finer than the hologram the object plane is sampled.
+        oversampling: Pitch of the hologram divided by the pitch in the object plane.
         padded: Samples, at the hologram's pitch, of the transform for the propagation to the object plane.
         window: Samples of the object plane at the hologram's pitch, with a margin for defocus and the tails of spots.
         fine: Samples of the same window at the oversampled pitch.
@@ -73,23 +73,17 @@ class CollapseSampling:
     @property
     def flops(self) -> float:
         """Floating-point operations for one image of one wavelength, 5 n log2 n for each transform."""
-        (py, px), (fy, fx) = self.padded, self.fine
-        # The chirp-z transform needs two FFTs of length padded + fine per line, rows first.
-        zoom = sum(10 * lines * n * math.log2(n) for lines, n in ((py, px + fx), (fx, py + fy)))
-        return _fft(py * px) + zoom + _fft(fy * fx) + _fft(math.prod(self.window))
+        padded, window, fine = (fft_flops(math.prod(shape)) for shape in (self.padded, self.window, self.fine))
+        return padded + zoom_flops(self.padded, self.fine) + fine + window
 
     def memory_bytes(self, passed: float, itemsize: int = 8, batch: int = 1) -> int:
-        """Largest extra memory, in bytes, for images of one wavelength.
+        """Largest extra memory in bytes for ``batch`` images of one wavelength, with samples of ``itemsize`` bytes.
 
-        The estimate is within 10 % of the measured memory from 1 GB to 8 GB; below 1 GB it is up to 0.2 GB too small.
-
-        Args:
-            passed: Number of samples of the spectrum that the pupil transmits (:func:`pupil_bands`), at least as many
-                as in ``window``.
-            itemsize: Bytes of a sample: 8 for complex64, 16 for complex128.
-            batch: Number of fields processed together.
+        ``passed`` is the number of samples of the spectrum that the pupil transmits, ``window`` times the number of
+        :func:`pupil_bands`. The estimate is within 10 % of measurements from 1 GB to 8 GB; below 1 GB it is up to
+        0.2 GB too small.
         """
-        kernel = 110 * math.prod(self.padded)  # building the kernel for the propagation to the object plane
+        kernel = 110 * math.prod(self.padded)  # computing the transfer function to the object plane
         lines = 4.2 * itemsize * batch * self.fine[1] * (self.fine[0] + self.padded[0])  # chirp-z transform
         return math.ceil(max(kernel, lines, (88 + 1.5 * itemsize * batch) * passed))
 
@@ -107,31 +101,28 @@ def propagate_collapsed(
 ) -> Tensor:
     """Field on the retina, referred back to the object plane: the g(x) of this module's derivation.
 
-    Neglected are the edge of the eyepiece (``plan_retina`` reports whether it blocks light that the pupil would
-    accept), the non-Fresnel phase behind the eyepiece for points beside the axis, and light that leaves the window of
-    ``grid`` before the object plane. This differs from Algorithm 6, which samples every lens phase at the hologram's
-    pitch, where the lens phases alias.
+    It neglects the edge of the eyepiece, the non-Fresnel phase behind the eyepiece for points beside the axis, and
+    light that leaves the window of ``grid`` before the object plane. The error that ``plan_retina`` predicts includes
+    the first two. Thesis Algorithm 6 instead samples every lens phase at the hologram's pitch, where it aliases.
 
     Args:
         field: Field of the hologram, complex [..., C, H, W].
         grid: Sampling of the hologram.
         wavelengths: In metres, one per channel.
         display: Positions of hologram, eyepiece and eye.
-        eye: Pupil, retina, accommodation. The pupil radius, accommodation and axial length of the eye and the lengths
-            of the display may require gradients.
+        eye: Pupil, retina and accommodation. All lengths of eye and display may require gradients.
         plane: Distance in metres from the hologram to the object plane, to which light is propagated first; by default
             the plane in focus. It sets the scale of the result.
         sampling: Sampling of the object plane; :func:`collapse_sampling` by default.
         paraxial: Use Fresnel's model for every distance. Otherwise propagation to the eyepiece is exact, and the pupil
-            function includes the fourth-order phase that Fresnel's model neglects behind the eyepiece for points on the
-            axis (spherical aberration): -k / 8 sum_i d_i u_i^4, where d_i are the distances eyepiece to eye and eye to
-            retina, and u_i the slopes there of the ray through xi. For points beside the axis the further terms
-            (mostly a shift) are neglected.
+            function includes the spherical aberration that Fresnel's model neglects behind the eyepiece for points on
+            the axis: the phase -k / 8 sum_i d_i u_i^4, where d_i are the distances from eyepiece to eye and from eye to
+            retina, and u_i the slopes over these distances of the ray through xi.
 
     Returns:
-        Complex [..., C, H, W] on ``grid``, upright: the image on the retina is :func:`retinal_scale` times as large and
-        upside down. The sum of the intensity times both pitches is the power on the retina. The phase omits the
-        curvature and the carrier, which do not affect the intensity.
+        Complex [..., C, H, W] on ``grid``, upright: a position times :func:`retinal_scale` (negative) is that on the
+        retina. The sum of the intensity times both pitches is the power on the retina. The curvature and the factor
+        exp(ikz), which do not affect the intensity, are omitted.
 
     Raises:
         ValueError: The pupil is an image of the object plane (B = 0), or the oversampling would exceed 64.
@@ -145,19 +136,11 @@ def propagate_collapsed(
     plane = display.object_plane(plane, eye.accommodation)
     least = collapse_sampling(grid, channel_wavelengths, display, eye, plane)
     sizes = sampling or least
-    if any(have < want * (1 - 1e-9) for have, want in zip(sizes.oversampling, least.oversampling, strict=True)):
-        warnings.warn(
-            f"an object plane sampled {max(sizes.oversampling):.3g} times as fine as the hologram aliases into the "
-            f"pupil; {max(least.oversampling):.3g} times would do",
-            SamplingWarning,
-            stacklevel=2,
-        )
-    passed = max(
-        math.prod(pupil_bands(grid, wavelength, display, eye, plane)) for wavelength in channel_wavelengths
-    ) * math.prod(sizes.window)
+    warn_if_coarse(sizes.oversampling, least.oversampling, "an object plane", "aliases into the pupil")
+    bands = max(math.prod(pupil_bands(grid, wavelength, display, eye, plane)) for wavelength in channel_wavelengths)
     size, batch = field.dtype.itemsize, field.numel() // max(1, math.prod(field.shape[-3:]))
     checks.affordable(
-        sizes.memory_bytes(passed, size, batch) + size * field.numel(),
+        sizes.memory_bytes(bands * math.prod(sizes.window), size, batch) + size * field.numel(),
         f"propagate_collapsed() on an object plane of {sizes.fine[0]} x {sizes.fine[1]} samples, "
         f"{max(sizes.oversampling):.3g} times as fine as the hologram's {grid.shape[0]} x {grid.shape[1]},",
         "crop the hologram, pass fewer fields at once, use a smaller pupil, or put the plane farther from the pupil",
@@ -177,10 +160,13 @@ def retinal_scale(display: Display, eye: Eye, plane: Length | None = None) -> Le
 
 
 def pupil_bands(grid: Grid, wavelength: float, display: Display, eye: Eye, plane: Length) -> tuple[int, int]:
-    """Odd number (y, x) of frequency bands of width 1 / pitch of the object plane's field that the pupil transmits."""
-    # A pupil may transmit more than one band: light from points beside the axis arrives at a slant.
-    taken = (number(eye.pupil_radius) + 8 * eye.softness) / (wavelength * abs(number(display.matrix(plane)[1])))
-    y, x = (2 * math.ceil(max(0.0, pitch * taken * _ROOM - 0.5)) + 1 for pitch in grid.pitch)
+    """Odd numbers (y, x) of bands of width 1 / pitch that cover the frequencies which the pupil transmits.
+
+    The frequencies are those of the field in the object plane times its parabolic phase, which shifts the light of
+    points beside the axis beyond 1 / (2 pitch).
+    """
+    highest = (number(eye.pupil_radius) + 8 * eye.softness) / (wavelength * abs(number(display.matrix(plane)[1])))
+    y, x = (2 * math.ceil(max(0.0, pitch * highest * _ROOM - 0.5)) + 1 for pitch in grid.pitch)
     return y, x
 
 
@@ -191,52 +177,38 @@ def collapse_sampling(
 
     In the object plane the field times its parabolic phase (this module's derivation) has frequencies up to
     F = 1 / (2 pitch) + |A| x / (lambda |B|), where x is the edge of the window. They may alias as long as no alias
-    falls into the band of the pupil with radius r, |f| <= r / (lambda |B|). That holds if 1 / (fine pitch) >= F + f.
+    falls into the pass-band |f| <= r / (lambda |B|) of a pupil with radius r. That holds if
+    1 / (fine pitch) >= F + r / (lambda |B|).
     """
     first, second, _, back = (number(value) for value in display.matrix(plane))
     radius, distance = number(eye.pupil_radius) + 8 * eye.softness, number(plane)
     blur = abs(back - second * number(inverse(eye.accommodation))) * radius
-    factors, padded, window, fine = [], [], [], []
+    axes = []
     for size, pitch in zip(grid.shape, grid.pitch, strict=True):
         if size == 1:
-            for each in (factors, padded, window, fine):
-                each.append(1)
+            axes.append((1, 1, 1, 1))
             continue
+        if abs(second) <= 1e-9 * (abs(distance) + number(display.eye_distance)):
+            raise ValueError("the pupil is an image of this object plane (B = 0); give another plane")
         # An even number of samples is added, so that the axis stays on sample n // 2.
         spot = max(wavelengths) * abs(second) / (2 * radius)
-        wide = size + 2 * math.ceil((blur + _SPOTS * spot) / pitch)
-        factor = 1.0
+        window = size + 2 * math.ceil((blur + _SPOTS * spot) / pitch)
+        factor, padded = 1.0, size
         for wavelength in wavelengths:
-            if abs(second) <= 1e-9 * (abs(distance) + number(display.eye_distance)):
-                raise ValueError("the pupil is an image of this object plane (B = 0); give another plane")
-            taken = radius / (wavelength * abs(second))
-            if taken > _ROOM / (2 * pitch):
-                # The pupil passes frequencies beyond the band of the hologram's pitch: the sampling must hold them.
-                factor = max(factor, 2 * pitch * taken)
-            highest = 1 / (2 * pitch) + abs(first) * wide * pitch / 2 / (wavelength * abs(second))
-            factor = max(factor, _ROOM * pitch * (highest + taken))
+            accepted = radius / (wavelength * abs(second))
+            if accepted > _ROOM / (2 * pitch):
+                # The pupil transmits frequencies above 1 / (2 pitch), which the sampling must hold too.
+                factor = max(factor, 2 * pitch * accepted)
+            highest = 1 / (2 * pitch) + abs(first) * window * pitch / 2 / (wavelength * abs(second))
+            factor = max(factor, _ROOM * pitch * (highest + accepted))
+            # A transform of size + window samples and the margin wraps light, which a taper removes.
+            tapered = size + window + fringe_width(wavelength, distance) / pitch
+            all_light = samples_for_all_light(size, window, pitch, wavelength, distance)
+            padded = max(padded, math.ceil(min(all_light, tapered)))
         if factor > _FINEST:
             raise ValueError(f"the collapse would need {factor:.3g} times the hologram's sampling; give another plane")
-        factors.append(factor)
-        window.append(wide)
-        fine.append(good_length(math.ceil(factor * wide)))
-        padded.append(max(_padding(size, wide, pitch, wavelength, distance) for wavelength in wavelengths))
-    pairs = [(each[0], each[1]) for each in (factors, padded, window, fine)]
-    return CollapseSampling(pairs[0], pairs[1], pairs[2], pairs[3])  # type: ignore[arg-type]
-
-
-def _padding(size: int, wide: int, pitch: float, wavelength: float, distance: float) -> int:
-    """Length of a transform that wraps no light into the window.
-
-    The transform either holds all the light, or has size + wide samples and a taper removes the light that would wrap.
-    """
-    sine = wavelength / (2 * pitch)
-    spread = abs(distance) * sine / math.sqrt(1 - sine**2) if sine < 1 else math.inf
-    need = min(
-        (size + wide) / 2 + (spread + fringe(wavelength, distance)) / pitch,
-        size + wide + fringe(wavelength, distance) / pitch,
-    )
-    return good_length(max(math.ceil(need), size))
+        axes.append((factor, good_length(padded), window, good_length(math.ceil(factor * window))))
+    return CollapseSampling(*zip(*axes, strict=True))
 
 
 def _image(
@@ -249,21 +221,20 @@ def _image(
     sizes: CollapseSampling,
     paraxial: bool,
 ) -> Tensor:
+    """One wavelength of :func:`propagate_collapsed`, [..., H, W] to [..., H, W]."""
     first, second, _, back = display.matrix(plane)
-    padded = Grid(sizes.padded, grid.pitch)
-    window = Grid(sizes.window, grid.pitch)
+    padded, window = Grid(sizes.padded, grid.pitch), Grid(sizes.window, grid.pitch)
     fy, fx = (p * n / m for p, n, m in zip(grid.pitch, sizes.window, sizes.fine, strict=True))
     fine = Grid(sizes.fine, (fy, fx))
-    whole = all(p >= n + w or n == 1 for p, n, w in zip(sizes.padded, grid.shape, sizes.window, strict=True))
     if paraxial:
         kernel = fresnel_kernel(padded, wavelength, plane)
     else:
         # Propagate exactly to the eyepiece, then back to the plane by Fresnel, because the ray matrix is paraxial.
         kernel = angular_spectrum_kernel(padded, wavelength, display.lens_distance, band_limit=False)
         kernel = kernel * fresnel_kernel(padded, wavelength, display.lens_distance - plane).conj()
-    if whole:
-        reach = [(n + w) / 2 * p for n, w, p in zip(grid.shape, sizes.window, grid.pitch, strict=True)]
-        kernel = kernel * window_taper(padded, wavelength, number(plane), (reach[0], reach[1]), paraxial=paraxial)
+    if all(p >= n + w or n == 1 for p, n, w in zip(sizes.padded, grid.shape, sizes.window, strict=True)):
+        half_y, half_x = ((n + w) / 2 * p for n, w, p in zip(grid.shape, sizes.window, grid.pitch, strict=True))
+        kernel = kernel * window_taper(padded, wavelength, number(plane), (half_y, half_x), paraxial=paraxial)
     kernel = (kernel * carrier(wavelength, plane)).to(field.device, field.dtype)
     light = zoomed(field, kernel, chirps(grid, padded, fine, (0.0, 0.0), field.device))
     y, x = fine.coordinates(field.device)
@@ -271,8 +242,8 @@ def _image(
     light = light * (turns_phasor(rate * y.square()) * turns_phasor(rate * x.square())).to(field.dtype)
     bands = pupil_bands(grid, wavelength, display, eye, plane)
     spectrum = _centred(centred_fft2(light), [n * m for n, m in zip(window.shape, bands, strict=True)])
-    # The window has the same width at both pitches, so the frequency step is the same: eta and xi are the positions on
-    # the pupil of the frequencies of the window's centred spectrum, continued over all bands.
+    # The positions (eta, xi) on the pupil of the frequencies of this spectrum. The window has the same width at both
+    # pitches and therefore the same frequency step.
     eta, xi = (
         (torch.arange(n * m, dtype=torch.float64, device=field.device) - n * m // 2) / (n * p) * (wavelength * second)
         for n, m, p in zip(window.shape, bands, window.pitch, strict=True)
@@ -281,25 +252,43 @@ def _image(
     square = eta.square() + xi.square()
     cycles = (back / second - inverse(eye.accommodation)) / (2 * wavelength) * square
     if not paraxial:
-        legs = display.eye_distance * (back / second) ** 4 + 1 / eye.axial_length**3
-        cycles = cycles - legs / (8 * wavelength) * square.square()
-    passed = eye.pupil_function(eta, xi, wavelength) * turns_phasor(cycles)
-    share = math.sqrt(math.prod(window.shape) / math.prod(fine.shape))
-    image = spectrum * (passed * share).to(field.dtype)
+        aberration = display.eye_distance * (back / second) ** 4 + 1 / eye.axial_length**3
+        cycles = cycles - aberration / (8 * wavelength) * square.square()
+    pupil = eye.pupil_function(eta, xi, wavelength) * turns_phasor(cycles)
+    norm = math.sqrt(math.prod(window.shape) / math.prod(fine.shape))
+    image = spectrum * (pupil * norm).to(field.dtype)
     # Sampling at the hologram's pitch adds up all bands of the spectrum.
     image = image.unflatten(-1, (bands[1], -1)).sum(-2).unflatten(-2, (bands[0], -1)).sum(-3)
     return _centred(centred_ifft2(image), grid.shape)
 
 
 def _centred(values: Tensor, shape: Sequence[int]) -> Tensor:
-    """Values cropped or padded with zeros to ``shape``, both sides of each axis; sample n // 2 stays the origin."""
+    """``values`` [..., h, w] cropped or zero-padded to ``shape`` so that sample n // 2 of each axis stays at n // 2."""
     (h, w), (height, width) = values.shape[-2:], shape
     top, left = height // 2 - h // 2, width // 2 - w // 2
     return torch.nn.functional.pad(values, (left, width - w - left, top, height - h - top))
 
 
-def _fft(count: int) -> float:
+def fft_flops(count: int) -> float:
+    """Floating-point operations of one FFT of ``count`` samples."""
     return 5 * count * math.log2(max(count, 2))
+
+
+def zoom_flops(padded: tuple[int, int], fine: tuple[int, int]) -> float:
+    """Floating-point operations of a chirp-z transform: two FFTs of padded + fine samples per line, rows first."""
+    (py, px), (fy, fx) = padded, fine
+    return sum(10 * lines * n * math.log2(n) for lines, n in ((py, px + fx), (fx, py + fy)))
+
+
+def warn_if_coarse(sampling: Sequence[float], least: Sequence[float], sampled: str, aliases: str) -> None:
+    """SamplingWarning in the name of the caller's caller if an oversampling (y, x) is below ``least``."""
+    if any(given < needed * (1 - 1e-9) for given, needed in zip(sampling, least, strict=True)):
+        warnings.warn(
+            f"{sampled} sampled {max(sampling):.3g} times as fine as the hologram {aliases}; "
+            f"{max(least):.3g} times would do",
+            SamplingWarning,
+            stacklevel=3,
+        )
 
 
 __getattr__ = renamed(__name__, {"imaged": "propagate_collapsed"})

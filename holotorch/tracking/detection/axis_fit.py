@@ -1,7 +1,8 @@
 """Fit of the axis and the width of a straight tube's image, to hundredths of a pixel, with covariance.
 
-The fit is made in linear light. The levels of the background beside the tube are linear parameters of each station and
-are projected out: variable projection (Golub and Pereyra 1973). Samples are weighted by their noise.
+A station is a row of samples across the tube, in linear light; S counts stations, K shadings. Samples are weighted by
+their inverse variances. The light of the background on both sides of each station is eliminated by variable projection
+(Golub and Pereyra 1973).
 """
 
 import math
@@ -14,14 +15,14 @@ from scipy.special import erf
 
 from holotorch.tracking.detection.fits import BLUNTEST, SHARPEST, median
 
-_STEPS = 8  # most Gauss-Newton steps
-_SETTLED = 0.03  # pixels: step of middle and blur at which the fit ends; the next step would be a third of it
-_WIDENED = 0.15  # pixels: step of width and taper at which the fit ends; the next step would be a fifth of it
+_STEPS = 8  # largest number of Gauss-Newton steps
+_SETTLED = 0.03  # pixels: steps of middle and blur at convergence; the next steps would be a third
+_WIDENED = 0.15  # pixels: steps of width and taper at convergence; the next steps would be a fifth
 _FARTHEST = np.array([1.5, 1.5, 1.5, 1.5, 0.5])  # pixels: largest step of middle (2), width (2) and blur
-_SLICES = 8  # slices across the tube with constant shading each
-_SHADINGS = (np.ones_like, lambda q: q, lambda q: np.sqrt(1 - q * q), lambda q: q**3)
+_SLICES = 8  # slices across the tube, each of constant shading
+_SHADINGS = (np.ones_like, lambda q: q, lambda q: np.sqrt(1 - q * q), lambda q: q**3)  # of positions -1 to 1
 _MEANS = (1.0, 0.0, math.pi / 4, 0.0)  # mean of each shading over the width of the tube
-_SHARES = (1e3, 1.0, 1.0, 0.7)  # prior deviation of each shading, relative to the band's light; the first one is free
+_SHARES = (1e3, 1.0, 1.0, 0.7)  # prior standard deviation of each shading over the band's light; the first one is free
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +30,13 @@ class AxisFit:
     """Fit to the image of a straight tube at stations along it.
 
     Attributes:
-        unknown: Fitted values: middle and width (each at t = 0, and its change up to t = reach), blur, and shadings.
+        unknown: [5 + bands K] fitted parameters: middle, its change up to t = reach, width, its change up to t = reach,
+            blur, and K shadings of each band; lengths in samples.
         normal: Inverse covariance of ``unknown``, from the noise and the priors.
         reach: Largest distance of a station from t = 0, in samples.
-        contrast: Median contrasts of the tube to both sides, divided by the larger one.
+        contrast: Median contrasts of the tube to its two sides, divided by the larger of the two.
         weight: [S] weight of each station; near 0 where the tube is covered.
-        moving: Change of the middle in the last step, in pixels.
+        moving: Change of the middle in the last step, in samples.
     """
 
     unknown: np.ndarray
@@ -46,7 +48,7 @@ class AxisFit:
 
     @property
     def sides(self) -> np.ndarray:
-        """[4] offset, slope, width and taper: the middle is offset + slope t, the width is width + taper t."""
+        """[4] offset, slope, width and taper: at t, the middle is offset + slope t, the width is width + taper t."""
         return self.unknown[:4] * self._scale
 
     @cached_property
@@ -60,9 +62,9 @@ class AxisFit:
         return np.array([1.0, 1.0 / self.reach, 1.0, 1.0 / self.reach])
 
     def given(self, width: tuple[float, float], known: float, before: float = math.inf) -> "AxisFit":
-        """First-order update of the fit for another prior of width and taper, of relative deviation ``known``.
+        """First-order update of the fit for another prior: ``width`` and taper with relative deviation ``known``.
 
-        ``before`` is the relative deviation of the prior that this fit used, which is removed.
+        ``before`` is the relative deviation of the prior of this fit, which is removed.
         """
         more, away = np.zeros(len(self.unknown)), np.zeros(len(self.unknown))
         more[2:4] = (known * width[0]) ** -2 - (before * width[0]) ** -2
@@ -85,9 +87,9 @@ def fit_axis(
 ) -> AxisFit:
     """Fit the two straight sides of the tube to all stations at once.
 
-    The model of a station is a blurred box. Each station has a free background level on either side of the tube. Each
-    band has four shadings across the tube: constant, linear, round (Lambert's law), and cubic (a partial shadow). Their
-    amplitudes have priors relative to the light of the band: the covariance includes what pixels cannot determine.
+    The model of a station is a blurred box with a free background level on either side. The light of each band is a sum
+    of four shadings across the tube: constant, linear, round (Lambert's law), and cubic (a partial shadow). Priors of
+    their amplitudes make the covariance include the uncertainty of shadings that the samples do not determine.
 
     Args:
         light: [S, U] samples across the tube, U odd, of one channel or a linear combination of channels.
@@ -95,11 +97,11 @@ def fit_axis(
         t: [S] positions of the stations along the tube, in samples.
         band: [S] index of the band of each station, from 0.
         level: [bands] light of each band, in the units of ``light``.
-        bright: [bands] the same without cancellation between channels; it scales the priors of the shadings.
+        bright: [bands] ``level`` if channels are combined with absolute weights; it scales the priors of the shadings.
         width: Expected width of the tube at t = 0 in samples, and its taper per sample.
-        blur: Standard deviation of the blur to begin with, in samples.
-        known: Relative deviation of the expected width and taper; a better known width gives a better middle.
-        start: ``unknown`` of an earlier fit to the same stations, to begin with, except for width and taper.
+        blur: Initial standard deviation of the blur, in samples.
+        known: Relative standard deviation of the expected width and taper; a smaller one gives a more precise middle.
+        start: ``unknown`` of an earlier fit to the same stations, as initial values except for width and taper.
     """
     light, weight = light.astype(np.float64), weight.astype(np.float64)[..., None]
     stations, count, bands, kinds = *light.shape, len(level), len(_SHADINGS)
@@ -160,15 +162,10 @@ def _contrasts(tube: np.ndarray, beside: np.ndarray) -> tuple[float, float]:
 
 
 def _station_parts(share: np.ndarray, member: np.ndarray) -> np.ndarray:
-    """[S, 4 + K, 6 + bands K]: the parameters of each station as linear functions of the unknowns.
+    """[S, 4 + K, 6 + bands K]: the parameters of each station as linear functions of ``AxisFit.unknown``.
 
-    The unknowns are middle and width (each at t = 0, and its change up to t = reach), the blur, and K shadings of each
-    band. Each station has the middle, width, blur and K shadings as parameters. The last row and column hold the
-    residual light.
-
-    Args:
-        share: [S] position of each station, -1 to 1.
-        member: [S, bands] 1 where the station lies on the band, else 0.
+    The parameters of a station are middle, width, blur and K shadings. The last row and column stand for the residual
+    light. ``share`` [S] are positions t / reach, and ``member`` [S, bands] is 1 where a station lies on a band, else 0.
     """
     kinds = len(_SHADINGS)
     parts = np.zeros((len(share), 4 + kinds, 6 + member.shape[1] * kinds))
@@ -182,7 +179,7 @@ def _station_parts(share: np.ndarray, member: np.ndarray) -> np.ndarray:
 def _expectation(
     level: np.ndarray, bright: np.ndarray, width: tuple[float, float], blur: float, known: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Expected unknowns, unknowns to start from, and inverse variances of the expected ones: [5 + bands K] each.
+    """Expected values, initial values, and inverse prior variances of ``AxisFit.unknown``: [5 + bands K] each.
 
     ``width`` is the expected width at t = 0 and its change up to t = reach, of relative deviation ``known``.
     """
@@ -198,8 +195,8 @@ def _expectation(
 def _solved(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Solution for a positive definite matrix [N, N] and right sides [N] or [N, K]; NaN if it is not definite.
 
-    OpenCV's Cholesky solver has less overhead per call than NumPy's, which takes several times as long for such small
-    matrices. OpenCV fails for pivots below 2e-16; in 3000 fits to frames of all conditions none was below 1e-3.
+    For such small matrices NumPy's solver takes several times as long as OpenCV's Cholesky solver. OpenCV fails for
+    pivots below 2e-16; in 3000 fits to frames of all conditions no pivot was below 1e-3.
     """
     solved, solution = cv2.solve(normal, right.reshape(len(right), -1), flags=cv2.DECOMP_CHOLESKY)
     return solution.reshape(right.shape) if solved else np.full_like(right, np.nan)
@@ -216,7 +213,7 @@ def _inverse(normal: np.ndarray) -> np.ndarray:
 
 
 def _slices() -> tuple[np.ndarray, np.ndarray]:
-    """Nodes [N] across the tube, -1 to 1, and the jump of each column (left, right, shadings) there, [N, 2 + K]."""
+    """Nodes [N] across the tube, -1 to 1, and the jumps [N, 2 + K] of the model's columns at these nodes."""
     q = np.linspace(-1, 1, _SLICES + 1)
     middle = (q[1:] + q[:-1]) / 2
     shadings = np.pad(np.stack([f(middle) for f in _SHADINGS], -1), ((1, 1), (0, 0)))
@@ -227,20 +224,21 @@ def _slices() -> tuple[np.ndarray, np.ndarray]:
 
 _NODES, _TAKES = _slices()
 _HALVES = _TAKES / 2
-# From the levels of the columns to the derivatives of each jump by the middle of the tube and by half of its width.
+# Maps the levels of the columns to the derivatives of all jumps by the middle of the tube and by half of its width.
 _RISES = -np.stack([_TAKES, _TAKES * _NODES[:, None]], 1).transpose(2, 0, 1).reshape(_TAKES.shape[1], -1)
 
 
 def _strip_terms(u: np.ndarray, at: np.ndarray, half: np.ndarray, blur: float):
-    """Columns of the model [S, U, 2 + K], and a function that writes the derivatives of their sum.
+    """Columns of the model [S, U, 2 + K] for tubes with middles ``at`` [S], and a function for their derivatives.
 
-    The columns are the background left and right of tubes at ``at`` [S], and the K shadings. The function takes their
-    levels [S, 2 + K] and an array [S, U, 3 or more], and writes the derivatives by middle, width and blur into the
-    first three entries of the latter.
+    The columns are the background to the left and to the right, and the K shadings. The function takes the levels
+    [S, 2 + K] of the columns and an array [S, U, 3 or more], and writes the derivatives of the model by middle, width
+    and blur into the first three entries of the last axis of that array.
     """
     scale = math.sqrt(2) * blur
     z = (u[:, None] - (at[:, None] + half[:, None] * _NODES)[:, None]) / scale  # [S, U, N]
-    # A jump is (1 + erf z) / 2. The jumps of a shading add up to 0, so that only the sides need the constant 1 / 2.
+    # A unit jump is (1 + erf z) / 2. The constant 1 / 2 is needed for the background only, since the jumps of a shading
+    # add up to 0.
     columns = erf(z) @ _HALVES
     columns[..., :2] += 0.5
     bell = np.exp(-z * z)

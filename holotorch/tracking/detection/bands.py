@@ -1,4 +1,8 @@
-"""Detection of the tube's line among colour labels, and of the bands along it by dynamic programming."""
+"""Detection of the tube's line in an image of colour labels, and of the bands along this line.
+
+A label is c + 1 for the colour c of a band and 0 for any other colour (:class:`ColourTable`); C counts the colours and
+N the edges.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -8,10 +12,11 @@ import numpy as np
 
 from holotorch.tracking.detection.colours import ColourTable
 
-_SIDE = 6  # number of pixels on each side of an edge whose colours are checked
-_MIXED, _MOVED = 2, 11  # pixels next to an edge that are not checked: usually, and if the tube moved along itself
-_RIGHT = 0.55  # least share of the checked pixels that must have the right colour
-_VOTERS = 300  # most coloured pixels that vote for a line; the line is then fitted to all of them
+_SIDE = 6  # pixels on each side of an edge whose colours are checked
+_MIXED = 2  # pixels next to an edge that are not checked, because they mix both colours
+_MOVED = 11  # the same for a tube that moved along its axis during the exposure
+_RIGHT = 0.55  # least fraction of the checked pixels that must have the band's colour
+_VOTERS = 300  # largest number of coloured pixels that select a line; the line is then fitted to all coloured pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,13 +24,13 @@ class Stretches:
     """Bands along a line, at positions t in pixels.
 
     Attributes:
-        edges: [N] position of each edge along the line; NaN where it is not visible.
-        shown: For each band, the number of pixels of its colour.
+        edges: [N] position t of each edge; NaN for an edge that is not visible.
+        shown: For each band, the number of pixels of its colour on the line.
         whole: For each band, its length on the line in pixels.
-        doubtful: For each edge, whether by its colours it may belong to an object in front of the tube.
+        doubtful: For each edge, whether its colours would also fit an object in front of the tube.
         flipped: Whether the tip lies towards larger t.
-        turned: Whether the direction of the tip was given, but fewer than three edges are visible and the reversed
-            direction fits better.
+        turned: Whether fewer than three edges are visible in the given direction of the tip, and the bands fit the
+            reversed direction better.
     """
 
     edges: np.ndarray
@@ -45,11 +50,11 @@ def find_axis(labels: np.ndarray, t: np.ndarray, u: np.ndarray, reach: float) ->
     """Offset and slope (u = offset + slope t) of the thin coloured object in labels [T, U], or None if there is none.
 
     ``t`` [T], centred on 0, and ``u`` [U] are evenly spaced positions along and across the strip in pixels; ``reach``
-    is the largest slope. The line with the most coloured pixels among a fan of lines is refined by weighted least
-    squares over the coloured pixels near it.
+    is the largest slope. Among lines of many offsets and slopes, the line with the most coloured pixels is selected,
+    and refined by weighted least squares over the coloured pixels near it.
     """
     along, across = np.divmod(np.flatnonzero(labels), labels.shape[1])
-    if len(along) and int(np.bincount(along).max()) >= 0.6 * len(u):  # rows of one colour are not thin
+    if len(along) and int(np.bincount(along).max()) >= 0.6 * len(u):  # a colour across most of the strip is not thin
         each = labels == np.arange(1, int(labels.max()) + 1, dtype=np.uint8)[:, None, None]
         thin = np.add.reduce(each.view(np.uint8), -1, dtype=np.uint16, keepdims=True) < 0.6 * len(u)
         along, across = np.divmod(np.flatnonzero((each & thin).any(0)), labels.shape[1])
@@ -65,7 +70,7 @@ def find_axis(labels: np.ndarray, t: np.ndarray, u: np.ndarray, reach: float) ->
     at = (offset[some] + (0.5 - low) - slopes[:, None] * place[some]).astype(np.intp)
     at += bins * np.arange(len(slopes))[:, None]
     counts = np.bincount(at.ravel(), minlength=bins * len(slopes)).reshape(len(slopes), bins)
-    sums = counts.cumsum(-1)  # the difference of two of these is the sum of five neighbours
+    sums = counts.cumsum(-1)  # differences five apart are sums over five neighbouring offsets
     best = int((sums[:, 5:] - sums[:, :-5]).argmax())
     slope, value = float(slopes[best // (bins - 5)]), best % (bins - 5) + 3 + low
     moments = np.empty((5, len(place)))
@@ -92,18 +97,15 @@ def find_stretches(
     *,
     onward: bool = False,
 ) -> Stretches | None:
-    """Bands along the labels [T, R] of a line's R central rows; None if they fit in no direction, or in both alike.
+    """Bands along a line; None if they fit in neither direction, or equally well in both.
 
-    All ways to cut the line into "before, band 1, ..., band n, after", in both directions, have a score, and the best
-    one is taken (:func:`_sweep`). Hidden stretches cost little, so that a finger across a band does not divide it.
+    Dynamic programming (:func:`_sweep`) finds the best division of the line into "before, band 1, ..., band n, after",
+    in both directions. Hidden parts of the line cost little, so that a finger across a band does not divide the band.
 
-    Args:
-        labels: [T, R] colour labels.
-        drape: [T] whether the surroundings have the same colour, so that the labels do not identify a band.
-        through: [T] whether the surroundings are visible through a transparent part of the tube.
-        table: Labels of colours.
-        middle: Index at which t = 0.
-        onward: Whether the tip is known to lie towards smaller t.
+    ``labels`` [T, R] are those at T positions in the R central rows of the line, and ``middle`` is the index of t = 0.
+    ``drape`` [T] is True where the surroundings have the same colour, so that the labels do not identify a band, and
+    ``through`` [T] where the surroundings are visible through a transparent part of the tube. ``onward`` states that
+    the tip is known to lie towards smaller t; only this direction is then considered.
     """
     raw = _shares(labels, table)  # [C, T]
     share = raw * ~drape
@@ -115,7 +117,7 @@ def find_stretches(
         return None
     at, edges = value.shape[-1] - 1, []
     for total, reached in reversed(cuts):
-        # First index at which the best value was reached; only one path is traced back.
+        # The first position with the best score, if several have it.
         at = int((total[int(flipped), : at + 1] >= reached[int(flipped), at]).argmax())
         edges.append(at)
     ways = (raw[:, ::-1], drape[::-1], through[::-1]) if flipped else (raw, drape, through)
@@ -127,19 +129,19 @@ def find_stretches(
 
 
 def order_scores(labels: np.ndarray, table: ColourTable) -> np.ndarray:
-    """Scores [K] in pixels of lines of labels [K, T, R] in the better direction, relative to lines without bands."""
+    """Scores [K] in pixels of K lines of labels [K, T, R] in the better direction; 0 for a line without bands."""
     sums = _worth(_shares(labels, table).swapaxes(0, 1), table.bands)
     one, other = (_sweep(order)[0][:, -1] for order in (sums, _reversed(sums)))
     return np.maximum(one, other) - sums[0, :, -1]
 
 
 def _reversed(sums: np.ndarray) -> list[np.ndarray]:
-    """Sums for the bands in reversed order: reversing the bands has the same effect as reversing the line."""
+    """Sums for the bands in reversed order, which is equivalent to reversing the line."""
     return [sums[0], *sums[-2:0:-1], sums[-1]]
 
 
 def _shares(labels: np.ndarray, table: ColourTable) -> np.ndarray:
-    """Share of the R labels [..., R] that have each of the C colours: float32 [C, ...]."""
+    """Fraction of the R labels [..., R] that have each of the C colours: float32 [C, ...]."""
     colours = len(table.colours)
     each = np.eye(colours + 1, colours, k=-1, dtype=np.float32) / labels.shape[-1]
     rows = [each.take(labels[..., i], axis=0) for i in range(labels.shape[-1])]
@@ -147,11 +149,11 @@ def _shares(labels: np.ndarray, table: ColourTable) -> np.ndarray:
 
 
 def _worth(share: np.ndarray, bands: tuple[int, ...]) -> np.ndarray:
-    """Cumulative scores [n + 2, K, T + 1] of pixels along lines, if they lie before the n bands, on each, or after.
+    """Cumulative scores [n + 2, K, T + 1] of pixels along K lines, as pixels before, on each of, and after the n bands.
 
-    ``share`` [K, C, T] are the shares of the colours. The score of a pixel on a band is +1 if it has the band's colour,
-    -1 if it has another band's colour and -0.6 if it has neither (a finger, for example). The score of a pixel before
-    or after the bands is -0.25 if it has a band's colour, else 0.
+    ``share`` [K, C, T] are the fractions of the colours. The score of a pixel on a band is +1 if it has the band's
+    colour, -1 if it has another band's colour and -0.6 if it has neither (a finger, for example). The score of a pixel
+    before or after the bands is -0.25 if it has a band's colour, else 0.
     """
     gains, least = _gains(bands, share.shape[1])
     sums = np.zeros((len(least), len(share), share.shape[-1] + 1), dtype=np.float32)
@@ -161,7 +163,7 @@ def _worth(share: np.ndarray, bands: tuple[int, ...]) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def _gains(bands: tuple[int, ...], colours: int) -> tuple[np.ndarray, np.ndarray]:
-    """Scores of pixels of each colour minus those of pixels without one [n + 2, colours]; the latter [n + 2, 1, 1]."""
+    """Scores of a colour minus the score of no colour, [n + 2, C]; and the score of no colour, [n + 2, 1, 1]."""
     gains = np.full((len(bands) + 2, colours), -0.4, dtype=np.float32)
     gains[[0, -1]] = -0.25
     for i, band in enumerate(bands):
@@ -170,11 +172,10 @@ def _gains(bands: tuple[int, ...], colours: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _sweep(order: Iterable[np.ndarray]) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
-    """Dynamic programming over the cuts between stretches, given their cumulative scores [K, T + 1] in order.
+    """Dynamic programming over the cuts between parts of a line, whose cumulative scores [K, T + 1] are in ``order``.
 
-    Returns:
-        Best score [K, T + 1] up to each position, and for each cut the candidates for its position and their running
-        maximum, both [K, T + 1].
+    Returns the best score up to each position, and for each cut the scores of its possible positions and their running
+    maximum; all are [K, T + 1].
     """
     value, *rest = order
     cuts = []
@@ -195,18 +196,22 @@ def _judged(
     flipped: bool,
     middle: float,
 ) -> Stretches:
-    # Plain Python numbers: for so few edges, calls into NumPy would take several times as long.
+    """Bands between the ``cuts`` [N] of a line; an edge is visible if both of its sides have the right colours.
+
+    ``share`` [C, T] are the fractions of the colours; other arguments as in :func:`find_stretches`.
+    """
+    # Python numbers: for so few edges, NumPy calls would take several times as long.
     count, last = share.shape[1], len(bands)
     sums = _sums(share)
     own = _sums(share * ~through) if through.any() else sums
-    drowned = _sums(drape[None])[0]
+    same_background = _sums(drape[None])[0]
 
     def mean(row: np.ndarray, low: int, high: int) -> float:
         low, high = max(0, low), min(count, high)
         return (row.item(high) - row.item(low)) / (high - low) if high > low else 0.0
 
     def clear(i: int, cut: int, mixed: int, side: int, longest: int) -> bool:
-        """Whether both sides of an edge have the right colours; ``mixed`` pixels next to it are ignored."""
+        """Whether ``side`` pixels on both sides of an edge, beyond ``mixed`` pixels, have the right colours."""
         before, after = (cut - mixed - side, cut - mixed), (cut + mixed, cut + mixed + side)
         if i > 0:
             was = sums[bands[i - 1]]
@@ -224,17 +229,20 @@ def _judged(
     edges, doubtful = [], []
     for i, cut in enumerate(cuts):
         length = [cuts[j + 1] - cuts[j] for j in (i - 1, i) if 0 <= j < last]
-        # A band on a background of its colour has no length here, but its edge to the next band may be visible.
+        # A band on a background of the same colour has length 0 here, but its edge to the next band may be visible.
         shortest = min((value for value in length if value > _MIXED), default=0)
-        seen = False
+        visible = False
         if _SIDE // 2 < cut < count - _SIDE // 2:
-            seen = clear(i, cut, _MIXED, max(1, min(_SIDE, shortest - _MIXED)), max(length))
-            if not seen and shortest > 3 * _MOVED:
-                seen = clear(i, cut, _MOVED, _SIDE, max(length))
-        near = mean(drowned, cut - _MIXED - _SIDE, cut - _MIXED), mean(drowned, cut + _MIXED, cut + _MIXED + _SIDE)
+            visible = clear(i, cut, _MIXED, max(1, min(_SIDE, shortest - _MIXED)), max(length))
+            if not visible and shortest > 3 * _MOVED:
+                visible = clear(i, cut, _MOVED, _SIDE, max(length))
+        near = (
+            mean(same_background, cut - _MIXED - _SIDE, cut - _MIXED),
+            mean(same_background, cut + _MIXED, cut + _MIXED + _SIDE),
+        )
         doubtful.append(i in (0, last) or max(near) > 0.25)
         at = cut - 0.5
-        edges.append((count - 1 - at if flipped else at) - middle if seen else np.nan)
+        edges.append((count - 1 - at if flipped else at) - middle if visible else np.nan)
     spans = list(zip(bands, cuts, cuts[1:], strict=False))
     return Stretches(
         np.array(edges),

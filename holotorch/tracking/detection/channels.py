@@ -1,4 +1,4 @@
-"""Order of a frame's colour channels, and the wrong orders in which a catheter's bands show another, valid pose."""
+"""Order of a frame's colour channels, and wrong orders in which a catheter appears in another, valid pose."""
 
 import warnings
 from collections.abc import Sequence
@@ -11,8 +11,8 @@ from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.detection.colours import ColourTable
 from holotorch.tracking.pose.catheter import Catheter
 
-_EDGES = 3  # least number of edges for which a tracker gives a pose
-_MARGIN = 8.0  # degrees by which shading, gloss and a codec change the hue of a colour
+_EDGES = 3  # least number of visible edges for which the tracker computes a pose
+_MARGIN = 8.0  # largest change of a hue by shading, gloss and codecs, in degrees
 
 
 class ChannelOrder(Enum):
@@ -26,14 +26,14 @@ class ChannelOrder(Enum):
     BGR = "BGR"
 
     def to_rgb(self, frames: Tensor) -> Tensor:
-        """Reorder the channels of frames [..., 3, H, W] to RGB; frames that are RGB are returned as they are."""
+        """Frames [..., 3, H, W] of this order with their channels reordered to RGB."""
         if self is ChannelOrder.RGB:
             return frames
         return frames[..., [self.value.index(name) for name in "RGB"], :, :]
 
 
 class ChannelOrderWarning(UserWarning):
-    """The order of the channels is not stated, and frames in another order would show another pose."""
+    """The order of the channels is not stated, and frames in another order would show the catheter in another pose."""
 
 
 def need_frames(frames: Tensor) -> None:
@@ -45,7 +45,7 @@ def need_frames(frames: Tensor) -> None:
 
 
 def stated_order(channels: ChannelOrder | None, camera: Camera, catheter: Catheter) -> ChannelOrder:
-    """Channel order stated by the user, else RGB, with a warning if this catheter cannot reveal a wrong order."""
+    """``channels``, or RGB for None, with a ChannelOrderWarning if the catheter has :func:`ambiguities`."""
     if channels is None:
         if text := ambiguity_text(ambiguities(camera, catheter)):
             text += (
@@ -59,23 +59,24 @@ def stated_order(channels: ChannelOrder | None, camera: Camera, catheter: Cathet
 
 
 def ambiguities(camera: Camera, catheter: Catheter) -> tuple[ChannelOrder, ...]:
-    """Channel orders whose frames, if taken for RGB, may show the bands of this catheter in wrong positions.
+    """Channel orders whose frames, if taken for RGB, may show this catheter in a wrong but valid pose.
 
     For the red, green and blue bands of the thesis, this is BGR: exchanging red and blue gives the same sequence of
-    bands from the other end. Three bands in reversed order fit some pose whatever their lengths are (the cross-ratio of
-    four edges is the same in reverse). Only the width of the tube may contradict this pose, or the lengths of the tube
-    beyond the bands if they are on the frame (:func:`~holotorch.tracking.detection.ends.shows_reversed`).
+    bands from the other end. Three bands in reversed order fit some pose for any lengths of the bands, because the
+    cross-ratio of four edges is the same in reverse. This pose can be refuted only by the width of the tube, or by the
+    lengths of the tube beyond the bands if these are on the frame
+    (:func:`~holotorch.tracking.detection.ends.shows_reversed`).
 
-    Mirrored frames are not covered: the mirror image of a straight tube is always the image of another pose, whatever
-    its colours and lengths are, so that only the scene beside the tube could reveal it.
+    Mirrored frames are not covered: the mirror image of a straight tube is always the image of another pose, for any
+    colours and lengths, so that only the scene beside the tube could reveal the mirror.
 
     Args:
         camera: Camera of the frames; its tone curve determines the hues of levels.
         catheter: Catheter, as for :class:`CatheterTracker`.
 
     Returns:
-        Orders in which at least three edges have colours of the catheter on both sides, in the catheter's sequence from
-        either end. Empty if no order of channels can cause a wrong pose.
+        Orders in which at least three edges show the colours of edges of the catheter, in its sequence from either end.
+        Empty if no order of channels can cause a wrong pose.
 
     Raises:
         ValueError: The colours of the bands are grey, too similar, or the same from both ends.
@@ -108,17 +109,17 @@ def ambiguity_text(orders: Sequence[ChannelOrder]) -> str:
 
 
 _Border = tuple[set[int], set[int]]
-_NONE = -1  # label beyond the bands, and of a colour that no band of the catheter has
+_NONE = -1  # label beyond the bands, and of a colour that no band has
 
 
 def _borders(labels: Sequence[set[int]]) -> list[_Border]:
-    """Labels before and after each edge."""
+    """Possible labels before and after each edge, from the possible labels of each band."""
     padded = [{_NONE}, *labels, {_NONE}]
     return list(zip(padded, padded[1:], strict=False))
 
 
 def _common(wanted: Sequence[_Border], shown: Sequence[_Border]) -> int:
-    """Number of the ``wanted`` edges that are among those ``shown`` in the same order: longest common subsequence."""
+    """Length of the longest common subsequence of the ``wanted`` and the ``shown`` edges."""
     best = [0] * (len(shown) + 1)
     for before, after in wanted:
         row = [0]

@@ -1,4 +1,8 @@
-"""Search of a whole frame for lines on which thin straight objects have the bands' colours, at a bounded cost."""
+"""Search of a whole frame for lines along thin straight objects in the bands' colours, at a bounded cost.
+
+The search reads every second pixel of every second row; these are the coarse pixels. The frame is divided into square
+tiles; a part is the set of pixels of one colour in one tile. M counts parts, K lines.
+"""
 
 import itertools
 from dataclasses import dataclass
@@ -11,15 +15,15 @@ from holotorch.tracking.detection.bands import order_scores
 from holotorch.tracking.detection.colours import ColourTable
 from holotorch.tracking.pose.status import Refusal, Status
 
-_STEP = 2  # every second pixel of every second row is read
-_TILE = 12  # side of a tile in coarse pixels, which are those that are read
-_DENSE = 0.35  # share of a colour in a tile and its neighbours that thin objects never reach
-_FEWEST = 6  # least number of pixels of a colour in a tile
-_TILES = 40  # most tiles of each colour
-_CANDIDATES = 16  # most lines whose labels are read
+_STEP = 2  # distance of coarse pixels, in pixels
+_TILE = 12  # side of a tile in coarse pixels
+_DENSE = 0.35  # fraction of a colour in a tile and its neighbours above which the object is not thin
+_FEWEST = 6  # least number of coarse pixels of a part
+_TILES = 40  # largest number of parts of each colour that are used
+_CANDIDATES = 16  # largest number of lines whose labels are read
 _EVERY = 2  # distance of these labels along a line, in coarse pixels
-_LINES = 3  # most lines that are returned
-_ACROSS = 3.0  # distance from a line up to which tiles belong to it, in coarse pixels
+_LINES = 3  # largest number of lines that are returned
+_ACROSS = 3.0  # distance from a line up to which parts belong to the line, in coarse pixels
 
 
 _Y, _X = np.divmod(np.arange(_TILE**2, dtype=np.float32), _TILE)
@@ -28,14 +32,14 @@ _MOMENTS = np.stack([np.ones_like(_X), _X, _Y, _X * _X, _X * _Y, _Y * _Y], -1)  
 
 @dataclass(frozen=True)
 class Segment:
-    """A line on the frame: two points x + i y in pixels, where its coloured part begins and ends."""
+    """Two points x + i y on the frame, in pixels, where the coloured part of a line begins and ends."""
 
     start: complex
     end: complex
 
 
 def find_segments(frame: Tensor, table: ColourTable) -> list[Segment]:
-    """The most promising lines with at least two bands on a frame uint8 [3, H, W], best first.
+    """Up to three lines with at least two bands on a frame uint8 [3, H, W], the best one first.
 
     Raises:
         Refusal: NO_CATHETER where nothing thin has a band's colour, BANDS_MISSING where no line has two bands in a row.
@@ -52,21 +56,21 @@ def find_segments(frame: Tensor, table: ColourTable) -> list[Segment]:
 
 
 def _labels(frame: Tensor, table: ColourTable) -> np.ndarray:
-    """Labels uint8 [h, w] of every second pixel of every second row; no other step reads the whole frame."""
+    """Labels uint8 [h, w] of the coarse pixels; no other step reads the whole frame."""
     rows, aside = frame.movedim(0, -1)[::_STEP], _STEP
     if frame.device.type != "cpu" or rows.stride()[1:] != (3, 1):
         rows, aside = rows[:, ::_STEP].contiguous().cpu(), 1
-    # As ColourTable.labels, but columns are skipped after the first step: skipping them before takes longer.
+    # The same as ColourTable.labels, but every second column is dropped after the first step, which is faster.
     packed = cv2.cvtColor(rows.numpy(), cv2.COLOR_RGB2BGR555).view(np.uint16)[..., 0]
     if aside == 2 and packed.shape[1] % 2 == 0:
-        # The lower 16 bits of a pair of pixels are the first one; this cast is four times as fast as a strided copy.
+        # The lower 16 bits of two pixels are the first pixel. This cast is four times as fast as a strided copy.
         return cv2.LUT(packed.view("<u4").astype(np.uint16), table.table)
     return cv2.LUT(np.ascontiguousarray(packed[:, ::aside]), table.table)
 
 
 @dataclass(frozen=True, eq=False)
 class _Tiles:
-    """Parts [M] of one colour in tiles: label, number of pixels, centre and unit direction (complex, coarse pixels)."""
+    """Parts [M]: colour index, number of coarse pixels, and centre and unit direction as complex numbers x + i y."""
 
     label: np.ndarray
     count: np.ndarray
@@ -75,12 +79,13 @@ class _Tiles:
 
 
 def _tiles(labels: np.ndarray, colours: int) -> _Tiles | None:
+    """The most elongated parts of each colour in labels [h, w], or None if there are no parts of thin objects."""
     height, width = labels.shape
     down, aside = -height % _TILE, -width % (2 * _TILE)  # padding to whole tiles and to whole words of eight pixels
     if down or aside:
         labels = cv2.copyMakeBorder(labels, 0, down, 0, aside, cv2.BORDER_CONSTANT, value=0)
     blocks = labels.reshape(-1, _TILE, labels.shape[1])
-    # Add eight pixels (bytes) at a time; the sums are small, so no byte overflows.
+    # The sums add eight pixels (bytes) at a time; no byte overflows.
     lit = np.add.reduce((blocks != 0).view(np.uint64), 1).view(np.uint8)
     lit = np.add.reduce(lit.reshape(len(lit), -1, _TILE), 2, dtype=np.float32)
     row, column = (lit >= _FEWEST).nonzero()
@@ -116,7 +121,7 @@ def _most(worth: np.ndarray, count: int, least: float) -> np.ndarray:
 
 
 def _lines(tiles: _Tiles, table: ColourTable) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-    """Lines through two tiles of different colours: middle, direction, first and last position along it, [K] each."""
+    """Lines through two parts of different colours: middle, direction, first and last position along it, [K] each."""
     pairs = []
     for one, other in itertools.combinations(range(len(table.colours)), 2):
         i, j = (tiles.label == one).nonzero()[0], (tiles.label == other).nonzero()[0]
@@ -131,14 +136,16 @@ def _lines(tiles: _Tiles, table: ColourTable) -> tuple[np.ndarray, np.ndarray, n
     if not len(good):
         return None
     i, back = i[good], back[good]
-    offsets = back[:, None] * (tiles.centre - tiles.centre[i, None])  # t + i u of all tiles on each line
+    offsets = back[:, None] * (
+        tiles.centre - tiles.centre[i, None]
+    )  # coordinates t + i u of all parts along and across each line
     t = offsets.real
     straight = np.abs((back[:, None] * tiles.along).real) > 0.8
     used = (np.abs(offsets.imag) < _ACROSS) & straight
     weight = np.where(used, tiles.count, 0)
     colours = len(table.colours)
     each = weight @ (tiles.label[:, None] == np.arange(colours)).astype(weight.dtype)
-    # Tiles spread far along the line reduce its score: they probably belong to other objects.
+    # Parts that are spread far along a line reduce its score, because they probably belong to other objects.
     whole = np.maximum(weight.sum(-1), 1e-6)
     middle = (weight * t).sum(-1) / whole
     spread = np.sqrt((weight * (t - middle[:, None]) ** 2).sum(-1) / whole)
@@ -160,7 +167,7 @@ def _lines(tiles: _Tiles, table: ColourTable) -> tuple[np.ndarray, np.ndarray, n
     chosen = weight[best[keep]]
     mean = chosen @ tiles.centre / chosen.sum(-1)
     offsets = tiles.centre - mean[:, None]
-    # The angle of the principal axis of points is half the angle of the sum of their squares.
+    # The angle of the principal axis of points x + i y is half the angle of the sum of their squares.
     onward = np.exp(0.5j * np.angle((chosen * offsets * offsets).sum(-1)))
     t = (offsets * onward.conj()[:, None]).real
     low = np.where(chosen > 0, t, np.inf).min(-1) - _TILE / 2
@@ -171,7 +178,7 @@ def _lines(tiles: _Tiles, table: ColourTable) -> tuple[np.ndarray, np.ndarray, n
 def _ranked(
     labels: np.ndarray, mean: np.ndarray, along: np.ndarray, low: np.ndarray, high: np.ndarray, table: ColourTable
 ) -> list[Segment]:
-    """The lines whose labels agree best with the order of the bands, best first."""
+    """The lines, given as by :func:`_lines`, whose labels agree best with the order of the bands, best first."""
     height, width = labels.shape
     half = int(0.5 * max(height, width))
     places = np.arange(-half, half + 1.0, _EVERY)[:, None] + 1j * np.array([-1.0, 0.0, 1.0, -7.0, 7.0])

@@ -1,4 +1,4 @@
-"""Table of 32 x 32 x 32 colours that assigns 8-bit pixels to bands without conversion to floating point."""
+"""Table of 32 x 32 x 32 colours that classifies 8-bit pixels without conversion to floating point."""
 
 import math
 
@@ -10,19 +10,19 @@ from torch import Tensor
 from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.pose.catheter import Catheter
 
-_BITS = 5
-_TURN = math.radians(32)  # largest angle between the chromas of a pixel and its band in linear light
-_PURE = 0.35  # least saturation relative to that of the band; gloss and mixed pixels have less
-_DARK = 24 / 255  # darker pixels are noise
+_BITS = 5  # bits of each channel in the index of the table
+_TURN = math.radians(32)  # largest angle between the chroma vectors of a pixel and of its band, in linear light
+_PURE = 0.35  # least saturation of a pixel relative to that of its band; gloss and mixed pixels are less saturated
+_DARK = 24 / 255  # least value of the brightest channel; darker pixels are noise
 
 
 class ColourTable:
-    """Labels pixels by hue, at any brightness: c + 1 for ``colours[c]``, 0 for any other colour.
+    """Labels of pixels by hue, at any brightness: c + 1 for ``colours[c]``, 0 for any other colour.
 
     Attributes:
         colours: The distinct colours of the catheter's bands.
         bands: For each band, the index of its colour in ``colours``.
-        table: uint8 [65536] labels. The index has 16 bits: five of each colour, and a highest bit of no effect.
+        table: uint8 [65536] labels. The index has 16 bits: five of each channel, and a highest bit without effect.
 
     Raises:
         ValueError: Bands are grey, their hues are too similar, or their sequence is the same from both ends.
@@ -53,11 +53,11 @@ class ColourTable:
 
     def labels(self, levels: np.ndarray) -> np.ndarray:
         """Labels uint8 [T, U] of the levels uint8 [T, U, 3], T > 0 and U > 0."""
-        # Concatenate the upper five bits of each colour to an index of the table.
+        # The upper five bits of all channels, concatenated, are the index into the table.
         return cv2.LUT(cv2.cvtColor(levels, cv2.COLOR_RGB2BGR555).view(np.uint16)[..., 0], self.table)
 
     def alike(self, levels: Tensor, margin: float) -> list[list[int]]:
-        """Possible labels of each of the levels [n, 3]: indices into ``colours``, and -1 if it may have no label.
+        """For each of the levels [n, 3], the indices into ``colours`` that it may be classified as; -1 means none.
 
         ``margin`` is the largest error of the hue in degrees.
         """
@@ -67,7 +67,7 @@ class ColourTable:
 
 
 def _chroma(light: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit vector [..., 3] of light minus its grey part; and saturation [...]: its length over that of the light."""
+    """Chroma [..., 3], the unit vector of light minus its mean; saturation [...], that difference's relative length."""
     away = light - light.mean(-1, keepdim=True)
     length = away.norm(dim=-1)
     return away / length.clamp(min=1e-9)[..., None], length / light.norm(dim=-1).clamp(min=1e-9)

@@ -1,4 +1,4 @@
-"""Test whether the tube extends beyond the bands as a pose says, or as the pose with reversed bands would."""
+"""Test whether the tube extends beyond the bands according to a pose, or according to the pose with reversed bands."""
 
 from dataclasses import dataclass
 
@@ -12,22 +12,22 @@ from holotorch.tracking.pose.resection import LinePose
 
 @dataclass(frozen=True)
 class EndCheck:
-    """Parameters of the search for the tube beyond its bands.
+    """Parameters of the search for the tube beyond its bands; a station is a row of samples across the tube.
 
     On the 70 correct and 63 reversed poses of ``trials.conditions``, ``trials.occlusions`` and 30 random poses, the
-    share of stations that show a tube was at least 0.82 with a tube and at most 0.23 without one.
+    fraction of stations that show a tube was at least 0.82 where there is a tube and at most 0.23 elsewhere.
     """
 
-    stations: int = 40  # stations along a part of the tube
+    stations: int = 40  # number of stations on a part of the axis
     fewest: int = 8  # least number of stations on the frame for a part to be evaluated
-    margin: float = 4e-3  # metres left out at each end of a part, for the error of the tip and its taper
-    shown: float = 0.6  # share of stations at and above which a part shows a tube
-    missing: float = 0.4  # share of stations up to which a part shows no tube
+    margin: float = 4e-3  # metres excluded at both ends of a part, for the error of the tip and for the tapered tip
+    shown: float = 0.6  # least fraction of stations for a part to show a tube
+    missing: float = 0.4  # largest fraction of stations for a part to show no tube
     contrast: float = 4.0  # least difference of the tube from both of its sides, in 8-bit levels
 
 
-_INSIDE = np.array([-0.3, -0.15, 0.0, 0.15, 0.3])  # rows on the tube, in widths from the axis
-_BESIDE = np.array([0.9, 1.2, 1.5, 1.8])
+_INSIDE = np.array([-0.3, -0.15, 0.0, 0.15, 0.3])  # samples on the tube: distance from the axis in widths
+_BESIDE = np.array([0.9, 1.2, 1.5, 1.8])  # samples on either side of the tube: the same distance
 _ACROSS = np.concatenate([-_BESIDE[::-1], _INSIDE, _BESIDE])
 _SIZES = len(_BESIDE), len(_INSIDE), len(_BESIDE)
 _MEANS = np.repeat(
@@ -38,15 +38,15 @@ _MEANS = np.repeat(
 def shows_reversed(
     sampler: Sampler, lens: Lens, found: LinePose, catheter: Catheter, check: EndCheck | None = None
 ) -> bool:
-    """Whether the tube is visible where only the reversed bands would put it, and missing where the pose puts it.
+    """Whether the tube is visible where only the reversed catheter would be, and missing where the pose predicts it.
 
     This happens on a frame with exchanged red and blue if the exchange reverses the order of the bands' colours. The
-    reversed catheter lies on the same line, but has other lengths of tube beyond its bands. Both signs are required,
-    because a hand may hide the rear, and another object may lie in line with the tip. The result is False if the tube
-    is equally long on both sides of the bands, or if these parts are outside the frame.
+    reversed catheter lies on the same line, but has other lengths of tube beyond its bands. Both conditions are
+    required, because a hand may hide the rear, and another object may lie in line with the tip. The result is False if
+    the tube is equally long on both sides of the bands, or if these parts are outside the frame.
     """
     check = check or EndCheck()
-    reach = catheter.edges[0] + catheter.edges[-1]  # where the tip lies if the bands are read from the other end
+    reach = catheter.edges[0] + catheter.edges[-1]  # position of the tip of the reversed catheter, in metres
     short, long = sorted((reach, catheter.length))
     ahead, behind = (reach - catheter.length, 0.0), (reach, catheter.length)
     if reach > catheter.length:
@@ -63,9 +63,9 @@ def shows_reversed(
 def _share(
     sampler: Sampler, lens: Lens, found: LinePose, radius: float, part: tuple[float, float], check: EndCheck
 ) -> float | None:
-    """Share of the stations along ``part``, in metres from the tip, at which an object of the tube's width is visible.
+    """Fraction of the stations along ``part``, in metres from the tip, that show an object of the tube's width.
 
-    None if fewer than ``check.fewest`` lie on the frame.
+    None if fewer than ``check.fewest`` stations lie on the frame.
     """
     begin, end = part[0] + check.margin, part[1] - check.margin
     places = begin + (end - begin) / (check.stations - 1) * np.arange(check.stations)
@@ -84,7 +84,7 @@ def _share(
     inside = sampler.inside(pixels[:, [0, -1]]).all(-1)
     if (count := int(inside.sum())) < check.fewest:
         return None
-    # Mean levels of all three channels over one side, the tube and the other side.
+    # Mean levels, over all three channels, of one side, the tube and the other side.
     levels = sampler.nearest(pixels if count == len(pixels) else pixels[inside])
     one, tube, other = _MEANS @ levels.reshape(count, -1).astype(np.float32).T
     brighter, darker = tube - np.maximum(one, other), np.minimum(one, other) - tube

@@ -1,7 +1,8 @@
 """Position of an edge between two colours to hundredths of a pixel, with its standard deviation.
 
-The fit works in linear light and weights samples by their inverse variances. The light levels of each row and channel
-are eliminated by variable projection (Golub and Pereyra 1973).
+The fit works in linear light and weights samples by their inverse variances. The light levels on both sides of an edge,
+in each row and channel, are eliminated by variable projection (Golub and Pereyra 1973). A row of samples crosses the
+edge; E counts edges, T samples along a row, U rows, C channels, and R = U C.
 """
 
 import math
@@ -12,23 +13,22 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-_STEPS = 8  # most Gauss-Newton steps
-# Largest last step of position and of blur at convergence, in samples or relative to the blur; the next steps would be
-# a twentieth of them.
-_ENDS = 0.06, 0.16
-_NEAR = 0.03  # the same for the last of the two further steps of the position alone
-_SHARED = 1.2  # measured ratio of a position's deviation to that without pixels shared by adjacent samples
-_STRANGE = 1.5  # ratio of the residual to its white part above which the model is incomplete
-_OWN = 1.4  # measured ratio of the channels' scatter, which shading and gloss increase, to that from noise
-_OTHER = 4.0  # standard deviations by which an edge's blur may differ from the shared one
+_STEPS = 8  # largest number of Gauss-Newton steps
+_ENDS = 0.06, 0.16  # steps of position and of blur at convergence, in units of the blur or of one sample if larger
+_NEAR = 0.03  # step at convergence, in samples, when the position alone is refined
+_SHARED = 1.2  # measured factor on a position's standard deviation, because adjacent samples share pixels
+_STRANGE = 1.5  # ratio of the residuals to their white part above which the model is incomplete
+_OWN = 1.4  # measured ratio of the scatter between channels, which shading and gloss increase, to that from noise
+_OTHER = 4.0  # standard deviations by which the blur of an edge may differ from the common blur
 SHARPEST, BLUNTEST = 0.35, 10.0  # least and largest standard deviation of an edge's blur in pixels
 
-# Model of an edge: maps t [T], position [E] and blur [E], in samples, to its values and both derivatives, [E, 3, T].
+# Model of an edge: maps t [T], position [E] and blur [E], in samples, to [E, 3, T]: the profile from 0 to 1, and its
+# derivatives by position and by blur.
 Shape = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 def median(values: np.ndarray) -> float:
-    """Upper median of values [n], n > 0; NumPy's median takes ten times as long for a few values."""
+    """Median of values [n], n > 0, the upper one for even n. NumPy's median takes ten times as long for few values."""
     return float(np.sort(values)[len(values) // 2])
 
 
@@ -40,10 +40,10 @@ class EdgeFit:
         place: [E] positions in samples from the middle of the window.
         blur: [E] standard deviations of the blur in samples.
         deviation: [E] standard deviations of ``place`` from the noise; infinite where there is no edge.
-        noise: Standard deviation of the residuals over that of the weights; 1 if the weights are correct.
-        steps: [E, U, C] light after the edge minus light before it, in each row and channel.
+        noise: [E] rms of the residuals in units of their expected standard deviation; 1 if the weights are correct.
+        steps: [E, U, C] light after the edge minus light before the edge, in each row and channel.
         levels: [E, U, C] light before the edge.
-        told: [E, U, C] inverse variance of the position from a unit step in each row and channel.
+        told: [E, U, C] inverse variance of the position from a step of 1 in each row and channel.
         apart: [E] scatter of the channels' positions relative to that from noise; at least 1, equal for all edges.
     """
 
@@ -57,20 +57,20 @@ class EdgeFit:
     apart: np.ndarray
 
     def or_better(self, other: "EdgeFit") -> "EdgeFit":
-        """For each edge, the one of the two fits that has the smaller deviation."""
+        """For each edge, this fit or the other one, whichever has the smaller deviation."""
         better = other.deviation < self.deviation
         pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
         return EdgeFit(*(np.where(better.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in pairs))
 
 
 def normal_step(t: np.ndarray, place: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Step from 0 to 1 at ``place`` [E], blurred by ``sigma`` [E], at t [T], and both derivatives: [E, 3, T]."""
+    """Step from 0 to 1 at ``place`` [E], blurred by ``sigma`` [E], at t [T]; a :data:`Shape`."""
     z = (t - place[:, None]) / sigma[:, None]
-    found = np.empty((len(z), 3, len(t)))
-    found[:, 0] = ndtr(z)
-    found[:, 1] = np.exp(-0.5 * z * z) / (-math.sqrt(2 * math.pi) * sigma[:, None])
-    np.multiply(found[:, 1], z, out=found[:, 2])
-    return found
+    values = np.empty((len(z), 3, len(t)))
+    values[:, 0] = ndtr(z)
+    values[:, 1] = np.exp(-0.5 * z * z) / (-math.sqrt(2 * math.pi) * sigma[:, None])
+    np.multiply(values[:, 1], z, out=values[:, 2])
+    return values
 
 
 def fit_edges(
@@ -84,10 +84,10 @@ def fit_edges(
 
     Args:
         light: [E, T, U, C] samples of E edges at T positions in U rows and C channels; T odd, the edge near the middle.
-        weight: [E, T, U, C] inverse variances; 0 leaves a sample out.
+        weight: [E, T, U, C] inverse variances; 0 excludes a sample.
         blur: Initial standard deviation of the blur in samples.
         shape: Model of an edge, by default a blurred step.
-        t: [T] positions of the samples, increasing and symmetric about 0; by default one apart.
+        t: [T] positions of the samples, increasing and symmetric about 0; by default with a spacing of 1.
     """
     rows, flat = light.shape[2:], (*light.shape[:2], -1)  # [E, T, U C]
     light, weight = (np.ascontiguousarray(given, dtype=np.float64).reshape(flat) for given in (light, weight))
@@ -120,18 +120,21 @@ def fit_edges(
         deviation.append(_SHARED * math.sqrt(variance) * max(noise[e], 0.5) * doubt if good else math.inf)
     noise, deviation = np.array(noise), np.array(deviation)
     good = np.isfinite(deviation)
-    # Where there is no edge (for example if one side lies beyond the frame), these values are only rounding errors.
+    # Only edges count: elsewhere, for example if one side lies outside the frame, these values are rounding errors.
     apart = _apart(terms.slope[good], terms.own[good], noise[good], rows[-1]) if good.any() else 1.0
     levels = mean - terms.amplitude * terms.middle
     steps, levels, told = (v.reshape(-1, *rows) for v in (terms.amplitude, levels, terms.told))
     return EdgeFit(np.array(place), blurs, apart * deviation, noise, steps, levels, told, np.full(len(place), apart))
 
 
-# Plain Python numbers: for a few numbers per edge, calls into NumPy would take several times as long.
+# This and the next function use Python numbers: for a few edges, NumPy calls would take several times as long.
 def _each_by_itself(
     shape: Shape, t: np.ndarray, blur: float, given: tuple[np.ndarray, np.ndarray]
 ) -> tuple[list[float], list[float], list[float]]:
-    """Separate fits of position and blur of each edge, and inverse variance of the blur; ``given``: weights, total."""
+    """Position, blur and inverse variance of the blur of each edge, fitted separately.
+
+    ``given`` are the last two arguments of :func:`_edge_terms`.
+    """
     count, far = len(given[0]), float(t[-1])
     place, sigma, sure = [0.0] * count, [blur] * count, [0.0] * count
     for _ in range(_STEPS):
@@ -139,10 +142,10 @@ def _each_by_itself(
         terms = _edge_terms(shape(t, np.array(place), np.array(sigma)), *given)
         for e, (((pp, pb), (_, bb)), (p, b)) in enumerate(terms.sums):
             sure[e] = _within(bb - pb * pb / max(pp, 1e-30), 0.0, 1e12)
-            whole = (1 + 1e-6) * pp * bb - pb * pb
-            if whole > 0:  # without weight it is 0: the edge stays, and its deviation is infinite
-                along = _within((bb * p - pb * b) / whole, -1.5, 1.5)
-                wider = _within((pp * b - pb * p) / whole, -1.5, 1.5)
+            determinant = (1 + 1e-6) * pp * bb - pb * pb
+            if determinant > 0:  # 0 if all weights are 0: the edge stays where it is
+                along = _within((bb * p - pb * b) / determinant, -1.5, 1.5)
+                wider = _within((pp * b - pb * p) / determinant, -1.5, 1.5)
                 place[e] = _within(place[e] + along, -far, far)
                 sigma[e] = _within(sigma[e] + wider, SHARPEST, BLUNTEST)
                 least = max(sigma[e], 1.0)
@@ -153,10 +156,10 @@ def _each_by_itself(
 
 
 def _one_lens(sigma: list[float], sure: list[float]) -> tuple[list[float], list[float], list[bool]]:
-    """Blurs, their inverse variances, and whether the blur of each edge significantly differs from the common one.
+    """Blurs, their inverse variances, and whether the blur of each edge differs significantly from the common blur.
 
-    The lens blurs all edges equally. If one side of an edge is dark and so has little noise, position and blur of this
-    edge alone are strongly correlated; a common blur removes this ambiguity.
+    The lens blurs all edges equally, and edges of similar blur get one common blur. This resolves the correlation of
+    position and blur, which is strong for an edge with one dark side, where the noise is small.
     """
     both = list(zip(sigma, sure, strict=True))
     common = max(sum(width * s for width, s in both) / max(sum(sure), 1e-30), 1e-30)
@@ -170,7 +173,7 @@ def _one_lens(sigma: list[float], sure: list[float]) -> tuple[list[float], list[
 
 
 def _left(left: np.ndarray, weight: np.ndarray) -> tuple[list[float], list[float], list[int]]:
-    """Of residuals [E, T, R]: their size over the noise, the ratio of it to their white part, degrees of freedom."""
+    """Of residuals [E, T, R]: rms in units of the noise, ratio of this rms to its white part, degrees of freedom."""
     bent = left[:, 2:] - 2 * left[:, 1:-1] + left[:, :-2]
     whole = (weight * left * left).sum((1, 2)).tolist()
     rough = (weight[:, 1:-1] * bent * bent).sum((1, 2)).tolist()
@@ -180,19 +183,18 @@ def _left(left: np.ndarray, weight: np.ndarray) -> tuple[list[float], list[float
     ends = used[:, :: used.shape[1] - 1].sum((1, 2)).tolist()
     free = [n - 2 * level - 2 for n, level in zip(count, levels, strict=True)]
     noise = [math.sqrt(value / max(n, 1)) for value, n in zip(whole, free, strict=True)]
-    # Residuals that vary from sample to sample are noise; smooth ones come from something the model does not contain.
+    # White residuals, estimated from second differences, are noise; smooth residuals are errors of the model.
     white = [math.sqrt(rough[e] / (6 * max(count[e] - ends[e], 1))) for e in range(len(rough))]
     return noise, [value / max(part, 1e-9) for value, part in zip(noise, white, strict=True)], free
 
 
 class _Terms(NamedTuple):
-    """Terms of the fit to edges [E] in rows and channels [R] at given positions and blurs.
+    """Normal equations of the fit for position p and blur b of edges [E], at given positions and blurs.
 
     Attributes:
-        sums: For each edge, normal matrix ((pp, pb), (pb, bb)) and right side (p, b) for position and blur, summed over
-            rows and channels.
+        sums: For each edge, normal matrix ((pp, pb), (pb, bb)) and right side (p, b), summed over rows and channels.
         own, slope: [E, R] pp and p of each row and channel.
-        told: [E, R] pp for a step of 1 if step and levels were known.
+        told: [E, R] pp for a step of 1 between known levels.
         amplitude: [E, R] fitted steps.
         middle: [E, R] weighted means of ``rise``.
         rise: [E, T] model of the edge.
@@ -208,9 +210,9 @@ class _Terms(NamedTuple):
 
 
 def _edge_terms(shape: np.ndarray, weights: np.ndarray, total: np.ndarray) -> _Terms:
-    """Terms of the fit from the model and its derivatives [E, 3, T].
+    """Normal equations from the model and its derivatives ``shape`` [E, 3, T].
 
-    ``weights`` [E, T, 2 R] are the weights, then weights times light; ``total`` [E, R] are the weights summed over T.
+    ``weights`` [E, T, 2 R] holds the weights, then weights times light; ``total`` [E, R] are the weights summed over T.
     """
     rows = total.shape[1]
     # Weighted moments over T of each row and channel, with the levels projected out.
@@ -236,11 +238,11 @@ def _within(value: float, least: float, most: float) -> float:
 
 
 def _apart(slope: np.ndarray, power: np.ndarray, noise: np.ndarray, colours: int) -> float:
-    """Ratio of the scatter of an edge's positions in the channels to that from noise, at least 1.
+    """Ratio of the scatter of an edge's position between channels to that from noise, at least 1.
 
-    Codecs store chroma at half the resolution of luma, often displaced by half a pixel, and blur levels instead of
-    light. The channels then disagree on the position of an edge, at all edges to the same degree. ``slope`` and
-    ``power`` [E, R] are right side and normal matrix for a separate position in each row and channel.
+    Codecs store chroma at half the resolution of luma, often displaced by half a pixel, and blur gamma-encoded levels
+    instead of light. The channels then disagree on the positions of all edges to the same degree. ``slope`` and
+    ``power`` [E, R] are the right sides and normal matrices of a separate position in each row and channel.
     """
     slope, power = (value.reshape(len(value), -1, colours).sum(1) for value in (slope, power))
     power = np.maximum(power, 1e-30)

@@ -1,4 +1,8 @@
-"""Image of a catheter at a given pose: the width of the tube along its image line, and the bulge of its rings."""
+"""Image of a catheter at a given pose: the width of the tube along its image line, and the bulge of its rings.
+
+A ring is the circle around the tube at a band edge. Only its front is visible. The bulge is the distance of this front
+from the image of the ring's centre.
+"""
 
 import math
 from collections.abc import Sequence
@@ -13,18 +17,19 @@ from holotorch.tracking.pose.resection import LinePose
 _INTERPOLATED = 1 / 6  # variance in pixels^2 that bilinear interpolation adds to a blur in any direction
 _NODES = (np.arange(16) + 0.5) / 8 - 1  # midpoints of 16 slices across a tube, whose sides lie at -1 and 1
 _ROUND = np.sqrt(1 - _NODES**2)
-_LIT = np.stack([np.ones_like(_NODES), _NODES, _ROUND], -1)
+_LIT = np.stack([np.ones_like(_NODES), _NODES, _ROUND], -1)  # shapes of a step of light across a tube
 _BOTH = np.concatenate([_LIT, _LIT * _ROUND[:, None]], -1)
-_RIDGE = 1e-4 * np.eye(_LIT.shape[1])
+_RIDGE = 1e-4 * np.eye(_LIT.shape[1])  # regularises the fit of the shapes
 
 
 def width_px(found: LinePose, positions: Sequence[float], radius: float, line: Line) -> tuple[float, float]:
-    """Width of the tube's image at t = 0 in pixels across the line, and its change per pixel.
+    """Width of the tube's image at t = 0 in pixels, and its change per pixel along the line.
 
     On the plane z = 1 the width is 2 r / (z sqrt(1 - n_z^2)), where n is the unit normal of the plane through the axis
-    and the camera centre. The root accounts for oblique rays away from the image centre.
+    and the camera centre. The root accounts for oblique rays away from the image centre. ``positions`` are those of the
+    edges in metres from the tip.
     """
-    # Plain Python numbers, here and below: for so few rings, NumPy calls cost several times as much.
+    # Python numbers here and below: for so few rings, NumPy calls would take several times as long.
     (x, y, z), (a, b, c) = found.tip.tolist(), found.direction.tolist()
     nx, ny, nz = y * c - z * b, z * a - x * c, x * b - y * a
     slant = math.sqrt(1 + nz * nz / (nx * nx + ny * ny)) if nx or ny else math.inf
@@ -55,14 +60,15 @@ def axis_on_plane(found: LinePose, position: float) -> complex:
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """Bulge of the rings' fronts in rows [U] across the images of tubes [E], relative to the bulge at the mid-line.
+    """Bulge of the rings' fronts at edges [E] in rows [U] across the tube, relative to the bulge at the mid-line.
 
-    The blur mixes adjacent rows: the observed bulge is their mean, weighted by the step of light at the edge in each.
-    These steps vary across the tube, in K shapes.
+    The blur mixes adjacent rows: the observed bulge is the mean over these rows, weighted by the step of light in each
+    row. The steps are modelled as a combination of K shapes across the tube.
 
     Attributes:
         mean: [E, U] bulge if the step of light is constant across the tube.
-        change, bulge: [E, U, K] blurred step of each shape, and the same weighted by the bulge.
+        change: [E, U, K] blurred step of each shape.
+        bulge: [E, U, K] blurred product of each shape and the bulge.
     """
 
     mean: np.ndarray
@@ -71,7 +77,7 @@ class Front:
 
     @staticmethod
     def of(u: np.ndarray, widths: np.ndarray, blur: float) -> "Front":
-        """Bulge in rows ``u`` [U] of tubes of ``widths`` [E] with sides of standard deviation ``blur``; pixels."""
+        """Bulge in rows ``u`` [U] of tubes of ``widths`` [E], with sides blurred by ``blur`` (sigma); all in pixels."""
         sigma = math.sqrt(max(blur**2 - _INTERPOLATED, SHARPEST**2))
         z = (u[:, None] - widths[:, None, None] / 2 * _NODES) * (math.sqrt(0.5) / sigma)
         both = (np.exp(-z * z) + 1e-30) @ _BOTH
@@ -79,12 +85,9 @@ class Front:
         return Front(bulge[..., 0] / change[..., 0], change, bulge)
 
     def shift(self, steps: np.ndarray, told: np.ndarray, row: np.ndarray) -> np.ndarray:
-        """Average bulge of the edges [E] in excess of ``mean``, from the steps of light at them.
+        """Average [E] over the rows of the bulge minus ``mean``, from the ``steps`` of light [E, U, C] at the edges.
 
-        Args:
-            steps: [E, U, C] steps of light at the edges.
-            told: [E, U, C] inverse variance of the position from a unit step.
-            row: [E, U] weights of the rows.
+        ``told`` [E, U, C] are the inverse variances of the position from a step of 1, ``row`` [E, U] weights of rows.
         """
         known = (row[:, None] * (told > 0).swapaxes(1, 2))[..., None]
         weighed = (self.change[:, None] * known).swapaxes(2, 3)  # [E, C, K, U]

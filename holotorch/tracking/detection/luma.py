@@ -1,7 +1,7 @@
 """Fits of edges in luma, for frames with subsampled chroma (4:2:0 video, JPEG, webcams).
 
 Codecs store luma (a weighted sum of gamma-encoded levels) for each pixel, but chroma only once per two or four pixels,
-often displaced by half a pixel. A fit to all channels then misplaces an edge by up to a pixel; a fit to luma does not.
+often displaced by half a pixel. A fit to all channels is then wrong by up to a pixel; a fit to luma is not.
 """
 
 import dataclasses
@@ -12,10 +12,11 @@ from holotorch.tracking.camera.numpy_lens import Points
 from holotorch.tracking.camera.strips import Sampler
 from holotorch.tracking.detection.fits import EdgeFit, fit_edges, normal_step
 
-_LUMA = np.array([0.299, 0.587, 0.114])  # of red, green and blue levels in luma, ITU-R BT.601
+_LUMA = np.array([0.299, 0.587, 0.114])  # weights of red, green and blue levels in luma, ITU-R BT.601
 _MIXES = np.stack([_LUMA, np.array([1.0, 0.0, 0.0]) - _LUMA]).astype(np.float32)  # luma, and red minus luma
 _LEVEL_SD = 2.5  # assumed standard deviation of a pixel's level; fits rescale it by their residuals
-_PATCH, _COARSE = 24, 0.6  # side of a patch in pixels; largest ratio to luma's change at which chroma is coarse
+_PATCH = 24  # side in pixels of the patches in which the resolution of chroma is estimated
+_COARSE = 0.6  # largest ratio of the changes of red minus luma to the changes of luma at which chroma is coarse
 _ASIDE = 0.25  # standard deviation in pixels of the error that coarse chroma adds to the position of an edge
 
 
@@ -23,9 +24,9 @@ def coarse_colours(sampler: Sampler, pixels: Points) -> np.ndarray:
     """Whether chroma has a lower resolution than luma near each of the pixels x + i y [n]: bool [n].
 
     The frame must have at least 24 x 24 pixels. With independent noise in each channel, red minus luma changes 1.4
-    times as much between neighbouring pixels as luma does. Where a codec has halved the resolution of chroma, it
-    changes less within a pair of pixels that share their chroma than between pairs; where the decoder has
-    interpolated it smoothly, its second differences are smaller than those of luma.
+    times as much between neighbouring pixels as luma. If a codec has halved the resolution of chroma, red minus luma
+    changes less within pairs of pixels that share their chroma than between pairs. If the decoder has interpolated
+    chroma smoothly, the second differences of red minus luma are smaller than those of luma.
     """
     patches = np.empty((3, len(pixels), _PATCH, _PATCH), dtype=np.float32)
     for n, pixel in enumerate(pixels.tolist()):
@@ -41,7 +42,7 @@ def coarse_colours(sampler: Sampler, pixels: Points) -> np.ndarray:
 
 
 def _median(values: np.ndarray) -> np.ndarray:
-    """Median of the absolute values over the last two axes; for an even count the upper one."""
+    """Median (the upper one for an even count) of the absolute values over the last two axes."""
     flat = np.abs(values).reshape(*values.shape[:-2], -1)
     middle = flat.shape[-1] // 2
     flat.partition(middle)
@@ -53,9 +54,9 @@ def fit_luma(
 ) -> tuple[EdgeFit, EdgeFit]:
     """Fit edges to luma, and use its positions where they are more precise than those of all channels.
 
-    Blur acts on linear light, whereas luma is a sum of gamma-encoded levels, so the luma profile of a blurred edge is
-    not an error function. It is computed from the light on both sides of the edge, which chroma subsampling does not
-    change.
+    Blur acts on linear light, whereas luma is a sum of gamma-encoded levels, so that the luma profile of a blurred edge
+    is not an error function. The profile is computed from the light on both sides of the edge, which chroma subsampling
+    does not change.
 
     Args:
         fit: Fit of all channels to ``light``.
@@ -65,9 +66,9 @@ def fit_luma(
         t: [T] positions of the samples, as in :func:`fit_edges`.
 
     Returns:
-        ``fit`` with position, blur and deviation (in samples) from luma where luma is more precise, and otherwise from
-        all channels with a larger deviation. Second, the fit to luma alone: its steps describe how the light changes
-        across a tube even where coarse chroma is smeared. Its ``told`` is 0 for the edges that use all channels.
+        First, ``fit`` with position, blur and deviation from luma for edges where luma is more precise, and a larger
+        deviation for the other edges. Second, the fit to luma alone, whose steps describe how the light varies across a
+        tube even where coarse chroma is smeared, and whose ``told`` is 0 for the other edges.
     """
     rows = shown.sum(1)[..., None]
     low, step = ((value * rows).sum(1) / np.maximum(rows.sum(1), 1e-9) for value in (fit.levels, fit.steps))  # [E, 3]
@@ -84,8 +85,8 @@ def fit_luma(
     luma = np.interp(light, curve, levels) @ _LUMA
     weight = shown[..., None] / (_LEVEL_SD**2 * float(_LUMA @ _LUMA))
     found = fit_edges(luma[..., None], np.broadcast_to(weight, (*shown.shape, 1)), float(np.median(fit.blur)), shape, t)
-    # All channels together may also be displaced, by up to half a chroma pixel, and by more where their positions
-    # disagree: their deviation is increased.
+    # The deviation of a position from all channels is increased: such a position may be wrong by up to half a chroma
+    # pixel, and by more if the channels disagree.
     worse = np.hypot(fit.apart * fit.deviation, _ASIDE)
     better = found.deviation < worse
     fit = dataclasses.replace(fit, deviation=worse)

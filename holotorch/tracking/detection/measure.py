@@ -22,45 +22,45 @@ from holotorch.tracking.pose.status import Refusal, Status
 
 @dataclass(frozen=True)
 class StripSearch:
-    """How the labels of a strip of the frame are searched for the tube and its bands."""
+    """Parameters of the search for the tube and its bands in a strip of the frame. A column is a position along it."""
 
-    columns: int = 40  # least columns in half of the strip that are classified, of every second to sixth pixel
-    columns_cold: int = 280  # the same where no previous pose says that the tube is there
-    similar: float = 0.2  # difference up to which two colours are equal, as a share of the brightest channel
-    pale: float = 0.5  # purity of a colour, relative to that of the background, below which cloth shines through a tube
-    beside: float = 14.0  # distance from the axis at which the background is read, in pixels: beside the widest tubes
-    halfway: int = 6  # samples to either side of a change of labels
+    columns: int = 40  # least number of columns in half of the strip that are classified; 2 to 6 pixels apart
+    columns_cold: int = 280  # the same number without a previous pose
+    similar: float = 0.2  # largest difference of equal colours, as a fraction of the brightest channel
+    pale: float = 0.5  # purity of a colour over that of the background below which cloth is visible through the tube
+    beside: float = 14.0  # distance from the axis at which the background is read, in pixels; beside the widest tubes
+    halfway: int = 6  # samples on either side of a change of labels
     halfway_ends: int = 3  # outermost samples on either side that surely show one colour
 
 
 @dataclass(frozen=True)
 class EdgeWindow:
-    """Which pixels around an edge are sampled, and with which weight; in pixels unless said otherwise."""
+    """Samples around an edge, and their weights; in pixels unless stated otherwise."""
 
-    half: int = 20  # half-width of the window along the tube; every second pixel is read
-    dense: int = 5  # distance up to which every pixel is read, plus two blurs
-    outside: int = 10  # distance beyond an outermost edge up to which samples count
-    aside: float = 0.9  # distance from the side of the tube beyond which a row of samples has no weight
-    white: int = 252  # highest level that is surely not saturated
-    saturated: float = 0.1  # share of saturated samples from which a row has no weight
+    half: int = 20  # half-width of the window along the tube, of which every second pixel is read
+    dense: int = 5  # distance from the edge, plus two blurs, up to which every pixel is read
+    outside: int = 10  # distance beyond an outermost edge, plus two blurs, up to which samples have weight
+    aside: float = 0.9  # distance outside the side of the tube from which on a row of samples has no weight
+    white: int = 252  # highest 8-bit level that is surely not saturated
+    saturated: float = 0.1  # fraction of saturated samples from which on a row has no weight
 
 
 @dataclass(frozen=True)
 class EdgeLimits:
-    """When an edge is measured again or refused. In pixels unless said otherwise; determined on synthetic frames."""
+    """Limits for measuring an edge again or refusing it, in pixels unless stated otherwise; from synthetic frames."""
 
-    far: float = 2.0  # distance from its expected position at which an edge is measured again
-    margin: float = 8.0  # distance to the border of the frame that an edge needs, plus two blurs
-    smeared: float = 4.0  # blur that only motion makes
+    far: float = 2.0  # distance from the expected position from which on an edge is measured again
+    margin: float = 8.0  # least distance of an edge to the border of the frame, in addition to two blurs
+    smeared: float = 4.0  # blur above which the tube must have moved during the exposure
     unsure: float = 0.1  # deviation above which an edge is measured again in the middle rows alone
-    lost: float = 3.0  # deviation above which there is no edge
-    across: float = 0.25  # change of the background beside an edge over the change on it: something lies across
-    same: float = 0.6  # the same ratio, from which on the bands continue beside the tube
-    clear: float = 4.0  # least significance of a change of the background, in standard deviations
+    lost: float = 3.0  # deviation from which on there is no edge
+    across: float = 0.25  # ratio of light's change beside and on an edge above which an object crosses the tube
+    same: float = 0.6  # the same ratio above which the bands continue beside the tube
+    clear: float = 4.0  # least change of the background in standard deviations for the change to be significant
 
 
 _SEARCH, _WINDOW, _LIMITS = StripSearch(), EdgeWindow(), EdgeLimits()
-BLURRED = 0.6  # pixels: difference of a blur from the expected one above which edges are measured again
+BLURRED = 0.6  # pixels: difference of the measured from the expected blur above which edges are measured again
 _SIGNS, _ROWS = np.repeat([-1.0, 1.0], 3), np.tile([2.0, 3.0, 4.0], 2)  # three background rows on each side of the tube
 
 
@@ -74,8 +74,8 @@ class Edges:
         blur: Median blur of the edges.
         expected: Blur for which the windows were chosen.
         bulge: Largest bulge of a ring's front along the line.
-        coarse: Whether the colours have fewer pixels than the luma.
-        hidden, outside: Indices of the edges that are hidden, or too close to the border of the frame.
+        coarse: Whether chroma has fewer pixels than luma.
+        hidden, outside: Indices of the edges that are hidden and of those that are too close to the frame's border.
     """
 
     t: np.ndarray
@@ -99,23 +99,17 @@ def find_bands(
     *,
     onward: bool,
 ) -> tuple[Line, Stretches]:
-    """Search a strip around a line for the tube, and the tube for its bands.
+    """Search a strip around ``line`` for the tube, and the line of the tube for its bands.
 
-    Args:
-        sampler: Reads the frame.
-        lens: Distortion of the camera.
-        line: Axis of the strip.
-        table: Labels of colours.
-        half: Half of the length of the strip, in pixels.
-        aside: Half of its width, in pixels.
-        reach: Largest slope of the tube relative to ``line``.
-        onward: Whether t on ``line`` is known to rise from the tip to the rear.
+    The strip extends ``half`` pixels from t = 0 in both directions along the line, and ``aside`` pixels to both sides.
+    ``reach`` is the largest slope of the tube relative to the line. ``onward`` states that t on the line is known to
+    rise from the tip to the rear.
 
     Returns:
-        Line along the tube, on which t rises from the tip to the rear, and the stretches of bands on it.
+        Line along the tube, on which t rises from the tip to the rear, and the bands on this line.
 
     Raises:
-        Refusal: NO_AXIS where nothing thin has the bands' colours, BANDS_MISSING where these are not in their order.
+        Refusal: NO_AXIS if nothing thin has the bands' colours, BANDS_MISSING if the colours are not in their order.
     """
     end = math.ceil(half)
     t = np.arange(-end, end + 1.0)
@@ -129,7 +123,7 @@ def find_bands(
     rows = np.array([-1.0, 0.0, 1.0, -_SEARCH.beside, _SEARCH.beside])
     levels = sampler.nearest(line.pixels(lens, t, rows))
     near = table.labels(levels)
-    # Where the line and both of its sides have the same colour, it may lie on a drape in the colour of a band.
+    # If the line and both sides have the same colour, the tube may lie on a drape in the colour of a band.
     shown = levels[:, [1, 3, 4]].transpose(2, 0, 1).astype(np.float32, order="C")
     most = shown.max(0)
     gap = np.abs(shown[..., 1:] - shown[..., :1]).max(0)
@@ -149,10 +143,10 @@ def find_bands(
 
 
 def halfway(sampler: Sampler, lens: Lens, line: Line, edges: np.ndarray) -> np.ndarray:
-    """Refine ``edges`` [N] from labels to the positions where the light is halfway between that on both sides.
+    """Refine ``edges`` [N] from labels to the positions where the light is the mean of the light on both sides.
 
     For a step from 0 to 1 at x, sampled at -n to n, the sum of 1 - step is x + n + 1/2 for any symmetric blur. An edge
-    whose refined position is more than a few pixels away stays as it is.
+    that would move by three pixels or more is not refined.
     """
     k = np.arange(-_SEARCH.halfway, _SEARCH.halfway + 1.0)
     around = lens.distort(line.plane((edges[:, None] + k)[..., None], np.array([-1.0, 0.0, 1.0])))
@@ -178,19 +172,13 @@ def measure_edges(
 ) -> Edges:
     """Measure the positions of the band edges along the axis.
 
-    An edge fails if it is hidden (the background changes there, too), unclear, or too close to the frame's border.
-
-    Args:
-        sampler: Reads the frame.
-        lens: Distortion of the camera.
-        axis: Axis and width of the tube's image.
-        guess: [N] expected positions in pixels; NaN for an edge that is not to be measured.
-        doubtful: Whether each edge may belong to an object that lies across the tube.
-        blur: Expected blur in pixels.
-        curve: [N] bulge of each ring's front along t, in pixels.
+    An edge is omitted if it is hidden (the background beside it changes, too), unclear, or close to the frame's border.
+    ``guess`` [N] are the expected positions in pixels, NaN for edges to omit; ``doubtful`` whether each edge may belong
+    to an object that lies across the tube; ``blur`` the expected blur in pixels; and ``curve`` [N] the bulge of each
+    ring's front along t, in pixels.
 
     Raises:
-        Refusal: INCONSISTENT where all edges continue beside the tube.
+        Refusal: INCONSISTENT if all edges continue beside the tube.
     """
     line = axis.line
     chosen = np.isfinite(guess).nonzero()[0]
@@ -223,7 +211,7 @@ def measure_edges(
         if coarse:
             fit, shading = fit_luma(fit, light, shown, sampler.light, along)
         elif bool((fit.deviation > _LIMITS.unsure).any()) and not _astray(fit, looks):
-            # An uneven background leaks into the outer rows, so that the middle rows alone may fit better.
+            # Light of an uneven background leaks into the outer rows, so that the middle rows alone may fit better.
             core = weight * (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)[:, None, :, None]
             fit = shading = fit.or_better(fit_edges(light, core, blur, t=along))
         near = near + fit.place
@@ -241,7 +229,7 @@ def measure_edges(
         if not within[j]:
             outside.append(index)
         elif doubtful[index] and covered[j]:
-            hidden.append(index)  # an edge between two bands is not doubtful: their colours identify it
+            hidden.append(index)  # an edge between two bands is not doubtful, since both colours identify it
         elif clear[j]:
             t[index], deviation[index] = near[j], fit.deviation[j]
     soft = median(fit.blur[known]) if (known := np.isfinite(fit.deviation)).any() else blur
@@ -249,9 +237,9 @@ def measure_edges(
 
 
 def _positions_along(near: np.ndarray, blur: float) -> tuple[np.ndarray, int]:
-    """Positions [T] of a window's samples relative to its edge, and its half-width, for edges at ``near``, in pixels.
+    """Positions [T] of the samples in a window relative to its edge, and the half-width of the window, in pixels.
 
-    The windows of neighbouring edges do not overlap. Samples far from the edge are two pixels apart.
+    The windows of neighbouring edges ``near`` do not overlap. Samples far from an edge are two pixels apart.
     """
     gap = min((abs(b - a) for a, b in itertools.pairwise(near.tolist())), default=math.inf)
     window = int(min(_WINDOW.half + 2 * blur, max(4.0, 0.45 * gap)))
@@ -262,11 +250,11 @@ def _positions_along(near: np.ndarray, blur: float) -> tuple[np.ndarray, int]:
 def _rows_across(
     u: np.ndarray, widths: np.ndarray, blur: float, bulge: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows across the tube: positions, shifts along by ``bulge`` [E, U], both [E, U + 6], and weights [E, U].
+    """Positions of rows across the tube [E, U + 6], their shifts along the tube [E, U + 6], and weights [E, U].
 
-    Besides the rows ``u`` [U] on the tube there are three background rows on each side, which show whether something
-    lies across the tube. A row that is mostly background has little weight: it carries little information on the edge,
-    and may show an edge of something else.
+    Besides the rows ``u`` [U] on the tube, which are shifted by ``bulge`` [E, U], there are three background rows on
+    each side, which show whether something lies across the tube. A row that is mostly background has little weight: it
+    carries little information on the edge, and may show an edge of something else.
     """
     rows = np.empty((len(widths), len(u) + 6))
     rows[:, : len(u)], rows[:, len(u) :] = u, _sides(widths, blur)
@@ -276,9 +264,9 @@ def _rows_across(
 
 
 def _weights(light: np.ndarray, shown: np.ndarray, most: float) -> np.ndarray:
-    """Weights [E, T, U, C] of samples, by their noise and by ``shown`` [E, T, U]; ``most`` is the largest exact light.
+    """Weights [E, T, U, C] of samples: ``shown`` [E, T, U] over their variance; light above ``most`` is saturated.
 
-    Saturated rows have no weight: where one side is saturated, the midpoint of the light is no longer at the edge.
+    Saturated rows have no weight, because the midpoint of the light is not at the edge if one side is saturated.
     """
     weight = shown[..., None] / variance_of(light)
     if light.max() > most:
@@ -287,9 +275,9 @@ def _weights(light: np.ndarray, shown: np.ndarray, most: float) -> np.ndarray:
 
 
 def _kept_along(along: np.ndarray, blur: float, chosen: np.ndarray, edges: int) -> np.ndarray:
-    """[E, T] 1, or 0 for samples far outside the first and the last of all ``edges``.
+    """[E, T] 1, or 0 for samples far outside the first or the last of all ``edges``.
 
-    There the texture of the background is visible through the tube, and its gradients would attract the fit.
+    There the texture of the background is visible through the tube, and its gradients would bias the fit.
     """
     outside = _WINDOW.outside + 2 * blur
     kept = np.ones((len(chosen), len(along)), dtype=np.float32)
@@ -303,7 +291,7 @@ def _kept_along(along: np.ndarray, blur: float, chosen: np.ndarray, edges: int) 
 def _within_frame(
     sampler: Sampler, lens: Lens, line: Line, near: np.ndarray, fit: EdgeFit, window: int
 ) -> Sequence[bool] | np.ndarray:
-    """Whether the surroundings of each edge lie on the frame; ``window`` pixels around it are known to do so."""
+    """[E] whether the surroundings of each edge lie on the frame; ``window`` pixels around it are known to do so."""
     margin = _LIMITS.margin + 2 * median(fit.blur)
     if window >= margin + np.abs(fit.place).max():
         return [True] * len(near)
@@ -311,27 +299,22 @@ def _within_frame(
 
 
 def _astray(fit: EdgeFit, looks: int) -> bool:
-    """Whether to measure again: an edge is far from its expected position, and ``looks`` measurements are left."""
+    """Whether to measure again: an edge is far from its expected position, and ``looks`` > 0 measurements are left."""
     distance = float(np.abs(fit.place).max())
     return looks > 0 and distance >= _LIMITS.far and int(np.count_nonzero(fit.deviation < _LIMITS.lost)) >= 2
 
 
 def _sides(widths: np.ndarray, blur: float) -> np.ndarray:
-    """Positions [E, 6] across of three rows on either side of tubes of ``widths`` [E], beyond their blurred sides."""
+    """Positions [E, 6] across tubes of ``widths`` [E], of three rows beyond either blurred side."""
     return _SIGNS * (_ROWS + 2 * blur + widths[:, None] / 2)
 
 
 def _across(light: np.ndarray, along: np.ndarray, fit: EdgeFit) -> tuple[np.ndarray, bool]:
-    """Whether the background changes where the edges are.
+    """Whether the background changes at the edges, from ``fit`` and the background rows ``light`` [E, T, 6, C].
 
-    Args:
-        light: [E, T, 6, C] light of the background rows.
-        along: [E, T] positions of these samples relative to the edges.
-        fit: Of the edges on the tube.
-
-    Returns:
-        [E] whether the background changes on both sides, so that something lies across the tube; and whether on one
-        side of all edges it changes about as much as the tube does.
+    ``along`` [E, T] are the positions of the samples relative to the edges. Returns [E] whether the background changes
+    on both sides, so that something lies across the tube; and whether on one side the background at all edges changes
+    about as much as the tube.
     """
     count, samples, _, colours = light.shape
     light = light.reshape(count, samples, -1).astype(np.float64)

@@ -1,4 +1,4 @@
-"""Axis and width of the tube's image, from several cross-sections of the bands."""
+"""Axis and width of the tube's image, from several cross-sections of the bands, called stations."""
 
 import math
 from collections.abc import Callable
@@ -16,37 +16,37 @@ from holotorch.tracking.pose.status import Refusal, Status
 
 @dataclass(frozen=True)
 class StationPlan:
-    """How many cross-sections of the tube, called stations, are sampled, and how densely."""
+    """Number of cross-sections of the tube, called stations, and of their samples."""
 
     most: int = 8  # stations of a tube of ordinary width
     fewest: int = 6  # stations of a wide tube
-    samples: int = 16  # lines averaged for each station: along the tube, neighbouring lines differ only in noise
-    most_across: int = 700  # samples across the tube, of all stations together; wide tubes take fewer stations
+    samples: int = 16  # neighbouring lines across the tube that are averaged for one station to reduce noise
+    most_across: int = 700  # samples across the tube of all stations together, which limits the stations of wide tubes
 
 
 @dataclass(frozen=True)
 class AxisLimits:
-    """When the fit of an axis is refused or its errors are raised. Determined on synthetic frames."""
+    """Limits for refusing the fit of an axis, and an error floor; determined on synthetic frames."""
 
-    one_sided: float = 0.15  # least ratio of the contrasts to both sides
-    narrowest: float = 2.4  # least width in pixels: below it no pixel shows the colour of one band alone
-    moving: float = 3.0  # largest move of the middle in the last step of a fit, in pixels: above it the fit diverges
-    floor: float = 0.002  # least deviation of the axis, in widths: gloss and shadow are constant along the tube
+    one_sided: float = 0.15  # least ratio of the smaller to the larger contrast of the tube to its two sides
+    narrowest: float = 2.4  # least width in pixels; in a narrower tube no pixel shows the colour of one band alone
+    moving: float = 3.0  # largest change of the middle in the last step of a converged fit, in pixels
+    floor: float = 0.002  # error of the axis in widths, from gloss and shadow that are constant along the tube
 
 
 @dataclass(frozen=True)
 class WidthFit:
-    """How the width of a tube is measured independently of a pose."""
+    """Limits of the measurement of a tube's width independently of a pose."""
 
-    slow: float = 0.2  # relative deviation of a width above which another fit follows: the fit may not have converged
-    linear: float = 0.1  # relative change of a width up to which one linear step replaces another fit
-    other_px: float = 1.5  # least difference in pixels at which the tube is surely wider or narrower than expected
-    blur_px: float = 0.9  # blur to begin with, standard deviation in pixels: that of a focused camera
+    slow: float = 0.2  # relative deviation of a width above which the fit may not have converged and is continued
+    linear: float = 0.1  # relative change of a width up to which one linear step replaces a fit
+    other_px: float = 1.5  # difference in pixels from which on the tube is surely wider or narrower than expected
+    blur_px: float = 0.9  # initial standard deviation of the blur in pixels: that of a focused camera
 
 
 STATION_PLAN, _LIMITS, _WIDTH = StationPlan(), AxisLimits(), WidthFit()
-THIRD = 0.35  # relative deviation of a width that is unknown
-_LEVEL_SD = 2.5 / 255  # noise of a pixel's level, standard deviation; fits scale it by their residuals
+THIRD = 0.35  # relative deviation of the prior for a width that is unknown
+_LEVEL_SD = 2.5 / 255  # assumed standard deviation of a pixel's level; fits rescale it by their residuals
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class Axis:
     """Axis of the tube's image, and the width of that image.
 
     Attributes:
-        line: Axis on the plane z = 1; the bands lie around t = 0.
+        line: Line of the axis on the plane z = 1, with the bands around t = 0.
         width, taper: Width at t = 0 in pixels, and its change per pixel.
         width_sd: Standard deviation of the width in pixels.
         offset_sd, slope_sd: Standard deviations of the axis at ``centre``, in pixels and pixels per pixel.
@@ -98,14 +98,14 @@ class Stations:
     bright: np.ndarray
 
     def rough_width(self) -> float:
-        """Width of the tube in pixels: the samples that differ from the background by over half of the maximum."""
+        """Width of the tube in pixels: median number of samples with over half of the largest contrast."""
         left, right = self.signal[:, :2].mean(1), self.signal[:, -2:].mean(1)
         middle = self.signal.shape[1] // 2
         away = np.abs(self.signal - np.repeat(np.stack([left, right], 1), [middle, middle + 1], 1))
         return median((2 * away > away.max(1, keepdims=True)).sum(1))
 
     def show(self, width: float, blur: float) -> bool:
-        """Whether the samples extend beyond the sides of a tube of this width and blur, in pixels."""
+        """Whether the samples extend beyond the blurred sides of a tube; ``width`` and ``blur`` in pixels."""
         return self.signal.shape[1] > 2 * (0.6 * width + 3 + 2 * blur)
 
 
@@ -118,7 +118,7 @@ def look_across(
     blur: float,
     plan: StationPlan = STATION_PLAN,
 ) -> Stations:
-    """Sample stations within the visible bands of a tube of about ``width`` pixels.
+    """Sample stations within the visible bands of a tube of about ``width`` pixels, with sides blurred by ``blur``.
 
     Raises:
         Refusal: BANDS_MISSING where no band is visible from end to end, TOO_NARROW where the bands are too short.
@@ -154,15 +154,12 @@ def measure_axis(
 ) -> Axis:
     """Axis and width from stations.
 
-    Args:
-        stations: Samples to fit.
-        width: Expected width at t = 0 in pixels, and taper per pixel.
-        known: Relative standard deviation of the expected width.
-        blur: Blur to begin with, in pixels.
-        before: Earlier axis of the same stations, whose fit is the start.
+    ``width`` is the expected width at t = 0 in pixels and the taper per pixel, with the relative standard deviation
+    ``known``; ``blur`` the initial standard deviation of the blur in pixels. The fit of ``before``, an earlier axis of
+    the same stations, gives the other initial values.
 
     Raises:
-        Refusal: NO_AXIS where the sides are unclear, one-sided or bent; TOO_NARROW.
+        Refusal: NO_AXIS if the sides are unclear or bent, or on one side only; TOO_NARROW for a narrow tube.
     """
     given = stations.signal, stations.weight, stations.t, stations.band, stations.level, stations.bright
     fit = fit_axis(*given, width, blur, known, before.fit.unknown if before else None)
@@ -186,16 +183,12 @@ def measure_width(
 ) -> tuple[Stations, Axis, Axis]:
     """Stations, axis with the expected width, and a second axis with an independently measured width, for checks.
 
-    Args:
-        look: Samples stations for a width and a blur in pixels. Where the tube extends beyond the stations, they are
-            sampled again before its width is measured, and once more for the measured width.
-        stations: Stations that gave ``axis``.
-        axis: Axis with the expected width.
-        wide: Expected width at t = 0 in pixels, and taper per pixel.
-        known: Relative standard deviation of the expected width.
+    ``stations`` gave ``axis`` with the expected width ``wide`` (pixels at t = 0, taper per pixel) of relative standard
+    deviation ``known``. If the tube extends beyond them, ``look`` samples stations again for a width and a blur in
+    pixels, before and after the measurement of the width.
 
     Raises:
-        Refusal: As of :func:`look_across` and :func:`measure_axis`.
+        Refusal: As :func:`look_across` and :func:`measure_axis`.
     """
     narrow = not stations.show(axis.width, axis.blur)
     if narrow:
@@ -206,7 +199,7 @@ def measure_width(
     elif abs(rough - wide[0]) >= max(_WIDTH.other_px, 0.25 * wide[0]):
         width = measure_axis(stations, (rough, 0.0), THIRD, _WIDTH.blur_px)
     else:
-        # Starting from a width that is nearly right avoids a fit to the width of a highlight.
+        # From a nearly correct initial width, the fit does not converge to the width of a highlight.
         width = _axis(stations, axis.fit.given(wide, THIRD, known))
         if narrow or abs(width.width - wide[0]) > _WIDTH.linear * wide[0]:
             width = measure_axis(stations, wide, THIRD, axis.blur, axis)
@@ -218,17 +211,20 @@ def measure_width(
     axis = measure_axis(stations, wide, known, width.blur)
     own = (width.width, width.taper) if other else wide
     width = measure_axis(stations, own, THIRD, width.blur, None if other else axis)
-    if width.width_sd > _WIDTH.slow * wide[0]:  # width and blur are nearly exchangeable, so that the fit is slow
+    if (
+        width.width_sd > _WIDTH.slow * wide[0]
+    ):  # width and blur are strongly correlated, so that the fit converges slowly
         width = measure_axis(stations, (width.width, width.taper), THIRD, width.blur)
     return stations, axis, width
 
 
 def narrowed(stations: Stations, axis: Axis, width: tuple[float, float], known: float) -> Axis:
-    """Axis under a better known width (pixels at t = 0, taper per pixel) of relative deviation ``known``."""
+    """``axis`` for a more precise ``width`` (pixels at t = 0, taper per pixel) of relative deviation ``known``."""
     return _axis(stations, axis.fit.given(width, known))
 
 
 def _axis(stations: Stations, fit: AxisFit) -> Axis:
+    """Axis from a fit; ``centre`` is where the errors of offset and slope are uncorrelated."""
     offset, slope, wide, taper = fit.sides.tolist()
     (variance, cross), (_, other) = fit.covariance[:2, :2].tolist()
     other = max(other, 1e-18)
@@ -246,14 +242,10 @@ def _axis(stations: Stations, fit: AxisFit) -> Axis:
 
 
 def _contrast(light: np.ndarray, u: np.ndarray, width: float, band: np.ndarray, samples: int):
-    """Reduce light [3, S, U] to one signal.
+    """Signal [S, U] from light [3, S, U], its inverse variance, and two levels of each band [bands].
 
-    The signal of each band is the linear combination of the channels with the best ratio of contrast to noise between
-    tube and background.
-
-    Returns:
-        Signal [S, U], its inverse variance [S, U], level of the signal in each band [bands], and the level without
-        cancellation between channels [bands].
+    In each band the signal is the linear combination of the channels that has the largest ratio of the contrast between
+    tube and background to the noise. The second level combines the channels with absolute weights.
     """
     away = np.abs(u)
     where = np.empty((len(u), 2), dtype=np.float32)
@@ -271,6 +263,6 @@ def _contrast(light: np.ndarray, u: np.ndarray, width: float, band: np.ndarray, 
 
 
 def variance_of(light: np.ndarray) -> np.ndarray:
-    """Variance of light from the noise of levels, through the slope of the inverse sRGB curve, about light^0.58."""
+    """Variance of linear light from the noise of levels: proportional to the squared slope of the sRGB decoding."""
     # NumPy vectorises logarithms and exponentials; its powers take ten times as long.
     return np.exp(np.log(np.maximum(light, 0.002)) * (2.8 / 2.4) + 2 * math.log(_LEVEL_SD * 2.4 / 1.055))

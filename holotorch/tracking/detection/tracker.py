@@ -1,4 +1,4 @@
-"""CatheterTracker: takes frames, and gives for each a pose with its covariance or the reason why there is none."""
+"""CatheterTracker: for each frame, a pose of the catheter with its covariance, or the reason for its refusal."""
 
 import cmath
 import dataclasses
@@ -42,48 +42,52 @@ from holotorch.tracking.pose.status import Pose, Refusal, Status
 
 @dataclasses.dataclass(frozen=True)
 class ErrorFloors:
-    """Errors of edges and line that do not shrink with the noise, 1 sigma in pixels unless said otherwise.
+    """Errors (1 sigma) of edges and line that do not shrink with the noise: pixels, or pixels per pixel of a cause.
 
-    Determined on synthetic frames, so that the 95 % ellipsoids of poses hold the truth in about 95 % of the frames.
+    Independent errors of one edge add in quadrature. Determined on synthetic frames such that the 95 % ellipsoids of
+    poses contain the true pose in about 95 % of the frames.
     """
 
-    model: float = 0.004  # error of one edge: the edge profile and the sampling by pixels are approximate
-    transparency: float = 0.010  # more for an outermost edge: the background shines through the clear tube beside it
-    bulge: float = 0.004  # more for each pixel by which the front of a ring bulges in the image
-    shared: float = 0.010  # error that all edges of a frame have in common
-    defocus: float = 0.08  # more for each pixel of blur in all directions: light from beside the tube leaks into it
-    smear: float = 0.03  # more for each pixel of blur along the tube, from the lens or from motion
-    coarse_edge: float = 0.07  # more for an edge where colours have fewer pixels than the luma (4:2:0 codecs)
-    coarse_line: float = 0.17  # more for the offset of the line in the same case
+    model: float = 0.004  # every edge: the edge profile and the sampling by pixels are approximate
+    transparency: float = 0.010  # outermost edges: the background is visible through the clear tube beside them
+    bulge: float = 0.004  # per pixel by which the front of a ring bulges along the line
+    shared: float = 0.010  # common to all edges of a frame
+    defocus: float = 0.08  # per pixel of blur in all directions, which lets light from beside the tube leak in
+    smear: float = 0.03  # per pixel of blur along the tube, from the lens or from motion
+    coarse_edge: float = 0.07  # edges of frames whose chroma has fewer pixels than their luma (4:2:0 codecs)
+    coarse_line: float = 0.17  # offset of the line in the same frames
 
 
 @dataclasses.dataclass(frozen=True)
 class WidthCheck:
-    """Limits of the check that the tube is as wide as its pose says. Determined on synthetic frames."""
+    """Limits of the check that the tube's measured width agrees with its pose. Determined on synthetic frames.
 
-    slant: float = 1.5  # largest factor between the widths by a rough pose and by the length of the bands: 55 degrees
-    vague: float = 0.15  # largest relative deviation of a width that may check a pose from three edges
+    Relative deviations are standard deviations of a width divided by the width.
+    """
+
+    slant: float = 1.5  # largest ratio of the width from a rough pose to that from the bands' length: 55 degrees
+    vague: float = 0.15  # largest relative deviation of a width that is used to check a pose from three edges
     path: float = 2.5  # longest motion across the tube during the exposure, in widths of the tube
     path_blur: float = 0.2  # largest relative difference between the blur of the sides and that of such a motion
-    path_deviation: float = 0.04  # largest relative deviation of a width that may show such a motion
-    nearly: float = 0.01  # relative deviation of the width that a rough pose gives
-    exact: float = 0.002  # relative deviation of the width that the fitted pose gives
+    path_deviation: float = 0.04  # largest relative deviation of a width that can indicate such a motion
+    nearly: float = 0.01  # relative deviation of the width from a rough pose
+    exact: float = 0.002  # relative deviation of the width from the fitted pose
 
 
 @dataclasses.dataclass(frozen=True)
 class SearchLimits:
-    """Where the tube is searched for, and when it is measured once more; all in pixels."""
+    """Limits of the search for the tube and of repeated measurements, in pixels."""
 
     widest: float = 120.0  # largest width of the tube
-    blur: float = 0.9  # blur that fits begin with, standard deviation: that of a focused camera
-    bulge_change: float = 0.1  # change of a bulge above which the edges are measured once more
-    bulge_settled: float = 0.05  # change of a bulge that changes the tube's width by nothing
-    aside: float = 16.0  # distance of a tube from its segment, the glow of a tube out of focus included
-    motion: float = 30.0  # distance that a catheter may move between two frames
+    blur: float = 0.9  # initial standard deviation of the blur in fits: that of a focused camera
+    bulge_change: float = 0.1  # change of a ring's bulge above which the edges are measured again
+    bulge_settled: float = 0.05  # change of a ring's bulge below which the pose is not computed again
+    aside: float = 16.0  # largest distance of the tube, with its blur, from a segment of the search of a whole frame
+    motion: float = 30.0  # largest motion of the catheter between two frames
 
 
 _FLOORS, _CHECK, _SEARCH = ErrorFloors(), WidthCheck(), SearchLimits()
-_SIGNIFICANCE = 1e-3  # share of right poses that the chi-square test of the edges refuses
+_SIGNIFICANCE = 1e-3  # fraction of correct poses that the chi-square test of the edges refuses
 _EXCHANGED = "a frame whose red and blue are exchanged looks so; state the order of its channels (ChannelOrder)"
 
 
@@ -97,28 +101,29 @@ class CatheterTracker:
     catheter has left this strip; a call without a previous pose searches the whole frame again. The work per frame is
     bounded.
 
-    Without a previous pose, two more checks apply: the width of the tube, measured independently, must agree with the
-    pose, and the tube must not be visible where only bands in the reversed order would put it
+    Without a previous pose, two more checks apply. The width of the tube, measured independently, must agree with the
+    pose. And the tube must not be visible at a position that only bands in the reversed order explain
     (:func:`shows_reversed`). With a previous pose, the detected bands are assumed to be those of the same catheter.
 
-    Frames may be on any device. The pixels that the tracker needs (every second one of every second row, or about
-    15,000 with a previous pose) are copied to the CPU, because the computation consists of about a thousand small
-    calls, each of which takes less time than the launch of a kernel on a GPU. Poses are on the CPU.
+    Frames may be on any device. The pixels that the tracker needs (every second pixel of every second row, or about
+    15,000 pixels with a previous pose) are copied to the CPU: the computation consists of about a thousand small calls,
+    each of which takes less time than the launch of a kernel on a GPU. Poses are on the CPU.
 
     Args:
         camera: Intrinsics and tone curve.
         catheter: Catheter to track; its colours must be saturated, with hues at least 25 degrees apart.
         most_sd: Standard deviation of the tip in metres above which a pose is refused as UNCERTAIN.
-        channels: Order of the frames' channels. Without it, frames are assumed to be RGB, and the tracker warns once
-            if the catheter is ambiguous under another order (:func:`ambiguities`).
+        channels: Order of the frames' channels. If it is None, frames are assumed to be RGB, and the constructor warns
+            if another order would show the catheter in another valid pose (:func:`ambiguities`).
         stations: How many cross-sections of the tube determine its axis and its width.
 
     Attributes:
-        times: Seconds that each stage of the last call took, summed over its frames: colour, axis, edges, pose.
+        times: Seconds that each stage ("colour", "axis", "edges", "pose") of the last call took, summed over frames.
 
     Raises:
         TypeError, ValueError: ``most_sd`` is not positive, or the colours are grey, too similar, or the same from both
-            ends. In a call: the frames are not uint8 [B, 3, H, W], or the number of previous poses differs from theirs.
+            ends. In a call: the frames are not uint8 [B, 3, H, W], or their number differs from that of the previous
+            poses.
 
     Source: Chapter 3 of the thesis defines the task (coloured bands, one camera). The method differs from the thesis.
     """
@@ -142,7 +147,7 @@ class CatheterTracker:
         self.times: dict[str, float] = {}
 
     def __call__(self, frames: Tensor, previous: Sequence[Pose] | None = None) -> list[Pose]:
-        """Track each frame of a batch, uint8 [B, 3, H, W]; ``previous`` holds one pose per frame to search around."""
+        """Poses [B] of the catheter in frames uint8 [B, 3, H, W]; each frame is searched near its ``previous`` pose."""
         need_frames(frames)
         self.camera.need_size(frames)
         if isinstance(previous, Pose) or not all(isinstance(pose, Pose) for pose in previous or ()):
@@ -158,11 +163,11 @@ class CatheterTracker:
         if height < 32 or width < 32:
             return Pose.refused(Status.BAD_FRAME, f"a frame of {height} x {width} px is too small")
         sampler = Sampler(frame, self.lens.light)
-        found = on_host(before) if before is not None and before.answered else None
+        line_pose = on_host(before) if before is not None and before.answered else None
         try:
-            if found is None:
+            if line_pose is None:
                 return self._search_frame(sampler)
-            return self._along(sampler, *self._near(sampler, found), found)
+            return self._along(sampler, *self._near(sampler, line_pose), line_pose)
         except Refusal as refusal:
             return Pose.refused(refusal.status, refusal.reason)
 
@@ -180,20 +185,16 @@ class CatheterTracker:
                 half = 0.5 * length + max(40.0, 0.7 * length)
                 shown = self._shown(sampler, line, half, _SEARCH.aside, onward=False)
             except Refusal as refusal:
-                # Report the refusal of the latest stage. Keep only its text: the exception keeps the frame in memory.
+                # The refusal of the latest stage is reported; the exception itself would keep the frame in memory.
                 if refusal.status > furthest[0]:
                     furthest = refusal.status, refusal.reason
-            else:  # only the first line with all bands in order is measured: it is seldom anything but the catheter
+            else:  # only the first line with all bands in order is measured, which is almost always the catheter
                 return self._along(sampler, *shown, None)
         raise Refusal(*furthest)
 
-    def _near(self, sampler: Sampler, found: LinePose) -> tuple[Line, Stretches]:
-        """Line near a previous pose and the bands on it.
-
-        Raises:
-            Refusal: No bands; its reason names exchanged channels where the bands have the reversed order.
-        """
-        line, half = self._expected(found)
+    def _near(self, sampler: Sampler, line_pose: LinePose) -> tuple[Line, Stretches]:
+        """Line near a previous pose, and the bands on it; for reversed bands the Refusal names exchanged channels."""
+        line, half = self._expected(line_pose)
         try:
             return self._shown(sampler, line, half, _SEARCH.motion, onward=True)
         except Refusal as refusal:
@@ -208,18 +209,17 @@ class CatheterTracker:
                 refusal.status, f"the bands lie along the previous line, in the other direction: {_EXCHANGED}"
             ) from None
 
-    def _expected(self, found: LinePose) -> tuple[Line, float]:
-        """Line through the bands of a pose, and half of their length plus a margin for motion, in pixels."""
-        start, end = (axis_on_plane(found, self._positions[n]) for n in (0, -1))
+    def _expected(self, line_pose: LinePose) -> tuple[Line, float]:
+        """Line through the bands of a pose, and half of the bands' length plus a margin for motion, in pixels."""
+        start, end = (axis_on_plane(line_pose, self._positions[n]) for n in (0, -1))
         return Line.between(self.lens, start, end), abs(end - start) * self.lens.scale / 2 + 1.5 * _SEARCH.motion
 
     def _shown(
         self, sampler: Sampler, line: Line, half: float, aside: float, *, onward: bool
     ) -> tuple[Line, Stretches]:
-        """Line near a first one of half-length ``half`` pixels, and the bands on it.
+        """Line of the tube within ``half`` pixels along ``line`` and ``aside`` across, and the bands on it.
 
-        Raises:
-            Refusal: Fewer than three band edges are visible.
+        ``onward``: t is known to rise from the tip. Raises a Refusal if fewer than three band edges are visible.
         """
         half = min(half, 1.5 * math.hypot(sampler.height, sampler.width))
         with self._timed("axis"):
@@ -232,12 +232,12 @@ class CatheterTracker:
         return line, stretches
 
     def _along(self, sampler: Sampler, line: Line, stretches: Stretches, before: LinePose | None) -> Pose:
-        """Pose of the catheter whose bands lie on ``line``; raises a Refusal where there is none."""
+        """Pose of the catheter whose bands lie on ``line``; raises a Refusal if a measurement or a check fails."""
         lens = self.lens
         with self._timed("axis"):
-            places = stretches.edges if before else halfway(sampler, lens, line, stretches.edges)
-            near = before or self._rough(line, places)
-            wide, known = (self._wide(near, line), _CHECK.nearly) if near else (self._slight(places), THIRD)
+            rough_t = stretches.edges if before else halfway(sampler, lens, line, stretches.edges)
+            near = before or self._rough(line, rough_t)
+            wide, known = (self._wide(near, line), _CHECK.nearly) if near else (self._slight(rough_t), THIRD)
             stations = look_across(sampler, lens, line, stretches, wide[0], _SEARCH.blur, self.stations)
             axis = width = measure_axis(stations, wide, known, _SEARCH.blur)
             if before is None:
@@ -246,23 +246,23 @@ class CatheterTracker:
                 look = partial(look_across, sampler, lens, line, stretches, plan=self.stations)
                 stations, axis, width = measure_width(look, stations, axis, wide, known)
         with self._timed("edges"):
-            first = curve = self._bulge(near, axis.line) if near else np.zeros(len(places))
-            guess, _ = axis.line.place(line.plane(places))
+            first = curve = self._bulge(near, axis.line) if near else np.zeros(len(rough_t))
+            guess, _ = axis.line.place(line.plane(rough_t))
             edges = measure_edges(sampler, lens, axis, guess - curve, stretches.doubtful, _SEARCH.blur, curve)
         with self._timed("pose"):
-            # A changed bulge shifts the edges by its mean over the front of a ring, pi / 4 of its height. Only a large
-            # change makes a second measurement necessary.
-            found = self._solved(axis, edges, rough=True)
+            # A change of the bulge shifts an edge by pi / 4 of this change, the mean over the front of a ring. Only a
+            # large change makes a second measurement necessary.
+            line_pose = self._solved(axis, edges, rough=True)
             for _ in range(2):
-                bulge = self._bulge(found, axis.line)
+                bulge = self._bulge(line_pose, axis.line)
                 change, curve = bulge - curve, bulge
                 edges = dataclasses.replace(edges, t=edges.t - math.pi / 4 * change)
                 if float(np.abs(change).max()) < _SEARCH.bulge_settled:
                     break
-                found = self._solved(axis, edges, rough=True)
-            plane, wide = axis.line.plane(edges.t), self._wide(found, line)
+                line_pose = self._solved(axis, edges, rough=True)
+            plane, wide = axis.line.plane(edges.t), self._wide(line_pose, line)
         with self._timed("axis"):
-            # Fit the axis with the width that pose and radius give; the width measured without them is the check.
+            # The axis is fitted with the width from pose and radius; the independent width is for the check.
             if before is None or abs(wide[0] - axis.width) > _CHECK.nearly * wide[0]:
                 rest = axis.blur, axis
                 axis = (
@@ -275,40 +275,42 @@ class CatheterTracker:
             with self._timed("edges"):
                 edges = measure_edges(sampler, lens, axis, edges.t, stretches.doubtful, edges.blur, curve)
         with self._timed("pose"):
-            found = self._solved(axis, edges)
-            pose = self._checked(found, width, edges, cold=before is None)
-            if before is None and shows_reversed(sampler, lens, found, self.catheter):
+            line_pose = self._solved(axis, edges)
+            pose = self._checked(line_pose, width, edges, cold=before is None)
+            if before is None and shows_reversed(sampler, lens, line_pose, self.catheter):
                 raise Refusal(Status.INCONSISTENT, f"the tube goes on beyond its end on one side only: {_EXCHANGED}")
             return pose
 
-    def _rough(self, line: Line, places: np.ndarray) -> LinePose | None:
-        """First pose, from the positions where colours change; None where one of these may not be a band edge."""
-        seen = [(t, s) for t, s in zip(places.tolist(), self._positions, strict=True) if math.isfinite(t)]
-        if (count := len(seen)) < 4:
+    def _rough(self, line: Line, rough_t: np.ndarray) -> LinePose | None:
+        """Rough pose from edge positions ``rough_t`` [N] in pixels; None if these are too few or not plausible."""
+        visible = [(t, s) for t, s in zip(rough_t.tolist(), self._positions, strict=True) if math.isfinite(t)]
+        if (count := len(visible)) < 4:
             return None
-        t, positions = zip(*seen, strict=True)
-        found = pose_on_line(line, t, positions, [1.0] * count, 1.0, 0.01, rough=True)
-        wide = width_px(found, self._positions, self.catheter.radius, line)[0] if found else 0.0
-        slight = self._slight(places)[0]
-        return found if slight / _CHECK.slant < wide < slight * _CHECK.slant else None
+        t, positions = zip(*visible, strict=True)
+        line_pose = pose_on_line(line, t, positions, [1.0] * count, 1.0, 0.01, rough=True)
+        wide = width_px(line_pose, self._positions, self.catheter.radius, line)[0] if line_pose else 0.0
+        slight = self._slight(rough_t)[0]
+        return line_pose if slight / _CHECK.slant < wide < slight * _CHECK.slant else None
 
-    def _slight(self, places: np.ndarray) -> tuple[float, float]:
-        """Rough width of the tube's image in pixels, from the length of the bands at a slight tilt; taper 0."""
-        seen = [(s, t) for s, t in zip(self._positions, places.tolist(), strict=True) if math.isfinite(t)]
-        (near, a), (far, b) = seen[0], seen[-1]
-        return min(max(2 * self.catheter.radius * 1.15 * (b - a) / (far - near), 2.0), _SEARCH.widest), 0.0
+    def _slight(self, rough_t: np.ndarray) -> tuple[float, float]:
+        """Rough width of the tube's image in pixels, from the length of the bands for a slight tilt; and taper 0."""
+        visible = [(s, t) for s, t in zip(self._positions, rough_t.tolist(), strict=True) if math.isfinite(t)]
+        (first, a), (last, b) = visible[0], visible[-1]
+        return min(max(2 * self.catheter.radius * 1.15 * (b - a) / (last - first), 2.0), _SEARCH.widest), 0.0
 
-    def _bulge(self, found: LinePose, line: Line) -> np.ndarray:
-        return bulge_px(found, self._positions, self.catheter.radius, line)
+    def _bulge(self, line_pose: LinePose, line: Line) -> np.ndarray:
+        """Bulge [N] of each ring's front along the line, in pixels."""
+        return bulge_px(line_pose, self._positions, self.catheter.radius, line)
 
-    def _wide(self, found: LinePose, line: Line) -> tuple[float, float]:
-        """Width of the tube's image in pixels and its taper by a pose; raises a Refusal where these are impossible."""
-        width, taper = width_px(found, self._positions, self.catheter.radius, line)
+    def _wide(self, line_pose: LinePose, line: Line) -> tuple[float, float]:
+        """Width of the tube's image in pixels and its taper, from a pose; raises a Refusal if they are impossible."""
+        width, taper = width_px(line_pose, self._positions, self.catheter.radius, line)
         if not 1.0 < width < _SEARCH.widest or not abs(taper) < 1:
             raise Refusal(Status.INCONSISTENT, "no pose in front of the camera explains the edges")
         return width, taper
 
     def _solved(self, axis: Axis, edges: Edges, *, rough: bool = False) -> LinePose:
+        """Pose from measured edges, with the error floors; raises a Refusal for fewer than three edges or no pose."""
         known, last = np.isfinite(edges.t).nonzero()[0].tolist(), len(edges.t) - 1
         t: list[float] = edges.t[known].tolist()
         if len(t) < 3:
@@ -328,32 +330,30 @@ class CatheterTracker:
         )
         shines = (_FLOORS.transparency if n in (0, last) else 0.0 for n in known)
         along = [math.hypot(*each, floor) for each in zip(edges.deviation[known].tolist(), shines, strict=True)]
-        # Shading that is constant along the tube shifts and rotates the line by more than its fit tells. Both of its
-        # deviations are therefore raised to the larger one, as a displacement at the edges.
+        # Shading that is constant along the tube shifts and rotates the line by more than the deviations of its fit.
+        # Both deviations, expressed as displacements at the edges, are therefore raised to the larger one.
         middle = sum(t) / len(t)
-        reach = math.sqrt(sum((place - middle) ** 2 for place in t) / len(t))
-        about = math.hypot(axis.offset_sd, axis.slope_sd * (middle - axis.centre), _FLOORS.coarse_line * edges.coarse)
-        most = max(about, axis.slope_sd * reach)
+        spread = math.sqrt(sum((each - middle) ** 2 for each in t) / len(t))
+        offset = math.hypot(axis.offset_sd, axis.slope_sd * (middle - axis.centre), _FLOORS.coarse_line * edges.coarse)
+        most = max(offset, axis.slope_sd * spread)
         positions = [self._positions[n] for n in known]
-        found = pose_on_line(axis.line, t, positions, along, most, most / max(reach, 1e-9), _FLOORS.shared, rough=rough)
-        if found is None:
+        line_pose = pose_on_line(
+            axis.line, t, positions, along, most, most / max(spread, 1e-9), _FLOORS.shared, rough=rough
+        )
+        if line_pose is None:
             raise Refusal(Status.INCONSISTENT, "no pose in front of the camera explains the edges")
-        return found
+        return line_pose
 
-    def _checked(self, found: LinePose, axis: Axis, edges: Edges, *, cold: bool) -> Pose:
-        """Pose after all checks. ``cold``: no previous pose; the width of ``axis`` was then measured independently.
-
-        Raises:
-            Refusal: A check fails.
-        """
-        seen = edges.t[np.isfinite(edges.t)]
-        count = len(seen)
-        freedom = count - 3  # the line is fitted separately, so only positions along it can disagree with the pose
-        if found.chi_square > self._chi_square_limits[freedom]:
-            text = f"edges disagree with any pose: chi-square {found.chi_square:.1f} of {freedom}"
+    def _checked(self, line_pose: LinePose, axis: Axis, edges: Edges, *, cold: bool) -> Pose:
+        """Pose after all checks; ``cold`` if there is no previous pose, so that ``axis`` has an independent width."""
+        visible = edges.t[np.isfinite(edges.t)]
+        count = len(visible)
+        freedom = count - 3  # degrees of freedom of positions along the line; the line is fitted separately
+        if line_pose.chi_square > self._chi_square_limits[freedom]:
+            text = f"edges disagree with any pose: chi-square {line_pose.chi_square:.1f} of {freedom}"
             raise Refusal(Status.INCONSISTENT, text)
-        middle = float(seen.sum()) / count
-        near, taper = self._wide(found, axis.line)
+        middle = float(visible.sum()) / count
+        near, taper = self._wide(line_pose, axis.line)
         wide = near + taper * middle
         ratio = float(axis.width_at(middle)) / wide
         most = min(
@@ -361,25 +361,25 @@ class CatheterTracker:
         )
         if axis.width_sd > (0.2 if freedom else 0.08) * wide:
             raise Refusal(Status.INCONSISTENT, f"{count} edges, and a width too unclear to check them with")
-        # A tube that moves across itself by more than its width appears as wide as its path, and the blur of its sides
-        # is that of a box of the tube's width.
-        own = wide / math.sqrt(12)
-        due = math.hypot(edges.blur, own)
+        # A tube that moves perpendicular to its axis by more than its width appears as wide as its path, and its sides
+        # have the blur of a box of the tube's width.
+        box = wide / math.sqrt(12)  # standard deviation of the box
+        expected = math.hypot(edges.blur, box)
         clear = axis.width_sd < _CHECK.path_deviation * axis.width
-        moved = clear and 1 < ratio < _CHECK.path and abs(axis.blur / due - 1) < _CHECK.path_blur
-        both = math.hypot(axis.blur, own * ratio) / due  # well determined, even where width or blur alone is not
-        if min(axis.blur, edges.blur) > own or (cold and both > max(ratio, 1.0)):
-            ratio = both
+        moved = clear and 1 < ratio < _CHECK.path and abs(axis.blur / expected - 1) < _CHECK.path_blur
+        combined = math.hypot(axis.blur, box * ratio) / expected  # determined even where width or blur alone is not
+        if min(axis.blur, edges.blur) > box or (cold and combined > max(ratio, 1.0)):
+            ratio = combined
         if abs(ratio - 1) > most and not moved:
-            away = float((found.tip + sum(self._positions) / len(self._positions) * found.direction)[2])
-            raise Refusal(Status.INCONSISTENT, f"{ratio:.2f} times as wide as it should be at {away:.2f} m")
-        if found.tip_sd > self.most_sd:
-            text = f"tip uncertain to {1e3 * found.tip_sd:.1f} mm, above {1e3 * self.most_sd:g} mm"
+            depth = float((line_pose.tip + sum(self._positions) / len(self._positions) * line_pose.direction)[2])
+            raise Refusal(Status.INCONSISTENT, f"{ratio:.2f} times as wide as it should be at {depth:.2f} m")
+        if line_pose.tip_sd > self.most_sd:
+            text = f"tip uncertain to {1e3 * line_pose.tip_sd:.1f} mm, above {1e3 * self.most_sd:g} mm"
             raise Refusal(Status.UNCERTAIN, text)
         status = Status.OK if freedom else Status.UNVERIFIED
         reason = "" if freedom else "three edges determine a pose and leave nothing to check it with"
-        tip, direction, covariance = map(torch.from_numpy, (found.tip, found.direction, found.covariance))
-        chi_square, degrees = torch.from_numpy(np.array([found.chi_square, freedom], dtype=np.float64))
+        tip, direction, covariance = map(torch.from_numpy, (line_pose.tip, line_pose.direction, line_pose.covariance))
+        chi_square, degrees = torch.from_numpy(np.array([line_pose.chi_square, freedom], dtype=np.float64))
         return Pose(tip, direction, covariance, chi_square, degrees, status, reason)
 
     @contextmanager
@@ -392,6 +392,6 @@ class CatheterTracker:
 
 
 def _chi_square_limits(edges: int) -> list[float]:
-    """Largest chi-square of a pose by its degrees of freedom, 0 to ``edges`` - 3: quantiles, looser ones from 10 on."""
+    """Largest accepted chi-square for 0 to ``edges`` - 3 degrees of freedom: quantiles, looser ones from 10 on."""
     limits = [float(chdtri(freedom, _SIGNIFICANCE)) for freedom in range(1, min(edges - 2, 10))]
     return [math.inf, *limits, *(freedom + 4 * math.sqrt(2 * freedom) + 6 for freedom in range(10, edges - 2))]
