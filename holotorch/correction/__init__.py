@@ -10,9 +10,24 @@ from holotorch.correction.solvers import APG, ProjectedAdam
 from holotorch.correction.stages import Stage, limit_peak_phase, penalty_schedule, proximal_pec, run_stages
 
 __all__ = [
-    "APG", "LBFGS", "Box", "PECProblem", "ProjectedAdam", "Solution", "Stage", "deconvolve", "deconvolve_admm",
-    "gerchberg_saxton", "inverse", "iterative_pec", "limit_peak_phase", "nonnegative", "penalty_schedule",
-    "proximal_pec", "run_stages", "spread_preconditioner",
-]  # fmt: skip
+    "APG",
+    "LBFGS",
+    "Box",
+    "PECProblem",
+    "ProjectedAdam",
+    "Solution",
+    "Stage",
+    "deconvolve",
+    "deconvolve_admm",
+    "gerchberg_saxton",
+    "inverse",
+    "iterative_pec",
+    "limit_peak_phase",
+    "nonnegative",
+    "penalty_schedule",
+    "proximal_pec",
+    "run_stages",
+    "spread_preconditioner",
+]
 
 __getattr__ = renamed(__name__, {"limited": "penalty_schedule", "below": "limit_peak_phase"})
