@@ -178,19 +178,16 @@ class PECExperiment:
             return AngularSpectrum(self.grid, self.wavelengths, distance, pad=1, band_limit=False)
 
     def problem(self, dtype: torch.dtype = torch.float32, **options) -> PECProblem:
-        """The objective over the lit colours."""
-        target, mask = (None if part is None else part.to(self.device, dtype) for part in (self.target, self.weights))
-        assert target is not None
-        return PECProblem(
-            self.array.crosstalk,
-            self.propagator,
-            target,
-            mask=mask,
-            scale_free=self.scale_free,
-            frames=self.joint,
-            power_weight=self.settings.modulator.power_weight,
-            **options,
-        )
+        """The objective over the lit colours; ``options`` of :class:`PECProblem` replace those of the configuration."""
+        weights = self.weights
+        configured: dict[str, Any] = {
+            "mask": None if weights is None else weights.to(self.device, dtype),
+            "scale_free": self.scale_free,
+            "frames": self.joint,
+            "power_weight": self.settings.modulator.power_weight,
+        }
+        target = self.target.to(self.device, dtype)
+        return PECProblem(self.array.crosstalk, self.propagator, target, **configured | options)
 
     def intensity(self, phase: Tensor) -> Tensor:
         """Mean intensity [C, *image] of the frames of heater phases [F, C, H, W]."""

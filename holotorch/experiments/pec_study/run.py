@@ -32,20 +32,25 @@ def build_study(settings: StudySettings) -> Study:
 
 
 def run_study(study: Study, opened: RunFolder) -> bool:
-    """Run a study and fill the folder; true if it is complete. A resumed study begins after its last complete case."""
+    """Run a study, fill the folder and print the table; a resumed study skips its complete cases.
+
+    Returns:
+        Whether the study is complete.
+    """
     settings, bench = study.settings, study.bench
     folder, files = opened.path, Results()
-    inputs = {"images": (bench.image,), "perceptual": ("none" if bench.perceptual is None else "LPIPS",)}
+    inputs = {"images": (bench.experiment.image,), "perceptual": ("none" if bench.perceptual is None else "LPIPS",)}
     cases = Cases(Checkpoint(folder / "checkpoint.pt", fingerprint(settings, inputs)))
     try:
-        rows = STUDIES[settings.study](bench, settings.sweep, settings.max_steps, cases)
+        for row in STUDIES[settings.study](bench, settings.sweep, settings.max_steps, cases):
+            cases.rows.append(row)
     except KeyboardInterrupt:
         if not cases.saved:
             raise
         summary = {"experiment": settings.experiment, "study": settings.study, "status": "", "cases": cases.saved}
         return conclude(opened, summary, files, done=False, checkpoint=cases.checkpoint)
+    rows, text = cases.rows, table_text(cases.rows)
     files.write(write_table, folder / "table.csv", rows)
-    text = table_text(rows)
     files.write(write_text, folder / "table.txt", text)
     picture = curves(rows, f"{settings.study}: mean of {', '.join(settings.images)} at {settings.size} px")
     files.write(write_bytes, folder / "images" / "table.png", picture)
