@@ -36,7 +36,7 @@ class Cases:
         return time.perf_counter() - self._started
 
     def each(self, cases: Iterable[Case], desc: str, unit: str) -> Iterator[Case]:
-        """Yield the cases that are not in the checkpoint; requesting the next case saves the rows of the previous one."""
+        """Yield the cases that are not in the checkpoint; requesting the next case saves the rows before it."""
         for case in tqdm(cases, desc=desc, unit=unit):
             self._count += 1
             if self._count <= self.saved:

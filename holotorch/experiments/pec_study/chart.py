@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
-from holotorch.correction import APG, LBFGS, ProjectedAdam, Solution, Stage, run_stages, spread_preconditioner
+from holotorch.correction import APG, LBFGS, ProjectedAdam, Stage, run_stages, spread_preconditioner
 from holotorch.correction.run import Callback
 from holotorch.experiments.pec.config import SIGMA_MEANING
 from holotorch.experiments.pec_study.bench import Bench, Track

@@ -32,11 +32,7 @@ def build_study(settings: StudySettings) -> Study:
 
 
 def run_study(study: Study, opened: RunFolder) -> bool:
-    """Run a study, fill the folder and print the table; a resumed study skips its complete cases.
-
-    Returns:
-        Whether the study is complete.
-    """
+    """Run a study without its complete cases, fill the folder and print the table. True if the study is complete."""
     settings, bench = study.settings, study.bench
     folder, files = opened.path, Results()
     inputs = {"images": (bench.experiment.image,), "perceptual": ("none" if bench.perceptual is None else "LPIPS",)}
