@@ -125,7 +125,7 @@ class PECExperiment:
 
     @property
     def mask(self) -> Tensor | None:
-        """Mask of the part of the image that is compared with the target, float64, broadcasts to it; None for all."""
+        """1 where the image is compared with the target and 0 elsewhere, float64; None if it is compared everywhere."""
         depths, width = len(self.distances), self.grid.shape[1]
         if self.settings.target.region:
             mask = torch.zeros(1, *self.grid.shape, dtype=torch.float64)
@@ -198,7 +198,7 @@ class PECExperiment:
     def start_phase(self) -> Tensor:
         """Heater phases at the start, float32 [C, H, W], or [F, C, H, W] for several frames; the same on every device.
 
-        Random numbers are drawn for one colour after another if frames are joint, otherwise for one frame after another.
+        The random numbers of joint frames are drawn colour by colour, those of independent frames frame by frame.
         """
         generator = torch.Generator().manual_seed(self.settings.seed)
         colours, frames, side = len(self.wavelengths), self.settings.frames, self.grid.shape

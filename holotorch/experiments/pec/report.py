@@ -16,7 +16,8 @@ METHOD_NAMES = {
     "unweighted": "Corrected, errors weighted equally",
     "corrected": "Corrected",
 }
-_PICTURES = {"target": "Target", **METHOD_NAMES, "isolated": "Corrected, on a chip that stands alone"}
+ISOLATED_NAME = "Corrected, on a chip that stands alone"
+_PICTURES = {"target": "Target", **METHOD_NAMES, "isolated": ISOLATED_NAME}
 _FIGURES = {
     "phase": "Heater phases, before the heat spreads{frame}",
     "temperature": "Temperature of the chip above ambient, after the heat has spread{frame}",
@@ -36,11 +37,7 @@ def pec_section(run: RunRecord) -> list[str]:
     methods: dict[str, Any] = run.summary["methods"]
     parts = [heading(run.title, run.summary["status"])]
     parts.append(table(["method", *_COLUMNS], [[METHOD_NAMES.get(n, n), *_numbers(m)] for n, m in methods.items()]))
-    parts.append(element("p", _verdict(run)))
-    head, rows = _zone_rows(methods)
-    if rows:
-        parts.append("<h2>By eccentricity</h2>" + table(head, rows))
-    parts.append('<div class="row">')
+    parts += [element("p", _verdict(run)), *_zone_table(methods), '<div class="row">']
     for name, caption in _PICTURES.items():
         if source := run.picture(name):
             parts.append(figure(source, f"{caption}{_score(run, name)}", "picture"))
@@ -50,7 +47,8 @@ def pec_section(run: RunRecord) -> list[str]:
     for name, caption in _FIGURES.items():
         if source := run.picture(name):
             parts.append(figure(source, caption.format(frame=which), "wide"))
-    parts.append("<h2>Plan</h2>" + table(["", ""], _plan_rows(run.plan), head=False))
+    plan = [[name.replace("_", " "), plain(value)] for name, value in run.plan.items() if name != "notes"]
+    parts.append("<h2>Plan</h2>" + table(["", ""], plan, head=False))
     return parts + [element("p", note, "warn") for note in run.plan["notes"]]
 
 
@@ -103,17 +101,16 @@ def _verdict(run: RunRecord) -> str:
     )
 
 
-def _zone_rows(methods: dict[str, dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
-    """Head and cells of a table of scores by zone, one row per method; empty if the run has no zones."""
+def _zone_table(methods: dict[str, dict[str, Any]]) -> list[str]:
+    """HTML of a table of scores by zone of the visual field, one row per method; empty if the run has no zones."""
     scored = {name: numbers["zones"] for name, numbers in methods.items() if "zones" in numbers}
     if not scored:
-        return [], []
-    zones: Sequence[dict[str, Any]] = next(iter(scored.values()))
-    limits = [f"{zone['from_deg']} to {zone['to_deg']} deg" for zone in zones[:-1]] + [
-        f"from {zones[-1]['from_deg']} deg"
-    ]
-    head = ["method"] + [f"{z['zone']}, {words}" for z, words in zip(zones, limits, strict=True)]
-    return head, [[METHOD_NAMES.get(name, name), *map(_cell, row)] for name, row in scored.items()]
+        return []
+    *zones, outermost = next(iter(scored.values()))
+    head = ["method", *(f"{zone['zone']}, {zone['from_deg']} to {zone['to_deg']} deg" for zone in zones)]
+    head.append(f"{outermost['zone']}, from {outermost['from_deg']} deg")
+    rows = [[METHOD_NAMES.get(name, name), *map(_cell, row)] for name, row in scored.items()]
+    return ["<h2>By eccentricity</h2>" + table(head, rows)]
 
 
 def _cell(zone: dict[str, Any]) -> str:
@@ -122,13 +119,9 @@ def _cell(zone: dict[str, Any]) -> str:
     return ", ".join([*parts, f"{100 * zone['error']:.0f} % of the error"])
 
 
-def _plan_rows(plan: dict[str, Any]) -> list[list[str]]:
-    return [[name.replace("_", " "), plain(value)] for name, value in plan.items() if name != "notes"]
-
-
 def _score(run: RunRecord, name: str) -> str:
-    isolated = run.summary["methods"]["corrected"].get("isolated", {})
-    value = (isolated if name == "isolated" else run.summary["methods"].get(name, {})).get("ssim_mean")
+    methods = run.summary["methods"]
+    value = (methods["corrected"] if name == "isolated" else methods).get(name, {}).get("ssim_mean")
     return "" if value is None else f": SSIM {value:.3f}"
 
 
@@ -137,5 +130,6 @@ def _fixed(value: float | None, digits: int) -> str:
 
 
 def _lit_mean(values: list[float]) -> float:
+    """Mean over the lit colours, whose values are above zero."""
     lit = [value for value in values if value > 0]
     return sum(lit) / len(lit) if lit else 0.0

@@ -35,25 +35,23 @@ def zone_scores(
 ) -> list[dict[str, Any]]:
     """PSNR and SSIM of a picture [C, H, W] in 0 .. 1, one row for each zone of the visual field, central zone first.
 
-    The PSNR of a zone is that of its pixels, over all lit colours. Its SSIM is the mean over the windows centred in it,
-    None if there is no such window. ``error`` is its share of the whole squared error. Zones without pixels are left
-    out.
+    The PSNR of a zone is computed over its pixels and all lit colours, and its SSIM over the windows centred in it; it
+    is None if there is no such window. ``error`` is the share of the zone in the total squared error. Zones without
+    pixels are left out.
     """
     picture, image = picture[lit].clamp(0, 1), image[lit]
-    where = eccentricities(settings, (image.shape[-2], image.shape[-1]))
+    angles, edge = eccentricities(settings, (image.shape[-2], image.shape[-1])), SSIM_WINDOW // 2
     square = (picture - image).double().square().mean(0)
-    edge = SSIM_WINDOW // 2
-    centres = where[edge:-edge, edge:-edge]  # eccentricities of the centres of the windows
-    windows = square[:0]
-    if min(where.shape) >= SSIM_WINDOW:
-        windows = ssim_map(picture, image, data_range=1.0).mean(0)
+    centres = angles[edge:-edge, edge:-edge]  # of the windows of SSIM
+    has_windows = min(angles.shape) >= SSIM_WINDOW
+    windows = ssim_map(picture, image, data_range=1.0).mean(0) if has_windows else torch.zeros_like(centres)
     rows: list[dict[str, Any]] = []
     for name, (low, high) in zip(_NAMES, ZONES, strict=True):
-        inside = (where >= low) & (where < high)
+        inside = (angles >= low) & (angles < high)
         if not inside.any():
             continue
         error = square[inside].mean().item()
-        similar = windows[(centres >= low) & (centres < high)] if len(windows) else windows
+        similar = windows[(centres >= low) & (centres < high)]
         rows.append(
             {
                 "zone": name,
