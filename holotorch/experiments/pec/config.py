@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import PydanticCustomError
@@ -111,7 +111,7 @@ class NearFieldSettings(Settings):
 class _SolverSettings(Settings):
     """Settings of any solver. It stops after ``patience`` steps with a relative change of loss below ``tolerance``."""
 
-    kind: str
+    kind: Any  # name of the solver, stated by each of the classes below
     max_steps: Count = 400
     tolerance: Annotated[Number, Field(ge=0)] = 1e-3
     patience: Count = 10
