@@ -1,4 +1,4 @@
-"""Chart of an observer's view: error over time, error over the number of wavelengths, and speckle over sharpness."""
+"""Chart of an observer's view: error against time, error against number of wavelengths, speckle against sharpness."""
 
 import math
 import warnings
@@ -52,10 +52,7 @@ def _settings() -> tuple[ObserverSettings, VolumeSettings]:
 
 
 def _quarter_size(settings: ObserverSettings, scene: VolumeSettings) -> Observer:
-    """An observer whose display, eye and distances are scaled by 1/4.
-
-    At full size, the element-by-element propagation of 512 px takes 11 GB.
-    """
+    """Observer whose display, eye and distances are scaled by 1/4; at full size, elements would need 11 GB."""
     display, eye = settings.display, settings.eye
     lengths = {name: value / 4 for name, value in display.model_dump().items() if isinstance(value, float)}
     smaller = {
@@ -78,18 +75,15 @@ def _methods(observer: Observer) -> list[dict]:
     field, eye, display = hologram[1].conj()[None], observer.eye(depth), observer.display
     least = least_oversampling(grid, [wavelength], display, eye, plane=depth)
 
+    setup: dict[str, Any] = {"plane": depth, "paraxial": True}
+
     def by_elements(factor: float) -> Tensor:
-        sampling = _scaled(least, factor)
-        return propagate_elements(
-            field, grid, [wavelength], display, eye, plane=depth, sampling=sampling, paraxial=True
-        )
+        return propagate_elements(field, grid, [wavelength], display, eye, sampling=_scaled(least, factor), **setup)
 
     reference = intensity(by_elements(1.3))
-    plan = plan_retina(grid, [wavelength], display, eye, plane=depth, paraxial=True)
+    plan = plan_retina(grid, [wavelength], display, eye, **setup)
     needed = max(least.oversampling)
-    calls: dict[str, Any] = {
-        "collapse": lambda: propagate_collapsed(field, grid, [wavelength], display, eye, plane=depth, paraxial=True)
-    }
+    calls: dict[str, Any] = {"collapse": partial(propagate_collapsed, field, grid, [wavelength], display, eye, **setup)}
     for factor in (*(f for f in FACTORS if f < 0.95 * needed), needed):
         name = f"elements, {factor:.2g} x" + (", the thesis's sampling" if factor == 1 else "")
         calls[name] = partial(by_elements, factor / needed)
@@ -98,9 +92,8 @@ def _methods(observer: Observer) -> list[dict]:
         with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the chart shows this aliasing
             call()  # warms up
             image, seconds = timed(call)
-        error = ((intensity(image) - reference).square().sum() / reference.square().sum()).sqrt().item()
         predicted = f"{plan.predicted_error:.1e}" if name == "collapse" else ""
-        rows.append(_row("way", name, seconds, f"{error:.1e}", predicted))
+        rows.append(_row("way", name, seconds, _error(intensity(image), reference), predicted))
     return rows
 
 
@@ -114,8 +107,8 @@ def _scaled(least: ElementSampling, factor: float) -> ElementSampling:
 def _counts(observer: Observer) -> list[dict]:
     """Error of a picture in green light by the number of wavelengths, relative to one wavelength every nanometre.
 
-    "followed": all wavelengths are in the sum, but only this many are propagated, and the others are derived from
-    their neighbours. "alone": only this many wavelengths are in the sum.
+    "followed": all wavelengths are in the sum, but only this number is propagated, and the pictures at the others are
+    derived from those. "alone": only this number of wavelengths is in the sum.
     """
     depth, wavelength, grid = observer.focus[0], observer.scene.settings.wavelengths[1], observer.scene.grid
     hologram, _ = observer.scene.hologram(0)
@@ -148,6 +141,7 @@ def _counts(observer: Observer) -> list[dict]:
 
 
 def _error(picture: Tensor, reference: Tensor) -> str:
+    """Relative L2 error."""
     return f"{((picture - reference).square().mean() / reference.square().mean()).sqrt().item():.1e}"
 
 
@@ -163,15 +157,14 @@ def _verdict(methods: list[dict], counts: list[dict], cases: list[Case]) -> list
     for source in PRESETS:
         selected = [row for row in counts if row["subject"] == source]
         full = float(selected[0]["seconds"])
-        through = [
+        derived = [
             f"{row['what']} {row['error']} (predicted {row['predicted']}), {full / float(row['seconds']):.1f} x as fast"
             for row in selected
             if "followed" in row["what"]
         ]
         alone = [f"{row['what']} {row['error']}" for row in selected if "alone" in row["what"]]
-        lines += [f"{source}: " + "; ".join(through), f"{source}: " + "; ".join(alone)]
-    lines += in_words(cases)
-    return lines
+        lines += [f"{source}: " + "; ".join(derived), f"{source}: " + "; ".join(alone)]
+    return lines + in_words(cases)
 
 
 def _draw(methods: list[dict], counts: list[dict], cases: list[Case]) -> bytes:
@@ -184,19 +177,15 @@ def _draw(methods: list[dict], counts: list[dict], cases: list[Case]) -> bytes:
     for k, source in enumerate(PRESETS):
         for how, line in (("followed", "o-"), ("alone", "x:")):
             selected = [row for row in counts if row["subject"] == source and how in row["what"]]
-            numbers, errors = (
-                [int(row["what"].split()[0]) for row in selected],
-                [float(row["error"]) for row in selected],
-            )
+            numbers = [int(row["what"].split()[0]) for row in selected]
+            errors = [float(row["error"]) for row in selected]
             second.loglog(numbers, errors, line, color=f"C{k}", label=f"{source}, {how}")
     second.set_xlabel("wavelengths through the optics")
     second.set_ylabel("relative L2 error against one every nm")
     for k, case in enumerate(cases):
         label = f"{case.distance * 1e3:g} mm, {case.wavelength * 1e9:.0f} nm"
-        widths = [width * 1e9 for width in WIDTHS]
-        third.semilogx(
-            widths, case.ssim, color=("C3", "C2", "C0")[k % 3], linestyle=("-", "--", ":")[k // 3 % 3], label=label
-        )
+        widths, colour, line = [width * 1e9 for width in WIDTHS], f"C{(3, 2, 0)[k % 3]}", ("-", "--", ":")[k // 3 % 3]
+        third.semilogx(widths, case.ssim, color=colour, linestyle=line, label=label)
     third.set_xticks([1.4, 3, 6, 12, 25, 50], ["1.4", "3", "6", "12", "25", "50"], minor=False)
     third.minorticks_off()
     third.set_xlabel("FWHM (nm)")

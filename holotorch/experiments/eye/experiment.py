@@ -1,8 +1,8 @@
-"""The view of an observer: a volume's hologram in light of real sources, through a display and a focused eye."""
+"""Observer: the view of a volume's hologram in the light of real sources, through a display and a focused eye."""
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -31,11 +31,11 @@ PRESETS: dict[str, Callable[[float], Spectrum]] = {
     "sled": Spectrum.sled,
     "led": Spectrum.led,
 }
-# Prefactor of the closed form for the best FWHM, fitted to the CT scan of a teapot; smooth scenes need a larger one
-# (C60: 0.8).
+# Prefactor of the closed form for the best FWHM (``optimum_fwhm``), fitted to the CT scan of a teapot. Smooth scenes
+# need a larger one (C60: 0.8).
 BEST = 0.46
 _REFERENCE_SEED = 100_000  # first seed of the realisations that only form the reference
-_MAX_RINGS = 16  # rings of directions of an extended source; 16 take a thousand times as long as a point source
+_MAX_RINGS = 16  # rings of directions of an extended source; 16 rings take 1024 times as long as a point source
 _LIT = 0.05  # speckle is measured on pixels brighter than this fraction of the brightest pixel of the reference
 
 
@@ -43,9 +43,9 @@ _LIT = 0.05  # speckle is measured on pixels brighter than this fraction of the 
 class Observer:
     """A scene, a display and an eye, as a configuration describes them.
 
-    The waves of the hologram diverge from a scene behind it (exp(+ikr)/r). A display shows the complex conjugate, whose
-    light converges to the scene in front of it, towards the observer. Every wavelength of a source is modulated with
-    the same amplitude and phase, as in the thesis; the dispersion of a panel is not modelled.
+    The hologram is computed for light that diverges from a scene behind it (exp(+ikr)/r). The display shows its complex
+    conjugate, whose light converges to the scene in front of the hologram, towards the observer. Every wavelength of a
+    source is modulated with the same amplitude and phase, as in the thesis; the dispersion of a panel is not modelled.
 
     Attributes:
         settings: The configuration.
@@ -56,6 +56,10 @@ class Observer:
     settings: ObserverSettings
     scene: VolumeExperiment
     focus: tuple[float, ...]
+    _samples: dict[tuple[str, float, float], tuple[Tensor, Tensor, int]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+    _retina_plans: dict[float, RetinaPlan] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @cached_property
     def display(self) -> Display:
@@ -69,7 +73,7 @@ class Observer:
         return Display(lens, given.focal_length, given.eye_distance)
 
     def accommodation(self, depth: float) -> float:
-        """Distance in front of the eye at which a depth of the scene appears, in metres."""
+        """Distance in metres in front of the eye at which a depth of the scene appears. ValueError if there is none."""
         given, to_lens = self.settings.display, float(self.display.lens_distance) - depth
         if isinstance(given, PlanarSettings):
             return to_lens
@@ -83,23 +87,26 @@ class Observer:
 
     @property
     def reference_wavelength(self) -> float:
-        """The wavelength for which an eye with chromatic aberration is in focus: the middle one."""
+        """The middle wavelength in metres, for which an eye with chromatic aberration is in focus."""
         return sorted(self.scene.settings.wavelengths)[1]
 
     def aperture(self, depth: float) -> float:
-        """Sine of the half angle of light from a depth that reaches the retina, limited by pupil or hologram."""
+        """Sine of the half angle of the light from a depth that reaches the retina, limited by pupil or hologram."""
         pupil = self.settings.eye.pupil_radius / abs(float(self.display.matrix(depth)[1]))
         return min(pupil, math.sin(math.atan(min(self.scene.grid.extent) / 2 / depth)))
 
     def detail(self, depth: float, wavelength: float) -> float:
-        """Sine of the half angle of light that carries detail: :meth:`aperture`, or the limit of the rays' pitch."""
+        """Sine of the half angle of the light that carries detail: :meth:`aperture`, or the limit by the ray pitch."""
         return min(self.aperture(depth), wavelength / (2 * max(self.scene.rays.pitch)))
 
     def samples(self, source: str, wavelength: float, depth: float) -> tuple[Tensor, Tensor, int]:
-        """Wavelengths (metres) and weights that represent a source within the tolerance, and how many to propagate."""
+        """Wavelengths (metres) and weights that represent a source within the tolerance, and how many to propagate.
+
+        Results are kept, since computing them may take a second. ConfigError if no light reaches the pupil.
+        """
         key = (source, wavelength, depth)
         if key not in self._samples:
-            # Two independent errors: that of the sum over wavelengths, and that of deriving most pictures from a few.
+            # Shared by two independent errors: of the sum over wavelengths, and of deriving most pictures from a few.
             eye, tolerance = self.eye(depth), self.settings.light.tolerance / math.sqrt(2)
             half_width = self.scene.width / 2
             light = seen_light(self.scene.grid, wavelength, self.display, eye, reach=half_width)
@@ -116,16 +123,11 @@ class Observer:
             self._samples[key] = wavelengths, weights, count
         return self._samples[key]
 
-    @cached_property
-    def _samples(self) -> dict[tuple[str, float, float], tuple[Tensor, Tensor, int]]:
-        """Results of :meth:`samples`, each of which may take a second."""
-        return {}
-
     def points(self, wavelength: float, depth: float) -> tuple[list[tuple[float, float]], list[float]]:
         """Directions (sines y, x) and weights of the points that represent an extended source.
 
-        Light from a direction shifts the picture by the depth times the sine of its angle. The rings of directions are
-        so dense that neighbouring rings are at most half a diffraction spot apart in the picture.
+        A tilt of the light by an angle shifts the picture by the depth times the sine of the angle. The rings of
+        directions are so dense that the pictures of neighbouring rings are at most half a diffraction spot apart.
 
         Raises:
             ConfigError: More than 16 rings (1024 directions) are needed.
@@ -143,7 +145,7 @@ class Observer:
     def retina(self, depth: float) -> RetinaPlan:
         """Choose the method of propagation to the retina of an eye that is focused at a depth.
 
-        All sources use the same method, since their pictures are compared. It is planned for the shortest and the
+        All sources use the same method, since their pictures are compared. The plan is made for the shortest and the
         longest wavelength of all sources; wavelengths between them have smaller errors and need fewer samples.
 
         Raises:
@@ -168,28 +170,24 @@ class Observer:
                 raise ConfigError([f"display: {error}"]) from error
         return self._retina_plans[depth]
 
-    @cached_property
-    def _retina_plans(self) -> dict[float, RetinaPlan]:
-        return {}
-
     def image(self, hologram: Tensor, source: str | None, depth: float) -> Tensor:
         """Intensity on the retina, mapped back to the scene, real [3, h, w] on the rays.
 
         Args:
             hologram: Complex [3, H, W].
             source: Name of a source; None for a single wavelength per colour.
-            depth: Depth in metres at which the eye is focused; the method depends on it, see :meth:`retina`.
+            depth: Depth in metres at which the eye is focused.
         """
         eye, grid, pictures = self.eye(depth), self.scene.grid, []
         elements = self.retina(depth).method == "elements"
-        for field, wavelength in zip(hologram.conj(), self.scene.settings.wavelengths, strict=True):
+        for light, wavelength in zip(hologram.conj(), self.scene.settings.wavelengths, strict=True):
             samples, points = ([wavelength], [1.0], 1), ([(0.0, 0.0)], [1.0])
             if source is not None:
                 samples, points = self.samples(source, wavelength, depth), self.points(wavelength, depth)
             wavelengths, weights, count = samples
-            total = torch.zeros(grid.shape, dtype=field.real.dtype, device=field.device)
+            total = torch.zeros(grid.shape, dtype=light.real.dtype, device=light.device)
             for tilt, share in zip(*points, strict=True):
-                tilted = field * tilted_wave(grid, wavelength, tilt).to(field) if any(tilt) else field
+                tilted = light * tilted_wave(grid, wavelength, tilt).to(light) if any(tilt) else light
                 total += share * spectral_image(
                     tilted, grid, wavelengths, weights, self.display, eye, count=count, elements=elements
                 )

@@ -1,6 +1,7 @@
 """Speckle against sharpness: the spectral width with the best picture, per colour and distance (thesis Sec. 6.4.2)."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,8 +27,8 @@ WIDTHS = tuple(1e-9 * width for width in (1.4, 2.5, 4, 6, 9, 13, 19, 28, 40, 56)
 # Offsets in metres from the central wavelength at which pictures are computed, on both sides. Up to 10 nm the step is
 # 0.5 nm, half the period of the beat at the corner of a scene; from there to 84 nm it is 1 nm.
 _OFFSETS = 1e-9 * np.concatenate([np.arange(0, 10, 0.5), np.arange(10, 85.0)])
-# Number of wavelengths of a colour that are propagated; the others are derived from them. Propagating only 1 of 60
-# wavelengths causes an error of only 0.4 % (``holotorch chart eye``).
+# Number of wavelengths of a colour that are propagated; the others are derived from them. If 1 of 60 wavelengths is
+# propagated, the error is 0.4 % (``holotorch chart eye``).
 _PROPAGATED = 16
 _REFERENCE_SEED = 1000  # first seed of the realisations of the reference
 _BRIGHTEST = 0.995  # quantile of the reference that is shown as white
@@ -41,12 +42,11 @@ class Case:
     Attributes:
         distance: Distance of the scene from the hologram in metres.
         wavelength: Central wavelength in metres.
-        aperture: Sine of the half angle of the light that carries detail; limited by the eye, the hologram or the
-            pitch of the rays.
+        aperture: Sine of the half angle of the light that carries detail, see ``Observer.detail``.
         ssim: SSIM for each of ``WIDTHS``, relative to the mean of other realisations.
         contrast: Speckle contrast for each of ``WIDTHS``.
         sharpness: Sharpness for each of ``WIDTHS``.
-        best: FWHM in metres with the highest SSIM, by a parabola through the largest value and its neighbours.
+        best: FWHM in metres with the highest SSIM, see :func:`parabola_peak`.
         inside: Whether ``best`` lies inside the range of ``WIDTHS``.
     """
 
@@ -60,15 +60,14 @@ class Case:
     inside: bool
 
     def formula(self, prefactor: float) -> float:
-        """FWHM in metres by the closed form; NaN for a prefactor of NaN."""
-        if math.isnan(prefactor):
-            return prefactor
-        return optimum_fwhm(self.wavelength, self.aperture, self.distance, defocus=prefactor)
+        """Best FWHM in metres by the closed form; NaN for a prefactor of NaN."""
+        defined = not math.isnan(prefactor)
+        return optimum_fwhm(self.wavelength, self.aperture, self.distance, defocus=prefactor) if defined else math.nan
 
     def row(self, prefactor: float) -> dict[str, Any]:
         """A row of the table; ``prefactor`` is that of the closed form."""
-        measured = (("ssim", self.ssim, 4), ("contrast", self.contrast, 3))
-        measured += (("predicted", tuple(map(self.predicted_contrast, WIDTHS)), 3),)
+        predicted = tuple(map(self.predicted_contrast, WIDTHS))
+        by_width = (("ssim", self.ssim, 4), ("contrast", self.contrast, 3), ("predicted", predicted, 3))
         return {
             "distance_mm": self.distance * 1e3,
             "wavelength_nm": round(self.wavelength * 1e9),
@@ -78,17 +77,17 @@ class Case:
             "formula_nm": round(self.formula(prefactor) * 1e9, 2),
         } | {
             f"{name}_{width * 1e9:g}": round(value, digits)
-            for name, values, digits in measured
+            for name, values, digits in by_width
             for width, value in zip(WIDTHS, values, strict=True)
         }
 
     @property
     def source(self) -> str:
-        """Preset source whose FWHM is nearest to ``best``, by ratio."""
+        """Name of the preset source whose FWHM has the ratio to ``best`` that is nearest to 1."""
         return min(PRESETS, key=lambda name: abs(math.log(PRESETS[name](self.wavelength).fwhm / self.best)))
 
     def predicted_contrast(self, width: float) -> float:
-        """Speckle contrast in closed form for a FWHM."""
+        """Speckle contrast in closed form for a FWHM in metres."""
         spectrum = Spectrum.lorentzian(self.wavelength, width)
         return predicted_contrast(spectrum, path_difference(self.distance, self.aperture))
 
@@ -98,8 +97,14 @@ def tradeoff(
 ) -> list[Case]:
     """Compute a case for every distance and colour, with the eye focused on the middle of the scene.
 
-    All pictures are computed with ``propagate_collapsed`` (one filter for eyepiece and eye), because each hologram
-    needs 189 wavelengths per colour.
+    All light is propagated by ``propagate_collapsed``, because each hologram needs 189 wavelengths per colour.
+
+    Args:
+        settings: Settings of the observer.
+        scene: Settings of the scene.
+        distances: Distances of the scene from the hologram, in metres.
+        seeds: Number of realisations that are measured.
+        others: Number of other realisations, whose mean is the reference.
     """
     cases = []
     for distance in tqdm(distances, desc="speckle against sharpness", unit="distance"):
@@ -125,24 +130,18 @@ def _case(eye: Observer, colour: int, wavelength: float, holograms: list[Tensor]
     depth = eye.focus[0]
     wavelengths = wavelength + np.concatenate([-_OFFSETS[:0:-1], _OFFSETS])
     weights = np.stack([_weights(wavelengths, Spectrum.lorentzian(wavelength, width)) for width in WIDTHS])
+    spectra, count = (torch.from_numpy(wavelengths), torch.from_numpy(weights)), min(_PROPAGATED, len(wavelengths))
     shown = []
     for hologram in holograms:
-        images = spectral_image(
-            hologram[colour].conj(),
-            eye.scene.grid,
-            torch.from_numpy(wavelengths),
-            torch.from_numpy(weights),
-            eye.display,
-            eye.eye(depth),
-            count=min(_PROPAGATED, len(wavelengths)),
-        )
+        field = hologram[colour].conj()
+        images = spectral_image(field, eye.scene.grid, *spectra, eye.display, eye.eye(depth), count=count)
         shown.append(torch.stack([pooled(image, eye.scene.stride) for image in images]))
     pictures = equal_power(torch.stack(shown), reference.expand(len(holograms), len(WIDTHS), *reference.shape))
     peak = reference.flatten().quantile(_BRIGHTEST)
     tone = tone_map(pictures[..., None, :, :], peak=peak), tone_map(reference[None], peak=peak)
     quality = ssim(tone[0], tone[1].expand_as(tone[0]).contiguous(), data_range=1.0)[..., 0].mean(0)
     contrast = speckle_contrast(pictures, reference=reference, mask=reference > _LIT * reference.max()).mean(0)
-    best, inside = _peak(np.log(np.array(WIDTHS)), quality.numpy())
+    best, inside = parabola_peak(np.log(WIDTHS).tolist(), quality.tolist())
     return Case(
         depth,
         wavelength,
@@ -171,17 +170,22 @@ def _weights(wavelengths: np.ndarray, spectrum: Spectrum) -> np.ndarray:
     return weights / weights.sum()
 
 
-def _peak(positions: np.ndarray, values: np.ndarray) -> tuple[float, bool]:
-    """Position of the maximum by a parabola through it and its neighbours, and whether it has two neighbours."""
-    i = int(values.argmax())
+def parabola_peak(positions: Sequence[float], values: Sequence[float]) -> tuple[float, bool]:
+    """Position of the maximum of a parabola through the largest value and its neighbours.
+
+    Returns:
+        The position and True, or the position of the largest value and False if it has only one neighbour.
+    """
+    i = int(np.argmax(values))
     if not 0 < i < len(positions) - 1:
-        return float(positions[i]), False
-    a, b, _ = np.polyfit(positions[i - 1 : i + 2], values[i - 1 : i + 2], 2)
-    return float(-b / (2 * a)), True
+        return positions[i], False
+    left, right = positions[i] - positions[i - 1], positions[i + 1] - positions[i]
+    rise, fall = values[i] - values[i - 1], values[i] - values[i + 1]
+    return positions[i] + 0.5 * (right**2 * rise - left**2 * fall) / (right * rise + left * fall), True
 
 
 def fitted_prefactor(cases: list[Case]) -> float:
-    """Prefactor of the closed form that fits the optima best (mean of logarithms); NaN if none is inside the widths."""
+    """Prefactor of the closed form that fits the optima best (mean of logarithms); NaN without an optimum inside."""
     ratios = [np.log(case.best / case.formula(1.0)) for case in cases if case.inside]
     return float(np.exp(np.mean(ratios))) if ratios else float("nan")
 
@@ -195,10 +199,9 @@ def in_words(cases: list[Case]) -> list[str]:
         f"best FWHM = 2 x {prefactor:.2f} wavelength^2 / (aperture^2 distance): {len(inside)} of {len(cases)} optima "
         f"lie inside the widths tried, off by {min(off, default=0):+.0%} to {max(off, default=0):+.0%}"
     ]
-    for case in cases:
-        lines.append(
-            f"{case.distance * 1e3:g} mm, {case.wavelength * 1e9:.0f} nm, aperture {case.aperture:.3f}: best "
-            f"{case.best * 1e9:.1f} nm (formula {case.formula(prefactor) * 1e9:.1f}), nearest to a "
-            f"{case.source.replace('_', ' ')}"
-        )
-    return lines
+    return lines + [
+        f"{case.distance * 1e3:g} mm, {case.wavelength * 1e9:.0f} nm, aperture {case.aperture:.3f}: best "
+        f"{case.best * 1e9:.1f} nm (formula {case.formula(prefactor) * 1e9:.1f}), nearest to a "
+        f"{case.source.replace('_', ' ')}"
+        for case in cases
+    ]
