@@ -77,7 +77,8 @@ def _measure(size: int, pitch: float) -> list[dict[str, Any]]:
     wide = Grid(2 * size, pitch)
     distances = [z for z in DISTANCES if size < LARGE or z in FEW_DISTANCES]
     for distance in tqdm(distances, desc=f"{size} px, {pitch * 1e6:g} um", unit="distance"):
-        exact = {kind: _exact(field, grid, wide, WAVELENGTH, distance) for kind, field in fields.items()}
+        reference = CroppedKernel(wide, WAVELENGTH, distance)
+        exact = {kind: _exact(reference, field) for kind, field in fields.items()}
         methods = _methods(grid, distance)
         dtypes = {name: torch.complex128 if "complex128" in name else torch.complex64 for name in methods}
         calls = {name: partial(call, fields["white"].to(dtypes[name])) for name, call in methods.items()}
@@ -100,10 +101,11 @@ def _measure(size: int, pitch: float) -> list[dict[str, Any]]:
     return rows
 
 
-def _exact(field: Tensor, grid: Grid, wide: Grid, wavelength: float, distance: float) -> Tensor:
-    """Field [H, W] at a distance by the exact kernel on the window ``wide``."""
-    (height, width), pad = grid.shape, (0, wide.shape[1] - grid.shape[1], 0, wide.shape[0] - grid.shape[0])
-    return CroppedKernel(wide, wavelength, distance)(torch.nn.functional.pad(field, pad)[None])[0, :height, :width]
+def _exact(reference: CroppedKernel, field: Tensor) -> Tensor:
+    """Propagate a field [H, W] by the exact kernel ``reference`` of a larger window."""
+    (height, width), (rows, columns) = field.shape, reference.grid.shape
+    padded = torch.nn.functional.pad(field, (0, columns - width, 0, rows - height))
+    return reference(padded[None])[0, :height, :width]
 
 
 def _error(field: Tensor, exact: Tensor) -> str:
@@ -124,9 +126,9 @@ def _methods(grid: Grid, distance: float) -> dict[str, Callable[[Tensor], Tensor
         # The kernel contains the scale 1 / N of the inverse transform, as in core.fourier.
         return torch.fft.ifft2(torch.fft.fft2(field, s=padded.shape) * naive, norm="forward")[:height, :width]
 
-    setup, planned = (grid, WAVELENGTH, distance), "planned, tolerance 1e-3"
+    setup = grid, WAVELENGTH, distance
     modules: dict[str, torch.nn.Module] = {
-        planned: Propagator(*setup, tolerance=TOLERANCE),
+        "planned, tolerance 1e-3": Propagator(*setup, tolerance=TOLERANCE),
         "planned, 1e-3, complex128": Propagator(*setup, tolerance=TOLERANCE),
         "cropped kernel": CroppedKernel(*setup),
         **{f"angular spectrum, pad {pad:g}": AngularSpectrum(*setup, pad=pad) for pad in (1.125, 2.0, 4.0)},
@@ -156,7 +158,7 @@ def _predictions() -> list[dict[str, Any]]:
         wavelength = float(generator.choice([450e-9, 530e-9, 636e-9]))
         distance = 10 ** generator.uniform(-2, 0.7) * 2 * max(grid.extent) * pitch / wavelength
         field, wide = _noise(grid, share, case), Grid((4 * grid.shape[0], 4 * grid.shape[1]), pitch)
-        exact = _exact(field, grid, wide, wavelength, distance)
+        exact = _exact(CroppedKernel(wide, wavelength, distance), field)
         path, content = PlanePair(grid, grid), FieldContent((share / 2 / pitch, share / 2 / pitch))
         for method in candidates(path, [wavelength], [distance], content):
             values = [torch.tensor(value, dtype=torch.float64) for value in (wavelength, distance)]
