@@ -34,7 +34,6 @@ PRESETS: dict[str, Callable[[float], Spectrum]] = {
 # Prefactor of the closed form for the best FWHM (``optimum_fwhm``), fitted to the CT scan of a teapot. Smooth scenes
 # need a larger one (C60: 0.8).
 BEST = 0.46
-_REFERENCE_SEED = 100_000  # first seed of the realisations that only form the reference
 _MAX_RINGS = 16  # rings of directions of an extended source; 16 rings take 1024 times as long as a point source
 _LIT = 0.05  # speckle is measured on pixels brighter than this fraction of the brightest pixel of the reference
 
@@ -114,13 +113,10 @@ class Observer:
                 words = f"no light of {wavelength * 1e9:.4g} nm of the scene reaches the pupil when the eye looks at"
                 hint = "change the distances of display, or the pupil"
                 raise ConfigError([f"display: {words} {depth * 1e3:.4g} mm from the hologram; {hint}"])
-            wavelengths, weights = PRESETS[source](wavelength).samples(
-                tolerance=tolerance, path_difference=light.path_difference, iris=False
-            )
-            count = least_followed(
-                wavelengths, weights, tolerance, self.scene.grid, self.display, eye, reach=half_width
-            )
-            self._samples[key] = wavelengths, weights, count
+            spectrum = PRESETS[source](wavelength)
+            samples = spectrum.samples(tolerance=tolerance, path_difference=light.path_difference, iris=False)
+            count = least_followed(*samples, tolerance, self.scene.grid, self.display, eye, reach=half_width)
+            self._samples[key] = *samples, count
         return self._samples[key]
 
     def points(self, wavelength: float, depth: float) -> tuple[list[tuple[float, float]], list[float]]:
@@ -152,62 +148,49 @@ class Observer:
             ConfigError: No method can be used.
         """
         if depth not in self._retina_plans:
-            wavelengths = self.scene.settings.wavelengths
-            sources = self.settings.light.sources
+            sources, wavelengths = self.settings.light.sources, self.scene.settings.wavelengths
             ends = [end for source in sources for each in wavelengths for end in PRESETS[source](each).band()]
+            setup = self.scene.grid, (min(ends), max(ends)), self.display, self.eye(depth)
+            options = {"tolerance": self.settings.tolerance, "plane": depth, "reach": self.scene.width / 2}
             try:
-                self._retina_plans[depth] = plan_retina(
-                    self.scene.grid,
-                    (min(ends), max(ends)),
-                    self.display,
-                    self.eye(depth),
-                    tolerance=self.settings.tolerance,
-                    plane=depth,
-                    reach=self.scene.width / 2,
-                    registered=True,
-                )
+                self._retina_plans[depth] = plan_retina(*setup, **options, registered=True)
             except ValueError as error:
                 raise ConfigError([f"display: {error}"]) from error
         return self._retina_plans[depth]
 
     def image(self, hologram: Tensor, source: str | None, depth: float) -> Tensor:
-        """Intensity on the retina, mapped back to the scene, real [3, h, w] on the rays.
+        """Intensity on the retina of an eye focused at a depth (metres), mapped to the rays of the scene, [3, h, w].
 
-        Args:
-            hologram: Complex [3, H, W].
-            source: Name of a source; None for a single wavelength per colour.
-            depth: Depth in metres at which the eye is focused.
+        ``hologram`` is complex [3, H, W]. Without a source, each colour has a single wavelength.
         """
         eye, grid, pictures = self.eye(depth), self.scene.grid, []
         elements = self.retina(depth).method == "elements"
         for light, wavelength in zip(hologram.conj(), self.scene.settings.wavelengths, strict=True):
-            samples, points = ([wavelength], [1.0], 1), ([(0.0, 0.0)], [1.0])
+            *spectrum, count = [wavelength], [1.0], 1
+            points: tuple[list, list] = [(0.0, 0.0)], [1.0]
             if source is not None:
-                samples, points = self.samples(source, wavelength, depth), self.points(wavelength, depth)
-            wavelengths, weights, count = samples
+                *spectrum, count = self.samples(source, wavelength, depth)
+                points = self.points(wavelength, depth)
             total = torch.zeros(grid.shape, dtype=light.real.dtype, device=light.device)
             for tilt, share in zip(*points, strict=True):
                 tilted = light * tilted_wave(grid, wavelength, tilt).to(light) if any(tilt) else light
-                total += share * spectral_image(
-                    tilted, grid, wavelengths, weights, self.display, eye, count=count, elements=elements
-                )
+                image = spectral_image(tilted, grid, *spectrum, self.display, eye, count=count, elements=elements)
+                total += share * image
             pictures.append(pooled(total, self.scene.stride))
         return torch.stack(pictures).cpu()
 
     def row(self, source: str, depth: float, pictures: Tensor, reference: Tensor) -> dict[str, Any]:
-        """Measurements of a source at a focus: for each quantity, a list with the mean over realisations per colour.
+        """Measurements of a source with the eye focused at a depth (metres): for each quantity, a value per colour.
 
-        Args:
-            source: Name of the source.
-            depth: Focus in metres.
-            pictures: [S, 3, h, w], one for each realisation.
-            reference: Picture free of speckle, [3, h, w].
+        The values are means over the S realisations in ``pictures`` [S, 3, h, w]; ``reference`` [3, h, w] is free of
+        speckle.
         """
         peak = reference.amax((-2, -1), keepdim=True)
         shown = equal_power(pictures, reference.expand_as(pictures))
         wavelengths = self.scene.settings.wavelengths
         samples = [self.samples(source, wavelength, depth) for wavelength in wavelengths]
         difference = path_difference(depth, self.aperture(depth))
+        best = [optimum_fwhm(each, self.detail(depth, each), depth, defocus=BEST) for each in wavelengths]
         quality = ssim((shown / peak).clamp(0, 1), (reference / peak).expand_as(shown), data_range=1.0)
         return {
             "source": source,
@@ -218,9 +201,7 @@ class Observer:
             "contrast_predicted": [predicted_contrast(PRESETS[source](each), difference) for each in wavelengths],
             "ssim": quality.mean(0).tolist(),
             "sharpness": sharpness(shown, reference).mean(0).tolist(),
-            "best_fwhm_nm_by_formula": [
-                optimum_fwhm(each, self.detail(depth, each), depth, defocus=BEST) * 1e9 for each in wavelengths
-            ],
+            "best_fwhm_nm_by_formula": [fwhm * 1e9 for fwhm in best],
         }
 
 
@@ -241,8 +222,3 @@ def observer(settings: ObserverSettings, scene_settings) -> Observer:
         except ValueError as error:
             raise ConfigError([f"display: {error}; the eye cannot focus at a depth of {depth * 1e3:.4g} mm"]) from error
     return result
-
-
-def realisations(count: int, *, reference: bool) -> list[int]:
-    """Seeds of ``count`` holograms; those of the reference differ from all others."""
-    return [(_REFERENCE_SEED if reference else 0) + k for k in range(count)]

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -108,16 +109,8 @@ def focus_sweep(eye: Observer, settings: SweepSettings, surface: Surface | None 
     """Compute the observer's view for one focus after another, with one wavelength per colour.
 
     The visible surface of the scene is divided into bands of depth. The fine detail of each band is correlated with
-    that of the rendering, which is sharp everywhere. The correlation of a band should be largest when the eye is
-    focused at its depth.
-
-    Args:
-        eye: The observer.
-        settings: Numbers of bands, steps and realisations.
-        surface: Result of :func:`visible_surface`; computed if it is not given.
-
-    Raises:
-        ValueError: As :func:`visible_surface`.
+    that of the rendering, which is sharp everywhere: the correlation should be largest when the eye is focused at the
+    depth of the band. Without ``surface``, :func:`visible_surface` is called, which may raise ValueError.
     """
     scene, surface = eye.scene, surface or visible_surface(eye)
     depth, (low, high) = surface.depth, surface.ends
@@ -134,15 +127,15 @@ def focus_sweep(eye: Observer, settings: SweepSettings, surface: Surface | None 
     details, wanted = _fine_detail(pictures), _fine_detail(surface.rendering[None].float())[0]
     bands = []
     ends = torch.linspace(low, high, settings.bands + 1).tolist()
-    for near, far in zip(ends, ends[1:], strict=False):
+    for near, far in pairwise(ends):
         part = surface.opaque & (depth >= near) & (depth <= far)
         if int(part.sum()) < _LEAST:
             continue
         mean = depth[part].mean().item()
         correlation = tuple(_correlation(detail[:, part], wanted[:, part]) for detail in details)
         spread, depth_of_focus = depth[part].std().item(), wavelength / eye.detail(mean, wavelength) ** 2
-        sharpest, inside = parabola_peak(focus, correlation)
-        sharpest = sharpest if inside else math.nan
+        position, inside = parabola_peak(focus, correlation)
+        sharpest = position if inside else math.nan
         bands.append(Band(mean, spread, int(part.sum()), correlation, sharpest, depth_of_focus))
     return FocusSweep(tuple(focus), pictures, tuple(bands))
 
@@ -186,4 +179,5 @@ def _fine_detail(pictures: Tensor) -> Tensor:
 
 
 def _correlation(first: Tensor, second: Tensor) -> float:
+    """Cosine similarity of two tensors."""
     return ((first * second).sum() / (first.norm() * second.norm()).clamp(min=1e-30)).item()

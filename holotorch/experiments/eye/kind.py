@@ -49,7 +49,7 @@ class ObserverKind(ExperimentKind[ObserverSettings, "Observer"]):
     def section(self, record: RunRecord) -> list[str]:
         from holotorch.experiments.eye.report import eye_section
 
-        return eye_section(record.title, record.summary, record.plan, record.picture)
+        return eye_section(record)
 
 
 KIND = ObserverKind()

@@ -14,7 +14,7 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.eye import focus as eye_focus
 from holotorch.experiments.eye import geometry as eye_geometry
 from holotorch.experiments.eye.config import ObserverSettings
-from holotorch.experiments.eye.experiment import Observer, realisations
+from holotorch.experiments.eye.experiment import Observer
 from holotorch.experiments.eye.report import by_wavelength
 from holotorch.experiments.eye.tradeoff import fitted_prefactor, in_words, tradeoff
 from holotorch.experiments.registry import load_config
@@ -35,7 +35,8 @@ from holotorch.io.files import save_array, write_bytes
 from holotorch.optics.picture import equal_power, gamut_map, linear_srgb, tone_map
 
 _SAVE_EVERY = 30.0  # seconds between two checkpoints
-_WHITE = 0.995  # quantile of the reference's brightness that is shown as white
+_WHITE = 0.995  # quantile of the brightness of the reference that is shown as white
+_REFERENCE_SEED = 100_000  # first seed of the realisations that form the reference
 
 
 def scene_settings(settings: ObserverSettings) -> VolumeSettings:
@@ -134,18 +135,17 @@ class _Views:
     def compute(self, pressed: list[int]) -> None:
         """Compute the remaining pictures. A signal raises KeyboardInterrupt after all whole realisations are saved."""
         sources, seeds = self.eye.settings.light.sources, self.eye.settings.seeds
-        references, measured = realisations(8 * seeds, reference=True), realisations(seeds, reference=False)
-        images = len(self.eye.focus), len(self.eye.focus) * len(sources)  # of a realisation, which has one hologram too
-        done = self.references * (1 + images[0]) + len(self.pictures) * (1 + images[1])
-        total = len(references) * (1 + images[0]) + seeds * (1 + images[1])
+        # Steps of the progress bar in a realisation: one for the hologram, and one for each picture.
+        reference, measured = 1 + len(self.eye.focus), 1 + len(self.eye.focus) * len(sources)
+        done, total = self.references * reference + len(self.pictures) * measured, seeds * (8 * reference + measured)
         with tqdm(total=total, initial=done, desc="imaging", unit="picture", dynamic_ncols=True) as bar:
             try:
-                for seed in references[self.references :]:
+                for seed in range(_REFERENCE_SEED + self.references, _REFERENCE_SEED + 8 * seeds):
                     pictures = self._pictures(seed, (None,), bar)[0]
                     with deferred(pressed):
                         self.total, self.references = self.total + pictures, self.references + 1
                     self._save_in_time(pressed)
-                for seed in measured[len(self.pictures) :]:
+                for seed in range(len(self.pictures), seeds):
                     self.pictures.append(self._pictures(seed, sources, bar))
                     self._save_in_time(pressed)
             finally:
@@ -155,7 +155,7 @@ class _Views:
                 raise KeyboardInterrupt
 
     def _pictures(self, seed: int, sources: Sequence[str | None], bar: tqdm) -> Tensor:
-        """Pictures of a realisation, [sources, F, 3, h, w]; the bar counts the hologram and every picture."""
+        """Pictures of a realisation, [sources, F, 3, h, w]."""
         hologram, _ = self.eye.scene.hologram(self.eye.settings.seed + seed)
         bar.set_postfix(mem=f"{peak_memory() / 1e9:.2f}GB", refresh=False)
         bar.update()

@@ -22,10 +22,9 @@ from holotorch.optics.light.spectrum import Spectrum
 from holotorch.optics.picture import equal_power, tone_map
 from holotorch.optics.viewing.imaging import propagate_collapsed
 
-# FWHM in metres of the spectra that are compared.
-WIDTHS = tuple(1e-9 * width for width in (1.4, 2.5, 4, 6, 9, 13, 19, 28, 40, 56))
-# Offsets in metres from the central wavelength at which pictures are computed, on both sides. Up to 10 nm the step is
-# 0.5 nm, half the period of the beat at the corner of a scene; from there to 84 nm it is 1 nm.
+WIDTHS = tuple(1e-9 * width for width in (1.4, 2.5, 4, 6, 9, 13, 19, 28, 40, 56))  # FWHM in metres, to be compared
+# Offsets in metres from the central wavelength at which pictures are computed, on both sides. The step is 0.5 nm up to
+# 10 nm, half the spectral period of the interference at the corner of a scene, and 1 nm beyond.
 _OFFSETS = 1e-9 * np.concatenate([np.arange(0, 10, 0.5), np.arange(10, 85.0)])
 # Number of wavelengths of a colour that are propagated; the others are derived from them. If 1 of 60 wavelengths is
 # propagated, the error is 0.4 % (``holotorch chart eye``).
@@ -95,16 +94,10 @@ class Case:
 def tradeoff(
     settings: ObserverSettings, scene: VolumeSettings, distances: tuple[float, ...], *, seeds: int = 2, others: int = 12
 ) -> list[Case]:
-    """Compute a case for every distance and colour, with the eye focused on the middle of the scene.
+    """Compute a case for every distance (metres) and colour, with the eye focused on the middle of the scene.
 
-    All light is propagated by ``propagate_collapsed``, because each hologram needs 189 wavelengths per colour.
-
-    Args:
-        settings: Settings of the observer.
-        scene: Settings of the scene.
-        distances: Distances of the scene from the hologram, in metres.
-        seeds: Number of realisations that are measured.
-        others: Number of other realisations, whose mean is the reference.
+    ``seeds`` realisations of the random phases are compared with the mean of ``others`` more. All light is propagated
+    by ``propagate_collapsed``, because each hologram needs 189 wavelengths per colour.
     """
     cases = []
     for distance in tqdm(distances, desc="speckle against sharpness", unit="distance"):
@@ -127,6 +120,7 @@ def _image(eye: Observer, field: Tensor, wavelength: float) -> Tensor:
 
 
 def _case(eye: Observer, colour: int, wavelength: float, holograms: list[Tensor], reference: Tensor) -> Case:
+    """Measurements of holograms [3, H, W] against a reference [h, w]."""
     depth = eye.focus[0]
     wavelengths = wavelength + np.concatenate([-_OFFSETS[:0:-1], _OFFSETS])
     weights = np.stack([_weights(wavelengths, Spectrum.lorentzian(wavelength, width)) for width in WIDTHS])
@@ -155,10 +149,7 @@ def _case(eye: Observer, colour: int, wavelength: float, holograms: list[Tensor]
 
 
 def _weights(wavelengths: np.ndarray, spectrum: Spectrum) -> np.ndarray:
-    """Weights of pictures at ``wavelengths`` in the trapezoidal rule over the band of the spectrum.
-
-    The pictures are interpolated linearly at the ends of the band.
-    """
+    """Weights of the trapezoidal rule over the band of a spectrum, whose ends are interpolated linearly."""
     low, high = (float(np.clip(end, wavelengths[0], wavelengths[-1])) for end in spectrum.band())
     inside = (wavelengths > low + 1e-13) & (wavelengths < high - 1e-13)
     nodes = np.concatenate([[low], wavelengths[inside], [high]])

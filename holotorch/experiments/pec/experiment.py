@@ -2,7 +2,6 @@
 
 import math
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -27,7 +26,7 @@ from holotorch.correction import (
     run_stages,
     spread_preconditioner,
 )
-from holotorch.correction.run import State
+from holotorch.correction.run import Callback, State
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.pec.config import PECSettings
 from holotorch.experiments.pec.weight import weight_map
@@ -35,8 +34,6 @@ from holotorch.io.images import fit_image, frame_image, load_image, with_channel
 from holotorch.modulator import PhasedArray, ThermalCrosstalk, quantised
 from holotorch.optics import AngularSpectrum, CroppedKernel, DepthStack, Fraunhofer, Fresnel
 from holotorch.optics.free_space.propagators import SpectralFilter
-
-Progress = Callable[[Solution], None]
 
 
 @dataclass(frozen=True)
@@ -80,7 +77,7 @@ class PECExperiment:
     @property
     def isolated(self) -> bool:
         """Whether the model is a single chip with an image at a distance, where light may leave the window."""
-        return _is_isolated(self.settings)
+        return getattr(self.settings.propagator, "boundary", None) == "isolated"
 
     @property
     def scale_free(self) -> bool:
@@ -214,17 +211,13 @@ class PECExperiment:
             lens = math.pi * (y.square() / height + x.square() / width)  # its slope at the edge is pi per pixel
             return (lens / spread + 0.01 * uniform).to(uniform.dtype)
         if self.start == "retrieved":
-            return self._retrieved(2 * math.pi * uniform)
+            if isinstance(self.propagator, DepthStack):
+                raise ValueError("a retrieved start needs one distance; use another solver.start")
+            image_phase, mask = 2 * math.pi * uniform, None if self.mask is None else self.mask.to(uniform)
+            target = self.target.to(uniform)
+            retrieved = gerchberg_saxton(self.propagator, target, image_phase, max_steps=30, mask=mask)
+            return deconvolve(self.array.crosstalk, retrieved.x, max_steps=100)
         return uniform * {"hot": 2 * math.pi, "cool": 2 * math.pi / spread, "flat": 1.0}[self.start]
-
-    def _retrieved(self, begin: Tensor) -> Tensor:
-        """Phases of 30 passes of Gerchberg-Saxton from the image phases ``begin``, deconvolved."""
-        propagator = self.propagator
-        if isinstance(propagator, DepthStack):
-            raise ValueError("a retrieved start needs one distance; use another solver.start")
-        mask = None if self.mask is None else self.mask.to(begin)
-        retrieved = gerchberg_saxton(propagator, self.target.to(begin), begin, max_steps=30, mask=mask).x
-        return deconvolve(self.array.crosstalk, retrieved, max_steps=100)
 
     def heater_phases(self, solution: Tensor) -> Tensor:
         """Phases [F, C, H, W] for the heaters: the solver's result, rounded to their levels and scaled to the limit."""
@@ -244,7 +237,7 @@ class PECExperiment:
             return penalty_schedule(self.problem, solver, crosstalk.total, self.settings.modulator.max_phase)
         return [Stage(self.problem(), APG(**options) if kind == "apg" else ProjectedAdam(**options))]
 
-    def solve(self, progress: Progress | None = None, resume: State | None = None) -> Solution:
+    def solve(self, progress: Callback | None = None, resume: State | None = None) -> Solution:
         """Run the configured solver on the lit colours. ConfigError if it cannot start."""
         try:
             return run_stages(self.stages(), self.start_phase(), callback=progress, resume=resume)
@@ -267,12 +260,9 @@ def build(settings: PECSettings) -> PECExperiment:
     array = PhasedArray(wavelengths, ThermalCrosstalk(settings.modulator.sigma_px, settings.modulator.kernel_size))
     # From a hot start most of the light of an isolated chip misses the window: at 128 px and sigma 0.66 the result has
     # 4 to 25 % of the light and an SSIM of 0.5 to 0.75. From a flat start it has half of the light and an SSIM of 0.9.
-    start = settings.solver.start or ("flat" if _is_isolated(settings) else "hot")
+    isolated = getattr(settings.propagator, "boundary", None) == "isolated"
+    start = settings.solver.start or ("flat" if isolated else "hot")
     return PECExperiment(settings, source, lit, array, start, _device(settings.device))
-
-
-def _is_isolated(settings: PECSettings) -> bool:
-    return getattr(settings.propagator, "boundary", None) == "isolated"
 
 
 def _device(name: str) -> torch.device:

@@ -28,15 +28,15 @@ _FIGURES = {
 
 def comparison(runs: Sequence[RunRecord]) -> list[str]:
     """HTML of a table that compares the corrected holograms of several runs."""
-    rows = [[run.title, *_numbers(run.summary["methods"]["corrected"])] for run in runs]
-    return ["<h1>Runs</h1>" + table(["run", *_COLUMNS], rows)]
+    rows = [{"run": run.title} | _cells(run.summary["methods"]["corrected"]) for run in runs]
+    return ["<h1>Runs</h1>" + _table(rows)]
 
 
 def pec_section(run: RunRecord) -> list[str]:
     """HTML of a run: scores by method, pictures side by side, figures and plan."""
     methods: dict[str, Any] = run.summary["methods"]
     parts = [heading(run.title, run.summary["status"])]
-    parts.append(table(["method", *_COLUMNS], [[METHOD_NAMES.get(n, n), *_numbers(m)] for n, m in methods.items()]))
+    parts.append(_table([{"method": METHOD_NAMES.get(name, name)} | _cells(each) for name, each in methods.items()]))
     parts += [element("p", _verdict(run)), *_zone_table(methods), '<div class="row">']
     for name, caption in _PICTURES.items():
         if source := run.picture(name):
@@ -52,33 +52,23 @@ def pec_section(run: RunRecord) -> list[str]:
     return parts + [element("p", note, "warn") for note in run.plan["notes"]]
 
 
-_COLUMNS = (
-    "frames",
-    "SSIM",
-    "PSNR (dB)",
-    "SSIM half a sample off",
-    "SSIM, chip alone (exact)",
-    "light in window",
-    "hottest pixel (degC above ambient)",
-    "heating power (mean drive, K)",
-    "evaluations",
-    "seconds",
-)
+def _table(rows: Sequence[dict[str, str]]) -> str:
+    return table(list(rows[0]), [list(row.values()) for row in rows])
 
 
-def _numbers(method: dict[str, Any]) -> list[str]:
-    return [
-        str(method["frames"]),
-        _fixed(method.get("ssim_mean"), 4),
-        _fixed(method.get("psnr_mean"), 1),
-        _fixed(method["between_samples"].get("ssim_mean"), 3),
-        _fixed(method.get("isolated", {}).get("ssim_mean"), 3),
-        f"{100 * _lit_mean(method['efficiency']):.0f} %",
-        _fixed(max(method["peak_temperature_rise_K"]), 0),
-        _fixed(_lit_mean(method["heating_power_K_per_pixel"]), 0),
-        str(method["evaluations"]),
-        _fixed(method["seconds"], 2),
-    ]
+def _cells(method: dict[str, Any]) -> dict[str, str]:
+    return {
+        "frames": str(method["frames"]),
+        "SSIM": _fixed(method.get("ssim_mean"), 4),
+        "PSNR (dB)": _fixed(method.get("psnr_mean"), 1),
+        "SSIM half a sample off": _fixed(method["between_samples"].get("ssim_mean"), 3),
+        "SSIM, chip alone (exact)": _fixed(method.get("isolated", {}).get("ssim_mean"), 3),
+        "light in window": f"{100 * _lit_mean(method['efficiency']):.0f} %",
+        "hottest pixel (degC above ambient)": f"{max(method['peak_temperature_rise_K']):.0f}",
+        "heating power (mean drive, K)": f"{_lit_mean(method['heating_power_K_per_pixel']):.0f}",
+        "evaluations": str(method["evaluations"]),
+        "seconds": f"{method['seconds']:.2f}",
+    }
 
 
 def _verdict(run: RunRecord) -> str:
@@ -109,11 +99,11 @@ def _zone_table(methods: dict[str, dict[str, Any]]) -> list[str]:
     *zones, outermost = next(iter(scored.values()))
     head = ["method", *(f"{zone['zone']}, {zone['from_deg']} to {zone['to_deg']} deg" for zone in zones)]
     head.append(f"{outermost['zone']}, from {outermost['from_deg']} deg")
-    rows = [[METHOD_NAMES.get(name, name), *map(_cell, row)] for name, row in scored.items()]
+    rows = [[METHOD_NAMES.get(name, name), *map(_zone_cell, row)] for name, row in scored.items()]
     return ["<h2>By eccentricity</h2>" + table(head, rows)]
 
 
-def _cell(zone: dict[str, Any]) -> str:
+def _zone_cell(zone: dict[str, Any]) -> str:
     parts = [] if zone["ssim"] is None else [f"SSIM {zone['ssim']:.3f}"]
     parts += [] if zone["psnr"] is None else [f"{zone['psnr']:.1f} dB"]
     return ", ".join([*parts, f"{100 * zone['error']:.0f} % of the error"])

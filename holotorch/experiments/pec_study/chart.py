@@ -135,8 +135,7 @@ def _tables(goals: dict[str, list[dict[str, Any]]]) -> list[str]:
         path = GOALS.parent / name / "table.csv"
         if not path.is_file():
             continue
-        with open(path, newline="", encoding="utf-8") as stream:
-            rows = list(csv.DictReader(stream))
+        rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
         missed = []
         for statement in statements:
             value, (low, high) = _statistic(rows, statement), statement["within"]
@@ -182,6 +181,5 @@ def _draw(rows: list[dict]) -> bytes:
                 axes.set_xlabel(measure)
                 axes.set_ylabel("mean SSIM")
                 axes.grid(alpha=0.3)
-    handles, labels = panels[-1][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=4, fontsize=9)
+    figure.legend(*panels[-1][0].get_legend_handles_labels(), loc="outside upper center", ncols=4, fontsize=9)
     return figure_png(figure)

@@ -202,12 +202,7 @@ def _timed_row(bench: Bench, method: str, work: Callable[[], Solution], setting:
 
 
 def _row(
-    bench: Bench,
-    method: str,
-    scores: dict[str, float],
-    seconds: float = 0.0,
-    setting: str = "",
-    count: int | str = "",
+    bench: Bench, method: str, scores: dict[str, float], seconds: float = 0.0, setting: str = "", count: int | str = ""
 ) -> Row:
     keys = ("ssim", "psnr", "perceptual", "error", "efficiency", "peak_rad", "power_rad")
     return {
