@@ -29,7 +29,7 @@ from holotorch.optics.viewing.retina import plan_retina
 
 SIDE, DISTANCES = 512, (10e-3, 20e-3, 30e-3)  # pixels of the hologram; distances of the scene in metres
 FOCUS = 30e-3  # metres from the hologram
-SCENE = "hologram={{shape: [{0}, {0}], pitch: 3.74 um, distance: 30 mm, depths: 58, rays: {1}}}"
+SCENE = f"hologram={{shape: [{SIDE}, {SIDE}], pitch: 3.74 um, distance: 30 mm, depths: 58, rays: {SIDE // 2}}}"
 FACTORS = (1.0, 2.0, 4.0)  # oversampling of the element-by-element propagation
 
 
@@ -46,7 +46,7 @@ def eye() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
 def _settings() -> tuple[ObserverSettings, VolumeSettings]:
     settings_file, scene_file = find_config("configs/eye/teapot.yaml"), find_config("configs/volume/c60.yaml")
     assert settings_file is not None and scene_file is not None
-    settings, scene = load_config(settings_file), load_config(scene_file, [SCENE.format(SIDE, SIDE // 2)])
+    settings, scene = load_config(settings_file), load_config(scene_file, [SCENE])
     assert isinstance(settings, ObserverSettings) and isinstance(scene, VolumeSettings)
     return settings, scene
 
@@ -74,7 +74,6 @@ def _methods(observer: Observer) -> list[dict]:
     hologram, _ = observer.scene.hologram(0)
     field, eye, display = hologram[1].conj()[None], observer.eye(depth), observer.display
     least = least_oversampling(grid, [wavelength], display, eye, plane=depth)
-
     setup: dict[str, Any] = {"plane": depth, "paraxial": True}
 
     def by_elements(factor: float) -> Tensor:
@@ -98,7 +97,7 @@ def _methods(observer: Observer) -> list[dict]:
 
 
 def _scaled(least: ElementSampling, factor: float) -> ElementSampling:
-    """The sampling ``least`` with ``factor`` times as many samples."""
+    """The sampling ``least`` with ``factor`` times as many samples along each axis."""
     fine = tuple(good_length(math.ceil(size * factor / 2) * 2) for size in least.fine)
     times = tuple(m * now / size for m, now, size in zip(least.oversampling, fine, least.fine, strict=True))
     return replace(least, oversampling=times, fine=fine)  # type: ignore[arg-type]
@@ -172,24 +171,20 @@ def _draw(methods: list[dict], counts: list[dict], cases: list[Case]) -> bytes:
     first, second, third = (figure.add_subplot(1, 3, k + 1) for k in range(3))
     for k, row in enumerate(methods):
         first.loglog(float(row["seconds"]), max(float(row["error"]), 1e-6), "os^vDP"[k % 6], label=row["what"])
-    first.set_xlabel("seconds")
-    first.set_ylabel("relative L2 error of the retina's intensity")
+    first.set(xlabel="seconds", ylabel="relative L2 error of the retina's intensity")
     for k, source in enumerate(PRESETS):
         for how, line in (("followed", "o-"), ("alone", "x:")):
             selected = [row for row in counts if row["subject"] == source and how in row["what"]]
-            numbers = [int(row["what"].split()[0]) for row in selected]
-            errors = [float(row["error"]) for row in selected]
-            second.loglog(numbers, errors, line, color=f"C{k}", label=f"{source}, {how}")
-    second.set_xlabel("wavelengths through the optics")
-    second.set_ylabel("relative L2 error against one every nm")
+            points = [(int(row["what"].split()[0]), float(row["error"])) for row in selected]
+            second.loglog(*zip(*points, strict=True), line, color=f"C{k}", label=f"{source}, {how}")
+    second.set(xlabel="wavelengths through the optics", ylabel="relative L2 error against one every nm")
     for k, case in enumerate(cases):
         label = f"{case.distance * 1e3:g} mm, {case.wavelength * 1e9:.0f} nm"
         widths, colour, line = [width * 1e9 for width in WIDTHS], f"C{(3, 2, 0)[k % 3]}", ("-", "--", ":")[k // 3 % 3]
         third.semilogx(widths, case.ssim, color=colour, linestyle=line, label=label)
     third.set_xticks([1.4, 3, 6, 12, 25, 50], ["1.4", "3", "6", "12", "25", "50"], minor=False)
     third.minorticks_off()
-    third.set_xlabel("FWHM (nm)")
-    third.set_ylabel("SSIM to the speckle-free mean")
+    third.set(xlabel="FWHM (nm)", ylabel="SSIM to the speckle-free mean")
     for axes in (first, second, third):
         axes.grid(alpha=0.3, which="both")
         axes.legend(fontsize=7)

@@ -109,8 +109,7 @@ def draw(eye: Observer) -> bytes:
             style = ("-", "--", "-.", ":")[list(PRESETS).index(source)]
             label = source.replace("_", " ") if colour == _COLOURS[0] else None
             spectra.plot(1e9 * band, power / power.max(), style, color=colour, label=label)
-    spectra.set_xlabel("wavelength (nm)")
-    spectra.set_ylabel("power relative to its peak, within the band that is used")
+    spectra.set(xlabel="wavelength (nm)", ylabel="power relative to its peak, within the band that is used")
     spectra.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.62, 1.0))
     spectra.grid(alpha=0.3)
     return figure_png(figure)
@@ -147,8 +146,7 @@ def _draw_display(axes: Any, eye: Observer) -> None:
     axes.plot([end + retina] * 2, [-retina / 6, retina / 6], color="0.4", linewidth=3)
     share = axes.get_xaxis_transform()  # heights are fractions of the height of the axes
     axes.text(end + retina, 0.97, "eye  ", ha="right", va="top", fontsize=8, transform=share)
-    axes.set_xlabel("along the axis (mm from the hologram)")
-    axes.set_ylabel("height (mm)")
+    axes.set(xlabel="along the axis (mm from the hologram)", ylabel="height (mm)")
     axes.set_title("display and eye: rays from the scene to the edge of the pupil", fontsize=10)
     axes.grid(alpha=0.3)
 
@@ -168,8 +166,7 @@ def _draw_regions(axes: Any, eye: Observer) -> None:
     mesh.set_rasterized(True)
     axes.plot([0, 0], [-1e3 * width / 2, 1e3 * width / 2], "k", linewidth=4)
     _draw_scene(axes, eye)
-    axes.set_xlabel("distance from the hologram (mm)")
-    axes.set_ylabel("height (mm)")
+    axes.set(xlabel="distance from the hologram (mm)", ylabel="height (mm)")
     axes.set_title(f"regions of a point at {1e9 * wavelength:.0f} nm, and the scene", fontsize=10)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.integrate import trapezoid
 from torch import Tensor
 from tqdm import tqdm
 
@@ -112,10 +113,8 @@ def tradeoff(
 
 
 def _image(eye: Observer, field: Tensor, wavelength: float) -> Tensor:
-    depth = eye.focus[0]
-    image = propagate_collapsed(
-        field.conj()[None], eye.scene.grid, [wavelength], eye.display, eye.eye(depth), plane=depth
-    )
+    depth, grid = eye.focus[0], eye.scene.grid
+    image = propagate_collapsed(field.conj()[None], grid, [wavelength], eye.display, eye.eye(depth), plane=depth)
     return pooled(intensity(image[0]), eye.scene.stride)
 
 
@@ -153,11 +152,8 @@ def _weights(wavelengths: np.ndarray, spectrum: Spectrum) -> np.ndarray:
     low, high = (float(np.clip(end, wavelengths[0], wavelengths[-1])) for end in spectrum.band())
     inside = (wavelengths > low + 1e-13) & (wavelengths < high - 1e-13)
     nodes = np.concatenate([[low], wavelengths[inside], [high]])
-    gaps = np.diff(nodes)
-    power = spectrum.power(torch.from_numpy(nodes)).numpy() * (np.append(gaps, 0) + np.insert(gaps, 0, 0)) / 2
-    after, count = np.searchsorted(wavelengths, nodes).clip(1, len(wavelengths) - 1), len(wavelengths)
-    share = (nodes - wavelengths[after - 1]) / (wavelengths[after] - wavelengths[after - 1])
-    weights = np.bincount(after - 1, power * (1 - share), count) + np.bincount(after, power * share, count)
+    basis = np.stack([np.interp(nodes, wavelengths, picture) for picture in np.eye(len(wavelengths))])
+    weights = trapezoid(spectrum.power(torch.from_numpy(nodes)).numpy() * basis, nodes)
     return weights / weights.sum()
 
 
@@ -178,7 +174,7 @@ def parabola_peak(positions: Sequence[float], values: Sequence[float]) -> tuple[
 def fitted_prefactor(cases: list[Case]) -> float:
     """Prefactor of the closed form that fits the optima best (mean of logarithms); NaN without an optimum inside."""
     ratios = [np.log(case.best / case.formula(1.0)) for case in cases if case.inside]
-    return float(np.exp(np.mean(ratios))) if ratios else float("nan")
+    return float(np.exp(np.mean(ratios))) if ratios else math.nan
 
 
 def in_words(cases: list[Case]) -> list[str]:
@@ -186,13 +182,13 @@ def in_words(cases: list[Case]) -> list[str]:
     prefactor = fitted_prefactor(cases)
     inside = [case for case in cases if case.inside]
     off = [case.best / case.formula(prefactor) - 1 for case in inside]
-    lines = [
+    return [
         f"best FWHM = 2 x {prefactor:.2f} wavelength^2 / (aperture^2 distance): {len(inside)} of {len(cases)} optima "
-        f"lie inside the widths tried, off by {min(off, default=0):+.0%} to {max(off, default=0):+.0%}"
-    ]
-    return lines + [
-        f"{case.distance * 1e3:g} mm, {case.wavelength * 1e9:.0f} nm, aperture {case.aperture:.3f}: best "
-        f"{case.best * 1e9:.1f} nm (formula {case.formula(prefactor) * 1e9:.1f}), nearest to a "
-        f"{case.source.replace('_', ' ')}"
-        for case in cases
+        f"lie inside the widths tried, off by {min(off, default=0):+.0%} to {max(off, default=0):+.0%}",
+        *(
+            f"{case.distance * 1e3:g} mm, {case.wavelength * 1e9:.0f} nm, aperture {case.aperture:.3f}: best "
+            f"{case.best * 1e9:.1f} nm (formula {case.formula(prefactor) * 1e9:.1f}), nearest to a "
+            f"{case.source.replace('_', ' ')}"
+            for case in cases
+        ),
     ]

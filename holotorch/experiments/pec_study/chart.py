@@ -178,8 +178,7 @@ def _draw(rows: list[dict]) -> bytes:
                         positions = [max(float(row[measure]), 1e-3) for row in chosen]
                         axes.semilogx(positions, [float(row["ssim"]) for row in chosen], color=f"C{c}", label=name)
                 axes.set_title(f"{kind}, sigma {sigma:g} px", fontsize=9)
-                axes.set_xlabel(measure)
-                axes.set_ylabel("mean SSIM")
+                axes.set(xlabel=measure, ylabel="mean SSIM")
                 axes.grid(alpha=0.3)
     figure.legend(*panels[-1][0].get_legend_handles_labels(), loc="outside upper center", ncols=4, fontsize=9)
     return figure_png(figure)

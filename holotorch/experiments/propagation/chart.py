@@ -263,8 +263,7 @@ def _draw_validity(rows: list[dict]) -> bytes:
         axes.axvline(1, color="k", linestyle=":", linewidth=1)
         axes.axhline(TOLERANCE, color="k", linestyle=":", linewidth=1)
         axes.set_title(f"{kind} source, {len(CASES)} grids")
-        axes.set_xlabel("distance / cross-over distance z_c = 2 L pitch / wavelength")
-        axes.set_ylabel("relative L2 error")
+        axes.set(xlabel="distance / cross-over distance z_c = 2 L pitch / wavelength", ylabel="relative L2 error")
         axes.grid(alpha=0.3)
     return _with_legend(figure, panels[0])
 
