@@ -66,10 +66,9 @@ class Observer:
         given = self.settings.display
         if isinstance(given, PlanarSettings):
             return Display.planar(given.distance)
-        lens = given.lens_distance
-        if lens is None:
-            lens = eyepiece_distance(self.scene.distance, given.focus_distance, given.focal_length, given.eye_distance)
-        return Display(lens, given.focal_length, given.eye_distance)
+        lengths = given.focal_length, given.eye_distance
+        lens = given.lens_distance or eyepiece_distance(self.scene.distance, given.focus_distance, *lengths)
+        return Display(lens, *lengths)
 
     def accommodation(self, depth: float) -> float:
         """Distance in metres in front of the eye at which a depth of the scene appears. ValueError if there is none."""

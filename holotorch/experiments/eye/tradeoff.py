@@ -65,8 +65,10 @@ class Case:
         return optimum_fwhm(self.wavelength, self.aperture, self.distance, defocus=prefactor) if defined else math.nan
 
     def row(self, prefactor: float) -> dict[str, Any]:
-        """A row of the table; ``prefactor`` is that of the closed form."""
-        predicted = tuple(map(self.predicted_contrast, WIDTHS))
+        """A row of the table; ``prefactor`` is that of the closed form for the best FWHM."""
+        difference = path_difference(self.distance, self.aperture)
+        spectra = (Spectrum.lorentzian(self.wavelength, width) for width in WIDTHS)
+        predicted = [predicted_contrast(spectrum, difference) for spectrum in spectra]
         by_width = (("ssim", self.ssim, 4), ("contrast", self.contrast, 3), ("predicted", predicted, 3))
         return {
             "distance_mm": self.distance * 1e3,
@@ -85,11 +87,6 @@ class Case:
     def source(self) -> str:
         """Name of the preset source whose FWHM has the ratio to ``best`` that is nearest to 1."""
         return min(PRESETS, key=lambda name: abs(math.log(PRESETS[name](self.wavelength).fwhm / self.best)))
-
-    def predicted_contrast(self, width: float) -> float:
-        """Speckle contrast in closed form for a FWHM in metres."""
-        spectrum = Spectrum.lorentzian(self.wavelength, width)
-        return predicted_contrast(spectrum, path_difference(self.distance, self.aperture))
 
 
 def tradeoff(

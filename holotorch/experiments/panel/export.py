@@ -21,7 +21,7 @@ from holotorch.io.panel_files import read_levels, read_phases, write_levels, wri
 from holotorch.modulator.panel import PhaseModulator
 
 FORMATS = ("png", "bmp", "exr")
-# Entry "content" of export.json for a run of kind pec.
+# Entry "content" of export.json for a run of kind ``pec``.
 _AFTER_SPREADING = (
     "phase after the heat has spread, modulo 2 pi, for a liquid-crystal panel; for the heaters of a thermal chip use "
     "arrays/phase.npy, [F, C, H, W] in rad before spreading and not modulo 2 pi"
@@ -154,15 +154,13 @@ def _window(hologram: Grid, panel: Grid, name: str) -> tuple:
     """Index of the hologram in frames [..., H, W] of the panel."""
     if any(abs(a / b - 1) > 1e-4 for a, b in zip(hologram.pitch, panel.pitch, strict=True)):
         run, has = (" x ".join(f"{step * 1e6:g}" for step in grid.pitch) for grid in (hologram, panel))
-        raise ConfigError(
-            [f"the run was computed for pixels of {run} um, the panel {name} has {has} um; run it again with its pitch"]
-        )
+        words = f"the run was computed for pixels of {run} um, the panel {name} has {has} um"
+        raise ConfigError([f"{words}; run it again with its pitch"])
     if any(a > b for a, b in zip(hologram.shape, panel.shape, strict=True)):
         run, has = (" x ".join(map(str, grid.shape)) for grid in (hologram, panel))
-        raise ConfigError(
-            [f"the hologram has {run} pixels, more than the {has} of the panel {name}; use a smaller grid"]
-        )
-    # Sample n // 2, the optical axis, of the hologram lies on that of the panel.
+        words = f"the hologram has {run} pixels, more than the {has} of the panel {name}"
+        raise ConfigError([f"{words}; use a smaller grid"])
+    # The optical axis, sample n // 2 of an axis of n samples, is that of the panel.
     begin = [large // 2 - small // 2 for large, small in zip(panel.shape, hologram.shape, strict=True)]
     return (..., *(slice(start, start + part) for start, part in zip(begin, hologram.shape, strict=True)))
 
@@ -207,7 +205,7 @@ def _write(
 
 
 def _compared(after: Tensor, before: Tensor) -> tuple[float, float]:
-    """Relative L2 change at the best scale, and correlation, of two pictures."""
+    """Relative L2 change from ``before`` to ``after`` at the best scale, and correlation of the two pictures."""
     a, b, tiny = after.double().flatten(), before.double().flatten(), torch.finfo(torch.float64).tiny
     scale = (a @ b) / (a @ a).clamp(min=tiny)
     change = (scale * a - b).norm() / b.norm().clamp(min=tiny)

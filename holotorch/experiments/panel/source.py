@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,13 +14,11 @@ from holotorch.core.complex import intensity
 from holotorch.core.grid import Grid
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.pec.config import PECSettings
+from holotorch.experiments.pec.experiment import PECExperiment, build
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.hologram import double_phase, encoding_loss, error_diffused, kinoform, refocused
 from holotorch.io.files import read_json
-
-if TYPE_CHECKING:
-    from holotorch.experiments.pec.experiment import PECExperiment
 
 ENCODINGS: dict[str, Callable[[Tensor], Tensor]] = {
     "double_phase": double_phase,
@@ -74,8 +72,6 @@ def load_panel_phases(folder: Path, encoding: str | None = None) -> PanelPhases:
 
 
 def _from_pec(folder: Path, settings: PECSettings) -> PanelPhases:
-    from holotorch.experiments.pec.experiment import build
-
     experiment = build(settings)
     shape = (settings.frames, len(settings.wavelengths), *settings.grid.shape)
     heaters = _array(folder / "arrays" / "phase.npy", shape, "(F, C, H, W)", "float32")
@@ -114,7 +110,7 @@ def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> Panel
     return PanelPhases(phase[None], settings.wavelengths, grid, encoding, picture, losses)
 
 
-def _check_axes(folder: Path, experiment: "PECExperiment", heaters: Tensor) -> None:
+def _check_axes(folder: Path, experiment: PECExperiment, heaters: Tensor) -> None:
     """Raise ValueError for a phase.npy of F = C whose first two axes were exchanged, which its shape does not show.
 
     The heating power of each colour in the run's summary identifies the order of the axes.

@@ -32,11 +32,7 @@ def _not_zero(value: float) -> float:
     return value
 
 
-def _is_picture(value: str) -> bool:
-    return value in BUNDLED_IMAGES or Path(value).is_file()
-
-
-Picture = Annotated[str, existing(_is_picture, no_such_picture)]
+Picture = Annotated[str, existing(lambda name: name in BUNDLED_IMAGES or Path(name).is_file(), no_such_picture)]
 # The heater phases at which the solver starts; plan.py describes each of them.
 Start = Literal["hot", "cool", "flat", "quadratic", "retrieved"]
 SIGMA_MEANING = (

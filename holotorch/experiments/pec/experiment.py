@@ -91,7 +91,7 @@ class PECExperiment:
 
     @cached_property
     def image(self) -> Tensor:
-        """The picture resampled to its pixels, float64 [all colours, H, W]; computed on first use, not for a plan."""
+        """The picture resampled to the grid, or to the region, float64 [all colours, H, W]; a plan does not need it."""
         settings = self.settings
         fitted = fit_image(self.source, settings.target.region or settings.grid.shape, settings.target.fit)
         return with_channels(fitted, len(settings.wavelengths)).contiguous()
@@ -104,7 +104,7 @@ class PECExperiment:
 
     @property
     def target(self) -> Tensor:
-        """Wanted intensity [C, *image]: the picture in the middle of the grid, or at each of several distances."""
+        """Wanted intensity [C, *image]; *image is (H, W), or (D, H, W) with the picture at each of D > 1 distances."""
         wanted = self.wanted
         if region := self.settings.target.region:
             whole = wanted.new_zeros(len(wanted), *self.grid.shape)
@@ -149,9 +149,9 @@ class PECExperiment:
         return replace(self, settings=self.settings.model_copy(update={"target": target}))
 
     def picture_in(self, formed: Tensor) -> Tensor:
-        """The picture [..., C, h, w] in an intensity [..., C, *image]: the region, or at each distance its band.
+        """Cut the picture [..., C, h, w] out of an image intensity [..., C, *image].
 
-        If the whole picture is the target at several distances, their mean.
+        It consists of the region, of the bands in focus at each distance, or else of the mean over the distances.
         """
         if len(self.distances) < 2:
             return formed[self.window]

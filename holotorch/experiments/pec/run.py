@@ -48,10 +48,10 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
         if several and settings.report.baselines:
             print("baselines are left out: they work at a single distance only", file=sys.stderr)
         for name in () if several else settings.report.baselines:
-            unweighted = name == "unweighted"
-            solve = experiment.unweighted.solve if unweighted else partial(baseline, experiment, name)
             try:
                 if not pressed:
+                    unweighted = name == "unweighted"
+                    solve = experiment.unweighted.solve if unweighted else partial(baseline, experiment, name)
                     results[name] = _result(experiment, *timed(solve), single=not unweighted)
             except KeyboardInterrupt:
                 pressed.append(signal.SIGINT)
@@ -120,7 +120,7 @@ def _write_results(
         "convergence": figures.convergence(losses, names, log.checked, log.metric),
     }
     if weight := experiment.settings.target.weight:
-        shape, rings = experiment.grid.shape, [zone[0] for zone in ZONES[1:]]
+        shape, rings = experiment.grid.shape, [low for low, _ in ZONES.values()][1:]
         angles = eccentricities(weight, shape)
         drawn["weight"] = figures.visual_field(weight_map(weight, shape), angles, weight.field_deg, rings, "weight")
     for name, data in drawn.items():

@@ -13,7 +13,6 @@ from holotorch.core.fourier import fft2, ifft2
 from holotorch.correction import (
     APG,
     LBFGS,
-    PECProblem,
     Solution,
     gerchberg_saxton,
     iterative_pec,
@@ -107,10 +106,6 @@ class Bench:
         """Spreading of the heat."""
         return self.experiment.array.crosstalk
 
-    def problem(self, **options) -> PECProblem:
-        """The objective in float32; ``options`` as for :class:`PECProblem`."""
-        return self.experiment.problem(**options)
-
     def start(self, kind: str, frames: int = 1, seed: int = 7) -> Tensor:
         """Heater phases at the start, [C, H, W] or [F, C, H, W]; ``kind`` as ``solver.start`` of a configuration."""
         settings = self.experiment.settings.model_copy(update={"frames": frames, "seed": seed})
@@ -126,18 +121,18 @@ class Bench:
         callback: Callback | None = None,
     ) -> Solution:
         """L-BFGS in stages; frames [F, C, H, W] share the image. ``limit`` in rad bounds the phase after spreading."""
-        make = partial(self.problem, frames=start.ndim == 4, power_weight=power_weight)
+        make = partial(self.experiment.problem, frames=start.ndim == 4, power_weight=power_weight)
         solver = LBFGS(precondition=spread_preconditioner(self.crosstalk.kernel), max_steps=steps, tolerance=1e-4)
         solution = run_stages(penalty_schedule(make, solver, self.crosstalk.total, limit), start, callback=callback)
         return solution if limit is None else replace(solution, x=limit_peak_phase(limit, solution.x, self.crosstalk))
 
     def algorithm2(self, start: Tensor, *, steps: int = 400, callback: Callback | None = None) -> Solution:
         """Algorithm 2 of the thesis, proximal proximity effect correction (PPEC)."""
-        return APG(max_steps=steps)(self.problem(), start, callback=callback)
+        return APG(max_steps=steps)(self.experiment.problem(), start, callback=callback)
 
     def retrieved(self, kind: str, seed: int = 7) -> Solution:
         """Gerchberg-Saxton: "none" (plain), "basic" (with the crosstalk in the loop) or "ipec" (deconvolution too)."""
-        problem, propagator = self.problem(), self.experiment.propagator
+        problem, propagator = self.experiment.problem(), self.experiment.propagator
         begin = 2 * math.pi * torch.rand(problem.target.shape, generator=torch.Generator().manual_seed(seed))
         if kind == "ipec":
             return iterative_pec(

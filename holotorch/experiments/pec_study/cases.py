@@ -36,7 +36,7 @@ class Cases:
         return time.perf_counter() - self._started
 
     def each(self, cases: Iterable[Case], desc: str, unit: str) -> Iterator[Case]:
-        """Yield the cases that are not in the checkpoint; requesting the next case saves the rows before it."""
+        """Yield the cases that are not in the checkpoint; all rows so far are saved when the next case is requested."""
         for case in tqdm(cases, desc=desc, unit=unit):
             self._count += 1
             if self._count <= self.saved:

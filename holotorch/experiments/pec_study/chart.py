@@ -50,11 +50,11 @@ def _solvers(bench: Bench) -> dict[str, Callable[[Callback], Any]]:
 
     Each takes a callback.
     """
-    hot, quadratic, problem = bench.start("hot"), bench.start("quadratic"), bench.problem()
+    hot, quadratic, problem = bench.start("hot"), bench.start("quadratic"), bench.experiment.problem()
     apg = APG(max_steps=STEPS, tolerance=0.0)
     plain = LBFGS(max_steps=STEPS // 2, tolerance=0.0)
     lbfgs = replace(plain, precondition=spread_preconditioner(bench.crosstalk.kernel))
-    staged = [Stage(bench.problem(amplitude=True), replace(lbfgs, max_steps=20)), Stage(problem, lbfgs)]
+    staged = [Stage(bench.experiment.problem(amplitude=True), replace(lbfgs, max_steps=20)), Stage(problem, lbfgs)]
     runs: dict[str, tuple[list[Stage], Tensor]] = {
         BASE: ([Stage(problem, apg)], hot),
         "APG, growing step, restart": ([Stage(problem, replace(apg, grow=1.3, restart=True))], hot),

@@ -37,27 +37,20 @@ def run_study(study: Study, opened: RunFolder) -> bool:
     folder, files = opened.path, Results()
     inputs = {"images": (bench.experiment.image,), "perceptual": ("none" if bench.perceptual is None else "LPIPS",)}
     cases = Cases(Checkpoint(folder / "checkpoint.pt", fingerprint(settings, inputs)))
+    summary: dict[str, Any] = {"experiment": settings.experiment, "study": settings.study, "status": ""}
     try:
         for row in STUDIES[settings.study](bench, settings.sweep, settings.max_steps, cases):
             cases.rows.append(row)
     except KeyboardInterrupt:
         if not cases.saved:
             raise
-        summary = {"experiment": settings.experiment, "study": settings.study, "status": "", "cases": cases.saved}
-        return conclude(opened, summary, files, done=False, checkpoint=cases.checkpoint)
+        return conclude(opened, summary | {"cases": cases.saved}, files, done=False, checkpoint=cases.checkpoint)
     rows, text = cases.rows, table_text(cases.rows)
     files.write(write_table, folder / "table.csv", rows)
     files.write(write_text, folder / "table.txt", text)
     picture = curves(rows, f"{settings.study}: mean of {', '.join(settings.images)} at {settings.size} px")
     files.write(write_bytes, folder / "images" / "table.png", picture)
-    summary = {
-        "experiment": settings.experiment,
-        "study": settings.study,
-        "status": "",
-        "rows": len(rows),
-        "seconds": round(cases.seconds, 1),
-        "peak_memory_bytes": peak_memory(),
-    }
+    summary |= {"rows": len(rows), "seconds": round(cases.seconds, 1), "peak_memory_bytes": peak_memory()}
     complete = conclude(opened, summary, files, done=True)
     print(text)
     return complete

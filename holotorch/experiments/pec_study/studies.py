@@ -1,8 +1,8 @@
 """Studies of proximity effect correction as tables: the comparisons of the thesis, and further ones.
 
 Every study yields table rows with the same keys. Its arguments are the bench, the values of ``sweep`` (sigmas in
-pixels unless stated otherwise), the largest number of solver steps, and the cases, some of which may be complete
-already. The chart ``pec`` compares the committed tables with the thesis.
+pixels unless stated otherwise), the largest number of solver steps, and the :class:`Cases` that store its progress.
+The chart ``pec`` compares the committed tables with the thesis.
 """
 
 import math
@@ -129,7 +129,7 @@ def targets(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> 
     near, alone = replace(bench, kind="fresnel"), replace(bench, kind="isolated")
     depths, region = replace(near, distances=DEPTHS), replace(bench, region=bench.size // 2)
     every = (0.66, 1.0, 1.5, 2.0)
-    # Method as in the table, bench, sigmas, start, frames, limit as a multiple of pi.
+    # Name of the method in the table, bench, sigmas, start, number of frames, limit as a multiple of pi.
     settings: list[tuple[str, Bench, Sequence[float], str, int, float | None]] = [
         ("4 joint frames, P <= 4 pi", bench, (0.66, 1.0), "hot", 4, 4),
         ("4 joint frames, P <= 4 pi", near, every, "cool", 4, 4),

@@ -72,9 +72,9 @@ def source(kind: str, grid: Grid) -> Tensor:
 
 
 def _measure(size: int, pitch: float) -> list[dict[str, Any]]:
-    grid, rows = Grid(size, pitch), []
+    """Rows of every method, source and distance on one grid."""
+    grid, wide, rows = Grid(size, pitch), Grid(2 * size, pitch), []
     fields = {kind: source(kind, grid) for kind in SOURCES}
-    wide = Grid(2 * size, pitch)
     distances = [z for z in DISTANCES if size < LARGE or z in FEW_DISTANCES]
     for distance in tqdm(distances, desc=f"{size} px, {pitch * 1e6:g} um", unit="distance"):
         reference = CroppedKernel(wide, WAVELENGTH, distance)
@@ -161,8 +161,8 @@ def _predictions() -> list[dict[str, Any]]:
         exact = _exact(CroppedKernel(wide, wavelength, distance), field)
         path, content = PlanePair(grid, grid), FieldContent((share / 2 / pitch, share / 2 / pitch))
         for method in candidates(path, [wavelength], [distance], content):
-            values = [torch.tensor(value, dtype=torch.float64) for value in (wavelength, distance)]
-            kernel = kernel_of(path, method, values[0], values[1], torch.complex64)
+            values = (torch.tensor(value, dtype=torch.float64) for value in (wavelength, distance))
+            kernel = kernel_of(path, method, *values, torch.complex64)
             rows.append(
                 {
                     "case": case,
@@ -193,8 +193,9 @@ def _verdict(rows: list[dict], prediction: list[dict]) -> list[str]:
     for name in dict.fromkeys(row["method"] for row in rows):
         selected = [row for row in rows if row["method"] == name]
         worst = {kind: max(float(row["error"]) for row in selected if row["source"] == kind) for kind in SOURCES}
-        ratio, words = np.median([row["ratio_to_bare"] for row in selected]), [f"{k} {e:.0e}" for k, e in worst.items()]
-        lines.append(f"{name}: worst error {', '.join(words)}; median time {ratio:.2f} of bare FFTs")
+        errors = ", ".join(f"{kind} {error:.0e}" for kind, error in worst.items())
+        ratio = np.median([row["ratio_to_bare"] for row in selected])
+        lines.append(f"{name}: worst error {errors}; median time {ratio:.2f} of bare FFTs")
     peers = [row for row in rows if row["method"].startswith("torchoptics") and row["source"] == "white"]
     if peers:
         case = itemgetter("size_px", "pitch_um", "distance_m")
@@ -237,9 +238,8 @@ def _draw(rows: list[dict]) -> bytes:
             crossovers = distance / unaliased_distance(Grid(size, pitch), WAVELENGTH, 2)
             axes.set_title(f"{kind}, {distance * 1e3:g} mm = {crossovers:.2g} z_c", fontsize=9)
             axes.grid(alpha=0.3)
-    figure.supxlabel(
-        f"time of one call / time of two bare FFTs at pad 2 ({size} px, {pitch * 1e6:g} um, 530 nm, complex64)"
-    )
+    setup = f"{size} px, {pitch * 1e6:g} um, 530 nm, complex64"
+    figure.supxlabel(f"time of one call / time of two bare FFTs at pad 2 ({setup})")
     figure.supylabel("relative L2 error")
     return _with_legend(figure, panels[0][0])
 
@@ -251,13 +251,9 @@ def _draw_validity(rows: list[dict]) -> bytes:
     panels = figure.subplots(1, 2)
     for axes, kind in zip(panels, ("white", "smooth"), strict=True):
         for k, name in enumerate(names):
-            points = sorted(
-                (row["crossovers"], min(float(row["error"]), 10))
-                for row in rows
-                if row["method"] == name and row["source"] == kind
-            )
+            chosen = [row for row in rows if row["method"] == name and row["source"] == kind]
+            points = sorted((row["crossovers"], min(float(row["error"]), 10)) for row in chosen)
             axes.loglog(*zip(*points, strict=True), "os^vD*PhX"[k % 9], color=f"C{k}", label=name, alpha=0.8)
-        for k, name in enumerate(names):
             for border in _borders(name):
                 axes.axvline(border, ymin=0.9, color=f"C{k}", linewidth=2)
         axes.axvline(1, color="k", linestyle=":", linewidth=1)
