@@ -52,7 +52,7 @@ def _settings() -> tuple[ObserverSettings, VolumeSettings]:
 
 
 def _quarter_size(settings: ObserverSettings, scene: VolumeSettings) -> Observer:
-    """Observer whose display, eye and distances are scaled by 1/4; at full size, elements would need 11 GB."""
+    """Observer with display, eye and distances scaled by 1/4: propagation by elements takes 11 GB at full size."""
     display, eye = settings.display, settings.eye
     lengths = {name: value / 4 for name, value in display.model_dump().items() if isinstance(value, float)}
     smaller = {
@@ -65,10 +65,9 @@ def _quarter_size(settings: ObserverSettings, scene: VolumeSettings) -> Observer
 
 
 def _methods(observer: Observer) -> list[dict]:
-    """Collapsed and element-by-element propagation of green light, paraxial.
+    """Rows of collapsed and element-by-element propagation of green light, both paraxial.
 
-    Errors are relative L2 errors of the intensity on the retina. The reference is the element-by-element propagation
-    with 1.3 times the least oversampling.
+    Their errors are relative to element-by-element propagation with 1.3 times the least oversampling.
     """
     grid, depth, wavelength = observer.scene.grid, observer.focus[0], observer.scene.settings.wavelengths[1]
     hologram, _ = observer.scene.hologram(0)

@@ -24,8 +24,8 @@ from holotorch.optics.picture import equal_power, tone_map
 from holotorch.optics.viewing.imaging import propagate_collapsed
 
 WIDTHS = tuple(1e-9 * width for width in (1.4, 2.5, 4, 6, 9, 13, 19, 28, 40, 56))  # FWHM in metres, to be compared
-# Offsets in metres from the central wavelength at which pictures are computed, on both sides. The step is 0.5 nm up to
-# 10 nm, half the spectral period of the interference at the corner of a scene, and 1 nm beyond.
+# Offsets in metres from the central wavelength at which pictures are computed, on both sides. Up to 10 nm the step is
+# 0.5 nm, half the period with which the picture at the corner of a scene oscillates; beyond, it is 1 nm.
 _OFFSETS = 1e-9 * np.concatenate([np.arange(0, 10, 0.5), np.arange(10, 85.0)])
 # Number of wavelengths of a colour that are propagated; the others are derived from them. If 1 of 60 wavelengths is
 # propagated, the error is 0.4 % (``holotorch chart eye``).
@@ -85,7 +85,7 @@ class Case:
 
     @property
     def source(self) -> str:
-        """Name of the preset source whose FWHM has the ratio to ``best`` that is nearest to 1."""
+        """Name of the preset source whose FWHM is nearest to ``best`` on a logarithmic scale."""
         return min(PRESETS, key=lambda name: abs(math.log(PRESETS[name](self.wavelength).fwhm / self.best)))
 
 

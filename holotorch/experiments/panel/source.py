@@ -51,7 +51,7 @@ class PanelPhases:
 
 
 def load_panel_phases(folder: Path, encoding: str | None = None) -> PanelPhases:
-    """Phases and propagation of a run folder of kind ``pec`` or ``volume``; ConfigError for any other folder."""
+    """Phases of a run of kind ``pec`` or ``volume``, from its folder; ConfigError for any other folder."""
     if not (folder / "config.yaml").is_file():
         raise ConfigError([f"{folder} holds no run: config.yaml is not there"])
     if encoding is not None and encoding not in ENCODINGS:

@@ -45,8 +45,8 @@ class PeripheralWeightSettings(Settings):
     """Weight of the squared error that falls with the eccentricity E as visual acuity does: (1 + E / e2_deg)^-2.
 
     ``field_deg``: angle that the picture spans from left to right; every pixel spans the same angle. ``gaze_deg``:
-    elevation and azimuth of the gaze from the middle of the picture. ``least``: lower limit of the weight, which is 1
-    at the gaze.
+    elevation and azimuth of the gaze from the middle of the picture. ``least``: lower limit of the weight, relative to
+    the weight at the gaze.
     """
 
     kind: Literal["peripheral"]

@@ -1,4 +1,4 @@
-"""Scores of heater phases, from a simulation in float64 that does not use results of the solver."""
+"""Scores of heater phases, from a simulation in float64 that uses nothing of the solver but the phases."""
 
 import math
 from dataclasses import dataclass
@@ -84,7 +84,7 @@ def _scale(experiment: PECExperiment, formed: Tensor) -> Tensor:
 
 
 def _isolated(experiment: PECExperiment, phase: Tensor) -> tuple[Tensor, dict[str, Any], Tensor]:
-    """Picture of a single chip by the exact kernel, its scores, and the scaled intensity half a sample off it."""
+    """Picture of a single chip by the exact kernel, its scores, and the intensity half a sample off its samples."""
     shape = (len(experiment.wavelengths), len(experiment.distances), *experiment.grid.shape)
     formed, between = (torch.zeros(shape, dtype=torch.float64) for _ in range(2))
     half = experiment.grid.pitch[0] / 2, experiment.grid.pitch[1] / 2

@@ -98,7 +98,7 @@ class PECExperiment:
 
     @property
     def wanted(self) -> Tensor:
-        """Intensity of the lit colours of the picture, scaled to mean 1 each, float64 [C, H, W]."""
+        """Intensity of the lit colours of the picture, each scaled to mean 1, float64 [C, H, W]."""
         image = self.image[self.lit]
         return image / image.mean((-2, -1), keepdim=True)
 
@@ -170,7 +170,7 @@ class PECExperiment:
         paraxial = self.settings.propagator.kind == "fresnel"
         if self.isolated:
             return CroppedKernel(self.grid, self.wavelengths, distance, paraxial=paraxial)
-        with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the plan has a note instead
+        with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the plan reports it in a note
             if paraxial:
                 return Fresnel(self.grid, self.wavelengths, distance, pad=1)
             return AngularSpectrum(self.grid, self.wavelengths, distance, pad=1, band_limit=False)

@@ -91,7 +91,7 @@ class Bench:
                 "experiment": "pec",
                 "grid": {"shape": self.size, "pitch": EXTENT / self.size},
                 "wavelengths": wavelengths,
-                "target": {"image": PHOTOGRAPHS[0], "region": self.region or None},  # the image is not loaded
+                "target": {"image": PHOTOGRAPHS[0], "region": self.region or None},  # required, but not loaded
                 "modulator": {"sigma_px": self.sigma_px},
                 "propagator": propagator,
                 "solver": {"kind": "lbfgs"},

@@ -46,10 +46,7 @@ def pec() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
 
 
 def _solvers(bench: Bench) -> dict[str, Callable[[Callback], Any]]:
-    """Solvers by name, from the thesis's hot start unless their name states another; they stop after a number of steps.
-
-    Each takes a callback.
-    """
+    """Solvers by name, which take a callback; they use the thesis's hot start unless their name states another."""
     hot, quadratic, problem = bench.start("hot"), bench.start("quadratic"), bench.experiment.problem()
     apg = APG(max_steps=STEPS, tolerance=0.0)
     plain = LBFGS(max_steps=STEPS // 2, tolerance=0.0)
@@ -86,7 +83,7 @@ def _tracks(bench: Bench) -> dict[str, Track]:
 
 
 def _compared(kind: str, sigma: float, tracks: dict[str, Track]) -> list[dict]:
-    """Rows that compare every solver with the solver ``BASE`` at each level of SSIM; cells not reached are empty."""
+    """Rows that compare every solver with the solver ``BASE`` at each level of SSIM, empty if it is not reached."""
     rows = []
     for name, track in tracks.items():
         for level in LEVELS[sigma]:

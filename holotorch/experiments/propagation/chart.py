@@ -272,9 +272,9 @@ def _with_legend(figure: Figure, axes: Any) -> bytes:
 def _borders(name: str) -> list[float]:
     """Distances, in cross-over distances z_c of each grid, at which a method becomes inaccurate by its error model.
 
-    Padding by a factor P suffices up to (P - 1) z_c. For the Fresnel approximation and for the kernel in float32, the
-    error of the phase reaches the tolerance: the former neglects pi z s^4 / (4 wavelength) for light of sine s, up to
-    the corner of the band, and the latter rounds k z to a relative 6e-8.
+    Padding by a factor P suffices up to (P - 1) z_c. The other limits are where an error of the phase reaches the
+    tolerance: the Fresnel approximation neglects pi z s^4 / (4 wavelength) for light of sine s, here at the corner of
+    the band, and float32 rounds the phase k z by a relative 6e-8.
     """
     if name.startswith("angular spectrum"):
         return [float(name.split()[-1]) - 1]
