@@ -15,6 +15,7 @@ from holotorch.core.complex import intensity
 from holotorch.core.fourier import good_length
 from holotorch.experiments.eye.config import ObserverSettings
 from holotorch.experiments.eye.experiment import PRESETS, Observer, observer
+from holotorch.experiments.eye.run import scene_settings
 from holotorch.experiments.eye.tradeoff import WIDTHS, Case, fitted_prefactor, in_words, tradeoff
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.runs.figures import figure_png
@@ -29,26 +30,23 @@ from holotorch.optics.viewing.retina import plan_retina
 
 SIDE, DISTANCES = 512, (10e-3, 20e-3, 30e-3)  # pixels of the hologram; distances of the scene in metres
 FOCUS = 30e-3  # metres from the hologram
-SCENE = f"hologram={{shape: [{SIDE}, {SIDE}], pitch: 3.74 um, distance: 30 mm, depths: 58, rays: {SIDE // 2}}}"
+HOLOGRAM = f"hologram={{shape: [{SIDE}, {SIDE}], pitch: 3.74 um, distance: 30 mm, depths: 58, rays: {SIDE // 2}}}"
+SCENE = f"scene={{config: configs/volume/c60.yaml, change: ['{HOLOGRAM}']}}"
 FACTORS = (1.0, 2.0, 4.0)  # oversampling of the element-by-element propagation
 
 
 def eye() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
     """Rows of methods and sources, rows of the trade-off, pictures by name, and the verdict."""
-    settings, scene = _settings()
+    path = find_config("configs/eye/teapot.yaml")
+    assert path is not None  # bundled with the package
+    settings = load_config(path, [SCENE])
+    assert isinstance(settings, ObserverSettings)
+    scene = scene_settings(settings)
     methods = _methods(_quarter_size(settings, scene))
     counts = _counts(observer(settings.model_copy(update={"focus": (FOCUS,)}), scene))
     cases = tradeoff(settings, scene, DISTANCES)
     rows = [case.row(fitted_prefactor(cases)) for case in cases]
     return methods + counts, rows, {"chart": _draw(methods, counts, cases)}, _verdict(methods, counts, cases)
-
-
-def _settings() -> tuple[ObserverSettings, VolumeSettings]:
-    settings_file, scene_file = find_config("configs/eye/teapot.yaml"), find_config("configs/volume/c60.yaml")
-    assert settings_file is not None and scene_file is not None
-    settings, scene = load_config(settings_file), load_config(scene_file, [SCENE])
-    assert isinstance(settings, ObserverSettings) and isinstance(scene, VolumeSettings)
-    return settings, scene
 
 
 def _quarter_size(settings: ObserverSettings, scene: VolumeSettings) -> Observer:

@@ -35,7 +35,7 @@ PRESETS: dict[str, Callable[[float], Spectrum]] = {
 # need a larger one (C60: 0.8).
 BEST = 0.46
 _MAX_RINGS = 16  # rings of directions of an extended source; 16 rings take 1024 times as long as a point source
-_LIT = 0.05  # speckle is measured on pixels brighter than this fraction of the brightest pixel of the reference
+LIT = 0.05  # speckle is measured on pixels brighter than this fraction of the brightest pixel of the reference
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,11 @@ class Observer:
             sources, wavelengths = self.settings.light.sources, self.scene.settings.wavelengths
             ends = [end for source in sources for each in wavelengths for end in PRESETS[source](each).band()]
             setup = self.scene.grid, (min(ends), max(ends)), self.display, self.eye(depth)
-            options = {"tolerance": self.settings.tolerance, "plane": depth, "reach": self.scene.width / 2}
+            options: dict[str, Any] = {
+                "tolerance": self.settings.tolerance,
+                "plane": depth,
+                "reach": self.scene.width / 2,
+            }
             try:
                 self._retina_plans[depth] = plan_retina(*setup, **options, registered=True)
             except ValueError as error:
@@ -165,15 +169,16 @@ class Observer:
         eye, grid, pictures = self.eye(depth), self.scene.grid, []
         elements = self.retina(depth).method == "elements"
         for light, wavelength in zip(hologram.conj(), self.scene.settings.wavelengths, strict=True):
-            *spectrum, count = [wavelength], [1.0], 1
-            points: tuple[list, list] = [(0.0, 0.0)], [1.0]
+            samples, points = ([wavelength], [1.0], 1), ([(0.0, 0.0)], [1.0])
             if source is not None:
-                *spectrum, count = self.samples(source, wavelength, depth)
-                points = self.points(wavelength, depth)
+                samples, points = self.samples(source, wavelength, depth), self.points(wavelength, depth)
+            lengths, weights, count = samples
             total = torch.zeros(grid.shape, dtype=light.real.dtype, device=light.device)
             for tilt, share in zip(*points, strict=True):
                 tilted = light * tilted_wave(grid, wavelength, tilt).to(light) if any(tilt) else light
-                image = spectral_image(tilted, grid, *spectrum, self.display, eye, count=count, elements=elements)
+                image = spectral_image(
+                    tilted, grid, lengths, weights, self.display, eye, count=count, elements=elements
+                )
                 total += share * image
             pictures.append(pooled(total, self.scene.stride))
         return torch.stack(pictures).cpu()
@@ -196,7 +201,7 @@ class Observer:
             "focus_mm": depth * 1e3,
             "wavelengths": [len(each) for each, _, _ in samples],
             "followed": [count for _, _, count in samples],
-            "contrast": speckle_contrast(shown, reference=reference, mask=reference > _LIT * peak).mean(0).tolist(),
+            "contrast": speckle_contrast(shown, reference=reference, mask=reference > LIT * peak).mean(0).tolist(),
             "contrast_predicted": [predicted_contrast(PRESETS[source](each), difference) for each in wavelengths],
             "ssim": quality.mean(0).tolist(),
             "sharpness": sharpness(shown, reference).mean(0).tolist(),

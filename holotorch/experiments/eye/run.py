@@ -16,7 +16,7 @@ from holotorch.experiments.eye import geometry as eye_geometry
 from holotorch.experiments.eye.config import ObserverSettings
 from holotorch.experiments.eye.experiment import Observer
 from holotorch.experiments.eye.report import by_wavelength
-from holotorch.experiments.eye.tradeoff import fitted_prefactor, in_words, tradeoff
+from holotorch.experiments.eye.tradeoff import WHITE, fitted_prefactor, in_words, tradeoff
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.runs import figures
 from holotorch.experiments.runs.fingerprint import Fingerprint, fingerprint
@@ -35,7 +35,6 @@ from holotorch.io.files import save_array, write_bytes
 from holotorch.optics.picture import equal_power, gamut_map, linear_srgb, tone_map
 
 _SAVE_EVERY = 30.0  # seconds between two checkpoints
-_WHITE = 0.995  # quantile of the brightness of the reference that is shown as white
 _REFERENCE_SEED = 100_000  # first seed of the realisations that form the reference
 
 
@@ -192,7 +191,7 @@ def _write(out: Path, eye: Observer, views: _Views, values: dict[str, Any], file
     reference = equal_power(reference, rendering.expand_as(reference))
     for f, depth in enumerate(focus):
         shown, captions = [], []
-        peak = gamut_map(linear_srgb(reference[f], matrix)).flatten().quantile(_WHITE)
+        peak = gamut_map(linear_srgb(reference[f], matrix)).flatten().quantile(WHITE)
         for s, source in enumerate(("reference", *sources)):
             light = reference[f] if s == 0 else equal_power(images[0, s - 1, f], reference[f])
             picture = tone_map(gamut_map(linear_srgb(light, matrix)), peak=peak)

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from holotorch.core.complex import intensity
 from holotorch.experiments.eye.config import ObserverSettings
-from holotorch.experiments.eye.experiment import PRESETS, Observer, observer
+from holotorch.experiments.eye.experiment import LIT, PRESETS, Observer, observer
 from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.experiments.volume.evaluation import pooled
 from holotorch.metrics import seed_statistics, sharpness, speckle_contrast, ssim
@@ -31,8 +31,7 @@ _OFFSETS = 1e-9 * np.concatenate([np.arange(0, 10, 0.5), np.arange(10, 85.0)])
 # propagated, the error is 0.4 % (``holotorch chart eye``).
 _PROPAGATED = 16
 _REFERENCE_SEED = 1000  # first seed of the realisations of the reference
-_BRIGHTEST = 0.995  # quantile of the reference that is shown as white
-_LIT = 0.05  # speckle is measured on pixels brighter than this fraction of the brightest pixel of the reference
+WHITE = 0.995  # quantile of the brightness of the reference that is shown as white
 
 
 @dataclass(frozen=True)
@@ -127,10 +126,10 @@ def _case(eye: Observer, colour: int, wavelength: float, holograms: list[Tensor]
         images = spectral_image(field, eye.scene.grid, *spectra, eye.display, eye.eye(depth), count=count)
         shown.append(torch.stack([pooled(image, eye.scene.stride) for image in images]))
     pictures = equal_power(torch.stack(shown), reference.expand(len(holograms), len(WIDTHS), *reference.shape))
-    peak = reference.flatten().quantile(_BRIGHTEST)
+    peak = reference.flatten().quantile(WHITE)
     tone = tone_map(pictures[..., None, :, :], peak=peak), tone_map(reference[None], peak=peak)
     quality = ssim(tone[0], tone[1].expand_as(tone[0]).contiguous(), data_range=1.0)[..., 0].mean(0)
-    contrast = speckle_contrast(pictures, reference=reference, mask=reference > _LIT * reference.max()).mean(0)
+    contrast = speckle_contrast(pictures, reference=reference, mask=reference > LIT * reference.max()).mean(0)
     best, inside = parabola_peak(np.log(WIDTHS).tolist(), quality.tolist())
     return Case(
         depth,

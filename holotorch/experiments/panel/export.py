@@ -120,9 +120,8 @@ def resimulate(
     }
     for name, frames in fields.items():
         after = source.picture(torch.stack(frames))
-        pairs = [_compared(a, b) for a, b in zip(after, before, strict=True)]
-        numbers[f"picture_change_by_{name}"] = [change for change, _ in pairs]
-        numbers[f"picture_correlation_{name}"] = [correlation for _, correlation in pairs]
+        changes, correlations = zip(*map(_compared, after, before), strict=True)
+        numbers |= {f"picture_change_by_{name}": list(changes), f"picture_correlation_{name}": list(correlations)}
     if source.losses:
         numbers["encoding_loss"] = source.losses
     return numbers

@@ -85,18 +85,15 @@ def _scale(experiment: PECExperiment, formed: Tensor) -> Tensor:
 
 def _isolated(experiment: PECExperiment, phase: Tensor) -> tuple[Tensor, dict[str, Any], Tensor]:
     """Picture of a single chip by the exact kernel, its scores, and the intensity half a sample off its samples."""
-    shape = (len(experiment.wavelengths), len(experiment.distances), *experiment.grid.shape)
-    formed, between = (torch.zeros(shape, dtype=torch.float64) for _ in range(2))
-    half = experiment.grid.pitch[0] / 2, experiment.grid.pitch[1] / 2
+    grid, axes = experiment.grid, (2, len(experiment.wavelengths), len(experiment.distances))
+    images = torch.zeros(*axes, *grid.shape, dtype=torch.float64)  # at the samples, and half a sample off them
     for i, wavelength in enumerate(experiment.wavelengths):  # one kernel at a time, since float64 kernels are large
         for j, distance in enumerate(experiment.distances):
-            for offset, total in (((0.0, 0.0), formed), (half, between)):
-                exact = CroppedKernel(experiment.grid, wavelength, distance, offset=offset).to(experiment.device)
+            for k, offset in enumerate(((0.0, 0.0), (grid.pitch[0] / 2, grid.pitch[1] / 2))):
+                exact = CroppedKernel(grid, wavelength, distance, offset=offset).to(experiment.device)
                 for each in phase:
-                    total[i, j] += intensity(exact(experiment.array(each)[i : i + 1]))[0].cpu() / len(phase)
-    if len(experiment.distances) == 1:
-        formed, between = formed[:, 0], between[:, 0]
-    formed, between = experiment.picture_in(formed), experiment.picture_in(between)
+                    images[k, i, j] += intensity(exact(experiment.array(each)[i : i + 1]))[0].cpu() / len(phase)
+    formed, between = experiment.picture_in(images[:, :, 0] if len(experiment.distances) == 1 else images)
     picture = _as_picture(experiment, formed, at_best_scale=True)
     numbers = _scores(experiment, picture, experiment.image)
     numbers["efficiency"] = _efficiency(experiment, formed)

@@ -133,15 +133,12 @@ class Bench:
     def retrieved(self, kind: str, seed: int = 7) -> Solution:
         """Gerchberg-Saxton: "none" (plain), "basic" (with the crosstalk in the loop) or "ipec" (deconvolution too)."""
         problem, propagator = self.experiment.problem(), self.experiment.propagator
-        begin = 2 * math.pi * torch.rand(problem.target.shape, generator=torch.Generator().manual_seed(seed))
+        target, mask = problem.target, problem.mask
+        begin = 2 * math.pi * torch.rand(target.shape, generator=torch.Generator().manual_seed(seed))
         if kind == "ipec":
-            return iterative_pec(
-                propagator, self.crosstalk, problem.target, begin, max_steps=IPEC_PASSES, mask=problem.mask
-            )
+            return iterative_pec(propagator, self.crosstalk, target, begin, max_steps=IPEC_PASSES, mask=mask)
         spread = self.crosstalk if kind == "basic" else None
-        return gerchberg_saxton(
-            propagator, problem.target, begin, max_steps=PASSES, crosstalk=spread, mask=problem.mask
-        )
+        return gerchberg_saxton(propagator, target, begin, max_steps=PASSES, crosstalk=spread, mask=mask)
 
     def formed(self, phase: Tensor) -> Tensor:
         """Picture [C, h, w] in the mean intensity of the frames of ``phase`` [C, H, W] or [F, C, H, W], float64."""
@@ -159,16 +156,16 @@ class Bench:
         if self.experiment.scale_free:
             formed = formed * best_scale(formed, self.experiment.wanted)[:, None, None]
         picture = (formed * image.mean((-2, -1), keepdim=True)).clamp(0, 1)
-        learned = {}
-        if self.perceptual is not None:
-            learned = {"perceptual": self.perceptual(picture[:, None], image[:, None]).mean().item()}
-        return learned | {
-            "ssim": ssim(picture, image, data_range=1.0).mean().item(),
-            "psnr": psnr(picture, image, data_range=1.0).mean().item(),
-            "efficiency": light.min().item(),
-            "peak_rad": self.crosstalk(phase.double()).max().item(),
-            "power_rad": phase.double().mean().item(),
+        scores = {
+            "ssim": ssim(picture, image, data_range=1.0).mean(),
+            "psnr": psnr(picture, image, data_range=1.0).mean(),
+            "efficiency": light.min(),
+            "peak_rad": self.crosstalk(phase.double()).max(),
+            "power_rad": phase.double().mean(),
         }
+        if self.perceptual is not None:
+            scores["perceptual"] = self.perceptual(picture[:, None], image[:, None]).mean()
+        return {name: value.item() for name, value in scores.items()}
 
 
 class Track:

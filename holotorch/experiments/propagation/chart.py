@@ -161,8 +161,8 @@ def _predictions() -> list[dict[str, Any]]:
         exact = _exact(CroppedKernel(wide, wavelength, distance), field)
         path, content = PlanePair(grid, grid), FieldContent((share / 2 / pitch, share / 2 / pitch))
         for method in candidates(path, [wavelength], [distance], content):
-            values = (torch.tensor(value, dtype=torch.float64) for value in (wavelength, distance))
-            kernel = kernel_of(path, method, *values, torch.complex64)
+            length, z = (torch.tensor(value, dtype=torch.float64) for value in (wavelength, distance))
+            kernel = kernel_of(path, method, length, z, torch.complex64)
             rows.append(
                 {
                     "case": case,
