@@ -150,13 +150,11 @@ class Observer:
             sources, wavelengths = self.settings.light.sources, self.scene.settings.wavelengths
             ends = [end for source in sources for each in wavelengths for end in PRESETS[source](each).band()]
             setup = self.scene.grid, (min(ends), max(ends)), self.display, self.eye(depth)
-            options: dict[str, Any] = {
-                "tolerance": self.settings.tolerance,
-                "plane": depth,
-                "reach": self.scene.width / 2,
-            }
+            tolerance, half_width = self.settings.tolerance, self.scene.width / 2
             try:
-                self._retina_plans[depth] = plan_retina(*setup, **options, registered=True)
+                self._retina_plans[depth] = plan_retina(
+                    *setup, tolerance=tolerance, plane=depth, reach=half_width, registered=True
+                )
             except ValueError as error:
                 raise ConfigError([f"display: {error}"]) from error
         return self._retina_plans[depth]
@@ -176,10 +174,8 @@ class Observer:
             total = torch.zeros(grid.shape, dtype=light.real.dtype, device=light.device)
             for tilt, share in zip(*points, strict=True):
                 tilted = light * tilted_wave(grid, wavelength, tilt).to(light) if any(tilt) else light
-                image = spectral_image(
-                    tilted, grid, lengths, weights, self.display, eye, count=count, elements=elements
-                )
-                total += share * image
+                setup = tilted, grid, lengths, weights, self.display, eye
+                total += share * spectral_image(*setup, count=count, elements=elements)
             pictures.append(pooled(total, self.scene.stride))
         return torch.stack(pictures).cpu()
 

@@ -16,7 +16,7 @@ from holotorch.experiments.eye.config import ObserverSettings
 from holotorch.experiments.eye.experiment import LIT, PRESETS, Observer, observer
 from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.experiments.volume.evaluation import pooled
-from holotorch.metrics import seed_statistics, sharpness, speckle_contrast, ssim
+from holotorch.metrics import seed_statistics, speckle_contrast, ssim
 from holotorch.optics.light.coherence import optimum_fwhm, path_difference, predicted_contrast
 from holotorch.optics.light.spectral import spectral_image
 from holotorch.optics.light.spectrum import Spectrum
@@ -44,7 +44,6 @@ class Case:
         aperture: Sine of the half angle of the light that carries detail, see ``Observer.detail``.
         ssim: SSIM for each of ``WIDTHS``, relative to the mean of other realisations.
         contrast: Speckle contrast for each of ``WIDTHS``.
-        sharpness: Sharpness for each of ``WIDTHS``.
         best: FWHM in metres with the highest SSIM, see :func:`parabola_peak`.
         inside: Whether ``best`` lies inside the range of ``WIDTHS``.
     """
@@ -54,7 +53,6 @@ class Case:
     aperture: float
     ssim: tuple[float, ...]
     contrast: tuple[float, ...]
-    sharpness: tuple[float, ...]
     best: float
     inside: bool
 
@@ -137,7 +135,6 @@ def _case(eye: Observer, colour: int, wavelength: float, holograms: list[Tensor]
         eye.detail(depth, wavelength),
         tuple(quality.tolist()),
         tuple(contrast.tolist()),
-        tuple(sharpness(pictures, reference).mean(0).tolist()),
         float(np.exp(best)),
         inside,
     )

@@ -4,6 +4,7 @@ import csv
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -107,21 +108,17 @@ def _verdict(compared: list[dict]) -> list[str]:
         f"sigma: {SIGMA_MEANING}",
     ]
     goals = yaml.safe_load(GOALS.read_text(encoding="utf-8")) if GOALS.is_file() else {"solver": {}, "tables": {}}
-    for kind in KINDS:
-        for sigma in SIGMAS:
-            rows = [row for row in compared if (row["kind"], row["sigma_px"]) == (kind, sigma)]
-            ratios: dict[str, list[tuple[float, float]]] = {}
-            for row in rows:
-                if row["solver"] != BASE and row["seconds_ratio"]:
-                    ratios.setdefault(row["solver"], []).append((row["evaluations_ratio"], row["seconds_ratio"]))
-            parts = [
-                f"{name} {each[0][0]}/{each[0][1]} .. {each[-1][0]}/{each[-1][1]}" for name, each in ratios.items()
-            ]
-            lines.append(f"{kind}, sigma {sigma:g}: " + "; ".join(parts))
-            if goal := goals["solver"].get(sigma):
-                wanted = goal["evaluations"], goal["seconds"]
-                met = [name for name, each in ratios.items() if all(a >= wanted[0] and b >= wanted[1] for a, b in each)]
-                lines[-1] += f" (goal {wanted[0]:g}/{wanted[1]:g}: {'met by ' + '; '.join(met) if met else 'not met'})"
+    for kind, sigma in product(KINDS, SIGMAS):
+        ratios: dict[str, list[tuple[float, float]]] = {}
+        for row in compared:
+            if (row["kind"], row["sigma_px"]) == (kind, sigma) and row["solver"] != BASE and row["seconds_ratio"]:
+                ratios.setdefault(row["solver"], []).append((row["evaluations_ratio"], row["seconds_ratio"]))
+        parts = [f"{name} {each[0][0]}/{each[0][1]} .. {each[-1][0]}/{each[-1][1]}" for name, each in ratios.items()]
+        lines.append(f"{kind}, sigma {sigma:g}: " + "; ".join(parts))
+        if goal := goals["solver"].get(sigma):
+            wanted = goal["evaluations"], goal["seconds"]
+            met = [name for name, each in ratios.items() if all(a >= wanted[0] and b >= wanted[1] for a, b in each)]
+            lines[-1] += f" (goal {wanted[0]:g}/{wanted[1]:g}: {'met by ' + '; '.join(met) if met else 'not met'})"
     return lines + _tables(goals["tables"])
 
 
@@ -165,17 +162,17 @@ def _draw(rows: list[dict]) -> bytes:
     names = list(dict.fromkeys(row["solver"] for row in rows))
     figure = Figure(figsize=(4 * len(SIGMAS), 3 * 2 * len(KINDS)), layout="constrained")
     panels = figure.subplots(2 * len(KINDS), len(SIGMAS), squeeze=False)
-    for i, kind in enumerate(KINDS):
-        for j, sigma in enumerate(SIGMAS):
-            for k, measure in enumerate(("seconds", "evaluations")):
-                axes = panels[2 * i + k][j]
-                for c, name in enumerate(names):
-                    chosen = [r for r in rows if (r["kind"], r["sigma_px"], r["solver"]) == (kind, sigma, name)]
-                    if chosen:
-                        positions = [max(float(row[measure]), 1e-3) for row in chosen]
-                        axes.semilogx(positions, [float(row["ssim"]) for row in chosen], color=f"C{c}", label=name)
-                axes.set_title(f"{kind}, sigma {sigma:g} px", fontsize=9)
-                axes.set(xlabel=measure, ylabel="mean SSIM")
-                axes.grid(alpha=0.3)
+    for (i, kind), (j, sigma), (k, measure) in product(
+        enumerate(KINDS), enumerate(SIGMAS), enumerate(("seconds", "evaluations"))
+    ):
+        axes = panels[2 * i + k][j]
+        for c, name in enumerate(names):
+            chosen = [row for row in rows if (row["kind"], row["sigma_px"], row["solver"]) == (kind, sigma, name)]
+            if chosen:
+                positions = [max(float(row[measure]), 1e-3) for row in chosen]
+                axes.semilogx(positions, [float(row["ssim"]) for row in chosen], color=f"C{c}", label=name)
+        axes.set_title(f"{kind}, sigma {sigma:g} px", fontsize=9)
+        axes.set(xlabel=measure, ylabel="mean SSIM")
+        axes.grid(alpha=0.3)
     figure.legend(*panels[-1][0].get_legend_handles_labels(), loc="outside upper center", ncols=4, fontsize=9)
     return figure_png(figure)
