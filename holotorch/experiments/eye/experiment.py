@@ -63,25 +63,25 @@ class Observer:
     @cached_property
     def display(self) -> Display:
         """Positions of the hologram, the eyepiece and the eye."""
-        given = self.settings.display
-        if isinstance(given, PlanarSettings):
-            return Display.planar(given.distance)
-        lengths = given.focal_length, given.eye_distance
-        lens = given.lens_distance or eyepiece_distance(self.scene.distance, given.focus_distance, *lengths)
+        settings = self.settings.display
+        if isinstance(settings, PlanarSettings):
+            return Display.planar(settings.distance)
+        lengths = settings.focal_length, settings.eye_distance
+        lens = settings.lens_distance or eyepiece_distance(self.scene.distance, settings.focus_distance, *lengths)
         return Display(lens, *lengths)
 
     def accommodation(self, depth: float) -> float:
         """Distance in metres in front of the eye at which a depth of the scene appears. ValueError if there is none."""
-        given, to_lens = self.settings.display, float(self.display.lens_distance) - depth
-        if isinstance(given, PlanarSettings):
+        settings, to_lens = self.settings.display, float(self.display.lens_distance) - depth
+        if isinstance(settings, PlanarSettings):
             return to_lens
-        return image_distance(to_lens, given.focal_length) + given.eye_distance
+        return image_distance(to_lens, settings.focal_length) + settings.eye_distance
 
     def eye(self, depth: float) -> Eye:
         """The eye, focused at a depth of the scene."""
-        given = self.settings.eye
-        reference = self.reference_wavelength if given.chromatic else None
-        return Eye(given.pupil_radius, given.axial_length, self.accommodation(depth), chromatic_reference=reference)
+        pupil, length = self.settings.eye.pupil_radius, self.settings.eye.axial_length
+        reference = self.reference_wavelength if self.settings.eye.chromatic else None
+        return Eye(pupil, length, self.accommodation(depth), chromatic_reference=reference)
 
     @property
     def reference_wavelength(self) -> float:

@@ -25,7 +25,7 @@ _INVISIBLE = 0.005  # the edge of the scene is invisible if a smaller share of i
 
 def geometry(eye: Observer) -> dict[str, Any]:
     """Fields of view, eye box, regions and spots of an observer's display, as JSON values in degrees and mm."""
-    scene, given = eye.scene, eye.settings.display
+    scene, display = eye.scene, eye.settings.display
     width, pitch, wavelengths = scene.grid.extent[1], scene.grid.pitch[1], scene.settings.wavelengths
     near, far = min(scene.depths), max(scene.depths)
     values: dict[str, Any] = {
@@ -47,13 +47,14 @@ def geometry(eye: Observer) -> dict[str, Any]:
     sines = [min(w / (2 * pitch), math.sin(math.atan(width / 2 / scene.distance))) for w in wavelengths]
     values["eye_box_mm"] = [1e3 * viewing.eye_box(scene.width, first, second, sine) for sine in sines]
     values["light_of_edge"] = [viewing.vignetting(scene.width / 2, first, second, pupil, sine) for sine in sines]
-    if isinstance(given, MagnifyingSettings):
-        to_lens, lengths = float(eye.display.lens_distance) - scene.distance, (given.focal_length, given.eye_distance)
-        field = viewing.magnified_fov(width, given.focal_length)
+    if isinstance(display, MagnifyingSettings):
+        to_lens = float(eye.display.lens_distance) - scene.distance
+        lengths = display.focal_length, display.eye_distance
+        field = viewing.magnified_fov(width, display.focal_length)
         values |= {
             "magnified_fov_deg": math.degrees(field),
             "scene_fov_deg": math.degrees(viewing.scene_fov(scene.width, to_lens, *lengths)),
-            "filling_scene_mm": 1e3 * viewing.volume_size(field, given.focus_distance, *lengths),
+            "filling_scene_mm": 1e3 * viewing.volume_size(field, display.focus_distance, *lengths),
         }
     return values
 
@@ -117,7 +118,7 @@ def draw(eye: Observer) -> bytes:
 
 def _draw_display(axes: Any, eye: Observer) -> None:
     """Hologram, scene, eyepiece and eye, with rays from the ends of the scene to the edges of the pupil."""
-    scene, given = eye.scene, eye.settings.display
+    scene, display = eye.scene, eye.settings.display
     half, pupil = 1e3 * scene.grid.extent[0] / 2, 1e3 * eye.settings.eye.pupil_radius
     lens, back = (1e3 * float(value) for value in (eye.display.lens_distance, eye.display.eye_distance))
     end, retina = lens + back, 1e3 * eye.settings.eye.axial_length
@@ -126,15 +127,15 @@ def _draw_display(axes: Any, eye: Observer) -> None:
     axes.text(0, half * 1.05, "hologram", va="bottom", **text)
     _draw_scene(axes, eye)
     first, second, _, _ = (float(value) for value in eye.display.matrix(scene.distance))
-    focal = given.focal_length if isinstance(given, MagnifyingSettings) else math.inf
+    focal = display.focal_length if isinstance(display, MagnifyingSettings) else math.inf
     for height in (-scene.width / 2, 0.0, scene.width / 2):
         for side in (-1, 1):
             # The ray matrix to the pupil gives the slope of the ray from this height to the edge of the pupil.
             slope = (side * pupil / 1e3 - first * height) / second
-            at = height + slope * (lens / 1e3 - scene.distance)
-            after = slope - at / focal
+            at_lens = height + slope * (lens / 1e3 - scene.distance)
+            behind_lens = slope - at_lens / focal
             positions = [scene.distance * 1e3, lens, end]
-            heights = [height, at, at + after * back / 1e3]
+            heights = [height, at_lens, at_lens + behind_lens * back / 1e3]
             axes.plot(positions, [1e3 * value for value in heights], color="tab:orange", linewidth=0.8)
     if math.isfinite(focal):
         half_width = max(half, pupil) * 1.6

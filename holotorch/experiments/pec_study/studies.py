@@ -53,14 +53,14 @@ def multiplexing(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases
             frames = [setup.retrieved("ipec", seed=k).x for k in range(count)]
             scores = setup.scores(torch.stack(frames))
             yield _row(setup, f"IPEC, {count} runs", scores, time.perf_counter() - started)
-        for name, where, work in (
+        for name, base, solve in (
             ("IPEC, signal region", region, partial(region.retrieved, "ipec")),
             ("PPEC", setup, partial(setup.algorithm2, setup.start("hot"), steps=steps)),
             ("ours, signal region", region, partial(region.lbfgs, region.start("hot"), steps=steps)),
             ("2 joint frames", setup, partial(setup.lbfgs, setup.start("hot", 2), steps=steps)),
             ("4 joint frames", setup, partial(setup.lbfgs, setup.start("hot", 4), steps=steps)),
         ):
-            yield _timed_row(where, name, work)
+            yield _timed_row(base, name, solve)
 
 
 def iterations(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> Iterator[Row]:
@@ -110,9 +110,9 @@ def limits(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> I
         setup = replace(bench, sigma_px=sigma)
         for multiple in (1, 2, 4, 8):
             for frames in (1, 4):
-                work = partial(setup.lbfgs, setup.start("hot", frames), steps=steps, limit=multiple * PI)
+                solve = partial(setup.lbfgs, setup.start("hot", frames), steps=steps, limit=multiple * PI)
                 setting = f"P <= {multiple} pi ({multiple * 175} degC at 630 nm)"
-                yield _timed_row(setup, f"{frames} frame(s)", work, setting=setting)
+                yield _timed_row(setup, f"{frames} frame(s)", solve, setting=setting)
         phase = setup.lbfgs(setup.start("hot"), steps=steps).x
         for error in (-0.05, -0.02, -0.01, 0.0, 0.01, 0.02, 0.05):
             formed = replace(setup, sigma_px=sigma * (1 + error)).formed(phase)
@@ -148,8 +148,8 @@ def targets(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> 
     for method, base, widths, start, frames, limit in cases.each(settings, desc="targets", unit="case"):
         for sigma in widths:
             setup = replace(base, sigma_px=sigma)
-            work = partial(setup.lbfgs, setup.start(start, frames), steps=steps, limit=limit and limit * PI)
-            solution, seconds = timed(work)
+            solve = partial(setup.lbfgs, setup.start(start, frames), steps=steps, limit=limit and limit * PI)
+            solution, seconds = timed(solve)
             # The solver's model of a single chip is paraxial; its scores are taken with the exact kernel.
             scored = replace(setup, kind="exact") if setup.kind == "isolated" else setup
             yield _row(setup, method, scored.scores(solution.x), seconds, count=solution.evaluations)
@@ -170,7 +170,7 @@ _CORRECTED = ("basic IPEC", "IPEC", "PPEC", "ours")  # all methods with a correc
 
 def _methods(bench: Bench, steps: int, names: Sequence[str] = _CORRECTED, setting: str = "") -> Iterator[Row]:
     """A row for each method; solvers use the thesis's hot start unless their name states another."""
-    work: dict[str, Callable[[], Solution]] = {
+    solvers: dict[str, Callable[[], Solution]] = {
         "none": lambda: bench.retrieved("none"),
         "basic IPEC": lambda: bench.retrieved("basic"),
         "IPEC": lambda: bench.retrieved("ipec"),
@@ -178,7 +178,7 @@ def _methods(bench: Bench, steps: int, names: Sequence[str] = _CORRECTED, settin
         "PPEC, cool start": lambda: bench.algorithm2(bench.start("cool"), steps=steps),
         "ours": lambda: bench.lbfgs(bench.start("hot"), steps=steps),
     }
-    return (_timed_row(bench, name, work[name], setting) for name in names)
+    return (_timed_row(bench, name, solvers[name], setting) for name in names)
 
 
 def _slices(bench: Bench, steps: int) -> Row:
@@ -195,9 +195,9 @@ def _slices(bench: Bench, steps: int) -> Row:
     return _row(bench, f"stack of {len(phases)} slices", scores, time.perf_counter() - started)
 
 
-def _timed_row(bench: Bench, method: str, work: Callable[[], Solution], setting: str = "") -> Row:
-    """Row of the heater phases that ``work`` returns, with the seconds that it takes."""
-    solution, seconds = timed(work)
+def _timed_row(bench: Bench, method: str, solve: Callable[[], Solution], setting: str = "") -> Row:
+    """Row of the heater phases that ``solve`` returns, with the seconds that it takes."""
+    solution, seconds = timed(solve)
     return _row(bench, method, bench.scores(solution.x), seconds, setting)
 
 
