@@ -1,4 +1,4 @@
-"""Chart of an observer's view: error over time, error over the number of wavelengths, and speckle over sharpness."""
+"""Chart of an observer's view: error against time, error against number of wavelengths, speckle against sharpness."""
 
 import math
 import warnings
@@ -15,6 +15,7 @@ from holotorch.core.complex import intensity
 from holotorch.core.fourier import good_length
 from holotorch.experiments.eye.config import ObserverSettings
 from holotorch.experiments.eye.experiment import PRESETS, Observer, observer
+from holotorch.experiments.eye.run import scene_settings
 from holotorch.experiments.eye.tradeoff import WIDTHS, Case, fitted_prefactor, in_words, tradeoff
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.runs.figures import figure_png
@@ -29,13 +30,18 @@ from holotorch.optics.viewing.retina import plan_retina
 
 SIDE, DISTANCES = 512, (10e-3, 20e-3, 30e-3)  # pixels of the hologram; distances of the scene in metres
 FOCUS = 30e-3  # metres from the hologram
-SCENE = "hologram={{shape: [{0}, {0}], pitch: 3.74 um, distance: 30 mm, depths: 58, rays: {1}}}"
+HOLOGRAM = f"hologram={{shape: [{SIDE}, {SIDE}], pitch: 3.74 um, distance: 30 mm, depths: 58, rays: {SIDE // 2}}}"
+SCENE = f"scene={{config: configs/volume/c60.yaml, change: ['{HOLOGRAM}']}}"
 FACTORS = (1.0, 2.0, 4.0)  # oversampling of the element-by-element propagation
 
 
 def eye() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
     """Rows of methods and sources, rows of the trade-off, pictures by name, and the verdict."""
-    settings, scene = _settings()
+    path = find_config("configs/eye/teapot.yaml")
+    assert path is not None  # bundled with the package
+    settings = load_config(path, [SCENE])
+    assert isinstance(settings, ObserverSettings)
+    scene = scene_settings(settings)
     methods = _methods(_quarter_size(settings, scene))
     counts = _counts(observer(settings.model_copy(update={"focus": (FOCUS,)}), scene))
     cases = tradeoff(settings, scene, DISTANCES)
@@ -43,19 +49,8 @@ def eye() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
     return methods + counts, rows, {"chart": _draw(methods, counts, cases)}, _verdict(methods, counts, cases)
 
 
-def _settings() -> tuple[ObserverSettings, VolumeSettings]:
-    settings_file, scene_file = find_config("configs/eye/teapot.yaml"), find_config("configs/volume/c60.yaml")
-    assert settings_file is not None and scene_file is not None
-    settings, scene = load_config(settings_file), load_config(scene_file, [SCENE.format(SIDE, SIDE // 2)])
-    assert isinstance(settings, ObserverSettings) and isinstance(scene, VolumeSettings)
-    return settings, scene
-
-
 def _quarter_size(settings: ObserverSettings, scene: VolumeSettings) -> Observer:
-    """An observer whose display, eye and distances are scaled by 1/4.
-
-    At full size, the element-by-element propagation of 512 px takes 11 GB.
-    """
+    """Observer with display, eye and distances scaled by 1/4: propagation by elements takes 11 GB at full size."""
     display, eye = settings.display, settings.eye
     lengths = {name: value / 4 for name, value in display.model_dump().items() if isinstance(value, float)}
     smaller = {
@@ -68,28 +63,23 @@ def _quarter_size(settings: ObserverSettings, scene: VolumeSettings) -> Observer
 
 
 def _methods(observer: Observer) -> list[dict]:
-    """Collapsed and element-by-element propagation of green light, paraxial.
+    """Rows of collapsed and element-by-element propagation of green light, both paraxial.
 
-    Errors are relative L2 errors of the intensity on the retina. The reference is the element-by-element propagation
-    with 1.3 times the least oversampling.
+    Their errors are relative to element-by-element propagation with 1.3 times the least oversampling.
     """
     grid, depth, wavelength = observer.scene.grid, observer.focus[0], observer.scene.settings.wavelengths[1]
     hologram, _ = observer.scene.hologram(0)
     field, eye, display = hologram[1].conj()[None], observer.eye(depth), observer.display
     least = least_oversampling(grid, [wavelength], display, eye, plane=depth)
+    setup: dict[str, Any] = {"plane": depth, "paraxial": True}
 
     def by_elements(factor: float) -> Tensor:
-        sampling = _scaled(least, factor)
-        return propagate_elements(
-            field, grid, [wavelength], display, eye, plane=depth, sampling=sampling, paraxial=True
-        )
+        return propagate_elements(field, grid, [wavelength], display, eye, sampling=_scaled(least, factor), **setup)
 
     reference = intensity(by_elements(1.3))
-    plan = plan_retina(grid, [wavelength], display, eye, plane=depth, paraxial=True)
+    plan = plan_retina(grid, [wavelength], display, eye, **setup)
     needed = max(least.oversampling)
-    calls: dict[str, Any] = {
-        "collapse": lambda: propagate_collapsed(field, grid, [wavelength], display, eye, plane=depth, paraxial=True)
-    }
+    calls: dict[str, Any] = {"collapse": partial(propagate_collapsed, field, grid, [wavelength], display, eye, **setup)}
     for factor in (*(f for f in FACTORS if f < 0.95 * needed), needed):
         name = f"elements, {factor:.2g} x" + (", the thesis's sampling" if factor == 1 else "")
         calls[name] = partial(by_elements, factor / needed)
@@ -98,14 +88,13 @@ def _methods(observer: Observer) -> list[dict]:
         with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the chart shows this aliasing
             call()  # warms up
             image, seconds = timed(call)
-        error = ((intensity(image) - reference).square().sum() / reference.square().sum()).sqrt().item()
         predicted = f"{plan.predicted_error:.1e}" if name == "collapse" else ""
-        rows.append(_row("way", name, seconds, f"{error:.1e}", predicted))
+        rows.append(_row("way", name, seconds, _error(intensity(image), reference), predicted))
     return rows
 
 
 def _scaled(least: ElementSampling, factor: float) -> ElementSampling:
-    """The sampling ``least`` with ``factor`` times as many samples."""
+    """The sampling ``least`` with ``factor`` times as many samples along each axis."""
     fine = tuple(good_length(math.ceil(size * factor / 2) * 2) for size in least.fine)
     times = tuple(m * now / size for m, now, size in zip(least.oversampling, fine, least.fine, strict=True))
     return replace(least, oversampling=times, fine=fine)  # type: ignore[arg-type]
@@ -114,8 +103,8 @@ def _scaled(least: ElementSampling, factor: float) -> ElementSampling:
 def _counts(observer: Observer) -> list[dict]:
     """Error of a picture in green light by the number of wavelengths, relative to one wavelength every nanometre.
 
-    "followed": all wavelengths are in the sum, but only this many are propagated, and the others are derived from
-    their neighbours. "alone": only this many wavelengths are in the sum.
+    "followed": all wavelengths are in the sum, but only this number is propagated, and the pictures at the others are
+    derived from those. "alone": only this number of wavelengths is in the sum.
     """
     depth, wavelength, grid = observer.focus[0], observer.scene.settings.wavelengths[1], observer.scene.grid
     hologram, _ = observer.scene.hologram(0)
@@ -148,6 +137,7 @@ def _counts(observer: Observer) -> list[dict]:
 
 
 def _error(picture: Tensor, reference: Tensor) -> str:
+    """Relative L2 error."""
     return f"{((picture - reference).square().mean() / reference.square().mean()).sqrt().item():.1e}"
 
 
@@ -163,15 +153,14 @@ def _verdict(methods: list[dict], counts: list[dict], cases: list[Case]) -> list
     for source in PRESETS:
         selected = [row for row in counts if row["subject"] == source]
         full = float(selected[0]["seconds"])
-        through = [
+        derived = [
             f"{row['what']} {row['error']} (predicted {row['predicted']}), {full / float(row['seconds']):.1f} x as fast"
             for row in selected
             if "followed" in row["what"]
         ]
         alone = [f"{row['what']} {row['error']}" for row in selected if "alone" in row["what"]]
-        lines += [f"{source}: " + "; ".join(through), f"{source}: " + "; ".join(alone)]
-    lines += in_words(cases)
-    return lines
+        lines += [f"{source}: " + "; ".join(derived), f"{source}: " + "; ".join(alone)]
+    return lines + in_words(cases)
 
 
 def _draw(methods: list[dict], counts: list[dict], cases: list[Case]) -> bytes:
@@ -179,28 +168,20 @@ def _draw(methods: list[dict], counts: list[dict], cases: list[Case]) -> bytes:
     first, second, third = (figure.add_subplot(1, 3, k + 1) for k in range(3))
     for k, row in enumerate(methods):
         first.loglog(float(row["seconds"]), max(float(row["error"]), 1e-6), "os^vDP"[k % 6], label=row["what"])
-    first.set_xlabel("seconds")
-    first.set_ylabel("relative L2 error of the retina's intensity")
+    first.set(xlabel="seconds", ylabel="relative L2 error of the retina's intensity")
     for k, source in enumerate(PRESETS):
         for how, line in (("followed", "o-"), ("alone", "x:")):
             selected = [row for row in counts if row["subject"] == source and how in row["what"]]
-            numbers, errors = (
-                [int(row["what"].split()[0]) for row in selected],
-                [float(row["error"]) for row in selected],
-            )
-            second.loglog(numbers, errors, line, color=f"C{k}", label=f"{source}, {how}")
-    second.set_xlabel("wavelengths through the optics")
-    second.set_ylabel("relative L2 error against one every nm")
+            points = [(int(row["what"].split()[0]), float(row["error"])) for row in selected]
+            second.loglog(*zip(*points, strict=True), line, color=f"C{k}", label=f"{source}, {how}")
+    second.set(xlabel="wavelengths through the optics", ylabel="relative L2 error against one every nm")
     for k, case in enumerate(cases):
         label = f"{case.distance * 1e3:g} mm, {case.wavelength * 1e9:.0f} nm"
-        widths = [width * 1e9 for width in WIDTHS]
-        third.semilogx(
-            widths, case.ssim, color=("C3", "C2", "C0")[k % 3], linestyle=("-", "--", ":")[k // 3 % 3], label=label
-        )
+        widths, colour, line = [width * 1e9 for width in WIDTHS], f"C{(3, 2, 0)[k % 3]}", ("-", "--", ":")[k // 3 % 3]
+        third.semilogx(widths, case.ssim, color=colour, linestyle=line, label=label)
     third.set_xticks([1.4, 3, 6, 12, 25, 50], ["1.4", "3", "6", "12", "25", "50"], minor=False)
     third.minorticks_off()
-    third.set_xlabel("FWHM (nm)")
-    third.set_ylabel("SSIM to the speckle-free mean")
+    third.set(xlabel="FWHM (nm)", ylabel="SSIM to the speckle-free mean")
     for axes in (first, second, third):
         axes.grid(alpha=0.3, which="both")
         axes.legend(fontsize=7)

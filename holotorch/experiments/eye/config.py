@@ -19,25 +19,24 @@ def _above_zero(value: float) -> float:
     return value
 
 
-def _no_scene(value: str) -> str:
-    return f"expected a configuration file of a volume that exists, got {short(value)}"
-
-
 Positive = Annotated[Length, AfterValidator(_above_zero)]
 
 
 class SceneSettings(Settings):
     """The hologram to look at: the configuration of a volume, and changes to it, written as on the command line."""
 
-    config: Annotated[str, existing(find_config, _no_scene)]
+    config: Annotated[
+        str,
+        existing(find_config, lambda path: f"expected a configuration file of a volume that exists, got {short(path)}"),
+    ]
     change: Annotated[tuple[str, ...], BeforeValidator(several)] = ()
 
 
 class MagnifyingSettings(Settings):
-    """The display of the thesis (Fig. 5.5): the eye sees the image of the volume that an eyepiece magnifies.
+    """The display of the thesis (Fig. 5.5): the eye sees the volume magnified by an eyepiece.
 
-    ``lens_distance`` is the distance from hologram to eyepiece; by default, the middle of the volume appears at
-    ``focus_distance`` from the eye.
+    ``lens_distance``: distance from hologram to eyepiece; by default, that for which the middle of the volume appears
+    at ``focus_distance`` from the eye.
     """
 
     kind: Literal["magnifying"]
@@ -55,7 +54,7 @@ class PlanarSettings(Settings):
 
 
 class EyeSettings(Settings):
-    """The eye: radius of its pupil, distance of its retina, and whether it has human chromatic aberration."""
+    """The eye: radius of the pupil, distance from pupil to retina, and whether it has human chromatic aberration."""
 
     pupil_radius: Annotated[Length, plausible(PUPIL_RADIUS)] = 1.5e-3
     axial_length: Annotated[Length, plausible(EYE_LENGTH)] = 24e-3
@@ -63,11 +62,11 @@ class EyeSettings(Settings):
 
 
 class LightSettings(Settings):
-    """Sources to compare, with FWHM of 1.4, 5, 10 and 20 nm.
+    """Sources to compare; laser, narrow_sled, sled and led have an FWHM of 1.4, 5, 10 and 20 nm.
 
-    ``tolerance`` bounds the error of the sum over wavelengths relative to the rms brightness of a picture; only a few
-    wavelengths are propagated. The sources are discs: ``extent`` is the sine of the half angle that they subtend at the
-    hologram, 0 for point sources.
+    ``tolerance``: error of the sum over a few wavelengths in place of the whole spectrum, relative to the rms
+    brightness of a picture. ``extent``: the sources are discs, and this is the sine of the half angle that they subtend
+    at the hologram, 0 for point sources.
     """
 
     sources: Annotated[tuple[Source, ...], BeforeValidator(several), Field(min_length=1)] = (
@@ -81,7 +80,10 @@ class LightSettings(Settings):
 
 
 class SweepSettings(Settings):
-    """A sweep of the focus over the scene in ``steps``; its surface is divided into ``bands`` of depth."""
+    """A sweep of the focus over the scene in ``steps``; the surface of the scene is divided into ``bands`` of depth.
+
+    ``realisations``: number of random phases over which each picture is averaged.
+    """
 
     bands: Annotated[Count, Field(le=64)] = 5
     steps: Annotated[Count, Field(ge=3, le=256)] = 11
@@ -92,12 +94,12 @@ class ObserverSettings(Settings):
     """An observer's view of the hologram of a volume, for several light sources and depths of focus.
 
     ``focus``: depths of the scene at which the eye is focused; by default, the 10, 50 and 90 % quantiles of the depths
-    of the rays. ``seeds``: number of realisations of the random phases; the reference that they are compared with is
-    the mean of eight times as many other realisations.
-    ``tolerance``: relative L2 error of the intensity on the retina. If collapsed propagation exceeds it, light is
-    propagated element by element, which takes 10 to 300 times as long and much memory.
+    of the rays. ``seeds``: number of realisations of the random phases; they are compared with the mean of eight times
+    as many other realisations.
+    ``tolerance``: relative L2 error of the intensity on the retina. If the error of collapsed propagation is larger,
+    light is propagated element by element, which takes 10 to 300 times as long and much memory.
     ``sweep``: also sweep the focus over the scene, to find the focus at which each part looks sharpest.
-    ``tradeoff``: distances at which the best spectral width is determined as well, for each colour.
+    ``tradeoff``: distances of the scene at which the best spectral width of each colour is determined as well.
     """
 
     experiment: Literal["eye"]

@@ -1,8 +1,8 @@
-"""The view of an observer: a volume's hologram in light of real sources, through a display and a focused eye."""
+"""Observer: the view of a volume's hologram in the light of real sources, through a display and a focused eye."""
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -31,21 +31,20 @@ PRESETS: dict[str, Callable[[float], Spectrum]] = {
     "sled": Spectrum.sled,
     "led": Spectrum.led,
 }
-# Prefactor of the closed form for the best FWHM, fitted to the CT scan of a teapot; smooth scenes need a larger one
-# (C60: 0.8).
+# Prefactor of the closed form for the best FWHM (``optimum_fwhm``), fitted to the CT scan of a teapot. Smooth scenes
+# need a larger one (C60: 0.8).
 BEST = 0.46
-_REFERENCE_SEED = 100_000  # first seed of the realisations that only form the reference
-_MAX_RINGS = 16  # rings of directions of an extended source; 16 take a thousand times as long as a point source
-_LIT = 0.05  # speckle is measured on pixels brighter than this fraction of the brightest pixel of the reference
+_MAX_RINGS = 16  # rings of directions of an extended source; 16 rings take 1024 times as long as a point source
+LIT = 0.05  # speckle is measured on pixels brighter than this fraction of the brightest pixel of the reference
 
 
 @dataclass(frozen=True)
 class Observer:
     """A scene, a display and an eye, as a configuration describes them.
 
-    The waves of the hologram diverge from a scene behind it (exp(+ikr)/r). A display shows the complex conjugate, whose
-    light converges to the scene in front of it, towards the observer. Every wavelength of a source is modulated with
-    the same amplitude and phase, as in the thesis; the dispersion of a panel is not modelled.
+    The hologram is computed for light that diverges from a scene behind it (exp(+ikr)/r). The display shows its complex
+    conjugate, whose light converges to the scene in front of the hologram, towards the observer. Every wavelength of a
+    source is modulated with the same amplitude and phase, as in the thesis; the dispersion of a panel is not modelled.
 
     Attributes:
         settings: The configuration.
@@ -56,50 +55,56 @@ class Observer:
     settings: ObserverSettings
     scene: VolumeExperiment
     focus: tuple[float, ...]
+    _samples: dict[tuple[str, float, float], tuple[Tensor, Tensor, int]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+    _retina_plans: dict[float, RetinaPlan] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @cached_property
     def display(self) -> Display:
         """Positions of the hologram, the eyepiece and the eye."""
-        given = self.settings.display
-        if isinstance(given, PlanarSettings):
-            return Display.planar(given.distance)
-        lens = given.lens_distance
-        if lens is None:
-            lens = eyepiece_distance(self.scene.distance, given.focus_distance, given.focal_length, given.eye_distance)
-        return Display(lens, given.focal_length, given.eye_distance)
+        settings = self.settings.display
+        if isinstance(settings, PlanarSettings):
+            return Display.planar(settings.distance)
+        lengths = settings.focal_length, settings.eye_distance
+        lens = settings.lens_distance or eyepiece_distance(self.scene.distance, settings.focus_distance, *lengths)
+        return Display(lens, *lengths)
 
     def accommodation(self, depth: float) -> float:
-        """Distance in front of the eye at which a depth of the scene appears, in metres."""
-        given, to_lens = self.settings.display, float(self.display.lens_distance) - depth
-        if isinstance(given, PlanarSettings):
+        """Distance in metres in front of the eye at which a depth of the scene appears. ValueError if there is none."""
+        settings, to_lens = self.settings.display, float(self.display.lens_distance) - depth
+        if isinstance(settings, PlanarSettings):
             return to_lens
-        return image_distance(to_lens, given.focal_length) + given.eye_distance
+        return image_distance(to_lens, settings.focal_length) + settings.eye_distance
 
     def eye(self, depth: float) -> Eye:
         """The eye, focused at a depth of the scene."""
-        given = self.settings.eye
-        reference = self.reference_wavelength if given.chromatic else None
-        return Eye(given.pupil_radius, given.axial_length, self.accommodation(depth), chromatic_reference=reference)
+        pupil, length = self.settings.eye.pupil_radius, self.settings.eye.axial_length
+        reference = self.reference_wavelength if self.settings.eye.chromatic else None
+        return Eye(pupil, length, self.accommodation(depth), chromatic_reference=reference)
 
     @property
     def reference_wavelength(self) -> float:
-        """The wavelength for which an eye with chromatic aberration is in focus: the middle one."""
+        """The middle wavelength in metres, for which an eye with chromatic aberration is in focus."""
         return sorted(self.scene.settings.wavelengths)[1]
 
     def aperture(self, depth: float) -> float:
-        """Sine of the half angle of light from a depth that reaches the retina, limited by pupil or hologram."""
+        """Sine of the half angle of the light from a depth that reaches the retina, limited by pupil or hologram."""
         pupil = self.settings.eye.pupil_radius / abs(float(self.display.matrix(depth)[1]))
         return min(pupil, math.sin(math.atan(min(self.scene.grid.extent) / 2 / depth)))
 
     def detail(self, depth: float, wavelength: float) -> float:
-        """Sine of the half angle of light that carries detail: :meth:`aperture`, or the limit of the rays' pitch."""
+        """Sine of the half angle of the light that carries detail: :meth:`aperture`, or the limit by the ray pitch."""
         return min(self.aperture(depth), wavelength / (2 * max(self.scene.rays.pitch)))
 
     def samples(self, source: str, wavelength: float, depth: float) -> tuple[Tensor, Tensor, int]:
-        """Wavelengths (metres) and weights that represent a source within the tolerance, and how many to propagate."""
+        """Wavelengths (metres) and weights that represent a source within the tolerance, and how many to propagate.
+
+        Results are kept, since computing them may take a second. ConfigError if no light reaches the pupil.
+        """
         key = (source, wavelength, depth)
         if key not in self._samples:
-            # Two independent errors: that of the sum over wavelengths, and that of deriving most pictures from a few.
+            # Shared by two independent errors: of the sum over wavelengths, and of deriving most pictures from a few.
             eye, tolerance = self.eye(depth), self.settings.light.tolerance / math.sqrt(2)
             half_width = self.scene.width / 2
             light = seen_light(self.scene.grid, wavelength, self.display, eye, reach=half_width)
@@ -107,25 +112,17 @@ class Observer:
                 words = f"no light of {wavelength * 1e9:.4g} nm of the scene reaches the pupil when the eye looks at"
                 hint = "change the distances of display, or the pupil"
                 raise ConfigError([f"display: {words} {depth * 1e3:.4g} mm from the hologram; {hint}"])
-            wavelengths, weights = PRESETS[source](wavelength).samples(
-                tolerance=tolerance, path_difference=light.path_difference, iris=False
-            )
-            count = least_followed(
-                wavelengths, weights, tolerance, self.scene.grid, self.display, eye, reach=half_width
-            )
-            self._samples[key] = wavelengths, weights, count
+            spectrum = PRESETS[source](wavelength)
+            samples = spectrum.samples(tolerance=tolerance, path_difference=light.path_difference, iris=False)
+            count = least_followed(*samples, tolerance, self.scene.grid, self.display, eye, reach=half_width)
+            self._samples[key] = *samples, count
         return self._samples[key]
-
-    @cached_property
-    def _samples(self) -> dict[tuple[str, float, float], tuple[Tensor, Tensor, int]]:
-        """Results of :meth:`samples`, each of which may take a second."""
-        return {}
 
     def points(self, wavelength: float, depth: float) -> tuple[list[tuple[float, float]], list[float]]:
         """Directions (sines y, x) and weights of the points that represent an extended source.
 
-        Light from a direction shifts the picture by the depth times the sine of its angle. The rings of directions are
-        so dense that neighbouring rings are at most half a diffraction spot apart in the picture.
+        A tilt of the light by an angle shifts the picture by the depth times the sine of the angle. The rings of
+        directions are so dense that the pictures of neighbouring rings are at most half a diffraction spot apart.
 
         Raises:
             ConfigError: More than 16 rings (1024 directions) are needed.
@@ -143,86 +140,68 @@ class Observer:
     def retina(self, depth: float) -> RetinaPlan:
         """Choose the method of propagation to the retina of an eye that is focused at a depth.
 
-        All sources use the same method, since their pictures are compared. It is planned for the shortest and the
+        All sources use the same method, since their pictures are compared. The plan is made for the shortest and the
         longest wavelength of all sources; wavelengths between them have smaller errors and need fewer samples.
 
         Raises:
             ConfigError: No method can be used.
         """
         if depth not in self._retina_plans:
-            wavelengths = self.scene.settings.wavelengths
-            sources = self.settings.light.sources
+            sources, wavelengths = self.settings.light.sources, self.scene.settings.wavelengths
             ends = [end for source in sources for each in wavelengths for end in PRESETS[source](each).band()]
+            setup = self.scene.grid, (min(ends), max(ends)), self.display, self.eye(depth)
+            tolerance, half_width = self.settings.tolerance, self.scene.width / 2
             try:
                 self._retina_plans[depth] = plan_retina(
-                    self.scene.grid,
-                    (min(ends), max(ends)),
-                    self.display,
-                    self.eye(depth),
-                    tolerance=self.settings.tolerance,
-                    plane=depth,
-                    reach=self.scene.width / 2,
-                    registered=True,
+                    *setup, tolerance=tolerance, plane=depth, reach=half_width, registered=True
                 )
             except ValueError as error:
                 raise ConfigError([f"display: {error}"]) from error
         return self._retina_plans[depth]
 
-    @cached_property
-    def _retina_plans(self) -> dict[float, RetinaPlan]:
-        return {}
-
     def image(self, hologram: Tensor, source: str | None, depth: float) -> Tensor:
-        """Intensity on the retina, mapped back to the scene, real [3, h, w] on the rays.
+        """Intensity on the retina of an eye focused at a depth (metres), mapped to the rays of the scene, [3, h, w].
 
-        Args:
-            hologram: Complex [3, H, W].
-            source: Name of a source; None for a single wavelength per colour.
-            depth: Depth in metres at which the eye is focused; the method depends on it, see :meth:`retina`.
+        ``hologram`` is complex [3, H, W]. Without a source, each colour has a single wavelength.
         """
         eye, grid, pictures = self.eye(depth), self.scene.grid, []
         elements = self.retina(depth).method == "elements"
-        for field, wavelength in zip(hologram.conj(), self.scene.settings.wavelengths, strict=True):
+        for light, wavelength in zip(hologram.conj(), self.scene.settings.wavelengths, strict=True):
             samples, points = ([wavelength], [1.0], 1), ([(0.0, 0.0)], [1.0])
             if source is not None:
                 samples, points = self.samples(source, wavelength, depth), self.points(wavelength, depth)
-            wavelengths, weights, count = samples
-            total = torch.zeros(grid.shape, dtype=field.real.dtype, device=field.device)
+            lengths, weights, count = samples
+            total = torch.zeros(grid.shape, dtype=light.real.dtype, device=light.device)
             for tilt, share in zip(*points, strict=True):
-                tilted = field * tilted_wave(grid, wavelength, tilt).to(field) if any(tilt) else field
-                total += share * spectral_image(
-                    tilted, grid, wavelengths, weights, self.display, eye, count=count, elements=elements
-                )
+                tilted = light * tilted_wave(grid, wavelength, tilt).to(light) if any(tilt) else light
+                setup = tilted, grid, lengths, weights, self.display, eye
+                total += share * spectral_image(*setup, count=count, elements=elements)
             pictures.append(pooled(total, self.scene.stride))
         return torch.stack(pictures).cpu()
 
     def row(self, source: str, depth: float, pictures: Tensor, reference: Tensor) -> dict[str, Any]:
-        """Measurements of a source at a focus: for each quantity, a list with the mean over realisations per colour.
+        """Measurements of a source with the eye focused at a depth (metres): for each quantity, a value per colour.
 
-        Args:
-            source: Name of the source.
-            depth: Focus in metres.
-            pictures: [S, 3, h, w], one for each realisation.
-            reference: Picture free of speckle, [3, h, w].
+        The values are means over the S realisations in ``pictures`` [S, 3, h, w]; ``reference`` [3, h, w] is free of
+        speckle.
         """
         peak = reference.amax((-2, -1), keepdim=True)
         shown = equal_power(pictures, reference.expand_as(pictures))
         wavelengths = self.scene.settings.wavelengths
         samples = [self.samples(source, wavelength, depth) for wavelength in wavelengths]
         difference = path_difference(depth, self.aperture(depth))
+        best = [optimum_fwhm(each, self.detail(depth, each), depth, defocus=BEST) for each in wavelengths]
         quality = ssim((shown / peak).clamp(0, 1), (reference / peak).expand_as(shown), data_range=1.0)
         return {
             "source": source,
             "focus_mm": depth * 1e3,
             "wavelengths": [len(each) for each, _, _ in samples],
             "followed": [count for _, _, count in samples],
-            "contrast": speckle_contrast(shown, reference=reference, mask=reference > _LIT * peak).mean(0).tolist(),
+            "contrast": speckle_contrast(shown, reference=reference, mask=reference > LIT * peak).mean(0).tolist(),
             "contrast_predicted": [predicted_contrast(PRESETS[source](each), difference) for each in wavelengths],
             "ssim": quality.mean(0).tolist(),
             "sharpness": sharpness(shown, reference).mean(0).tolist(),
-            "best_fwhm_nm_by_formula": [
-                optimum_fwhm(each, self.detail(depth, each), depth, defocus=BEST) * 1e9 for each in wavelengths
-            ],
+            "best_fwhm_nm_by_formula": [fwhm * 1e9 for fwhm in best],
         }
 
 
@@ -243,8 +222,3 @@ def observer(settings: ObserverSettings, scene_settings) -> Observer:
         except ValueError as error:
             raise ConfigError([f"display: {error}; the eye cannot focus at a depth of {depth * 1e3:.4g} mm"]) from error
     return result
-
-
-def realisations(count: int, *, reference: bool) -> list[int]:
-    """Seeds of ``count`` holograms; those of the reference differ from all others."""
-    return [(_REFERENCE_SEED if reference else 0) + k for k in range(count)]

@@ -1,6 +1,8 @@
 """A sweep of the eye's focus over a scene: the focus at which each part looks sharpest (thesis Fig. 5.9)."""
 
+import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -11,12 +13,13 @@ from tqdm import tqdm
 
 from holotorch.experiments.eye.config import SweepSettings
 from holotorch.experiments.eye.experiment import Observer
+from holotorch.experiments.eye.tradeoff import parabola_peak
 from holotorch.experiments.runs.figures import figure_png
 
 _BLUR = 6.0  # standard deviation, in rays, of the blurred picture that is subtracted to compare only fine detail
 _OPAQUE = 0.5  # opacity above which a ray shows a surface
 _LEAST = 100  # least number of rays in a band
-_ENDS = (0.02, 0.98)  # quantiles of the depths of the surface at which the first band begins and the last one ends
+_ENDS = (0.02, 0.98)  # quantiles of the depth of the surface at which the first band begins and the last band ends
 
 
 @dataclass(frozen=True)
@@ -25,11 +28,11 @@ class Band:
 
     Attributes:
         depth: Mean depth in metres from the hologram.
-        spread: Standard deviation of the depths, in metres.
+        spread: Standard deviation of the depth in metres.
         rays: Number of rays that show the band.
-        correlation: Correlation of its fine detail with that of the rendering, one value for each focus of the sweep.
-        sharpest: Focus in metres with the largest correlation, interpolated between the steps; NaN if it is at an end
-            of the sweep.
+        correlation: Correlation of the fine detail of the band with that of the rendering, for each focus of the sweep.
+        sharpest: Focus in metres with the largest correlation, interpolated between the steps; NaN if the largest
+            correlation is at an end of the sweep.
         depth_of_focus: wavelength / aperture^2 of the middle colour, in metres.
     """
 
@@ -86,7 +89,7 @@ class Surface:
 
 
 def visible_surface(eye: Observer) -> Surface:
-    """The visible surface of a scene. ValueError for a scene without a surface, or with one at a single depth."""
+    """The visible surface of a scene. ValueError for a scene without a surface, or with a surface at a single depth."""
     sampler = eye.scene.sampler()
     with torch.no_grad():
         rendering, opacity = (part.cpu() for part in sampler.render(eye.scene.volume))
@@ -106,15 +109,8 @@ def focus_sweep(eye: Observer, settings: SweepSettings, surface: Surface | None 
     """Compute the observer's view for one focus after another, with one wavelength per colour.
 
     The visible surface of the scene is divided into bands of depth. The fine detail of each band is correlated with
-    that of the rendering, which is sharp everywhere: a band looks sharpest when the eye is focused at its depth.
-
-    Args:
-        eye: The observer.
-        settings: Numbers of bands, steps and realisations.
-        surface: Result of :func:`visible_surface`; computed if it is not given.
-
-    Raises:
-        ValueError: For the same scenes as :func:`visible_surface`.
+    that of the rendering, which is sharp everywhere: the correlation should be largest when the eye is focused at the
+    depth of the band. Without ``surface``, :func:`visible_surface` is called, which may raise ValueError.
     """
     scene, surface = eye.scene, surface or visible_surface(eye)
     depth, (low, high) = surface.depth, surface.ends
@@ -131,14 +127,15 @@ def focus_sweep(eye: Observer, settings: SweepSettings, surface: Surface | None 
     details, wanted = _fine_detail(pictures), _fine_detail(surface.rendering[None].float())[0]
     bands = []
     ends = torch.linspace(low, high, settings.bands + 1).tolist()
-    for near, far in zip(ends, ends[1:], strict=False):
+    for near, far in pairwise(ends):
         part = surface.opaque & (depth >= near) & (depth <= far)
         if int(part.sum()) < _LEAST:
             continue
         mean = depth[part].mean().item()
         correlation = tuple(_correlation(detail[:, part], wanted[:, part]) for detail in details)
         spread, depth_of_focus = depth[part].std().item(), wavelength / eye.detail(mean, wavelength) ** 2
-        sharpest = _peak(focus, correlation)
+        position, inside = parabola_peak(focus, correlation)
+        sharpest = position if inside else math.nan
         bands.append(Band(mean, spread, int(part.sum()), correlation, sharpest, depth_of_focus))
     return FocusSweep(tuple(focus), pictures, tuple(bands))
 
@@ -182,13 +179,5 @@ def _fine_detail(pictures: Tensor) -> Tensor:
 
 
 def _correlation(first: Tensor, second: Tensor) -> float:
+    """Cosine similarity of two tensors."""
     return ((first * second).sum() / (first.norm() * second.norm()).clamp(min=1e-30)).item()
-
-
-def _peak(positions: list[float], values: tuple[float, ...]) -> float:
-    """Position of the maximum of the parabola through the largest value and its neighbours; NaN without both."""
-    at = max(range(len(values)), key=values.__getitem__)
-    if at in (0, len(values) - 1):
-        return float("nan")
-    before, best, after = values[at - 1 : at + 2]
-    return positions[at] + 0.5 * (positions[1] - positions[0]) * (before - after) / (before - 2 * best + after)

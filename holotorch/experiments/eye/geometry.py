@@ -1,4 +1,4 @@
-"""Geometry of a display and its observer: numbers and a drawing to scale (thesis Sec. 5.4 and 5.6.2)."""
+"""Geometry of a display and its observer as numbers, text and a drawing to scale (thesis Sec. 5.4 and 5.6.2)."""
 
 import math
 from typing import Any
@@ -13,19 +13,19 @@ from holotorch.experiments.runs.figures import figure_png
 from holotorch.optics.viewing import display_geometry as viewing
 
 _COLOURS = ("tab:red", "tab:green", "tab:blue")  # colours of the curves of the three wavelengths
-_REGIONS = {
-    0: "no light of the point reaches the hologram",
-    1: "the hologram holds the whole cone of light of a point, so spots are smallest",
-    2: "the hologram holds part of the cone of light",
-    3: "the cone of light covers the whole hologram, so spots grow with distance",
-}
-_ROMAN = {0: "none", 1: "I", 2: "II", 3: "III"}
-_INVISIBLE = 0.005  # the edge of the scene counts as lost if a smaller share of its light enters the pupil
+_ROMAN = ("none", "I", "II", "III")  # names of the regions of points
+_REGIONS = (
+    "no light of the point reaches the hologram",
+    "the hologram holds the whole cone of light of a point, so spots are smallest",
+    "the hologram holds part of the cone of light",
+    "the cone of light covers the whole hologram, so spots grow with distance",
+)
+_INVISIBLE = 0.005  # the edge of the scene is invisible if a smaller share of its light enters the pupil
 
 
 def geometry(eye: Observer) -> dict[str, Any]:
     """Fields of view, eye box, regions and spots of an observer's display, as JSON values in degrees and mm."""
-    scene, given = eye.scene, eye.settings.display
+    scene, display = eye.scene, eye.settings.display
     width, pitch, wavelengths = scene.grid.extent[1], scene.grid.pitch[1], scene.settings.wavelengths
     near, far = min(scene.depths), max(scene.depths)
     values: dict[str, Any] = {
@@ -43,26 +43,24 @@ def geometry(eye: Observer) -> dict[str, Any]:
     }
     first, second, _, _ = (float(value) for value in eye.display.matrix(scene.distance))
     pupil = eye.settings.eye.pupil_radius
-    # The pitch limits the cone of light of a point, and the width of the hologram cuts off part of it.
+    # The pitch limits the cone of light of a point, and so does the width of the hologram.
     sines = [min(w / (2 * pitch), math.sin(math.atan(width / 2 / scene.distance))) for w in wavelengths]
     values["eye_box_mm"] = [1e3 * viewing.eye_box(scene.width, first, second, sine) for sine in sines]
     values["light_of_edge"] = [viewing.vignetting(scene.width / 2, first, second, pupil, sine) for sine in sines]
-    if isinstance(given, MagnifyingSettings):
-        before = float(eye.display.lens_distance) - scene.distance
-        field = viewing.magnified_fov(width, given.focal_length)
+    if isinstance(display, MagnifyingSettings):
+        to_lens = float(eye.display.lens_distance) - scene.distance
+        lengths = display.focal_length, display.eye_distance
+        field = viewing.magnified_fov(width, display.focal_length)
         values |= {
             "magnified_fov_deg": math.degrees(field),
-            "scene_fov_deg": math.degrees(
-                viewing.scene_fov(scene.width, before, given.focal_length, given.eye_distance)
-            ),
-            "filling_scene_mm": 1e3
-            * viewing.volume_size(field, given.focus_distance, given.focal_length, given.eye_distance),
+            "scene_fov_deg": math.degrees(viewing.scene_fov(scene.width, to_lens, *lengths)),
+            "filling_scene_mm": 1e3 * viewing.volume_size(field, display.focus_distance, *lengths),
         }
     return values
 
 
 def in_words(values: dict[str, Any]) -> list[str]:
-    """Lines of a plan."""
+    """Lines of a plan for the result of :func:`geometry`."""
     fields = f"of view {_span(values['planar_fov_deg'])} deg without an eyepiece"
     if "scene_fov_deg" in values:
         fields += (
@@ -110,10 +108,9 @@ def draw(eye: Observer) -> bytes:
             band = np.linspace(*spectrum.band(), 201)
             power = spectrum.power(band).numpy()
             style = ("-", "--", "-.", ":")[list(PRESETS).index(source)]
-            label = source.replace("_", " ") if wavelength == eye.scene.settings.wavelengths[0] else None
+            label = source.replace("_", " ") if colour == _COLOURS[0] else None
             spectra.plot(1e9 * band, power / power.max(), style, color=colour, label=label)
-    spectra.set_xlabel("wavelength (nm)")
-    spectra.set_ylabel("power relative to its peak, within the band that is used")
+    spectra.set(xlabel="wavelength (nm)", ylabel="power relative to its peak, within the band that is used")
     spectra.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.62, 1.0))
     spectra.grid(alpha=0.3)
     return figure_png(figure)
@@ -121,42 +118,42 @@ def draw(eye: Observer) -> bytes:
 
 def _draw_display(axes: Any, eye: Observer) -> None:
     """Hologram, scene, eyepiece and eye, with rays from the ends of the scene to the edges of the pupil."""
-    scene, given = eye.scene, eye.settings.display
+    scene, display = eye.scene, eye.settings.display
     half, pupil = 1e3 * scene.grid.extent[0] / 2, 1e3 * eye.settings.eye.pupil_radius
     lens, back = (1e3 * float(value) for value in (eye.display.lens_distance, eye.display.eye_distance))
     end, retina = lens + back, 1e3 * eye.settings.eye.axial_length
+    text: dict[str, Any] = {"ha": "center", "fontsize": 8}
     axes.plot([0, 0], [-half, half], "k", linewidth=4)
-    axes.text(0, half * 1.05, "hologram", ha="center", va="bottom", fontsize=8)
-    _box(axes, eye)
+    axes.text(0, half * 1.05, "hologram", va="bottom", **text)
+    _draw_scene(axes, eye)
     first, second, _, _ = (float(value) for value in eye.display.matrix(scene.distance))
-    focal = given.focal_length if isinstance(given, MagnifyingSettings) else math.inf
+    focal = display.focal_length if isinstance(display, MagnifyingSettings) else math.inf
     for height in (-scene.width / 2, 0.0, scene.width / 2):
         for side in (-1, 1):
             # The ray matrix to the pupil gives the slope of the ray from this height to the edge of the pupil.
             slope = (side * pupil / 1e3 - first * height) / second
-            at = height + slope * (lens / 1e3 - scene.distance)
-            after = slope - at / focal
+            at_lens = height + slope * (lens / 1e3 - scene.distance)
+            behind_lens = slope - at_lens / focal
             positions = [scene.distance * 1e3, lens, end]
-            heights = [height, at, at + after * back / 1e3]
+            heights = [height, at_lens, at_lens + behind_lens * back / 1e3]
             axes.plot(positions, [1e3 * value for value in heights], color="tab:orange", linewidth=0.8)
     if math.isfinite(focal):
         half_width = max(half, pupil) * 1.6
         arrow = {"arrowstyle": "<->", "color": "tab:blue"}
         axes.annotate("", (lens, half_width), (lens, -half_width), arrowprops=arrow)
-        axes.text(lens, -half_width * 1.05, f"eyepiece, f {1e3 * focal:.3g} mm", ha="center", va="top", fontsize=8)
+        axes.text(lens, -half_width * 1.05, f"eyepiece, f {1e3 * focal:.3g} mm", va="top", **text)
     for sign in (-1, 1):
         axes.plot([end, end], [sign * pupil, sign * max(2.5 * pupil, half)], "k", linewidth=2)
     axes.plot([end + retina] * 2, [-retina / 6, retina / 6], color="0.4", linewidth=3)
     share = axes.get_xaxis_transform()  # heights are fractions of the height of the axes
     axes.text(end + retina, 0.97, "eye  ", ha="right", va="top", fontsize=8, transform=share)
-    axes.set_xlabel("along the axis (mm from the hologram)")
-    axes.set_ylabel("height (mm)")
+    axes.set(xlabel="along the axis (mm from the hologram)", ylabel="height (mm)")
     axes.set_title("display and eye: rays from the scene to the edge of the pupil", fontsize=10)
     axes.grid(alpha=0.3)
 
 
 def _draw_regions(axes: Any, eye: Observer) -> None:
-    """Regions of points for the shortest wavelength, whose cone is the narrowest, and the scene in them."""
+    """Regions of points at the shortest wavelength, whose cone of light is the narrowest, and the scene in them."""
     scene = eye.scene
     width, pitch, wavelength = scene.grid.extent[0], scene.grid.pitch[0], min(scene.settings.wavelengths)
     apex = viewing.region_apex(width, pitch, wavelength)
@@ -165,25 +162,21 @@ def _draw_regions(axes: Any, eye: Observer) -> None:
     z, y = np.linspace(1e-4 * deep, deep, 300), np.linspace(-high, high, 241)
     kinds = [[viewing.region(height, distance, width, pitch, wavelength) for distance in z] for height in y]
     mesh = axes.pcolormesh(1e3 * z, 1e3 * y, kinds, cmap="Blues", vmin=0, vmax=4, shading="nearest")
-    for number, distance in ((1, 0.5 * apex), (3, 1.6 * apex)):
-        axes.text(1e3 * distance, 0, "I" * number, ha="center", va="center")
-    axes.text(1e3 * apex, 1e3 * width / 2, "II", ha="center", va="center")
+    for name, distance, height in (("I", 0.5 * apex, 0.0), ("II", apex, width / 2), ("III", 1.6 * apex, 0.0)):
+        axes.text(1e3 * distance, 1e3 * height, name, ha="center", va="center")
     mesh.set_rasterized(True)
     axes.plot([0, 0], [-1e3 * width / 2, 1e3 * width / 2], "k", linewidth=4)
-    _box(axes, eye)
-    axes.set_xlabel("distance from the hologram (mm)")
-    axes.set_ylabel("height (mm)")
+    _draw_scene(axes, eye)
+    axes.set(xlabel="distance from the hologram (mm)", ylabel="height (mm)")
     axes.set_title(f"regions of a point at {1e9 * wavelength:.0f} nm, and the scene", fontsize=10)
 
 
-def _box(axes: Any, eye: Observer) -> None:
-    scene = eye.scene
-    near, far = 1e3 * min(scene.depths), 1e3 * max(scene.depths)
-    corner = near, -1e3 * scene.width / 2
-    axes.add_patch(Rectangle(corner, far - near, 1e3 * scene.width, fill=False, edgecolor="tab:red", linewidth=1.5))
-    middle, below = (near + far) / 2, -1e3 * scene.width / 2 * 1.1
+def _draw_scene(axes: Any, eye: Observer) -> None:
+    near, far, width = (1e3 * size for size in (min(eye.scene.depths), max(eye.scene.depths), eye.scene.width))
+    corner, below = (near, -width / 2), -width / 2 * 1.1
+    axes.add_patch(Rectangle(corner, far - near, width, fill=False, edgecolor="tab:red", linewidth=1.5))
     plate = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1}
-    axes.text(middle, below, "scene", ha="center", va="top", fontsize=8, color="tab:red", bbox=plate)
+    axes.text((near + far) / 2, below, "scene", ha="center", va="top", fontsize=8, color="tab:red", bbox=plate)
 
 
 def _span(values: list[float]) -> str:

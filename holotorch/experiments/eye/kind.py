@@ -21,9 +21,10 @@ class ObserverKind(ExperimentKind[ObserverSettings, "Observer"]):
     example = "configs/eye/teapot.yaml"
 
     def build(self, settings: ObserverSettings) -> Observer:
-        from holotorch.experiments.eye.run import build_observer
+        from holotorch.experiments.eye.experiment import observer
+        from holotorch.experiments.eye.run import scene_settings
 
-        return build_observer(settings)
+        return observer(settings, scene_settings(settings))
 
     def plan(self, experiment: Observer) -> RunPlan:
         from holotorch.experiments.eye.plan import plan_text, plan_values, too_large
@@ -48,7 +49,7 @@ class ObserverKind(ExperimentKind[ObserverSettings, "Observer"]):
     def section(self, record: RunRecord) -> list[str]:
         from holotorch.experiments.eye.report import eye_section
 
-        return eye_section(record.title, record.summary, record.plan, record.picture)
+        return eye_section(record)
 
 
 KIND = ObserverKind()

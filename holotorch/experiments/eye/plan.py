@@ -1,4 +1,4 @@
-"""The plan of an observer's run: methods, cost and geometry, before anything is computed."""
+"""Plan of a run of kind ``eye``: methods, cost and geometry, before anything is computed."""
 
 import math
 from typing import Any
@@ -14,25 +14,23 @@ from holotorch.optics.viewing.imaging import retinal_scale
 _FLOP_SECONDS = {"collapse": 2e-10, "elements": 4e-10}  # seconds per operation of a RetinaPlan
 _DERIVED_SECONDS = 1e-9  # seconds to derive the picture of one wavelength from another, per n log2(n) of n samples
 _BASE_BYTES = 600e6  # libraries, holograms of 512 px, and pictures of the report
-_MARGIN = 1.1  # factor on the memory of a propagation for the margin that derived wavelengths need
+_MARGIN = 1.1  # factor on the memory of a propagation, because derived wavelengths need a margin around the picture
 _DERIVED_BYTES = 96.0  # bytes per sample of the fields from which wavelengths are derived
+_RETINA = ("method", "predicted_error", "adequate", "reason", "runner_up")  # values of a RetinaPlan that are reported
 
 
 def plan_values(eye: Observer) -> dict[str, Any]:
     """Choices with their reasons, cost and physics, as plain JSON values."""
     settings, scene, display = eye.settings, eye.scene, eye.display
     wavelengths, deepest = scene.settings.wavelengths, max(eye.focus)
-    counts: dict[str, list[int]] = {}
-    propagated: dict[str, list[int]] = {}
-    for source in settings.light.sources:
-        samples = [eye.samples(source, wavelength, deepest) for wavelength in wavelengths]
-        counts[source] = [len(each) for each, _, _ in samples]
-        propagated[source] = [count for _, _, count in samples]
+    samples = {name: [eye.samples(name, each, deepest) for each in wavelengths] for name in settings.light.sources}
+    counts = {name: [len(lengths) for lengths, _, _ in each] for name, each in samples.items()}
+    propagated = {name: [count for _, _, count in each] for name, each in samples.items()}
     directions = [len(eye.points(wavelength, deepest)[0]) for wavelength in wavelengths]
 
-    def pictures(each: dict[str, list[int]]) -> int:
-        per_source = (zip(count, directions, strict=True) for count in each.values())
-        return settings.seeds * sum(n * tilts for pairs in per_source for n, tilts in pairs)
+    def pictures(per_source: dict[str, list[int]]) -> int:
+        pairs = (pair for each in per_source.values() for pair in zip(each, directions, strict=True))
+        return settings.seeds * sum(count * tilts for count, tilts in pairs)
 
     references = 8 * settings.seeds
     images = references * len(wavelengths) + pictures(propagated)
@@ -57,16 +55,7 @@ def plan_values(eye: Observer) -> dict[str, Any]:
         "retinal_scale": [float(retinal_scale(display, eye.eye(depth), depth)) for depth in eye.focus],
         "aperture": [eye.aperture(depth) for depth in eye.focus],
         "tolerance": settings.tolerance,
-        "retina": [
-            {
-                "method": each.method,
-                "predicted_error": each.predicted_error,
-                "adequate": each.adequate,
-                "reason": each.reason,
-                "runner_up": each.runner_up,
-            }
-            for each in retina
-        ],
+        "retina": [{key: getattr(plan, key) for key in _RETINA} for plan in retina],
         "wavelengths": counts,
         "followed": propagated,
         "directions": directions,

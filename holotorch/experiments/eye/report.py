@@ -1,9 +1,9 @@
 """The section of a report page for what an observer sees."""
 
-from collections.abc import Callable
 from typing import Any
 
 from holotorch.experiments.runs.page import element, figure, heading, plain, table
+from holotorch.experiments.runs.record import RunRecord
 
 _PREDICTED = (
     "The predicted contrast is that of an evenly filled round pupil and fully developed speckle; a scene with "
@@ -20,15 +20,16 @@ def by_wavelength(row: dict[str, Any], wavelengths: list[float]) -> dict[str, An
     return flat
 
 
-def eye_section(title: str, summary: dict[str, Any], plan: dict[str, Any], picture: Callable[[str], str]) -> list[str]:
-    """HTML of a run: pictures by focus, numbers by source, plan; ``picture`` gives an image's data URL or nothing."""
-    parts = [heading(title, summary["status"]), element("p", "What the observer sees.")]
+def eye_section(run: RunRecord) -> list[str]:
+    """HTML of a run: pictures by focus, numbers by source, and the plan."""
+    summary, plan = run.summary, run.plan
+    parts = [heading(run.title, summary["status"]), element("p", "What the observer sees.")]
     if summary["synthetic"]:
         parts.append(element("p", f"Synthetic volume: {summary['synthetic']}.", "warn"))
     synthetic = ", synthetic volume" if summary["synthetic"] else ""
     captions = {f"comparison_{f}": f"focus {depth:.4g} mm{synthetic}" for f, depth in enumerate(plan["focus_mm"])}
     captions |= {"focus": "the eye's focus swept over the scene", "geometry": "geometry and sources"}
-    parts += [figure(source, caption, "wide") for name, caption in captions.items() if (source := picture(name))]
+    parts += [figure(source, caption, "wide") for name, caption in captions.items() if (source := run.picture(name))]
     first = summary["rows"][0]
     at = f" at {' / '.join(f'{wavelength:.0f}' for wavelength in summary['wavelengths_nm'])} nm"
     names = [key.replace("_", " ") + (at if isinstance(first[key], list) else "") for key in first]

@@ -1,6 +1,8 @@
-"""A run of the observer: pictures of every source and focus, their measurements, and a page."""
+"""Run of kind ``eye``: pictures of every source and focus, their measurements, and the files of the run folder."""
 
+import itertools
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +14,9 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.eye import focus as eye_focus
 from holotorch.experiments.eye import geometry as eye_geometry
 from holotorch.experiments.eye.config import ObserverSettings
-from holotorch.experiments.eye.experiment import Observer, observer, realisations
+from holotorch.experiments.eye.experiment import Observer
 from holotorch.experiments.eye.report import by_wavelength
-from holotorch.experiments.eye.tradeoff import fitted_prefactor, in_words, tradeoff
+from holotorch.experiments.eye.tradeoff import WHITE, fitted_prefactor, in_words, tradeoff
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.runs import figures
 from holotorch.experiments.runs.fingerprint import Fingerprint, fingerprint
@@ -33,7 +35,7 @@ from holotorch.io.files import save_array, write_bytes
 from holotorch.optics.picture import equal_power, gamut_map, linear_srgb, tone_map
 
 _SAVE_EVERY = 30.0  # seconds between two checkpoints
-_WHITE = 0.995  # quantile of the reference's brightness that is shown as white
+_REFERENCE_SEED = 100_000  # first seed of the realisations that form the reference
 
 
 def scene_settings(settings: ObserverSettings) -> VolumeSettings:
@@ -46,13 +48,8 @@ def scene_settings(settings: ObserverSettings) -> VolumeSettings:
     return scene
 
 
-def build_observer(settings: ObserverSettings) -> Observer:
-    """The observer of the scene that the settings name."""
-    return observer(settings, scene_settings(settings))
-
-
 def visible_surface(eye: Observer) -> eye_focus.Surface | None:
-    """The surface for a sweep of the focus, or None without a sweep. ConfigError for a scene without a surface."""
+    """The surface that the focus is swept over, or None without a sweep. ConfigError for a scene without a surface."""
     try:
         return eye_focus.visible_surface(eye) if eye.settings.sweep else None
     except ValueError as error:
@@ -60,7 +57,7 @@ def visible_surface(eye: Observer) -> eye_focus.Surface | None:
 
 
 def run_observer(eye: Observer, opened: RunFolder) -> bool:
-    """Compute the observer's view as planned and fill the folder; True if the run is complete."""
+    """Compute the observer's view and fill the folder; True if the run is complete."""
     settings, folder, files, done = eye.settings, opened.path, Results(), False
     values, surface = opened.plan.values, visible_surface(eye)
     (folder / "arrays").mkdir(exist_ok=True)
@@ -92,33 +89,32 @@ def run_observer(eye: Observer, opened: RunFolder) -> bool:
 
 
 def _fingerprint(eye: Observer) -> Fingerprint:
-    """Fingerprint without the number of realisations and the sweeps, which may change before a run is resumed."""
+    """Settings and inputs that must not change before a run is resumed."""
     settings, inputs, free = fingerprint_inputs(eye.scene)
     scene = fingerprint(settings, inputs, {*free, "report"})
-    own = fingerprint(eye.settings, {}, {"seeds", "sweep", "tradeoff", "scene"})
-    return own | {f"scene.{key}": value for key, value in scene.items()}
+    observer = fingerprint(eye.settings, {}, {"seeds", "sweep", "tradeoff", "scene"})
+    return observer | {f"scene.{key}": value for key, value in scene.items()}
 
 
 class _Views:
-    """The pictures computed so far, saved to disk from time to time.
+    """The pictures computed so far, saved to disk every 30 seconds.
 
     Attributes:
-        total: Sum of the pictures of the reference [F, 3, h, w].
+        total: Sum of the pictures of the reference for each focus, [F, 3, h, w].
         references: Number of realisations in ``total``.
-        pictures: [sources, F, 3, h, w] of each realisation.
-        checkpoint: The file that keeps them.
+        pictures: Pictures of each realisation for each source and focus, [sources, F, 3, h, w].
+        checkpoint: The file that stores them.
     """
 
     def __init__(self, eye: Observer, checkpoint: Checkpoint):
         self.eye, self.checkpoint = eye, checkpoint
         self.total, self.references = torch.zeros(()), 0
         self.pictures: list[Tensor] = []
-        self._before, self._started = 0.0, time.perf_counter()
-        self._saved = self._started
+        self._started = self._saved = time.perf_counter()
         if content := checkpoint.load():
             try:
                 self.total, self.references = content["total"], content["references"]
-                self.pictures, self._before = content["seen"], content["seconds"]
+                self.pictures, self._started = content["seen"], self._started - content["seconds"]
             except KeyError as error:
                 raise checkpoint.unreadable(error) from None
         if (done := len(self.pictures)) > (seeds := eye.settings.seeds):
@@ -128,47 +124,47 @@ class _Views:
     @property
     def seconds(self) -> float:
         """Time spent so far, including that before an interruption."""
-        return self._before + time.perf_counter() - self._started
+        return time.perf_counter() - self._started
 
     @property
     def reference(self) -> Tensor:
-        """Mean picture of the reference [F, 3, h, w]."""
+        """Mean picture of the reference for each focus, [F, 3, h, w]."""
         return self.total / self.references
 
     def compute(self, pressed: list[int]) -> None:
         """Compute the remaining pictures. A signal raises KeyboardInterrupt after all whole realisations are saved."""
-        eye, sources, focus = self.eye, self.eye.settings.light.sources, self.eye.focus
-        seeds = eye.settings.seeds
-        references, own = realisations(8 * seeds, reference=True), realisations(seeds, reference=False)
-        each = [1 + len(focus), 1 + len(focus) * len(sources)]
-        before = self.references * each[0] + len(self.pictures) * each[1]
-        total = len(references) * each[0] + len(own) * each[1]
-        with tqdm(total=total, initial=before, desc="imaging", unit="picture", dynamic_ncols=True) as bar:
+        sources, seeds = self.eye.settings.light.sources, self.eye.settings.seeds
+        # Steps of the progress bar in a realisation: one for the hologram, and one for each picture.
+        reference, measured = 1 + len(self.eye.focus), 1 + len(self.eye.focus) * len(sources)
+        done, total = self.references * reference + len(self.pictures) * measured, seeds * (8 * reference + measured)
+        with tqdm(total=total, initial=done, desc="imaging", unit="picture", dynamic_ncols=True) as bar:
             try:
-                for seed in references[self.references :]:
-                    hologram = _hologram(eye, seed, bar)
-                    pictures = torch.stack([_image(eye, hologram, None, depth, bar) for depth in focus])
+                for seed in range(_REFERENCE_SEED + self.references, _REFERENCE_SEED + 8 * seeds):
+                    pictures = self._pictures(seed, (None,), bar)[0]
                     with deferred(pressed):
                         self.total, self.references = self.total + pictures, self.references + 1
-                    self._keep(pressed)
-                for seed in own[len(self.pictures) :]:
-                    hologram = _hologram(eye, seed, bar)
-                    rows = [torch.stack([_image(eye, hologram, source, at, bar) for at in focus]) for source in sources]
-                    self.pictures.append(torch.stack(rows))
-                    self._keep(pressed)
-            except Exception:
-                self._save()
-                raise
-            except KeyboardInterrupt:
+                    self._save_in_time(pressed)
+                for seed in range(len(self.pictures), seeds):
+                    self.pictures.append(self._pictures(seed, sources, bar))
+                    self._save_in_time(pressed)
+            finally:
                 with deferred(pressed):
                     self._save()
-                raise
-            with deferred(pressed):
-                self._save()
             if pressed:
                 raise KeyboardInterrupt
 
-    def _keep(self, pressed: list[int]) -> None:
+    def _pictures(self, seed: int, sources: Sequence[str | None], bar: tqdm) -> Tensor:
+        """Pictures of a realisation, [sources, F, 3, h, w]."""
+        hologram, _ = self.eye.scene.hologram(self.eye.settings.seed + seed)
+        bar.set_postfix(mem=f"{peak_memory() / 1e9:.2f}GB", refresh=False)
+        bar.update()
+        pictures = []
+        for source, depth in itertools.product(sources, self.eye.focus):
+            pictures.append(self.eye.image(hologram, source, depth))
+            bar.update()
+        return torch.stack(pictures).unflatten(0, (len(sources), -1))
+
+    def _save_in_time(self, pressed: list[int]) -> None:
         if pressed:  # the signal came while signals were deferred
             raise KeyboardInterrupt
         if time.perf_counter() - self._saved > _SAVE_EVERY:
@@ -181,21 +177,8 @@ class _Views:
         self._saved = time.perf_counter()
 
 
-def _hologram(eye: Observer, seed: int, bar: tqdm) -> Tensor:
-    hologram, _ = eye.scene.hologram(eye.settings.seed + seed)
-    bar.set_postfix(mem=f"{peak_memory() / 1e9:.2f}GB", refresh=False)
-    bar.update()
-    return hologram
-
-
-def _image(eye: Observer, hologram: Tensor, source: str | None, depth: float, bar: tqdm) -> Tensor:
-    picture = eye.image(hologram, source, depth)
-    bar.update()
-    return picture
-
-
 def _write(out: Path, eye: Observer, views: _Views, values: dict[str, Any], files: Results) -> dict[str, Any]:
-    """Write arrays, pictures and the table; returns the numbers for the summary."""
+    """Write arrays, pictures and the table; returns numbers for the summary."""
     reference, images = views.reference, torch.stack(views.pictures)  # [F, 3, h, w], [S, sources, F, 3, h, w]
     sources, focus = eye.settings.light.sources, eye.focus
     files.write(save_array, out / "arrays" / "retina.npy", images[0])
@@ -206,9 +189,9 @@ def _write(out: Path, eye: Observer, views: _Views, values: dict[str, Any], file
     with torch.no_grad():
         rendering = eye.scene.sampler().render(eye.scene.volume)[0].cpu()
     reference = equal_power(reference, rendering.expand_as(reference))
-    shown, captions = [], []
     for f, depth in enumerate(focus):
-        peak = gamut_map(linear_srgb(reference[f], matrix)).flatten().quantile(_WHITE)
+        shown, captions = [], []
+        peak = gamut_map(linear_srgb(reference[f], matrix)).flatten().quantile(WHITE)
         for s, source in enumerate(("reference", *sources)):
             light = reference[f] if s == 0 else equal_power(images[0, s - 1, f], reference[f])
             picture = tone_map(gamut_map(linear_srgb(light, matrix)), peak=peak)
@@ -216,12 +199,7 @@ def _write(out: Path, eye: Observer, views: _Views, values: dict[str, Any], file
             shown.append(picture)
             kind = ", synthetic" if values["synthetic"] else ""
             captions.append(f"{source.replace('_', ' ')}, focus {depth * 1e3:.4g} mm{kind}")
-    columns = len(sources) + 1
-    rows = [
-        figures.comparison(shown[k : k + columns], captions[k : k + columns]) for k in range(0, len(shown), columns)
-    ]
-    for f, data in enumerate(rows):
-        files.write(write_bytes, out / "images" / f"comparison_{f}.png", data)
+        files.write(write_bytes, out / "images" / f"comparison_{f}.png", figures.comparison(shown, captions))
     measured = [
         eye.row(source, depth, images[:, s, f], reference[f])
         for s, source in enumerate(sources)

@@ -1,37 +1,37 @@
 """Speckle against sharpness: the spectral width with the best picture, per colour and distance (thesis Sec. 6.4.2)."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from scipy.integrate import trapezoid
 from torch import Tensor
 from tqdm import tqdm
 
 from holotorch.core.complex import intensity
 from holotorch.experiments.eye.config import ObserverSettings
-from holotorch.experiments.eye.experiment import PRESETS, Observer, observer
+from holotorch.experiments.eye.experiment import LIT, PRESETS, Observer, observer
 from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.experiments.volume.evaluation import pooled
-from holotorch.metrics import seed_statistics, sharpness, speckle_contrast, ssim
+from holotorch.metrics import seed_statistics, speckle_contrast, ssim
 from holotorch.optics.light.coherence import optimum_fwhm, path_difference, predicted_contrast
 from holotorch.optics.light.spectral import spectral_image
 from holotorch.optics.light.spectrum import Spectrum
 from holotorch.optics.picture import equal_power, tone_map
 from holotorch.optics.viewing.imaging import propagate_collapsed
 
-# FWHM in metres of the spectra that are compared.
-WIDTHS = tuple(1e-9 * width for width in (1.4, 2.5, 4, 6, 9, 13, 19, 28, 40, 56))
+WIDTHS = tuple(1e-9 * width for width in (1.4, 2.5, 4, 6, 9, 13, 19, 28, 40, 56))  # FWHM in metres, to be compared
 # Offsets in metres from the central wavelength at which pictures are computed, on both sides. Up to 10 nm the step is
-# 0.5 nm, half the period of the beat at the corner of a scene; from there to 84 nm it is 1 nm.
+# 0.5 nm, half the period with which the picture at the corner of a scene oscillates; beyond, it is 1 nm.
 _OFFSETS = 1e-9 * np.concatenate([np.arange(0, 10, 0.5), np.arange(10, 85.0)])
-# Number of wavelengths of a colour that are propagated; the others are derived from them. Propagating only 1 of 60
-# wavelengths causes an error of only 0.4 % (``holotorch chart eye``).
+# Number of wavelengths of a colour that are propagated; the others are derived from them. If 1 of 60 wavelengths is
+# propagated, the error is 0.4 % (``holotorch chart eye``).
 _PROPAGATED = 16
 _REFERENCE_SEED = 1000  # first seed of the realisations of the reference
-_BRIGHTEST = 0.995  # quantile of the reference that is shown as white
-_LIT = 0.05  # speckle is measured on pixels brighter than this fraction of the brightest pixel of the reference
+WHITE = 0.995  # quantile of the brightness of the reference that is shown as white
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,10 @@ class Case:
     Attributes:
         distance: Distance of the scene from the hologram in metres.
         wavelength: Central wavelength in metres.
-        aperture: Sine of the half angle of the light that carries detail; limited by the eye, the hologram or the
-            pitch of the rays.
+        aperture: Sine of the half angle of the light that carries detail, see ``Observer.detail``.
         ssim: SSIM for each of ``WIDTHS``, relative to the mean of other realisations.
         contrast: Speckle contrast for each of ``WIDTHS``.
-        sharpness: Sharpness for each of ``WIDTHS``.
-        best: FWHM in metres with the highest SSIM, by a parabola through the largest value and its neighbours.
+        best: FWHM in metres with the highest SSIM, see :func:`parabola_peak`.
         inside: Whether ``best`` lies inside the range of ``WIDTHS``.
     """
 
@@ -55,20 +53,20 @@ class Case:
     aperture: float
     ssim: tuple[float, ...]
     contrast: tuple[float, ...]
-    sharpness: tuple[float, ...]
     best: float
     inside: bool
 
     def formula(self, prefactor: float) -> float:
-        """FWHM in metres by the closed form; NaN for a prefactor of NaN."""
-        if math.isnan(prefactor):
-            return prefactor
-        return optimum_fwhm(self.wavelength, self.aperture, self.distance, defocus=prefactor)
+        """Best FWHM in metres by the closed form; NaN for a prefactor of NaN."""
+        defined = not math.isnan(prefactor)
+        return optimum_fwhm(self.wavelength, self.aperture, self.distance, defocus=prefactor) if defined else math.nan
 
     def row(self, prefactor: float) -> dict[str, Any]:
-        """A row of the table; ``prefactor`` is that of the closed form."""
-        measured = (("ssim", self.ssim, 4), ("contrast", self.contrast, 3))
-        measured += (("predicted", tuple(map(self.predicted_contrast, WIDTHS)), 3),)
+        """A row of the table; ``prefactor`` is that of the closed form for the best FWHM."""
+        difference = path_difference(self.distance, self.aperture)
+        spectra = (Spectrum.lorentzian(self.wavelength, width) for width in WIDTHS)
+        predicted = [predicted_contrast(spectrum, difference) for spectrum in spectra]
+        by_width = (("ssim", self.ssim, 4), ("contrast", self.contrast, 3), ("predicted", predicted, 3))
         return {
             "distance_mm": self.distance * 1e3,
             "wavelength_nm": round(self.wavelength * 1e9),
@@ -78,28 +76,23 @@ class Case:
             "formula_nm": round(self.formula(prefactor) * 1e9, 2),
         } | {
             f"{name}_{width * 1e9:g}": round(value, digits)
-            for name, values, digits in measured
+            for name, values, digits in by_width
             for width, value in zip(WIDTHS, values, strict=True)
         }
 
     @property
     def source(self) -> str:
-        """Preset source whose FWHM is nearest to ``best``, by ratio."""
+        """Name of the preset source whose FWHM is nearest to ``best`` on a logarithmic scale."""
         return min(PRESETS, key=lambda name: abs(math.log(PRESETS[name](self.wavelength).fwhm / self.best)))
-
-    def predicted_contrast(self, width: float) -> float:
-        """Speckle contrast in closed form for a FWHM."""
-        spectrum = Spectrum.lorentzian(self.wavelength, width)
-        return predicted_contrast(spectrum, path_difference(self.distance, self.aperture))
 
 
 def tradeoff(
     settings: ObserverSettings, scene: VolumeSettings, distances: tuple[float, ...], *, seeds: int = 2, others: int = 12
 ) -> list[Case]:
-    """Compute a case for every distance and colour, with the eye focused on the middle of the scene.
+    """Compute a case for every distance (metres) and colour, with the eye focused on the middle of the scene.
 
-    All pictures are computed with ``propagate_collapsed`` (one filter for eyepiece and eye), because each hologram
-    needs 189 wavelengths per colour.
+    ``seeds`` realisations of the random phases are compared with the mean of ``others`` more. All light is propagated
+    by ``propagate_collapsed``, because each hologram needs 189 wavelengths per colour.
     """
     cases = []
     for distance in tqdm(distances, desc="speckle against sharpness", unit="distance"):
@@ -114,76 +107,67 @@ def tradeoff(
 
 
 def _image(eye: Observer, field: Tensor, wavelength: float) -> Tensor:
-    depth = eye.focus[0]
-    image = propagate_collapsed(
-        field.conj()[None], eye.scene.grid, [wavelength], eye.display, eye.eye(depth), plane=depth
-    )
+    depth, grid = eye.focus[0], eye.scene.grid
+    image = propagate_collapsed(field.conj()[None], grid, [wavelength], eye.display, eye.eye(depth), plane=depth)
     return pooled(intensity(image[0]), eye.scene.stride)
 
 
 def _case(eye: Observer, colour: int, wavelength: float, holograms: list[Tensor], reference: Tensor) -> Case:
+    """Measurements of holograms [3, H, W] against a reference [h, w]."""
     depth = eye.focus[0]
     wavelengths = wavelength + np.concatenate([-_OFFSETS[:0:-1], _OFFSETS])
     weights = np.stack([_weights(wavelengths, Spectrum.lorentzian(wavelength, width)) for width in WIDTHS])
+    spectra, count = (torch.from_numpy(wavelengths), torch.from_numpy(weights)), min(_PROPAGATED, len(wavelengths))
     shown = []
     for hologram in holograms:
-        images = spectral_image(
-            hologram[colour].conj(),
-            eye.scene.grid,
-            torch.from_numpy(wavelengths),
-            torch.from_numpy(weights),
-            eye.display,
-            eye.eye(depth),
-            count=min(_PROPAGATED, len(wavelengths)),
-        )
+        field = hologram[colour].conj()
+        images = spectral_image(field, eye.scene.grid, *spectra, eye.display, eye.eye(depth), count=count)
         shown.append(torch.stack([pooled(image, eye.scene.stride) for image in images]))
     pictures = equal_power(torch.stack(shown), reference.expand(len(holograms), len(WIDTHS), *reference.shape))
-    peak = reference.flatten().quantile(_BRIGHTEST)
+    peak = reference.flatten().quantile(WHITE)
     tone = tone_map(pictures[..., None, :, :], peak=peak), tone_map(reference[None], peak=peak)
     quality = ssim(tone[0], tone[1].expand_as(tone[0]).contiguous(), data_range=1.0)[..., 0].mean(0)
-    contrast = speckle_contrast(pictures, reference=reference, mask=reference > _LIT * reference.max()).mean(0)
-    best, inside = _peak(np.log(np.array(WIDTHS)), quality.numpy())
+    contrast = speckle_contrast(pictures, reference=reference, mask=reference > LIT * reference.max()).mean(0)
+    best, inside = parabola_peak(np.log(WIDTHS).tolist(), quality.tolist())
     return Case(
         depth,
         wavelength,
         eye.detail(depth, wavelength),
         tuple(quality.tolist()),
         tuple(contrast.tolist()),
-        tuple(sharpness(pictures, reference).mean(0).tolist()),
         float(np.exp(best)),
         inside,
     )
 
 
 def _weights(wavelengths: np.ndarray, spectrum: Spectrum) -> np.ndarray:
-    """Weights of pictures at ``wavelengths`` in the trapezoidal rule over the band of the spectrum.
-
-    The pictures are interpolated linearly at the ends of the band.
-    """
+    """Weights of the trapezoidal rule over the band of a spectrum, whose ends are interpolated linearly."""
     low, high = (float(np.clip(end, wavelengths[0], wavelengths[-1])) for end in spectrum.band())
     inside = (wavelengths > low + 1e-13) & (wavelengths < high - 1e-13)
     nodes = np.concatenate([[low], wavelengths[inside], [high]])
-    gaps = np.diff(nodes)
-    power = spectrum.power(torch.from_numpy(nodes)).numpy() * (np.append(gaps, 0) + np.insert(gaps, 0, 0)) / 2
-    after, count = np.searchsorted(wavelengths, nodes).clip(1, len(wavelengths) - 1), len(wavelengths)
-    share = (nodes - wavelengths[after - 1]) / (wavelengths[after] - wavelengths[after - 1])
-    weights = np.bincount(after - 1, power * (1 - share), count) + np.bincount(after, power * share, count)
+    basis = np.stack([np.interp(nodes, wavelengths, picture) for picture in np.eye(len(wavelengths))])
+    weights = trapezoid(spectrum.power(torch.from_numpy(nodes)).numpy() * basis, nodes)
     return weights / weights.sum()
 
 
-def _peak(positions: np.ndarray, values: np.ndarray) -> tuple[float, bool]:
-    """Position of the maximum by a parabola through it and its neighbours, and whether it has two neighbours."""
-    i = int(values.argmax())
+def parabola_peak(positions: Sequence[float], values: Sequence[float]) -> tuple[float, bool]:
+    """Position of the maximum of a parabola through the largest value and its neighbours.
+
+    Returns:
+        The position and True, or the position of the largest value and False if it has only one neighbour.
+    """
+    i = int(np.argmax(values))
     if not 0 < i < len(positions) - 1:
-        return float(positions[i]), False
-    a, b, _ = np.polyfit(positions[i - 1 : i + 2], values[i - 1 : i + 2], 2)
-    return float(-b / (2 * a)), True
+        return positions[i], False
+    left, right = positions[i] - positions[i - 1], positions[i + 1] - positions[i]
+    rise, fall = values[i] - values[i - 1], values[i] - values[i + 1]
+    return positions[i] + 0.5 * (right**2 * rise - left**2 * fall) / (right * rise + left * fall), True
 
 
 def fitted_prefactor(cases: list[Case]) -> float:
-    """Prefactor of the closed form that fits the optima best (mean of logarithms); NaN if none is inside the widths."""
+    """Prefactor of the closed form that fits the optima best (mean of logarithms); NaN without an optimum inside."""
     ratios = [np.log(case.best / case.formula(1.0)) for case in cases if case.inside]
-    return float(np.exp(np.mean(ratios))) if ratios else float("nan")
+    return float(np.exp(np.mean(ratios))) if ratios else math.nan
 
 
 def in_words(cases: list[Case]) -> list[str]:
@@ -191,14 +175,13 @@ def in_words(cases: list[Case]) -> list[str]:
     prefactor = fitted_prefactor(cases)
     inside = [case for case in cases if case.inside]
     off = [case.best / case.formula(prefactor) - 1 for case in inside]
-    lines = [
+    return [
         f"best FWHM = 2 x {prefactor:.2f} wavelength^2 / (aperture^2 distance): {len(inside)} of {len(cases)} optima "
-        f"lie inside the widths tried, off by {min(off, default=0):+.0%} to {max(off, default=0):+.0%}"
-    ]
-    for case in cases:
-        lines.append(
+        f"lie inside the widths tried, off by {min(off, default=0):+.0%} to {max(off, default=0):+.0%}",
+        *(
             f"{case.distance * 1e3:g} mm, {case.wavelength * 1e9:.0f} nm, aperture {case.aperture:.3f}: best "
             f"{case.best * 1e9:.1f} nm (formula {case.formula(prefactor) * 1e9:.1f}), nearest to a "
             f"{case.source.replace('_', ' ')}"
-        )
-    return lines
+            for case in cases
+        ),
+    ]

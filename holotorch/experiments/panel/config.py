@@ -1,9 +1,11 @@
-"""Settings of the description of a phase panel, and the panel that is built from them."""
+"""Description of a phase panel: its settings, and the panel that is built from them."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
+import numpy as np
 import torch
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
@@ -17,14 +19,18 @@ from holotorch.io.files import read_bytes
 from holotorch.modulator.dispersion import Birefringence, BirefringenceTable, Cauchy, phase_scale
 from holotorch.modulator.panel import PhaseModulator, checked_lut, even_lut
 
-# Largest relative difference at which a wavelength uses a calibration unchanged, as lasers deviate from nominal values.
+# Largest relative difference between the wavelengths of light and calibration at which the calibration is used
+# unchanged, because the wavelength of a laser differs from its nominal value.
 _SAME = 1e-3
 
 
+def _rises(points: Sequence[tuple[float, float]]) -> bool:
+    return all(before[0] < after[0] for before, after in pairwise(points))
+
+
 def _rising(points: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
-    for before, after in zip(points, points[1:], strict=False):
-        if after[0] <= before[0]:
-            raise PydanticCustomError("lut", "expected levels that rise from row to row")
+    if not _rises(points):
+        raise PydanticCustomError("lut", "expected levels that rise from row to row")
     return points
 
 
@@ -34,9 +40,9 @@ Points = Annotated[tuple[tuple[Number, Number], ...], Field(min_length=2), After
 class CalibrationSettings(Settings):
     """Phases of the grey levels at one wavelength: evenly spaced, or a table of [level, phase in rad].
 
-    ``full_turn``: level at which the phase is 2 pi, not necessarily whole; 2^bits by default. ``lut``: rows from level
-    0 to the top level, interpolated linearly. ``lut_file``: the same table as a text file of ``level, phase`` lines,
-    with its path relative to the description.
+    ``full_turn``: level at which the phase is 2 pi, not necessarily an integer; 2^bits by default. ``lut``: rows from
+    level 0 to the top level, interpolated linearly. ``lut_file``: the same table as a text file of ``level, phase``
+    lines; its path is relative to the folder of the description.
     """
 
     wavelength: Wavelength
@@ -54,7 +60,7 @@ class DispersionSettings(Settings):
 
 
 class PanelSettings(GridSettings):
-    """A phase panel: its pixels, grey levels, calibration and orientation; see ``PhaseModulator``."""
+    """A phase panel: its pixels, grey levels, calibration and orientation, as in ``PhaseModulator``."""
 
     name: str = "panel"
     bits: Annotated[Count, Field(le=16)] = 8
@@ -103,8 +109,8 @@ def load_panel(path: Path | str, overrides: Sequence[str] = ()) -> PanelSettings
 def build_panel(settings: PanelSettings, wavelengths: Sequence[float]) -> PhaseModulator:
     """Build the panel for light of ``wavelengths`` in metres, one per channel.
 
-    The phase table of each channel is that of the calibration at its wavelength (to 0.1 %), or that of the nearest
-    calibration, scaled by the dispersion of the crystal.
+    The phases of the levels in each channel are those of the calibration at its wavelength (to 0.1 %), or those of the
+    nearest calibration, scaled by the dispersion of the liquid crystal.
 
     Raises:
         ConfigError: A wavelength has no calibration and the panel no dispersion, or it is outside the dispersion table.
@@ -125,35 +131,21 @@ def build_panel(settings: PanelSettings, wavelengths: Sequence[float]) -> PhaseM
             except ValueError as error:
                 raise ConfigError([f"the panel {settings.name}: {error}"]) from error
         rows.append(table)
-    return PhaseModulator(
-        Grid(settings.shape, settings.pitch),
-        wavelengths,
-        bits=settings.bits,
-        lut=torch.stack(rows),
-        fill_factor=settings.fill_factor,
-        gap=settings.gap,
-        flip_rows=settings.flip_rows,
-        flip_columns=settings.flip_columns,
-        crosstalk=settings.crosstalk_px,
-        birefringence=law,
-    )
+    options = settings.model_dump(include={"bits", "fill_factor", "gap", "flip_rows", "flip_columns"})
+    options |= {"crosstalk": settings.crosstalk_px, "birefringence": law}
+    return PhaseModulator(Grid(settings.shape, settings.pitch), wavelengths, lut=torch.stack(rows), **options)
 
 
 def _table(row: CalibrationSettings, bits: int) -> torch.Tensor:
     """Phase in rad of every level, float64 [2^bits]."""
     if row.lut is None:
         return even_lut(bits, row.full_turn)
+    levels, phases = zip(*row.lut, strict=True)
     top = 2**bits - 1
-    if row.lut[0][0] != 0 or row.lut[-1][0] != top:
-        raise ValueError(
-            f"expected rows from level 0 to {top}, the top one of {bits} bits, got {row.lut[0][0]:g} to "
-            f"{row.lut[-1][0]:g}"
-        )
-    points = torch.tensor(row.lut, dtype=torch.float64)
-    levels = torch.arange(top + 1, dtype=torch.float64)
-    upper = torch.bucketize(levels, points[:, 0].contiguous()).clamp(min=1)
-    (x0, y0), (x1, y1) = points[upper - 1].T, points[upper].T
-    return checked_lut(y0 + (levels - x0) / (x1 - x0) * (y1 - y0), bits)
+    if levels[0] != 0 or levels[-1] != top:
+        wanted = f"expected rows from level 0 to {top}, the top one of {bits} bits"
+        raise ValueError(f"{wanted}, got {levels[0]:g} to {levels[-1]:g}")
+    return checked_lut(torch.from_numpy(np.interp(np.arange(top + 1), levels, phases)), bits)
 
 
 def _read_points(path: Path) -> tuple[tuple[float, float], ...]:
@@ -172,7 +164,7 @@ def _read_points(path: Path) -> tuple[tuple[float, float], ...]:
         except ValueError:
             raise ValueError(f"{path}:{number}: expected a level and a phase in rad, got {line!r}") from None
         points.append((level, phase))
-    if len(points) < 2 or any(after[0] <= before[0] for before, after in zip(points, points[1:], strict=False)):
+    if len(points) < 2 or not _rises(points):
         raise ValueError(f"{path}: expected at least two rows with levels that rise from row to row")
     return tuple(points)
 
@@ -185,8 +177,3 @@ def _law(settings: DispersionSettings) -> Birefringence:
     if settings.a is None or settings.b is None:
         raise ValueError("expected both a and b, such as {a: 0.18, b: 8.5e-15}, or a table")
     return Cauchy(settings.a, settings.b)
-
-
-def described(settings: PanelSettings) -> dict[str, Any]:
-    """The description as plain data for ``export.json``."""
-    return settings.model_dump(mode="json", exclude_none=True)

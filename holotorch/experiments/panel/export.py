@@ -14,15 +14,14 @@ from holotorch import __version__
 from holotorch.core.complex import phasor
 from holotorch.core.grid import Grid
 from holotorch.experiments.config.errors import ConfigError
-from holotorch.experiments.panel.config import build_panel, described, load_panel
+from holotorch.experiments.panel.config import build_panel, load_panel
 from holotorch.experiments.panel.source import PanelPhases, load_panel_phases
 from holotorch.io.files import write_json
 from holotorch.io.panel_files import read_levels, read_phases, write_levels, write_phases
 from holotorch.modulator.panel import PhaseModulator
 
 FORMATS = ("png", "bmp", "exr")
-_CYCLE = 2 * math.pi
-# Content of the files of a pec run.
+# Entry "content" of export.json for a run of kind ``pec``.
 _AFTER_SPREADING = (
     "phase after the heat has spread, modulo 2 pi, for a liquid-crystal panel; for the heaters of a thermal chip use "
     "arrays/phase.npy, [F, C, H, W] in rad before spreading and not modulo 2 pi"
@@ -42,8 +41,8 @@ def export_slm(
 
     A hologram smaller than the panel is centred on the optical axis, with phase 0 around it; the simulation assumes
     that no light comes from the pixels around it. The files of a run of kind ``pec`` hold the phases after the heat has
-    spread, modulo 2 pi: they suit a liquid crystal, which has no thermal crosstalk, but not a thermal chip. Those of a
-    run of kind ``volume`` hold the encoded field of its first realisation.
+    spread, modulo 2 pi: they suit a liquid crystal, which has no thermal crosstalk, but not a thermal chip. The files
+    of a run of kind ``volume`` hold the encoded field of its first realisation.
 
     Args:
         folder: Folder of the run.
@@ -74,11 +73,11 @@ def export_slm(
         names = _write(place, source, panel, window, form, folder, settings.name)
         report = {
             "source": str(folder),
-            "panel": described(settings),
+            "panel": settings.model_dump(mode="json", exclude_none=True),
             "encoding": source.encoding,
             **({"content": _AFTER_SPREADING} if source.encoding == "phase" else {}),
             "format": form,
-            "files": [name for row in names for name in row],
+            "files": sum(names, []),
             "padded": source.grid.shape != panel.grid.shape,
             **resimulate(place, names, source, panel, window, form),
         }
@@ -92,14 +91,17 @@ def export_slm(
 def resimulate(
     place: Path, names: list[list[str]], source: PanelPhases, panel: PhaseModulator, window: tuple, form: str
 ) -> dict[str, Any]:
-    """Errors of the written files, computed from the files and the panel alone, one value per colour.
+    """Errors of the written files, computed from the files and the panel, one value per colour.
 
-    The errors are the rms error in rad of the phases of the levels, with its expected value for uniformly distributed
-    phases, and the relative L2 change and the correlation of the picture at its best scale: once due to the levels
-    alone, and once due to the whole panel with fringing fields and gaps.
+    They are the rms error of the phase in rad, with its expected value for uniformly distributed phases, and two errors
+    of the picture: its relative L2 change at the best scale, and its correlation with the picture of the run. The
+    errors of the picture are given for the levels alone, and for the whole panel with fringing fields and gaps.
+
+    ``names`` are the names of the files in the folder ``place``, a list of colours for each frame; ``window`` is the
+    index of the hologram in frames [..., H, W] of the panel. ConfigError for a file of another table of levels.
     """
     square = torch.zeros(len(source.wavelengths), dtype=torch.float64)
-    fields: dict[str, list[Tensor]] = {"levels": [], "panel": []}
+    fields: dict[str, list[Tensor]] = {"levels": [], "panel": []}  # one field [C, H, W] for each frame
     for frame, row in zip(source.phase, names, strict=True):
         files = [(read_phases if form == "exr" else read_levels)(place / name) for name in row]
         for c, (name, (_, facts)) in enumerate(zip(row, files, strict=True)):
@@ -107,7 +109,7 @@ def resimulate(
                 raise ConfigError([f"{name} was written for another table of levels, or has lost its metadata"])
         whole = torch.stack([each for each, _ in files])
         whole = whole.flip(panel.flips) if form == "exr" else panel.phase(whole)
-        error = torch.remainder(whole[window].double() - frame.double() + math.pi, _CYCLE) - math.pi
+        error = torch.remainder(whole[window].double() - frame.double() + math.pi, 2 * math.pi) - math.pi
         square += error.square().mean((-2, -1)) / len(names)
         fields["levels"].append(phasor(whole[window].float()))
         fields["panel"].append(panel.emitted(whole.float())[window])
@@ -118,9 +120,8 @@ def resimulate(
     }
     for name, frames in fields.items():
         after = source.picture(torch.stack(frames))
-        pairs = [_compared(a, b) for a, b in zip(after, before, strict=True)]
-        numbers[f"picture_change_by_{name}"] = [change for change, _ in pairs]
-        numbers[f"picture_correlation_{name}"] = [correlation for _, correlation in pairs]
+        changes, correlations = zip(*map(_compared, after, before), strict=True)
+        numbers |= {f"picture_change_by_{name}": list(changes), f"picture_correlation_{name}": list(correlations)}
     if source.losses:
         numbers["encoding_loss"] = source.losses
     return numbers
@@ -128,23 +129,21 @@ def resimulate(
 
 def export_text(report: dict[str, Any]) -> str:
     """Summary of an export in a few lines."""
-
-    def listed(values: list[float]) -> str:
-        return " / ".join(format(value, ".2g") for value in values)
-
+    text = {
+        name: " / ".join(f"{value:.2g}" for value in values)
+        for name, values in (report | report.get("encoding_loss", {})).items()
+        if isinstance(values, list) and name != "files"
+    }
     lines = [
-        f"Files      {len(report['files'])} {report['format']} for {report['panel']['name']}, {report['encoding']}"
+        f"Files      {len(report['files'])} {report['format']} for {report['panel']['name']}, {report['encoding']}",
+        *(["Padding    the hologram lies in the panel's middle, phase 0 around it"] if report["padded"] else []),
+        f"Phase      rms error {text['rms_phase_error_rad']} rad from the files, "
+        f"{text['expected_rms_phase_error_rad']} rad expected of these levels",
+        f"Picture    changes by {text['picture_change_by_levels']} through the levels, "
+        f"{text['picture_change_by_panel']} with the panel's gaps and fringes",
     ]
-    if report["padded"]:
-        lines.append("Padding    the hologram lies in the panel's middle, phase 0 around it")
-    error, expected = listed(report["rms_phase_error_rad"]), listed(report["expected_rms_phase_error_rad"])
-    lines.append(f"Phase      rms error {error} rad from the files, {expected} rad expected of these levels")
-    levels, panel = listed(report["picture_change_by_levels"]), listed(report["picture_change_by_panel"])
-    lines.append(f"Picture    changes by {levels} through the levels, {panel} with the panel's gaps and fringes")
-    losses = report.get("encoding_loss", {})
-    words = [f"{listed(values)} by {name}" for name, values in losses.items()]
-    if words:
-        lines.append(f"Encoding   costs {', '.join(words)} (relative squared error of the picture, no aperture)")
+    if losses := ", ".join(f"{text[name]} by {name}" for name in report.get("encoding_loss", {})):
+        lines.append(f"Encoding   costs {losses} (relative squared error of the picture, no aperture)")
     if "content" in report:
         lines.append(f"Content    {report['content']}")
     return "\n".join(lines)
@@ -154,15 +153,13 @@ def _window(hologram: Grid, panel: Grid, name: str) -> tuple:
     """Index of the hologram in frames [..., H, W] of the panel."""
     if any(abs(a / b - 1) > 1e-4 for a, b in zip(hologram.pitch, panel.pitch, strict=True)):
         run, has = (" x ".join(f"{step * 1e6:g}" for step in grid.pitch) for grid in (hologram, panel))
-        raise ConfigError(
-            [f"the run was computed for pixels of {run} um, the panel {name} has {has} um; run it again with its pitch"]
-        )
+        words = f"the run was computed for pixels of {run} um, the panel {name} has {has} um"
+        raise ConfigError([f"{words}; run it again with its pitch"])
     if any(a > b for a, b in zip(hologram.shape, panel.shape, strict=True)):
         run, has = (" x ".join(map(str, grid.shape)) for grid in (hologram, panel))
-        raise ConfigError(
-            [f"the hologram has {run} pixels, more than the {has} of the panel {name}; use a smaller grid"]
-        )
-    # Sample n // 2, the optical axis, of the hologram lies on that of the panel.
+        words = f"the hologram has {run} pixels, more than the {has} of the panel {name}"
+        raise ConfigError([f"{words}; use a smaller grid"])
+    # The optical axis, sample n // 2 of an axis of n samples, is that of the panel.
     begin = [large // 2 - small // 2 for large, small in zip(panel.shape, hologram.shape, strict=True)]
     return (..., *(slice(start, start + part) for start, part in zip(begin, hologram.shape, strict=True)))
 
@@ -178,12 +175,13 @@ def _claim(place: Path) -> None:
 
 
 def _write(
-    place: Path, source: PanelPhases, panel: PhaseModulator, window: tuple, form: str, folder: Path, name: str
+    place: Path, source: PanelPhases, panel: PhaseModulator, window: tuple, form: str, folder: Path, panel_name: str
 ) -> list[list[str]]:
     """Write all files; returns their names, a list of colours for each frame."""
+    write = write_phases if form == "exr" else write_levels
     common = {
         "program": f"holotorch {__version__}",
-        "panel": name,
+        "panel": panel_name,
         "pitch_m": list(panel.grid.pitch),
         "encoding": source.encoding,
         "bits": panel.bits,
@@ -198,20 +196,17 @@ def _write(
         whole = phase.new_zeros(len(phase), *panel.grid.shape)
         whole[window] = phase
         frames = whole.flip(panel.flips) if form == "exr" else panel.levels(whole)
-        names.append([])
-        for c, wavelength in enumerate(source.wavelengths):
+        names.append([f"frame-{f:03d}_{wavelength * 1e9:.6g}nm.{form}" for wavelength in source.wavelengths])
+        for c, (name, wavelength) in enumerate(zip(names[-1], source.wavelengths, strict=True)):
             facts = {"wavelength_m": wavelength, "lut_sha256": panel.lut_hash(c), "frame": f, "colour": c}
-            file = f"frame-{f:03d}_{wavelength * 1e9:.6g}nm.{form}"
-            write = write_phases if form == "exr" else write_levels
-            write(place / file, frames[c], common | facts)
-            names[-1].append(file)
+            write(place / name, frames[c], common | facts)
     return names
 
 
 def _compared(after: Tensor, before: Tensor) -> tuple[float, float]:
-    """Relative L2 change at the best scale, and correlation, of two pictures."""
-    a, b = after.double().flatten(), before.double().flatten()
-    scale = (a @ b) / (a @ a).clamp(min=torch.finfo(a.dtype).tiny)
-    change = (scale * a - b).norm() / b.norm().clamp(min=torch.finfo(a.dtype).tiny)
+    """Relative L2 change from ``before`` to ``after`` at the best scale, and correlation of the two pictures."""
+    a, b, tiny = after.double().flatten(), before.double().flatten(), torch.finfo(torch.float64).tiny
+    scale = (a @ b) / (a @ a).clamp(min=tiny)
+    change = (scale * a - b).norm() / b.norm().clamp(min=tiny)
     a, b = a - a.mean(), b - b.mean()
-    return change.item(), ((a @ b) / (a.norm() * b.norm()).clamp(min=torch.finfo(a.dtype).tiny)).item()
+    return change.item(), ((a @ b) / (a.norm() * b.norm()).clamp(min=tiny)).item()

@@ -1,9 +1,9 @@
-"""Phases that a panel shows for a finished run, and the propagation to the picture that they form."""
+"""PanelPhases: the phases that a panel shows for a finished run, and the picture that they form."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,13 +14,11 @@ from holotorch.core.complex import intensity
 from holotorch.core.grid import Grid
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.pec.config import PECSettings
+from holotorch.experiments.pec.experiment import PECExperiment, build
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.volume.config import VolumeSettings
 from holotorch.hologram import double_phase, encoding_loss, error_diffused, kinoform, refocused
 from holotorch.io.files import read_json
-
-if TYPE_CHECKING:
-    from holotorch.experiments.pec.experiment import PECExperiment
 
 ENCODINGS: dict[str, Callable[[Tensor], Tensor]] = {
     "double_phase": double_phase,
@@ -37,11 +35,11 @@ class PanelPhases:
         phase: float32 [F, C, H, W] in rad, not wrapped.
         wavelengths: Wavelengths of the C colours in metres.
         grid: Pixels of the hologram.
-        encoding: Encoding of the field as phases; "phase" for a run whose result is phases.
-        picture: Function from fields [F, C, H, W] to the intensity [C, ...] that they form in the plane of the picture,
-            the mean over the F frames.
-        losses: Relative squared error of the picture due to the encoding and to a kinoform, without an aperture, one
-            value per colour; empty for a run whose result is phases.
+        encoding: Encoding of the field as phases; "phase" if the result of the run is phases.
+        picture: Function from fields [F, C, H, W] to the intensity [C, ...] of the picture that they form, the mean
+            over the F frames.
+        losses: Relative squared error of the picture for this encoding and for a kinoform, without an aperture, one
+            value per colour; empty if the result of the run is phases.
     """
 
     phase: Tensor
@@ -53,40 +51,36 @@ class PanelPhases:
 
 
 def load_panel_phases(folder: Path, encoding: str | None = None) -> PanelPhases:
-    """Phases and propagation of a run folder of kind ``pec`` or ``volume``; ConfigError for any other folder."""
+    """Phases of a run of kind ``pec`` or ``volume``, from its folder; ConfigError for any other folder."""
     if not (folder / "config.yaml").is_file():
         raise ConfigError([f"{folder} holds no run: config.yaml is not there"])
     if encoding is not None and encoding not in ENCODINGS:
         raise ConfigError([f"expected one of {', '.join(ENCODINGS)} as the encoding, got {encoding!r}"])
     settings = load_config(folder / "config.yaml")
+    if not isinstance(settings, PECSettings | VolumeSettings):
+        raise ConfigError([f"{folder} holds a {settings.experiment}; only runs of kind pec and volume have a hologram"])
+    if isinstance(settings, PECSettings) and encoding is not None:
+        raise ConfigError([f"{folder} holds phases already, which need no encoding; leave out --encoding"])
     try:
         if isinstance(settings, PECSettings):
-            if encoding is not None:
-                raise ConfigError([f"{folder} holds phases already, which need no encoding; leave out --encoding"])
             return _from_pec(folder, settings)
-        if isinstance(settings, VolumeSettings):
-            return _from_volume(folder, settings, encoding or "double_phase")
+        return _from_volume(folder, settings, encoding or "double_phase")
     except ConfigError:
         raise
     except ValueError as error:
         raise ConfigError([f"{folder}: {error}"]) from error
-    raise ConfigError([f"{folder} holds a {settings.experiment}; only runs of kind pec and volume have a hologram"])
 
 
 def _from_pec(folder: Path, settings: PECSettings) -> PanelPhases:
-    from holotorch.experiments.pec.experiment import build
-
     experiment = build(settings)
-    colours = len(settings.wavelengths)
-    shape = (settings.frames, colours, *settings.grid.shape)
+    shape = (settings.frames, len(settings.wavelengths), *settings.grid.shape)
     heaters = _array(folder / "arrays" / "phase.npy", shape, "(F, C, H, W)", "float32")
     checks.all_finite("phase", heaters)
     _check_axes(folder, experiment, heaters)
     phase = experiment.array.crosstalk(heaters[:, experiment.lit].double()).float()
 
     def picture(fields: Tensor) -> Tensor:
-        device = experiment.device
-        formed = [intensity(experiment.propagator(each.to(device))) for each in fields]
+        formed = [intensity(experiment.propagator(each.to(experiment.device))) for each in fields]
         return experiment.picture_in(torch.stack(formed).mean(0)).cpu()
 
     return PanelPhases(phase, experiment.wavelengths, experiment.grid, "phase", picture)
@@ -98,7 +92,7 @@ def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> Panel
     shape = (len(settings.wavelengths), height, width)
     hologram = _array(folder / "arrays" / "hologram.npy", shape, "(C, H, W)", "complex64")
     checks.all_finite("hologram", torch.view_as_real(hologram))
-    # Scaled to about 1 by an exact power of two, as the losses contain fourth powers that may overflow float32.
+    # The losses contain fourth powers, which may overflow float32. A power of two scales the field without rounding.
     hologram = hologram * 2.0 ** -torch.frexp(hologram.abs().amax()).exponent.double().item()
     depth = _depth(folder, settings)
 
@@ -109,16 +103,17 @@ def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> Panel
         return torch.stack([intensity(propagator(c)(fields[:, c])).mean(0) for c in range(fields.shape[1])])
 
     phase = torch.stack([ENCODINGS[encoding](each) for each in hologram])
-    losses = {}
-    for name, phases in ((encoding, phase), ("kinoform", kinoform(hologram))):
-        losses[name] = [encoding_loss(hologram[c], phases[c], propagator(c)).item() for c in range(len(hologram))]
+    losses = {
+        name: [encoding_loss(hologram[c], phases[c], propagator(c)).item() for c in range(len(hologram))]
+        for name, phases in ((encoding, phase), ("kinoform", kinoform(hologram)))
+    }
     return PanelPhases(phase[None], settings.wavelengths, grid, encoding, picture, losses)
 
 
-def _check_axes(folder: Path, experiment: "PECExperiment", heaters: Tensor) -> None:
-    """Raise ValueError for a phase.npy whose first two axes were exchanged; with F = C its shape does not show this.
+def _check_axes(folder: Path, experiment: PECExperiment, heaters: Tensor) -> None:
+    """Raise ValueError for a phase.npy of F = C whose first two axes were exchanged, which its shape does not show.
 
-    The heating power of each colour in the run's summary identifies the order [F, C, H, W].
+    The heating power of each colour in the run's summary identifies the order of the axes.
     """
     try:
         numbers = _summary(folder).get("methods", {}).get("corrected", {}).get("heating_power_K_per_pixel")
@@ -141,7 +136,7 @@ def _check_axes(folder: Path, experiment: "PECExperiment", heaters: Tensor) -> N
 
 
 def _depth(folder: Path, settings: VolumeSettings) -> float:
-    """The middle one of the depths in metres at which the run was refocused."""
+    """The middle of the depths at which the run was refocused, in metres."""
     try:
         depths = _summary(folder).get("refocused_m") or [settings.hologram.distance / settings.scale]
         return checks.finite("refocused_m", depths[len(depths) // 2], "metres")

@@ -6,7 +6,6 @@ import torch
 
 from holotorch.core.complex import wrapped
 from holotorch.correction import Solution, deconvolve, gerchberg_saxton, inverse, iterative_pec
-from holotorch.correction.run import Callback
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.optics import DepthStack
 
@@ -14,7 +13,7 @@ PASSES = 100  # passes of Gerchberg-Saxton and of basic IPEC, as in the thesis's
 IPEC_PASSES = 30  # passes of IPEC, each with 30 steps of deconvolution
 
 
-def baseline(experiment: PECExperiment, name: str, callback: Callback | None = None) -> Solution:
+def baseline(experiment: PECExperiment, name: str) -> Solution:
     """Heater phases [C, H, W] of the lit colours, one frame, by a method of the thesis's comparisons.
 
     "none": phases of Gerchberg-Saxton, without any correction. "chopping" and "shifting": these phases deconvolved by
@@ -22,8 +21,8 @@ def baseline(experiment: PECExperiment, name: str, callback: Callback | None = N
     phases deconvolved by non-negative least squares. "basic_ipec": Gerchberg-Saxton with the crosstalk in its loop.
     "ipec": iterative proximity effect correction, which also deconvolves in the loop (Algorithm 1).
 
-    All methods begin with the image that the solver's start phases form, so that the same share of light is in the
-    window. ValueError for a crosstalk that has no inverse.
+    All methods begin with the phase of the image that the solver's start phases form, so that the same share of light
+    is in the window. ValueError for a crosstalk that has no inverse.
     """
     propagator, crosstalk = experiment.propagator, experiment.array.crosstalk
     assert not isinstance(propagator, DepthStack)
@@ -33,11 +32,9 @@ def baseline(experiment: PECExperiment, name: str, callback: Callback | None = N
     target = experiment.target.to(start)
     mask = None if experiment.mask is None else experiment.mask.to(start)
     if name == "ipec":
-        return iterative_pec(propagator, crosstalk, target, start, max_steps=IPEC_PASSES, mask=mask, callback=callback)
+        return iterative_pec(propagator, crosstalk, target, start, max_steps=IPEC_PASSES, mask=mask)
     spread = crosstalk if name == "basic_ipec" else None
-    solution = gerchberg_saxton(
-        propagator, target, start, max_steps=PASSES, crosstalk=spread, mask=mask, callback=callback
-    )
+    solution = gerchberg_saxton(propagator, target, start, max_steps=PASSES, crosstalk=spread, mask=mask)
     phase = wrapped(solution.x)
     if name in ("chopping", "shifting"):
         phase = inverse(crosstalk, phase)

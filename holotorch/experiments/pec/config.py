@@ -1,7 +1,8 @@
 """Settings of a configuration of kind ``pec``, proximity effect correction."""
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import PydanticCustomError
@@ -31,11 +32,7 @@ def _not_zero(value: float) -> float:
     return value
 
 
-def _is_picture(value: str) -> bool:
-    return value in BUNDLED_IMAGES or Path(value).is_file()
-
-
-Picture = Annotated[str, existing(_is_picture, no_such_picture)]
+Picture = Annotated[str, existing(lambda name: name in BUNDLED_IMAGES or Path(name).is_file(), no_such_picture)]
 # The heater phases at which the solver starts; plan.py describes each of them.
 Start = Literal["hot", "cool", "flat", "quadratic", "retrieved"]
 SIGMA_MEANING = (
@@ -47,8 +44,9 @@ SIGMA_MEANING = (
 class PeripheralWeightSettings(Settings):
     """Weight of the squared error that falls with the eccentricity E as visual acuity does: (1 + E / e2_deg)^-2.
 
-    ``field_deg``: angle that the picture spans from left to right, at equal angles per pixel; ``gaze_deg``: elevation
-    and azimuth of the gaze; ``least``: lower limit of the weight, relative to that at the gaze.
+    ``field_deg``: angle that the picture spans from left to right; every pixel spans the same angle. ``gaze_deg``:
+    elevation and azimuth of the gaze from the middle of the picture. ``least``: lower limit of the weight, relative to
+    the weight at the gaze.
     """
 
     kind: Literal["peripheral"]
@@ -62,9 +60,9 @@ class TargetSettings(Settings):
     """A bundled photograph or a picture file, cropped or padded to the aspect ratio of the grid or of a region of it.
 
     ``region``: size in pixels of the middle part of the image that shows the picture; the rest of the image is free
-    (thesis Eqs. 4.7, 4.8). ``depths``: with several distances, ``bands`` divides the picture into as many vertical
-    bands, each of which is the target at one distance only; with ``full`` the whole picture is the target at each.
-    ``weight``: weight of the squared error over the picture.
+    (thesis Eqs. 4.7, 4.8). ``depths``: ``bands`` divides the picture into as many vertical bands as there are
+    distances, and each band is the target at one distance only; with ``full`` the whole picture is the target at every
+    distance. ``weight``: weight of the squared error over the picture.
     """
 
     image: Picture
@@ -78,9 +76,9 @@ class ModulatorSettings(Settings):
     """The phased array and the heat that spreads between its pixels.
 
     ``sigma_px``: width of the heat kernel. ``kernel_size``: its number of taps, by default as many as the width needs.
-    ``max_phase``: limit in rad on the phase after spreading, also of the hottest pixel (4 pi is 700 degC at 630 nm);
-    the thesis has no limit. ``bits``: resolution of the heaters, whose levels are even between 0 and the largest phase.
-    ``power_weight``: weight of the sum of the heater phases, which is added to the squared error of the image.
+    ``max_phase``: upper limit in rad on the phase of every pixel after spreading (4 pi is 700 degC at 630 nm); no limit
+    by default, as in the thesis. ``bits``: resolution of the heaters, whose levels are evenly spaced from 0 to the
+    largest phase. ``power_weight``: weight of the sum of the heater phases, which is added to the squared error.
     """
 
     sigma_px: Annotated[Number, plausible(SIGMA_PX), Field(description=SIGMA_MEANING)]
@@ -106,7 +104,17 @@ class NearFieldSettings(Settings):
     boundary: Literal["isolated", "periodic"] = "isolated"
 
 
-class APGSettings(Settings):
+class _SolverSettings(Settings):
+    """Settings of any solver. It stops after ``patience`` steps with a relative change of loss below ``tolerance``."""
+
+    kind: Any  # name of the solver, stated by each of the classes below
+    max_steps: Count = 400
+    tolerance: Annotated[Number, Field(ge=0)] = 1e-3
+    patience: Count = 10
+    start: Start | None = None
+
+
+class APGSettings(_SolverSettings):
     """Accelerated proximal gradient, thesis Algorithm 2."""
 
     kind: Literal["apg"]
@@ -114,32 +122,22 @@ class APGSettings(Settings):
     shrink: Annotated[Number, Field(gt=0, lt=1)] = 0.5
     grow: Annotated[Number, Field(ge=1, le=10)] = 1.0
     restart: bool = False
-    max_steps: Count = 400
-    tolerance: Annotated[Number, Field(ge=0)] = 1e-3
-    patience: Count = 10
-    start: Start | None = None
 
 
-class AdamSettings(Settings):
+class AdamSettings(_SolverSettings):
     """Adam with projection onto phases >= 0."""
 
     kind: Literal["adam"]
     learning_rate: Annotated[Number, Field(ge=1e-6, le=10)] = 0.1
-    max_steps: Count = 400
-    tolerance: Annotated[Number, Field(ge=0)] = 1e-3
-    patience: Count = 10
-    start: Start | None = None
 
 
-class LBFGSSettings(Settings):
+class LBFGSSettings(_SolverSettings):
     """Preconditioned L-BFGS in stages: first the loss of the amplitude, then that of the intensity with any limit."""
 
     kind: Literal["lbfgs"]
     memory: Annotated[Count, Field(le=100)] = 3
     max_steps: Count = 300
     tolerance: Annotated[Number, Field(ge=0)] = 1e-4
-    patience: Count = 10
-    start: Start | None = None
 
 
 # Methods to compare with; "unweighted" is the solver of the run without target.weight.
@@ -173,50 +171,38 @@ class PECSettings(Settings):
     report: ReportSettings = ReportSettings()
 
 
-def contradictions(settings: PECSettings) -> list[tuple[Key, str]]:
+def contradictions(settings: PECSettings) -> Iterator[tuple[Key, str]]:
     """Settings that are valid one by one but contradict each other: the key and the message for each."""
-    mistakes: list[tuple[Key, str]] = []
-    smallest = min(settings.grid.shape)
+    shape, light, size = settings.grid.shape, settings.propagator, settings.modulator.kernel_size
+    region, weight, scored_by_ssim = settings.target.region, settings.target.weight, "ssim" in settings.report.metrics
     if len(settings.wavelengths) not in (1, 3):
-        mistakes.append(
-            (("wavelengths",), f"expected 1 (grey) or 3 (red, green, blue), got {len(settings.wavelengths)}")
-        )
-    if "ssim" in settings.report.metrics and smallest < 11:
+        yield ("wavelengths",), f"expected 1 (grey) or 3 (red, green, blue), got {len(settings.wavelengths)}"
+    if scored_by_ssim and min(shape) < 11:
         hint = "use a larger grid, or report.metrics: [psnr]"
-        mistakes.append(
-            (("grid", "shape"), f"expected at least 11 x 11 px for ssim, got {settings.grid.shape}; {hint}")
-        )
-    size = settings.modulator.kernel_size
+        yield ("grid", "shape"), f"expected at least 11 x 11 px for ssim, got {shape}; {hint}"
     if size is not None and size % 2 == 0:
-        mistakes.append((("modulator", "kernel_size"), f"expected an odd number of taps, got {size}; use {size + 1}"))
-    elif size is not None and size > smallest:
-        key = ("modulator", "kernel_size")
-        mistakes.append((key, f"expected at most {smallest}, the smaller side of the grid, got {size}"))
-    light, finest, longest = settings.propagator, min(settings.grid.pitch), max(settings.wavelengths, default=0.0)
+        yield ("modulator", "kernel_size"), f"expected an odd number of taps, got {size}; use {size + 1}"
+    elif size is not None and size > min(shape):
+        message = f"expected at most {min(shape)}, the smaller side of the grid, got {size}"
+        yield ("modulator", "kernel_size"), message
+    finest, longest = min(settings.grid.pitch), max(settings.wavelengths, default=0.0)
     if isinstance(light, NearFieldSettings) and finest < 0.9 * longest:
         least = f"at least 0.9 of the longest wavelength, {0.9 * longest:.3g} m, for an image at a distance"
-        mistakes.append((("grid", "pitch"), f"expected {least}, got {finest:g} m"))
-    smaller = settings.target.region
-    if smaller and (smaller[0] > settings.grid.shape[0] or smaller[1] > settings.grid.shape[1]):
-        mistakes.append((("target", "region"), f"expected at most the grid, {settings.grid.shape}, got {smaller}"))
-    if smaller and "ssim" in settings.report.metrics and min(smaller) < 11:
-        mistakes.append((("target", "region"), f"expected at least 11 x 11 px for ssim, got {smaller}"))
-    limit = settings.modulator.max_phase
-    if limit is not None and settings.solver.kind != "lbfgs":
-        hint = "'solver={kind: lbfgs}'"
-        mistakes.append(
-            (("modulator", "max_phase"), f"only the solver lbfgs keeps a limit; use {hint}, or leave it out")
-        )
+        yield ("grid", "pitch"), f"expected {least}, got {finest:g} m"
+    if region and (region[0] > shape[0] or region[1] > shape[1]):
+        yield ("target", "region"), f"expected at most the grid, {shape}, got {region}"
+    if region and scored_by_ssim and min(region) < 11:
+        yield ("target", "region"), f"expected at least 11 x 11 px for ssim, got {region}"
+    if settings.modulator.max_phase is not None and settings.solver.kind != "lbfgs":
+        message = "only the solver lbfgs keeps a limit; use 'solver={kind: lbfgs}', or leave it out"
+        yield ("modulator", "max_phase"), message
     several = isinstance(light, NearFieldSettings) and len(light.distance) > 1
-    if several and smaller:
-        mistakes.append((("target", "region"), "expected one distance beside a region"))
-    if settings.target.weight and (several or smaller):
-        mistakes.append((("target", "weight"), "expected one distance and no region beside a weight"))
-    if settings.target.weight:
-        rows, columns = settings.grid.shape
-        if (high := settings.target.weight.field_deg * rows / columns) > 360:
-            field = f"expected a picture of at most 360 deg in height as well, got {high:g}"
-            mistakes.append((("target", "weight", "field_deg"), field))
-    if "unweighted" in settings.report.baselines and not settings.target.weight:
-        mistakes.append((("report", "baselines"), "unweighted asks for a target.weight that can be left out"))
-    return mistakes
+    if several and region:
+        yield ("target", "region"), "expected one distance beside a region"
+    if weight and (several or region):
+        yield ("target", "weight"), "expected one distance and no region beside a weight"
+    if weight and (high := weight.field_deg * shape[0] / shape[1]) > 360:
+        message = f"expected a picture of at most 360 deg in height as well, got {high:g}"
+        yield ("target", "weight", "field_deg"), message
+    if "unweighted" in settings.report.baselines and not weight:
+        yield ("report", "baselines"), "unweighted asks for a target.weight that can be left out"

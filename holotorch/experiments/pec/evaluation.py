@@ -1,4 +1,4 @@
-"""Scores of heater phases, from a simulation in float64 that does not use results of the solver."""
+"""Scores of heater phases, from a simulation in float64 that uses nothing of the solver but the phases."""
 
 import math
 from dataclasses import dataclass
@@ -14,16 +14,14 @@ from holotorch.experiments.pec.weight import zone_scores
 from holotorch.metrics import SSIM_WINDOW, psnr, ssim
 from holotorch.optics import CroppedKernel
 
-_METRICS = {"ssim": ssim, "psnr": psnr}
-
 
 @dataclass(frozen=True)
 class Result:
-    """One method's outcome.
+    """Result of one method, for all C colours of the configuration.
 
     Attributes:
-        phase: Heater phases in rad, [F, C, H, W] for F frames and C colours.
-        picture: Intensity, scaled so that it can be compared with the target, float64 [C, h, w] in its pixels.
+        phase: Heater phases in rad, [F, C, H, W] for F frames.
+        picture: Intensity in the pixels of the target and on its scale, float64 [C, h, w].
         isolated: The same for a single chip without periodic repetition; None in the far field.
         numbers: Entry of summary.json for the method.
     """
@@ -35,28 +33,26 @@ class Result:
 
 
 def quality(experiment: PECExperiment, phase: Tensor) -> float:
-    """First metric of ``report.metrics``, mean over the lit colours, of phases [F, C, H, W]; for progress bars."""
-    name = experiment.settings.report.metrics[0]
+    """First metric of ``report.metrics`` for heater phases [F, C, H, W], mean over the lit colours."""
     formed = experiment.picture_in(experiment.intensity(phase.double())).cpu()
     picture = _as_picture(experiment, formed, at_best_scale=experiment.scale_free)
-    return _scores(experiment, picture, experiment.image)[f"{name}_mean"]
+    return _scores(experiment, picture, experiment.image)[f"{experiment.settings.report.metrics[0]}_mean"]
 
 
 def evaluate(experiment: PECExperiment, phase: Tensor) -> Result:
     """Score heater phases [F, C, H, W] of the lit colours.
 
-    There are three scores: at the samples of the image, half a sample off them, and for a single chip without periodic
-    repetition.
+    The image is scored at its samples, half a sample off them, and for a single chip without periodic repetition.
     """
     phase = phase.detach().double()
+    spread = experiment.array.crosstalk(phase)
     formed = experiment.picture_in(experiment.intensity(phase)).cpu()
     picture = _as_picture(experiment, formed, at_best_scale=experiment.scale_free)
-    warm = experiment.array.temperature(experiment.array.crosstalk(phase))
-    driven = experiment.array.temperature(phase)
+    warm, driven = experiment.array.temperature(spread), experiment.array.temperature(phase)
     numbers = _scores(experiment, picture, experiment.image) | {
         "frames": len(phase),
-        "efficiency": _per_colour(experiment, _efficiency(experiment, formed)),
-        "peak_phase_rad": experiment.array.crosstalk(phase).max().item(),
+        "efficiency": _efficiency(experiment, formed),
+        "peak_phase_rad": spread.max().item(),
         "peak_temperature_rise_K": _per_colour(experiment, warm.amax((0, -2, -1))),
         "mean_temperature_rise_K": _per_colour(experiment, warm.mean((0, -2, -1))),
         "heating_power_K_per_pixel": _per_colour(experiment, driven.mean((0, -2, -1))),
@@ -70,41 +66,42 @@ def evaluate(experiment: PECExperiment, phase: Tensor) -> Result:
         shifted = [intensity(experiment.propagator(experiment.array(each) * half_a_sample)) for each in phase]
         between = experiment.picture_in(torch.stack(shifted).mean(0)).cpu()
         if experiment.scale_free:
-            between = between * best_scale(formed, experiment.wanted)[:, None, None]
+            between = between * _scale(experiment, formed)
     numbers["between_samples"] = _between_scores(experiment, between)
     if weight := experiment.settings.target.weight:
         numbers["zones"] = zone_scores(weight, picture, experiment.image, experiment.lit)
     return Result(_all_colours(experiment, phase.cpu()), picture, isolated, numbers)
 
 
-def _efficiency(experiment: PECExperiment, formed: Tensor) -> Tensor:
-    """Share of the array's light that falls in the picture, [C]."""
-    return formed.sum((-2, -1)) / math.prod(experiment.grid.shape)
+def _efficiency(experiment: PECExperiment, formed: Tensor) -> list[float]:
+    """Share of the array's light that falls in the picture, for each colour."""
+    return _per_colour(experiment, formed.sum((-2, -1)) / math.prod(experiment.grid.shape))
+
+
+def _scale(experiment: PECExperiment, formed: Tensor) -> Tensor:
+    """Factors [C, 1, 1] by which an intensity fits the target best."""
+    return best_scale(formed, experiment.wanted)[:, None, None]
 
 
 def _isolated(experiment: PECExperiment, phase: Tensor) -> tuple[Tensor, dict[str, Any], Tensor]:
-    """Picture of a single chip by the exact kernel, its scores, and the intensity half a sample off the samples."""
-    shape = (len(experiment.wavelengths), len(experiment.distances), *experiment.grid.shape)
-    formed, between = (torch.zeros(shape, dtype=torch.float64) for _ in range(2))
-    half = experiment.grid.pitch[0] / 2, experiment.grid.pitch[1] / 2
+    """Picture of a single chip by the exact kernel, its scores, and the intensity half a sample off its samples."""
+    grid, axes = experiment.grid, (2, len(experiment.wavelengths), len(experiment.distances))
+    images = torch.zeros(*axes, *grid.shape, dtype=torch.float64)  # at the samples, and half a sample off them
     for i, wavelength in enumerate(experiment.wavelengths):  # one kernel at a time, since float64 kernels are large
         for j, distance in enumerate(experiment.distances):
-            for offset, total in (((0.0, 0.0), formed), (half, between)):
-                exact = CroppedKernel(experiment.grid, wavelength, distance, offset=offset).to(experiment.device)
+            for k, offset in enumerate(((0.0, 0.0), (grid.pitch[0] / 2, grid.pitch[1] / 2))):
+                exact = CroppedKernel(grid, wavelength, distance, offset=offset).to(experiment.device)
                 for each in phase:
-                    total[i, j] += intensity(exact(experiment.array(each)[i : i + 1]))[0].cpu() / len(phase)
-    if len(experiment.distances) == 1:
-        formed, between = formed[:, 0], between[:, 0]
-    formed, between = experiment.picture_in(formed), experiment.picture_in(between)
+                    images[k, i, j] += intensity(exact(experiment.array(each)[i : i + 1]))[0].cpu() / len(phase)
+    formed, between = experiment.picture_in(images[:, :, 0] if len(experiment.distances) == 1 else images)
     picture = _as_picture(experiment, formed, at_best_scale=True)
     numbers = _scores(experiment, picture, experiment.image)
-    numbers["efficiency"] = _per_colour(experiment, _efficiency(experiment, formed))
-    scale = best_scale(formed, experiment.wanted)[:, None, None]
-    return picture, numbers, between * scale
+    numbers["efficiency"] = _efficiency(experiment, formed)
+    return picture, numbers, between * _scale(experiment, formed)
 
 
 def _between_scores(experiment: PECExperiment, between: Tensor) -> dict[str, Any]:
-    """Scores half a sample off the image's samples, against the mean of the four nearest pixels of the picture."""
+    """Scores half a sample off the image's samples, against the mean of the four nearest pixels of the target."""
     picture = _as_picture(experiment, between, at_best_scale=False)[..., :-1, :-1]
     image = experiment.image
     wanted = (image[..., 1:, 1:] + image[..., 1:, :-1] + image[..., :-1, 1:] + image[..., :-1, :-1]) / 4
@@ -112,9 +109,10 @@ def _between_scores(experiment: PECExperiment, between: Tensor) -> dict[str, Any
 
 
 def _scores(experiment: PECExperiment, picture: Tensor, image: Tensor) -> dict[str, Any]:
+    """Each metric of the report, one value for every colour and the mean over the lit colours; None if infinite."""
     numbers: dict[str, Any] = {}
     for name in experiment.settings.report.metrics:
-        values = _METRICS[name](picture.clamp(0, 1), image, data_range=1.0)
+        values = (ssim if name == "ssim" else psnr)(picture.clamp(0, 1), image, data_range=1.0)
         numbers[name] = [_finite(value) for value in values.tolist()]
         numbers[f"{name}_mean"] = _finite(values[experiment.lit].mean().item())
     return numbers
@@ -122,10 +120,8 @@ def _scores(experiment: PECExperiment, picture: Tensor, image: Tensor) -> dict[s
 
 def _as_picture(experiment: PECExperiment, formed: Tensor, *, at_best_scale: bool) -> Tensor:
     """Intensity of the lit colours [C, h, w] scaled to the target's mean in each; zeros for the other colours."""
-    if at_best_scale:
-        formed = formed * best_scale(formed, experiment.wanted)[:, None, None]
     mean = experiment.image[experiment.lit].mean((-2, -1), keepdim=True)
-    return _all_colours(experiment, formed * mean)
+    return _all_colours(experiment, (formed * _scale(experiment, formed) if at_best_scale else formed) * mean)
 
 
 def _all_colours(experiment: PECExperiment, lit: Tensor) -> Tensor:

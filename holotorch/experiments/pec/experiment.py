@@ -2,7 +2,6 @@
 
 import math
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -27,16 +26,14 @@ from holotorch.correction import (
     run_stages,
     spread_preconditioner,
 )
-from holotorch.correction.run import State
+from holotorch.correction.run import Callback, State
 from holotorch.experiments.config.errors import ConfigError
-from holotorch.experiments.pec.config import APGSettings, LBFGSSettings, NearFieldSettings, PECSettings
+from holotorch.experiments.pec.config import PECSettings
 from holotorch.experiments.pec.weight import weight_map
 from holotorch.io.images import fit_image, frame_image, load_image, with_channels
 from holotorch.modulator import PhasedArray, ThermalCrosstalk, quantised
 from holotorch.optics import AngularSpectrum, CroppedKernel, DepthStack, Fraunhofer, Fresnel
 from holotorch.optics.free_space.propagators import SpectralFilter
-
-Progress = Callable[[Solution], None]
 
 
 @dataclass(frozen=True)
@@ -75,18 +72,16 @@ class PECExperiment:
     @property
     def distances(self) -> tuple[float, ...]:
         """Distances of the image in metres; none in the far field."""
-        light = self.settings.propagator
-        return light.distance if isinstance(light, NearFieldSettings) else ()
+        return getattr(self.settings.propagator, "distance", ())
 
     @property
     def isolated(self) -> bool:
         """Whether the model is a single chip with an image at a distance, where light may leave the window."""
-        light = self.settings.propagator
-        return isinstance(light, NearFieldSettings) and light.boundary == "isolated"
+        return getattr(self.settings.propagator, "boundary", None) == "isolated"
 
     @property
     def scale_free(self) -> bool:
-        """Whether light may leave the picture, so that the image is compared at its best scale."""
+        """Whether light may leave the picture, so that the image is scaled to fit the target best before comparison."""
         return self.isolated or self.settings.target.region is not None
 
     @property
@@ -96,25 +91,25 @@ class PECExperiment:
 
     @cached_property
     def image(self) -> Tensor:
-        """The picture resampled to its pixels, float64 [all colours, H, W]; computed on first use, not for a plan."""
+        """The picture resampled to the grid, or to the region, float64 [all colours, H, W]; a plan does not need it."""
         settings = self.settings
         fitted = fit_image(self.source, settings.target.region or settings.grid.shape, settings.target.fit)
         return with_channels(fitted, len(settings.wavelengths)).contiguous()
 
     @property
     def wanted(self) -> Tensor:
-        """Intensity of the lit colours of the picture, scaled to mean 1 each, float64 [C, H, W]."""
+        """Intensity of the lit colours of the picture, each scaled to mean 1, float64 [C, H, W]."""
         image = self.image[self.lit]
         return image / image.mean((-2, -1), keepdim=True)
 
     @property
     def target(self) -> Tensor:
-        """Wanted intensity [C, *image]: the picture in the middle of the grid, or at each of several distances."""
+        """Wanted intensity [C, *image]; *image is (H, W), or (D, H, W) with the picture at each of D > 1 distances."""
         wanted = self.wanted
         if region := self.settings.target.region:
             whole = wanted.new_zeros(len(wanted), *self.grid.shape)
             whole[self.window] = wanted
-            # A region holds about half of the light of such holograms. The scale of the image is free.
+            # About half of the light falls in the region; the exact share does not matter, as the scale is free.
             return whole * (math.prod(self.grid.shape) / math.prod(region) / 2)
         return wanted[:, None].repeat(1, len(self.distances), 1, 1) if len(self.distances) > 1 else wanted
 
@@ -122,12 +117,12 @@ class PECExperiment:
     def window(self) -> tuple[Any, ...]:
         """Index of the picture in a tensor [..., H, W] on the grid."""
         size = self.settings.target.region or self.grid.shape
-        begin = [whole // 2 - part // 2 for whole, part in zip(self.grid.shape, size, strict=True)]
-        return (..., slice(begin[0], begin[0] + size[0]), slice(begin[1], begin[1] + size[1]))
+        first = [whole // 2 - part // 2 for whole, part in zip(self.grid.shape, size, strict=True)]
+        return (..., *(slice(start, start + part) for start, part in zip(first, size, strict=True)))
 
     @property
     def mask(self) -> Tensor | None:
-        """1 where the image is compared with the target, else 0, float64, broadcasts to the target; None for all 1."""
+        """1 where the image is compared with the target and 0 elsewhere, float64; None if it is compared everywhere."""
         depths, width = len(self.distances), self.grid.shape[1]
         if self.settings.target.region:
             mask = torch.zeros(1, *self.grid.shape, dtype=torch.float64)
@@ -142,7 +137,7 @@ class PECExperiment:
 
     @property
     def weights(self) -> Tensor | None:
-        """Factor on the error: the mask, or the square root of ``target.weight``. None for 1 everywhere."""
+        """Factor on the error: the mask, or the square root of ``target.weight``; None for a factor of 1."""
         if self.settings.target.weight is None:
             return self.mask
         return weight_map(self.settings.target.weight, self.grid.shape).sqrt()[None]
@@ -154,7 +149,10 @@ class PECExperiment:
         return replace(self, settings=self.settings.model_copy(update={"target": target}))
 
     def picture_in(self, formed: Tensor) -> Tensor:
-        """The picture [..., C, h, w] in an intensity [..., C, *image]: its region, or the bands that are in focus."""
+        """Cut the picture [..., C, h, w] out of an image intensity [..., C, *image].
+
+        It consists of the region, of the bands in focus at each distance, or else of the mean over the distances.
+        """
         if len(self.distances) < 2:
             return formed[self.window]
         mask = self.mask
@@ -172,25 +170,22 @@ class PECExperiment:
         paraxial = self.settings.propagator.kind == "fresnel"
         if self.isolated:
             return CroppedKernel(self.grid, self.wavelengths, distance, paraxial=paraxial)
-        with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the plan's notes contain it
+        with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the plan reports it in a note
             if paraxial:
                 return Fresnel(self.grid, self.wavelengths, distance, pad=1)
             return AngularSpectrum(self.grid, self.wavelengths, distance, pad=1, band_limit=False)
 
     def problem(self, dtype: torch.dtype = torch.float32, **options) -> PECProblem:
-        """The objective over the lit colours."""
-        target, mask = (None if part is None else part.to(self.device, dtype) for part in (self.target, self.weights))
-        assert target is not None
-        return PECProblem(
-            self.array.crosstalk,
-            self.propagator,
-            target,
-            mask=mask,
-            scale_free=self.scale_free,
-            frames=self.joint,
-            power_weight=self.settings.modulator.power_weight,
-            **options,
-        )
+        """The objective over the lit colours; ``options`` of :class:`PECProblem` replace those of the configuration."""
+        weights = self.weights
+        configured: dict[str, Any] = {
+            "mask": None if weights is None else weights.to(self.device, dtype),
+            "scale_free": self.scale_free,
+            "frames": self.joint,
+            "power_weight": self.settings.modulator.power_weight,
+        }
+        target = self.target.to(self.device, dtype)
+        return PECProblem(self.array.crosstalk, self.propagator, target, **configured | options)
 
     def intensity(self, phase: Tensor) -> Tensor:
         """Mean intensity [C, *image] of the frames of heater phases [F, C, H, W]."""
@@ -213,23 +208,19 @@ class PECExperiment:
         if self.start == "quadratic":
             (y, x), (height, width) = self.grid.coordinates(self.device), self.grid.shape
             y, x = y / self.grid.pitch[0], x / self.grid.pitch[1]
-            lens = math.pi * (y.square() / height + x.square() / width)  # with a slope of pi per pixel at the edge
+            lens = math.pi * (y.square() / height + x.square() / width)  # its slope at the edge is pi per pixel
             return (lens / spread + 0.01 * uniform).to(uniform.dtype)
         if self.start == "retrieved":
-            return self._retrieved(2 * math.pi * uniform)
+            if isinstance(self.propagator, DepthStack):
+                raise ValueError("a retrieved start needs one distance; use another solver.start")
+            image_phase, mask = 2 * math.pi * uniform, None if self.mask is None else self.mask.to(uniform)
+            target = self.target.to(uniform)
+            retrieved = gerchberg_saxton(self.propagator, target, image_phase, max_steps=30, mask=mask)
+            return deconvolve(self.array.crosstalk, retrieved.x, max_steps=100)
         return uniform * {"hot": 2 * math.pi, "cool": 2 * math.pi / spread, "flat": 1.0}[self.start]
 
-    def _retrieved(self, begin: Tensor) -> Tensor:
-        """Phases of 30 passes of Gerchberg-Saxton from the image phases ``begin``, deconvolved."""
-        propagator = self.propagator
-        if isinstance(propagator, DepthStack):
-            raise ValueError("a retrieved start needs one distance; use another solver.start")
-        mask = None if self.mask is None else self.mask.to(begin)
-        retrieved = gerchberg_saxton(propagator, self.target.to(begin), begin, max_steps=30, mask=mask).x
-        return deconvolve(self.array.crosstalk, retrieved, max_steps=100)
-
     def heater_phases(self, solution: Tensor) -> Tensor:
-        """Phases [F, C, H, W] for the heaters: the solver's result on their levels and scaled to keep the limit."""
+        """Phases [F, C, H, W] for the heaters: the solver's result, rounded to their levels and scaled to the limit."""
         phase = solution.detach() if self.settings.frames > 1 else solution.detach()[None]
         limit, bits = self.settings.modulator.max_phase, self.settings.modulator.bits
         if bits is not None:
@@ -239,17 +230,14 @@ class PECExperiment:
 
     def stages(self) -> list[Stage]:
         """The runs of the configured solver, one after another."""
-        solver = self.settings.solver
-        rule = {"max_steps": solver.max_steps, "tolerance": solver.tolerance, "patience": solver.patience}
-        if isinstance(solver, APGSettings):
-            return [Stage(self.problem(), APG(solver.step, solver.shrink, solver.grow, solver.restart, **rule))]
-        if not isinstance(solver, LBFGSSettings):
-            return [Stage(self.problem(), ProjectedAdam(solver.learning_rate, **rule))]
-        crosstalk = self.array.crosstalk
-        method = LBFGS(solver.memory, spread_preconditioner(crosstalk.kernel), **rule)
-        return penalty_schedule(self.problem, method, crosstalk.total, self.settings.modulator.max_phase)
+        kind, crosstalk = self.settings.solver.kind, self.array.crosstalk
+        options = self.settings.solver.model_dump(exclude={"kind", "start"})
+        if kind == "lbfgs":
+            solver = LBFGS(precondition=spread_preconditioner(crosstalk.kernel), **options)
+            return penalty_schedule(self.problem, solver, crosstalk.total, self.settings.modulator.max_phase)
+        return [Stage(self.problem(), APG(**options) if kind == "apg" else ProjectedAdam(**options))]
 
-    def solve(self, progress: Progress | None = None, resume: State | None = None) -> Solution:
+    def solve(self, progress: Callback | None = None, resume: State | None = None) -> Solution:
         """Run the configured solver on the lit colours. ConfigError if it cannot start."""
         try:
             return run_stages(self.stages(), self.start_phase(), callback=progress, resume=resume)
@@ -258,7 +246,7 @@ class PECExperiment:
 
 
 def build(settings: PECSettings) -> PECExperiment:
-    """Load the picture, and choose the settings that the configuration leaves open. ConfigError for a bad picture."""
+    """Load the picture, and choose device and start if the configuration does not. ConfigError for a bad picture."""
     shape = settings.target.region or settings.grid.shape
     try:
         source = load_image(settings.target.image)
@@ -270,15 +258,11 @@ def build(settings: PECSettings) -> PECExperiment:
         raise ConfigError([f"target.image: {settings.target.image} is black inside its crop; use target.fit: pad"])
     wavelengths = [length for length, on in zip(settings.wavelengths, lit.tolist(), strict=True) if on]
     array = PhasedArray(wavelengths, ThermalCrosstalk(settings.modulator.sigma_px, settings.modulator.kernel_size))
-    start = settings.solver.start or _start_for(settings)
-    return PECExperiment(settings, source, lit, array, start, _device(settings.device))
-
-
-def _start_for(settings: PECSettings) -> str:
     # From a hot start most of the light of an isolated chip misses the window: at 128 px and sigma 0.66 the result has
     # 4 to 25 % of the light and an SSIM of 0.5 to 0.75. From a flat start it has half of the light and an SSIM of 0.9.
-    light = settings.propagator
-    return "flat" if isinstance(light, NearFieldSettings) and light.boundary == "isolated" else "hot"
+    isolated = getattr(settings.propagator, "boundary", None) == "isolated"
+    start = settings.solver.start or ("flat" if isolated else "hot")
+    return PECExperiment(settings, source, lit, array, start, _device(settings.device))
 
 
 def _device(name: str) -> torch.device:

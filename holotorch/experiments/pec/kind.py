@@ -23,7 +23,7 @@ class PECKind(ExperimentKind[PECSettings, "PECExperiment"]):
     example = "configs/pec/fourier.yaml"
 
     def contradictions(self, settings: PECSettings) -> list[tuple[Key, str]]:
-        return contradictions(settings)
+        return list(contradictions(settings))
 
     def build(self, settings: PECSettings) -> PECExperiment:
         from holotorch.experiments.pec.experiment import build

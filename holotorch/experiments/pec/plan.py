@@ -1,51 +1,45 @@
-"""Plan of a run: its choices with their reasons, its cost, and the physics of its setup."""
+"""Plan of a run of kind ``pec``: its choices with their reasons, its cost, and the physics of its setup."""
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
-from holotorch.core.grid import Grid
 from holotorch.experiments.pec.baselines import PASSES
-from holotorch.experiments.pec.config import SIGMA_MEANING, NearFieldSettings
+from holotorch.experiments.pec.config import SIGMA_MEANING
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.optics import diffraction_angle, plan_propagation, unaliased_distance
 
-
-@dataclass(frozen=True)
-class _Cost:
-    """Seconds of one evaluation on two CPU cores, and bytes, measured in runs of 128 to 1024 px.
-
-    The predicted seconds are right within a factor of 2 on an idle machine, the predicted bytes within 30 %.
-    """
-
-    pixel_s: float = 8e-9  # per pixel, colour and frame
-    fft_s: float = 0.8e-9  # per padded sample, times log2 of their number
-    base_bytes: float = 450e6  # the interpreter with its libraries
-    pixel_bytes: int = 240  # per pixel, colour and frame
-    solver_bytes: int = 60  # per padded sample of the solver
-    evaluation_bytes: int = 112  # per sample of the grid of one colour in the float64 evaluation
+# Seconds of one evaluation on two CPU cores, and bytes, measured in runs of 128 to 1024 px. The predicted seconds are
+# right within a factor of 2 on an idle machine, the predicted bytes within 30 %.
+_PIXEL_SECONDS = 8e-9  # per pixel, colour and frame
+_FFT_SECONDS = 0.8e-9  # per padded sample, times log2 of the number of padded samples
+_BASE_BYTES = 450e6  # the interpreter with its libraries
+_PIXEL_BYTES = 240  # per pixel, colour and frame
+_SOLVER_BYTES = 60  # per padded sample of the solver
+_EVALUATION_BYTES = 112  # per sample of the grid of one colour in the float64 evaluation
 
 
 def plan_values(experiment: PECExperiment) -> dict[str, Any]:
     """Choices with their reasons, cost and physics, as values of plan.json."""
-    settings, light, grid = experiment.settings, experiment.settings.propagator, experiment.grid
-    padded = grid.padded(2 if experiment.isolated else 1)
-    pixels = len(experiment.wavelengths) * math.prod(grid.shape) * settings.frames
-    samples = len(experiment.wavelengths) * math.prod(padded.shape) * settings.frames
+    settings, grid = experiment.settings, experiment.grid
+    padded, channels = grid.padded(2 if experiment.isolated else 1), len(experiment.wavelengths) * settings.frames
+    pixels, samples = channels * math.prod(grid.shape), channels * math.prod(padded.shape)
     samples *= max(1, (1 + len(experiment.distances)) // 2)
     evaluations = (2 if settings.solver.kind == "apg" else 1) * settings.solver.max_steps
     work = evaluations + PASSES / settings.frames * len(settings.report.baselines)
-    cost, final = _Cost(), 0
-    seconds = work * (cost.pixel_s * pixels + cost.fft_s * samples * math.log2(max(2, samples)))
-    if isinstance(light, NearFieldSettings):  # bytes of the evaluation after the solver
-        final = 16 * samples + cost.evaluation_bytes * 5 * math.prod(grid.shape)
+    seconds = work * (_PIXEL_SECONDS * pixels + _FFT_SECONDS * samples * math.log2(max(2, samples)))
+    solver_bytes, evaluation_bytes = _SOLVER_BYTES * samples, 0
+    if experiment.distances:
+        evaluation_bytes = 16 * samples + _EVALUATION_BYTES * 5 * math.prod(grid.shape)
     single = {}
-    if experiment.isolated and isinstance(light, NearFieldSettings):
-        single = {"single_propagation": asdict(plan_propagation(grid, experiment.wavelengths, list(light.distance)))}
+    if experiment.isolated:
+        propagation = plan_propagation(grid, experiment.wavelengths, list(experiment.distances))
+        single = {"single_propagation": asdict(propagation)}
     crosstalk = experiment.array.crosstalk
     size_rule = "as given" if settings.modulator.kernel_size else "chosen so that no tap above 1e-6 is dropped"
+    free_scale = " at its best scale, since light may leave the picture" if experiment.scale_free else ""
     return {
-        "propagator": light.kind,
+        "propagator": settings.propagator.kind,
         "padding": {"samples": list(padded.shape), "reason": _padding_reason(experiment)},
         **single,
         "crosstalk": {
@@ -58,17 +52,14 @@ def plan_values(experiment: PECExperiment) -> dict[str, Any]:
         "heat": _heat(experiment),
         "frames": settings.frames,
         "start": {"kind": experiment.start, "reason": _START_REASONS[experiment.start]},
-        "loss": "intensity"
-        + (" at its best scale, since light may leave the picture" if experiment.scale_free else ""),
+        "loss": "intensity" + free_scale,
         "device": str(experiment.device),
         "precision": "complex64 in the solver, complex128 in the evaluation",
         "predicted_evaluations": evaluations,
         "predicted_seconds": round(seconds, 2),
-        "predicted_peak_bytes": round(
-            cost.base_bytes + cost.pixel_bytes * pixels + max(cost.solver_bytes * samples, final)
-        ),
-        "physics": _physics(experiment, grid),
-        "notes": _notes(experiment, grid),
+        "predicted_peak_bytes": round(_BASE_BYTES + _PIXEL_BYTES * pixels + max(solver_bytes, evaluation_bytes)),
+        "physics": _physics(experiment),
+        "notes": _notes(experiment),
     }
 
 
@@ -130,7 +121,7 @@ def _listed(values: list[float], form: str = ".3g") -> str:
 
 
 def _heat(experiment: PECExperiment) -> str:
-    """Text about the limit on the temperature and the resolution of the heaters."""
+    """Text about the temperature limit and the resolution of the heaters."""
     limit, bits = experiment.settings.modulator.max_phase, experiment.settings.modulator.bits
     steps = "" if bits is None else f"; heaters with {2**bits} steps"
     if limit is None:
@@ -142,18 +133,18 @@ def _heat(experiment: PECExperiment) -> str:
 def _padding_reason(experiment: PECExperiment) -> str:
     if experiment.isolated:
         return "a chip that stands alone: its exact kernel on twice the window, so that no light wraps around"
-    if isinstance(experiment.settings.propagator, NearFieldSettings):
+    if experiment.distances:
         return "unpadded: the periodic model of the thesis"
     return "unpadded: the far field of the array, sampled once per pixel"
 
 
-def _notes(experiment: PECExperiment, grid: Grid) -> list[str]:
+def _notes(experiment: PECExperiment) -> list[str]:
     """Warnings about the limits of the model."""
     notes = []
-    light, longest = experiment.settings.propagator, max(experiment.wavelengths)
-    if isinstance(light, NearFieldSettings):
-        limit, farthest = unaliased_distance(grid, longest, 1), max(map(abs, light.distance))
-        if min(light.distance) < 0:
+    grid, distances, longest = experiment.grid, experiment.distances, max(experiment.wavelengths)
+    if distances:
+        limit, farthest = unaliased_distance(grid, longest, 1), max(map(abs, distances))
+        if min(distances) < 0:
             notes.append("a distance is negative: that image is virtual, behind the array as seen from the observer")
         if not experiment.isolated:
             notes.append(
@@ -179,8 +170,7 @@ def _notes(experiment: PECExperiment, grid: Grid) -> list[str]:
     lost = experiment.array.crosstalk.lost_heat
     if lost > 0.01:
         notes.append(f"{100 * lost:.1f} % of the heat falls outside the kernel's taps; leave modulator.kernel_size out")
-    dark = [i for i, on in enumerate(experiment.lit.tolist()) if not on]
-    if dark:
+    if dark := [i for i, on in enumerate(experiment.lit.tolist()) if not on]:
         notes.append(f"colour {', '.join(map(str, dark))} of the picture is black: its light source stays off")
     if experiment.source.mean() < 0.02:
         notes.append(
@@ -189,9 +179,9 @@ def _notes(experiment: PECExperiment, grid: Grid) -> list[str]:
     return notes
 
 
-def _physics(experiment: PECExperiment, grid: Grid) -> dict[str, Any]:
+def _physics(experiment: PECExperiment) -> dict[str, Any]:
     """Sizes, angles and distances of the setup, as values of plan.json."""
-    light, wavelengths = experiment.settings.propagator, experiment.wavelengths
+    grid, distances, wavelengths = experiment.grid, experiment.distances, experiment.wavelengths
     values: dict[str, Any] = {
         "height_mm": grid.extent[0] * 1e3,
         "width_mm": grid.extent[1] * 1e3,
@@ -200,10 +190,10 @@ def _physics(experiment: PECExperiment, grid: Grid) -> dict[str, Any]:
         "phase_response_rad_per_K": list(experiment.array.response),
         "kernel_sum": experiment.array.crosstalk.total,
     }
-    if isinstance(light, NearFieldSettings):
+    if distances:
         values |= {
-            "distance_mm": [distance * 1e3 for distance in light.distance],
-            "spot_um": [each * max(map(abs, light.distance)) / min(grid.extent) * 1e6 for each in wavelengths],
+            "distance_mm": [distance * 1e3 for distance in distances],
+            "spot_um": [each * max(map(abs, distances)) / min(grid.extent) * 1e6 for each in wavelengths],
             "alias_free_mm": [unaliased_distance(grid, each, 1) * 1e3 for each in wavelengths],
         }
     return values

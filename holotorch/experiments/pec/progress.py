@@ -1,4 +1,4 @@
-"""Log of a running solver: progress bar, metrics.csv, checkpoints."""
+"""Log of a running solver: progress bar, rows of metrics.csv, checkpoints."""
 
 import time
 from collections.abc import Iterator
@@ -14,32 +14,35 @@ from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.runs.memory import peak_memory
 from holotorch.experiments.runs.saving import Checkpoint
 
-_CHECK_STEPS = 10  # steps between two measurements of the quality, each of which takes about as long as a step
+_CHECK_STEPS = 10  # steps between two measurements of the quality; a measurement takes about as long as a step
 _SAVE_EVERY = 30.0  # seconds between two checkpoints
 
 
 class Log:
-    """Callback of the solver that draws the progress bar and keeps the rows of metrics.csv and the last solution.
+    """Callback of the solver that draws the progress bar and writes a checkpoint every 30 seconds.
 
-    It writes a checkpoint every 30 seconds.
+    Attributes:
+        last: The solution after the last step, or None.
+        rows: Rows of metrics.csv.
+        checked: Steps at which the quality of the hologram was measured, with its value.
+        resume: State of the solver in the checkpoint, or None.
     """
 
     def __init__(self, experiment: PECExperiment, checkpoint: Checkpoint):
         self.experiment, self.checkpoint, self.last = experiment, checkpoint, None
         self.rows: list[list[str]] = []
         self.checked: list[tuple[int, float]] = []
-        self.before = self.seconds_spent = 0.0
         self.resume: dict[str, torch.Tensor] | None = None
+        self._started = self._saved = time.perf_counter()
         if content := checkpoint.load():
-            self._restore(content)
-        self.started = self.saved = time.perf_counter()
-        self.bar = tqdm(
-            total=experiment.settings.solver.max_steps,
-            initial=len(self.rows),
-            desc="correcting",
-            unit="step",
-            dynamic_ncols=True,
-        )
+            try:
+                self.resume, self.rows = content["state"], content["rows"]
+                self.checked = [tuple(pair) for pair in content["checked"]]
+                self._started -= content["seconds"]
+            except (KeyError, TypeError, ValueError) as error:
+                raise checkpoint.unreadable(error) from None
+        steps, done = experiment.settings.solver.max_steps, len(self.rows)
+        self.bar = tqdm(total=steps, initial=done, desc="correcting", unit="step", dynamic_ncols=True)
 
     @property
     def metric(self) -> str:
@@ -48,15 +51,13 @@ class Log:
 
     @property
     def seconds(self) -> float:
-        """Time that the solver has taken, including the runs before an interruption and excluding this log."""
-        return self.before + time.perf_counter() - self.started - self.seconds_spent
+        """Time that the solver has taken, including that before an interruption and excluding that of this log."""
+        return time.perf_counter() - self._started
 
     def __call__(self, solution: Solution) -> None:
         """Log one step."""
-        entered = time.perf_counter()
-        elapsed = self.before + entered - self.started - self.seconds_spent
-        step = len(solution.losses) - 1
-        shown, score = {}, ""
+        entered, step, score = time.perf_counter(), len(solution.losses) - 1, ""
+        elapsed = entered - self._started
         if step % _CHECK_STEPS == 0:
             self.checked.append((step, quality(self.experiment, self.experiment.heater_phases(solution.x))))
             score = f"{self.checked[-1][1]:.6f}"
@@ -64,17 +65,17 @@ class Log:
         self.rows.append([str(step), str(solution.evaluations), f"{elapsed:.4f}", score, *map(repr, losses)])
         self.last = solution
         relative = (solution.losses[-1] / solution.losses[0].clamp(min=1e-30)).mean().item()
-        shown |= {"loss": f"{relative:.2e}", "mem": f"{peak_memory() / 1e9:.2f}GB"}
+        shown = {"loss": f"{relative:.2e}", "mem": f"{peak_memory() / 1e9:.2f}GB"}
         if self.checked:
             shown[self.metric] = f"{self.checked[-1][1]:.4f}"
         self.bar.set_postfix(shown, refresh=False)
         self.bar.update()
-        if entered - self.saved > _SAVE_EVERY:
+        if entered - self._saved > _SAVE_EVERY:
             self.save()
-        self.seconds_spent += time.perf_counter() - entered
+        self._started += time.perf_counter() - entered
 
     def save(self) -> bool:
-        """Write a checkpoint of the last step; False if that is not possible."""
+        """Write a checkpoint of the last step, if there is one; False if the disk refuses it."""
         if self.last is None:
             return True
         content: dict[str, Any] = {
@@ -83,12 +84,12 @@ class Log:
             "checked": self.checked,
             "seconds": self.seconds,
         }
-        self.saved = time.perf_counter()  # set even after a failure, so that the next attempt is 30 seconds later
+        self._saved = time.perf_counter()  # set even after a failure, so that the next attempt is 30 seconds later
         return self.checkpoint.save(content)
 
     @contextmanager
     def saved_on_failure(self) -> Iterator[None]:
-        """Save the last step if the block raises an exception, so that ``resume`` repeats no steps."""
+        """Save the last step if the block raises an exception, so that ``holotorch resume`` repeats no steps."""
         try:
             yield
         except Exception:
@@ -96,19 +97,8 @@ class Log:
                 self.save()
             raise
 
-    def close(self) -> None:
-        """End the progress bar."""
-        self.bar.close()
-
     def table(self) -> str:
         """The rows as CSV."""
         colours = [f"loss_{wavelength * 1e9:.0f}nm" for wavelength in self.experiment.wavelengths]
         header = ["step", "evaluations", "seconds", f"{self.metric}_mean", *colours]
         return "\n".join(",".join(row) for row in [header, *self.rows]) + "\n"
-
-    def _restore(self, content: dict[str, Any]) -> None:
-        try:
-            self.resume, self.rows = content["state"], content["rows"]
-            self.checked, self.before = [tuple(pair) for pair in content["checked"]], content["seconds"]
-        except (KeyError, TypeError, ValueError) as error:
-            raise self.checkpoint.unreadable(error) from None

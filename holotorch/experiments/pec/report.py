@@ -16,7 +16,8 @@ METHOD_NAMES = {
     "unweighted": "Corrected, errors weighted equally",
     "corrected": "Corrected",
 }
-_PICTURES = {"target": "Target", **METHOD_NAMES, "isolated": "Corrected, on a chip that stands alone"}
+ISOLATED_NAME = "Corrected, on a chip that stands alone"
+_PICTURES = {"target": "Target", **METHOD_NAMES, "isolated": ISOLATED_NAME}
 _FIGURES = {
     "phase": "Heater phases, before the heat spreads{frame}",
     "temperature": "Temperature of the chip above ambient, after the heat has spread{frame}",
@@ -27,20 +28,16 @@ _FIGURES = {
 
 def comparison(runs: Sequence[RunRecord]) -> list[str]:
     """HTML of a table that compares the corrected holograms of several runs."""
-    rows = [[run.title, *_numbers(run.summary["methods"]["corrected"])] for run in runs]
-    return ["<h1>Runs</h1>" + table(["run", *_COLUMNS], rows)]
+    rows = [{"run": run.title} | _cells(run.summary["methods"]["corrected"]) for run in runs]
+    return ["<h1>Runs</h1>" + _table(rows)]
 
 
 def pec_section(run: RunRecord) -> list[str]:
     """HTML of a run: scores by method, pictures side by side, figures and plan."""
     methods: dict[str, Any] = run.summary["methods"]
     parts = [heading(run.title, run.summary["status"])]
-    parts.append(table(["method", *_COLUMNS], [[METHOD_NAMES.get(n, n), *_numbers(m)] for n, m in methods.items()]))
-    parts.append(element("p", _verdict(run)))
-    head, rows = _zone_rows(methods)
-    if rows:
-        parts.append("<h2>By eccentricity</h2>" + table(head, rows))
-    parts.append('<div class="row">')
+    parts.append(_table([{"method": METHOD_NAMES.get(name, name)} | _cells(each) for name, each in methods.items()]))
+    parts += [element("p", _verdict(run)), *_zone_table(methods), '<div class="row">']
     for name, caption in _PICTURES.items():
         if source := run.picture(name):
             parts.append(figure(source, f"{caption}{_score(run, name)}", "picture"))
@@ -50,37 +47,28 @@ def pec_section(run: RunRecord) -> list[str]:
     for name, caption in _FIGURES.items():
         if source := run.picture(name):
             parts.append(figure(source, caption.format(frame=which), "wide"))
-    parts.append("<h2>Plan</h2>" + table(["", ""], _plan_rows(run.plan), head=False))
+    plan = [[name.replace("_", " "), plain(value)] for name, value in run.plan.items() if name != "notes"]
+    parts.append("<h2>Plan</h2>" + table(["", ""], plan, head=False))
     return parts + [element("p", note, "warn") for note in run.plan["notes"]]
 
 
-_COLUMNS = (
-    "frames",
-    "SSIM",
-    "PSNR (dB)",
-    "SSIM half a sample off",
-    "SSIM, chip alone (exact)",
-    "light in window",
-    "hottest pixel (degC above ambient)",
-    "heating power (mean drive, K)",
-    "evaluations",
-    "seconds",
-)
+def _table(rows: Sequence[dict[str, str]]) -> str:
+    return table(list(rows[0]), [list(row.values()) for row in rows])
 
 
-def _numbers(method: dict[str, Any]) -> list[str]:
-    return [
-        str(method["frames"]),
-        _fixed(method.get("ssim_mean"), 4),
-        _fixed(method.get("psnr_mean"), 1),
-        _fixed(method["between_samples"].get("ssim_mean"), 3),
-        _fixed(method.get("isolated", {}).get("ssim_mean"), 3),
-        f"{100 * _lit_mean(method['efficiency']):.0f} %",
-        _fixed(max(method["peak_temperature_rise_K"]), 0),
-        _fixed(_lit_mean(method["heating_power_K_per_pixel"]), 0),
-        str(method["evaluations"]),
-        _fixed(method["seconds"], 2),
-    ]
+def _cells(method: dict[str, Any]) -> dict[str, str]:
+    return {
+        "frames": str(method["frames"]),
+        "SSIM": _fixed(method.get("ssim_mean"), 4),
+        "PSNR (dB)": _fixed(method.get("psnr_mean"), 1),
+        "SSIM half a sample off": _fixed(method["between_samples"].get("ssim_mean"), 3),
+        "SSIM, chip alone (exact)": _fixed(method.get("isolated", {}).get("ssim_mean"), 3),
+        "light in window": f"{100 * _lit_mean(method['efficiency']):.0f} %",
+        "hottest pixel (degC above ambient)": f"{max(method['peak_temperature_rise_K']):.0f}",
+        "heating power (mean drive, K)": f"{_lit_mean(method['heating_power_K_per_pixel']):.0f}",
+        "evaluations": str(method["evaluations"]),
+        "seconds": f"{method['seconds']:.2f}",
+    }
 
 
 def _verdict(run: RunRecord) -> str:
@@ -103,32 +91,27 @@ def _verdict(run: RunRecord) -> str:
     )
 
 
-def _zone_rows(methods: dict[str, dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
-    """Head and cells of a table of scores by zone, one row per method; empty if the run has no zones."""
+def _zone_table(methods: dict[str, dict[str, Any]]) -> list[str]:
+    """HTML of a table of scores by zone of the visual field, one row per method; empty if the run has no zones."""
     scored = {name: numbers["zones"] for name, numbers in methods.items() if "zones" in numbers}
     if not scored:
-        return [], []
-    zones: Sequence[dict[str, Any]] = next(iter(scored.values()))
-    limits = [f"{zone['from_deg']} to {zone['to_deg']} deg" for zone in zones[:-1]] + [
-        f"from {zones[-1]['from_deg']} deg"
-    ]
-    head = ["method"] + [f"{z['zone']}, {words}" for z, words in zip(zones, limits, strict=True)]
-    return head, [[METHOD_NAMES.get(name, name), *map(_cell, row)] for name, row in scored.items()]
+        return []
+    *zones, outermost = next(iter(scored.values()))
+    head = ["method", *(f"{zone['zone']}, {zone['from_deg']} to {zone['to_deg']} deg" for zone in zones)]
+    head.append(f"{outermost['zone']}, from {outermost['from_deg']} deg")
+    rows = [[METHOD_NAMES.get(name, name), *map(_zone_cell, row)] for name, row in scored.items()]
+    return ["<h2>By eccentricity</h2>" + table(head, rows)]
 
 
-def _cell(zone: dict[str, Any]) -> str:
+def _zone_cell(zone: dict[str, Any]) -> str:
     parts = [] if zone["ssim"] is None else [f"SSIM {zone['ssim']:.3f}"]
     parts += [] if zone["psnr"] is None else [f"{zone['psnr']:.1f} dB"]
     return ", ".join([*parts, f"{100 * zone['error']:.0f} % of the error"])
 
 
-def _plan_rows(plan: dict[str, Any]) -> list[list[str]]:
-    return [[name.replace("_", " "), plain(value)] for name, value in plan.items() if name != "notes"]
-
-
 def _score(run: RunRecord, name: str) -> str:
-    isolated = run.summary["methods"]["corrected"].get("isolated", {})
-    value = (isolated if name == "isolated" else run.summary["methods"].get(name, {})).get("ssim_mean")
+    methods = run.summary["methods"]
+    value = (methods["corrected"] if name == "isolated" else methods).get(name, {}).get("ssim_mean")
     return "" if value is None else f": SSIM {value:.3f}"
 
 
@@ -137,5 +120,6 @@ def _fixed(value: float | None, digits: int) -> str:
 
 
 def _lit_mean(values: list[float]) -> float:
+    """Mean over the lit colours, whose values are above zero."""
     lit = [value for value in values if value > 0]
     return sum(lit) / len(lit) if lit else 0.0

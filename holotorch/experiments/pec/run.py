@@ -1,19 +1,17 @@
-"""Run of kind ``pec``: the solver, the evaluation beside the baselines, and the files of the run folder."""
+"""Run of kind ``pec``: the solver, the baselines, their evaluation, and the files of the run folder."""
 
 import signal
 import sys
-import time
+from functools import partial
 from pathlib import Path
 from typing import Any
-
-from torch import Tensor
 
 from holotorch.correction import Solution
 from holotorch.experiments.pec.baselines import baseline
 from holotorch.experiments.pec.evaluation import Result, evaluate
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.pec.progress import Log
-from holotorch.experiments.pec.report import METHOD_NAMES
+from holotorch.experiments.pec.report import ISOLATED_NAME, METHOD_NAMES
 from holotorch.experiments.pec.weight import ZONES, eccentricities, weight_map
 from holotorch.experiments.runs import figures
 from holotorch.experiments.runs.fingerprint import Fingerprint, fingerprint
@@ -22,6 +20,7 @@ from holotorch.experiments.runs.memory import peak_memory
 from holotorch.experiments.runs.pictures import save_picture
 from holotorch.experiments.runs.saving import Checkpoint, Results
 from holotorch.experiments.runs.signals import deferred
+from holotorch.experiments.timing import timed
 from holotorch.io.files import save_array, write_bytes, write_text
 
 
@@ -36,7 +35,7 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
         except KeyboardInterrupt:
             solution = log.last
         finally:
-            log.close()
+            log.bar.close()
         if solution is None:
             raise KeyboardInterrupt
         seconds = log.seconds
@@ -51,11 +50,9 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
         for name in () if several else settings.report.baselines:
             try:
                 if not pressed:
-                    started = time.perf_counter()
-                    all_frames = name == "unweighted"
-                    other = experiment.unweighted.solve() if all_frames else baseline(experiment, name)
-                    seconds = time.perf_counter() - started
-                    results[name] = _result(experiment, other, seconds, single=not all_frames)
+                    unweighted = name == "unweighted"
+                    solve = experiment.unweighted.solve if unweighted else partial(baseline, experiment, name)
+                    results[name] = _result(experiment, *timed(solve), single=not unweighted)
             except KeyboardInterrupt:
                 pressed.append(signal.SIGINT)
             except ValueError as error:
@@ -74,20 +71,17 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
 
 
 def _fingerprint(experiment: PECExperiment) -> Fingerprint:
-    """Settings and inputs that must not change before a run is resumed.
-
-    Baselines are computed after the solver. The number of steps is free for solvers whose steps do not depend on it.
-    """
-    free = {"device", "report.baselines"}
+    """Settings and inputs that must not change before a run is resumed."""
+    free = {"device", "report.baselines"}  # baselines are computed after the solver
     if experiment.settings.solver.kind != "lbfgs":  # its stages divide the number of steps among them
         free.add("solver.max_steps")
     kept = fingerprint(experiment.settings, {"target.image": (experiment.source,)}, free)
-    # Refuses checkpoints of version 0.1.0, whose joint frames are [C, F, H, W]: where F = C the shape is the same.
+    # Checkpoints of version 0.1.0 are refused: their joint frames are [C, F, H, W], the same shape if F = C.
     return kept | ({"axes of joint frames": "F, C, H, W"} if experiment.joint else {})
 
 
 def _result(experiment: PECExperiment, solution: Solution, seconds: float, *, single: bool = False) -> Result:
-    """Scores of a solution; ``single`` for phases [C, H, W] of one frame, even if the run has several."""
+    """Scores of a solution; ``single`` if its phases are one frame [C, H, W] even in a run of several frames."""
     result = evaluate(experiment, solution.x[None] if single else experiment.heater_phases(solution.x))
     result.numbers.update(
         evaluations=solution.evaluations,
@@ -110,7 +104,7 @@ def _write_results(
     captions = ["Target", *(METHOD_NAMES[name] + _score(results[name].numbers) for name in shown if name in results)]
     if corrected.isolated is not None and not experiment.isolated:
         shown["isolated"] = corrected.isolated
-        captions.append("Corrected, on a chip that stands alone" + _score(corrected.numbers["isolated"]))
+        captions.append(ISOLATED_NAME + _score(corrected.numbers["isolated"]))
     for name, picture in shown.items():
         files.write(save_picture, out / "images" / name, picture)
     names = [f"{wavelength * 1e9:.0f} nm" for wavelength in experiment.wavelengths]
@@ -118,23 +112,19 @@ def _write_results(
     maps = [f"{name}, frame 1 of {frames}" for name in names] if frames > 1 else names
     phase = corrected.phase[0][experiment.lit].to(experiment.device)
     warm = experiment.array.temperature(experiment.array.crosstalk(phase)).cpu()
+    losses = solution.losses.reshape(len(solution.losses), -1, len(names)).mean(1)  # mean over independent frames
     drawn = {
         "comparison": figures.comparison(list(shown.values()), captions),
         "phase": figures.channel_maps(phase.cpu(), maps, "heater phase (rad)", "viridis"),
         "temperature": figures.channel_maps(warm, maps, "temperature rise (degC)", "inferno", (0, None)),
-        "convergence": figures.convergence(_per_colour(solution.losses, len(names)), names, log.checked, log.metric),
+        "convergence": figures.convergence(losses, names, log.checked, log.metric),
     }
     if weight := experiment.settings.target.weight:
-        shape, rings = experiment.grid.shape, [zone[0] for zone in ZONES[1:]]
+        shape, rings = experiment.grid.shape, [low for low, _ in ZONES.values()][1:]
         angles = eccentricities(weight, shape)
         drawn["weight"] = figures.visual_field(weight_map(weight, shape), angles, weight.field_deg, rings, "weight")
     for name, data in drawn.items():
         files.write(write_bytes, out / "images" / f"{name}.png", data)
-
-
-def _per_colour(losses: Tensor, colours: int) -> Tensor:
-    """Losses [steps, ..., C] as [steps, C]: the mean over independent frames."""
-    return losses.reshape(len(losses), -1, colours).mean(1)
 
 
 def _score(numbers: dict[str, Any]) -> str:

@@ -1,23 +1,18 @@
-"""Bench: grey photographs as a batch on one array, the common work of the charts and studies of PEC."""
+"""Bench: photographs that are corrected as one batch on one array, for the chart and the studies of PEC."""
 
 import math
 import time
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
 
-from holotorch.core.checks import SamplingWarning
-from holotorch.core.complex import intensity, phasor
 from holotorch.core.fourier import fft2, ifft2
-from holotorch.core.grid import Grid
 from holotorch.correction import (
     APG,
     LBFGS,
-    PECProblem,
     Solution,
     gerchberg_saxton,
     iterative_pec,
@@ -28,37 +23,45 @@ from holotorch.correction import (
 )
 from holotorch.correction.problem import best_scale
 from holotorch.correction.run import Callback
-from holotorch.io.images import fit_image, load_image
+from holotorch.experiments.pec.baselines import IPEC_PASSES, PASSES
+from holotorch.experiments.pec.config import PECSettings
+from holotorch.experiments.pec.experiment import PECExperiment
+from holotorch.io.images import fit_image, load_image, with_channels
 from holotorch.metrics import PerceptualSimilarity, psnr, ssim
-from holotorch.modulator import ThermalCrosstalk
-from holotorch.optics import CroppedKernel, DepthStack, Fraunhofer, Fresnel
+from holotorch.modulator import PhasedArray, ThermalCrosstalk
 
 PHOTOGRAPHS = ("camera", "astronaut", "coffee", "page")
 WAVELENGTH, EXTENT, DISTANCE = 530e-9, 2e-3, 0.1  # metres: the thesis's chip of 2 mm and its image at 100 mm
-# Weights of linear red, green and blue in the luminance: ITU-R BT.709.
-LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)[:, None, None]
+# Settings of the propagator for each value of ``Bench.kind``.
+_PROPAGATORS = {
+    "fourier": {"kind": "fraunhofer"},
+    "fresnel": {"kind": "fresnel", "boundary": "periodic"},
+    "isolated": {"kind": "fresnel", "boundary": "isolated"},
+    "exact": {"kind": "angular_spectrum", "boundary": "isolated"},
+}
 
 
 def grey(name: str, size: tuple[int, int]) -> Tensor:
-    """A photograph as luminance, float64 [1, H, W]."""
-    image = fit_image(load_image(name), size, "crop").double()
-    return (image * LUMINANCE).sum(0, keepdim=True) if len(image) == 3 else image
+    """Luminance of a photograph, float64 [1, H, W]."""
+    return with_channels(fit_image(load_image(name), size, "crop"), 1)
 
 
 @dataclass(frozen=True)
 class Bench:
-    """One array, one kind of propagation, and C photographs as its channels.
+    """One array, one kind of propagation, and C photographs as its channels, all at the same wavelength.
 
     Attributes:
         images: Names of the photographs.
         size: Pixels of the array along each axis.
-        sigma_px: Width of the heat kernel, exp(-d^2 / sigma^2).
-        kind: "fourier", "fresnel" (the thesis's periodic model) or "isolated".
+        sigma_px: Width of the heat kernel exp(-d^2 / sigma^2) in pixels.
+        kind: "fourier" (far field), "fresnel" (near field of the array repeated periodically, as in the thesis),
+            "isolated" (near field of a single array, paraxial) or "exact" (the same, not paraxial).
         region: Pixels along each axis of a signal region, or 0 for the whole window.
-        distances: Distances of the image in metres for "fresnel" and "isolated"; several divide it into as many bands.
-        lowpass: Cut-off of a Butterworth filter on the targets in cycles per pixel, or 0 for none.
-        perceptual: Learned similarity that scores the pictures too, if it is installed.
-        pictures: Luminances [C, h, w] instead of those of the photographs.
+        distances: Distances of the image in metres, except in the far field. Several distances divide the image into as
+            many vertical bands.
+        lowpass: Cut-off of a Butterworth filter on the targets in cycles per pixel, or 0 for no filter.
+        perceptual: Learned similarity that also scores the pictures, or None.
+        pictures: Targets [C, h, w] in place of the photographs.
     """
 
     images: Sequence[str] = PHOTOGRAPHS
@@ -72,88 +75,41 @@ class Bench:
     pictures: Tensor | None = field(default=None, compare=False, repr=False)
 
     @cached_property
-    def image(self) -> Tensor:
-        """Luminances, float64 [C, h, w]."""
-        if self.pictures is not None:
-            return self.pictures
-        size = self.region or self.size
-        pictures = torch.cat([grey(name, (size, size)) for name in self.images])
-        return butterworth(pictures, self.lowpass) if self.lowpass else pictures
+    def experiment(self) -> PECExperiment:
+        """The array, the light and the targets as an experiment of kind ``pec`` with C colours.
 
-    @cached_property
-    def wanted(self) -> Tensor:
-        """Luminances scaled to mean 1."""
-        return self.image / self.image.mean((-2, -1), keepdim=True)
+        The crosstalk has seven taps, as in the thesis, or one tap if no heat spreads.
+        """
+        pictures, side = self.pictures, self.region or self.size
+        if pictures is None:
+            pictures = torch.cat([grey(name, (side, side)) for name in self.images])
+            pictures = butterworth(pictures, self.lowpass) if self.lowpass else pictures
+        wavelengths = (WAVELENGTH,) * len(pictures)
+        propagator = _PROPAGATORS[self.kind] | ({} if self.kind == "fourier" else {"distance": self.distances})
+        settings = PECSettings.model_validate(
+            {
+                "experiment": "pec",
+                "grid": {"shape": self.size, "pitch": EXTENT / self.size},
+                "wavelengths": wavelengths,
+                "target": {"image": PHOTOGRAPHS[0], "region": self.region or None},  # required, but not loaded
+                "modulator": {"sigma_px": self.sigma_px},
+                "propagator": propagator,
+                "solver": {"kind": "lbfgs"},
+            }
+        )
+        array = PhasedArray(wavelengths, ThermalCrosstalk(self.sigma_px, 7 if self.sigma_px else 1))
+        lit = torch.ones(len(pictures), dtype=torch.bool)
+        return PECExperiment(settings, pictures, lit, array, "hot", torch.device("cpu"))
 
     @property
-    def grid(self) -> Grid:
-        """Sampling of the array."""
-        return Grid(self.size, EXTENT / self.size)
-
-    @cached_property
     def crosstalk(self) -> ThermalCrosstalk:
-        """Crosstalk with seven taps, as in the thesis, or with one tap where no heat spreads."""
-        return ThermalCrosstalk(self.sigma_px, 7 if self.sigma_px else 1)
-
-    @cached_property
-    def propagator(self) -> Fraunhofer | DepthStack | Fresnel | CroppedKernel:
-        """Propagator of all channels to the image."""
-        wavelengths = [WAVELENGTH] * len(self.images)
-        if self.kind == "fourier":
-            return Fraunhofer(self.grid, wavelengths)
-        if self.kind == "isolated":
-            return CroppedKernel(self.grid, wavelengths, self.distances[0], paraxial=True)
-        with warnings.catch_warnings(action="ignore", category=SamplingWarning):  # the thesis's model is periodic
-            filters = [Fresnel(self.grid, wavelengths, z, pad=1) for z in self.distances]
-        return filters[0] if len(filters) == 1 else DepthStack(filters)
-
-    @property
-    def mask(self) -> Tensor | None:
-        """1 where the image is compared with the target: in the region, or in the band in focus at each distance."""
-        if self.region:
-            begin = (self.size - self.region) // 2
-            mask = torch.zeros(1, self.size, self.size)
-            mask[:, begin : begin + self.region, begin : begin + self.region] = 1
-            return mask
-        count = len(self.distances)
-        if count == 1:
-            return None
-        mask = torch.zeros(1, count, 1, self.size)
-        for i in range(count):
-            mask[:, i, :, i * self.size // count : (i + 1) * self.size // count] = 1
-        return mask
-
-    @property
-    def target(self) -> Tensor:
-        """Wanted intensity, float32 [C, *image]."""
-        if self.region:
-            begin, part = (self.size - self.region) // 2, self.size**2 / self.region**2 / 2
-            around = (begin, self.size - self.region - begin)
-            return torch.nn.functional.pad(self.wanted * part, (*around, *around)).float()
-        if len(self.distances) > 1:
-            return self.wanted[:, None].repeat(1, len(self.distances), 1, 1).float()
-        return self.wanted.float()
-
-    @property
-    def scale_free(self) -> bool:
-        """Whether light may leave the picture."""
-        return self.kind == "isolated" or self.region > 0
-
-    def problem(self, **options) -> PECProblem:
-        """The objective in float32."""
-        options = {"mask": self.mask, "scale_free": self.scale_free, **options}
-        return PECProblem(self.crosstalk, self.propagator, self.target, **options)
+        """Spreading of the heat."""
+        return self.experiment.array.crosstalk
 
     def start(self, kind: str, frames: int = 1, seed: int = 7) -> Tensor:
-        """Heater phases at the start, [C, H, W] or [F, C, H, W], of a kind as in the configurations ``pec``."""
-        generator = torch.Generator().manual_seed(seed)
-        uniform = torch.rand(len(self.images), frames, self.size, self.size, generator=generator)
-        uniform = uniform.movedim(1, 0).contiguous() if frames > 1 else uniform[:, 0]
-        if kind == "quadratic":
-            n = torch.arange(self.size) - self.size // 2
-            lens = math.pi * n.square() / self.size
-            return (lens[:, None] + lens) / self.crosstalk.total + 0.01 * uniform
-        return uniform * {"hot": 2 * math.pi, "cool": 2 * math.pi / self.crosstalk.total, "flat": 1.0}[kind]
+        """Heater phases at the start, [C, H, W] or [F, C, H, W]; ``kind`` as ``solver.start`` of a configuration."""
+        settings = self.experiment.settings.model_copy(update={"frames": frames, "seed": seed})
+        return replace(self.experiment, settings=settings, start=kind).start_phase()
 
     def lbfgs(
         self,
@@ -161,97 +117,71 @@ class Bench:
         *,
         steps: int = 300,
         limit: float | None = None,
-        tolerance: float = 1e-4,
         power_weight: float = 0.0,
         callback: Callback | None = None,
     ) -> Solution:
-        """L-BFGS in stages; frames [F, C, H, W] share the image."""
-        frames = start.ndim == 4
-        solver = LBFGS(precondition=spread_preconditioner(self.crosstalk.kernel), max_steps=steps, tolerance=tolerance)
-
-        def make(**options) -> PECProblem:
-            return self.problem(frames=frames, power_weight=power_weight, **options)
-
-        stages = penalty_schedule(make, solver, self.crosstalk.total, limit)
-        solution = run_stages(stages, start, callback=callback)
+        """L-BFGS in stages; frames [F, C, H, W] share the image. ``limit`` in rad bounds the phase after spreading."""
+        make = partial(self.experiment.problem, frames=start.ndim == 4, power_weight=power_weight)
+        solver = LBFGS(precondition=spread_preconditioner(self.crosstalk.kernel), max_steps=steps, tolerance=1e-4)
+        solution = run_stages(penalty_schedule(make, solver, self.crosstalk.total, limit), start, callback=callback)
         return solution if limit is None else replace(solution, x=limit_peak_phase(limit, solution.x, self.crosstalk))
 
     def algorithm2(self, start: Tensor, *, steps: int = 400, callback: Callback | None = None) -> Solution:
         """Algorithm 2 of the thesis, proximal proximity effect correction (PPEC)."""
-        return APG(max_steps=steps)(self.problem(), start, callback=callback)
+        return APG(max_steps=steps)(self.experiment.problem(), start, callback=callback)
 
-    def retrieved(self, kind: str, *, passes: int = 100, inner: int = 30, seed: int = 7) -> Solution:
+    def retrieved(self, kind: str, seed: int = 7) -> Solution:
         """Gerchberg-Saxton: "none" (plain), "basic" (with the crosstalk in the loop) or "ipec" (deconvolution too)."""
-        generator = torch.Generator().manual_seed(seed)
-        begin = 2 * math.pi * torch.rand(self.target.shape, generator=generator)
-        assert not isinstance(self.propagator, DepthStack)
+        problem, propagator = self.experiment.problem(), self.experiment.propagator
+        target, mask = problem.target, problem.mask
+        begin = 2 * math.pi * torch.rand(target.shape, generator=torch.Generator().manual_seed(seed))
         if kind == "ipec":
-            return iterative_pec(
-                self.propagator, self.crosstalk, self.target, begin, max_steps=passes, inner_steps=inner, mask=self.mask
-            )
+            return iterative_pec(propagator, self.crosstalk, target, begin, max_steps=IPEC_PASSES, mask=mask)
         spread = self.crosstalk if kind == "basic" else None
-        return gerchberg_saxton(self.propagator, self.target, begin, max_steps=passes, crosstalk=spread, mask=self.mask)
+        return gerchberg_saxton(propagator, target, begin, max_steps=PASSES, crosstalk=spread, mask=mask)
 
-    @property
-    def exact(self) -> CroppedKernel:
-        """Exact propagator of a single chip, neither paraxial nor periodic, for its scores."""
-        return CroppedKernel(self.grid, [WAVELENGTH] * len(self.images), self.distances[0])
-
-    def formed(
-        self,
-        phase: Tensor,
-        crosstalk: Callable[[Tensor], Tensor] | None = None,
-        propagator: Callable[[Tensor], Tensor] | None = None,
-    ) -> Tensor:
+    def formed(self, phase: Tensor) -> Tensor:
         """Picture [C, h, w] in the mean intensity of the frames of ``phase`` [C, H, W] or [F, C, H, W], float64."""
-        frames = phase.double().reshape(-1, *phase.shape[-3:])
-        spread, propagate = crosstalk or self.crosstalk, propagator or self.propagator
-        formed = intensity(propagate(phasor(spread(frames[0]))))
-        for frame in frames[1:]:
-            formed = formed + intensity(propagate(phasor(spread(frame))))
-        formed = formed / len(frames)
-        if len(self.distances) > 1:
-            mask = self.mask
-            assert mask is not None
-            return (formed * mask).sum(-3)
-        begin, size = (self.size - (self.region or self.size)) // 2, self.region or self.size
-        return formed[:, begin : begin + size, begin : begin + size]
+        return self.experiment.picture_in(self.experiment.intensity(phase.double().reshape(-1, *phase.shape[-3:])))
 
     def scores(self, phase: Tensor, formed: Tensor | None = None) -> dict[str, float]:
-        """Mean SSIM and PSNR over the photographs, light in the picture, and the largest phase after spreading."""
+        """Scores of heater phases by name, each the mean over the photographs unless stated otherwise.
+
+        They are ``ssim``, ``psnr``, ``perceptual`` if it is installed, ``efficiency`` (share of the light in the
+        picture, least over the photographs), ``peak_rad`` (largest phase after spreading) and ``power_rad`` (mean
+        heater phase). ``formed`` replaces the picture that the phases form.
+        """
         formed = self.formed(phase) if formed is None else formed
-        light = formed.sum((-2, -1)) / self.size**2
-        if self.scale_free:
-            formed = formed * best_scale(formed, self.wanted)[:, None, None]
-        picture = (formed * self.image.mean((-2, -1), keepdim=True)).clamp(0, 1)
-        learned = {}
-        if self.perceptual is not None:
-            learned = {"perceptual": self.perceptual(picture[:, None], self.image[:, None]).mean().item()}
-        return learned | {
-            "ssim": ssim(picture, self.image, data_range=1.0).mean().item(),
-            "psnr": psnr(picture, self.image, data_range=1.0).mean().item(),
-            "efficiency": light.min().item(),
-            "peak_rad": self.crosstalk(phase.double()).max().item(),
-            "power_rad": phase.double().mean().item(),
+        image, light = self.experiment.image, formed.sum((-2, -1)) / self.size**2
+        if self.experiment.scale_free:
+            formed = formed * best_scale(formed, self.experiment.wanted)[:, None, None]
+        picture = (formed * image.mean((-2, -1), keepdim=True)).clamp(0, 1)
+        scores = {
+            "ssim": ssim(picture, image, data_range=1.0).mean(),
+            "psnr": psnr(picture, image, data_range=1.0).mean(),
+            "efficiency": light.min(),
+            "peak_rad": self.crosstalk(phase.double()).max(),
+            "power_rad": phase.double().mean(),
         }
+        if self.perceptual is not None:
+            scores["perceptual"] = self.perceptual(picture[:, None], image[:, None]).mean()
+        return {name: value.item() for name, value in scores.items()}
 
 
 class Track:
-    """Callback that scores the intermediate phases of a solver; the recorded times exclude the scoring."""
+    """Callback that scores every few steps of a solver; the recorded times exclude the scoring."""
 
     def __init__(self, bench: Bench, every: int = 5):
-        self.bench, self.every = bench, every
+        self.bench, self.every, self.started = bench, every, time.perf_counter()
         self.rows: list[tuple[float, int, float, float]] = []  # seconds, evaluations, SSIM, largest phase in rad
-        self.spent, self.started = 0.0, time.perf_counter()
 
     def __call__(self, solution: Solution) -> None:
-        """Score every few steps."""
+        """Score the phases if the step is a multiple of ``every``."""
         entered = time.perf_counter()
         if (len(solution.losses) - 1) % self.every == 0:
             scores = self.bench.scores(solution.x)
-            seconds = entered - self.started - self.spent
-            self.rows.append((seconds, solution.evaluations, scores["ssim"], scores["peak_rad"]))
-        self.spent += time.perf_counter() - entered
+            self.rows.append((entered - self.started, solution.evaluations, scores["ssim"], scores["peak_rad"]))
+        self.started += time.perf_counter() - entered
 
     def reached(self, quality: float) -> tuple[float, int, float, float] | None:
         """The first row whose SSIM is at least ``quality``; None if there is none."""
@@ -259,7 +189,7 @@ class Track:
 
 
 def butterworth(images: Tensor, cutoff: float) -> Tensor:
-    """Low-pass of thesis Eqs. 4.43, 4.44, H = 1 / (1 + (f / cutoff)^4), f in cycles per pixel, counted from zero."""
+    """Low-pass H = 1 / (1 + (f / cutoff)^4) of thesis Eqs. 4.43, 4.44; frequencies f in cycles per pixel."""
     fy, fx = (torch.fft.fftfreq(size, dtype=torch.float64) for size in images.shape[-2:])
     square = fy[:, None] ** 2 + fx**2
     spectrum = fft2(images.to(torch.complex128))

@@ -1,4 +1,4 @@
-"""Cases of a study with a checkpoint, so that a resumed study computes only the cases that are missing."""
+"""Cases of a study with a checkpoint, so that a resumed study computes only the missing cases."""
 
 import time
 from collections.abc import Iterable, Iterator
@@ -15,28 +15,28 @@ class Cases:
     """Progress of a study: the table rows computed so far, and the cases that remain.
 
     Attributes:
-        rows: Rows of all cases so far; a study appends to this list.
+        rows: Rows of all cases so far; the run appends the rows of each case to this list.
         saved: Number of cases whose rows are in the checkpoint.
-        checkpoint: File that keeps the rows.
+        checkpoint: The file that stores the rows.
     """
 
     def __init__(self, checkpoint: Checkpoint):
         self.checkpoint, self.rows, self.saved, self._count = checkpoint, [], 0, 0
-        self._before, self._started = 0.0, time.perf_counter()
+        self._started = time.perf_counter()
         if content := checkpoint.load():
             try:
                 self.rows: list[dict[str, Any]] = content["rows"]
-                self.saved, self._before = content["cases"], content["seconds"]
+                self.saved, self._started = content["cases"], self._started - content["seconds"]
             except KeyError as error:
                 raise checkpoint.unreadable(error) from None
 
     @property
     def seconds(self) -> float:
-        """Time so far, including the runs before an interruption."""
-        return self._before + time.perf_counter() - self._started
+        """Seconds so far, including the runs before an interruption."""
+        return time.perf_counter() - self._started
 
     def each(self, cases: Iterable[Case], desc: str, unit: str) -> Iterator[Case]:
-        """The cases that are not in the checkpoint; requesting the next case marks the one before as complete."""
+        """Yield the cases that are not in the checkpoint; all rows so far are saved when the next case is requested."""
         for case in tqdm(cases, desc=desc, unit=unit):
             self._count += 1
             if self._count <= self.saved:

@@ -17,7 +17,7 @@ METHODS = (
 class StudySettings(Settings):
     """A comparison of methods over several photographs.
 
-    ``sweep``: sigmas in pixels, or for the study ``lowpass`` cut-offs in cycles per pixel; ``targets`` has its sigmas.
+    ``sweep``: sigmas in pixels, or cut-offs in cycles per pixel for the study ``lowpass``; ``targets`` does not use it.
     """
 
     experiment: Literal["pec_study"]

@@ -32,31 +32,25 @@ def build_study(settings: StudySettings) -> Study:
 
 
 def run_study(study: Study, opened: RunFolder) -> bool:
-    """Run a study and fill the folder; true if it is complete. A resumed study begins after its last complete case."""
+    """Run a study without its complete cases, fill the folder and print the table. True if the study is complete."""
     settings, bench = study.settings, study.bench
     folder, files = opened.path, Results()
-    inputs = {"images": (bench.image,), "perceptual": ("none" if bench.perceptual is None else "LPIPS",)}
+    inputs = {"images": (bench.experiment.image,), "perceptual": ("none" if bench.perceptual is None else "LPIPS",)}
     cases = Cases(Checkpoint(folder / "checkpoint.pt", fingerprint(settings, inputs)))
+    summary: dict[str, Any] = {"experiment": settings.experiment, "study": settings.study, "status": ""}
     try:
-        rows = STUDIES[settings.study](bench, settings.sweep, settings.max_steps, cases)
+        for row in STUDIES[settings.study](bench, settings.sweep, settings.max_steps, cases):
+            cases.rows.append(row)
     except KeyboardInterrupt:
         if not cases.saved:
             raise
-        summary = {"experiment": settings.experiment, "study": settings.study, "status": "", "cases": cases.saved}
-        return conclude(opened, summary, files, done=False, checkpoint=cases.checkpoint)
+        return conclude(opened, summary | {"cases": cases.saved}, files, done=False, checkpoint=cases.checkpoint)
+    rows, text = cases.rows, table_text(cases.rows)
     files.write(write_table, folder / "table.csv", rows)
-    text = table_text(rows)
     files.write(write_text, folder / "table.txt", text)
     picture = curves(rows, f"{settings.study}: mean of {', '.join(settings.images)} at {settings.size} px")
     files.write(write_bytes, folder / "images" / "table.png", picture)
-    summary = {
-        "experiment": settings.experiment,
-        "study": settings.study,
-        "status": "",
-        "rows": len(rows),
-        "seconds": round(cases.seconds, 1),
-        "peak_memory_bytes": peak_memory(),
-    }
+    summary |= {"rows": len(rows), "seconds": round(cases.seconds, 1), "peak_memory_bytes": peak_memory()}
     complete = conclude(opened, summary, files, done=True)
     print(text)
     return complete

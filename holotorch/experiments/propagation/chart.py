@@ -1,4 +1,4 @@
-"""Chart of free-space propagation: error against time for every method, and predicted against true error."""
+"""Chart of free-space propagation: error against time of every method, and predicted against true error."""
 
 import math
 import platform
@@ -32,10 +32,11 @@ DISTANCES = (1e-3, 5e-3, 20e-3, 60e-3, 200e-3, 2.0)  # metres
 CASES = ((256, 8e-6), (512, 8e-6), (1024, 8e-6), (2048, 8e-6), (256, 3.74e-6), (512, 3.74e-6), (1024, 3.74e-6))
 SHOWN = (512, 8e-6)  # the case whose error is drawn against time
 LARGE = 2000  # px from which only FEW_DISTANCES are measured
-FEW_DISTANCES = (5e-3, 60e-3, 2.0)
+FEW_DISTANCES = (5e-3, 60e-3, 2.0)  # metres
 PEER_LIMIT = 512  # px up to which torchoptics is measured; larger grids take minutes
 SOURCES = ("smooth", "slm", "white", "hard edge")
-PREDICTION_CASES, TOLERANCE = 40, 1e-3
+PREDICTION_CASES = 40
+TOLERANCE = 1e-3  # relative L2 error of the planned method
 
 
 def propagation() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
@@ -50,7 +51,8 @@ def propagation() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
 def source(kind: str, grid: Grid) -> Tensor:
     """A test field, complex128 [H, W].
 
-    ``kind``: "smooth", a Gaussian; "slm", smooth phase with amplitude 1; "white", white phase; "hard edge", a disc.
+    ``kind``: "smooth", a Gaussian amplitude; "slm", smooth random phase; "white", random phase that is independent in
+    every sample; "hard edge", a disc.
     """
     generator = torch.Generator().manual_seed(1)
     y, x = grid.coordinates()
@@ -61,7 +63,7 @@ def source(kind: str, grid: Grid) -> Tensor:
     if kind == "hard edge":
         return (square < (0.3 * grid.extent[0]) ** 2).to(torch.complex128)
     if kind == "slm":
-        # White phase, blurred to a quarter of the band.
+        # White noise, blurred to a quarter of the band.
         fy, fx = grid.frequencies()
         low = torch.exp(-((fy * grid.pitch[0]) ** 2 + (fx * grid.pitch[1]) ** 2) / 0.06**2)
         smooth = ifft2(fft2(random - 0.5) * low).real
@@ -70,21 +72,19 @@ def source(kind: str, grid: Grid) -> Tensor:
 
 
 def _measure(size: int, pitch: float) -> list[dict[str, Any]]:
-    grid, rows = Grid(size, pitch), []
+    """Rows of every method, source and distance on one grid."""
+    grid, wide, rows = Grid(size, pitch), Grid(2 * size, pitch), []
     fields = {kind: source(kind, grid) for kind in SOURCES}
-    wide = Grid(2 * size, pitch)
     distances = [z for z in DISTANCES if size < LARGE or z in FEW_DISTANCES]
     for distance in tqdm(distances, desc=f"{size} px, {pitch * 1e6:g} um", unit="distance"):
         reference = CroppedKernel(wide, WAVELENGTH, distance)
-        pad = (0, size, 0, size)
-        exact = {kind: reference(torch.nn.functional.pad(f, pad)[None])[0, :size, :size] for kind, f in fields.items()}
+        exact = {kind: _exact(reference, field) for kind, field in fields.items()}
         methods = _methods(grid, distance)
         dtypes = {name: torch.complex128 if "complex128" in name else torch.complex64 for name in methods}
         calls = {name: partial(call, fields["white"].to(dtypes[name])) for name, call in methods.items()}
         seconds = interleaved(calls, rounds=5 if size < LARGE else 3)
         for name, call in methods.items():
             for kind, field in fields.items():
-                error = (call(field.to(dtypes[name])).to(torch.complex128) - exact[kind]).norm() / exact[kind].norm()
                 rows.append(
                     {
                         "size_px": size,
@@ -93,12 +93,24 @@ def _measure(size: int, pitch: float) -> list[dict[str, Any]]:
                         "crossovers": round(distance / unaliased_distance(grid, WAVELENGTH, 2), 4),
                         "source": kind,
                         "method": name,
-                        "error": f"{error.item():.3e}",
+                        "error": _error(call(field.to(dtypes[name])), exact[kind]),
                         "seconds": f"{seconds[name]:.3e}",
                         "ratio_to_bare": round(seconds[name] / seconds["bare FFTs, pad 2, float32 kernel"], 3),
                     }
                 )
     return rows
+
+
+def _exact(reference: CroppedKernel, field: Tensor) -> Tensor:
+    """Propagate a field [H, W] by the exact kernel ``reference`` of a larger window."""
+    (height, width), (rows, columns) = field.shape, reference.grid.shape
+    padded = torch.nn.functional.pad(field, (0, columns - width, 0, rows - height))
+    return reference(padded[None])[0, :height, :width]
+
+
+def _error(field: Tensor, exact: Tensor) -> str:
+    """Relative L2 error."""
+    return f"{((field.to(torch.complex128) - exact).norm() / exact.norm()).item():.3e}"
 
 
 def _methods(grid: Grid, distance: float) -> dict[str, Callable[[Tensor], Tensor]]:
@@ -107,21 +119,20 @@ def _methods(grid: Grid, distance: float) -> dict[str, Callable[[Tensor], Tensor
     padded = grid.padded(2)
     fy, fx = (f.float() for f in padded.frequencies())
     root = torch.sqrt(torch.clamp(1 / WAVELENGTH**2 - fy**2 - fx**2, min=0))
-    # Computed in float32, as it is often done.
+    # Many programs compute the kernel in float32 like this.
     naive = torch.exp(2j * math.pi * distance * root) / math.prod(padded.shape)
 
     def bare(field: Tensor) -> Tensor:
-        # The kernel contains the scale of the inverse transform; core.fourier explains why.
+        # The kernel contains the scale 1 / N of the inverse transform, as in core.fourier.
         return torch.fft.ifft2(torch.fft.fft2(field, s=padded.shape) * naive, norm="forward")[:height, :width]
 
-    modules = {
-        "planned, tolerance 1e-3": Propagator(grid, WAVELENGTH, distance, tolerance=TOLERANCE),
-        "planned, 1e-3, complex128": Propagator(grid, WAVELENGTH, distance, tolerance=TOLERANCE),
-        "cropped kernel": CroppedKernel(grid, WAVELENGTH, distance),
-        "angular spectrum, pad 1.125": AngularSpectrum(grid, WAVELENGTH, distance, pad=1.125),
-        "angular spectrum, pad 2": AngularSpectrum(grid, WAVELENGTH, distance, pad=2),
-        "angular spectrum, pad 4": AngularSpectrum(grid, WAVELENGTH, distance, pad=4),
-        "Fresnel, pad 2": Fresnel(grid, WAVELENGTH, distance, pad=2),
+    setup = grid, WAVELENGTH, distance
+    modules: dict[str, torch.nn.Module] = {
+        "planned, tolerance 1e-3": Propagator(*setup, tolerance=TOLERANCE),
+        "planned, 1e-3, complex128": Propagator(*setup, tolerance=TOLERANCE),
+        "cropped kernel": CroppedKernel(*setup),
+        **{f"angular spectrum, pad {pad:g}": AngularSpectrum(*setup, pad=pad) for pad in (1.125, 2.0, 4.0)},
+        "Fresnel, pad 2": Fresnel(*setup, pad=2),
     }
     calls: dict[str, Callable[[Tensor], Tensor]] = {"bare FFTs, pad 2, float32 kernel": bare}
     calls |= {name: (lambda field, m=module: m(field[None])[0]) for name, module in modules.items()}
@@ -146,23 +157,19 @@ def _predictions() -> list[dict[str, Any]]:
         grid = Grid((int(generator.integers(40, 120)), int(generator.integers(40, 120))), pitch)
         wavelength = float(generator.choice([450e-9, 530e-9, 636e-9]))
         distance = 10 ** generator.uniform(-2, 0.7) * 2 * max(grid.extent) * pitch / wavelength
-        field = _noise(grid, share, case)
-        wide = Grid((4 * grid.shape[0], 4 * grid.shape[1]), pitch)
-        large = torch.nn.functional.pad(field, (0, 3 * grid.shape[1], 0, 3 * grid.shape[0]))
-        exact = CroppedKernel(wide, wavelength, distance)(large[None])[0, : grid.shape[0], : grid.shape[1]]
-        path = PlanePair(grid, grid)
-        content = FieldContent((share / 2 / pitch, share / 2 / pitch))
+        field, wide = _noise(grid, share, case), Grid((4 * grid.shape[0], 4 * grid.shape[1]), pitch)
+        exact = _exact(CroppedKernel(wide, wavelength, distance), field)
+        path, content = PlanePair(grid, grid), FieldContent((share / 2 / pitch, share / 2 / pitch))
         for method in candidates(path, [wavelength], [distance], content):
-            values = [torch.tensor(value, dtype=torch.float64) for value in (wavelength, distance)]
-            kernel = kernel_of(path, method, values[0], values[1], torch.complex64)
-            out = filter_spectrum(field.to(torch.complex64), kernel).to(torch.complex128)
+            length, z = (torch.tensor(value, dtype=torch.float64) for value in (wavelength, distance))
+            kernel = kernel_of(path, method, length, z, torch.complex64)
             rows.append(
                 {
                     "case": case,
                     "method": method.method,
                     "padded": f"{method.padded[0]}x{method.padded[1]}",
                     "predicted": f"{method.error:.3e}",
-                    "true": f"{((out - exact).norm() / exact.norm()).item():.3e}",
+                    "true": _error(filter_spectrum(field.to(torch.complex64), kernel), exact),
                     "flops": f"{method.flops:.3e}",
                 }
             )
@@ -183,16 +190,12 @@ def _verdict(rows: list[dict], prediction: list[dict]) -> list[str]:
         f"torch {torch.__version__}, {torch.get_num_threads()} threads, {platform.machine()}, complex64; errors "
         "against the cropped kernel in complex128 on twice the window"
     ]
-    names = list(dict.fromkeys(row["method"] for row in rows))
-    for name in names:
+    for name in dict.fromkeys(row["method"] for row in rows):
         selected = [row for row in rows if row["method"] == name]
         worst = {kind: max(float(row["error"]) for row in selected if row["source"] == kind) for kind in SOURCES}
+        errors = ", ".join(f"{kind} {error:.0e}" for kind, error in worst.items())
         ratio = np.median([row["ratio_to_bare"] for row in selected])
-        lines.append(
-            f"{name}: worst error "
-            + ", ".join(f"{kind} {value:.0e}" for kind, value in worst.items())
-            + f"; median time {ratio:.2f} of bare FFTs"
-        )
+        lines.append(f"{name}: worst error {errors}; median time {ratio:.2f} of bare FFTs")
     peers = [row for row in rows if row["method"].startswith("torchoptics") and row["source"] == "white"]
     if peers:
         case = itemgetter("size_px", "pitch_um", "distance_m")
@@ -235,48 +238,43 @@ def _draw(rows: list[dict]) -> bytes:
             crossovers = distance / unaliased_distance(Grid(size, pitch), WAVELENGTH, 2)
             axes.set_title(f"{kind}, {distance * 1e3:g} mm = {crossovers:.2g} z_c", fontsize=9)
             axes.grid(alpha=0.3)
-    figure.supxlabel(
-        f"time of one call / time of two bare FFTs at pad 2 ({size} px, {pitch * 1e6:g} um, 530 nm, complex64)"
-    )
+    setup = f"{size} px, {pitch * 1e6:g} um, 530 nm, complex64"
+    figure.supxlabel(f"time of one call / time of two bare FFTs at pad 2 ({setup})")
     figure.supylabel("relative L2 error")
-    handles, labels = panels[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=4, fontsize=9)
-    return figure_png(figure)
+    return _with_legend(figure, panels[0][0])
 
 
 def _draw_validity(rows: list[dict]) -> bytes:
-    """PNG of error against distance, in cross-over distances; bars at the top mark where methods become invalid."""
+    """PNG of error against distance in cross-over distances; bars at the top mark where a method becomes inaccurate."""
     names = list(dict.fromkeys(row["method"] for row in rows))
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     panels = figure.subplots(1, 2)
     for axes, kind in zip(panels, ("white", "smooth"), strict=True):
         for k, name in enumerate(names):
-            points = sorted(
-                (row["crossovers"], min(float(row["error"]), 10))
-                for row in rows
-                if row["method"] == name and row["source"] == kind
-            )
+            chosen = [row for row in rows if row["method"] == name and row["source"] == kind]
+            points = sorted((row["crossovers"], min(float(row["error"]), 10)) for row in chosen)
             axes.loglog(*zip(*points, strict=True), "os^vD*PhX"[k % 9], color=f"C{k}", label=name, alpha=0.8)
-        for k, name in enumerate(names):
             for border in _borders(name):
                 axes.axvline(border, ymin=0.9, color=f"C{k}", linewidth=2)
         axes.axvline(1, color="k", linestyle=":", linewidth=1)
         axes.axhline(TOLERANCE, color="k", linestyle=":", linewidth=1)
         axes.set_title(f"{kind} source, {len(CASES)} grids")
-        axes.set_xlabel("distance / cross-over distance z_c = 2 L pitch / wavelength")
-        axes.set_ylabel("relative L2 error")
+        axes.set(xlabel="distance / cross-over distance z_c = 2 L pitch / wavelength", ylabel="relative L2 error")
         axes.grid(alpha=0.3)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=4, fontsize=9)
+    return _with_legend(figure, panels[0])
+
+
+def _with_legend(figure: Figure, axes: Any) -> bytes:
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=4, fontsize=9)
     return figure_png(figure)
 
 
 def _borders(name: str) -> list[float]:
     """Distances, in cross-over distances z_c of each grid, at which a method becomes inaccurate by its error model.
 
-    Padding by a factor P contains the light up to (P - 1) z_c. The Fresnel approximation neglects a phase of
-    pi z s^4 / (4 wavelength) for the sine s, up to the corner of the band. float32 rounds k z to a relative 6e-8. The
-    last two give the distance at which the error reaches the tolerance.
+    Padding by a factor P suffices up to (P - 1) z_c. The other limits are where an error of the phase reaches the
+    tolerance: the Fresnel approximation neglects pi z s^4 / (4 wavelength) for light of sine s, here at the corner of
+    the band, and float32 rounds the phase k z by a relative 6e-8.
     """
     if name.startswith("angular spectrum"):
         return [float(name.split()[-1]) - 1]

@@ -14,7 +14,7 @@ from holotorch.optics.light.spectrum import Spectrum
 
 def case(distance: float, wavelength: float, aperture: float, best: float, inside: bool = True) -> Case:
     flat = (0.5,) * len(WIDTHS)
-    return Case(distance, wavelength, aperture, flat, flat, flat, best, inside)
+    return Case(distance, wavelength, aperture, flat, flat, best, inside)
 
 
 def test_the_prefactor_is_that_of_the_cases():
