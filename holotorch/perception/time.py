@@ -34,9 +34,8 @@ class PerceptionTime:
     freedom: Tensor | None = None
 
     def __post_init__(self):
-        for name, value in (("slope", self.slope), ("intercept", self.intercept)):
-            checks.real(name, value)
-            angles.as_tensor(name, value, "seconds")
+        for name in ("slope", "intercept"):  # numbers become tensors
+            object.__setattr__(self, name, angles.as_tensor(name, getattr(self, name), "seconds"))
         if self.slope.shape != self.intercept.shape:
             shapes = f"{tuple(self.slope.shape)} and {tuple(self.intercept.shape)}"
             raise ValueError(f"slope and intercept must share a shape, got {shapes}")
