@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from holotorch.core import checks
 from holotorch.perception import angles
 
 
