@@ -151,7 +151,7 @@ def _solve(normal: list[float], right: Vector) -> Vector:
 
 
 def on_host(pose: Pose) -> LinePose | None:
-    """Tip and direction of a pose on any device as NumPy arrays, with zero covariance; None where they are not finite."""
+    """Tip and direction of a pose on any device, with zero covariance; None where they are not finite."""
     tip, direction = (value.numpy(force=True).astype(np.float64) for value in (pose.tip, pose.direction))
     finite = all(map(math.isfinite, (*tip.tolist(), *direction.tolist())))
     return LinePose(tip, direction, np.zeros((6, 6)), 0.0) if finite else None
