@@ -115,8 +115,8 @@ def fit_band_edges(
 class _Problem:
     """Least squares over F frames.
 
-    Each frame has 2 unknowns for the direction, and 3 for the tip unless it rests (``own``). Those that all frames
-    share are the free positions, m or, with a resting tip, m - 3 of them, and the resting tip (``shared``).
+    Each frame has 2 unknowns for its direction, and 3 for its tip unless that rests (``own``). The other m unknowns,
+    the free positions and a resting tip, are the same in all frames (``shared``).
     """
 
     def __init__(self, plane: Tensor, weights: Tensor, free: Tensor, resting: bool, offset: float):

@@ -14,7 +14,8 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.tracking.pose.catheter import Catheter
 from holotorch.tracking.simulation import scenery
-from holotorch.tracking.simulation.render import Look, Occluder, render
+from holotorch.tracking.simulation.look import Look, Occluder
+from holotorch.tracking.simulation.render import render
 from holotorch.tracking.simulation.world import Case, World, aimed
 
 _TILT = math.radians(20)
