@@ -81,7 +81,7 @@ def photograph(image: Tensor, size: tuple[int, int], seed: int = 0) -> Tensor:
 
 
 def papers(size: tuple[int, int], seed: int, colours: Sequence[Colour]) -> Tensor:
-    """Sheets of paper on a table: some at random with random or given colours, and a row in the order of ``colours``."""
+    """Sheets of paper on a table: some at random in random or given colours, and a row in the order of ``colours``."""
     rng = np.random.default_rng(seed)
     image = _interleaved(desk(size, seed))
     scale = size[1] / 1920
@@ -122,7 +122,7 @@ def clutter(size: tuple[int, int], seed: int, colours: Sequence[Colour], amount:
 def finger(
     start: tuple[float, float], end: tuple[float, float], radius: float, colour: Colour = SKIN
 ) -> tuple[Occluder, ...]:
-    """A finger from its tip ``start`` to its root ``end`` in pixels, lighter along its middle; for ``Look.occluders``."""
+    """A finger from its tip ``start`` to its root ``end`` in pixels, lighter along its middle."""
     checks.positive("radius", radius, "pixels")
     parts = []
     for i in range(6):
@@ -132,7 +132,7 @@ def finger(
 
 
 def hand(at: tuple[float, float], turn: float, finger_px: float, colour: Colour = WHITE_GLOVE) -> tuple[Occluder, ...]:
-    """A hand with finger tips around the pixel ``at`` (x, y) and fingers of radius ``finger_px``; for ``Look.occluders``.
+    """A hand with finger tips around the pixel ``at`` (x, y) and fingers of radius ``finger_px`` in pixels.
 
     The arm extends from the hand at the angle ``turn`` in radians, from +x towards +y.
     """

@@ -57,7 +57,7 @@ def synthetic_camera(size: tuple[int, int] = (1080, 1920), tone: str = "srgb") -
 
 
 def aimed(tilt: float, roll: float = _ROLL) -> Tensor:
-    """Direction [3] of a catheter at the angle ``roll`` from x to y, its rear tilted by ``tilt`` to the camera; radians."""
+    """Direction [3] of a catheter at an angle ``roll`` from x to y, its rear tilted to the camera; both in radians."""
     flat = math.cos(tilt)
     return torch.tensor([flat * math.cos(roll), flat * math.sin(roll), -math.sin(tilt)], dtype=torch.float64)
 
@@ -131,7 +131,8 @@ class World:
 
         Args:
             depth: Coordinate z in metres of the point that ``point`` selects.
-            tilt, roll: Angles in radians, see :func:`aimed`.
+            tilt: Angle in radians, see :func:`aimed`.
+            roll: Angle in radians, see :func:`aimed`.
             at: Point (x, y) of the plane z = 1 on the ray from the camera through the middle of the bands.
             point: Distance in metres from the tip of the point at ``depth``; None for the middle of the bands.
 
@@ -145,8 +146,8 @@ class World:
         ahead = depth + (0.0 if point is None else (middle - checks.finite("point", point)) * float(direction[2]))
         if ahead <= 0:
             raise ValueError(
-                f"the middle of the bands must lie in front of the camera, got {ahead:.3g} m with the point {point:g} m "
-                f"from the tip at depth {depth:g} m; tilt less or go farther"
+                f"the middle of the bands must lie in front of the camera, got {ahead:.3g} m with the point {point:g} "
+                f"m from the tip at depth {depth:g} m; tilt less or go farther"
             )
         return ahead * torch.tensor([*at, 1.0], dtype=torch.float64) - middle * direction, direction
 
