@@ -19,18 +19,26 @@ from holotorch.tracking.simulation.look import Look, Occluder
 from holotorch.tracking.simulation.render import render
 from holotorch.tracking.simulation.world import Case, World, aimed
 
-_TILT, _DEPTH = (
-    math.radians(20),
-    0.52,
-)  # default pose: rear tilted to the camera, distance of the bands' middle in metres
-# Kinds of frames without the catheter.
-_KINDS = "bare|papers|wrong order|photograph|other colours|clutter|unequal bands|texture|thick|hand".split("|")
+_TILT = math.radians(20)  # default tilt of the rear to the camera
+_DEPTH = 0.52  # metres: default distance of the middle of the bands
+_KINDS = (
+    "bare",
+    "papers",
+    "wrong order",
+    "photograph",
+    "other colours",
+    "clutter",
+    "unequal bands",
+    "texture",
+    "thick",
+    "hand",
+)
 
 
 def conditions(world: World) -> list[Case]:
     """One case for each of many difficult conditions: motion, blur, noise, light, slant, distance and clutter.
 
-    The middle of the bands is at 0.52 m and the rear tilted by 20 degrees to the camera, unless the name says otherwise.
+    Unless the name says otherwise, the rear is tilted by 20 degrees to the camera and the bands' middle 0.52 m away.
     """
     size, bands = world.size, world.catheter.colours
     pose = world.pose(_DEPTH, _TILT)
