@@ -38,8 +38,8 @@ class ThermalCrosstalk(nn.Module):
         if size is not None and checks.whole("crosstalk size", size, 1) % 2 == 0:
             raise ValueError(f"crosstalk size must be an odd number of taps of at least 1, got {size!r}")
         radius = _needed_radius(sigma) if size is None else size // 2
-        taps = [[_tap(offset, sigma)] for offset in range(-radius, radius + 1)]
-        self._set_factors(torch.tensor(taps, dtype=torch.float64), torch.tensor(taps, dtype=torch.float64).T)
+        column = torch.tensor([[_tap(offset, sigma)] for offset in range(-radius, radius + 1)], dtype=torch.float64)
+        self._set_factors(column, column.T)
         self.sigma_px, self.size_is_given = sigma, size is not None
 
     @classmethod
@@ -92,10 +92,7 @@ class ThermalCrosstalk(nn.Module):
     @property
     def kernel(self) -> Tensor:
         """The two-dimensional kernel, float64 [h, w], with a centre tap of 1."""
-        kernel = torch.ones(1, 1, dtype=torch.float64)
-        for factor in self._factors:
-            kernel = kernel * torch.tensor(factor, dtype=torch.float64)
-        return kernel
+        return math.prod(torch.tensor(factor, dtype=torch.float64) for factor in self._factors)  # type: ignore[return-value]
 
     @property
     def total(self) -> float:

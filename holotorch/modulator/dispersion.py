@@ -29,7 +29,6 @@ class Cauchy:
         checks.quantity(CAUCHY_B, self.b)
 
     def __call__(self, wavelength: Tensor) -> Tensor:
-        """Birefringence at ``wavelength``."""
         value = self.a + self.b / _checked(wavelength).square()
         if bool((value.detach() <= 0).any()):
             raise ValueError(
@@ -41,17 +40,16 @@ class Cauchy:
 
 @dataclass(frozen=True)
 class BirefringenceTable:
-    """Measured birefringence, interpolated linearly in 1 / lambda^2, which is exact for Cauchy's law.
-
-    :func:`phase_scale` needs only ratios, so the values may have any unit, such as phase times wavelength.
+    """Measured birefringence, interpolated linearly in 1 / lambda^2, which is exact for Cauchy's law; called likewise.
 
     Args:
         wavelengths: In metres, at least two different ones in any order; they are sorted.
-        values: Birefringence at each wavelength, above zero.
+        values: Birefringence at each wavelength, above zero. A common factor does not matter for :func:`phase_scale`,
+            so that they may be phases times wavelengths.
 
     Raises:
-        ValueError: Fewer than two rows, a wavelength given twice, values that are not positive; in a call: a
-            wavelength outside the table.
+        ValueError: Fewer than two rows, equal wavelengths, values that are not positive; in a call: a wavelength
+            outside the table.
     """
 
     wavelengths: Sequence[float]
@@ -69,10 +67,9 @@ class BirefringenceTable:
             object.__setattr__(self, name, column)
 
     def __call__(self, wavelength: Tensor) -> Tensor:
-        """Birefringence at ``wavelength``."""
         lengths = _checked(wavelength)
         low, high = self.wavelengths[0], self.wavelengths[-1]
-        # The margin of 1e-6 admits end points that were rounded to float32.
+        # A margin of 1e-6 admits end points that were rounded to float32.
         if bool(((lengths.detach() < low * (1 - 1e-6)) | (lengths.detach() > high * (1 + 1e-6))).any()):
             raise ValueError(
                 f"wavelengths {lengths.min().item() * 1e9:.6g} to {lengths.max().item() * 1e9:.6g} nm lie outside the "
@@ -108,8 +105,7 @@ def phase_scale(light: float | Tensor, design: float | Tensor, birefringence: Bi
 def kinoform_efficiency(scale: Tensor) -> Tensor:
     """Share of the light that forms the image of a kinoform whose phases on [0, 2 pi) are multiplied by ``scale``.
 
-    It is sinc^2(1 - scale) for uniformly distributed phases, such as those of a blazed grating or of the kinoform of a
-    diffuse image. Source: Goodman, Sec. 4.4; Dammann (1970), blazed gratings of the wrong depth.
+    It is sinc^2(1 - scale) for uniformly distributed phases. Source: Goodman, Sec. 4.4; Dammann (1970).
     """
     return torch.sinc(1 - scale).square()
 
@@ -124,8 +120,7 @@ class CauchyFit:
     """Result of :func:`fit_cauchy`.
 
     Attributes:
-        law: The birefringence. Without a path length, a and b are in error by one unknown factor, which cancels in
-            :func:`phase_scale`.
+        law: The birefringence; without a path length, only the ratio b / a is meaningful.
         residuals: Measured minus fitted phase in rad, in the order of the measurements.
         rms: Root mean square of the residuals in rad.
         errors: Standard errors of (a, b), estimated from the residuals; NaN for two measurements.
@@ -146,7 +141,7 @@ def fit_cauchy(wavelengths: Sequence[float], phases: Sequence[float], *, path: f
         wavelengths: In metres, at least two different ones; with two, the fit is exact.
         phases: Phase range at each wavelength in rad, not wrapped.
         path: Length of the light's path through the crystal in metres, in reflection twice the thickness of the cell.
-            Without it, only the ratio b / a is determined, which is all that :func:`phase_scale` needs.
+            :func:`phase_scale` needs only the ratio b / a, which does not depend on it.
 
     Raises:
         ValueError: Fewer than two wavelengths, unequal lengths, phases that are not positive, or phases that no

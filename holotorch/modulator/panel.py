@@ -68,22 +68,18 @@ def quantisation_rms(lut: Tensor) -> float:
 class PhaseModulator(nn.Module):
     """Emitted field of one panel, complex [..., C, H, W], for a wanted phase, real [..., C, H, W] in rad.
 
-    The model has these steps: round the phase to that of the nearest grey level (:func:`snapped`); smooth it by the
-    fringing fields between pixels; scale it by dispersion, if the light has another wavelength than the calibration;
-    add the light of the gaps between the pixels. Colours are shown one after another, each with a separate look-up
-    table.
+    The phase is rounded to that of the nearest grey level (:func:`snapped`), smoothed by the fringing fields between
+    pixels, and scaled by dispersion if the light has another wavelength than the calibration. Fringing is a convolution
+    of the phase, and not of the field, since it smooths the orientation of the crystal; its kernel is normalised, also
+    at the border of the panel.
 
-    Fringing is a convolution of the phase with a kernel of sum 1, which is normalised again at the border of the panel.
-    The phase and not the field is convolved, since fringing smooths the orientation of the crystal. Detail within a
-    pixel is not modelled. The amplitude is that of the central diffraction order for unit illumination:
-    ``fill_factor`` times the modulated field, plus (1 - ``fill_factor``) ``gap`` for the gaps, which are not modulated.
-    ``holotorch.optics.PixelShape`` models the lower amplitude of the higher diffraction orders. It may be applied to
-    the emitted field with a ``fill`` of the square root of ``fill_factor``, but only if ``gap`` is 0: the light of the
-    gaps depends on the order in another way.
+    The amplitude is that of the central diffraction order for unit illumination: ``fill_factor`` times the modulated
+    field, plus (1 - ``fill_factor``) ``gap`` for the gaps between pixels. If ``gap`` is 0, the lower amplitude of the
+    higher orders may be modelled by applying ``holotorch.optics.PixelShape`` with a ``fill`` of sqrt(``fill_factor``).
 
     Args:
         grid: Pixels of the panel.
-        wavelengths: Wavelengths of the calibration in metres, one per channel.
+        wavelengths: Wavelengths of the calibration in metres, one per channel; the channels are shown in sequence.
         bits: Bits of a grey level, 1 to 16.
         full_turn: Level at which the phase is 2 pi, see :func:`even_lut`.
         lut: Phase in rad of every level, real [2^bits] or [C, 2^bits], strictly rising or falling; excludes
@@ -91,8 +87,7 @@ class PhaseModulator(nn.Module):
         fill_factor: Share of the area that is modulated, above 0 and at most 1.
         gap: Amplitude reflected by the gaps, 0 (dark) to 1, with phase 0.
         flip_rows: Whether the panel shows the last row of a frame at its top; affects only :meth:`levels` and
-            :meth:`phase`. A frame is flipped about its middle, which for an even size moves the optical axis, at pixel
-            n // 2, by one pixel.
+            :meth:`phase`. For an even size, the flip moves the optical axis, at pixel n // 2, by one pixel.
         flip_columns: The same for columns.
         crosstalk: Fringing kernel: the standard deviation in pixels of a Gaussian, or a measured kernel [h, w], see
             :meth:`ThermalCrosstalk.from_patch`.

@@ -14,8 +14,6 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.modulator.quantised import checked_bits
 
-_KNOTS = 17  # knots of the fitted phase curve, evenly spaced in grey level
-
 
 def uniform(shape: tuple[int, int], level: int, *, bits: int = 8) -> Tensor:
     """One grey level everywhere, [H, W]."""
@@ -33,14 +31,9 @@ def grating(
 ) -> Tensor:
     """Binary grating [H, W]; its first order has (2 / pi)^2 sin^2(phase difference / 2) of the light.
 
-    Args:
-        shape: (H, W) of the panel.
-        period: In pixels, at least 2. A grating along x or y whose period is an even number of pixels has two equal
-            halves, and therefore no even diffraction orders.
-        level: Grey level of the second half of each period.
-        reference: Grey level of the first half, which begins at pixel (0, 0).
-        angle: Direction of the grating vector in rad, from +x (right) towards +y (down).
-        bits: Bits of a grey level.
+    The first half of each period has the level ``reference``, the second half ``level``; the first period begins at
+    pixel (0, 0). ``period`` is 2 pixels or more; an even one along x or y avoids even diffraction orders. ``angle`` is
+    the direction of the grating vector in rad, from +x (right) towards +y (down).
     """
     if not checks.finite("period", period, "pixels") >= 2:
         raise ValueError(f"period must be at least 2 pixels, got {period!r}")
@@ -60,10 +53,7 @@ def grating_sweep(
     angle: float = 0.0,
     bits: int = 8,
 ) -> Tensor:
-    """Gratings [L, H, W] between ``reference`` and each of L ``levels``, see :func:`grating`.
-
-    :func:`fit_lut` takes the intensities of their first orders.
-    """
+    """Gratings [L, H, W], one for each of L ``levels``, whose first orders :func:`fit_lut` takes; see :func:`grating`."""
     frames = [grating(shape, period, level, reference=reference, angle=angle, bits=bits) for level in levels]
     return torch.stack(frames) if frames else torch.empty(0, *_shape(shape), dtype=torch.uint8)
 
@@ -78,9 +68,8 @@ def checkerboard(shape: tuple[int, int], side: int, level: int, *, reference: in
 def orientation_chart(shape: tuple[int, int], *, bits: int = 8) -> Tensor:
     """Four grey quadrants and a letter F, [H, W]: every flip, quarter turn or transposition changes the picture.
 
-    The quadrants have 1/4 (upper left), 1/2 (upper right), 3/4 (lower left) and 1/1 (lower right) of the largest grey
-    level. The F has level 0, is in the middle, and is a third of the shorter side of the frame high. The frame has at
-    least 16 x 16 pixels.
+    The quadrants have 1/4 (upper left), 1/2 (upper right), 3/4 (lower left) and 1/1 (lower right) of the largest level.
+    The F in the middle has level 0 and a third of the height of the frame, which has at least 16 x 16 pixels.
     """
     height, width = _shape(shape)
     if min(height, width) < 16:
@@ -97,10 +86,9 @@ def orientation_chart(shape: tuple[int, int], *, bits: int = 8) -> Tensor:
 
 
 def circles(shape: tuple[int, int], radii: Sequence[float], level: int, *, width: float = 2.0, bits: int = 8) -> Tensor:
-    """Rings about the optical axis (pixel n // 2) and a cross through it, of ``level`` on a background of 0, [H, W].
+    """Rings about the optical axis (pixel n // 2) and a cross through it, one pixel wide, on level 0, [H, W].
 
-    ``radii`` are those of the centre lines of the rings and ``width`` is the width of each ring, in pixels. The lines
-    of the cross are one pixel wide and as long as the frame.
+    ``radii`` are those of the centre lines of the rings and ``width`` is the width of each ring, in pixels.
     """
     y, x = _coordinates(shape)
     y, x = y - shape[0] // 2, x - shape[1] // 2
@@ -132,19 +120,18 @@ class LUTFit:
 def fit_lut(levels: Sequence[int], first_order_intensity: Sequence[float] | Tensor, *, bits: int = 8) -> LUTFit:
     """Phase of every level from the first-order intensity of gratings between level 0 and each of ``levels``.
 
-    Fits the model background + peak sin^2(phase / 2) by least squares, where the phase is a smooth monotone curve
-    through 17 knots. Near multiples of pi, sin^2 is flat, and a single intensity hardly determines the phase; therefore
-    the model is fitted to all intensities together instead of being inverted for each. The intensity does not determine
-    the sign of the phase, which is assumed to rise with the level.
+    Fits the model background + peak sin^2(phase / 2) by least squares, where the phase is a smooth curve through 17
+    knots that rises with the level; the intensity does not determine its sign. Near multiples of pi, sin^2 is flat, and
+    a single intensity hardly determines the phase, so that all intensities are fitted together.
 
     Args:
-        levels: Grey levels of the sweep, rising, at least 24 of them, from 0 to the largest level 2^bits - 1.
+        levels: At least 24 rising grey levels, from 0 to the largest one.
         first_order_intensity: One value per level, in any unit.
         bits: Bits of a grey level.
 
     Raises:
-        ValueError: Levels other than described, NaN, intensities that are all equal, or a phase range below about pi,
-            for which the intensity has no maximum within the sweep and the peak is unknown.
+        ValueError: Levels other than described, NaN, equal intensities, or a phase range below about pi, for which the
+            intensity has no maximum within the sweep and the peak is unknown.
     """
     top = 2 ** checked_bits(bits) - 1
     swept = [_level("level", level, bits) for level in levels]
@@ -177,15 +164,12 @@ def fit_lut(levels: Sequence[int], first_order_intensity: Sequence[float] | Tens
 
 
 def _first_guess(x: Tensor, unit: Tensor) -> Tensor:
-    """Phase increments between knots, of that curve stroke * x^power, among 96 strokes and 13 powers, that fits best.
-
-    ``x`` [L] are the levels divided by the largest, ``unit`` [L] the intensities scaled to [0, 1].
-    """
+    """Phase increments between knots of the best power law, for levels ``x`` and intensities ``unit`` in [0, 1]."""
     strokes = torch.linspace(math.pi / 2, 8 * math.pi, 96, dtype=torch.float64)
     powers = torch.logspace(math.log10(0.4), math.log10(2.5), 13, dtype=torch.float64)
     curves = torch.cartesian_prod(strokes, powers)
     stroke, power = curves[_linear_part(curves[:, :1] * x ** curves[:, 1:], unit)[2].argmin()]
-    knots = torch.linspace(0, 1, _KNOTS, dtype=torch.float64)
+    knots = torch.linspace(0, 1, 17, dtype=torch.float64)
     return torch.diff(stroke * knots**power).clamp(min=1e-3 * stroke)
 
 
@@ -207,22 +191,15 @@ def _refined(x: Tensor, unit: Tensor, increments: Tensor) -> Tensor:
 
 
 def _curve(increments: Tensor, x: Tensor) -> Tensor:
-    """Phase at ``x`` in [0, 1] by monotone cubic Hermite interpolation.
-
-    The slope at an inner knot is the harmonic mean of the two neighbouring increments, which keeps the curve monotone.
-    """
+    """Phase at ``x`` in [0, 1] by cubic Hermite interpolation, monotone since slopes are harmonic means."""
     values = torch.cat([increments.new_zeros(1), increments.cumsum(0)])
     inner = 2 / (1 / increments[1:] + 1 / increments[:-1])
     slopes = torch.cat([increments[:1], inner, increments[-1:]])
     scaled = x * len(increments)
     row = scaled.floor().long().clamp(0, len(increments) - 1)
     t = scaled - row
-    return (
-        values[row] * (1 + 2 * t) * (1 - t).square()
-        + slopes[row] * t * (1 - t).square()
-        + values[row + 1] * t.square() * (3 - 2 * t)
-        + slopes[row + 1] * t.square() * (t - 1)
-    )
+    start = values[row] * (1 + 2 * t) * (1 - t).square() + slopes[row] * t * (1 - t).square()
+    return start + values[row + 1] * t.square() * (3 - 2 * t) + slopes[row + 1] * t.square() * (t - 1)
 
 
 def _linear_part(phase: Tensor, unit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
