@@ -17,8 +17,8 @@ Birefringence = Callable[[Tensor], Tensor]
 class Cauchy:
     """Cauchy's law of birefringence, dn = a + b / lambda^2, b in m^2; the defaults describe a common nematic mixture.
 
-    A call takes wavelengths in metres of any shape and returns the birefringence, float64 of the same shape and
-    differentiable. It raises ValueError where the birefringence is not positive.
+    A call takes wavelengths in metres and returns the birefringence, float64 of the same shape and differentiable. It
+    raises ValueError where the birefringence is not positive.
     """
 
     a: float = 0.18
@@ -29,6 +29,7 @@ class Cauchy:
         checks.quantity(CAUCHY_B, self.b)
 
     def __call__(self, wavelength: Tensor) -> Tensor:
+        """Birefringence at ``wavelength``."""
         value = self.a + self.b / _checked(wavelength).square()
         if bool((value.detach() <= 0).any()):
             raise ValueError(
@@ -67,6 +68,7 @@ class BirefringenceTable:
             object.__setattr__(self, name, column)
 
     def __call__(self, wavelength: Tensor) -> Tensor:
+        """Birefringence at ``wavelength``."""
         lengths = _checked(wavelength)
         low, high = self.wavelengths[0], self.wavelengths[-1]
         # A margin of 1e-6 admits end points that were rounded to float32.

@@ -53,7 +53,7 @@ def grating_sweep(
     angle: float = 0.0,
     bits: int = 8,
 ) -> Tensor:
-    """Gratings [L, H, W], one for each of L ``levels``, whose first orders :func:`fit_lut` takes; see :func:`grating`."""
+    """Gratings [L, H, W], one for each of L ``levels``, see :func:`grating`; for :func:`fit_lut`."""
     frames = [grating(shape, period, level, reference=reference, angle=angle, bits=bits) for level in levels]
     return torch.stack(frames) if frames else torch.empty(0, *_shape(shape), dtype=torch.uint8)
 

@@ -54,11 +54,9 @@ class Charuco:
             raise ValueError(f"marker must be smaller than square, {self.square:g} m, got {self.marker:g} m")
         if self.dictionary not in _DICTIONARIES:
             raise ValueError(f"dictionary must be one of {', '.join(_DICTIONARIES)}, got {self.dictionary!r}")
-        available = len(cv2.aruco.getPredefinedDictionary(_DICTIONARIES[self.dictionary]).bytesList)
-        if available < (needed := self.columns * self.rows // 2):
-            raise ValueError(
-                f"the board has {needed} markers, {self.dictionary} only {available}; check the board's size"
-            )
+        held = len(cv2.aruco.getPredefinedDictionary(_DICTIONARIES[self.dictionary]).bytesList)
+        if held < (needed := self.columns * self.rows // 2):
+            raise ValueError(f"the board has {needed} markers, {self.dictionary} only {held}; check the board's size")
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +114,7 @@ def find_board(image: Tensor, board: Chessboard | Charuco, name: str = "") -> Vi
             f"no {describe_board(board)} found; is its size right, is it flat, sharp, evenly lit and, with a white "
             "margin, in the picture?"
         )
-    points, pixels = (torch.from_numpy(np.asarray(part, dtype=np.float64)) for part in corners)
-    return View(points, pixels, name)
+    return View(*map(torch.from_numpy, corners), name=name)
 
 
 def describe_board(board: Chessboard | Charuco) -> str:
@@ -144,9 +141,8 @@ def _chessboard(grey: np.ndarray, board: Chessboard) -> tuple[np.ndarray, np.nda
         found, corners = cv2.findChessboardCornersSB(grey, shape, flags=flags)
     if not found:
         return None
-    points = np.zeros((board.rows, board.columns, 3))
-    points[..., 0], points[..., 1] = np.meshgrid(np.arange(board.columns), np.arange(board.rows))
-    return board.square * points.reshape(-1, 3), corners.reshape(-1, 2)
+    points = [(x, y, 0.0) for y in range(board.rows) for x in range(board.columns)]
+    return board.square * np.array(points), corners.reshape(-1, 2)
 
 
 def _charuco(grey: np.ndarray, board: Charuco) -> tuple[np.ndarray, np.ndarray] | None:

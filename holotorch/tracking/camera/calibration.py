@@ -72,8 +72,7 @@ def calibrate(views: Sequence[View], size: tuple[int, int]) -> Calibration:
 
     Views with an rms error above 3 times the median and above 0.5 px are left out, the worst one first, as long as
     three quarters of the views and at least 4 remain. Fewer than 4 views are supplemented by a prior of ordinary
-    cameras (square pixels, central principal point, moderate distortion, no fisheye), whose uncertainty is part of the
-    deviations. Such a calibration is not accurate enough for measurements.
+    cameras, which is not accurate enough for measurements; its uncertainty is part of the deviations.
 
     Args:
         views: 10 or more views of a flat board with different tilts; see ``holotorch.tracking.camera.boards``. A bend
@@ -97,19 +96,16 @@ def calibrate(views: Sequence[View], size: tuple[int, int]) -> Calibration:
             raise ValueError(f"corners must lie within {width} x {height} px, but {view.name!r} has others")
     names = [view.name or f"view {i}" for i, view in enumerate(kept)]
     left_out: dict[str, float] = {}
-    if len(kept) < _CHECKED:
-        fit = estimate(kept, size)
-        coverage = _coverage(kept, fit, size)
-    else:
+    fit = estimate(kept, size) if len(kept) < _CHECKED else _fit(kept, size)
+    while len(kept) > _CHECKED and 4 * (len(kept) - 1) >= 3 * len(views):
+        worst = int(fit.errors.argmax())
+        if fit.errors[worst] <= max(3 * float(np.median(fit.errors)), 0.5):
+            break
+        left_out[names.pop(worst)] = float(fit.errors[worst])
+        kept.pop(worst)
         fit = _fit(kept, size)
-        while len(kept) > _CHECKED and 4 * (len(kept) - 1) >= 3 * len(views):
-            worst = int(fit.errors.argmax())
-            if fit.errors[worst] <= max(3 * float(np.median(fit.errors)), 0.5):
-                break
-            left_out[names.pop(worst)] = float(fit.errors[worst])
-            kept.pop(worst)
-            fit = _fit(kept, size)
-        coverage = _coverage(kept, fit, size)
+    coverage = _coverage(kept, fit, size)
+    if len(kept) >= _CHECKED:
         if coverage.between < math.radians(10):
             raise ValueError(
                 f"all boards are parallel to within {math.degrees(coverage.between):.1f} degrees, which leaves the "

@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 from holotorch.tracking.camera.boards import View
 
 _TRAITS = ("focal length", "fx / fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")  # in the order of the prior
-# Factor on the scatter of the corners, since errors of neighbouring corners are correlated (bent boards, uneven light).
-# For each of OpenCV's 13 sample photographs, the error by the camera that the other 12 determine is 1.2 to 4.2 times
-# the scatter of its corners, with a median of 2.9.
+# Factor on the scatter of the corners, whose errors are correlated (bent boards, uneven light): each of OpenCV's 13
+# sample photographs deviates from the camera of the other 12 by 1.2 to 4.2 times its scatter, with a median of 2.9.
 _CORRELATION = 3.0
 
 
@@ -64,15 +63,10 @@ def estimate(views: Sequence[View], size: tuple[int, int]) -> Estimate:
         )
     values = _values(fit.unknowns)
     scale = np.concatenate([values[:2], np.ones(7)])
+    normals = Rotation.from_rotvec(fit.unknowns[9:].reshape(-1, 6)[:, :3]).as_matrix()[:, :, 2]
     errors = np.split(fit.errors, np.cumsum([len(view.points) for view in views])[:-1])
-    rotations = Rotation.from_rotvec(fit.unknowns[9:].reshape(-1, 6)[:, :3])
-    return Estimate(
-        values,
-        scale * fit.deviations,
-        scale * fit.formal,
-        rotations.as_matrix()[:, :, 2],
-        np.array([math.sqrt(np.square(part).sum(-1).mean()) for part in errors]),
-    )
+    rms = np.array([math.sqrt(np.square(part).sum(-1).mean()) for part in errors])
+    return Estimate(values, scale * fit.deviations, scale * fit.formal, normals, rms)
 
 
 def camera_matrix(values: np.ndarray) -> np.ndarray:
@@ -152,10 +146,7 @@ class _Problem(NamedTuple):
 
 
 def _prior(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Whitening matrix [9, 9] and mean [9] of log fx, log fy, cx, cy, k1, k2, p1, p2, k3.
-
-    The prior is wide enough for phones, webcams and machine vision, but not for fisheye lenses.
-    """
+    """Whitening matrix [9, 9] and mean [9] of log fx, log fy, cx, cy, k1, k2, p1, p2, k3 for all but fisheye lenses."""
     height, width = size
     centre_sd, focal_sd, ratio_sd = 0.05 * math.hypot(width, height), 0.5, 0.01  # pixels, ln(fx), ln(fx / fy)
     rows = np.diag(1 / np.array([1.0, 1, centre_sd, centre_sd, 0.3, 1.0, 0.005, 0.005, 2.0]))

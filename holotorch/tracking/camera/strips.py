@@ -33,11 +33,10 @@ class Line:
         return self.origin + (t + 1j * np.asarray(u)) * (self.along / self.scale)
 
     def pixels(self, lens: Lens, t: np.ndarray, u: np.ndarray) -> Points:
-        """Pixels [T, U] at coordinates t [T] and u [U], where u is at most some tens of pixels.
+        """Pixels [T, U] at coordinates t [T] and u [U], by quadratic interpolation across the line, which is fast.
 
-        For speed, the distortion is exact at the largest u, at its negative and at 0, and interpolated quadratically
-        between them. The error is proportional to the third power of the largest u. It is 0.001 pixels for u = 30,
-        k1 = -0.12 and a focal length of 1400 pixels.
+        Its error is proportional to the third power of the largest u: 0.001 pixels for u = 30, k1 = -0.12 and a focal
+        length of 1400 pixels.
         """
         half_width, step = max(1.0, float(np.abs(u).max())), self.along / self.scale
         half = u / (2 * half_width)
@@ -91,7 +90,8 @@ class Sampler:
         # OpenCV's remap is ten times as fast, but needs interleaved colours in memory, as cameras provide them.
         fits = self._host is not None and strides[::2] == (1, 3) and max(self.height, self.width) < _REMAP_LIMIT
         self._image = frame.numpy().transpose(1, 2, 0) if fits else None
-        self._last, self._before_last = _last_pixels(self.width, self.height)
+        self._last = np.array([[self.width - 1.0], [self.height - 1.0]])  # (x, y) of the last pixel
+        self._before_last = self._last.astype(np.intp) - 1
 
     def inside(self, pixels: Points) -> np.ndarray:
         """Whether pixels x + i y lie between the centres of the border pixels of the frame; False for NaN."""
@@ -136,10 +136,7 @@ class Sampler:
         return self._levels(index[..., None] + self._colours) * inside[..., None]
 
     def __call__(self, pixels: Points) -> np.ndarray:
-        """Light, float32 [3, ...], at pixels x + i y [...] by bilinear interpolation of the light, not of the levels.
-
-        Outside the frame, the light is that of the nearest border pixel.
-        """
+        """Light, float32 [3, ...], at pixels [...] by bilinear interpolation; outside the frame that at its border."""
         xy = self._clipped(pixels)
         whole = np.minimum(xy.astype(np.intp), self._before_last)
         fraction = (xy - whole).astype(np.float32)
@@ -161,19 +158,8 @@ class Sampler:
 
 
 @lru_cache(maxsize=16)
-def _last_pixels(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates (x, y) [2, 1] of the last pixel of a frame, and the same minus 1."""
-    last = np.array([[width - 1.0], [height - 1.0]])
-    return last, last.astype(np.intp) - 1
-
-
-@lru_cache(maxsize=16)
 def _neighbours(colour: int, down: int, right: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Offsets in memory from the red value of a pixel, for the strides of a frame.
-
-    They lead to all colours [3] of the pixel, of the 2 x 2 pixels [3, 4] for bilinear interpolation, and of the 4 x 4
-    pixels [3, 4, 4] for cubic convolution.
-    """
+    """Offsets in memory from a pixel's red to all colours of 1 [3], 2 x 2 [3, 4] and 4 x 4 pixels [3, 4, 4]."""
     colours, lines = colour * np.arange(3), np.arange(-1, 3)
     four = np.add.outer(colours, [0, right, down, down + right])
     return colours, four, np.add.outer(colours, np.add.outer(lines * down, lines * right))

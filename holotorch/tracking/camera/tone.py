@@ -11,13 +11,12 @@ _CLIPPED = 3  # number of levels at each end of the range that count as clipped
 def tone_curve(frames: Tensor, exposures: Tensor) -> Tensor:
     """Estimate the light of each 8-bit level from frames of a still scene at known exposure times.
 
-    The frames determine the curve only if the ratios of the exposure times are true, and gain and white balance fixed.
-    Averaging several frames of each exposure beforehand reduces noise.
+    Gain and white balance must be fixed. Averaging several frames of each exposure beforehand reduces noise.
 
     Args:
         frames: uint8 [E, 3, H, W] or [E, H, W], E >= 3 exposures that together cover the range of levels. All three
             colours have the same curve.
-        exposures: [E] exposure times in any unit.
+        exposures: [E] exposure times in any unit, with true ratios.
 
     Returns:
         float64 [256], increasing from 0 to 1, for ``Camera.tone``. Levels below 3 and above 252 are extrapolated.
@@ -43,10 +42,9 @@ def tone_curve(frames: Tensor, exposures: Tensor) -> Tensor:
     weights = counts * hat[:, None] * hat
     weights = weights / weights.sum()
     # Least squares for the curve g, the logarithm of the light: g(j) - g(i) = step for each pair of levels (i, j).
-    normal, right = weights.new_zeros(256, 256), weights.new_zeros(256)
-    for weight, step in zip(weights, steps, strict=True):
-        normal += torch.diag(weight.sum(0) + weight.sum(1)) - weight - weight.T
-        right += step * (weight.sum(0) - weight.sum(1))
+    first, second = weights.sum(2), weights.sum(1)
+    normal = (torch.diag_embed(second + first) - weights - weights.mT).sum(0)
+    right = (steps[:, None] * (second - first)).sum(0)
     # The mean squared curvature of g over the logarithm of the level, in which a power law is straight, is added.
     logarithm = level.clamp(min=0.5).log()
     curvature = torch.zeros(254, 256, dtype=torch.float64)
@@ -58,10 +56,7 @@ def tone_curve(frames: Tensor, exposures: Tensor) -> Tensor:
     normal += 1 / 254 * curvature.mT @ curvature
     normal[255, 255] += 1.0  # g(255) = 0 fixes the scale of the light
     curve = torch.linalg.solve(normal, right)
-    misfit = sum(
-        float((weight * (curve[None] - curve[:, None] - step).square()).sum())
-        for weight, step in zip(weights, steps, strict=True)
-    )
+    misfit = float((weights * (curve[None] - curve[:, None] - steps[:, None, None]).square()).sum())
     if not misfit**0.5 < 0.1:  # exposure times that are wrong by 10 %, or a moving scene, exceed this
         raise ValueError(
             f"the frames do not fit their exposures, by {100 * misfit**0.5:.0f} % of the light; was the scene still, "
@@ -93,9 +88,8 @@ def _checked(frames: Tensor, exposures: Tensor) -> tuple[Tensor, Tensor]:
 def _pairs(levels: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
     """Pairs of levels in successive exposures, from levels [E, n] and exposure times [E].
 
-    Returns:
-        Counts [E - 1, 256, 256] of the pixels with level i in one exposure and j in the next, without clipped levels,
-        and the logarithms [E - 1] of the ratios of the two exposure times.
+    Returns the counts [E - 1, 256, 256] of the pixels with level i in one exposure and j in the next, without clipped
+    levels, and the logarithms [E - 1] of the ratios of successive exposure times.
     """
     pairs = 256 * levels[:-1] + levels[1:]
     counts = torch.stack([torch.bincount(row, minlength=65536).view(256, 256) for row in pairs])
