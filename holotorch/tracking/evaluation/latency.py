@@ -67,7 +67,8 @@ def latency(times: Tensor, tips: Tensor, reference_times: Tensor, reference: Ten
         raise ValueError(f"{end - start:.3g} s at steps of {step:.3g} s are too many samples; are times in seconds?")
     clock = start + step * torch.arange(count, dtype=torch.float64)
     most = math.ceil(longest / step)
-    scores = _correlation(*(_resample(curve, clock) for curve in curves), most)
+    track, other = (_resample(curve, clock) for curve in curves)
+    scores = _correlation(track, other, most)
     return _peak(scores, step, most, fewest, end - start)
 
 

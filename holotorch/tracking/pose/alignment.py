@@ -58,7 +58,7 @@ def headset_from_camera(camera: Tensor, headset: Tensor) -> Alignment:
         headset: [n, 2, 3] the same points in the headset's frame, which must be right-handed.
 
     Returns:
-        The map, differentiable with respect to both arguments, with its residuals.
+        The map and its residuals, differentiable with respect to both arguments.
 
     Raises:
         TypeError, ValueError: Wrong shapes or types, fewer than 3 alignments, all parallel to within 10 degrees, tools
@@ -68,8 +68,7 @@ def headset_from_camera(camera: Tensor, headset: Tensor) -> Alignment:
     """
     points = []
     for name, value in (("camera", camera), ("headset", headset)):
-        if not isinstance(value, Tensor) or not value.is_floating_point():
-            raise TypeError(f"{name} must be a floating tensor, got {getattr(value, 'dtype', type(value).__name__)}")
+        checks.real(name, value)
         if value.ndim != 3 or value.shape[1:] != (2, 3):
             raise ValueError(f"{name} must be of shape [n, 2, 3], two points for each alignment, got {value.shape}")
         checks.quantities(quantities.POSITION, value, name)
@@ -79,20 +78,18 @@ def headset_from_camera(camera: Tensor, headset: Tensor) -> Alignment:
         raise ValueError(f"camera and headset must hold the same alignments, got {len(source)} and {len(target)}")
     if len(source) < 3:
         raise ValueError(
-            f"an alignment needs 3 poses of the tool or more, not parallel to each other, got {len(source)}; "
-            "one leaves the turn about the tool open"
+            f"an alignment needs 3 poses of the tool or more, not parallel to each other, got {len(source)}; one "
+            "leaves the turn about the tool open"
         )
-    lengths = [(part[:, 1] - part[:, 0]).detach().norm(dim=-1) for part in points]
-    differences = (lengths[0] - lengths[1]).abs()
-    worst = int(differences.argmax())
-    if bool(differences[worst] > 0.02):  # metres: more than tremor of the hand causes
+    first, second = ((part[:, 1] - part[:, 0]).detach().norm(dim=-1) for part in points)
+    worst = int((first - second).abs().argmax())
+    if bool((first - second).abs()[worst] > 0.02):  # metres: more than tremor of the hand causes
         raise ValueError(
-            f"the two points must be equally far apart in both frames, got {lengths[0][worst]:.3f} and "
-            f"{lengths[1][worst]:.3f} m in alignment {worst}; are both in metres, and the same points?"
+            f"the two points must be equally far apart in both frames, got {first[worst]:.3f} and "
+            f"{second[worst]:.3f} m in alignment {worst}; are both in metres, and the same points?"
         )
     for name, part in zip(("camera", "headset"), points, strict=True):
-        spread = _spread(part)
-        if spread < SAME_DIRECTION:
+        if (spread := _spread(part)) < SAME_DIRECTION:
             raise ValueError(
                 f"the alignments are parallel to within {math.degrees(spread):.1f} degrees in the {name}'s frame, "
                 "which leaves the turn about the tool nearly open; hold the tool in different directions, 45 degrees "

@@ -55,27 +55,24 @@ def fit_band_edges(
     """Fit the positions of the edges together with the pose of every frame.
 
     Frames of a freely moving straight tool determine the positions s only up to a shift, a scale and a projective
-    stretch s -> s / (1 + e s), since other poses have the same images. Therefore three independent distances must be
-    known, whatever the number of frames. If the catheter is tilted about a resting tip, shift and stretch are
-    determined too, and one known distance gives the scale.
+    stretch s -> s / (1 + e s), so that three independent distances must be known, whatever the number of frames. If the
+    catheter is tilted about a resting tip, one known distance suffices.
 
     Args:
         edges_px: [F, N, 2] pixels (x, y) of the edges in F >= 5 frames, all visible.
         positions_m: [N] nominal distances from the tip in metres, increasing.
         camera: Camera that took the frames.
-        known: Nominal distances that are exact: an index i for that of edge i from the tip, a pair (i, j) for that
-            between two edges.
+        known: Nominal distances that are exact: i for that of edge i from the tip, (i, j) for that of two edges.
         resting_tip: Whether the tip was in the same place in all frames.
         along_px: Standard deviation of an edge along the tool's image, in pixels.
         across_px: Standard deviation of an edge across the tool's image, in pixels.
-        offset: Distance of the edges from the axis toward the camera, in metres, as in ``solve_pose``.
+        offset: Distance of the edges from the axis toward the camera, in metres.
 
     Raises:
         TypeError, ValueError: Wrong shapes or types, too few known distances, fewer than 5 frames, parallel directions,
             or positions with a deviation above 0.5 mm. The message says what to do.
 
-    Source: joint least squares with the poses eliminated by the Schur complement, as in bundle adjustment (Triggs et
-    al. 2000).
+    Source: bundle adjustment (Triggs et al. 2000), with the poses eliminated by the Schur complement.
     """
     pixels, start = _checked(edges_px, positions_m)
     free = _constraints(known, start, resting_tip)
@@ -83,8 +80,7 @@ def fit_band_edges(
     lost = [i for i, tip in enumerate(poses.tip) if not bool(torch.isfinite(tip).all())]
     if lost:
         raise ValueError(f"no pose found in the frames {lost[:10]}: leave them out, or correct the nominal positions")
-    spread = widest_angle(poses.direction)
-    if spread < SAME_DIRECTION:
+    if (spread := widest_angle(poses.direction)) < SAME_DIRECTION:
         raise ValueError(
             f"the catheter is parallel to itself within {math.degrees(spread):.1f} degrees in all frames, so that "
             "every frame has the same faults; tilt it toward the camera and away from it by 20 to 45 degrees"
@@ -113,10 +109,9 @@ def fit_band_edges(
 
 
 class _Problem:
-    """Least squares over F frames.
+    """Least squares over F frames, each with 2 unknowns for the direction and 3 for a tip that moves (``own``).
 
-    Each frame has 2 unknowns for its direction, and 3 for its tip unless that rests (``own``). The other m unknowns,
-    the free positions and a resting tip, are the same in all frames (``shared``).
+    The other m unknowns, the free positions and a resting tip, are the same in all frames (``shared``).
     """
 
     def __init__(self, plane: Tensor, weights: Tensor, free: Tensor, resting: bool, offset: float):
@@ -187,10 +182,7 @@ class _Problem:
 
 
 def _checked(edges_px: Tensor, positions_m: Tensor) -> tuple[Tensor, Tensor]:
-    if not isinstance(edges_px, Tensor) or not edges_px.is_floating_point():
-        raise TypeError(
-            f"edges_px must be a floating tensor, got {getattr(edges_px, 'dtype', type(edges_px).__name__)}"
-        )
+    checks.real("edges_px", edges_px)
     if edges_px.ndim != 3 or edges_px.shape[2] != 2 or edges_px.shape[1] < 3:
         raise ValueError(f"edges_px must be of shape [F, N, 2] with N >= 3 edges, got {list(edges_px.shape)}")
     checks.all_finite("edges_px", edges_px)

@@ -23,17 +23,16 @@ def solve_pose(
 ) -> Pose:
     """Pose of a straight tool from the images of points at known distances from its tip, such as band edges.
 
-    A linear solution (the null vector of ``u_i x (A + s_i d) = 0``) is the start of Levenberg-Marquardt steps that
-    minimise the reprojection error in five unknowns. Three visible points determine a pose, which is unique in front of
-    the camera, but nothing verifies it, so that its status is UNVERIFIED. The pose is differentiable with respect to
-    all tensors by the implicit function theorem.
+    Levenberg-Marquardt steps from a linear solution (the null vector of ``u_i x (A + s_i d) = 0``) minimise the
+    reprojection error in five unknowns. Three visible points determine a pose that nothing verifies; its status is
+    UNVERIFIED. The pose is differentiable with respect to all tensors by the implicit function theorem.
 
     Args:
         edges_px: [B, N, 2] pixels (x, y) of the points; NaN for a point that is not visible.
         positions_m: [N] distances from the tip in metres, all different, in any order.
         camera: Camera whose distortion is removed from the pixels.
         along_px: Standard deviation of a point along the tool's image, in pixels; a number or [B, N].
-        across_px: Standard deviation of a point across the tool's image, in pixels; a number or [B, N].
+        across_px: Standard deviation across the tool's image, like ``along_px``.
         seen: [B, N] bool; False excludes a point.
         offset: Distance of the points from the axis toward the camera, in metres; a number or [B].
 
@@ -41,7 +40,7 @@ def solve_pose(
         Poses [B] in float64. A pose that cannot be computed is NaN, and its status gives the reason.
 
     Raises:
-        TypeError, ValueError: Wrong shapes or types, fewer than three positions, equal ones, deviations <= 0.
+        TypeError, ValueError: Wrong shapes or types, fewer than three positions, equal positions, deviations <= 0.
 
     Source: the problem of Sec. 3.4.2 of the thesis; :func:`closed_form` implements its Eqs. 3.8 to 3.11.
     """
@@ -56,13 +55,10 @@ def solve_pose(
         visible = visible & seen
     known = visible & torch.isfinite(plane.detach()).all(-1)
     offset = _expanded("offset", TOOL_OFFSET, offset, pixels, 1)
-    deviations = [
-        _expanded(name, EDGE_DEVIATION, v, pixels, 2) for name, v in (("along_px", along_px), ("across_px", across_px))
-    ]
-    plane = torch.where(known[..., None], plane, 0.0)
-    weights = edge_weights(
-        torch.where(known[..., None], pixels, 0.0), plane, known, torch.stack(deviations, -1), camera
-    )
+    along_px = _expanded("along_px", EDGE_DEVIATION, along_px, pixels, 2)
+    across_px = _expanded("across_px", EDGE_DEVIATION, across_px, pixels, 2)
+    plane, pixels = (torch.where(known[..., None], value, 0.0) for value in (plane, pixels))
+    weights = edge_weights(pixels, plane, known, torch.stack([along_px, across_px], -1), camera)
     middle = (positions * known).sum(-1) / known.sum(-1).clamp(min=1)
     edges = plane, positions - middle[:, None], weights, offset
     with torch.no_grad():
@@ -104,9 +100,8 @@ def closed_form(edges_px: Tensor, positions_m: Tensor, camera: Camera) -> tuple[
     Raises:
         ValueError: Wrong shapes or types, fewer than three positions, equal positions.
 
-    Source: Eqs. 3.3 to 3.12 of the thesis, with these departures. Angles are computed by atan2. Bands may have
-    different lengths. There is no quadratic equation, which loses half of the digits at its double root for a tool
-    parallel to the image. The ratio |AT| / |AB| of Eq. 3.12 is printed inverted.
+    Source: Eqs. 3.3 to 3.12 of the thesis, except that angles are computed by atan2, bands may have different lengths,
+    and no quadratic equation loses digits for a tool parallel to the image. Eq. 3.12 prints |AT| / |AB| inverted.
     """
     pixels, positions = _checked(edges_px, positions_m)
     plane = camera.undistort(pixels)
@@ -129,11 +124,7 @@ def closed_form(edges_px: Tensor, positions_m: Tensor, camera: Camera) -> tuple[
 
 
 def _covariance(jacobian: Tensor, middle: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
-    """Covariance [B, 6, 6] of tip and direction, and which poses [B] are singular.
-
-    ``jacobian`` [B, 2 N, 5] is that of :func:`_residuals` by the middle point, ``middle`` [B] metres from the tip, and
-    by the tilts of the direction along ``basis`` [B, 3, 2].
-    """
+    """Covariance [B, 6, 6] of tip and direction, and which [B] are singular; ``middle`` [B] is metres from the tip."""
     inverse, singular = torch.linalg.inv_ex(jacobian.mT @ jacobian)
     pose = jacobian.new_zeros(len(jacobian), 6, 5)  # derivatives of tip and direction by the unknowns
     pose[:, :3, :3] = torch.eye(3, dtype=jacobian.dtype)
@@ -167,10 +158,7 @@ def _expanded(name: str, kind: Quantity, value: float | Tensor, like: Tensor, ax
 
 
 def edge_weights(pixels: Tensor, plane: Tensor, known: Tensor, deviations: Tensor, camera: Camera) -> Tensor:
-    """Matrices [B, N, 2, 2] from errors on the plane z = 1 to errors along and across the tool's image.
-
-    The latter are divided by their standard ``deviations`` [B, N, 2], and are zero for edges that are not ``known``.
-    """
+    """Matrices [B, N, 2, 2] from errors on the plane z = 1 to (along, across) in units of ``deviations`` [B, N, 2]."""
     mask = known[..., None].to(pixels.dtype)
     x, y = ((pixels - pixels.sum(1, True) / mask.sum(1, True).clamp(min=1)) * mask).unbind(-1)
     # The principal axis of the edges, at half the angle of their second moment.
@@ -182,10 +170,7 @@ def edge_weights(pixels: Tensor, plane: Tensor, known: Tensor, deviations: Tenso
 
 
 def _start(plane: Tensor, relative: Tensor, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Linear solution: middle point [B, 3] and direction [B, 3], and which [B] have none because all edges coincide.
-
-    ``relative`` [B, N] are the distances from the middle point.
-    """
+    """Linear solution: middle point [B, 3] and direction [B, 3], and which [B] have none because all edges coincide."""
     mask = known.to(plane.dtype)
     count = mask.sum(-1, keepdim=True).clamp(min=1)
     centre = (plane * mask[..., None]).sum(1) / count
@@ -227,8 +212,7 @@ def tilted(along: Tensor, basis: Tensor, angles: Tensor) -> Tensor:
 def _residuals(point: Tensor, along: Tensor, basis: Tensor, edges: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
     """Weighted residuals [B, 2 N] and their derivatives [B, 2 N, 5] by the middle point and two tilts of the direction.
 
-    ``edges`` are their images on the plane z = 1 [B, N, 2], their distances from the middle point [B, N], the weights
-    [B, N, 2, 2] and the offsets toward the camera [B].
+    ``edges`` are images on the plane z = 1 [B, N, 2], distances from the middle point [B, N], weights and offsets [B].
     """
     plane, relative, weights, offset = edges
     identity = torch.eye(3, dtype=point.dtype, device=point.device)

@@ -48,9 +48,8 @@ def pose_on_line(
     """Pose of a tool from the coordinates along ``line`` of its points; the fast counterpart of :func:`solve_pose`.
 
     A point of the tool at a distance s from the mean of ``positions`` has the coordinate t = (h0 + h1 s) / (1 + h2 s)
-    along the line. Weighted least squares determine the homography h of the line: a linear solution, then two
-    Gauss-Newton steps. The known distances on the tool give the scale. An error of the line tilts the plane of the tool
-    and the centre of the camera, and is independent of the errors of h.
+    along the line. Weighted least squares determine h, by a linear solution and two Gauss-Newton steps; the distances
+    give the scale. Errors of the line are independent of those of h.
 
     Args:
         line: Image of the axis of the tool on the plane z = 1.
@@ -110,10 +109,10 @@ def pose_on_line(
     return LinePose(pose[0], pose[1], covariance, chi_square) if np.isfinite(covariance).all() else None
 
 
-def _normal_equations(points: list[tuple[float, float, float]], h: Vector) -> tuple[list[float], Vector, float, float]:
-    """Upper triangle of the normal matrix (six entries), gradient, chi-square and least depth 1 + h2 s at h.
+def _normal_equations(points: list[Vector], h: Vector) -> tuple[list[float], Vector, float, float]:
+    """Upper triangle of the normal matrix, gradient, chi-square and least depth 1 + h2 s at h; linear for h = 0.
 
-    ``points`` are (t, s, 1 / standard deviation of t). Where h is zero, the problem is the linear one.
+    ``points`` are (t, s, 1 / standard deviation of t).
     """
     h0, h1, h2 = h
     a00 = a01 = a02 = a11 = a12 = a22 = b0 = b1 = b2 = chi = 0.0

@@ -18,16 +18,16 @@ class OneEuro:
     direction moves by the fraction alpha along the great circle to the new one. The cutoff of both is ``min_cutoff +
     beta * speed``, where the speed is the larger one of those of the tip and of the point ``arm`` behind the tip.
 
-    For a steady motion, the smoothed pose is :attr:`lag` seconds late. The lag follows lag' = (1 - alpha) (lag + dt),
-    which is exact for any time steps and converges to tau: 80 ms at 2 Hz and 8 ms at 20 Hz. With the defaults and 60
-    frames per second, white jitter at rest falls to a third, and the lag at 50 mm/s is 13 ms.
+    For a steady motion, the smoothed pose is :attr:`lag` seconds late, where lag' = (1 - alpha) (lag + dt) converges to
+    tau. With the defaults and 60 frames per second, white jitter at rest falls to a third, and the lag is 80 ms at rest
+    and 13 ms at 50 mm/s.
 
     The filter restarts after a refusal, a gap above ``longest_gap``, or a rotation of 90 degrees or more from the
     smoothed pose to the next, such as an exchange of tip and rear. It returns the first pose unchanged.
 
     Args:
         min_cutoff: Cutoff at rest, in Hz.
-        beta: Increase of the cutoff with speed, in Hz per m/s; 0 gives a low-pass filter with a fixed cutoff.
+        beta: Increase of the cutoff with speed, in Hz per m/s; 0 for a fixed cutoff.
         derivative_cutoff: Cutoff of the filter for the speed, in Hz.
         longest_gap: Longest time between poses that the filter bridges, in seconds.
         arm: Distance from the tip to the second point, in metres; about that of the bands.
@@ -115,9 +115,9 @@ class OneEuro:
     def predict(self, when: float, *, longest: float = 0.1, acceleration: float = 0.3) -> Pose:
         """Extrapolate the last smoothed pose to the time of display ``when`` at the filtered speed.
 
-        The extrapolation is over h = when - captured + lag seconds, so that it is exact for a steady motion. The
-        covariance of the speed, times h^2, is added to that of the pose, and so is the covariance of the displacement
-        h (h / 2 + 1 / (2 pi derivative_cutoff)) a by an acceleration a, which the filtered speed follows with delay.
+        The extrapolation is over h = when - captured + lag seconds, which is exact for a steady motion. Two covariances
+        are added to that of the pose: that of the speed times h^2, and that of the displacement by an acceleration a
+        that the filtered speed follows with delay, h (h / 2 + 1 / (2 pi derivative_cutoff)) a.
 
         Args:
             when: Time in seconds on the clock of ``captured``.
@@ -126,8 +126,7 @@ class OneEuro:
                 0.3 for slow careful work, 2 for a hand that swings by 5 cm once a second.
 
         Returns:
-            A pose; or a refusal (UNCERTAIN) beyond ``longest``, or where fewer than two poses followed the last restart
-            of the filter, so that there is no speed.
+            A pose; or a refusal (UNCERTAIN) beyond ``longest``, or without two poses since the last restart.
         """
         when = checks.finite("when", when, "seconds")
         ahead = when - self._captured

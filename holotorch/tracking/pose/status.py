@@ -95,7 +95,7 @@ class Pose:
         if status.answered:
             raise ValueError(f"{status.name} is no refusal")
         nan = (torch.full(shape, torch.nan, dtype=torch.float64) for shape in ((3,), (3,), (6, 6), ()))
-        return Pose(*nan, torch.zeros((), dtype=torch.float64), status, reason)
+        return Pose(*nan, freedom=torch.zeros((), dtype=torch.float64), status=status, reason=reason)
 
     @property
     def answered(self) -> bool:
@@ -140,4 +140,4 @@ class Pose:
         if isinstance(self.status, Status):
             raise IndexError("this is one pose, not a batch")
         tensors = (self.tip, self.direction, self.covariance, self.chi_square, self.freedom)
-        return Pose(*(value[index] for value in tensors), self.status[index], self.reason)
+        return Pose(*(value[index] for value in tensors), status=self.status[index], reason=self.reason)
