@@ -15,8 +15,6 @@ from holotorch.modulator.crosstalk import ThermalCrosstalk
 from holotorch.modulator.dispersion import Birefringence, phase_scale
 from holotorch.modulator.quantised import checked_bits
 
-_CYCLE = 2 * math.pi
-
 
 def even_lut(bits: int, full_turn: float | None = None) -> Tensor:
     """Phases of evenly spaced levels, float64 [2^bits] in rad, 0 at level 0.
@@ -26,7 +24,7 @@ def even_lut(bits: int, full_turn: float | None = None) -> Tensor:
     """
     count = 2 ** checked_bits(bits)
     levels_per_cycle = checks.positive("full_turn", count if full_turn is None else full_turn, "levels")
-    return torch.arange(count, dtype=torch.float64) * (_CYCLE / levels_per_cycle)
+    return torch.arange(count, dtype=torch.float64) * (math.tau / levels_per_cycle)
 
 
 def nearest_levels(phase: Tensor, lut: Tensor) -> Tensor:
@@ -37,11 +35,11 @@ def nearest_levels(phase: Tensor, lut: Tensor) -> Tensor:
         lut: Phases of the levels, float64 [L] in rad, over any range. If they cover less than 2 pi, a phase outside
             their range gives the nearer end. Of several levels with the same phase modulo 2 pi, any may be returned.
     """
-    circle, order = torch.sort(torch.remainder(lut, _CYCLE))
-    circle = torch.cat([circle[-1:] - _CYCLE, circle, circle[:1] + _CYCLE])
+    circle, order = torch.sort(torch.remainder(lut, math.tau))
+    circle = torch.cat([circle[-1:] - math.tau, circle, circle[:1] + math.tau])
     order = torch.cat([order[-1:], order, order[:1]])
     borders = ((circle[1:] + circle[:-1]) / 2).to(phase.device)
-    wanted = torch.remainder(phase.detach().double(), _CYCLE).contiguous()
+    wanted = torch.remainder(phase.detach().double(), math.tau).contiguous()
     return order.to(phase.device)[torch.bucketize(wanted, borders)]
 
 
@@ -60,9 +58,9 @@ def quantisation_rms(lut: Tensor) -> float:
     It is sqrt(sum g^3 / (24 pi)) over the gaps g between neighbouring levels on the circle: 2 pi / (L sqrt(12)) for L
     evenly spaced levels, 0.0071 rad for 8 bits.
     """
-    circle = torch.remainder(lut.double(), _CYCLE).sort().values
-    gaps = torch.diff(circle, append=circle[:1] + _CYCLE)
-    return math.sqrt((gaps**3).sum().item() / (12 * _CYCLE))
+    circle = torch.remainder(lut.double(), math.tau).sort().values
+    gaps = torch.diff(circle, append=circle[:1] + math.tau)
+    return math.sqrt((gaps**3).sum().item() / (12 * math.tau))
 
 
 class PhaseModulator(nn.Module):

@@ -1,7 +1,8 @@
 """Performance of a tracker: stability, accuracy over grids, false poses, and coverage of its covariances.
 
-Tips are floating tensors [n, 3] in metres, one row per frame in the order of time. A row of NaN is a refused frame. All
-functions raise TypeError or ValueError for tensors of another type or shape. Sections and equations are of the thesis.
+Tips are floating tensors [n, 3] in metres, one row per frame in the order of time. A row of NaN is a refused frame.
+Sections and equations are those of the thesis. All functions raise TypeError or ValueError for arguments of another
+type or shape than described, and if too few frames have a pose.
 """
 
 import math
@@ -44,8 +45,7 @@ class GridAccuracy(NamedTuple):
             point. It is insensitive to a constant bias and to errors perpendicular to the direction of the reference.
         absolute: Median, 95th percentile and maximum of the distances from the true tips; NaN without true tips.
         rigid: The same statistics after the best rigid alignment of the measured points with the grid.
-        answered: Number of points with a pose.
-        refused: Number of points without a pose.
+        answered, refused: Numbers of points with and without a pose.
     """
 
     acc: float
@@ -61,8 +61,7 @@ class PlanarAccuracy(NamedTuple):
     Attributes:
         in_plane: Mean distance in the plane of the grid, as in Fig. 3.10.
         in_space: Mean distance including the error along the normal of the plane.
-        answered: Number of points with a pose, without the reference.
-        refused: Number of points without a pose.
+        answered, refused: Numbers of points with and without a pose, except for the reference.
     """
 
     in_plane: float
@@ -90,11 +89,7 @@ class WrongPoses(NamedTuple):
 
 
 def s_rms(tips: Tensor) -> Stability:
-    """Stability of unfiltered tips [n, 3] of a catheter at rest, by Eq. 3.13 without the differences to refused frames.
-
-    Raises:
-        TypeError, ValueError: No two consecutive frames have a pose.
-    """
+    """Stability of unfiltered tips [n, 3] of a catheter at rest, by Eq. 3.13 without differences to refused frames."""
     tips = _rows("tips", tips)
     known = _has_pose(tips)
     changes = tips.diff(dim=0)[known[1:] & known[:-1]]
@@ -114,11 +109,8 @@ def grid_accuracy(found: Tensor, grid: Tensor, reference: int, truth: Tensor | N
     Args:
         found: [n, 3] measured tips in metres, in the camera's frame; NaN where refused.
         grid: [n, 3] designed points in metres, in any frame.
-        reference: Index of the reference point.
+        reference: Index of the reference point, which must have a pose.
         truth: [n, 3] true tips in the camera's frame, if they are known.
-
-    Raises:
-        TypeError, ValueError: A reference that is no point or was refused, or NaN in ``grid`` or ``truth``.
     """
     found, grid = _rows("found", found), _rows("grid", grid, like=found)
     checks.all_finite("grid", grid)
@@ -147,9 +139,6 @@ def planar_accuracy(found: Tensor, grid: Tensor, right: Tensor, up: Tensor, refe
         right: [3] direction of the grid's first axis in the camera's frame.
         up: [3] direction of its second axis, perpendicular to the first to within one degree.
         reference: Index of the intersection to which all positions are relative.
-
-    Raises:
-        TypeError, ValueError: As :func:`grid_accuracy`, or directions that are not perpendicular.
     """
     found, grid = _rows("found", found), _rows("grid", grid, axes=2)
     if len(found) != len(grid):
@@ -159,11 +148,10 @@ def planar_accuracy(found: Tensor, grid: Tensor, right: Tensor, up: Tensor, refe
     if abs(float(axes[0] @ axes[1])) > math.sin(math.radians(1)):
         raise ValueError(f"right and up must be at right angles, their cosine is {float(axes[0] @ axes[1]):.3g}")
     others, known = _others(found, reference)
-    wanted = grid - grid[reference]
-    moved = found - found[reference]
-    flat = (moved @ axes.T - wanted)[others].norm(dim=-1).mean()
-    space = (moved - wanted @ axes)[others].norm(dim=-1).mean()
-    return PlanarAccuracy(float(flat), float(space), int(others.sum()), len(found) - int(known.sum()))
+    designed, measured = grid - grid[reference], found - found[reference]
+    in_plane = (measured @ axes.T - designed)[others].norm(dim=-1).mean()
+    in_space = (measured - designed @ axes)[others].norm(dim=-1).mean()
+    return PlanarAccuracy(float(in_plane), float(in_space), int(others.sum()), len(found) - int(known.sum()))
 
 
 def chi_square_quantile(level: float) -> float:
@@ -178,12 +166,9 @@ def coverage(tips: Tensor, covariance: Tensor, truth: Tensor, level: float = 0.9
 
     Args:
         tips: [n, 3] in metres; NaN where refused.
-        covariance: [n, 3, 3] covariances of the tips in m^2.
+        covariance: [n, 3, 3] covariances of the tips in m^2, positive definite where there is a pose.
         truth: [n, 3] true tips in metres.
         level: Confidence level, which is the expected share for correct covariances.
-
-    Raises:
-        TypeError, ValueError: No frame with a pose, NaN in its true tip, or a covariance that is not positive definite.
     """
     tips, truth = _rows("tips", tips), _rows("truth", truth, like=tips)
     if covariance.shape != (len(tips), 3, 3):
@@ -209,12 +194,9 @@ def counts(statuses: Iterable[IntEnum]) -> dict[str, int]:
 
 
 def wrong_poses(tips: Tensor, truth: Tensor, limit: float = 5e-3) -> WrongPoses:
-    """Count false and wrong poses.
+    """Count false and wrong poses, the latter with errors of ``tips`` [n, 3] above ``limit`` in metres.
 
-    Args:
-        tips: [n, 3] in metres; NaN where refused.
-        truth: [n, 3] true tips in metres; NaN where the frame shows no catheter.
-        limit: Largest error in metres of a correct pose.
+    ``truth`` [n, 3] are the true tips, NaN for frames without a catheter.
     """
     tips, truth = _rows("tips", tips), _rows("truth", truth, like=tips)
     checks.quantity(TOOL_DEVIATION, limit, "limit")

@@ -1,6 +1,8 @@
 """Pose of a straight tool whose image lies on a known line, from the images of known points along the line."""
 
+import itertools
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -89,18 +91,18 @@ def pose_on_line(
         [[extent * step.real, extent * step.imag, 0.0], [origin.real, origin.imag, 1.0], [-step.imag, step.real, 0.0]]
     )
     (p, q), (along, deep) = (h0 + h1 * start, 1 + h2 * start), (h1 * unit, h2 * unit)
+    pose = np.array([[p, q, 0.0], [along, deep, 0.0]]) @ axes
+    size = math.sqrt(float(pose[1] @ pose[1]))
+    if not size > 0:
+        return None
+    pose = pose / size
     if rough:
-        tip, direction = np.array([[p, q, 0.0], [along, deep, 0.0]]) @ axes
-        size = math.sqrt(float(direction @ direction))
-        return LinePose(tip / size, direction / size, np.zeros((6, 6)), chi_square) if size > 0 else None
-    # In rows: the vector, and its derivatives with respect to h0, h1, h2, and the offset and slope of the line.
-    tip = [[p, q, 0.0], [1.0, 0.0, 0.0], [start, 0.0, 0.0], [0.0, start, 0.0], [0.0, 0.0, q], [0.0, 0.0, p * extent]]
-    direction = [[along, deep, 0.0], [0.0, 0.0, 0.0], [unit, 0.0, 0.0], [0.0, unit, 0.0]]
-    direction += [[0.0, 0.0, deep], [0.0, 0.0, along * extent]]
-    rows = np.array([tip, direction]) @ axes  # [2, 6, 3]
-    rows /= np.sqrt(rows[1, 0] @ rows[1, 0])
-    pose, slopes = rows[:, 0], rows[:, 1:]
-    slopes = slopes - (slopes[1] @ pose[1])[:, None] * pose[:, None]  # the direction keeps unit length
+        return LinePose(pose[0], pose[1], np.zeros((6, 6)), chi_square)
+    # Derivatives of tip and direction [2, 5, 3] with respect to h0, h1, h2, and the offset and slope of the line.
+    tip = [[1.0, 0.0, 0.0], [start, 0.0, 0.0], [0.0, start, 0.0], [0.0, 0.0, q], [0.0, 0.0, p * extent]]
+    direction = [[0.0, 0.0, 0.0], [unit, 0.0, 0.0], [0.0, unit, 0.0], [0.0, 0.0, deep], [0.0, 0.0, along * extent]]
+    slopes = np.array([tip, direction]) @ axes / size
+    slopes -= (slopes[1] @ pose[1])[:, None] * pose[:, None]  # the direction keeps unit length
     inner = np.diag([0.0, 0.0, 0.0, offset_sd**2, slope_sd**2])  # covariance of h, offset and slope
     inner[:3, :3] = [_solve(normal, row) for row in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]
     shared = shared_sd / extent * np.array([1.0, h2, 0.0, 0.0, 0.0])
@@ -115,26 +117,19 @@ def _normal_equations(points: list[Vector], h: Vector) -> tuple[list[float], Vec
     ``points`` are (t, s, 1 / standard deviation of t).
     """
     h0, h1, h2 = h
-    a00 = a01 = a02 = a11 = a12 = a22 = b0 = b1 = b2 = chi = 0.0
-    least = math.inf
-    for x, s, weight in points:
+    rows = []
+    for t, s, weight in points:
         depth = 1 + h2 * s
-        least = min(least, depth)
-        image = (h0 + h1 * s) / depth if depth else math.inf
-        scaled = weight / depth if depth else math.inf
-        rest = (x - image) * weight
-        one, two = scaled * s, -scaled * s * (image if h1 else x)
-        a00 += scaled * scaled
-        a01 += scaled * one
-        a02 += scaled * two
-        a11 += one * one
-        a12 += one * two
-        a22 += two * two
-        b0 += scaled * rest
-        b1 += one * rest
-        b2 += two * rest
-        chi += rest * rest
-    return [a00, a01, a02, a11, a12, a22], (b0, b1, b2), chi, least
+        image, scaled = ((h0 + h1 * s) / depth, weight / depth) if depth else (math.inf, math.inf)
+        rows.append((scaled, scaled * s, -scaled * s * (image if h1 else t), (t - image) * weight, depth))
+    *columns, residuals, depths = zip(*rows, strict=True)
+
+    def dot(a: Sequence[float], b: Sequence[float]) -> float:
+        return sum(map(operator.mul, a, b))
+
+    normal = [dot(a, b) for a, b in itertools.combinations_with_replacement(columns, 2)]
+    first, second, third = (dot(column, residuals) for column in columns)
+    return normal, (first, second, third), dot(residuals, residuals), min(depths)
 
 
 def _solve(normal: list[float], right: Vector) -> Vector:

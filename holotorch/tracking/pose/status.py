@@ -34,19 +34,11 @@ class Status(enum.IntEnum):
     @property
     def stage(self) -> str:
         """Stage that decided the status: "frame", "colour", "axis", "edges", "camera" or "pose"."""
-        return _STAGES.get(self, "pose")
+        return _STAGES[self]
 
 
-_STAGES = {
-    Status.BAD_FRAME: "frame",
-    Status.NO_CATHETER: "colour",
-    Status.BANDS_MISSING: "colour",
-    Status.NO_AXIS: "axis",
-    Status.TOO_NARROW: "axis",
-    Status.EDGES_UNCLEAR: "edges",
-    Status.OUT_OF_FRAME: "edges",
-    Status.OUTSIDE_CAMERA: "camera",
-}
+# In the order of Status.
+_STAGES = ("pose", "pose", "frame", "colour", "colour", "axis", "axis", "edges", "edges", "camera", "pose", "pose")
 
 
 class Refusal(Exception):

@@ -13,10 +13,7 @@ Colour = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Occluder:
-    """Flat polygon in front of the catheter: corners (x, y) in pixels and 8-bit sRGB colour.
-
-    Its image may be larger by up to 0.2 pixels at each side.
-    """
+    """Flat polygon in front of the catheter: corners (x, y) in pixels, to 0.2 pixels, and 8-bit sRGB colour."""
 
     corners: tuple[tuple[float, float], ...]
     colour: Colour

@@ -177,10 +177,7 @@ def _motion_kernel(motion: tuple[float, float]) -> np.ndarray:
 
 @lru_cache(maxsize=256)
 def _blur_matrix(blur_px: float, count: int, pad: int) -> np.ndarray:
-    """Matrix, float32 [count, (count + 2 pad) _FINE], from samples to pixels along an axis; its rows sum to 1.
-
-    Each row is the convolution of the point spread function and a square pixel.
-    """
+    """Matrix, float32 [count, (count + 2 pad) _FINE], from samples to pixels by point spread and pixel integration."""
     half = _FINE * pad
     spread = np.exp(-0.5 * (np.arange(-half, half + 1) / (_FINE * max(blur_px, 1e-6))) ** 2)
     kernel = np.convolve(spread / spread.sum(), np.full(_FINE, 1 / _FINE))  # 2 half + _FINE values

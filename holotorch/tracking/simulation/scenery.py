@@ -36,13 +36,8 @@ def drape(size: tuple[int, int], seed: int, colour: Colour = (40, 70, 190)) -> T
     ridge = across / rng.uniform(40, 80) + _clouds(rng, size, 600)
     fold = 0.7 * np.sin(ridge) + 0.3 * np.sin(2.3 * ridge + _clouds(rng, size, 300))
     weave = 0.03 * rng.standard_normal(size, dtype=np.float32)
-    shade = (
-        0.85
-        + 0.22 * fold
-        + 0.08 * _clouds(rng, size, 400)
-        + 0.02 * _clouds(rng, size, 60)
-        + cv2.GaussianBlur(weave, (0, 0), 0.8)
-    )
+    shade = 0.85 + 0.22 * fold + 0.08 * _clouds(rng, size, 400) + 0.02 * _clouds(rng, size, 60)
+    shade = shade + cv2.GaussianBlur(weave, (0, 0), 0.8)
     white = 12 * np.clip(fold, 0, None)  # the crests of the folds are less saturated
     return _levels(np.asarray(colour, np.float32) * np.clip(shade, 0.3, 1.5)[..., None] + white[..., None])
 
@@ -137,25 +132,19 @@ def hand(at: tuple[float, float], turn: float, finger_px: float, colour: Colour 
     The arm extends from the hand at the angle ``turn`` in radians, from +x towards +y.
     """
     along, across = _axes(turn)
+    # Arm, palm, fingers and thumb from one point to another, and their radii; in radii of a finger, along and across.
+    strokes = [((11, 0), (60, 0), 3.6), ((10, -1.5), (11, 1.5), 3.9)]
+    strokes += [((tip, b), (9, 0.9 * b), 1.0) for b, tip in ((-3.2, 1.4), (-1.1, 0.0), (1.1, 0.4), (3.2, 2.6))]
+    strokes += [((5, 6.4), (10, 3.5), 1.15)]
     parts: list[Occluder] = []
-
-    def stroke(first: tuple[float, float], last: tuple[float, float], radius: float) -> None:
-        ends = [np.asarray(at) + finger_px * (a * along + b * across) for a, b in (first, last)]
-        parts.extend(finger(tuple(ends[0]), tuple(ends[1]), finger_px * radius, colour))  # type: ignore[arg-type]
-
-    stroke((11, 0), (60, 0), 3.6)
-    stroke((10, -1.5), (11, 1.5), 3.9)
-    for side, tip in ((-3.2, 1.4), (-1.1, 0.0), (1.1, 0.4), (3.2, 2.6)):
-        stroke((tip, side), (9, 0.9 * side), 1.0)
-    stroke((5, 6.4), (10, 3.5), 1.15)
+    for *points, radius in strokes:
+        start, end = ((np.asarray(at) + finger_px * (a * along + b * across)).tolist() for a, b in points)
+        parts += finger((start[0], start[1]), (end[0], end[1]), finger_px * radius, colour)
     return tuple(parts)
 
 
 def _clouds(rng: np.random.Generator, size: tuple[int, int], scale: float, stretch: float = 1.0) -> np.ndarray:
-    """Normal deviates at a spacing of ``scale`` pixels, interpolated cubically to float32 [H, W].
-
-    ``stretch`` multiplies the horizontal spacing.
-    """
+    """Normal deviates at a spacing of ``scale`` (x: ``scale * stretch``) pixels, interpolated to float32 [H, W]."""
     rows, columns = math.ceil(size[0] / scale) + 3, math.ceil(size[1] / (scale * stretch)) + 3
     coarse = rng.standard_normal((rows, columns), dtype=np.float32)
     width, height = round(columns * scale * stretch), round(rows * scale)

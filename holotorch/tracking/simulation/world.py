@@ -98,16 +98,10 @@ class World:
         shown: Catheter | None = None,
         **changes: Any,
     ) -> Case:
-        """A case with the catheter at a pose (tip, direction), or with no catheter if ``pose`` is None.
+        """A case with the catheter at a pose (tip, direction), or without a catheter if ``pose`` is None.
 
-        Args:
-            name: Name of the case, which determines the noise together with the seed.
-            pose: Tip in metres and direction, [3] each.
-            background: Makes the background; by default :meth:`desk`.
-            why: Reason for ``answerable``.
-            answerable: Whether the frame determines a pose.
-            shown: Another catheter that the frame shows instead.
-            changes: Fields of the look that differ from ``look``.
+        ``background`` makes the background, by default :meth:`desk`. ``shown`` is another catheter, which is rendered
+        instead. ``changes`` replace fields of the look. Seed and name determine the noise.
         """
 
         def frame() -> Tensor:
@@ -127,18 +121,11 @@ class World:
         at: Sequence[float] = (0.0, 0.0),
         point: float | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Tip in metres and direction, float64 [3] each, of a catheter whose bands have their middle on a given ray.
+        """Tip in metres and direction, float64 [3] each, with the bands' middle on the ray through ``at`` on z = 1.
 
-        Args:
-            depth: Coordinate z in metres of the point that ``point`` selects.
-            tilt: Angle in radians, see :func:`aimed`.
-            roll: Angle in radians, see :func:`aimed`.
-            at: Point (x, y) of the plane z = 1 on the ray from the camera through the middle of the bands.
-            point: Distance in metres from the tip of the point at ``depth``; None for the middle of the bands.
-
-        Raises:
-            TypeError, ValueError: ``depth`` not above 0, ``point`` not finite, or the middle of the bands not in front
-                of the camera.
+        ``depth`` is the coordinate z in metres of the point ``point`` metres from the tip, by default of the middle of
+        the bands. For ``tilt`` and ``roll`` see :func:`aimed`. Raises ValueError for a ``depth`` not above 0, a
+        ``point`` that is not finite, and if the middle of the bands is not in front of the camera.
         """
         checks.quantity(CAMERA_DEPTH, depth)
         direction = aimed(tilt, roll)
@@ -166,10 +153,7 @@ class World:
     def still(
         self, depth: float, tilt: float, count: int, at: Sequence[float] = (0.0, 0.0), point: float | None = None
     ) -> list[Case]:
-        """``count`` frames of a catheter at rest, which differ only in their noise, Sec. 3.5.1 of the thesis.
-
-        The other arguments are those of :meth:`pose`.
-        """
+        """``count`` frames of a catheter at a :meth:`pose`, which differ in noise only, Sec. 3.5.1 of the thesis."""
         pose = self.pose(depth, tilt, at=at, point=point)
         suffix = f", {1e3 * at[0]:.3f} {1e3 * at[1]:.3f}" if any(at) else ""
 
@@ -186,10 +170,10 @@ class World:
         return [Case(name, partial(frame, name), *pose, True, "") for name in names]
 
     def grid_2d(self, depth: float = 0.52, tilt: float = math.radians(20)) -> list[Case]:
-        """The sheet of Sec. 3.5.2 of the thesis: the tip at 9 x 9 points of a square of 8.16 cm, in one direction.
+        """The sheet of Sec. 3.5.2 of the thesis: the tip at 9 x 9 points of a square of 8.16 cm that faces the camera.
 
-        The cases are in rows. The sheet faces the camera. For the centre of the sheet, the middle of the bands lies on
-        the optical axis at ``depth`` in metres, which the thesis does not state.
+        The cases are in rows. With the tip at the central point, the middle of the bands lies on the optical axis at
+        ``depth`` metres, which the thesis does not state.
         """
         centre, direction = self.pose(depth, tilt)
         steps = [0.0816 * (i / 8 - 0.5) for i in range(9)]
@@ -199,13 +183,10 @@ class World:
         ]
 
     def grid_3d(self) -> dict[str, list[Case]]:
-        """The block of Sec. 3.5.3 of the thesis: 8 x 8 holes, 10 mm apart, in each of three faces A, B and C.
+        """The block of Sec. 3.5.3 of the thesis: 8 x 8 holes, 10 mm apart, in upper (A), left (B) and right face (C).
 
-        The cases of each face are in rows. The block is a cube of 90 mm with its centre at a distance of 560 mm, which
-        the thesis does not state, seen from an elevation of 37 degrees with a vertical edge in front. A is the upper
-        face, B the left and C the right one. In each face, the catheter has one direction, as if held by hand: in the
-        image of A to the upper right, of B to the left, of C to the right, with the rear tilted to the camera by 9, 20
-        and 25 degrees.
+        The cases of each face are in rows, with one direction as if held by hand. The block is a cube of 90 mm with its
+        centre 560 mm from the camera, which the thesis does not state, and seen from an elevation of 37 degrees.
         """
         up, front, side = (torch.tensor(v, dtype=torch.float64) for v in ([0, -0.8, -0.6], [0, 0.6, -0.8], [1.0, 0, 0]))
         left, right = (front - side) / math.sqrt(2), (front + side) / math.sqrt(2)
