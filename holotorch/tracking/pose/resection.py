@@ -1,8 +1,6 @@
 """Pose of a straight tool whose image lies on a known line, from the images of known points along the line."""
 
-import itertools
 import math
-import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -117,19 +115,25 @@ def _normal_equations(points: list[Vector], h: Vector) -> tuple[list[float], Vec
     ``points`` are (t, s, 1 / standard deviation of t).
     """
     h0, h1, h2 = h
-    rows = []
-    for t, s, weight in points:
+    a00 = a01 = a02 = a11 = a12 = a22 = b0 = b1 = b2 = chi = 0.0
+    least = math.inf
+    for t, s, weight in points:  # written out, since sums over generators would take several times as long
         depth = 1 + h2 * s
+        least = min(least, depth)
         image, scaled = ((h0 + h1 * s) / depth, weight / depth) if depth else (math.inf, math.inf)
-        rows.append((scaled, scaled * s, -scaled * s * (image if h1 else t), (t - image) * weight, depth))
-    *columns, residuals, depths = zip(*rows, strict=True)
-
-    def dot(a: Sequence[float], b: Sequence[float]) -> float:
-        return sum(map(operator.mul, a, b))
-
-    normal = [dot(a, b) for a, b in itertools.combinations_with_replacement(columns, 2)]
-    first, second, third = (dot(column, residuals) for column in columns)
-    return normal, (first, second, third), dot(residuals, residuals), min(depths)
+        rest = (t - image) * weight
+        one, two = scaled * s, -scaled * s * (image if h1 else t)
+        a00 += scaled * scaled
+        a01 += scaled * one
+        a02 += scaled * two
+        a11 += one * one
+        a12 += one * two
+        a22 += two * two
+        b0 += scaled * rest
+        b1 += one * rest
+        b2 += two * rest
+        chi += rest * rest
+    return [a00, a01, a02, a11, a12, a22], (b0, b1, b2), chi, least
 
 
 def _solve(normal: list[float], right: Vector) -> Vector:
