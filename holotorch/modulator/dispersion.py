@@ -41,7 +41,7 @@ class Cauchy:
 
 @dataclass(frozen=True)
 class BirefringenceTable:
-    """Measured birefringence, interpolated linearly in 1 / lambda^2, which is exact for Cauchy's law; called likewise.
+    """Measured birefringence, interpolated linearly in 1 / lambda^2, which is exact for :class:`Cauchy`'s law.
 
     Args:
         wavelengths: In metres, at least two different ones in any order; they are sorted.
@@ -89,7 +89,7 @@ def phase_scale(light: float | Tensor, design: float | Tensor, birefringence: Bi
     """Phase at the wavelength l = ``light`` divided by that at l0 = ``design``: (l0 / l) dn(l) / dn(l0).
 
     This follows from the phase 2 pi d dn(l) / l of a cell of thickness d. The orientation of the crystal depends on the
-    voltage and not on the wavelength. The dissertation leaves this correction to future work (Sec. 6.4.1).
+    voltage and not on the wavelength. Source: thesis Sec. 6.4.1, which asks for this correction.
 
     Args:
         light: Wavelengths of the light in metres, which broadcast against ``design``.

@@ -24,7 +24,7 @@ class Camera:
     Attributes:
         matrix: float64 [3, 3] with fx, fy, cx, cy in pixels; no skew. It may carry a gradient, as ``distortion`` may.
         distortion: float64 [5]: k1, k2, p1, p2, k3, in OpenCV's order.
-        tone: Tone curve: "srgb", "linear", or an increasing table [256] of the light, 0 to 1, of each 8-bit level.
+        tone: "srgb", "linear", or an increasing table [256] of the light, 0 to 1, of each 8-bit level.
         size: (H, W) of the frames for which the parameters are valid. Trackers refuse frames of another size, since
             their poses would be wrong but plausible. None accepts every size.
 
@@ -52,14 +52,13 @@ class Camera:
             raise ValueError(f"matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx, fy > 0, got {given.tolist()}")
         if self.size is not None:
             object.__setattr__(self, "size", tuple(checks.whole("size", side, 1) for side in self.size))
-        if isinstance(self.tone, str):
-            if self.tone not in ("srgb", "linear"):
-                raise ValueError(f"tone must be 'srgb', 'linear' or a table of 256 values, got {self.tone!r}")
-        else:
+        if not isinstance(self.tone, str):
             table = torch.as_tensor(self.tone).to(torch.float64)
             if table.shape != (256,) or not bool((table.diff() > 0).all()) or table[0] < 0 or table[-1] > 1:
                 raise ValueError("a tone table must have 256 values that rise from >= 0 to <= 1, one for each level")
             object.__setattr__(self, "tone", table)
+        elif self.tone not in ("srgb", "linear"):
+            raise ValueError(f"tone must be 'srgb', 'linear' or a table of 256 values, got {self.tone!r}")
 
     def need_size(self, frames: Tensor) -> None:
         """Raise ValueError for frames [..., H, W] of another size than that of the camera."""

@@ -140,9 +140,7 @@ def planar_accuracy(found: Tensor, grid: Tensor, right: Tensor, up: Tensor, refe
         up: [3] direction of its second axis, perpendicular to the first to within one degree.
         reference: Index of the intersection to which all positions are relative.
     """
-    found, grid = _rows("found", found), _rows("grid", grid, axes=2)
-    if len(found) != len(grid):
-        raise ValueError(f"found and grid must have a row for each point, got {len(found)} and {len(grid)}")
+    found, grid = _rows("found", found), _rows("grid", grid, like=found, axes=2)
     checks.all_finite("grid", grid)
     axes = torch.stack([_direction("right", right), _direction("up", up)]).to(found.device)
     if abs(float(axes[0] @ axes[1])) > math.sin(math.radians(1)):

@@ -26,15 +26,8 @@ def light_of(colour: tuple[int, int, int]) -> np.ndarray:
 class Tube:
     """A finite cylinder with coloured bands in front of a camera.
 
-    Args:
-        catheter: Geometry and colours.
-        tip: [3] tip in metres, in the camera frame.
-        direction: Unit vector [3] from the tip to the rear.
-        look: Light, and the optical properties of the tube.
-
-    Raises:
-        TypeError, ValueError: ``tip`` or ``direction`` is not a vector of 3 finite numbers, ``direction`` is not a unit
-            vector, or the tube comes within 10 radii of the camera.
+    Arguments and exceptions are those of :func:`holotorch.tracking.simulation.render.render`, where "too close to the
+    camera" means within 10 radii of the tube.
     """
 
     def __init__(self, catheter: Catheter, tip: Tensor | None, direction: Tensor | None, look: Look):
