@@ -109,7 +109,7 @@ def fit_band_edges(
 
 
 class _Problem:
-    """Least squares over F frames, each with 2 unknowns for the direction and 3 for a tip that moves (``own``).
+    """Least squares over F frames, each with 2 unknowns for the direction and 3 for a tip that moves (``per_frame``).
 
     The other m unknowns, the free positions and a resting tip, are the same in all frames (``shared``).
     """
@@ -117,9 +117,9 @@ class _Problem:
     def __init__(self, plane: Tensor, weights: Tensor, free: Tensor, resting: bool, offset: float):
         self.plane, self.weights, self.free = plane, weights, free
         self.resting, self.offset = resting, offset
-        self.own = 2 if resting else 5
+        self.per_frame = 2 if resting else 5
         self.shared = free.shape[1] + (3 if resting else 0)
-        self.unknowns = len(plane) * self.own + self.shared
+        self.unknowns = len(plane) * self.per_frame + self.shared
 
     def residuals(self, state: _State) -> Tensor:
         """Residuals [F, 2 N] in standard deviations."""
@@ -130,42 +130,42 @@ class _Problem:
         errors = points[..., :2] / points[..., 2:] - self.plane
         return (self.weights @ errors[..., None])[..., 0].flatten(1)
 
-    def step(self, state: _State, own: Tensor, shared: Tensor) -> _State:
-        """The state after steps ``own`` [F, 2 or 5] and ``shared`` [..., m] of the unknowns."""
+    def step(self, state: _State, per_frame: Tensor, shared: Tensor) -> _State:
+        """The state after steps ``per_frame`` [F, 2 or 5] and ``shared`` [..., m] of the unknowns."""
         tip, along, positions = state
         count = self.free.shape[1]
         positions = positions + shared[..., :count] @ self.free.mT
-        tip = tip + (shared[..., count:] if self.resting else own[:, 2:])
-        return tip, tilted(along, tangent_basis(along), own[:, :2]), positions
+        tip = tip + (shared[..., count:] if self.resting else per_frame[:, 2:])
+        return tip, tilted(along, tangent_basis(along), per_frame[:, :2]), positions
 
     def jacobians(self, state: _State) -> tuple[Tensor, Tensor]:
         """Derivatives [F, 2 N, 2 or 5] and [F, 2 N, m] of the residuals by the unknowns."""
         frames = len(self.plane)
 
         def stepped(step: Tensor) -> Tensor:
-            own, shared = step[: self.own].expand(frames, -1), step[self.own :].expand(frames, -1)
-            return self.residuals(self.step(state, own, shared))
+            per_frame, shared = step[: self.per_frame].expand(frames, -1), step[self.per_frame :].expand(frames, -1)
+            return self.residuals(self.step(state, per_frame, shared))
 
-        both = torch.func.jacfwd(stepped)(self.plane.new_zeros(self.own + self.shared))
-        return both[..., : self.own], both[..., self.own :]
+        both = torch.func.jacfwd(stepped)(self.plane.new_zeros(self.per_frame + self.shared))
+        return both[..., : self.per_frame], both[..., self.per_frame :]
 
     def solve(self, state: _State) -> tuple[_State, float, Tensor]:
         """Levenberg-Marquardt: the state, its chi-square, and the information [m, m] on the shared unknowns."""
         damping, cost = 1e-6, float(self.residuals(state).square().sum())
-        own, shared = self.jacobians(state)
+        per_frame, shared = self.jacobians(state)
         for _ in range(60):
             residuals = self.residuals(state)[..., None]
             # The blocks of the normal equations, damped, and the Schur complement of the block of each frame.
-            block, mixed = own.mT @ own, own.mT @ shared
+            block, mixed = per_frame.mT @ per_frame, per_frame.mT @ shared
             block = block + damping * torch.diag_embed(block.diagonal(dim1=-2, dim2=-1))
             total = (shared.mT @ shared).sum(0)
             total = total + damping * torch.diag(total.diagonal())
-            solved = torch.linalg.solve(block, torch.cat([mixed, own.mT @ residuals], -1))
+            solved = torch.linalg.solve(block, torch.cat([mixed, per_frame.mT @ residuals], -1))
             complement = total - (mixed.mT @ solved[..., :-1]).sum(0)
             gradient = (shared.mT @ residuals).sum(0) - (mixed.mT @ solved[..., -1:]).sum(0)
             shared_step = -torch.linalg.lstsq(complement, gradient, driver="gelsd").solution
-            own_step = -(solved[..., -1:] + solved[..., :-1] @ shared_step)
-            trial = self.step(state, own_step[..., 0], shared_step[:, 0])
+            frame_step = -(solved[..., -1:] + solved[..., :-1] @ shared_step)
+            trial = self.step(state, frame_step[..., 0], shared_step[:, 0])
             trial_cost = float(self.residuals(trial).square().sum())
             if not trial_cost <= cost or bool((trial[0][:, 2] <= 0).any()):
                 damping = max(10 * damping, 1e-9)
@@ -174,10 +174,10 @@ class _Problem:
                 continue
             converged = cost - trial_cost <= 1e-12 * (1 + trial_cost)
             state, cost, damping = trial, trial_cost, damping / 10
-            own, shared = self.jacobians(state)
+            per_frame, shared = self.jacobians(state)
             if converged:
                 break
-        block, mixed = own.mT @ own, own.mT @ shared
+        block, mixed = per_frame.mT @ per_frame, per_frame.mT @ shared
         return state, cost, (shared.mT @ shared - mixed.mT @ torch.linalg.solve(block, mixed)).sum(0)
 
 
