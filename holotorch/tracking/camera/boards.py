@@ -94,8 +94,8 @@ def find_board(image: Tensor, board: Chessboard | Charuco, name: str = "") -> Vi
 
     Args:
         image: uint8, grey [H, W] or RGB [3, H, W].
-        board: Board to detect. If a rotation by 180 degrees does not change a chessboard, its first corner is
-            arbitrary, which has no influence on the estimated intrinsics.
+        board: Board to detect. The first corner of a chessboard with a symmetry of 180 degrees is arbitrary, which does
+            not influence the estimated intrinsics.
         name: Name of the photograph, for messages.
 
     Raises:

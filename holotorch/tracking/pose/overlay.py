@@ -17,22 +17,11 @@ _GREEN, _ORANGE, _RED, _WHITE = (60, 230, 90), (255, 170, 30), (255, 70, 60), (2
 
 
 def overlay(pixels: Tensor, pose: Pose, camera: Camera, catheter: Catheter) -> Tensor:
-    """A copy of the frame with the pose drawn on it, or with the reason why there is none.
+    """A copy of the RGB frame ``pixels``, uint8 [3, H, W], with the pose drawn on it, or with the reason of a refusal.
 
     The line is the axis from the tip to the rear end. Ticks across it are the band edges, the cross is the tip, and the
-    ellipse around the cross is the image of its 95 % confidence region.
-
-    Args:
-        pixels: uint8 [3, H, W], RGB.
-        pose: Pose of one catheter.
-        camera: Camera that took the frame.
-        catheter: Catheter with this pose.
-
-    Returns:
-        uint8 [3, H, W] on the device of ``pixels``.
-
-    Raises:
-        TypeError, ValueError: The frame has another type or shape, or ``pose`` is a batch.
+    ellipse around the cross is the image of its 95 % confidence region. Raises TypeError or ValueError for a frame of
+    another type or shape, and for a batch of poses.
     """
     if pixels.dtype != torch.uint8:
         raise TypeError(f"pixels must be uint8, got {pixels.dtype}")

@@ -87,18 +87,12 @@ def solve_pose(
 def closed_form(edges_px: Tensor, positions_m: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Pose from the three edges of two neighbouring bands by the sine rule, the method of the thesis.
 
-    For more than three edges, the result is the mean over all triples of neighbouring edges.
-
-    Args:
-        edges_px: [B, N, 2] pixels (x, y).
-        positions_m: [N] distances from the tip in metres, increasing.
-        camera: Camera whose distortion is removed from the pixels.
+    ``edges_px`` [B, N, 2] are the pixels (x, y) of N >= 3 edges, and ``positions_m`` [N] their increasing distances from
+    the tip in metres. The result is the mean over all triples of neighbouring edges. Raises ValueError for other shapes
+    or types.
 
     Returns:
         Tip [B, 3] in metres and direction [B, 3]; NaN where edges coincide or are NaN.
-
-    Raises:
-        ValueError: Wrong shapes or types, fewer than three positions, equal positions.
 
     Source: Eqs. 3.3 to 3.12 of the thesis, except that angles are computed by atan2, bands may have different lengths,
     and no quadratic equation loses digits for a tool parallel to the image. Eq. 3.12 prints |AT| / |AB| inverted.

@@ -26,8 +26,7 @@ def light_of(colour: tuple[int, int, int]) -> np.ndarray:
 class Tube:
     """A finite cylinder with coloured bands in front of a camera.
 
-    Arguments and exceptions are those of :func:`holotorch.tracking.simulation.render.render`, where "too close to the
-    camera" means within 10 radii of the tube.
+    Arguments and exceptions are those of :func:`holotorch.tracking.simulation.render.render`.
     """
 
     def __init__(self, catheter: Catheter, tip: Tensor | None, direction: Tensor | None, look: Look):

@@ -41,13 +41,12 @@ def render(
         camera: Camera with intrinsics for frames of ``size``.
         tip: [3] tip in metres, in the camera frame.
         direction: Unit vector [3] from the tip to the rear.
-        size: (H, W) in pixels.
+        size: (H, W) in pixels, 8 to 8192.
         look: Appearance and image errors; None for the defaults.
         generator: Random generator of the noise, on the CPU.
 
     Raises:
-        TypeError, ValueError: Wrong shapes, NaN, ``direction`` is not a unit vector, or the tube is too close to the
-            camera.
+        TypeError, ValueError: Wrong shapes, NaN, no unit vector, or a tube within 10 radii of the camera.
     """
     look = look or Look()
     levels = mean_levels(catheter, camera, (tip, direction), size, look)

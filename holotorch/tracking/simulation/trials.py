@@ -228,9 +228,5 @@ def _background(world: World, kind: str, i: int, rng: np.random.Generator) -> Ca
         return partial(scenery.photograph, photographs[which], size, seed)
     if kind in ("photograph", "texture"):
         return partial(scenery.texture, size, seed)
-    plain = (
-        partial(scenery.desk, size, seed),
-        partial(scenery.drape, size, seed, blue),
-        partial(scenery.skin, size, seed),
-    )
-    return plain[(i // len(_KINDS) + int(rng.integers(2))) % 3]
+    options = (scenery.desk, partial(scenery.drape, colour=blue), scenery.skin)
+    return partial(options[(i // len(_KINDS) + int(rng.integers(2))) % 3], size, seed)
