@@ -124,8 +124,12 @@ class PhaseModulator(nn.Module):
         self.register_buffer("lut", table.expand(len(self.wavelengths), -1).contiguous(), persistent=False)
         self.fill_factor, self.gap = _fraction("fill_factor", fill_factor), _fraction("gap", gap, allow_zero=True)
         self.flips = tuple(axis for axis, flipped in ((-2, flip_rows), (-1, flip_columns)) if flipped)
-        self.crosstalk = _fringing(crosstalk)
-        self.birefringence = birefringence
+        self.crosstalk, self.birefringence = None, birefringence
+        if isinstance(crosstalk, Tensor) and crosstalk.ndim > 0:
+            self.crosstalk = ThermalCrosstalk.from_patch(crosstalk)
+        elif width := checks.finite("crosstalk", float(crosstalk), "pixels"):
+            # A Gaussian of standard deviation s, exp(-d^2 / (2 s^2)), is exp(-d^2 / sigma^2) with sigma = sqrt(2) s.
+            self.crosstalk = ThermalCrosstalk(math.sqrt(2) * width)
 
     @property
     def expected_rms(self) -> tuple[float, ...]:
@@ -244,11 +248,3 @@ def _fraction(name: str, value: float, *, allow_zero: bool = False) -> float:
     if not 0 <= number <= 1 or (number == 0 and not allow_zero):
         raise ValueError(f"{name} must be {'at least' if allow_zero else 'above'} 0 and at most 1, got {value!r}")
     return number
-
-
-def _fringing(crosstalk: float | Tensor) -> ThermalCrosstalk | None:
-    if isinstance(crosstalk, Tensor) and crosstalk.ndim > 0:
-        return ThermalCrosstalk.from_patch(crosstalk)
-    width = checks.finite("crosstalk", float(crosstalk), "pixels")
-    # A Gaussian of standard deviation s, exp(-d^2 / (2 s^2)), is exp(-d^2 / sigma^2) with sigma = sqrt(2) s.
-    return None if width == 0 else ThermalCrosstalk(math.sqrt(2) * width)

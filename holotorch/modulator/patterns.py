@@ -148,7 +148,7 @@ def fit_lut(levels: Sequence[int], first_order_intensity: Sequence[float] | Tens
         raise ValueError("the first order does not change with the level: no phase can be found in it")
     unit = (measured - measured.min()) / spread
     x = torch.tensor(swept, dtype=torch.float64) / top
-    increments = _refined(x, unit, _first_guess(x, unit))
+    increments = _fitted_increments(x, unit)
     if increments.sum() < 1.05 * math.pi:
         raise ValueError(
             f"the stroke comes out as {increments.sum().item():.3g} rad: the first order has no clear maximum within "
@@ -163,19 +163,16 @@ def fit_lut(levels: Sequence[int], first_order_intensity: Sequence[float] | Tens
     )
 
 
-def _first_guess(x: Tensor, unit: Tensor) -> Tensor:
-    """Phase increments between knots of the best power law, for levels ``x`` and intensities ``unit`` in [0, 1]."""
+def _fitted_increments(x: Tensor, unit: Tensor) -> Tensor:
+    """Phase increments between knots that fit best, for levels ``x`` and intensities ``unit`` in [0, 1]."""
+    # The start is the best of many power laws.
     strokes = torch.linspace(math.pi / 2, 8 * math.pi, 96, dtype=torch.float64)
     powers = torch.logspace(math.log10(0.4), math.log10(2.5), 13, dtype=torch.float64)
     curves = torch.cartesian_prod(strokes, powers)
     stroke, power = curves[_linear_part(curves[:, :1] * x ** curves[:, 1:], unit)[2].argmin()]
     knots = torch.linspace(0, 1, 17, dtype=torch.float64)
-    return torch.diff(stroke * knots**power).clamp(min=1e-3 * stroke)
-
-
-def _refined(x: Tensor, unit: Tensor, increments: Tensor) -> Tensor:
-    """Increments that fit best; the unknowns are their logarithms, which keeps the increments above zero."""
-    logs = increments.log().requires_grad_()
+    start = torch.diff(stroke * knots**power).clamp(min=1e-3 * stroke)
+    logs = start.log().requires_grad_()  # the unknowns are logarithms, which keeps the increments above zero
     solver = torch.optim.LBFGS([logs], max_iter=300, tolerance_grad=1e-10, line_search_fn="strong_wolfe")
 
     def loss() -> Tensor:

@@ -87,9 +87,8 @@ def solve_pose(
 def closed_form(edges_px: Tensor, positions_m: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Pose from the three edges of two neighbouring bands by the sine rule, the method of the thesis.
 
-    ``edges_px`` [B, N, 2] are the pixels (x, y) of N >= 3 edges, and ``positions_m`` [N] their increasing distances from
-    the tip in metres. The result is the mean over all triples of neighbouring edges. Raises ValueError for other shapes
-    or types.
+    ``edges_px`` [B, N, 2] are the pixels (x, y) of N >= 3 edges, ``positions_m`` [N] their distances from the tip in
+    metres, increasing. The result is the mean over all triples of neighbours. Raises ValueError for other shapes.
 
     Returns:
         Tip [B, 3] in metres and direction [B, 3]; NaN where edges coincide or are NaN.

@@ -56,9 +56,9 @@ class Refusal(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Pose of one catheter, or a batch of poses with leading axis [...], in the frame of the camera: x right, y down.
+    """Pose of one catheter, or a batch of poses with leading axis [...], in the frame of the camera.
 
-    Where there is no pose, ``tip``, ``direction``, ``covariance`` and ``chi_square`` are NaN.
+    The frame of the camera is x right, y down, z forward. Where there is no pose, ``tip``, ``direction``, ``covariance`` and ``chi_square`` are NaN.
 
     Attributes:
         tip: [..., 3] in metres.

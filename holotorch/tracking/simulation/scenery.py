@@ -54,7 +54,9 @@ def texture(size: tuple[int, int], seed: int) -> Tensor:
     """Random shapes of strong colours at all scales, with light, shadow and grain, as a substitute for a photograph."""
     rng = np.random.default_rng(seed)
     half = ((size[0] + 1) // 2, (size[1] + 1) // 2)  # suffices, since the smallest shapes are 19 pixels wide
-    light, hue, strength = (_scales(rng, half) for _ in range(3))
+    # Clouds of six scales, whose amplitude falls with the scale.
+    scales = [[_clouds(rng, half, 300 / 2**i) / 1.6**i for i in range(6)] for _ in range(3)]
+    light, hue, strength = np.sum(scales, axis=1)
     angle = (1.5 * hue + rng.uniform(0, 7))[..., None] + np.array([0, 2 * math.pi / 3, -2 * math.pi / 3], np.float32)
     colour = 0.55 + 0.22 * (1 + np.tanh(strength))[..., None] * np.cos(angle)
     image = np.clip(240 / (1 + np.exp(-1.2 * light - 0.3))[..., None] * colour, 0, 255).astype(np.float32)
@@ -151,11 +153,6 @@ def _clouds(rng: np.random.Generator, size: tuple[int, int], scale: float, stret
     # The first deviate lies outside the image, so that interpolation does not depend on the border.
     matrix = np.array([[columns / width, 0, 1], [0, rows / height, 1]])
     return cv2.warpAffine(coarse, matrix, size[::-1], flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP)
-
-
-def _scales(rng: np.random.Generator, size: tuple[int, int]) -> np.ndarray:
-    """Sum of clouds of six scales, whose amplitude falls with the scale."""
-    return np.sum([_clouds(rng, size, 300 / 2**i) / 1.6**i for i in range(6)], axis=0)
 
 
 def _axes(angle: float) -> tuple[np.ndarray, np.ndarray]:
