@@ -58,7 +58,8 @@ class Refusal(Exception):
 class Pose:
     """Pose of one catheter, or a batch of poses with leading axis [...], in the frame of the camera.
 
-    The frame of the camera is x right, y down, z forward. Where there is no pose, ``tip``, ``direction``, ``covariance`` and ``chi_square`` are NaN.
+    In this frame, x points right, y down and z forward. Where there is no pose, ``tip``, ``direction``, ``covariance``
+    and ``chi_square`` are NaN.
 
     Attributes:
         tip: [..., 3] in metres.
