@@ -9,24 +9,21 @@ from torch.nn import functional
 from holotorch.core import checks
 from holotorch.core.quantities import SIGMA_PX
 
-# Taps below 1e-12 of the centre tap are set to 0: their products would be denormal numbers, which are slow.
-_SMALLEST_TAP = 1e-12
-# With no size given, the kernel ends where the taps fall below 1e-6 of the centre tap.
-_DROPPED_TAP = 1e-6
+_SMALLEST_TAP = 1e-12  # smaller taps are set to 0: products with them may be denormal numbers, which are slow
 
 
 class ThermalCrosstalk(nn.Module):
     """Convolution of heater phases (or temperatures) [..., H, W] with the heat kernel exp(-d^2 / sigma^2).
 
-    A pixel heated alone warms one at a distance of d pixels by exp(-d^2 / sigma^2) of its own rise, so sigma is the
-    usual Gaussian sigma times sqrt 2. The centre tap is 1 and the kernel is not normalised: heat in the neighbours adds
-    to that in the pixel. Outside the array there is no pixel that warms or is warmed. Linear and real; dtype and device
-    follow the input.
+    The kernel at a distance of d pixels is the temperature rise there, relative to the rise of a pixel that is heated
+    alone. Sigma is sqrt 2 times the standard deviation of the Gaussian. The centre tap is 1 and the kernel is not
+    normalised, since the heat from all neighbours adds to that of the pixel. The array is padded with zeros. The
+    operator is linear and real; dtype and device follow the input.
 
     Args:
         sigma_px: Sigma in pixels, 0 to 100; 0 means no crosstalk. The thesis's chip has 0.66.
-        size: Odd number of taps per axis. By default all taps above 1e-6 of the centre tap; the thesis always takes 7,
-            which loses 2.3 % of the heat at sigma 2.0 (see :attr:`lost_heat`).
+        size: Odd number of taps per axis. By default, the kernel has all taps of at least 1e-6. The thesis always uses
+            7, which loses 2.3 % of the heat at sigma 2.0 (see :attr:`lost_heat`).
 
     Raises:
         ValueError: ``sigma_px`` outside its range, ``size`` even or below 1; in a call: an array smaller than the given
@@ -41,16 +38,16 @@ class ThermalCrosstalk(nn.Module):
         if size is not None and checks.whole("crosstalk size", size, 1) % 2 == 0:
             raise ValueError(f"crosstalk size must be an odd number of taps of at least 1, got {size!r}")
         radius = _needed_radius(sigma) if size is None else size // 2
-        taps = [[_tap(offset, sigma)] for offset in range(-radius, radius + 1)]
-        self._set_factors(torch.tensor(taps, dtype=torch.float64), torch.tensor(taps, dtype=torch.float64).T)
+        column = torch.tensor([[_tap(offset, sigma)] for offset in range(-radius, radius + 1)], dtype=torch.float64)
+        self._set_factors(column, column.T)
         self.sigma_px, self.size_is_given = sigma, size is not None
 
     @classmethod
     def from_patch(cls, patch: Tensor) -> "ThermalCrosstalk":
-        """Build from a measured response: the temperature rises [h, w], odd sizes, around one heated centre pixel.
+        """Build from a measured response: the temperature rises [h, w] around one heated pixel in the centre.
 
-        The patch is divided by its centre, so its unit does not matter; it need not be symmetric. Raises ValueError for
-        even sizes, NaN, negative rises or a centre that is not the warmest.
+        h and w are odd. The rises have any unit, since they are divided by that of the centre; they need not be
+        symmetric. Raises ValueError for even sizes, NaN, negative rises or a centre that is not the warmest.
         """
         checks.real("patch", patch)
         checks.all_finite("patch", patch)
@@ -69,11 +66,11 @@ class ThermalCrosstalk(nn.Module):
 
     @classmethod
     def fitted(cls, patch: Tensor, size: int | None = None) -> "ThermalCrosstalk":
-        """Build from the Gaussian exp(-d^2 / sigma^2) that fits a measured response [h, w] best, as in Sec. 4.3.2.
+        """Build from the Gaussian that fits a measured response best, as in Sec. 4.3.2 of the thesis.
 
-        The patch is as for :meth:`from_patch`, and larger than one pixel; ``size`` is that of the constructor. The fit
-        is by least squares in the rises, not in their logarithms, which would amplify the noise of cold pixels. Raises
-        ValueError as ``from_patch``, and for a patch that does not fall off.
+        ``patch`` is as in :meth:`from_patch`, but larger than one pixel; ``size`` is as in the constructor. The fit is
+        by least squares in the rises and not in their logarithms, which would amplify the noise of cold pixels. Raises
+        ValueError as ``from_patch``, and for a patch that is nowhere below its centre.
         """
         measured = cls.from_patch(patch).kernel
         y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in measured.shape)
@@ -81,10 +78,11 @@ class ThermalCrosstalk(nn.Module):
         if not (measured[square > 0] < 1).any():
             raise ValueError("patch must fall off from its centre to be fitted")
         low, high = 1e-2, SIGMA_PX.high**2
-        for _ in range(60):  # bisection: the derivative of the squared error by sigma^2 changes sign once
+        # Bisection: the derivative of the squared error with respect to s = sigma^2 changes sign once.
+        for _ in range(60):
             middle = math.sqrt(low * high)
             model = torch.exp(-square / middle)
-            # d/ds of sum (exp(-d^2 / s) - k)^2 with s = sigma^2, up to a positive factor
+            # The derivative of sum (exp(-d^2 / s) - k)^2 for the measured kernel k, up to a positive factor.
             if ((model - measured) * model * square).sum() > 0:
                 high = middle
             else:
@@ -93,20 +91,17 @@ class ThermalCrosstalk(nn.Module):
 
     @property
     def kernel(self) -> Tensor:
-        """The two-dimensional kernel, float64 [h, w], centre 1."""
-        kernel = torch.ones(1, 1, dtype=torch.float64)
-        for factor in self._factors:
-            kernel = kernel * torch.tensor(factor, dtype=torch.float64)
-        return kernel
+        """The two-dimensional kernel, float64 [h, w], with a centre tap of 1."""
+        return math.prod(torch.tensor(factor, dtype=torch.float64) for factor in self._factors)  # type: ignore[return-value]
 
     @property
     def total(self) -> float:
-        """Sum of the kernel: the phase of a pixel in a uniformly heated array, per unit of heater phase."""
+        """Sum of the kernel: phase per heater phase of a uniformly heated, infinite array."""
         return self.kernel.sum().item()
 
     @property
     def lost_heat(self) -> float:
-        """Share of the Gaussian's heat that falls outside the taps; NaN for a measured patch."""
+        """Share of the heat of the Gaussian that the taps do not include; NaN for a measured patch."""
         if math.isnan(self.sigma_px):
             return math.nan
         radius = _needed_radius(self.sigma_px) + 4
@@ -118,16 +113,15 @@ class ThermalCrosstalk(nn.Module):
         return self._apply_factors(phase, self._factors)
 
     def adjoint(self, phase: Tensor) -> Tensor:
-        """Apply the transpose, the correlation with the kernel; it equals :meth:`forward` for a symmetric kernel."""
-        flipped = tuple(tuple(row[::-1] for row in factor[::-1]) for factor in reversed(self._factors))
-        return self._apply_factors(phase, flipped)
+        """Apply the transpose, which is the correlation with the kernel."""
+        return self._apply_factors(phase, tuple(map(_flipped, reversed(self._factors))))
 
     def extra_repr(self) -> str:
-        """Width and number of taps, for ``print(module)``."""
+        """Main parameters, for ``print(module)``."""
         return f"sigma_px={self.sigma_px:g}, taps={tuple(self.kernel.shape)}"
 
     def _set_factors(self, *factors: Tensor) -> None:
-        # Taps are Python floats, not buffers, so that they have full precision for any dtype and device of the input.
+        # Taps are Python floats, not tensors, so that they have full precision for every dtype and device.
         self._factors = tuple(tuple(map(tuple, factor.tolist())) for factor in factors)
 
     def _apply_factors(self, phase: Tensor, factors: tuple) -> Tensor:
@@ -148,8 +142,8 @@ class ThermalCrosstalk(nn.Module):
 class _ShiftAndAdd(torch.autograd.Function):
     """Convolution as a sum of shifted copies of the image, one per tap.
 
-    On a CPU and with one channel, the backward pass of conv2d takes about ten times as long (``scripts/bench.py
-    crosstalk``). Forward-mode derivatives are not defined, since torch.compile refuses a function that has them.
+    On a CPU, the backward pass of conv2d with one channel takes about ten times as long (``scripts/bench.py
+    crosstalk``). There is no forward-mode derivative, since torch.compile does not accept a function with one.
     """
 
     generate_vmap_rule = True
@@ -173,19 +167,22 @@ class _ShiftAndAdd(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *gradients: Tensor):
-        flipped = tuple(row[::-1] for row in ctx.taps[::-1])
-        return _ShiftAndAdd.apply(gradients[0], flipped), None
+        return _ShiftAndAdd.apply(gradients[0], _flipped(ctx.taps)), None
+
+
+def _flipped(taps: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
+    """Kernel of the transposed convolution: both axes reversed."""
+    return tuple(row[::-1] for row in taps[::-1])
 
 
 def _tap(offset: int, sigma: float) -> float:
     """One-dimensional kernel at a whole number of pixels from its centre."""
-    if offset == 0:
-        return 1.0
-    ratio = offset / sigma if sigma > 0 else math.inf
-    tap = math.exp(-ratio * ratio)
+    if offset == 0 or sigma == 0:
+        return float(offset == 0)
+    tap = math.exp(-((offset / sigma) ** 2))
     return tap if tap >= _SMALLEST_TAP else 0.0
 
 
 def _needed_radius(sigma: float) -> int:
-    """Largest offset whose tap is not below ``_DROPPED_TAP``."""
-    return max(0, math.ceil(sigma * math.sqrt(-math.log(_DROPPED_TAP))) - 1)
+    """Largest offset in pixels whose tap is at least 1e-6."""
+    return max(0, math.ceil(sigma * math.sqrt(-math.log(1e-6))) - 1)

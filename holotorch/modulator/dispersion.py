@@ -15,10 +15,10 @@ Birefringence = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Cauchy:
-    """Birefringence dn(lambda) = a + b / lambda^2, b in m^2; the defaults are those of a common nematic mixture.
+    """Cauchy's law of birefringence, dn = a + b / lambda^2, b in m^2; the defaults describe a common nematic mixture.
 
-    Called with wavelengths in metres, any shape; returns float64 of the same shape, differentiable. Raises ValueError
-    for a birefringence that is not positive at some wavelength.
+    A call takes wavelengths in metres and returns the birefringence, float64 of the same shape and differentiable. It
+    raises ValueError where the birefringence is not positive.
     """
 
     a: float = 0.18
@@ -41,38 +41,37 @@ class Cauchy:
 
 @dataclass(frozen=True)
 class BirefringenceTable:
-    """Measured birefringence, interpolated linearly in 1 / lambda^2, which is exact for Cauchy's law.
-
-    :func:`phase_scale` needs only ratios, so the values may have any unit, such as phase times wavelength.
+    """Measured birefringence, interpolated linearly in 1 / lambda^2, which is exact for :class:`Cauchy`'s law.
 
     Args:
-        wavelengths: In metres, at least two, each once, in any order.
-        values: Birefringence at each, above zero.
+        wavelengths: In metres, at least two different ones in any order; they are sorted.
+        values: Birefringence at each wavelength, above zero. A common factor does not matter for :func:`phase_scale`,
+            so that they may be phases times wavelengths.
 
     Raises:
-        ValueError: Fewer than two rows, a wavelength given twice, values that are not positive; in a call: a
-            wavelength outside the table.
+        ValueError: Fewer than two rows, equal wavelengths, values that are not positive; in a call: a wavelength
+            outside the table.
     """
 
-    wavelengths: tuple[float, ...]
-    values: tuple[float, ...]
+    wavelengths: Sequence[float]
+    values: Sequence[float]
 
-    def __init__(self, wavelengths: Sequence[float], values: Sequence[float]):
-        lengths = checks.wavelengths(wavelengths)
-        if len(lengths) != len(values) or len(lengths) < 2 or len(set(lengths)) < len(lengths):
+    def __post_init__(self):
+        lengths = checks.wavelengths(self.wavelengths)
+        if len(lengths) != len(self.values) or len(lengths) < 2 or len(set(lengths)) < len(lengths):
             raise ValueError(
                 f"a birefringence table needs at least two different wavelengths with one value each, got "
-                f"{len(lengths)} wavelengths ({len(set(lengths))} different) and {len(values)} values"
+                f"{len(lengths)} wavelengths ({len(set(lengths))} different) and {len(self.values)} values"
             )
-        rows = sorted(zip(lengths, (checks.positive("birefringence", value) for value in values), strict=True))
-        object.__setattr__(self, "wavelengths", tuple(row[0] for row in rows))
-        object.__setattr__(self, "values", tuple(row[1] for row in rows))
+        rows = sorted(zip(lengths, (checks.positive("birefringence", value) for value in self.values), strict=True))
+        for name, column in zip(("wavelengths", "values"), zip(*rows, strict=True), strict=True):
+            object.__setattr__(self, name, column)
 
     def __call__(self, wavelength: Tensor) -> Tensor:
         """Birefringence at ``wavelength``."""
         lengths = _checked(wavelength)
         low, high = self.wavelengths[0], self.wavelengths[-1]
-        # With a margin of 1e-6, as float32 rounds the end points.
+        # A margin of 1e-6 admits end points that were rounded to float32.
         if bool(((lengths.detach() < low * (1 - 1e-6)) | (lengths.detach() > high * (1 + 1e-6))).any()):
             raise ValueError(
                 f"wavelengths {lengths.min().item() * 1e9:.6g} to {lengths.max().item() * 1e9:.6g} nm lie outside the "
@@ -81,7 +80,7 @@ class BirefringenceTable:
         nodes = torch.tensor(self.wavelengths, dtype=torch.float64, device=lengths.device).square().reciprocal()
         values = torch.tensor(self.values, dtype=torch.float64, device=lengths.device)
         x = lengths.square().reciprocal()
-        row = torch.bucketize(-x.detach(), -nodes).clamp(1, len(nodes) - 1)  # nodes fall with the wavelength
+        row = torch.bucketize(-x.detach(), -nodes).clamp(1, len(nodes) - 1)  # the signs make the nodes increase
         part = (x - nodes[row - 1]) / (nodes[row] - nodes[row - 1])
         return values[row - 1] + part * (values[row] - values[row - 1])
 
@@ -89,16 +88,16 @@ class BirefringenceTable:
 def phase_scale(light: float | Tensor, design: float | Tensor, birefringence: Birefringence | None = None) -> Tensor:
     """Phase at the wavelength l = ``light`` divided by that at l0 = ``design``: (l0 / l) dn(l) / dn(l0).
 
+    This follows from the phase 2 pi d dn(l) / l of a cell of thickness d. The orientation of the crystal depends on the
+    voltage and not on the wavelength. Source: thesis Sec. 6.4.1, which asks for this correction.
+
     Args:
-        light: Wavelengths in metres of the light; broadcasts against ``design``.
-        design: Wavelengths in metres of the calibration.
-        birefringence: :class:`Cauchy` with its defaults if not given, or a :class:`BirefringenceTable`.
+        light: Wavelengths of the light in metres, which broadcast against ``design``.
+        design: Wavelengths of the calibration in metres.
+        birefringence: Such as a :class:`BirefringenceTable`; :class:`Cauchy` with its defaults if not given.
 
     Returns:
-        float64, differentiable in both wavelengths. The orientation of the crystal depends on the voltage, not on the
-        light, and is taken to be the same at both wavelengths.
-
-    Source: thesis Sec. 6.4.1, which asks for it; phi = 2 pi d dn / lambda for a cell of thickness d.
+        float64, differentiable with respect to both wavelengths.
     """
     law = Cauchy() if birefringence is None else birefringence
     lit, calibrated = _checked(light), _checked(design)
@@ -106,10 +105,9 @@ def phase_scale(light: float | Tensor, design: float | Tensor, birefringence: Bi
 
 
 def kinoform_efficiency(scale: Tensor) -> Tensor:
-    """Share of the light in the picture of a kinoform whose phases on [0, 2 pi) are multiplied by ``scale``.
+    """Share of the light that forms the image of a kinoform whose phases on [0, 2 pi) are multiplied by ``scale``.
 
-    It is sinc^2(1 - scale) for uniformly distributed phases, such as those of a blazed grating or a diffuse picture.
-    Source: Goodman, Sec. 4.4; Dammann (1970), blazed gratings of the wrong depth.
+    It is sinc^2(1 - scale) for uniformly distributed phases. Source: Goodman, Sec. 4.4; Dammann (1970).
     """
     return torch.sinc(1 - scale).square()
 
@@ -124,10 +122,10 @@ class CauchyFit:
     """Result of :func:`fit_cauchy`.
 
     Attributes:
-        law: The birefringence; without a path length it is multiplied by an unknown length, which cancels in ratios.
-        residuals: Measured minus fitted phase in rad, in the order of the table.
-        rms: Root mean square of the residuals.
-        errors: Standard errors of (a, b) from the residuals; NaN for a table of two rows.
+        law: The birefringence; without a path length, only the ratio b / a is meaningful.
+        residuals: Measured minus fitted phase in rad, in the order of the measurements.
+        rms: Root mean square of the residuals in rad.
+        errors: Standard errors of (a, b), estimated from the residuals; NaN for two measurements.
     """
 
     law: Cauchy
@@ -137,15 +135,15 @@ class CauchyFit:
 
 
 def fit_cauchy(wavelengths: Sequence[float], phases: Sequence[float], *, path: float = 1.0) -> CauchyFit:
-    """Fit a and b of Cauchy's law to measured phase differences between no and full drive at several wavelengths.
+    """Fit a and b of Cauchy's law to the phase range of a panel, from the lowest to the highest voltage.
 
-    Least squares in the phase, which is linear in a and b: phi = 2 pi path (a / lambda + b / lambda^3).
+    Linear least squares: the phase is 2 pi path (a / lambda + b / lambda^3).
 
     Args:
-        wavelengths: In metres, at least two different ones; residuals need a third.
-        phases: In rad, not wrapped.
-        path: Length of the light's path through the crystal in metres, twice the cell's thickness in reflection.
-            Without it only the ratio b / a is determined, which is all that :func:`phase_scale` needs.
+        wavelengths: In metres, at least two different ones; with two, the fit is exact.
+        phases: Phase range at each wavelength in rad, not wrapped.
+        path: Length of the light's path through the crystal in metres, in reflection twice the thickness of the cell.
+            :func:`phase_scale` needs only the ratio b / a, which does not depend on it.
 
     Raises:
         ValueError: Fewer than two wavelengths, unequal lengths, phases that are not positive, or phases that no
@@ -159,7 +157,7 @@ def fit_cauchy(wavelengths: Sequence[float], phases: Sequence[float], *, path: f
             f"{len(lengths)} wavelengths ({len(set(lengths))} different) and {len(wanted)} phases"
         )
     length = checks.positive("path", path, "metres")
-    unit = 1e-6  # metres: in micrometres the two columns are of similar size
+    unit = 1e-6  # wavelengths in micrometres make the two columns of the matrix similar in size
     inverse = unit / torch.tensor(lengths, dtype=torch.float64)
     matrix = 2 * math.pi * torch.stack([inverse, inverse**3], 1)
     solution = torch.linalg.lstsq(matrix, wanted[:, None]).solution[:, 0]
@@ -169,10 +167,9 @@ def fit_cauchy(wavelengths: Sequence[float], phases: Sequence[float], *, path: f
         raise ValueError(
             "no positive birefringence gives these phases; expected unwrapped ones, falling with wavelength"
         )
-    spare = len(lengths) - 2
     errors = (math.nan, math.nan)
-    if spare:
-        covariance = torch.linalg.inv(matrix.T @ matrix) * residuals.square().sum() / spare
+    if len(lengths) > 2:
+        covariance = torch.linalg.inv(matrix.T @ matrix) * residuals.square().sum() / (len(lengths) - 2)
         deviation = covariance.diagonal().sqrt().tolist()
         errors = deviation[0] * unit / length, deviation[1] * unit**3 / length
     return CauchyFit(Cauchy(a, b), tuple(residuals.tolist()), residuals.square().mean().sqrt().item(), errors)

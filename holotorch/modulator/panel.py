@@ -13,19 +13,18 @@ from holotorch.core.grid import Grid
 from holotorch.core.quantities import WAVELENGTH
 from holotorch.modulator.crosstalk import ThermalCrosstalk
 from holotorch.modulator.dispersion import Birefringence, phase_scale
-
-_CYCLE = 2 * math.pi
+from holotorch.modulator.quantised import checked_bits
 
 
 def even_lut(bits: int, full_turn: float | None = None) -> Tensor:
     """Phases of evenly spaced levels, float64 [2^bits] in rad, 0 at level 0.
 
-    ``full_turn`` is the level at which the phase is 2 pi. It need not be a whole number. The default 2^bits spreads the
-    levels evenly over the circle; it is larger for a panel whose phases do not reach 2 pi.
+    ``full_turn`` is the level at which the phase is 2 pi, by default 2^bits. It need not be a whole number, and may be
+    larger than 2^bits for a panel whose largest phase is below 2 pi.
     """
-    count = 2 ** _checked_bits(bits)
+    count = 2 ** checked_bits(bits)
     levels_per_cycle = checks.positive("full_turn", count if full_turn is None else full_turn, "levels")
-    return torch.arange(count, dtype=torch.float64) * (_CYCLE / levels_per_cycle)
+    return torch.arange(count, dtype=torch.float64) * (math.tau / levels_per_cycle)
 
 
 def nearest_levels(phase: Tensor, lut: Tensor) -> Tensor:
@@ -33,22 +32,21 @@ def nearest_levels(phase: Tensor, lut: Tensor) -> Tensor:
 
     Args:
         phase: In rad, of any size.
-        lut: Phases of the levels, float64 [L] in rad, of any stroke. Wanted phases beyond a stroke of less than 2 pi go
-            to the nearer of its two ends; of levels with the same phase modulo 2 pi one is taken.
+        lut: Phases of the levels, float64 [L] in rad, over any range. If they cover less than 2 pi, a phase outside
+            their range gives the nearer end. Of several levels with the same phase modulo 2 pi, any may be returned.
     """
-    circle, order = torch.sort(torch.remainder(lut, _CYCLE))
-    circle = torch.cat([circle[-1:] - _CYCLE, circle, circle[:1] + _CYCLE])
+    circle, order = torch.sort(torch.remainder(lut, math.tau))
+    circle = torch.cat([circle[-1:] - math.tau, circle, circle[:1] + math.tau])
     order = torch.cat([order[-1:], order, order[:1]])
     borders = ((circle[1:] + circle[:-1]) / 2).to(phase.device)
-    wanted = torch.remainder(phase.detach().double(), _CYCLE).contiguous()
+    wanted = torch.remainder(phase.detach().double(), math.tau).contiguous()
     return order.to(phase.device)[torch.bucketize(wanted, borders)]
 
 
 def snapped(phase: Tensor, lut: Tensor) -> Tensor:
-    """Phase of the nearest level, in the dtype of ``phase`` and the range of ``lut`` [L].
+    """Phase from ``lut`` [L] of the level by :func:`nearest_levels`, in the shape and dtype of ``phase``.
 
-    The gradient is that of the identity (straight-through estimator), as in :func:`holotorch.modulator.quantised`. Here
-    the levels are those of the panel, and phases are compared modulo 2 pi.
+    The gradient is that of the identity (straight-through estimator).
     """
     shown = lut.to(phase.device)[nearest_levels(phase, lut)].to(phase.dtype)
     return shown + (phase - phase.detach())  # the second term is exactly zero and carries the gradient
@@ -57,50 +55,46 @@ def snapped(phase: Tensor, lut: Tensor) -> Tensor:
 def quantisation_rms(lut: Tensor) -> float:
     """Expected rms phase error in rad of the nearest level for phases uniform on the circle.
 
-    It is sqrt(sum g^3 / 24 pi) over the gaps g between neighbouring levels on the circle. For L evenly spread levels
-    this is 2 pi / L / sqrt(12), 0.0071 rad for 8 bits.
+    It is sqrt(sum g^3 / (24 pi)) over the gaps g between neighbouring levels on the circle: 2 pi / (L sqrt(12)) for L
+    evenly spaced levels, 0.0071 rad for 8 bits.
     """
-    circle = torch.remainder(lut.double(), _CYCLE).sort().values
-    gaps = torch.diff(circle, append=circle[:1] + _CYCLE)
-    return math.sqrt((gaps**3).sum().item() / (12 * _CYCLE))
+    circle = torch.remainder(lut.double(), math.tau).sort().values
+    gaps = torch.diff(circle, append=circle[:1] + math.tau)
+    return math.sqrt((gaps**3).sum().item() / (12 * math.tau))
 
 
 class PhaseModulator(nn.Module):
     """Emitted field of one panel, complex [..., C, H, W], for a wanted phase, real [..., C, H, W] in rad.
 
-    The model has these steps: the grey level nearest to the wanted phase modulo 2 pi, with the gradient of the
-    identity; the phase of that level by the look-up table; fringing fields between pixels; dispersion, if the light has
-    another wavelength than the calibration; the gaps between the pixels. Colours are shown one after another, each with
-    a separate table.
+    The phase is rounded to that of the nearest grey level (:func:`snapped`), smoothed by the fringing fields between
+    pixels, and scaled by dispersion if the light has another wavelength than the calibration. Fringing is a convolution
+    of the phase, and not of the field, since it smooths the orientation of the crystal; its kernel is normalised, also
+    at the border of the panel.
 
-    Fringing is a convolution of the phases with a kernel of sum 1, normalised at the border of the panel. Phases and
-    not phasors are convolved, since the orientation of the crystal is smoothed. Detail within a pixel is not modelled.
-    The amplitude is that of the central diffraction order for unit illumination: the modulated light, weighted by
-    ``fill_factor``, plus the unmodulated light of the gaps, a zero order. ``holotorch.optics.PixelShape`` models the
-    decrease towards higher orders and may follow, with a ``fill`` of the square root of ``fill_factor`` and only with a
-    ``gap`` of 0, as the light of the gaps decreases in another way.
+    The amplitude is that of the central diffraction order for unit illumination: ``fill_factor`` times the modulated
+    field, plus (1 - ``fill_factor``) ``gap`` for the gaps between pixels. If ``gap`` is 0, the lower amplitude of the
+    higher orders may be modelled by applying ``holotorch.optics.PixelShape`` with a ``fill`` of sqrt(``fill_factor``).
 
     Args:
         grid: Pixels of the panel.
-        wavelengths: Wavelengths of the calibration in metres, one per channel.
+        wavelengths: Wavelengths of the calibration in metres, one per channel; the channels are shown in sequence.
         bits: Bits of a grey level, 1 to 16.
         full_turn: Level at which the phase is 2 pi, see :func:`even_lut`.
         lut: Phase in rad of every level, real [2^bits] or [C, 2^bits], strictly rising or falling; excludes
             ``full_turn``.
         fill_factor: Share of the area that is modulated, above 0 and at most 1.
-        gap: Amplitude reflected by the rest, 0 (dark) to 1, with phase 0.
-        flip_rows: Whether the panel shows its last row first; affects only :meth:`levels` and :meth:`phase`. A frame is
-            flipped about its middle, which for an even size moves the optical axis by one pixel.
+        gap: Amplitude reflected by the gaps, 0 (dark) to 1, with phase 0.
+        flip_rows: Whether the panel shows the last row of a frame at its top; affects only :meth:`levels` and
+            :meth:`phase`. For an even size, the flip moves the optical axis, at pixel n // 2, by one pixel.
         flip_columns: The same for columns.
-        crosstalk: Standard deviation in pixels of a Gaussian fringing field, or its measured kernel, odd sizes, centre
-            largest.
+        crosstalk: Fringing kernel: the standard deviation in pixels of a Gaussian, or a measured kernel [h, w], see
+            :meth:`ThermalCrosstalk.from_patch`.
         birefringence: Birefringence of the crystal, see :func:`holotorch.modulator.dispersion.phase_scale`. With None
             the phase is the same for every wavelength, as in the thesis's simulation.
 
     Raises:
         TypeError: A wrong kind of number or tensor.
-        ValueError: A parameter outside its range, a table of another size or one that is not monotone; in a call: a
-            phase of another shape.
+        ValueError: A parameter outside its range, a table of another size or not monotone, a phase of another shape.
     """
 
     lut: Tensor
@@ -121,17 +115,21 @@ class PhaseModulator(nn.Module):
         birefringence: Birefringence | None = None,
     ):
         super().__init__()
-        self.grid, self.wavelengths, self.bits = grid, checks.wavelengths(wavelengths), _checked_bits(bits)
+        self.grid, self.wavelengths, self.bits = grid, checks.wavelengths(wavelengths), checked_bits(bits)
         if lut is not None and full_turn is not None:
             raise ValueError("give lut or full_turn, not both: the table says how far the levels reach")
         table = even_lut(bits, full_turn) if lut is None else checked_lut(lut, self.bits)
         if table.ndim == 2 and len(table) != len(self.wavelengths):
             raise ValueError(f"lut must have one row for each of {len(self.wavelengths)} wavelengths, got {len(table)}")
         self.register_buffer("lut", table.expand(len(self.wavelengths), -1).contiguous(), persistent=False)
-        self.fill_factor, self.gap = _share("fill_factor", fill_factor), _share("gap", gap, least=True)
+        self.fill_factor, self.gap = _fraction("fill_factor", fill_factor), _fraction("gap", gap, allow_zero=True)
         self.flips = tuple(axis for axis, flipped in ((-2, flip_rows), (-1, flip_columns)) if flipped)
-        self.crosstalk = _fringing(crosstalk)
-        self.birefringence = birefringence
+        self.crosstalk, self.birefringence = None, birefringence
+        if isinstance(crosstalk, Tensor) and crosstalk.ndim > 0:
+            self.crosstalk = ThermalCrosstalk.from_patch(crosstalk)
+        elif width := checks.finite("crosstalk", float(crosstalk), "pixels"):
+            # A Gaussian of standard deviation s, exp(-d^2 / (2 s^2)), is exp(-d^2 / sigma^2) with sigma = sqrt(2) s.
+            self.crosstalk = ThermalCrosstalk(math.sqrt(2) * width)
 
     @property
     def expected_rms(self) -> tuple[float, ...]:
@@ -141,42 +139,42 @@ class PhaseModulator(nn.Module):
     def forward(self, phase: Tensor, light: float | Sequence[float] | Tensor | None = None) -> Tensor:
         """Emitted field [..., C, H, W] for a wanted phase [..., C, H, W].
 
-        ``light``: wavelengths of the illumination in metres, broadcast against [..., C]; by default those of the
+        ``light``: Wavelengths of the illumination in metres, which broadcast against [..., C]; by default those of the
         calibration.
         """
         return self.emitted(self.shown(phase), light)
 
     def shown(self, phase: Tensor) -> Tensor:
-        """Phase [..., C, H, W] of the levels nearest to a wanted phase, in the range of the table."""
+        """Phase [..., C, H, W] of the levels nearest to a wanted phase, see :func:`snapped`."""
         self._check(phase)
         rows = [snapped(phase[..., c, :, :], row) for c, row in enumerate(self.lut)]
         return torch.stack(rows, -3)
 
     def emitted(self, shown: Tensor, light: float | Sequence[float] | Tensor | None = None) -> Tensor:
-        """Emitted field for the phases [..., C, H, W] of grey levels, such as :meth:`phase` returns."""
+        """Emitted field for the phases [..., C, H, W] of grey levels, as :meth:`phase` returns; ``light`` as above."""
         self._check(shown)
         if self.crosstalk is not None:
             weight = self.crosstalk(torch.ones(self.grid.shape, dtype=shown.dtype, device=shown.device))
             shown = self.crosstalk(shown) / weight
-        lit = None if light is None else torch.as_tensor(light, dtype=torch.float64)
-        if lit is not None:
+        if light is not None:
+            lit = torch.as_tensor(light, dtype=torch.float64)
             checks.quantities(WAVELENGTH, lit, "light")
-        if lit is not None and self.birefringence is not None:
-            design = torch.tensor(self.wavelengths, dtype=torch.float64, device=lit.device)
-            scale = phase_scale(lit, design, self.birefringence)
-            shown = shown * scale.to(shown.device, shown.dtype)[..., None, None]
+            if self.birefringence is not None:
+                design = torch.tensor(self.wavelengths, dtype=torch.float64, device=lit.device)
+                scale = phase_scale(lit, design, self.birefringence)
+                shown = shown * scale.to(shown.device, shown.dtype)[..., None, None]
         field = phasor(shown)
         return field if self.fill_factor == 1 else self.fill_factor * field + (1 - self.fill_factor) * self.gap
 
     def levels(self, phase: Tensor) -> Tensor:
-        """Frames for the panel, uint8 or (above 8 bits) uint16 [..., C, H, W], flipped as the panel is mounted."""
+        """Frames of the nearest levels, uint8 (uint16 above 8 bits) [..., C, H, W], with the flips of the panel."""
         self._check(phase)
         checks.all_finite("phase", phase.detach())
         rows = [nearest_levels(phase[..., c, :, :], row) for c, row in enumerate(self.lut)]
         return torch.stack(rows, -3).flip(self.flips).to(torch.uint8 if self.bits <= 8 else torch.uint16)
 
     def phase(self, levels: Tensor) -> Tensor:
-        """Phase in rad, float64 [..., C, H, W], of frames as :meth:`levels` returns them, with the flips undone."""
+        """Phase in rad, float64 [..., C, H, W], of frames from :meth:`levels`, with the flips undone."""
         if levels.is_floating_point() or levels.is_complex():
             raise TypeError(f"levels must be whole numbers, got {levels.dtype}")
         index = levels.to(torch.int64)
@@ -197,22 +195,22 @@ class PhaseModulator(nn.Module):
         return hashlib.sha256(data).hexdigest()[:16]
 
     def extra_repr(self) -> str:
-        """Sampling, levels and gaps, for ``print(module)``."""
+        """Main parameters, for ``print(module)``."""
         return f"grid={self.grid}, bits={self.bits}, fill_factor={self.fill_factor:g}, gap={self.gap:g}"
 
     def _check(self, phase: Tensor) -> None:
         checks.field("phase", phase, (len(self.wavelengths), *self.grid.shape), complex_valued=False)
 
     def _apply(self, fn, recurse=True):
-        # The tables stay float64 when a module is cast: 16 bits are finer than half precision.
+        # The tables stay float64 when the module is cast, since float16 has fewer digits than a panel of 16 bits.
         return super()._apply(lambda tensor: tensor.to(fn(tensor).device), recurse)
 
 
 def checked_lut(lut: Tensor, bits: int) -> Tensor:
-    """A table of phases [..., 2^bits] as float64, or ValueError saying what is wrong with it."""
+    """``lut`` of [2^bits] or [C, 2^bits] phases as float64; ValueError for another size, NaN or no monotone table."""
     checks.real("lut", lut)
     checks.all_finite("lut", lut)
-    if lut.ndim not in (1, 2) or lut.shape[-1] != 2 ** _checked_bits(bits):
+    if lut.ndim not in (1, 2) or lut.shape[-1] != 2 ** checked_bits(bits):
         raise ValueError(f"lut must hold {2**bits} phases for {bits} bits, one per level, got {tuple(lut.shape)}")
     steps = torch.diff(lut.double())
     for row in steps.reshape(-1, steps.shape[-1]):
@@ -230,11 +228,11 @@ def checked_lut(lut: Tensor, bits: int) -> Tensor:
 def level_of(phase: Tensor, lut: Tensor) -> Tensor:
     """Inverse of a look-up table: the continuous level of a phase, float64, by linear interpolation.
 
-    ``phase`` is in rad and not wrapped, ``lut`` [L] is monotone; differentiable in both. Raises ValueError for phases
-    outside the table.
+    ``phase``, of any shape, is in rad and not wrapped; ``lut`` [L] is monotone. Differentiable with respect to both.
+    Raises ValueError for phases outside the range of the table.
     """
-    table = lut.double() if lut[-1] >= lut[0] else -lut.double()
-    wanted = phase.double() if lut[-1] >= lut[0] else -phase.double()
+    sign = 1 if lut[-1] >= lut[0] else -1
+    table, wanted = sign * lut.double(), sign * phase.double()
     low, high = table.detach()[0], table.detach()[-1]
     if bool(((wanted.detach() < low) | (wanted.detach() > high)).any()):
         raise ValueError(
@@ -245,22 +243,8 @@ def level_of(phase: Tensor, lut: Tensor) -> Tensor:
     return row - 1 + (wanted - table[row - 1]) / (table[row] - table[row - 1])
 
 
-def _checked_bits(bits: int) -> int:
-    if checks.whole("bits", bits, 1) > 16:
-        raise ValueError(f"bits must be at most 16, got {bits}")
-    return bits
-
-
-def _share(name: str, value: float, *, least: bool = False) -> float:
+def _fraction(name: str, value: float, *, allow_zero: bool = False) -> float:
     number = checks.finite(name, value)
-    if not (0 <= number <= 1) or (number == 0 and not least):
-        raise ValueError(f"{name} must be {'at least' if least else 'above'} 0 and at most 1, got {value!r}")
+    if not 0 <= number <= 1 or (number == 0 and not allow_zero):
+        raise ValueError(f"{name} must be {'at least' if allow_zero else 'above'} 0 and at most 1, got {value!r}")
     return number
-
-
-def _fringing(crosstalk: float | Tensor) -> ThermalCrosstalk | None:
-    if isinstance(crosstalk, Tensor) and crosstalk.ndim > 0:
-        return ThermalCrosstalk.from_patch(crosstalk)
-    width = checks.finite("crosstalk", float(crosstalk), "pixels")
-    # A Gaussian of standard deviation s, exp(-d^2 / (2 s^2)), is exp(-d^2 / sigma^2) with sigma = sqrt(2) s.
-    return None if width == 0 else ThermalCrosstalk(math.sqrt(2) * width)

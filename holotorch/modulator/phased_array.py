@@ -10,20 +10,20 @@ from holotorch.core import checks
 from holotorch.core.complex import phasor
 from holotorch.modulator.crosstalk import ThermalCrosstalk
 
-# The thesis's phase shifter shifts light of 630 nm by pi at 175 K above ambient: metres, and rad/K at that wavelength.
-REFERENCE_WAVELENGTH, REFERENCE_RESPONSE = 630e-9, math.pi / 175
+# The thesis's phase shifter shifts light of 630 nm by pi at 175 K above ambient.
+REFERENCE_WAVELENGTH, REFERENCE_RESPONSE = 630e-9, math.pi / 175  # metres; rad/K at this wavelength
 
 
 class PhasedArray(nn.Module):
     """Thermally driven phased array with uniform amplitude: one heater and one antenna per pixel and colour.
 
+    A phase is the product of a temperature rise above ambient and :attr:`response`. Departure from the thesis: its text
+    under Eq. 4.1 calls the response proportional to the wavelength, but its three printed values are inversely
+    proportional, as here.
+
     Args:
         wavelengths: In metres, one per channel.
         crosstalk: Spreading of the heat, an operator on heater phases [..., C, H, W].
-
-    A phase is a temperature rise above ambient times ``response`` in rad/K, which is inversely proportional to the
-    wavelength: (pi/175 rad/K)(630 nm / wavelength). Departure from the thesis: its text says "proportional" under
-    Eq. 4.1, but its three printed values are inversely proportional.
     """
 
     crosstalk: ThermalCrosstalk
@@ -34,16 +34,16 @@ class PhasedArray(nn.Module):
 
     @property
     def response(self) -> tuple[float, ...]:
-        """Phase per temperature rise in rad/K, one value per channel."""
+        """Phase per temperature rise in rad/K, (pi / 175)(630 nm / wavelength), one value per channel."""
         return tuple(REFERENCE_RESPONSE * REFERENCE_WAVELENGTH / wavelength for wavelength in self.wavelengths)
 
     def forward(self, phase: Tensor) -> Tensor:
-        """Emitted field, complex [..., C, H, W], for heater phases in rad, real [..., C, H, W]; frames [F, C, H, W]."""
+        """Emitted field, complex [..., C, H, W], for heater phases in rad, real [..., C, H, W]."""
         self._check(phase)
         return phasor(self.crosstalk(phase))
 
     def temperature(self, phase: Tensor) -> Tensor:
-        """Temperature rise in kelvin for ``phase`` [..., C, H, W]; that of the chip for a phase after spreading."""
+        """Temperature rise in kelvin for ``phase`` [..., C, H, W] in rad, which includes crosstalk or does not."""
         return phase / self._response_like(phase)
 
     def phase(self, temperature: Tensor) -> Tensor:

@@ -11,9 +11,7 @@ from holotorch.core import checks
 from holotorch.core.quantities import BOARD_SQUARE
 
 _DICTIONARIES = {name: getattr(cv2.aruco, name) for name in dir(cv2.aruco) if name.startswith("DICT_")}
-_FEWEST = 8  # least corners of a view: 4 determine a homography, and the others check it
-# Refinement of corners ends after 50 steps, or with a step below 1e-3 pixels.
-_REFINED = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+_FEWEST = 8  # least number of corners of a view: 4 determine a homography, the others check it
 
 
 @dataclass(frozen=True)
@@ -21,7 +19,7 @@ class Chessboard:
     """A plain chessboard.
 
     Attributes:
-        columns, rows: Numbers of inner corners along both sides (a board of 10 x 7 squares has 9 x 6).
+        columns, rows: Numbers of inner corners, 3 to 100; a board of 10 x 7 squares has 9 x 6.
         square: Side of a square in metres.
     """
 
@@ -30,8 +28,7 @@ class Chessboard:
     square: float
 
     def __post_init__(self) -> None:
-        # OpenCV finds no smaller boards.
-        _sides(self, least=3)
+        _check_sides(self, least=3)  # OpenCV finds no smaller boards
         checks.quantity(BOARD_SQUARE, self.square)
 
 
@@ -40,9 +37,9 @@ class Charuco:
     """A chessboard with a marker in each white square. It may be partly hidden or outside the picture.
 
     Attributes:
-        columns, rows: Numbers of squares along both sides.
+        columns, rows: Numbers of squares, 4 to 100.
         square, marker: Sides of a square and of a marker in metres.
-        dictionary: Name of the dictionary of the markers in OpenCV, such as DICT_6X6_250.
+        dictionary: OpenCV's name of the dictionary of the markers, such as DICT_6X6_250.
     """
 
     columns: int
@@ -52,14 +49,13 @@ class Charuco:
     dictionary: str
 
     def __post_init__(self) -> None:
-        _sides(self, least=4)
+        _check_sides(self, least=4)
         if not checks.quantity(BOARD_SQUARE, self.marker, "marker") < checks.quantity(BOARD_SQUARE, self.square):
             raise ValueError(f"marker must be smaller than square, {self.square:g} m, got {self.marker:g} m")
         if self.dictionary not in _DICTIONARIES:
             raise ValueError(f"dictionary must be one of {', '.join(_DICTIONARIES)}, got {self.dictionary!r}")
         held = len(cv2.aruco.getPredefinedDictionary(_DICTIONARIES[self.dictionary]).bytesList)
-        if held < self.columns * self.rows // 2:
-            needed = self.columns * self.rows // 2
+        if held < (needed := self.columns * self.rows // 2):
             raise ValueError(f"the board has {needed} markers, {self.dictionary} only {held}; check the board's size")
 
 
@@ -68,8 +64,8 @@ class View:
     """Corners of a board in one photograph.
 
     Attributes:
-        points: float64 [n, 3] corners on the board in metres, z = 0.
-        pixels: float64 [n, 2] their images (x, y).
+        points: float64 [n, 3], n >= 8 corners in the frame of the board in metres, z = 0.
+        pixels: float64 [n, 2], the images (x, y) of the corners in pixels.
         name: Name of the photograph.
     """
 
@@ -98,8 +94,8 @@ def find_board(image: Tensor, board: Chessboard | Charuco, name: str = "") -> Vi
 
     Args:
         image: uint8, grey [H, W] or RGB [3, H, W].
-        board: Board to detect. Where a chessboard is symmetric under half a rotation, its first corner is arbitrary;
-            the intrinsics of a camera do not depend on it.
+        board: Board to detect. The first corner of a chessboard with a symmetry of 180 degrees is arbitrary, which does
+            not influence the estimated intrinsics.
         name: Name of the photograph, for messages.
 
     Raises:
@@ -109,52 +105,50 @@ def find_board(image: Tensor, board: Chessboard | Charuco, name: str = "") -> Vi
         raise TypeError(f"image must be a uint8 tensor, got {getattr(image, 'dtype', type(image).__name__)}")
     if not (image.ndim == 2 or (image.ndim == 3 and image.shape[0] == 3)) or min(image.shape[-2:]) < 32:
         raise ValueError(f"image must be [H, W] or [3, H, W] of at least 32 x 32 pixels, got {list(image.shape)}")
-    values = image.cpu().numpy()
-    grey = (
-        values
-        if values.ndim == 2
-        else cv2.cvtColor(np.ascontiguousarray(values.transpose(1, 2, 0)), cv2.COLOR_RGB2GRAY)
-    )
+    grey = image.cpu().numpy()
+    if grey.ndim == 3:
+        grey = cv2.cvtColor(np.ascontiguousarray(grey.transpose(1, 2, 0)), cv2.COLOR_RGB2GRAY)
     corners = _chessboard(grey, board) if isinstance(board, Chessboard) else _charuco(grey, board)
     if corners is None:
         raise ValueError(
             f"no {describe_board(board)} found; is its size right, is it flat, sharp, evenly lit and, with a white "
             "margin, in the picture?"
         )
-    points, pixels = (torch.from_numpy(np.asarray(part, dtype=np.float64)) for part in corners)
-    return View(points, pixels, name)
+    return View(*map(torch.from_numpy, corners), name=name)
 
 
 def describe_board(board: Chessboard | Charuco) -> str:
-    """Description of the board for messages."""
+    """Description of a board for messages."""
     if isinstance(board, Chessboard):
         return f"chessboard of {board.columns} x {board.rows} inner corners"
     return f"ChArUco board of {board.columns} x {board.rows} squares ({board.dictionary})"
 
 
 def _chessboard(grey: np.ndarray, board: Chessboard) -> tuple[np.ndarray, np.ndarray] | None:
+    """Points [n, 3] and pixels [n, 2] of all corners, or None."""
     shape = (board.columns, board.rows)
     found, corners = cv2.findChessboardCorners(grey, shape)
     if found:
-        # The window must not contain the next corner. In one of OpenCV's sample photographs, a fixed window of 11 px
+        # The search window must not contain the next corner. In one of OpenCV's sample photographs, a window of 11 px
         # causes errors of 1.2 px in the corners, and of 3 px in the focal length.
         lattice = corners.reshape(board.rows, board.columns, 2)
         steps = [np.linalg.norm(np.diff(lattice, axis=axis), axis=-1).min() for axis in (0, 1)]
         window = int(np.clip(0.4 * min(steps), 2, 11))
-        corners = cv2.cornerSubPix(grey, corners, (window, window), (-1, -1), _REFINED)
+        end = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3  # 50 steps, or a step below 1e-3 pixels
+        corners = cv2.cornerSubPix(grey, corners, (window, window), (-1, -1), end)
     else:  # each of the two methods detects some boards that the other one misses
         flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
         found, corners = cv2.findChessboardCornersSB(grey, shape, flags=flags)
     if not found:
         return None
-    points = np.zeros((board.rows, board.columns, 3))
-    points[..., 0], points[..., 1] = np.meshgrid(np.arange(board.columns), np.arange(board.rows))
-    return board.square * points.reshape(-1, 3), corners.reshape(-1, 2)
+    points = [(x, y, 0.0) for y in range(board.rows) for x in range(board.columns)]
+    return board.square * np.array(points), corners.reshape(-1, 2)
 
 
 def _charuco(grey: np.ndarray, board: Charuco) -> tuple[np.ndarray, np.ndarray] | None:
+    """Points [n, 3] and pixels [n, 2] of the visible corners, or None."""
     dictionary = cv2.aruco.getPredefinedDictionary(_DICTIONARIES[board.dictionary])
-    # Boards of an even number of rows printed with OpenCV before 4.6 begin with a black square.
+    # Boards with an even number of rows that were printed by OpenCV before 4.6 begin with a black square.
     for legacy in (False, True) if board.rows % 2 == 0 else (False,):
         pattern = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, dictionary)
         pattern.setLegacyPattern(legacy)
@@ -163,13 +157,13 @@ def _charuco(grey: np.ndarray, board: Charuco) -> tuple[np.ndarray, np.ndarray] 
             continue
         numbers = np.asarray(numbers, dtype=np.int64).reshape(-1)
         points = np.asarray(pattern.getChessboardCorners(), dtype=np.float64)[numbers]
-        # The corners of a single row or column do not determine a homography.
+        # Corners in a single row or column do not determine a homography.
         if np.linalg.matrix_rank(points[:, :2] - points[:, :2].mean(0), tol=1e-9) == 2:
             return points, np.asarray(corners).reshape(-1, 2)
     return None
 
 
-def _sides(board: Chessboard | Charuco, least: int) -> None:
+def _check_sides(board: Chessboard | Charuco, least: int) -> None:
     for name in ("columns", "rows"):
         if checks.whole(name, getattr(board, name), least) > 100:
             raise ValueError(f"{name} must be at most 100, got {getattr(board, name)}")

@@ -1,70 +1,63 @@
-"""Estimation of a camera's tone curve, from light to 8-bit levels, from several exposures of one still scene."""
+"""Estimate of a camera's tone curve from several exposures of a still scene."""
 
 import torch
 from torch import Tensor
 
 from holotorch.core import checks
 
-_CLIPPED = 3  # number of levels at each end of the range that may be clipped
-_SMOOTH = 1.0  # weight of the mean squared curvature relative to the mean squared residual of the pixels
-_NEEDED = 0.8  # share of the unclipped levels that must occur, at least
-_MISFIT = 0.1  # largest rms residual of ln(light): exposures that are wrong by 10 %, or a moving scene, exceed it
+_CLIPPED = 3  # number of levels at each end of the range that count as clipped
 
 
 def tone_curve(frames: Tensor, exposures: Tensor) -> Tensor:
-    """Estimate the light of each 8-bit level from frames of a still scene at known exposures.
+    """Estimate the light of each 8-bit level from frames of a still scene at known exposure times.
 
-    Exposures and curve raised to the same power fit the frames equally well, so the exposure times must be true, and
-    gain and white balance fixed. Averaging several frames of each exposure beforehand reduces noise.
+    Gain and white balance must be fixed. Averaging several frames of each exposure beforehand reduces noise.
 
     Args:
-        frames: uint8 [E, 3, H, W] or [E, H, W], E >= 3 exposures that together cover the range of levels. One
-            curve is assumed for all three colours.
-        exposures: [E] exposure times, or ratios of them; only their ratios count.
+        frames: uint8 [E, 3, H, W] or [E, H, W], E >= 3 exposures that together cover the range of levels. All three
+            colours have the same curve.
+        exposures: [E] exposure times in any unit, with true ratios.
 
     Returns:
         float64 [256], increasing from 0 to 1, for ``Camera.tone``. Levels below 3 and above 252 are extrapolated.
 
     Raises:
-        TypeError, ValueError: There are too few exposures or levels, the exposures do not fit the frames, or the curve
-            does not increase.
+        TypeError, ValueError: Wrong shapes or types, too few exposures or levels, exposure times that do not fit the
+            frames, or a curve that does not increase.
 
-    Source: Debevec and Malik (1997), Eq. 3. Unlike OpenCV, which samples a few hundred pixels, this uses the pairs of
-    levels of all pixels in successive exposures, so that the radiances cancel and noise averages out.
+    Source: Debevec and Malik (1997), Eq. 3. Departure from it: instead of a few hundred pixels with unknown radiances,
+    the equations compare the levels of every pixel in successive exposures, in which its radiance cancels.
     """
     counts, steps = _pairs(*_checked(frames, exposures))
     level = torch.arange(256, dtype=torch.float64)
     inside = (level >= _CLIPPED) & (level <= 255 - _CLIPPED)
-    seen = (counts.sum((0, 1)) + counts.sum((0, 2)) > 0) & inside
-    if seen.sum() < _NEEDED * inside.sum():
+    occurring = (counts.sum((0, 1)) + counts.sum((0, 2)) > 0) & inside
+    if occurring.sum() < 0.8 * inside.sum():
         raise ValueError(
-            f"only {int(seen.sum())} of {int(inside.sum())} levels occur in two exposures that are not clipped; add "
-            "exposures between the others, or a scene with more shades"
+            f"only {int(occurring.sum())} of {int(inside.sum())} levels occur in two exposures that are not clipped; "
+            "add exposures between the others, or a scene with more shades"
         )
-    # Noise of constant size in levels has a standard deviation proportional to 1 / level in the logarithm.
-    trust = torch.minimum(level, 255 - level).clamp(min=0) * inside
-    weights = counts * trust[:, None] * trust
+    # The hat-shaped weights of the paper, one for each level of a pair.
+    hat = torch.minimum(level, 255 - level).clamp(min=0) * inside
+    weights = counts * hat[:, None] * hat
     weights = weights / weights.sum()
-    normal, right = weights.new_zeros(256, 256), weights.new_zeros(256)
-    for weight, step in zip(weights, steps, strict=True):  # g(second) - g(first) = step
-        normal += torch.diag(weight.sum(0) + weight.sum(1)) - weight - weight.T
-        right += step * (weight.sum(0) - weight.sum(1))
-    # Curvature over the logarithm of the level, in which a power law is straight.
-    place = level.clamp(min=0.5).log()
+    # Least squares for the curve g, the logarithm of the light: g(j) - g(i) = step for each pair of levels (i, j).
+    first, second = weights.sum(2), weights.sum(1)
+    normal = (torch.diag_embed(second + first) - weights - weights.mT).sum(0)
+    right = (steps[:, None] * (second - first)).sum(0)
+    # The mean squared curvature of g over the logarithm of the level, in which a power law is straight, is added.
+    logarithm = level.clamp(min=0.5).log()
     curvature = torch.zeros(254, 256, dtype=torch.float64)
     rows = torch.arange(254)
-    before, after = place.diff()[:-1], place.diff()[1:]
+    before, after = logarithm.diff()[:-1], logarithm.diff()[1:]
     curvature[rows, rows], curvature[rows, rows + 2] = 1 / before, 1 / after
     curvature[rows, rows + 1] = -(1 / before + 1 / after)
-    curvature *= (2 * (before + after)).sqrt()[:, None]  # weight of each point: its step in the logarithm
-    normal += _SMOOTH / 254 * curvature.mT @ curvature
-    normal[255, 255] += 1.0  # the scale: the logarithm of level 255 is 0
+    curvature *= (2 * (before + after)).sqrt()[:, None]
+    normal += 1 / 254 * curvature.mT @ curvature
+    normal[255, 255] += 1.0  # g(255) = 0 fixes the scale of the light
     curve = torch.linalg.solve(normal, right)
-    misfit = sum(
-        float((weight * (curve[None] - curve[:, None] - step).square()).sum())
-        for weight, step in zip(weights, steps, strict=True)
-    )
-    if not misfit**0.5 < _MISFIT:
+    misfit = float((weights * (curve[None] - curve[:, None] - steps[:, None, None]).square()).sum())
+    if not misfit**0.5 < 0.1:  # exposure times that are wrong by 10 %, or a moving scene, exceed this
         raise ValueError(
             f"the frames do not fit their exposures, by {100 * misfit**0.5:.0f} % of the light; was the scene still, "
             "the light steady, gain and white balance fixed, the exposure times true?"
@@ -93,17 +86,16 @@ def _checked(frames: Tensor, exposures: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _pairs(levels: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
-    """Pairs of levels in successive exposures.
+    """Pairs of levels in successive exposures, from levels [E, n] and exposure times [E].
 
-    Returns:
-        Counts [E - 1, 256, 256] of the pixels with level i in one exposure and j in the next, and the logarithm of the
-        ratio of both exposure times [E - 1].
+    Returns the counts [E - 1, 256, 256] of the pixels with level i in one exposure and j in the next, without clipped
+    levels, and the logarithms [E - 1] of the ratios of successive exposure times.
     """
-    both = 256 * levels[:-1] + levels[1:]
-    counts = torch.stack([torch.bincount(row, minlength=65536).view(256, 256) for row in both])
-    # A clipped level does not determine the light.
-    counts[:, :_CLIPPED], counts[:, 256 - _CLIPPED :] = 0, 0
-    counts[:, :, :_CLIPPED], counts[:, :, 256 - _CLIPPED :] = 0, 0
-    if not bool(counts.sum((1, 2)).gt(0).all()):
+    pairs = 256 * levels[:-1] + levels[1:]
+    counts = torch.stack([torch.bincount(row, minlength=65536).view(256, 256) for row in pairs])
+    inside = slice(_CLIPPED, 256 - _CLIPPED)
+    kept = torch.zeros_like(counts)
+    kept[:, inside, inside] = counts[:, inside, inside]
+    if not bool(kept.sum((1, 2)).gt(0).all()):
         raise ValueError("two successive exposures share no pixel that is clipped in neither; take smaller steps")
-    return counts.to(torch.float64), times.log().diff()
+    return kept.to(torch.float64), times.log().diff()

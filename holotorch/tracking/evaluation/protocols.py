@@ -1,6 +1,8 @@
 """Performance of a tracker: stability, accuracy over grids, false poses, and coverage of its covariances.
 
-Tips are float64 [n, 3] in metres, one row per frame in the order of time. A row of NaN is a refused frame.
+Tips are floating tensors [n, 3] in metres, one row per frame in the order of time. A row of NaN is a refused frame.
+Sections and equations are those of the thesis. All functions raise TypeError or ValueError for arguments of another
+type or shape than described, and if too few frames have a pose.
 """
 
 import math
@@ -17,16 +19,14 @@ from holotorch.core import checks
 from holotorch.core.quantities import TOOL_DEVIATION
 from holotorch.tracking.pose.alignment import rigid_map
 
-_UNKNOWN = (math.nan, math.nan, math.nan)
-
 
 class Stability(NamedTuple):
     """Stability of the tip of a catheter at rest.
 
     Attributes:
-        s_rms: Eq. 3.13 in metres: root mean square change from one frame to the next; insensitive to drift.
-        sd: Root mean square distance from the mean tip in metres, over all three axes, with n - 1 degrees of freedom.
-            White noise gives s_rms = sqrt(2) sd; drift gives a larger sd, flicker a larger s_rms.
+        s_rms: Root mean square change in metres from one frame to the next, Eq. 3.13; insensitive to drift. For white
+            noise it is sqrt(2) ``sd``; drift increases ``sd``, and flicker increases ``s_rms``.
+        sd: Root mean square distance from the mean tip in metres, with n - 1 degrees of freedom.
         differences: Number of pairs of consecutive frames that both have a pose.
         answered: Number of frames with a pose.
     """
@@ -43,7 +43,7 @@ class GridAccuracy(NamedTuple):
     Attributes:
         acc: Acc_f of Sec. 3.5.3: mean absolute difference between measured and designed distances to the reference
             point. It is insensitive to a constant bias and to errors perpendicular to the direction of the reference.
-        absolute: Median, 95th percentile and maximum of the distance from the true tip; NaN without ground truth.
+        absolute: Median, 95th percentile and maximum of the distances from the true tips; NaN without true tips.
         rigid: The same statistics after the best rigid alignment of the measured points with the grid.
         answered, refused: Numbers of points with and without a pose.
     """
@@ -61,7 +61,7 @@ class PlanarAccuracy(NamedTuple):
     Attributes:
         in_plane: Mean distance in the plane of the grid, as in Fig. 3.10.
         in_space: Mean distance including the error along the normal of the plane.
-        answered, refused: Numbers of points with and without a pose, not counting the reference.
+        answered, refused: Numbers of points with and without a pose, except for the reference.
     """
 
     in_plane: float
@@ -89,15 +89,9 @@ class WrongPoses(NamedTuple):
 
 
 def s_rms(tips: Tensor) -> Stability:
-    """Stability of unfiltered tips [n, 3] of a catheter at rest. Differences across refused frames do not count.
-
-    Raises:
-        TypeError, ValueError: ``tips`` is no floating tensor [n, 3], or no two consecutive frames have a pose.
-
-    Source: Eq. 3.13. With no refusals there are n - 1 differences, as printed.
-    """
+    """Stability of unfiltered tips [n, 3] of a catheter at rest, by Eq. 3.13 without differences to refused frames."""
     tips = _rows("tips", tips)
-    known = _answered(tips)
+    known = _has_pose(tips)
     changes = tips.diff(dim=0)[known[1:] & known[:-1]]
     if not len(changes):
         raise ValueError(f"no two neighbouring frames of {len(tips)} were answered; stability needs at least two")
@@ -107,19 +101,16 @@ def s_rms(tips: Tensor) -> Stability:
 
 
 def grid_accuracy(found: Tensor, grid: Tensor, reference: int, truth: Tensor | None = None) -> GridAccuracy:
-    """Accuracy of tips ``found`` [n, 3] at the points of a ``grid`` [n, 3], one face of Sec. 3.5.3.
+    """Accuracy of tips at the points of a grid, such as one face of Sec. 3.5.3.
+
+    Departure from Sec. 3.5.3, which divides ``acc`` by the number of all 64 points: the reference, whose error is zero
+    by construction, is not counted.
 
     Args:
-        found: Measured tips in metres, in the camera's frame; NaN where refused.
-        grid: Designed points in metres, in any frame.
-        reference: Index of the reference point.
-        truth: True tips [n, 3] in the camera's frame, where they are known, as for synthetic frames.
-
-    Raises:
-        TypeError, ValueError: Shapes that differ, a reference that is no point or was refused, or a grid with NaN.
-
-    Source: Sec. 3.5.3. The printed mean divides by all 64 points, although the error of the reference is zero by
-    construction. This function divides by the number of the other points with a pose, 63 for a full face.
+        found: [n, 3] measured tips in metres, in the camera's frame; NaN where refused.
+        grid: [n, 3] designed points in metres, in any frame.
+        reference: Index of the reference point, which must have a pose.
+        truth: [n, 3] true tips in the camera's frame, if they are known.
     """
     found, grid = _rows("found", found), _rows("grid", grid, like=found)
     checks.all_finite("grid", grid)
@@ -127,44 +118,38 @@ def grid_accuracy(found: Tensor, grid: Tensor, reference: int, truth: Tensor | N
     designed = (grid - grid[reference]).norm(dim=-1)
     measured = (found - found[reference]).norm(dim=-1)
     acc = (designed - measured).abs()[others]
-    absolute = rigid = _UNKNOWN
+    absolute = rigid = (math.nan, math.nan, math.nan)
     if truth is not None:
         truth = _rows("truth", truth, like=found)
         checks.all_finite("truth", truth)
-        absolute = _summed((found - truth)[known].norm(dim=-1))
-    if int(known.sum()) >= 3:  # fewer points always fit
+        absolute = _statistics((found - truth)[known].norm(dim=-1))
+    if int(known.sum()) >= 3:  # fewer points do not determine the alignment
         fitted = rigid_map(found[known], grid[known])
-        rigid = _summed((found[known] @ fitted[:3, :3].mT + fitted[:3, 3] - grid[known]).norm(dim=-1))
+        rigid = _statistics((found[known] @ fitted[:3, :3].mT + fitted[:3, 3] - grid[known]).norm(dim=-1))
     count = int(known.sum())
     return GridAccuracy(float(acc.mean()), absolute, rigid, count, len(found) - count)
 
 
 def planar_accuracy(found: Tensor, grid: Tensor, right: Tensor, up: Tensor, reference: int) -> PlanarAccuracy:
-    """Distances of tips ``found`` [n, 3] from the intersections ``grid`` [n, 2] of a printed grid, Sec. 3.5.2.
+    """Distances of tips from the intersections of a printed grid, Sec. 3.5.2.
 
     Args:
-        found: Measured tips in metres, in the camera's frame; NaN where refused.
-        grid: Intersections in metres along ``right`` and ``up``.
-        right: Direction [3] of the grid's first axis in the camera's frame, as a marker under the sheet gives it.
-        up: Direction [3] of its second axis, perpendicular to the first to within one degree.
-        reference: Index of the intersection that all positions are relative to.
-
-    Raises:
-        TypeError, ValueError: As :func:`grid_accuracy`, or directions that are not perpendicular.
+        found: [n, 3] measured tips in metres, in the camera's frame; NaN where refused.
+        grid: [n, 2] coordinates of the intersections in metres along ``right`` and ``up``.
+        right: [3] direction of the grid's first axis in the camera's frame.
+        up: [3] direction of its second axis, perpendicular to the first to within one degree.
+        reference: Index of the intersection to which all positions are relative.
     """
-    found, grid = _rows("found", found), _rows("grid", grid, axes=2)
-    if len(found) != len(grid):
-        raise ValueError(f"found and grid must have a row for each point, got {len(found)} and {len(grid)}")
+    found, grid = _rows("found", found), _rows("grid", grid, like=found, axes=2)
     checks.all_finite("grid", grid)
     axes = torch.stack([_direction("right", right), _direction("up", up)]).to(found.device)
     if abs(float(axes[0] @ axes[1])) > math.sin(math.radians(1)):
         raise ValueError(f"right and up must be at right angles, their cosine is {float(axes[0] @ axes[1]):.3g}")
     others, known = _others(found, reference)
-    wanted = grid - grid[reference]
-    moved = found - found[reference]
-    flat = (moved @ axes.T - wanted)[others].norm(dim=-1).mean()
-    space = (moved - wanted @ axes)[others].norm(dim=-1).mean()
-    return PlanarAccuracy(float(flat), float(space), int(others.sum()), len(found) - int(known.sum()))
+    designed, measured = grid - grid[reference], found - found[reference]
+    in_plane = (measured @ axes.T - designed)[others].norm(dim=-1).mean()
+    in_space = (measured - designed @ axes)[others].norm(dim=-1).mean()
+    return PlanarAccuracy(float(in_plane), float(in_space), int(others.sum()), len(found) - int(known.sum()))
 
 
 def chi_square_quantile(level: float) -> float:
@@ -175,26 +160,23 @@ def chi_square_quantile(level: float) -> float:
 
 
 def coverage(tips: Tensor, covariance: Tensor, truth: Tensor, level: float = 0.95) -> tuple[float, int]:
-    """Share of poses whose confidence ellipsoid of ``level`` contains the true tip, and the number of poses.
+    """Share of poses whose confidence ellipsoid contains the true tip, and the number of poses.
 
     Args:
         tips: [n, 3] in metres; NaN where refused.
-        covariance: [n, 3, 3] covariances of the tips in m^2.
-        truth: [n, 3] in metres.
-        level: Confidence level, which correct covariances reach as their share.
-
-    Raises:
-        TypeError, ValueError: Shapes that differ, no answered frame, NaN truth or a covariance that is not positive.
+        covariance: [n, 3, 3] covariances of the tips in m^2, positive definite where there is a pose.
+        truth: [n, 3] true tips in metres.
+        level: Confidence level, which is the expected share for correct covariances.
     """
     tips, truth = _rows("tips", tips), _rows("truth", truth, like=tips)
     if covariance.shape != (len(tips), 3, 3):
         raise ValueError(f"covariance must be of shape [{len(tips)}, 3, 3], got {list(covariance.shape)}")
-    known = _answered(tips)
+    known = _has_pose(tips)
     if not bool(known.any()):
         raise ValueError(f"none of {len(tips)} frames was answered, so that there is nothing to cover")
     checks.all_finite("truth of answered frames", truth[known])
     root, failed = torch.linalg.cholesky_ex(covariance[known].to(torch.float64))
-    bad = (failed > 0) | ~root.isfinite().all(-1).all(-1)
+    bad = (failed > 0) | ~root.isfinite().flatten(1).all(-1)
     if bool(bad.any()):
         raise ValueError(f"{int(bad.sum())} covariances are not positive definite; each answer needs one that is")
     error = (tips - truth)[known, :, None]
@@ -204,23 +186,20 @@ def coverage(tips: Tensor, covariance: Tensor, truth: Tensor, level: float = 0.9
 
 
 def counts(statuses: Iterable[IntEnum]) -> dict[str, int]:
-    """Number of frames of each status that occurs, by name, in the order of the enumeration."""
+    """Number of frames of each status that occurs, by its name, in the order of the enumeration."""
     numbers = Counter(statuses)
     return {status.name: numbers[status] for status in sorted(numbers)}
 
 
 def wrong_poses(tips: Tensor, truth: Tensor, limit: float = 5e-3) -> WrongPoses:
-    """Count false and wrong poses.
+    """Count false and wrong poses, the latter with errors of ``tips`` [n, 3] above ``limit`` in metres.
 
-    Args:
-        tips: [n, 3] in metres; NaN where refused.
-        truth: [n, 3] in metres; NaN where the frame shows no catheter.
-        limit: Largest error in metres of a correct pose.
+    ``truth`` [n, 3] are the true tips, NaN for frames without a catheter.
     """
     tips, truth = _rows("tips", tips), _rows("truth", truth, like=tips)
     checks.quantity(TOOL_DEVIATION, limit, "limit")
-    known, present = _answered(tips), _answered(truth)
-    wrong = (tips - truth).norm(dim=-1) > limit  # NaN compares as not above
+    known, present = _has_pose(tips), _has_pose(truth)
+    wrong = (tips - truth).norm(dim=-1) > limit  # False for NaN
     return WrongPoses(
         false=int((known & ~present).sum()),
         empty=int((~present).sum()),
@@ -231,11 +210,11 @@ def wrong_poses(tips: Tensor, truth: Tensor, limit: float = 5e-3) -> WrongPoses:
 
 
 def _others(found: Tensor, reference: int) -> tuple[Tensor, Tensor]:
-    """Masks [n] of the points with a pose, without and with the reference."""
+    """Masks [n] of the points with a pose: without the reference, and with it."""
     checks.whole("reference", reference, 0)
     if reference >= len(found):
         raise ValueError(f"reference must be one of {len(found)} points, got {reference}")
-    known = _answered(found)
+    known = _has_pose(found)
     if not bool(known[reference]):
         raise ValueError(f"the reference point {reference} was refused; choose another or record it again")
     others = known.clone()
@@ -245,11 +224,12 @@ def _others(found: Tensor, reference: int) -> tuple[Tensor, Tensor]:
     return others, known
 
 
-def _summed(errors: Tensor) -> tuple[float, float, float]:
+def _statistics(errors: Tensor) -> tuple[float, float, float]:
+    """Median, 95th percentile and maximum."""
     return float(errors.quantile(0.5)), float(errors.quantile(0.95)), float(errors.max())
 
 
-def _answered(tips: Tensor) -> Tensor:
+def _has_pose(tips: Tensor) -> Tensor:
     return tips.isfinite().all(-1)
 
 

@@ -1,4 +1,4 @@
-"""Positions of a catheter's band edges from many frames: a joint fit of poses and positions."""
+"""Positions of a catheter's band edges from many frames, by a joint fit of poses and positions."""
 
 import math
 from collections.abc import Sequence
@@ -9,13 +9,11 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.tracking.camera.camera import Camera
-from holotorch.tracking.pose.alignment import widest_angle
-from holotorch.tracking.pose.pose import edge_weights, solve_pose
+from holotorch.tracking.pose.alignment import SAME_DIRECTION, widest_angle
+from holotorch.tracking.pose.pose import edge_weights, solve_pose, tangent_basis, tilted
 
 _FEWEST = 5  # least number of frames
-_SAME_DIRECTION = math.radians(10)  # angle between directions below which they count as parallel
-_WORST = 5e-4  # metres: largest accepted deviation of a position; a ruler is more accurate
-_STEPS = 60  # most Levenberg-Marquardt steps
+_State = tuple[Tensor, Tensor, Tensor]  # tips [F, 3], directions [F, 3], positions of the edges [N]
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +22,8 @@ class BandEdges:
 
     Attributes:
         positions: float64 [N] in metres from the tip.
-        covariance: [N, N] in m^2, zero for known distances; multiplied by chi_square / freedom where that exceeds 1. It
-            includes only random errors of the edges, and none that are the same in all frames, such as a highlight.
+        covariance: [N, N] in m^2, zero for known distances; multiplied by chi_square / freedom if that exceeds 1. It
+            includes no errors that are the same in all frames, such as those by a highlight.
         chi_square: Sum of the squared residuals, each divided by its variance.
         freedom: Degrees of freedom of ``chi_square``.
         pivot: [3] position of a resting tip in the camera's frame; None where the tip moved.
@@ -56,29 +54,25 @@ def fit_band_edges(
 ) -> BandEdges:
     """Fit the positions of the edges together with the pose of every frame.
 
-    Views of a freely moving straight tool determine its positions only up to a shift, a scale and a projective stretch
-    s -> s / (1 + e s), since other poses compensate each of them in the images. Therefore three distances must be known
-    for any number of frames, and of four edges only one position is fitted. If the catheter is tilted about a tip that
-    rests in one place (``resting_tip``, a pivot), shift and stretch are determined too, and one known distance gives
-    the scale.
+    Frames of a freely moving straight tool determine the positions s only up to a shift, a scale and a projective
+    stretch s -> s / (1 + e s), so that three independent distances must be known, whatever the number of frames. If the
+    catheter is tilted about a resting tip, one known distance suffices.
 
     Args:
-        edges_px: [F, N, 2] pixels (x, y) of the edges in F frames, all visible.
+        edges_px: [F, N, 2] pixels (x, y) of the edges in F >= 5 frames, all visible.
         positions_m: [N] nominal distances from the tip in metres, increasing.
         camera: Camera that took the frames.
-        known: Known nominal distances: an index i for that of edge i from the tip, a pair (i, j) for that between two
-            edges.
+        known: Nominal distances that are exact: i for that of edge i from the tip, (i, j) for that of two edges.
         resting_tip: Whether the tip was in the same place in all frames.
         along_px: Standard deviation of an edge along the tool's image, in pixels.
         across_px: Standard deviation of an edge across the tool's image, in pixels.
-        offset: Distance of the edges from the axis toward the camera, in metres; as in ``solve_pose``.
+        offset: Distance of the edges from the axis toward the camera, in metres.
 
     Raises:
-        TypeError, ValueError: Wrong input, too few known distances, fewer than 5 frames, parallel directions, or
-            positions with a deviation above 0.5 mm. The message says what to do.
+        TypeError, ValueError: Wrong shapes or types, too few known distances, fewer than 5 frames, parallel directions,
+            or positions with a deviation above 0.5 mm. The message says what to do.
 
-    Source: joint least squares with the poses eliminated by their Schur complement, as in bundle adjustment (Triggs et
-    al. 2000).
+    Source: bundle adjustment (Triggs et al. 2000), with the poses eliminated by the Schur complement.
     """
     pixels, start = _checked(edges_px, positions_m)
     free = _constraints(known, start, resting_tip)
@@ -86,11 +80,15 @@ def fit_band_edges(
     lost = [i for i, tip in enumerate(poses.tip) if not bool(torch.isfinite(tip).all())]
     if lost:
         raise ValueError(f"no pose found in the frames {lost[:10]}: leave them out, or correct the nominal positions")
-    _check_directions(poses.direction)
+    if (spread := widest_angle(poses.direction)) < SAME_DIRECTION:
+        raise ValueError(
+            f"the catheter is parallel to itself within {math.degrees(spread):.1f} degrees in all frames, so that "
+            "every frame has the same faults; tilt it toward the camera and away from it by 20 to 45 degrees"
+        )
     plane = camera.undistort(pixels).detach()
-    seen = torch.ones_like(plane[..., 0], dtype=torch.bool)
+    visible = torch.ones_like(plane[..., 0], dtype=torch.bool)
     deviations = plane.new_tensor([along_px, across_px]).expand_as(plane)
-    weights = edge_weights(pixels, plane, seen, deviations, camera).detach()
+    weights = edge_weights(pixels, plane, visible, deviations, camera).detach()
     problem = _Problem(plane, weights, free, resting_tip, offset)
     tip = poses.tip.mean(0).expand_as(poses.tip) if resting_tip else poses.tip
     state, chi_square, information = problem.solve((tip.detach(), poses.direction.detach(), start))
@@ -100,7 +98,7 @@ def fit_band_edges(
     shared = torch.cholesky_inverse(factor) * size[:, None] * size
     covariance = free @ shared[: free.shape[1], : free.shape[1]] @ free.mT * max(1.0, chi_square / max(freedom, 1))
     deviations = covariance.diagonal().clamp(min=0).sqrt()
-    if bool(failed) or not bool((deviations <= _WORST).all()):
+    if bool(failed) or not bool((deviations <= 5e-4).all()):  # a ruler is more accurate
         worst = "" if bool(failed) else f" (edge {int(deviations.argmax())} to {1e3 * float(deviations.max()):.1f} mm)"
         raise ValueError(
             f"the frames leave the positions open{worst}: take more of them, nearer to the camera, tilted toward it "
@@ -111,88 +109,80 @@ def fit_band_edges(
 
 
 class _Problem:
-    """Least squares over F frames: each has a direction (2 unknowns) and a tip (3, unless it rests) of its own.
+    """Least squares over F frames, each with 2 unknowns for the direction and 3 for a tip that moves (``per_frame``).
 
-    Unknowns that all frames share are the free positions and a resting tip.
+    The other m unknowns, the free positions and a resting tip, are the same in all frames (``shared``).
     """
 
     def __init__(self, plane: Tensor, weights: Tensor, free: Tensor, resting: bool, offset: float):
         self.plane, self.weights, self.free = plane, weights, free
         self.resting, self.offset = resting, offset
-        self.own = 2 if resting else 5
+        self.per_frame = 2 if resting else 5
         self.shared = free.shape[1] + (3 if resting else 0)
-        self.unknowns = len(plane) * self.own + self.shared
+        self.unknowns = len(plane) * self.per_frame + self.shared
 
-    def residuals(self, state: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    def residuals(self, state: _State) -> Tensor:
         """Residuals [F, 2 N] in standard deviations."""
         tip, along, positions = state
         forward = (tip * along).sum(-1, keepdim=True)
         toward = torch.nn.functional.normalize(forward * along - tip, dim=-1)  # from the axis to the camera
-        where = (tip + self.offset * toward)[:, None] + positions[..., None] * along[:, None]
-        missed = where[..., :2] / where[..., 2:] - self.plane
-        return (self.weights @ missed[..., None])[..., 0].flatten(1)
+        points = (tip + self.offset * toward)[:, None] + positions[..., None] * along[:, None]
+        errors = points[..., :2] / points[..., 2:] - self.plane
+        return (self.weights @ errors[..., None])[..., 0].flatten(1)
 
-    def moved(self, state: tuple[Tensor, Tensor, Tensor], own: Tensor, shared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The state after steps ``own`` [F, 2 or 5] and ``shared`` [..., m]."""
+    def step(self, state: _State, per_frame: Tensor, shared: Tensor) -> _State:
+        """The state after steps ``per_frame`` [F, 2 or 5] and ``shared`` [..., m] of the unknowns."""
         tip, along, positions = state
         count = self.free.shape[1]
         positions = positions + shared[..., :count] @ self.free.mT
-        tip = tip + (shared[..., count:] if self.resting else own[:, 2:])
-        helper = torch.nn.functional.one_hot(along.abs().argmin(-1), 3).to(along.dtype)
-        first = torch.nn.functional.normalize(torch.linalg.cross(along, helper), dim=-1)
-        turned = along + own[:, :1] * first + own[:, 1:2] * torch.linalg.cross(along, first)
-        return tip, torch.nn.functional.normalize(turned, dim=-1), positions
+        tip = tip + (shared[..., count:] if self.resting else per_frame[:, 2:])
+        return tip, tilted(along, tangent_basis(along), per_frame[:, :2]), positions
 
-    def slopes(self, state: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        """Jacobians [F, 2 N, own] and [F, 2 N, shared], by forward differentiation in all frames at once."""
+    def jacobians(self, state: _State) -> tuple[Tensor, Tensor]:
+        """Derivatives [F, 2 N, 2 or 5] and [F, 2 N, m] of the residuals by the unknowns."""
         frames = len(self.plane)
-        zeros = self.plane.new_zeros(self.own + self.shared)
 
         def stepped(step: Tensor) -> Tensor:
-            own, shared = step[: self.own].expand(frames, -1), step[self.own :].expand(frames, -1)
-            return self.residuals(self.moved(state, own, shared))
+            per_frame, shared = step[: self.per_frame].expand(frames, -1), step[self.per_frame :].expand(frames, -1)
+            return self.residuals(self.step(state, per_frame, shared))
 
-        both = torch.func.jacfwd(stepped)(zeros)
-        return both[..., : self.own], both[..., self.own :]
+        both = torch.func.jacfwd(stepped)(self.plane.new_zeros(self.per_frame + self.shared))
+        return both[..., : self.per_frame], both[..., self.per_frame :]
 
-    def solve(self, state: tuple[Tensor, Tensor, Tensor]) -> tuple[tuple[Tensor, Tensor, Tensor], float, Tensor]:
+    def solve(self, state: _State) -> tuple[_State, float, Tensor]:
         """Levenberg-Marquardt: the state, its chi-square, and the information [m, m] on the shared unknowns."""
         damping, cost = 1e-6, float(self.residuals(state).square().sum())
-        own, shared = self.slopes(state)
-        for _ in range(_STEPS):
-            missed = self.residuals(state)[..., None]
-            within, across = own.mT @ own, own.mT @ shared
-            within = within + damping * torch.diag_embed(within.diagonal(dim1=-2, dim2=-1))
+        per_frame, shared = self.jacobians(state)
+        for _ in range(60):
+            residuals = self.residuals(state)[..., None]
+            # The blocks of the normal equations, damped, and the Schur complement of the block of each frame.
+            block, mixed = per_frame.mT @ per_frame, per_frame.mT @ shared
+            block = block + damping * torch.diag_embed(block.diagonal(dim1=-2, dim2=-1))
             total = (shared.mT @ shared).sum(0)
             total = total + damping * torch.diag(total.diagonal())
-            solved = torch.linalg.solve(within, torch.cat([across, own.mT @ missed], -1))
-            reduced = total - (across.mT @ solved[..., :-1]).sum(0)
-            goal = (shared.mT @ missed).sum(0) - (across.mT @ solved[..., -1:]).sum(0)
-            common = -torch.linalg.lstsq(reduced, goal, driver="gelsd").solution
-            each = -(solved[..., -1:] + solved[..., :-1] @ common)
-            trial = self.moved(state, each[..., 0], common[:, 0])
-            new = float(self.residuals(trial).square().sum())
-            if not new <= cost or bool((trial[0][:, 2] <= 0).any()):
+            solved = torch.linalg.solve(block, torch.cat([mixed, per_frame.mT @ residuals], -1))
+            complement = total - (mixed.mT @ solved[..., :-1]).sum(0)
+            gradient = (shared.mT @ residuals).sum(0) - (mixed.mT @ solved[..., -1:]).sum(0)
+            shared_step = -torch.linalg.lstsq(complement, gradient, driver="gelsd").solution
+            frame_step = -(solved[..., -1:] + solved[..., :-1] @ shared_step)
+            trial = self.step(state, frame_step[..., 0], shared_step[:, 0])
+            trial_cost = float(self.residuals(trial).square().sum())
+            if not trial_cost <= cost or bool((trial[0][:, 2] <= 0).any()):
                 damping = max(10 * damping, 1e-9)
                 if damping > 1e6:
                     break
                 continue
-            state, damping = trial, damping / 10
-            own, shared = self.slopes(state)
-            settled = cost - new <= 1e-12 * (1 + new)
-            cost = new
-            if settled:
+            converged = cost - trial_cost <= 1e-12 * (1 + trial_cost)
+            state, cost, damping = trial, trial_cost, damping / 10
+            per_frame, shared = self.jacobians(state)
+            if converged:
                 break
-        within, across = own.mT @ own, own.mT @ shared
-        information = (shared.mT @ shared - across.mT @ torch.linalg.solve(within, across)).sum(0)
-        return state, cost, information
+        block, mixed = per_frame.mT @ per_frame, per_frame.mT @ shared
+        return state, cost, (shared.mT @ shared - mixed.mT @ torch.linalg.solve(block, mixed)).sum(0)
 
 
 def _checked(edges_px: Tensor, positions_m: Tensor) -> tuple[Tensor, Tensor]:
-    if not isinstance(edges_px, Tensor) or not edges_px.is_floating_point():
-        raise TypeError(
-            f"edges_px must be a floating tensor, got {getattr(edges_px, 'dtype', type(edges_px).__name__)}"
-        )
+    checks.real("edges_px", edges_px)
     if edges_px.ndim != 3 or edges_px.shape[2] != 2 or edges_px.shape[1] < 3:
         raise ValueError(f"edges_px must be of shape [F, N, 2] with N >= 3 edges, got {list(edges_px.shape)}")
     checks.all_finite("edges_px", edges_px)
@@ -208,9 +198,9 @@ def _checked(edges_px: Tensor, positions_m: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _constraints(known: Sequence[int | tuple[int, int]], positions: Tensor, resting: bool) -> Tensor:
-    """Basis [N, m] of the changes of the positions that keep the known distances."""
+    """Basis [N, n] of the changes of the positions that keep the known distances."""
     count = len(positions)
-    rows = positions.new_zeros(len(known), count)
+    rows = positions.new_zeros(len(known), count)  # the distances are rows @ positions
     for row, entry in zip(rows, known, strict=True):
         ends = entry if isinstance(entry, tuple) else (entry,)
         fitting = len(ends) in (1, 2) and len(set(ends)) == len(ends)
@@ -219,11 +209,11 @@ def _constraints(known: Sequence[int | tuple[int, int]], positions: Tensor, rest
         row[ends[-1]] = 1.0
         if len(ends) == 2:
             row[ends[0]] = -1.0
-    # Changes that the images do not determine: c, c s and c s^2; for a resting tip only c s.
+    # Changes of positions s that the images do not determine: 1, s and s^2; for a resting tip only s.
     scaled = (2 * positions - positions[0] - positions[-1]) / (positions[-1] - positions[0])
     moving = torch.stack([torch.ones_like(scaled), scaled, scaled.square()], -1)
-    open_ = positions[:, None] / positions[-1] if resting else moving
-    if len(known) == 0 or int(torch.linalg.matrix_rank(rows @ open_, rtol=0.02)) < open_.shape[1]:
+    undetermined = positions[:, None] / positions[-1] if resting else moving
+    if len(known) == 0 or int(torch.linalg.matrix_rank(rows @ undetermined, rtol=0.02)) < undetermined.shape[1]:
         raise ValueError(
             f"one known distance is needed beside a resting tip, got known={list(known)}"
             if resting
@@ -237,12 +227,3 @@ def _constraints(known: Sequence[int | tuple[int, int]], positions: Tensor, rest
     if rank == count:
         raise ValueError("all positions are given, nothing is left to be found; name fewer in known")
     return vectors[rank:].mT
-
-
-def _check_directions(directions: Tensor) -> None:
-    spread = widest_angle(directions)
-    if spread < _SAME_DIRECTION:
-        raise ValueError(
-            f"the catheter is parallel to itself within {math.degrees(spread):.1f} degrees in all frames, so that "
-            "every frame has the same faults; tilt it toward the camera and away from it by 20 to 45 degrees"
-        )

@@ -1,5 +1,6 @@
 """Catheter: a straight thin tube with bands of colour at known distances from its tip."""
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -15,16 +16,16 @@ class Catheter:
     """Geometry and colours of a catheter.
 
     Attributes:
-        edges: Distances of the band edges from the tip in metres, increasing; at least 4, of any spacing. Neighbouring
-            bands touch: band i extends from edge i to edge i + 1.
-        colours: Colours of the ``len(edges) - 1`` bands, 8-bit sRGB triples; neighbours differ.
+        edges: At least 4 distances of the band edges from the tip in metres, increasing. Band i extends from edge i to
+            edge i + 1.
+        colours: 8-bit sRGB triples, one for each of the ``len(edges) - 1`` bands; those of neighbours differ.
         radius: Outer radius in metres.
         length: Distance from the tip to the rear end in metres.
 
     Raises:
-        TypeError, ValueError: Impossible values.
+        TypeError, ValueError: A value of another type or range.
 
-    Source: Sec. 3.3.1 and Fig. 3.5 of the thesis: three bands of 38 mm that begin 70 mm from the tip.
+    Source: Sec. 3.3.1 and Fig. 3.5 of the thesis. Its catheter, ``THESIS``, has three bands of 38 mm.
     """
 
     edges: tuple[float, ...]
@@ -34,7 +35,8 @@ class Catheter:
 
     def __post_init__(self) -> None:
         edges = tuple(checks.quantity(TOOL_POSITION, edge, "edges") for edge in self.edges)
-        if len(edges) < 4 or edges[0] < 0 or any(b <= a for a, b in zip(edges, edges[1:], strict=False)):
+        lengths = [b - a for a, b in itertools.pairwise(edges)]
+        if len(edges) < 4 or edges[0] < 0 or min(lengths) <= 0:
             raise ValueError(f"edges must be at least 4 rising distances from the tip in metres, got {edges}")
         colours = tuple(tuple(int(value) for value in colour) for colour in self.colours)
         if len(colours) != len(edges) - 1:
@@ -42,13 +44,13 @@ class Catheter:
         for colour in colours:
             if len(colour) != 3 or not all(0 <= value <= 255 for value in colour):
                 raise ValueError(f"colours must be triples of 8-bit levels, got {colour}")
-        for one, other in zip(colours, colours[1:], strict=False):
+        for one, other in itertools.pairwise(colours):
             if math.dist(one, other) < 40:
                 raise ValueError(f"neighbouring bands must differ in colour, got {one} beside {other}")
         checks.quantity(TOOL_RADIUS, self.radius)
         if checks.quantity(TOOL_LENGTH, self.length) < edges[-1]:
             raise ValueError(f"length must reach the last edge at {edges[-1]:g} m, got {self.length:g} m")
-        if self.radius > min(b - a for a, b in zip(edges, edges[1:], strict=False)) / 2:
+        if self.radius > min(lengths) / 2:
             raise ValueError(f"bands must be longer than they are wide, got radius {self.radius:g} m, edges {edges}")
         object.__setattr__(self, "edges", edges)
         object.__setattr__(self, "colours", colours)

@@ -1,4 +1,4 @@
-"""A pose drawn on its frame: axis, band edges, and the tip, visible or hidden, with its uncertainty."""
+"""Drawing of a pose on its frame: axis, band edges, and the visible or hidden tip with its uncertainty."""
 
 import math
 import textwrap
@@ -13,28 +13,15 @@ from holotorch.tracking.pose.catheter import Catheter
 from holotorch.tracking.pose.status import Pose, Status
 
 ELLIPSE = -2 * math.log(0.05)  # 95 % quantile of chi-square with 2 degrees of freedom
-_FINE = 4  # fractional bits of OpenCV's drawing coordinates
-_TINY = 1e-6  # of the depth: step of the derivatives of the projection
 _GREEN, _ORANGE, _RED, _WHITE = (60, 230, 90), (255, 170, 30), (255, 70, 60), (255, 255, 255)
 
 
 def overlay(pixels: Tensor, pose: Pose, camera: Camera, catheter: Catheter) -> Tensor:
-    """A copy of the frame with the pose drawn on it, or with the reason why there is none.
+    """A copy of the RGB frame ``pixels``, uint8 [3, H, W], with the pose drawn on it, or with the reason of a refusal.
 
     The line is the axis from the tip to the rear end. Ticks across it are the band edges, the cross is the tip, and the
-    ellipse around the cross is the image of its 95 % confidence region.
-
-    Args:
-        pixels: uint8 [3, H, W], RGB.
-        pose: Pose of one catheter.
-        camera: Camera that took the frame.
-        catheter: Catheter with this pose.
-
-    Returns:
-        uint8 [3, H, W] on the device of ``pixels``.
-
-    Raises:
-        TypeError, ValueError: The frame has another type or shape, or ``pose`` is a batch.
+    ellipse around the cross is the image of its 95 % confidence region. Raises TypeError or ValueError for a frame of
+    another type or shape, and for a batch of poses.
     """
     if pixels.dtype != torch.uint8:
         raise TypeError(f"pixels must be uint8, got {pixels.dtype}")
@@ -46,72 +33,63 @@ def overlay(pixels: Tensor, pose: Pose, camera: Camera, catheter: Catheter) -> T
     unit = max(1, round(min(canvas.shape[:2]) / 500))
     colour = {Status.OK: _GREEN, Status.UNVERIFIED: _ORANGE}.get(pose.status, _RED)
     if pose.answered:
-        _catheter(canvas, pose, camera, catheter, colour, unit)
-    _text(canvas, _words(pose), colour, unit)
+        _draw_catheter(canvas, pose, camera, catheter, colour, unit)
+        x, y, z = (1e3 * pose.tip.detach()).tolist()
+        headline = f"{pose.status.name}: tip {x:.1f} {y:.1f} {z:.1f} mm, sd {1e3 * float(pose.tip_sd.detach()):.2f} mm"
+    else:
+        headline = f"{pose.status.name}: no pose ({pose.status.stage})"
+    _draw_text(canvas, [headline, pose.reason], colour, unit)
     return torch.from_numpy(np.stack(cv2.split(canvas))).to(pixels.device)
 
 
 def ellipse_px(pose: Pose, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Image of the tip [2] in pixels and of its covariance [2, 2] in pixels squared; NaN outside the camera."""
+    """Image of the tip [2] in pixels, and its covariance [2, 2] in pixels squared; NaN where there is no image."""
     tip = pose.tip.detach().cpu()
-    steps = _TINY * tip[2].abs() * torch.eye(3, dtype=torch.float64)
-    ahead, behind = camera.project(tip + steps), camera.project(tip - steps)
-    slopes = (ahead - behind).T / (2 * _TINY * tip[2].abs())
-    return camera.project(tip), slopes @ pose.covariance[:3, :3].detach().cpu() @ slopes.T
+    step = 1e-6 * tip[2].abs()  # metres: central differences
+    steps = step * torch.eye(3, dtype=torch.float64)
+    jacobian = (camera.project(tip + steps) - camera.project(tip - steps)).T / (2 * step)
+    return camera.project(tip), jacobian @ pose.covariance[:3, :3].detach().cpu() @ jacobian.T
 
 
-def _catheter(
+def _draw_catheter(
     canvas: np.ndarray, pose: Pose, camera: Camera, catheter: Catheter, colour: tuple[int, int, int], unit: int
 ) -> None:
     tip, direction = pose.tip.detach().cpu(), pose.direction.detach().cpu()
     along = torch.linspace(0, catheter.length, 65, dtype=torch.float64)
-    # A thin line, so that the bands remain visible.
-    _line(canvas, camera.project(tip + along[:, None] * direction), colour, max(1, unit // 2))
+    # The axis is a thin line, so that the bands remain visible.
+    _draw_line(canvas, camera.project(tip + along[:, None] * direction), colour, max(1, unit // 2))
     edges = tip + catheter.positions[:, None] * direction
     across = torch.linalg.cross(direction.expand_as(edges), edges)  # perpendicular to the axis and to the ray
     across = across / across.norm(dim=-1, keepdim=True).clamp(min=1e-12)
     for edge, side in zip(edges, 4 * catheter.radius * across, strict=True):
-        _line(canvas, camera.project(torch.stack([edge - side, edge + side])), _WHITE, unit)
-    spot, covariance = ellipse_px(pose, camera)
-    arm = 6.0 * unit
-    for step in (torch.tensor([arm, 0.0]), torch.tensor([0.0, arm])):
-        _line(canvas, torch.stack([spot - step, spot + step]), colour, unit)
+        _draw_line(canvas, camera.project(torch.stack([edge - side, edge + side])), _WHITE, unit)
+    centre, covariance = ellipse_px(pose, camera)
+    for step in 6.0 * unit * torch.eye(2):
+        _draw_line(canvas, torch.stack([centre - step, centre + step]), colour, unit)
     if bool(covariance.isfinite().all()):
         values, axes = torch.linalg.eigh(covariance)
-        turn = torch.linspace(0, 2 * torch.pi, 73, dtype=torch.float64)
-        circle = torch.stack([turn.cos(), turn.sin()], -1)
-        outline = circle * (ELLIPSE * values.clamp(min=0)).sqrt()
-        _line(canvas, spot + outline @ axes.T, colour, unit)
+        angle = torch.linspace(0, 2 * torch.pi, 73, dtype=torch.float64)
+        ellipse = torch.stack([angle.cos(), angle.sin()], -1) * (ELLIPSE * values.clamp(min=0)).sqrt()
+        _draw_line(canvas, centre + ellipse @ axes.T, colour, unit)
 
 
-def _line(canvas: np.ndarray, points: Tensor, colour: tuple[int, int, int], unit: int) -> None:
-    """Draw [n, 2] pixels as a line that is open where a point is NaN or far outside."""
+def _draw_line(canvas: np.ndarray, points: Tensor, colour: tuple[int, int, int], unit: int) -> None:
+    """Draw a line through pixels [n, 2], with gaps where they are NaN or far outside the frame."""
     near = points.isfinite().all(-1) & (points.abs().amax(-1) < 20 * max(canvas.shape[:2]))
-    spots = (points.nan_to_num(0.0) * (1 << _FINE)).round()
-    for first in range(len(points) - 1):
-        if bool(near[first] & near[first + 1]):
-            start, end = ([int(value) for value in spots[index].tolist()] for index in (first, first + 1))
-            cv2.line(canvas, start, end, colour, unit, cv2.LINE_AA, _FINE)
+    sixteenths = (points.nan_to_num(0.0) * 16).round()
+    segments = torch.stack([sixteenths[:-1], sixteenths[1:]], 1)[near[:-1] & near[1:]]
+    cv2.polylines(canvas, list(segments.numpy().astype(np.int32)), False, colour, unit, cv2.LINE_AA, 4)
 
 
-def _words(pose: Pose) -> list[str]:
-    assert isinstance(pose.status, Status)
-    if not pose.answered:
-        return [f"{pose.status.name}: no pose ({pose.status.stage})", pose.reason]
-    x, y, z = (1e3 * pose.tip.detach()).tolist()
-    sd = 1e3 * float(pose.tip_sd.detach())
-    return [f"{pose.status.name}: tip {x:.1f} {y:.1f} {z:.1f} mm, sd {sd:.2f} mm", pose.reason]
-
-
-def _text(canvas: np.ndarray, lines: list[str], colour: tuple[int, int, int], unit: int) -> None:
+def _draw_text(canvas: np.ndarray, lines: list[str], colour: tuple[int, int, int], unit: int) -> None:
+    """Write lines of text at the top left, wrapped at the width of the frame."""
     face, size, row = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * unit, 20 * unit
     for line in lines:
         text = line.encode("ascii", "replace").decode()  # the font has only ASCII characters
-        wide = cv2.getTextSize(text, face, size, unit)[0][0]
-        room = max(8, int(len(text) * (canvas.shape[1] - 20 * unit) / max(wide, 1)))
-        for part in textwrap.wrap(text, room):
-            for shift in (-unit, unit):  # a dark outline makes it legible on any background
-                for place in ((10 * unit + shift, row), (10 * unit, row + shift)):
-                    cv2.putText(canvas, part, place, face, size, (0, 0, 0), unit, cv2.LINE_AA)
+        width = cv2.getTextSize(text, face, size, unit)[0][0]
+        characters = max(8, int(len(text) * (canvas.shape[1] - 20 * unit) / max(width, 1)))
+        for part in textwrap.wrap(text, characters):
+            for x, y in ((-unit, 0), (0, -unit), (unit, 0), (0, unit)):  # a dark outline for bright backgrounds
+                cv2.putText(canvas, part, (10 * unit + x, row + y), face, size, (0, 0, 0), unit, cv2.LINE_AA)
             cv2.putText(canvas, part, (10 * unit, row), face, size, colour, unit, cv2.LINE_AA)
             row += 20 * unit

@@ -1,4 +1,4 @@
-"""Pose of a straight tool from the positions of known points along a known line of the image: three unknowns."""
+"""Pose of a straight tool whose image lies on a known line, from the images of known points along the line."""
 
 import math
 from collections.abc import Sequence
@@ -9,14 +9,12 @@ import numpy as np
 from holotorch.tracking.camera.strips import Line
 from holotorch.tracking.pose.status import Pose
 
-_STEPS = 2  # Gauss-Newton steps after the linear start, whose relative error is 1e-3 or less; each step squares it
-
-_Three = tuple[float, float, float]
+Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class LinePose:
-    """A pose as in :class:`holotorch.tracking.pose.status.Pose`, as NumPy arrays.
+    """A pose as in :class:`holotorch.tracking.pose.status.Pose`, in NumPy arrays.
 
     Attributes:
         tip: [3] in metres.
@@ -32,7 +30,7 @@ class LinePose:
 
     @property
     def tip_sd(self) -> float:
-        """Standard deviation of the tip in metres, over all three axes."""
+        """Standard deviation of the tip in metres: the root of the sum of the variances of all three axes."""
         return float(np.sqrt(self.covariance.diagonal()[:3].sum()))
 
 
@@ -47,95 +45,84 @@ def pose_on_line(
     *,
     rough: bool = False,
 ) -> LinePose | None:
-    """Pose of a tool whose image is ``line``: :func:`solve_pose` for a known line.
+    """Pose of a tool from the coordinates along ``line`` of its points; the fast counterpart of :func:`solve_pose`.
 
-    The tool and the centre of the camera span a plane, whose image is the line. A point at s from the middle of the
-    tool has the image t = (h0 + h1 s) / (1 + h2 s). Weighted least squares determine h: a linear solution, then
-    Gauss-Newton steps. The known distances on the tool give the scale. The errors of the line tilt the plane, and are
-    independent of those of h.
+    A point of the tool at a distance s from the mean of ``positions`` has the coordinate t = (h0 + h1 s) / (1 + h2 s)
+    along the line. Weighted least squares determine h, by a linear solution and two Gauss-Newton steps; the distances
+    give the scale. Errors of the line are independent of those of h.
 
     Args:
-        line: Line on the plane z = 1.
-        t: [N] positions along the line, in units of a pixel at the principal point; N >= 3.
+        line: Image of the axis of the tool on the plane z = 1.
+        t: [N] coordinates along the line, in pixels at the principal point; N >= 3.
         positions: [N] distances from the tip in metres.
         deviation: [N] standard deviations of t.
         offset_sd: Standard deviation of the line's offset at the mean of t, in the unit of t.
-        slope_sd: Standard deviation of the line's slope in radians; independent of the offset.
-        shared_sd: Standard deviation of an error of t that all points share, in addition to ``deviation``.
+        slope_sd: Standard deviation of the line's slope in radians, whose error is independent of that of the offset.
+        shared_sd: Standard deviation of an additional error of t that is the same for all points.
         rough: Whether to omit the covariance, which takes half of the time; it is then zero.
 
     Returns:
         The pose, or None where no pose in front of the camera fits the points.
     """
-    # Python floats: for so few points, calls of NumPy would take several times as long.
+    # Python floats, since NumPy would take several times as long for so few points. They are centred and scaled.
     middle, mean = sum(t) / len(t), sum(positions) / len(t)
     offsets, levers = [value - middle for value in t], [value - mean for value in positions]
-    wide, length = max(map(abs, offsets)), max(map(abs, levers))
-    if not wide > 0:
+    extent, length = max(map(abs, offsets)), max(map(abs, levers))
+    if not extent > 0:
         return None
     each = zip(offsets, levers, deviation, strict=True)
-    points = [(x / wide, s / length, wide / sd if sd else math.inf) for x, s, sd in each]
+    points = [(x / extent, s / length, extent / sd if sd else math.inf) for x, s, sd in each]
     h = (0.0, 0.0, 0.0)
-    for _ in range(1 + _STEPS):
-        normal, slope, _, _ = _terms(points, h)
-        step = _solved(normal, slope)
+    for _ in range(3):  # the linear solution has a relative error of at most 1e-3, which each further step squares
+        normal, gradient, _, _ = _normal_equations(points, h)
+        step = _solve(normal, gradient)
         h = (h[0] + step[0], h[1] + step[1], h[2] + step[2])
-    normal, _, chi_square, least = _terms(points, h)
-    if not (least > 0 and math.isfinite(chi_square)):
+    normal, _, chi_square, least_depth = _normal_equations(points, h)
+    if not (least_depth > 0 and math.isfinite(chi_square)):
         return None
-    # Points in space are p e1 + q e2 up to one common scale, for both tip and direction. Errors of the line move them
-    # along e3.
+    # Tip and direction are combinations of the first two axes, up to a common scale. An error of the line moves them
+    # along the third axis.
     (h0, h1, h2), step = h, line.along / line.scale
     origin = line.origin + middle * step
     unit, start = 1 / length, -mean / length
     axes = np.array(
-        [[wide * step.real, wide * step.imag, 0.0], [origin.real, origin.imag, 1.0], [-step.imag, step.real, 0.0]]
+        [[extent * step.real, extent * step.imag, 0.0], [origin.real, origin.imag, 1.0], [-step.imag, step.real, 0.0]]
     )
     (p, q), (along, deep) = (h0 + h1 * start, 1 + h2 * start), (h1 * unit, h2 * unit)
+    pose = np.array([[p, q, 0.0], [along, deep, 0.0]]) @ axes
+    size = math.sqrt(float(pose[1] @ pose[1]))
+    if not size > 0:
+        return None
+    pose = pose / size
     if rough:
-        tip, direction = np.array([[p, q, 0.0], [along, deep, 0.0]]) @ axes
-        size = math.sqrt(float(direction @ direction))
-        return LinePose(tip / size, direction / size, np.zeros((6, 6)), chi_square) if size > 0 else None
-    # Tip and direction, and their derivatives by h (3), and by the offset and the slope of the line.
-    tip = [[p, q, 0.0], [1.0, 0.0, 0.0], [start, 0.0, 0.0], [0.0, start, 0.0], [0.0, 0.0, q], [0.0, 0.0, p * wide]]
-    rear = [[along, deep], [0.0, 0.0], [unit, 0.0], [0.0, unit]]
-    direction = [*([x, y, 0.0] for x, y in rear), [0.0, 0.0, deep], [0.0, 0.0, along * wide]]
-    raw = np.array([tip, direction]) @ axes  # [2, 6, 3]
-    raw /= np.sqrt(raw[1, 0] @ raw[1, 0])
-    pose, moved = raw[:, 0], raw[:, 1:]
-    moved = moved - (moved[1] @ pose[1])[:, None] * pose[:, None]
-    covariance = _covariance(moved, normal, shared_sd / wide * np.array([1.0, h2, 0.0, 0.0, 0.0]), offset_sd, slope_sd)
+        return LinePose(pose[0], pose[1], np.zeros((6, 6)), chi_square)
+    # Derivatives of tip and direction [2, 5, 3] with respect to h0, h1, h2, and the offset and slope of the line.
+    tip = [[1.0, 0.0, 0.0], [start, 0.0, 0.0], [0.0, start, 0.0], [0.0, 0.0, q], [0.0, 0.0, p * extent]]
+    direction = [[0.0, 0.0, 0.0], [unit, 0.0, 0.0], [0.0, unit, 0.0], [0.0, 0.0, deep], [0.0, 0.0, along * extent]]
+    slopes = np.array([tip, direction]) @ axes / size
+    slopes -= (slopes[1] @ pose[1])[:, None] * pose[:, None]  # the direction keeps unit length
+    inner = np.diag([0.0, 0.0, 0.0, offset_sd**2, slope_sd**2])  # covariance of h, offset and slope
+    inner[:3, :3] = [_solve(normal, row) for row in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]
+    shared = shared_sd / extent * np.array([1.0, h2, 0.0, 0.0, 0.0])
+    jacobian = slopes.swapaxes(1, 2).reshape(6, 5)
+    covariance = jacobian @ (inner + shared * shared[:, None]) @ jacobian.T
     return LinePose(pose[0], pose[1], covariance, chi_square) if np.isfinite(covariance).all() else None
 
 
-def _covariance(
-    moved: np.ndarray, normal: list[float], shared: np.ndarray, offset_sd: float, slope_sd: float
-) -> np.ndarray:
-    """[6, 6] of tip and direction, from their derivatives ``moved`` [2, 5, 3] by h and by the line's offset and slope.
+def _normal_equations(points: list[Vector], h: Vector) -> tuple[list[float], Vector, float, float]:
+    """Upper triangle of the normal matrix, gradient, chi-square and least depth 1 + h2 s at h; linear for h = 0.
 
-    ``normal`` is the inverse covariance of h, ``shared`` [5] the standard deviation of the error common to all points.
+    ``points`` are (t, s, 1 / standard deviation of t).
     """
-    own = np.zeros((5, 5))
-    for column, right in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))):
-        own[:3, column] = _solved(normal, right)
-    own += np.diag([0.0, 0.0, 0.0, offset_sd**2, slope_sd**2]) + shared * shared[:, None]
-    lever = moved.swapaxes(1, 2).reshape(6, 5)
-    return lever @ own @ lever.T
-
-
-def _terms(points: list[tuple[float, float, float]], h: _Three) -> tuple[list[float], _Three, float, float]:
-    """Normal matrix (six entries), gradient, chi-square and least depth at h; the linear problem where h is zero."""
     h0, h1, h2 = h
-    started = h1 != 0
     a00 = a01 = a02 = a11 = a12 = a22 = b0 = b1 = b2 = chi = 0.0
     least = math.inf
-    for x, s, weight in points:
+    for t, s, weight in points:  # written out, since sums over generators would take several times as long
         depth = 1 + h2 * s
         least = min(least, depth)
-        seen = (h0 + h1 * s) / depth if depth else math.inf
-        scaled = weight / depth if depth else math.inf
-        rest = (x - seen) * weight
-        one, two = scaled * s, -scaled * s * (seen if started else x)
+        image, scaled = ((h0 + h1 * s) / depth, weight / depth) if depth else (math.inf, math.inf)
+        rest = (t - image) * weight
+        one, two = scaled * s, -scaled * s * (image if h1 else t)
         a00 += scaled * scaled
         a01 += scaled * one
         a02 += scaled * two
@@ -149,20 +136,20 @@ def _terms(points: list[tuple[float, float, float]], h: _Three) -> tuple[list[fl
     return [a00, a01, a02, a11, a12, a22], (b0, b1, b2), chi, least
 
 
-def _solved(normal: list[float], right: _Three) -> _Three:
-    """Solution of a symmetric 3 x 3 system by Cramer's rule; NaN where the matrix is not positive definite."""
+def _solve(normal: list[float], right: Vector) -> Vector:
+    """Solution of a symmetric 3 x 3 system by Cramer's rule; NaN for a determinant that is not positive."""
     a, b, c, d, e, f = normal
     df, ce, be = d * f - e * e, c * e - b * f, b * e - c * d
-    whole = a * df + b * ce + c * be
-    if not whole > 0:
+    det = a * df + b * ce + c * be
+    if not det > 0:
         return (math.nan, math.nan, math.nan)
     af, bc, ad = a * f - c * c, b * c - a * e, a * d - b * b
     x, y, z = right
-    return (df * x + ce * y + be * z) / whole, (ce * x + af * y + bc * z) / whole, (be * x + bc * y + ad * z) / whole
+    return (df * x + ce * y + be * z) / det, (ce * x + af * y + bc * z) / det, (be * x + bc * y + ad * z) / det
 
 
 def on_host(pose: Pose) -> LinePose | None:
-    """Tip and direction of a pose on any device as NumPy arrays; None where they are not finite."""
-    place, onward = (value.numpy(force=True).astype(np.float64) for value in (pose.tip, pose.direction))
-    known = all(map(math.isfinite, (*place.tolist(), *onward.tolist())))
-    return LinePose(place, onward, np.zeros((6, 6)), 0.0) if known else None
+    """Tip and direction of a pose on any device, with zero covariance; None where they are not finite."""
+    tip, direction = (value.numpy(force=True).astype(np.float64) for value in (pose.tip, pose.direction))
+    finite = all(map(math.isfinite, (*tip.tolist(), *direction.tolist())))
+    return LinePose(tip, direction, np.zeros((6, 6)), 0.0) if finite else None

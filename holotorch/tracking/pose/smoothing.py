@@ -12,32 +12,31 @@ from holotorch.tracking.pose.status import Pose, Status
 
 
 class OneEuro:
-    """A low-pass whose cutoff rises with speed: steady at rest, quick in motion. One object follows one catheter.
+    """Low-pass filter whose cutoff rises with speed: little jitter at rest, little lag in motion; for one catheter.
 
     With alpha = dt / (dt + tau) and tau = 1 / (2 pi cutoff), the smoothed tip x' becomes x' + alpha (x - x'), and the
-    direction moves by the fraction alpha along the great circle to the new one. Both use the same cutoff, and so have
-    the same lag: ``min_cutoff + beta * speed``, where the speed is the larger one of those of the tip and of the point
-    ``arm`` behind it. Departure from the paper: the speed is that of the measured poses. The difference between the new
-    pose and the last smoothed one would include the lag.
+    direction moves by the fraction alpha along the great circle to the new one. The cutoff of both is ``min_cutoff +
+    beta * speed``, where the speed is the larger one of those of the tip and of the point ``arm`` behind the tip.
 
-    For a steady motion, the smoothed pose is :attr:`lag` seconds late. The lag follows lag' = (1 - alpha) (lag + dt),
-    which is exact for any time steps and converges to tau: 80 ms at 2 Hz and 8 ms at 20 Hz. With the defaults and 60
-    frames per second, white jitter at rest falls to a third, and the lag at 50 mm/s is 13 ms.
+    For a steady motion, the smoothed pose is :attr:`lag` seconds late, where lag' = (1 - alpha) (lag + dt) converges to
+    tau. With the defaults and 60 frames per second, white jitter at rest falls to a third, and the lag is 80 ms at rest
+    and 13 ms at 50 mm/s.
 
-    The filter starts anew after a refusal, a gap above ``longest_gap``, or a rotation of 90 degrees or more from the
-    smoothed pose to the next, such as an exchange of tip and rear. The first pose passes unchanged.
+    The filter restarts after a refusal, a gap above ``longest_gap``, or a rotation of 90 degrees or more from the
+    smoothed pose to the next, such as an exchange of tip and rear. It returns the first pose unchanged.
 
     Args:
         min_cutoff: Cutoff at rest, in Hz.
-        beta: Increase of the cutoff with speed, in Hz per m/s; 0 gives a low-pass filter with a fixed cutoff.
-        derivative_cutoff: Cutoff of the speed, in Hz.
+        beta: Increase of the cutoff with speed, in Hz per m/s; 0 for a fixed cutoff.
+        derivative_cutoff: Cutoff of the filter for the speed, in Hz.
         longest_gap: Longest time between poses that the filter bridges, in seconds.
-        arm: Distance from the tip, in metres, of the second point whose speed counts; about that of the bands.
+        arm: Distance from the tip to the second point, in metres; about that of the bands.
 
     Raises:
-        TypeError, ValueError: A parameter that is not a finite number, not above 0, or a negative beta.
+        TypeError, ValueError: A parameter that is not a finite number or not above 0; beta may be 0.
 
-    Source: Casiez, Roussel and Vogel, "1 Euro Filter", CHI 2012, Algorithm 1.
+    Source: Casiez, Roussel and Vogel, "1 Euro Filter", CHI 2012, Algorithm 1. Departure from it: the speed is that of
+    the measured poses, since the difference between a measured and a smoothed pose would include the lag.
     """
 
     def __init__(
@@ -50,9 +49,7 @@ class OneEuro:
         arm: float = 0.127,
     ):
         self.min_cutoff = checks.positive("min_cutoff", min_cutoff, "Hz")
-        self.beta = checks.finite("beta", beta, "Hz per m/s")
-        if self.beta < 0:
-            raise ValueError(f"beta must not be negative, got {beta!r}")
+        self.beta = checks.nonnegative("beta", beta, "Hz per m/s")
         self.derivative_cutoff = checks.positive("derivative_cutoff", derivative_cutoff, "Hz")
         self.longest_gap = checks.positive("longest_gap", longest_gap, "seconds")
         self.arm = checks.quantity(TOOL_LENGTH, arm, "arm")
@@ -64,17 +61,16 @@ class OneEuro:
         self._captured = -math.inf
         self._raw: Pose | None = None
         self._smooth: Pose | None = None
-        self._rate: Tensor | None = None  # [2, 3]: of the tip in m/s, of the rotation in rad/s
+        self._rate: Tensor | None = None  # [2, 3]: velocity of the tip in m/s, angular velocity in rad/s
         self._rate_covariance: Tensor | None = None
 
     def __call__(self, pose: Pose, captured: float) -> Pose:
         """Smooth a pose whose frame was captured at ``captured`` seconds; a refusal is returned unchanged.
 
-        The covariance becomes (1 - alpha) C' + alpha C. This is an upper bound for any correlation of the errors:
-        smoothing reduces jitter, but no bias.
+        The covariance becomes (1 - alpha) C' + alpha C, which is an upper bound for any correlation of the errors.
 
         Raises:
-            TypeError: A batch.
+            TypeError: A batch of poses.
             ValueError: NaN in a pose, or a capture time that is not later than the last one.
         """
         captured = checks.finite("captured", captured, "seconds")
@@ -94,42 +90,43 @@ class OneEuro:
             self.reset()
             self._captured, self._raw, self._smooth = captured, pose, pose
             return pose
-        rotation = _rotation(raw.direction, pose.direction)
-        self._learn(torch.stack([pose.tip - raw.tip, rotation]) / dt, (pose.covariance + raw.covariance) / dt**2, dt)
+        rate = torch.stack([pose.tip - raw.tip, _rotation_vector(raw.direction, pose.direction)]) / dt
+        self._update_rate(rate, (pose.covariance + raw.covariance) / dt**2, dt)
         alpha = dt / (dt + 1 / (2 * math.pi * self.cutoff))
-        covariance = (1 - alpha) * before.covariance + alpha * pose.covariance
-        turn = alpha * _rotation(before.direction, pose.direction)
-        tip = before.tip + alpha * (pose.tip - before.tip)
-        smooth = replace(pose, tip=tip, direction=_turned(before.direction, turn), covariance=covariance)
+        smooth = replace(
+            pose,
+            tip=before.tip + alpha * (pose.tip - before.tip),
+            direction=_rotated(before.direction, alpha * _rotation_vector(before.direction, pose.direction)),
+            covariance=(1 - alpha) * before.covariance + alpha * pose.covariance,
+        )
         self.lag = (1 - alpha) * (self.lag + dt)
         self._captured, self._raw, self._smooth = captured, pose, smooth
         return smooth
 
     @property
     def cutoff(self) -> float:
-        """Cutoff in Hz at the current speed; the lag of a steady motion converges to 1 / (2 pi cutoff)."""
+        """Cutoff in Hz at the current speed."""
         if self._rate is None or self._smooth is None:
             return self.min_cutoff
-        tip, turn = self._rate
-        behind = tip + self.arm * torch.linalg.cross(turn, self._smooth.direction)
+        tip, rotation = self._rate
+        behind = tip + self.arm * torch.linalg.cross(rotation, self._smooth.direction)
         return self.min_cutoff + self.beta * max(float(tip.norm()), float(behind.norm()))
 
     def predict(self, when: float, *, longest: float = 0.1, acceleration: float = 0.3) -> Pose:
-        """Extrapolate the last pose to the time of display ``when`` at its filtered speed.
+        """Extrapolate the last smoothed pose to the time of display ``when`` at the filtered speed.
 
-        The prediction compensates the lag, so that it is exact for a steady motion. The covariance grows by that of the
-        speed times h^2, where h = when - captured + lag. It also grows by the displacement due to an unknown
-        acceleration during h, which the filtered speed follows with a delay of 1 / (2 pi derivative_cutoff).
+        The extrapolation is over h = when - captured + lag seconds, which is exact for a steady motion. Two covariances
+        are added to that of the pose: that of the speed times h^2, and that of the displacement by an acceleration a
+        that the filtered speed follows with delay, h (h / 2 + 1 / (2 pi derivative_cutoff)) a.
 
         Args:
             when: Time in seconds on the clock of ``captured``.
-            longest: Longest prediction in seconds from the capture.
+            longest: Largest difference between ``when`` and the last capture, in seconds.
             acceleration: Standard deviation of the acceleration of the tip and of the point ``arm`` behind it in m/s^2:
                 0.3 for slow careful work, 2 for a hand that swings by 5 cm once a second.
 
         Returns:
-            A pose, or a refusal (UNCERTAIN) beyond ``longest``, after a refusal, or after the first pose of a sequence,
-            when the speed is unknown.
+            A pose; or a refusal (UNCERTAIN) beyond ``longest``, or without two poses since the last restart.
         """
         when = checks.finite("when", when, "seconds")
         ahead = when - self._captured
@@ -140,39 +137,35 @@ class OneEuro:
             text = f"display is {ahead * 1e3:.0f} ms from the last frame, more than {longest * 1e3:.0f} ms"
             return Pose.refused(Status.UNCERTAIN, text)
         span, pose = ahead + self.lag, self._smooth
-        late = 1 / (2 * math.pi * self.derivative_cutoff)
-        way = checks.positive("acceleration", acceleration, "m/s^2") * abs(span) * (abs(span) / 2 + late)
-        direction = _turned(pose.direction, span * self._rate[1])
+        delay = 1 / (2 * math.pi * self.derivative_cutoff)
+        displacement = checks.positive("acceleration", acceleration, "m/s^2") * abs(span) * (abs(span) / 2 + delay)
+        direction = _rotated(pose.direction, span * self._rate[1])
         tangent = torch.eye(3).to(direction) - torch.outer(direction, direction)
-        growth = torch.block_diag(torch.eye(3).to(direction), tangent / self.arm**2) * way**2
+        growth = torch.block_diag(torch.eye(3).to(direction), tangent / self.arm**2) * displacement**2
         covariance = pose.covariance + span**2 * self._rate_covariance + growth
         return replace(pose, tip=pose.tip + span * self._rate[0], direction=direction, covariance=covariance)
 
-    def _learn(self, rate: Tensor, covariance: Tensor, dt: float) -> None:
+    def _update_rate(self, rate: Tensor, covariance: Tensor, dt: float) -> None:
         if self._rate is None or self._rate_covariance is None:
             self._rate, self._rate_covariance = rate, covariance
             return
         alpha = dt / (dt + 1 / (2 * math.pi * self.derivative_cutoff))
         self._rate = self._rate + alpha * (rate - self._rate)
-        # Consecutive differences share a pose with opposite signs; independent ones would have a larger variance.
+        # An upper bound: errors of consecutive differences partly cancel, since they share a pose.
         self._rate_covariance = (1 - alpha) ** 2 * self._rate_covariance + alpha**2 * covariance
 
 
-def _rotation(start: Tensor, end: Tensor) -> Tensor:
+def _rotation_vector(start: Tensor, end: Tensor) -> Tensor:
     """Rotation vector [3] (axis times angle) of the smallest rotation from one unit vector to the other."""
     normal = torch.linalg.cross(start, end)
     sine = normal.norm()
-    if sine < 1e-12:
-        return torch.zeros_like(normal)
-    return normal * (torch.atan2(sine, start @ end) / sine)
+    return normal * (torch.atan2(sine, start @ end) / sine.clamp(min=1e-300))
 
 
-def _turned(vector: Tensor, rotation: Tensor) -> Tensor:
-    """A unit vector rotated by a rotation vector (Rodrigues' formula), and normalised."""
-    angle = rotation.norm()
-    if angle < 1e-12:
-        return vector
-    axis = rotation / angle
-    across = torch.linalg.cross(axis, vector) * torch.sin(angle)
-    turned = vector * torch.cos(angle) + across + axis * (axis @ vector) * (1 - torch.cos(angle))
-    return turned / turned.norm()
+def _rotated(vector: Tensor, rotation: Tensor) -> Tensor:
+    """A unit vector rotated by a rotation vector (Rodrigues' formula, differentiable), and normalised."""
+    cycles = rotation.norm() / (2 * math.pi)
+    first = torch.linalg.cross(rotation, vector)
+    second = torch.linalg.cross(rotation, first)
+    rotated = vector + torch.sinc(2 * cycles) * first + torch.sinc(cycles) ** 2 / 2 * second
+    return torch.nn.functional.normalize(rotated, dim=0)

@@ -11,11 +11,11 @@ from torch import Tensor
 
 
 class Status(enum.IntEnum):
-    """Result of a frame, as trackers for surgery report it: a pose, or the first stage that failed."""
+    """Result of tracking in one frame: a pose, or the reason why the first failing stage refused one."""
 
     OK = 0
-    UNVERIFIED = 1  # a pose from three edges, without redundancy to check it
-    BAD_FRAME = 2  # not an image: unreadable, wrong size, no contrast
+    UNVERIFIED = 1  # a pose from three edges, which nothing verifies
+    BAD_FRAME = 2  # the frame is unreadable, of the wrong size, or without contrast
     NO_CATHETER = 3  # nothing thin and long has the colours of the bands
     BANDS_MISSING = 4  # fewer than two neighbouring bands are visible
     NO_AXIS = 5  # the bands do not lie on a straight line
@@ -34,19 +34,11 @@ class Status(enum.IntEnum):
     @property
     def stage(self) -> str:
         """Stage that decided the status: "frame", "colour", "axis", "edges", "camera" or "pose"."""
-        return _STAGES.get(self, "pose")
+        return _STAGES[self]
 
 
-_STAGES = {
-    Status.BAD_FRAME: "frame",
-    Status.NO_CATHETER: "colour",
-    Status.BANDS_MISSING: "colour",
-    Status.NO_AXIS: "axis",
-    Status.TOO_NARROW: "axis",
-    Status.EDGES_UNCLEAR: "edges",
-    Status.OUT_OF_FRAME: "edges",
-    Status.OUTSIDE_CAMERA: "camera",
-}
+# In the order of Status.
+_STAGES = ("pose", "pose", "frame", "colour", "colour", "axis", "axis", "edges", "edges", "camera", "pose", "pose")
 
 
 class Refusal(Exception):
@@ -54,7 +46,7 @@ class Refusal(Exception):
 
     Attributes:
         status, reason: Status and reason of the refused pose.
-        turned: Whether the bands may be visible in the reversed order.
+        turned: Whether the bands may appear in the reversed order.
     """
 
     def __init__(self, status: Status, reason: str, *, turned: bool = False):
@@ -64,20 +56,22 @@ class Refusal(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Pose of one catheter or a batch of poses, with leading axes [...], in the frame of the camera.
+    """Pose of one catheter, or a batch of poses with leading axis [...], in the frame of the camera.
 
-    In this frame x points right, y down, z forward.
+    In this frame, x points right, y down and z forward. Where there is no pose, ``tip``, ``direction``, ``covariance``
+    and ``chi_square`` are NaN.
 
     Attributes:
-        tip: [..., 3] in metres; NaN where there is no pose, as all attributes below.
-        direction: [..., 3], unit vector from the tip to the rear: ``tip + s * direction`` lies s metres from the tip.
-        covariance: [..., 6, 6] of (tip, direction) in m^2, m and 1; of rank 5. It includes the errors of the frame, but
-            not those of the calibration or of the positions of the edges on the catheter. The latter shift the poses of
-            all frames in the same way, and even for a good calibration (rms 0.04 px) by more than this covariance.
+        tip: [..., 3] in metres.
+        direction: [..., 3], unit vector from the tip to the rear.
+        covariance: [..., 6, 6] of (tip, direction) in m^2, m and 1; of rank 5. It includes errors of the edges in the
+            frame, but not those of the calibration and of the positions of the edges on the catheter. These are the
+            same in all frames, and shift a pose by more than its standard deviation even for a good calibration (rms
+            0.04 px).
         chi_square: [...] sum of the squared residuals of the edges, each divided by its variance.
         freedom: [...] degrees of freedom of ``chi_square``.
-        status: Status of the pose, or a tuple of them for a batch.
-        reason: Reason for a refusal or a warning, one sentence; else empty.
+        status: Status of the pose, or a tuple of statuses for a batch.
+        reason: One sentence: the reason for a refusal, or a warning; empty if there is neither.
     """
 
     tip: Tensor
@@ -93,46 +87,40 @@ class Pose:
         """A refusal: no pose, with its status and reason."""
         if status.answered:
             raise ValueError(f"{status.name} is no refusal")
-        nowhere = torch.full((3,), torch.nan, dtype=torch.float64)
-        covariance = torch.full((6, 6), torch.nan, dtype=torch.float64)
-        none = torch.zeros((), dtype=torch.float64)
-        return Pose(nowhere, nowhere.clone(), covariance, none * torch.nan, none, status, reason)
+        nan = (torch.full(shape, torch.nan, dtype=torch.float64) for shape in ((3,), (3,), (6, 6), ()))
+        return Pose(*nan, freedom=torch.zeros((), dtype=torch.float64), status=status, reason=reason)
 
     @property
     def answered(self) -> bool:
-        """Whether there is a pose; of one pose only."""
+        """Whether there is a pose; ValueError for a batch."""
         if not isinstance(self.status, Status):
             raise ValueError("a batch of poses has a status for each; ask pose[i].answered")
         return self.status.answered
 
     @property
     def tip_sd(self) -> Tensor:
-        """[...] standard deviation of the tip in metres: the root of the sum of the variances of all three axes."""
+        """Standard deviation of the tip in metres [...]: the root of the sum of the variances of all three axes."""
         return self.covariance[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
 
     @property
     def camera_from_tool(self) -> Tensor:
-        """[..., 4, 4] rigid map that takes the origin to the tip and, by the smallest rotation, z to ``direction``."""
+        """Rigid map [..., 4, 4] of the origin to the tip and, by the smallest rotation, of the z axis to direction."""
         x, y, z = self.direction.unbind(-1)
         square = x * x + y * y
-        back = (z < 0) & (square < 1e-30)  # rotation by 180 degrees about x
+        opposite = (z < 0) & (square < 1e-30)  # no unique smallest rotation: by 180 degrees about x
         # 1 / (1 + z), without cancellation for z near -1.
-        share = torch.where(z < 0, (1 - z) / torch.where(back | (z >= 0), 1.0, square), 1 / (1 + z.clamp(min=0)))
-        zero, one = torch.zeros_like(z), torch.ones_like(z)
-        columns = [
-            torch.stack([torch.where(back, one, 1 - x * x * share), torch.where(back, zero, -x * y * share), -x], -1),
-            torch.stack([torch.where(back, zero, -x * y * share), torch.where(back, -one, 1 - y * y * share), -y], -1),
-            self.direction,
-            self.tip,
-        ]
+        factor = torch.where(z < 0, (1 - z) / torch.where(opposite | (z >= 0), 1.0, square), 1 / (1 + z.clamp(min=0)))
+        xx, xy = torch.where(opposite, 1.0, 1 - x * x * factor), torch.where(opposite, 0.0, -x * y * factor)
+        yy = torch.where(opposite, -1.0, 1 - y * y * factor)
+        columns = torch.stack([xx, xy, -x], -1), torch.stack([xy, yy, -y], -1), self.direction, self.tip
         matrix = torch.stack(columns, -1)
         last = torch.tensor([0.0, 0, 0, 1], dtype=matrix.dtype, device=matrix.device).expand(*matrix.shape[:-2], 1, 4)
         return torch.cat([matrix, last], -2)
 
     def point(self, along: float | Tensor) -> Tensor:
         """Point [..., 3] ``along`` metres from the tip."""
-        where = torch.as_tensor(along, dtype=self.tip.dtype, device=self.tip.device)
-        return self.tip + where[..., None] * self.direction
+        distance = torch.as_tensor(along, dtype=self.tip.dtype, device=self.tip.device)
+        return self.tip + distance[..., None] * self.direction
 
     def __len__(self) -> int:
         return len(self.tip) if self.tip.ndim > 1 else 1
@@ -144,7 +132,5 @@ class Pose:
         """One pose of a batch."""
         if isinstance(self.status, Status):
             raise IndexError("this is one pose, not a batch")
-        tip, direction, covariance = self.tip[index], self.direction[index], self.covariance[index]
-        return Pose(
-            tip, direction, covariance, self.chi_square[index], self.freedom[index], self.status[index], self.reason
-        )
+        tensors = (self.tip, self.direction, self.covariance, self.chi_square, self.freedom)
+        return Pose(*(value[index] for value in tensors), status=self.status[index], reason=self.reason)

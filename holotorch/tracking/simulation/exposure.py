@@ -1,4 +1,4 @@
-"""Effects of a sensor and a codec on levels: noise, rounding, chroma at half resolution, JPEG."""
+"""Effects of a sensor and a codec on a frame: noise, rounding, chroma at half resolution, JPEG."""
 
 from functools import lru_cache
 
@@ -6,20 +6,22 @@ import cv2
 import numpy as np
 import torch
 
-_NOISE = 1 << 21  # number of normal deviates, drawn once; each row of a frame starts at a random one
 _ROWS = 64  # rows processed at a time, so that they fit the processor's cache
 
 
 @lru_cache(maxsize=1)
 def _deviates() -> np.ndarray:
-    """Normal deviates that all frames share."""
-    return torch.randn(_NOISE, generator=torch.Generator().manual_seed(20)).numpy()
+    """Normal deviates, drawn once for all frames; the noise of each row of a frame is a random section of them."""
+    return torch.randn(1 << 21, generator=torch.Generator().manual_seed(20)).numpy()
 
 
 def sensed(
     levels: np.ndarray, noise: float, video: bool, jpeg_quality: int | None, generator: torch.Generator | None
 ) -> np.ndarray:
-    """Frame uint8 [3, H, W] that sensor and codec produce from levels float32 [3, H, W]; ``noise`` in levels."""
+    """Frame, uint8 [3, H, W], that sensor and codec produce from levels, float32 [3, H, W].
+
+    ``noise`` is the standard deviation in levels; the other arguments are as in :class:`Look`.
+    """
     frame = expose(levels, noise, generator)
     if video:
         frame = halve_colours(frame)
@@ -27,7 +29,7 @@ def sensed(
 
 
 def expose(frame: np.ndarray, noise: float, generator: torch.Generator | None) -> np.ndarray:
-    """Levels uint8 [3, H, W]: rounded levels float32 [3, H, W] with white noise of standard deviation ``noise``."""
+    """Levels, float32 [3, H, W], with white noise of standard deviation ``noise``, rounded and clipped to uint8."""
     flat = frame.reshape(-1, frame.shape[-1])
     rows = np.lib.stride_tricks.sliding_window_view(_deviates(), frame.shape[-1])
     start = torch.randint(len(rows), (len(flat),), generator=generator).numpy()
@@ -39,7 +41,7 @@ def expose(frame: np.ndarray, noise: float, generator: torch.Generator | None) -
 
 
 def halve_colours(levels: np.ndarray) -> np.ndarray:
-    """Levels [3, H, W] with full luma, where each 2 x 2 pixels share the chroma of the upper left one."""
+    """Levels [3, H, W] after chroma subsampling: each 2 x 2 pixels have the chroma of the upper left one."""
     height, width = levels.shape[1:]
     even = np.pad(levels, ((0, 0), (0, height % 2), (0, width % 2)), "edge").transpose(1, 2, 0)
     planes = cv2.cvtColor(np.ascontiguousarray(even), cv2.COLOR_RGB2YUV_I420)
@@ -48,7 +50,7 @@ def halve_colours(levels: np.ndarray) -> np.ndarray:
 
 
 def compress(levels: np.ndarray, quality: int) -> np.ndarray:
-    """Levels [3, H, W] after JPEG compression with ``quality`` 1 to 100 and chroma at half resolution."""
+    """Levels [3, H, W] after JPEG compression with a ``quality`` of 1 to 100 and chroma at half resolution."""
     options = [cv2.IMWRITE_JPEG_QUALITY, quality]
     options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(levels[::-1].transpose(1, 2, 0)), options)

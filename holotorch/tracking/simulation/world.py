@@ -1,4 +1,4 @@
-"""Synthetic scenes with exact truth, some of which a catheter tracker must answer and others refuse."""
+"""Synthetic frames of a catheter with exactly known poses, for tests of trackers."""
 
 import itertools
 import math
@@ -18,21 +18,20 @@ from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.pose.catheter import THESIS, Catheter
 from holotorch.tracking.simulation import scenery
 from holotorch.tracking.simulation.exposure import sensed
-from holotorch.tracking.simulation.render import Look, mean_levels, render
+from holotorch.tracking.simulation.look import Look
+from holotorch.tracking.simulation.render import mean_levels, render
 
-# Side of the sheet of Sec. 3.5.2 and distance of the holes of Sec. 3.5.3 of the thesis, in metres.
-_GRID, _SPACING = 0.0816, 0.010
 _ROLL = math.radians(25)  # default angle of the catheter within the frame
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A frame that is rendered on demand, and the truth about it.
+    """A frame that is rendered on demand, and the true pose.
 
     Attributes:
-        name: Description of the frame, unique in its list.
-        frame: Renders the frame, uint8 [3, H, W]; each call gives the same one.
-        tip: [3] in metres, in the camera's coordinates; None if the catheter is not in the frame.
+        name: Description of the frame, different for each case of a list.
+        frame: Renders the frame, uint8 [3, H, W], the same at each call.
+        tip: [3] in metres, in the camera's frame; None if the frame does not show the catheter.
         direction: Unit vector [3] from the tip to the rear, or None.
         answerable: Whether the frame determines a pose.
         why: The reason for ``answerable``, in a few words.
@@ -47,9 +46,9 @@ class Case:
 
 
 def synthetic_camera(size: tuple[int, int] = (1080, 1920), tone: str = "srgb") -> Camera:
-    """Camera of the synthetic frames: focal length 1400 pixels at a width of 1920, weak distortion.
+    """Camera of the synthetic frames: focal length of 1400 pixels at a width of 1920, weak distortion.
 
-    Its principal point is (W / 2, H / 2), half a pixel right of and below the frame's centre.
+    The principal point is (W / 2, H / 2), half a pixel right of and below the centre of the frame.
     """
     height, width = size
     focal = 1400 * width / 1920
@@ -58,26 +57,26 @@ def synthetic_camera(size: tuple[int, int] = (1080, 1920), tone: str = "srgb") -
 
 
 def aimed(tilt: float, roll: float = _ROLL) -> Tensor:
-    """Direction [3] of a catheter at the angle ``roll`` in the frame, its rear tilted to the camera; in radians."""
+    """Direction [3] of a catheter at an angle ``roll`` from x to y, its rear tilted to the camera; both in radians."""
     flat = math.cos(tilt)
     return torch.tensor([flat * math.cos(roll), flat * math.sin(roll), -math.sin(tilt)], dtype=torch.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Scenes of one catheter in front of one camera. Each method returns cases, whose frames are rendered on demand.
+    """Cases of one catheter in front of one camera.
 
     Attributes:
         size: (H, W) in pixels.
         camera: By default :func:`synthetic_camera`.
-        catheter: The catheter to be tracked; similar objects in negative cases differ from it.
+        catheter: The catheter to be tracked.
         look: Blur, noise and light of all frames, which a case may change. Its background is not used.
         photographs: Images uint8 [3, h, w] of any size for backgrounds, in addition to procedural ones.
         seed: Seed of backgrounds, poses and noise.
     """
 
     size: tuple[int, int] = (1080, 1920)
-    camera: Camera = None  # type: ignore[assignment]  # filled in below
+    camera: Camera = None  # type: ignore[assignment]  # the default depends on ``size``
     catheter: Catheter = THESIS
     look: Look = field(default_factory=Look)
     photographs: tuple[Tensor, ...] = ()
@@ -99,17 +98,17 @@ class World:
         shown: Catheter | None = None,
         **changes: Any,
     ) -> Case:
-        """A case of the catheter, or of another one ``shown``, at a pose (tip, direction); without a pose, of none.
+        """A case with the catheter at a pose (tip, direction), or without a catheter if ``pose`` is None.
 
-        The default background is the desk. ``changes`` replace fields of the look. The noise depends on the world's
-        seed and the name.
+        ``background`` makes the background, by default :meth:`desk`. ``shown`` is another catheter, which is rendered
+        instead. ``changes`` replace fields of the look. Seed and name determine the noise.
         """
 
         def frame() -> Tensor:
             look = replace(self.look, background=(background or self.desk)(), **changes)
             tip, direction = pose or (None, None)
-            tool = None if pose is None else shown or self.catheter
-            return render(tool, self.camera, tip, direction, self.size, look, generator=self._noise(name))
+            catheter = None if pose is None else shown or self.catheter
+            return render(catheter, self.camera, tip, direction, self.size, look, generator=self._noise(name))
 
         true = None if shown is not None else pose
         return Case(name, frame, *(true or (None, None)), answerable, why)
@@ -124,30 +123,27 @@ class World:
     ) -> tuple[Tensor, Tensor]:
         """Tip in metres and direction, float64 [3] each, with the bands' middle on the ray through ``at`` on z = 1.
 
-        At ``depth``, in metres along the optical axis, lies the ``point`` so many metres from the tip; None for that
-        middle. ``tilt`` and ``roll`` are in radians, as of :func:`aimed`.
-
-        Raises:
-            TypeError, ValueError: ``depth`` not above 0, ``point`` not finite, or the bands' middle not in front of the
-                camera.
+        ``depth`` is the coordinate z in metres of the point ``point`` metres from the tip, by default of the middle of
+        the bands. For ``tilt`` and ``roll`` see :func:`aimed`. Raises ValueError for a ``depth`` not above 0, a
+        ``point`` that is not finite, and if the middle of the bands is not in front of the camera.
         """
         checks.quantity(CAMERA_DEPTH, depth)
         direction = aimed(tilt, roll)
         middle = (self.catheter.edges[0] + self.catheter.edges[-1]) / 2
         ahead = depth + (0.0 if point is None else (middle - checks.finite("point", point)) * float(direction[2]))
         if ahead <= 0:
-            got = f"{ahead:.3g} m with the point {point:g} m from the tip at depth {depth:g} m"
             raise ValueError(
-                f"the middle of the bands must lie in front of the camera, got {got}; tilt less or go farther"
+                f"the middle of the bands must lie in front of the camera, got {ahead:.3g} m with the point {point:g} "
+                f"m from the tip at depth {depth:g} m; tilt less or go farther"
             )
         return ahead * torch.tensor([*at, 1.0], dtype=torch.float64) - middle * direction, direction
 
     def _noise(self, name: str) -> torch.Generator:
-        """Of the frame of this name: the same at each call."""
+        """Generator of the noise of the case of this name."""
         return torch.Generator().manual_seed(zlib.crc32(f"{self.seed} {name}".encode()))
 
     def desk(self) -> Tensor:
-        """The table of the measurements."""
+        """The default background, a plain table."""
         return self._desk
 
     @cached_property
@@ -157,43 +153,40 @@ class World:
     def still(
         self, depth: float, tilt: float, count: int, at: Sequence[float] = (0.0, 0.0), point: float | None = None
     ) -> list[Case]:
-        """``count`` frames of a catheter at rest, differing in noise only: Sec. 3.5.1; at a pose as :meth:`pose`'s."""
-        place = self.pose(depth, tilt, at=at, point=point)
-        where = f", {1e3 * at[0]:.3f} {1e3 * at[1]:.3f}" if any(at) else ""
+        """``count`` frames of a catheter at a :meth:`pose`, which differ in noise only, Sec. 3.5.1 of the thesis."""
+        pose = self.pose(depth, tilt, at=at, point=point)
+        suffix = f", {1e3 * at[0]:.3f} {1e3 * at[1]:.3f}" if any(at) else ""
 
         @cache
-        def levels() -> np.ndarray:  # the same of all frames, and most of their making
+        def levels() -> np.ndarray:  # cached, since they take most of the time and are the same in all frames
             look = replace(self.look, background=self.desk())
-            return mean_levels(self.catheter, self.camera, place, self.size, look)
+            return mean_levels(self.catheter, self.camera, pose, self.size, look)
 
         def frame(name: str) -> Tensor:
-            seen = self.look.noise_dn, self.look.video, self.look.jpeg_quality
-            return torch.from_numpy(sensed(levels(), *seen, self._noise(name)))
+            look = self.look
+            return torch.from_numpy(sensed(levels(), look.noise_dn, look.video, look.jpeg_quality, self._noise(name)))
 
-        names = [f"still {i}{where}" for i in range(checks.whole("count", count, 1))]
-        return [Case(name, partial(frame, name), *place, True, "") for name in names]
+        names = [f"still {i}{suffix}" for i in range(checks.whole("count", count, 1))]
+        return [Case(name, partial(frame, name), *pose, True, "") for name in names]
 
     def grid_2d(self, depth: float = 0.52, tilt: float = math.radians(20)) -> list[Case]:
-        """The sheet of Sec. 3.5.2: the tip at 9 x 9 places over 8.16 cm, row by row, always in the same direction.
+        """The sheet of Sec. 3.5.2 of the thesis: the tip at 9 x 9 points of a square of 8.16 cm that faces the camera.
 
-        The sheet faces the camera. At its centre the middle of the bands is at ``depth`` on the axis; the thesis does
-        not print its distance.
+        The cases are in rows. With the tip at the central point, the middle of the bands lies on the optical axis at
+        ``depth`` metres, which the thesis does not state.
         """
         centre, direction = self.pose(depth, tilt)
-        steps = [_GRID * (i / 8 - 0.5) for i in range(9)]
-        cases = []
-        for (row, y), (column, x) in itertools.product(enumerate(steps), repeat=2):
-            tip = centre + torch.tensor([x, y, 0.0], dtype=torch.float64)
-            cases.append(self.case(f"2d {row} {column}", (tip, direction)))
-        return cases
+        steps = [0.0816 * (i / 8 - 0.5) for i in range(9)]
+        return [
+            self.case(f"2d {row} {column}", (centre + torch.tensor([x, y, 0.0], dtype=torch.float64), direction))
+            for (row, y), (column, x) in itertools.product(enumerate(steps), repeat=2)
+        ]
 
     def grid_3d(self) -> dict[str, list[Case]]:
-        """The block of Sec. 3.5.3: on each of its three faces A, B, C 8 x 8 holes, 10 mm apart, row by row.
+        """The block of Sec. 3.5.3 of the thesis: 8 x 8 holes, 10 mm apart, in upper (A), left (B) and right face (C).
 
-        A cube of 90 mm with its centre 560 mm away, seen from 37 degrees above its edge to the front: A is on top, B
-        and C are on its left and right. Tips are 505 to 570 mm away. In each face the catheter keeps a direction that
-        a hand would give it: A up and right, rear 9 degrees to the camera, B left, 20, C right, 25. (The thesis prints
-        no distance.)
+        The cases of each face are in rows, with one direction as if held by hand. The block is a cube of 90 mm with its
+        centre 560 mm from the camera, which the thesis does not state, and seen from an elevation of 37 degrees.
         """
         up, front, side = (torch.tensor(v, dtype=torch.float64) for v in ([0, -0.8, -0.6], [0, 0.6, -0.8], [1.0, 0, 0]))
         left, right = (front - side) / math.sqrt(2), (front + side) / math.sqrt(2)
@@ -203,11 +196,11 @@ class World:
             "B": (left, up, right, aimed(math.radians(20), math.radians(-174))),
             "C": (right, up, left, aimed(math.radians(25), math.radians(-20))),
         }
-        steps = [_SPACING * (i - 3.5) for i in range(8)]
-        cases: dict[str, list[Case]] = {}
-        for face, (normal, down, along, direction) in faces.items():
-            cases[face] = []
-            for (row, y), (column, x) in itertools.product(enumerate(steps), repeat=2):
-                tip = centre + 0.045 * normal + y * down + x * along
-                cases[face].append(self.case(f"3d {face} {row} {column}", (tip, direction)))
-        return cases
+        steps = [0.010 * (i - 3.5) for i in range(8)]
+        return {
+            face: [
+                self.case(f"3d {face} {row} {column}", (centre + 0.045 * normal + y * down + x * along, direction))
+                for (row, y), (column, x) in itertools.product(enumerate(steps), repeat=2)
+            ]
+            for face, (normal, down, along, direction) in faces.items()
+        }

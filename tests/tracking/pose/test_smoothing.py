@@ -189,7 +189,7 @@ def test_impossible_input():
         filtered(replace(pose([0, 0, 0.5]), tip=torch.zeros(2, 3)), 2.0)
     with pytest.raises(ValueError, match="min_cutoff must be above zero in Hz"):
         OneEuro(0.0)
-    with pytest.raises(ValueError, match="beta must not be negative"):
+    with pytest.raises(ValueError, match="beta must be at least zero in Hz per m/s"):
         OneEuro(beta=-1.0)
     filtered.reset()
     assert filtered(pose([0, 0, 0.5]), 0.5).status is Status.OK
