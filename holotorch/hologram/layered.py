@@ -8,11 +8,11 @@ from torch import Tensor, nn
 from holotorch.core import checks
 from holotorch.core.grid import Grid
 from holotorch.core.operator import linear
-from holotorch.hologram.cone import Cone, check_cone, check_layers, check_scene
+from holotorch.hologram.cone import Cone, check_cone, check_scene
 
 
 class LayerHologram(nn.Module):
-    """A linear map from layers of point sources to the field on a hologram, with its conjugate transpose.
+    """A linear map from layers of point sources to the complex field on a hologram, with its conjugate transpose.
 
     A subclass implements ``_forward`` and ``_adjoint`` for one batch axis B; this class derives gradients of any order
     and ``vmap`` from the two.
@@ -28,7 +28,7 @@ class LayerHologram(nn.Module):
         TypeError, ValueError: Invalid arguments; in a call: layers that are not complex [..., D, h, w].
     """
 
-    def __init__(self, grid: Grid, wavelength: float, depths: Sequence[float], cone: Cone, stride: int):
+    def __init__(self, grid: Grid, wavelength: float, depths: Sequence[float], *, cone: Cone = "box", stride: int = 1):
         super().__init__()
         self.grid = grid
         self.wavelength, self.depths, self.stride = check_scene(grid, wavelength, depths, stride)
@@ -36,10 +36,14 @@ class LayerHologram(nn.Module):
         self.cone: Cone = cone
 
     def forward(self, layers: Tensor) -> Tensor:
-        """Field [..., H, W] of ``layers``, complex [..., D, h, w], whose samples h // 2, w // 2 lie on the axis."""
-        check_layers(layers, len(self.depths))
-        shape = (layers.shape[-2], layers.shape[-1])
-        return linear(layers, *self._maps(shape))
+        """Field [..., H, W] of complex layers [..., D, h, w], one per depth; sample (h // 2, w // 2) is on the axis."""
+        if not isinstance(layers, Tensor) or not layers.is_complex():
+            kind = getattr(layers, "dtype", type(layers))
+            raise TypeError(f"layers must be a complex tensor (..., D, h, w), got {kind}")
+        count = len(self.depths)
+        if layers.ndim < 3 or layers.shape[-3] != count or 0 in layers.shape[-2:]:
+            raise ValueError(f"layers must end in (D, h, w) with D = {count} depths, got {tuple(layers.shape)}")
+        return linear(layers, *self._maps((layers.shape[-2], layers.shape[-1])))
 
     def adjoint(self, field: Tensor, shape: tuple[int, int] | None = None) -> Tensor:
         """Apply the conjugate transpose to a field [..., H, W].
@@ -74,7 +78,7 @@ class LayerHologram(nn.Module):
 
 
 def _flattened(function: Callable[[Tensor], Tensor], x: Tensor, axes: int) -> Tensor:
-    """Apply ``function``, which expects one batch axis, to ``x`` with any number of batch axes before ``axes`` axes."""
+    """Apply ``function``, which expects one batch axis before ``axes`` axes, to ``x`` with any number of batch axes."""
     batch = x.shape[:-axes]
     out = function(x.reshape(math.prod(batch), *x.shape[-axes:]))
     return out.reshape(*batch, *out.shape[1:])
