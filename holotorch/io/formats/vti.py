@@ -13,9 +13,8 @@ from holotorch.io.formats.scan import (
     Scan,
     chosen,
     expect_bytes,
-    from_words,
+    from_text,
     placed,
-    readable,
     stated_bytes,
     three_axes,
     uncompressed_from,
@@ -33,7 +32,7 @@ _APPENDED = re.compile(
 
 
 def read_vti(path: Path, member: str | None = None) -> Scan:
-    """Read a scalar array of a file with one piece: ``member``, else the active array, else the only one.
+    """Read the scalar array ``member`` of a file with one piece, by default the active array or the only one.
 
     VTK states no units, so the volume is "relative". Large raw appended data without compression are memory-mapped.
     """
@@ -61,16 +60,15 @@ def read_vti(path: Path, member: str | None = None) -> Scan:
     if "Spacing" not in image.attrib:
         return Scan(values)
     spacing = np.array([float(word) for word in image.attrib["Spacing"].split()])
-    # Columns of Direction are the axes.
     direction = np.reshape([float(word) for word in image.get("Direction", "1 0 0 0 1 0 0 0 1").split()], (3, 3))
-    axes = direction.T * spacing[:, None]
+    axes = direction.T * spacing[:, None]  # the columns of Direction are unit vectors along the axes
     corner = np.array([float(word) for word in image.get("Origin", "0 0 0").split()])
     first = np.array(bounds[::2]) + (0.5 if cells else 0)
     return placed(values, axes, corner + first @ axes, "relative")
 
 
 def _document(path: Path) -> tuple[ElementTree.Element, int, bool]:
-    """Parse XML without the appended data; also return their offset in the file, or -1, and whether it is base64."""
+    """Root of the XML without the appended data, the offset of these data or -1, and whether they are in base64."""
     data = np.memmap(path, np.uint8, "r")
     match = _APPENDED.search(data)  # type: ignore[arg-type]
     text = bytes(data[: match.start()]) + b"</VTKFile>" if match else bytes(data)
@@ -82,7 +80,7 @@ def _document(path: Path) -> tuple[ElementTree.Element, int, bool]:
 
 
 def _array(piece: ElementTree.Element, member: str | None, path: Path) -> tuple[ElementTree.Element, int]:
-    """The selected array, and 1 for cell data, which have one value fewer per axis than point data, else 0."""
+    """The selected array, and by how many values per axis it is smaller than the points: 1 for cell data, else 0."""
     for name, cells in (("PointData", 0), ("CellData", 1)):
         holder = piece.find(name)
         arrays = {item.get("Name", ""): item for item in (holder if holder is not None else ())}
@@ -102,12 +100,10 @@ def _values(
     start: int,
     base64_coded: bool,
 ) -> np.ndarray:
+    """Voxels of an array; ``start`` and ``base64_coded`` describe the appended data, see :func:`_document`."""
     form, compressor = array.get("format", "ascii"), root.get("compressor")
     if form == "ascii":
-        with readable(path, "text of numbers"):
-            values = from_words((array.text or "").split(), dtype)
-        expect_bytes(path, values.nbytes, shape, dtype)
-        return values.reshape(shape)
+        return from_text(path, array.text or "", shape, dtype)
     header_type = root.get("header_type", "UInt32")
     if header_type not in ("UInt32", "UInt64"):
         raise ValueError(f"{path} has header_type {header_type!r}, expected UInt32 or UInt64")
@@ -119,7 +115,12 @@ def _values(
     offset = start + int(array.get("offset", 0))
     if form == "appended" and not base64_coded:
         if compressor is None:
-            return _mapped(path, shape, dtype, offset, count)
+            with open(path, "rb") as stream:
+                stream.seek(offset)
+                size = _length(stream.read(count.itemsize), count)
+            offset += count.itemsize
+            expect_bytes(path, max(0, min(size, path.stat().st_size - offset)), shape, dtype)
+            return uncompressed_from(path, shape, dtype, offset)
         data = path.read_bytes()[offset:]
     else:
         data = _decoded(array.text or "" if form == "binary" else path.read_bytes()[offset:].decode("latin-1"))
@@ -128,30 +129,22 @@ def _values(
     return unpacked(path, data[count.itemsize : count.itemsize + _length(data, count)], shape, dtype)
 
 
-def _mapped(path: Path, shape: list[int], dtype: np.dtype, offset: int, count: np.dtype) -> np.ndarray:
-    with open(path, "rb") as stream:
-        stream.seek(offset)
-        size = _length(stream.read(count.itemsize), count)
-    present = max(0, min(size, path.stat().st_size - offset - count.itemsize))
-    expect_bytes(path, present, shape, dtype)
-    return uncompressed_from(path, shape, dtype, offset + count.itemsize)
-
-
 def _length(data: bytes, count: np.dtype) -> int:
+    """Number of bytes of uncompressed data, which is stated before them as a ``count``."""
     return int.from_bytes(data[: count.itemsize], "big" if count.byteorder == ">" else "little")
 
 
 def _decoded(text: str) -> bytes:
-    # The length at the beginning is encoded separately, so padding "=" may occur inside; the data end at "<".
+    # The data end at "<". Their length is encoded before them as a separate part, which may end with "=".
     parts = re.findall(r"[A-Za-z0-9+/]+=*", "".join(text.partition("<")[0].split()))
-    # A truncated file may end within a group of four characters.
+    # In a truncated file the last group of four characters may be incomplete.
     return b"".join(base64.b64decode(part[: len(part) // 4 * 4]) for part in parts)
 
 
 def _inflated(path: Path, data: bytes, count: np.dtype, size: int) -> bytearray:
-    """Decompress blocks, which follow a table: their number, full size, size of the last one, and compressed sizes.
+    """Decompress ``data`` to at most ``size`` bytes.
 
-    More than ``size`` bytes of content are an error.
+    A table precedes the blocks: their number, their size, the size of the last block, and the compressed sizes.
     """
     try:
         blocks = int(np.frombuffer(data, count, 1)[0])
