@@ -78,7 +78,7 @@ class AxialHologram(LayerHologram):
             if self.cone == "full" and not all(axis.within_band for axis in axes):
                 raise ValueError(
                     f"cone='full' leaves out no light only where every pixel lies within every source's cone, from "
-                    f"{max(axis.apart * axis.pitch / axis.steepest for axis in axes):.3g} m on for layers of {shape}; "
+                    f"{max(axis.displacement * axis.pitch / axis.steepest for axis in axes):.3g} m on for layers of {shape}; "
                     f"the nearest depth is {min(self.depths):.3g} m: use cone='taper' or ConvolutionHologram"
                 )
             # Of the tolerance, 0.4 is granted to each axis and 0.3 to the nodes; the errors add in quadrature.

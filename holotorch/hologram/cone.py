@@ -16,7 +16,7 @@ If every pixel lies well inside the cone of every source, ``full``, ``box``, ``d
 """
 
 import math
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -26,7 +26,6 @@ from holotorch.core.grid import Grid
 from holotorch.core.quantities import DEPTH
 from holotorch.optics.free_space.geometry import lateral_spread
 from holotorch.optics.free_space.kernels import turns_phasor
-from holotorch.optics.free_space.padding import FINEST
 
 Cone = Literal["full", "box", "disc", "taper", "band"]
 TAPER_BEGIN = 0.7  # fraction of the highest frequency at which the taper begins
@@ -89,17 +88,6 @@ def spherical_wave(dy: Tensor, dx: Tensor, pitch: tuple[float, float], wavelengt
     y, x = (displacement.abs() / (limit * (1 + 1e-12)) for displacement, limit in zip((dy, dx), spread, strict=True))
     inside = (y.square() + x.square() <= 1) if cone == "disc" else (y <= 1) & (x <= 1)
     return torch.where(inside, wave, 0)
-
-
-def check_cone(cone: Cone, pitch: tuple[float, float], wavelength: float) -> None:
-    """Raise ValueError if ``cone`` is unknown, or needs a coarser ``pitch`` (y, x) in metres."""
-    if cone not in get_args(Cone):
-        raise ValueError(f"cone must be one of {', '.join(map(repr, get_args(Cone)))}, got {cone!r}")
-    if cone in ("taper", "band") and min(pitch) < FINEST * wavelength:
-        raise ValueError(
-            f"cone={cone!r} needs a pitch of at least {FINEST} wavelengths, {FINEST * wavelength:.3g} m, got "
-            f"{min(pitch):g} m: use cone='box' of ConvolutionHologram"
-        )
 
 
 def check_scene(grid: Grid, wavelength: float, depths, stride: int) -> tuple[float, tuple[float, ...], int]:

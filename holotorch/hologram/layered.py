@@ -2,13 +2,15 @@
 
 import math
 from collections.abc import Callable, Sequence
+from typing import get_args
 
 from torch import Tensor, nn
 
 from holotorch.core import checks
 from holotorch.core.grid import Grid
 from holotorch.core.operator import linear
-from holotorch.hologram.cone import Cone, check_cone, check_scene
+from holotorch.hologram.cone import Cone, check_scene
+from holotorch.optics.free_space.padding import FINEST
 
 
 class LayerHologram(nn.Module):
@@ -32,7 +34,13 @@ class LayerHologram(nn.Module):
         super().__init__()
         self.grid = grid
         self.wavelength, self.depths, self.stride = check_scene(grid, wavelength, depths, stride)
-        check_cone(cone, grid.pitch, self.wavelength)
+        if cone not in get_args(Cone):
+            raise ValueError(f"cone must be one of {', '.join(map(repr, get_args(Cone)))}, got {cone!r}")
+        if cone in ("taper", "band") and min(grid.pitch) < FINEST * self.wavelength:
+            raise ValueError(
+                f"cone={cone!r} needs a pitch of at least {FINEST} wavelengths, {FINEST * self.wavelength:.3g} m, got "
+                f"{min(grid.pitch):g} m: use cone='box' of ConvolutionHologram"
+            )
         self.cone: Cone = cone
 
     def forward(self, layers: Tensor) -> Tensor:

@@ -48,7 +48,7 @@ class Axis:
     cone: Cone
 
     @property
-    def apart(self) -> int:
+    def displacement(self) -> int:
         """Bound on the displacement between a source and a pixel, in samples."""
         return (self.sources + self.pixels) // 2
 
@@ -64,34 +64,37 @@ class Axis:
         Light from the nearest plane reaches no pixel if it is steeper than the first. Light from the farthest plane
         wraps onto no pixel, in FFTs of ``length`` samples, if it is less steep than the second.
         """
-        begin = self.apart * self.pitch / self.nearest
-        end = (length - self.apart) * self.pitch / self.farthest
+        begin = self.displacement * self.pitch / self.nearest
+        end = (length - self.displacement) * self.pitch / self.farthest
         # The spectrum of the "full" wave is attenuated to 0 at the highest frequency, since a sharp end causes ringing.
         return begin, min(end, self.steepest) if self.cone == "full" else end
 
     @property
     def within_band(self) -> bool:
         """Whether the pitch samples the direction from every source to every pixel, at every depth."""
-        return self.steepest * self.nearest > self.apart * self.pitch
+        return self.steepest * self.nearest > self.displacement * self.pitch
 
     def least(self) -> int:
         """Shortest length at which all rays that wrap onto a pixel are attenuated."""
-        extent = min(self.steepest * self.farthest / self.pitch, 1.02 * self.apart * self.farthest / self.nearest)
-        return strided_length(math.ceil(self.apart + extent) + 1, self.stride)
+        extent = min(
+            self.steepest * self.farthest / self.pitch, 1.02 * self.displacement * self.farthest / self.nearest
+        )
+        return strided_length(math.ceil(self.displacement + extent) + 1, self.stride)
 
     def error(self, length: int) -> float:
         """Relative L2 error of the field of random sources: the larger error of the nearest and the farthest depth."""
         return max(self._error(length, depth) for depth in {self.nearest, self.farthest})
 
     def _error(self, length: int, depth: float) -> float:
-        displacement = np.arange(self.apart + 1)
+        offsets = np.arange(self.displacement + 1)
         sine = np.clip(np.fft.fftfreq(length, self.pitch) * self.wavelength, -0.999, 0.999)
         weights = faded_out(torch.from_numpy(sine / np.sqrt(1 - sine**2)), *self.fade(length)).numpy()
-        kernel = np.fft.ifft(self._spectrum(length, depth) * weights)[displacement % length]
+        kernel = np.fft.ifft(self._spectrum(length, depth) * weights)[offsets % length]
         # On an array at least four times as long, much less of the light wraps around.
-        exact_length = good_length(math.ceil(4 * max(length, self.apart + self.steepest * depth / self.pitch)))
+        exact_length = good_length(math.ceil(4 * max(length, self.displacement + self.steepest * depth / self.pitch)))
         exact = _exact_kernel(self, exact_length, depth)
-        pairs = np.clip(self.apart - displacement, 0, min(self.sources, self.pixels)) + 1.0
+        # Number of pairs of a source and a pixel at each offset; those in the other direction are counted as well.
+        pairs = np.clip(self.displacement - offsets, 0, min(self.sources, self.pixels)) + 1.0
         pairs[1:] *= 2
         return math.sqrt((pairs * np.abs(kernel - exact) ** 2).sum() / (pairs * np.abs(exact) ** 2).sum())
 
@@ -109,11 +112,11 @@ class Axis:
 
 @lru_cache(maxsize=8)  # for distant planes ``length`` is the same for all transform lengths that are tried
 def _exact_kernel(axis: Axis, length: int, depth: float) -> np.ndarray:
-    """Kernel at displacements of 0, 1, ... samples, without its carrier; ``length`` samples unless in closed form."""
+    """Kernel at offsets of 0, 1, ... samples without its carrier, in closed form or from an FFT of ``length``."""
     if axis.cone != "full":
-        return np.fft.ifft(axis._spectrum(length, depth))[: axis.apart + 1].copy()
+        return np.fft.ifft(axis._spectrum(length, depth))[: axis.displacement + 1].copy()
     # The integral of exp(2 pi i (f x + z w)) over f, with w = sqrt(1 / wavelength^2 - f^2).
-    x, k = np.arange(axis.apart + 1) * axis.pitch, 2 * math.pi / axis.wavelength
+    x, k = np.arange(axis.displacement + 1) * axis.pitch, 2 * math.pi / axis.wavelength
     distance = np.hypot(x, depth)
     wave = 0.5j * k * depth / distance * hankel1e(1, k * distance)
     return axis.pitch * wave * np.exp(1j * k * (x**2 / (distance + depth)))
@@ -131,7 +134,7 @@ def choose_length(axis: Axis, tolerance: float) -> tuple[int, float]:
     Lengths are tried up to three times the sum of sources and pixels, plus twelve times the width sqrt(wavelength z) of
     the diffraction at an edge.
     """
-    spread = 4 * (axis.apart + axis.steepest * axis.farthest / axis.pitch)
+    spread = 4 * (axis.displacement + axis.steepest * axis.farthest / axis.pitch)
     if spread > _LONGEST:
         raise ValueError(
             f"depth {axis.farthest:g} m is too far for pixels of {axis.pitch:g} m: light spreads over {spread / 4:.2g} "

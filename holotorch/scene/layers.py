@@ -60,8 +60,7 @@ class SourceLayers:
         phase_factor = None if self.phase is None else phasor(self.phase)
         shape, expected, count = (self.channels, *self.grid.shape), len(self.depths), 0
         for count, amplitude in enumerate(self.amplitudes(), 1):
-            if tuple(amplitude.shape) != shape:
-                given = tuple(amplitude.shape)
+            if (given := tuple(amplitude.shape)) != shape:
                 raise ValueError(f"plane {count} of the layers must be (C, h, w) = {shape}, got {given}")
             if count > expected:
                 raise ValueError(f"layers must bring a plane for each of {expected} depths, got more")

@@ -29,13 +29,14 @@ class Step:
     colour: Tensor
 
 
+@dataclass(eq=False)
 class March:
     """Front-to-back compositing of a volume along rays, slab by slab.
 
     Only the rays of ``window`` are followed, which may meet visible voxels. ``visible`` is the range of depths in
     metres that contains visible voxels, rounded outwards to whole bricks, or None without visible voxels.
 
-    Args:
+    Attributes:
         volume: Scalar field.
         place: Position, size and rotation of the volume.
         transfer: Colours and opacities.
@@ -50,27 +51,21 @@ class March:
         ValueError: A voxel is NaN or infinite.
     """
 
-    def __init__(
-        self,
-        volume: Volume,
-        place: Placement,
-        transfer: TransferFunction,
-        lighting: Lighting | None,
-        rays: Rays,
-        depths: Sequence[float],
-        spans: Sequence[tuple[float, float]],
-        observer: float,
-        early: float,
-    ):
-        self.volume, self.place, self.transfer, self.lighting = volume, place, transfer, lighting
-        self.rays, self.depths, self.observer, self.early = rays, depths, observer, early
-        near, far = place.depth_range()
-        self.spans = [(max(low, near) - place.distance, min(high, far) - place.distance) for low, high in spans]
-        self.dtype = transfer.colours.dtype
+    volume: Volume
+    place: Placement
+    transfer: TransferFunction
+    lighting: Lighting | None
+    rays: Rays
+    depths: Sequence[float]
+    spans: Sequence[tuple[float, float]]
+    observer: float
+    early: float
+
+    def __post_init__(self) -> None:
+        volume, place, transfer, rays = self.volume, self.place, self.transfer, self.rays
+        self.dtype, self.device = transfer.colours.dtype, volume.values.device
         if volume.values.is_floating_point():
             self.dtype = torch.promote_types(self.dtype, volume.values.dtype)
-        self.device = volume.values.device
-        self.unit = transfer.unit_distance * max(place.half) * 2  # in metres
         low, high = volume.bricks(BRICK)
         # No voxel is skipped if voxels are optimised, since transparent ones have a gradient as well.
         self.learned = volume.values.requires_grad
@@ -78,8 +73,7 @@ class March:
         box = occupied_box(self.occupied, volume.shape)
         self.visible = place.depth_range(*box) if box is not None else None
         rows, columns = place.footprint(rays, *box) if box is not None else (range(0), range(0))
-        like = torch.empty((), dtype=self.dtype, device=self.device)
-        self.window = Window.of(place, rays, rows, columns, like)
+        self.window = Window.of(place, rays, rows, columns, torch.empty((), dtype=self.dtype, device=self.device))
 
     def steps(self, wanted: Tensor | None = None) -> Iterator[Step]:
         """Yield the contributions of the planes, front to back; planes without a contribution are left out.
@@ -88,50 +82,48 @@ class March:
         """
         if not self.window.size:
             return
-        reader = self._reader()
+        reader, place = self._reader(), self.place
+        unit = self.transfer.unit_distance * max(place.half) * 2  # in metres
+        rotation = torch.tensor(place.rotation, dtype=torch.float64, device=self.device)
+        near, far = place.depth_range()
         transmittance = self.zeros(1)[0] + 1
         if wanted is not None:
             rows, columns = self.window.rows, self.window.columns
             transmittance = transmittance * wanted[rows.start : rows.stop, columns.start : columns.stop].flatten()
         for plane, (low, high) in enumerate(self.spans):
             alive = transmittance.detach() > self.early
-            if low >= high:
-                continue
-            sampled = reader.read(low, high, alive)
+            if not alive.any():
+                return
+            low, high = max(low, near) - place.distance, min(high, far) - place.distance
+            sampled = reader.read(low, high, alive) if low < high else None
             if sampled is None:
-                if not alive.any():
-                    return
                 continue
             colour, opacity = self.transfer(sampled.samples[0])
             if self.lighting is not None:
-                rotation = torch.tensor(self.place.rotation, dtype=torch.float64, device=self.device)
                 colour = self.lighting.shade(colour, sampled.samples[1:], rotation, self.observer)
             before = transmittance.index_select(0, sampled.rays)
-            weight, after = absorb(before, corrected_opacity(opacity, sampled.length * (1 / self.unit)))
+            weight, after = absorb(before, corrected_opacity(opacity, sampled.length * (1 / unit)))
             transmittance.index_copy_(0, sampled.rays, after)
             yield Step(plane, sampled.rays, weight, colour)
 
     def amplitudes(self) -> Iterator[Tensor]:
         """Yield the square root of the radiance, [3, h, w], for every plane."""
+        # A single expanded zero, which takes no memory.
+        dark = torch.zeros((), dtype=self.dtype, device=self.device).expand(3, *self.rays.grid.shape)
         done = 0
         for step in self.steps():
-            yield from (self.empty() for _ in range(done, step.plane))
+            yield from [dark] * (step.plane - done)
             done = step.plane + 1
-            scale = self.rays.scale(self.depths[step.plane])
+            scale, radiance = self.rays.scale(self.depths[step.plane]), step.weight * step.colour
             if scale == 1:
-                yield self._scattered(step.rays, safe_sqrt(step.weight * step.colour))
+                yield self.whole(self.zeros(3).index_copy_(1, step.rays, safe_sqrt(radiance)))
             else:
-                window = self.zeros(3).index_copy(1, step.rays, step.weight * step.colour)
-                yield safe_sqrt(self._resampled(window, scale))
-        yield from (self.empty() for _ in range(done, len(self.depths)))
+                yield safe_sqrt(self._resampled(self.zeros(3).index_copy_(1, step.rays, radiance), scale))
+        yield from [dark] * (len(self.depths) - done)
 
     def zeros(self, channels: int) -> Tensor:
         """Zeros [channels, rays of the window]."""
         return torch.zeros(channels, self.window.size, dtype=self.dtype, device=self.device)
-
-    def empty(self) -> Tensor:
-        """A dark plane [3, h, w] that takes no memory, since it is a single expanded zero."""
-        return torch.zeros((), dtype=self.dtype, device=self.device).expand(3, *self.rays.grid.shape)
 
     def whole(self, values: Tensor) -> Tensor:
         """Values [c, rays of the window] on the grid, [c, h, w], which is zero outside the window."""
@@ -140,15 +132,6 @@ class March:
             return values.new_zeros(len(values), height, width)
         framed = values.unflatten(1, (len(rows), len(columns)))
         return functional.pad(framed, (columns.start, width - columns.stop, rows.start, height - rows.stop))
-
-    def _scattered(self, rays: Tensor, values: Tensor) -> Tensor:
-        """Values [3, n] of rays with flat indices [n] into the window, on the grid, [3, h, w], which is else zero."""
-        (height, width), rows, columns = self.rays.grid.shape, self.window.rows, self.window.columns
-        if len(columns) < width:
-            rays = rays + torch.div(rays, len(columns), rounding_mode="floor") * (width - len(columns))
-        rays = rays + (rows.start * width + columns.start)
-        plane = torch.zeros(3, height * width, dtype=values.dtype, device=values.device)
-        return plane.index_copy_(1, rays, values).unflatten(1, (height, width))
 
     def _reader(self) -> SliceReader | PointReader:
         """Reader of the values and, with lighting, their slopes as further channels."""

@@ -5,7 +5,6 @@ interpolates between two slices that are parallel to the hologram; ``PointReader
 volume.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -111,13 +110,13 @@ class SliceReader:
         depth = (low + high) / 2
         index = min(max(depth / place.spacing[0] + (place.shape[0] - 1) / 2, 0.0), place.shape[0] - 1.0)
         k = min(int(index), max(0, place.shape[0] - 2))
-        band = _true_range(self.occupied[k // BRICK].any(1))
-        if band is None:
+        occupied = self.occupied[k // BRICK].any(1).nonzero()
+        if not len(occupied):
             return None
         scale = self.rays.scale(place.distance + depth)
         first, part = _taps(self.window.down * scale, place.shape[1], place.spacing[1])
         # The index of the voxel rises with the row of the ray, so the rows that meet occupied bricks are one range.
-        limits = first.new_tensor([band.start * BRICK, band.stop * BRICK])
+        limits = first.new_tensor([int(occupied[0]) * BRICK, (int(occupied[-1]) + 1) * BRICK])
         start, stop = (int(row) for row in torch.searchsorted(first, limits))
         if start >= stop:
             return None
@@ -131,7 +130,7 @@ class SliceReader:
         lines = interpolate(plane, left, share, -1)
         first, part = first[start:stop], part[start:stop]
         values = interpolate(lines[:1], first, part, -2).flatten(1)
-        rays = _visible(mask, values[0], self.support)
+        rays = (mask & _visible(values[0], self.support)).nonzero().flatten()
         if not rays.numel():
             return None
         samples = values.index_select(1, rays)
@@ -175,7 +174,7 @@ class PointReader:
         samples = torch.nn.functional.grid_sample(
             self.channels[None], (points / ends).flip(-1)[None, None, None], padding_mode="border", align_corners=True
         )[0, :, 0, 0]
-        kept = _visible(None, samples[0], self.support)
+        kept = _visible(samples[0], self.support).nonzero().flatten()
         if kept.numel() < rays.numel():
             rays, samples = rays[kept], samples.index_select(1, kept)
         return RaySamples(rays, samples, length.index_select(0, rays)) if rays.numel() else None
@@ -191,21 +190,13 @@ class PointReader:
 
 def occupied_box(occupied: Tensor, shape: tuple[int, int, int]) -> tuple[list[float], list[float]] | None:
     """Smallest and largest index coordinates (z, y, x) of the occupied bricks in a volume; None without any."""
-    low, high = [], []
-    for axis, n in enumerate(shape):
-        others = [other for other in range(3) if other != axis]
-        band = _true_range(occupied.any(others[1]).any(others[0]))
-        if band is None:
-            return None
-        low.append(band.start * BRICK if band.start else -0.5)
-        high.append(band.stop * BRICK if band.stop * BRICK < n else n - 0.5)
+    bricks = occupied.nonzero()
+    if not len(bricks):
+        return None
+    first, last = bricks.amin(0).tolist(), bricks.amax(0).tolist()
+    low = [brick * BRICK if brick else -0.5 for brick in first]
+    high = [min((brick + 1) * BRICK, n - 0.5) for brick, n in zip(last, shape, strict=True)]
     return low, high
-
-
-def _true_range(mask: Tensor) -> range | None:
-    """Range from the first to the last true element of ``mask`` [n], or None."""
-    indices = mask.nonzero().flatten().tolist()
-    return range(indices[0], indices[-1] + 1) if indices else None
 
 
 def _taps(offsets: Tensor, count: int, spacing: float) -> tuple[Tensor, Tensor]:
@@ -238,12 +229,7 @@ def _between_rows(lines: Tensor, first: Tensor, share: Tensor, rays: Tensor) -> 
     return torch.lerp(lines.index_select(1, index), lines.index_select(1, following), share)
 
 
-def _visible(mask: Tensor | None, values: Tensor, support: tuple[float, float]) -> Tensor:
-    """Flat indices at which ``mask`` is true and the value lies within ``support``, where opacity is above zero."""
+def _visible(values: Tensor, support: tuple[float, float]) -> Tensor:
+    """Mask of the values within ``support``, beyond which the opacity is zero."""
     low, high = support
-    values = values.detach()
-    if low > -math.inf:
-        mask = values > low if mask is None else mask & (values > low)
-    if high < math.inf:
-        mask = values < high if mask is None else mask & (values < high)
-    return torch.arange(values.numel(), device=values.device) if mask is None else mask.nonzero().flatten()
+    return (values.detach() > low) & (values.detach() < high)

@@ -101,19 +101,17 @@ class DVRSampler(nn.Module):
             ValueError: A voxel is NaN or infinite, or the eye is not in front of the slabs.
         """
         march = self._march(volume)
-        maps = self.phase(self.grid) if self.phase is not None else None
-        common = maps.to(march.device, march.dtype) if isinstance(maps, Tensor) else None
-        per_point = maps if isinstance(maps, PointPhases) else None
-        factors = None if per_point is None else phasor(per_point.phase.to(march.device, march.dtype))
+        phase = self.phase(self.grid) if self.phase is not None else None
+        if not isinstance(phase, PointPhases):
+            common = phase if phase is None else phase.to(march.device, march.dtype)
+            return SourceLayers(self.grid, self.depths, 3, march.amplitudes, common)
+        factors = phasor(phase.phase.to(march.device, march.dtype))
 
         def amplitudes() -> Iterator[Tensor]:
             for plane, amplitude in enumerate(march.amplitudes()):
-                if per_point is None or factors is None:
-                    yield amplitude
-                else:
-                    yield _with_phase(amplitude, per_point.window(factors, plane))
+                yield _with_phase(amplitude, phase.window(factors, plane))
 
-        return SourceLayers(self.grid, self.depths, 3, amplitudes, common)
+        return SourceLayers(self.grid, self.depths, 3, amplitudes)
 
     def render(self, volume: Volume, rays: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Rendered picture of ``volume``: the sum of all contributions along each ray.
@@ -145,7 +143,8 @@ class DVRSampler(nn.Module):
         if not isinstance(volume, Volume):
             raise TypeError(f"volume must be a Volume, got {type(volume).__name__}; use Volume(values, spacing, unit)")
         volume, rotation = upright(volume, self.rotation)
-        place = Placement.of(volume, self.width, self.distance, rotation)
+        scale, (z, y, x) = self.width / max(volume.extent), volume.spacing
+        place = Placement(volume.shape, (z * scale, y * scale, x * scale), self.distance, rotation)
         spans = slabs(self.depths, self.boundaries, place.depth_range())
         near, far = min(span[0] for span in spans), max(span[1] for span in spans)
         first, eye = self.depths[0], self.eye
