@@ -76,9 +76,10 @@ class AxialHologram(LayerHologram):
                 for count, pixels, pitch in zip(shape, self.grid.shape, self.grid.pitch, strict=True)
             ]
             if self.cone == "full" and not all(axis.within_band for axis in axes):
+                least = max(axis.displacement * axis.pitch / axis.steepest for axis in axes)
                 raise ValueError(
-                    f"cone='full' leaves out no light only where every pixel lies within every source's cone, from "
-                    f"{max(axis.displacement * axis.pitch / axis.steepest for axis in axes):.3g} m on for layers of {shape}; "
+                    "cone='full' leaves out no light only where every pixel lies within every source's cone, from "
+                    f"{least:.3g} m on for layers of {shape}; "
                     f"the nearest depth is {min(self.depths):.3g} m: use cone='taper' or ConvolutionHologram"
                 )
             # Of the tolerance, 0.4 is granted to each axis and 0.3 to the nodes; the errors add in quadrature.

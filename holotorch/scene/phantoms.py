@@ -50,7 +50,7 @@ def marschner_lobb(
 def gaussian_ball(
     shape: Shape = 64, *, sigma: float = 0.25, width: float | None = None, dtype: torch.dtype = torch.float32
 ) -> Volume:
-    """f(r) = exp(-r^2 / (2 sigma^2)); its integral along a line at distance b from the centre: sqrt(2 pi) sigma f(b)."""
+    """exp(-r^2 / (2 sigma^2)). The integral along a line is sqrt(2 pi) sigma times the value nearest to the centre."""
     sigma = checks.positive("sigma", sigma)
     return _sampled(lambda z, y, x: torch.exp((z**2 + y**2 + x**2) / (-2 * sigma**2)), shape, width, dtype)
 

@@ -80,18 +80,17 @@ def read_metaimage(path: Path) -> Scan:
     big = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", "False")).lower() == "true"
     dtype = np.dtype((">" if big else "<") + _META_TYPES[kind])
     shape = _whole(fields, "DimSize", 3, path, least=1)[::-1]
-    skip = _whole(fields, "HeaderSize", 1, path, least=-1)[0] if "HeaderSize" in fields else 0
+    skip = _whole(fields, "HeaderSize", 1, path, least=-1, default="0")[0]
     offset = end if name == "LOCAL" else skip
     if fields.get("CompressedData", "False").lower() == "true":
         values = unpacked(data, unzipped(data, stated_bytes(data, shape, dtype), offset), shape, dtype)
     else:
         values = uncompressed(data, shape, dtype, None if skip == -1 else offset)
-    spacing = _numbers(fields, ("ElementSpacing", "ElementSize"), 3, path, default=[])
-    if not spacing:
+    if not {"ElementSpacing", "ElementSize"} & fields.keys():
         return Scan(values)
-    identity = [1.0, 0, 0, 0, 1, 0, 0, 0, 1]
-    rows = _numbers(fields, ("TransformMatrix", "Orientation", "Rotation"), 9, path, default=identity)
-    origin = _numbers(fields, ("Offset", "Position", "Origin"), 3, path, default=[0.0, 0, 0])
+    spacing = _numbers(fields, ("ElementSpacing", "ElementSize"), 3, path)
+    rows = _numbers(fields, ("TransformMatrix", "Orientation", "Rotation"), 9, path, default="1 0 0 0 1 0 0 0 1")
+    origin = _numbers(fields, ("Offset", "Position", "Origin"), 3, path, default="0 0 0")
     axes = np.reshape(rows, (3, 3)) * np.reshape(spacing, (3, 1))
     return placed(values, axes, origin, "m", metres(fields.get("DistanceUnits", "mm"), path))
 
@@ -189,25 +188,25 @@ def _metaimage_header(path: Path) -> tuple[dict[str, str], int]:
         return fields, stream.tell()
 
 
-def _whole(fields: dict[str, str], name: str, count: int, path: Path, *, least: int) -> list[int]:
-    """Whole numbers >= ``least`` of a field that must exist."""
-    numbers = _numbers(fields, (name,), count, path)
+def _whole(
+    fields: dict[str, str], name: str, count: int, path: Path, *, least: int, default: str | None = None
+) -> list[int]:
+    """As :func:`_numbers`, for whole numbers of at least ``least``."""
+    numbers = _numbers(fields, (name,), count, path, default)
     if not all(number.is_integer() and number >= least for number in numbers):
         raise ValueError(f"{path} must give whole numbers from {least} on as {name}, got {fields[name]!r}")
     return [int(number) for number in numbers]
 
 
 def _numbers(
-    fields: dict[str, str], names: Sequence[str], count: int, path: Path, default: list[float] | None = None
+    fields: dict[str, str], names: Sequence[str], count: int, path: Path, default: str | None = None
 ) -> list[float]:
-    """Numbers of the first field of ``names`` that exists, else ``default``; ValueError if that is None."""
-    name = next((name for name in names if name in fields), None)
-    if name is None and default is not None:
-        return default
+    """The ``count`` numbers of the first field of ``names`` that exists, or of ``default``."""
+    text = next((fields[name] for name in names if name in fields), default)
     try:
-        numbers = [float(word) for word in fields[name or names[0]].split()]
-    except (KeyError, ValueError):
+        numbers = [float(word) for word in (text or "").split()]
+    except ValueError:
         numbers = []
     if len(numbers) != count:
-        raise ValueError(f"{path} must give {count} numbers as {names[0]}, got {fields.get(name or names[0])!r}")
+        raise ValueError(f"{path} must give {count} numbers as {names[0]}, got {text!r}")
     return numbers

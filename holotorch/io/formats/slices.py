@@ -44,10 +44,11 @@ def read_folder(folder: Path) -> Scan:
             raise ValueError(f"{folder} holds slice {number} twice: {numbered[number].name} and {path.name}")
         numbered[number] = path
     numbers = range(min(numbered), max(numbered) + 1)
-    missing = [number for number in numbers if number not in numbered]
+    missing = len(numbers) - len(numbered)
     if missing:
+        first = next(number for number in numbers if number not in numbered)
         raise ValueError(
-            f"{folder}: slices {numbers[0]} to {numbers[-1]}, but {len(missing)} missing, the first being {missing[0]}"
+            f"{folder}: slices {numbers[0]} to {numbers[-1]}, but {missing} missing, the first being {first}"
         )
     ordered = [numbered[number] for number in numbers]
     return _stacked((_picture(path) for path in ordered), [str(path) for path in ordered])
