@@ -107,14 +107,8 @@ class AxialHologram(LayerHologram):
     def accumulate(self, planes: Iterable[Tensor], phase: Tensor | None = None) -> Tensor:
         """Field [H, W] of planes [h, w], real or complex, in the order of ``depths``, which must rise or fall.
 
-        The planes are read one after another and not all kept in memory.
-
-        Args:
-            planes: One plane for each depth.
-            phase: Phase in rad, [h, w], that is added to all planes.
-
-        Raises:
-            ValueError: No planes, or depths that neither rise nor fall.
+        The planes are read one after another and not all kept in memory. ``phase`` in rad, [h, w], is added to all of
+        them. ValueError if there is no plane, or if the depths neither rise nor fall.
         """
         total = None
         for j, plane in enumerate(planes):

@@ -38,16 +38,9 @@ def band_limited_wave(
 ) -> Tensor:
     """Spherical wave whose spectrum is limited to frequencies up to 1 / (2 ``pitch``), complex128 [A, B].
 
-    Args:
-        dy: Displacements along y in metres, float64 [A].
-        dx: Displacements along x in metres, float64 [B].
-        pitch: (y, x) in metres, at least 0.9 wavelengths.
-        wavelength: In metres.
-        depth: In metres, above 0.
-        soft: Whether the spectrum ends with the taper of ``cone.taper``, or sharply.
-
-    Raises:
-        ValueError: The depth is so large that the quadrature needs too many nodes.
+    ``dy`` [A] and ``dx`` [B] are displacements in metres, float64. ``pitch`` (y, x) in metres is at least 0.9
+    wavelengths. The spectrum ends with the taper of ``cone.taper`` if ``soft``, else sharply. ValueError if ``depth``
+    in metres is so large that the quadrature needs too many nodes.
     """
     fy, fx = (
         _nodes(displacement, step, wavelength, depth, soft) for displacement, step in zip((dy, dx), pitch, strict=True)

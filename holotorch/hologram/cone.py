@@ -63,19 +63,12 @@ def cone_samples(grid: Grid, wavelength: float, depth: float) -> tuple[float, fl
 
 
 def spherical_wave(dy: Tensor, dx: Tensor, pitch: tuple[float, float], wavelength: float, depth: float, cone: Cone):
-    """exp(i k r) / r within the cone, at displacements in metres.
+    """exp(i k r) / r within the cone, with r^2 = ``depth``^2 + ``dy``^2 + ``dx``^2, complex128 of the broadcast shape.
 
-    Args:
-        dy: Displacements along y, float64, any shape.
-        dx: Displacements along x, float64, any shape that broadcasts with ``dy``.
-        pitch: Pitch (y, x) of the hologram in metres, which defines the cone.
-        wavelength: In metres.
-        depth: z > 0 in metres; r^2 = z^2 + dy^2 + dx^2.
-        cone: "full", "box" or "disc"; for "taper" and "band" see ``band_limited_wave``.
-
-    Returns:
-        complex128 of the broadcast shape. k r is computed as k z + k s / (r + z) with s = dy^2 + dx^2, to avoid the
-        cancellation of r - z, and whole cycles of k z are removed in float64.
+    All lengths are in metres; the displacements ``dy`` and ``dx`` are float64. ``pitch`` (y, x) defines the width of
+    the cone, which is "full", "box" or "disc"; for "taper" and "band" see ``band_limited_wave``. With z = ``depth`` and
+    s = dy^2 + dx^2, k r is computed as k z + k s / (r + z), to avoid the cancellation of r - z, and whole cycles of k z
+    are removed in float64.
     """
     square = dy.square() + dx.square()
     distance = torch.sqrt(depth**2 + square)

@@ -54,15 +54,10 @@ class LayerHologram(nn.Module):
         return linear(layers, *self._maps((layers.shape[-2], layers.shape[-1])))
 
     def adjoint(self, field: Tensor, shape: tuple[int, int] | None = None) -> Tensor:
-        """Apply the conjugate transpose to a field [..., H, W].
+        """Conjugate transpose: layers [..., D, h, w] from a complex field [..., H, W] on the grid of the hologram.
 
-        Args:
-            field: Complex field on the grid of the hologram.
-            shape: Number of sources (h, w) of a layer; by default the number of pixels along each axis divided by
-                ``stride`` and rounded up.
-
-        Returns:
-            Layers [..., D, h, w].
+        ``shape`` is the number of sources (h, w) of a layer; by default the number of pixels along each axis divided by
+        ``stride`` and rounded up.
         """
         checks.field("field", field, self.grid.shape)
         height, width = shape or (-(-n // self.stride) for n in self.grid.shape)

@@ -82,16 +82,11 @@ class DirectHologram(LayerHologram):
     def _row_matrices(
         self, depth: float, shape: Sequence[int], columns: tuple[int, int], positions: Tensor
     ) -> Iterator[tuple[int, Tensor]]:
-        """Yield the waves between a row of sources and a row of pixels, for each distance of the two rows.
+        """Yield each distance of a source row and a pixel row in samples, and the waves from one to the other.
 
-        Args:
-            depth: In metres.
-            shape: Number of sources (h, w) of a plane.
-            columns: First source column, and the column after the last.
-            positions: Index of the pixel row at the position of each source row.
-
-        Yields:
-            Distance of the rows in samples, and the waves complex128 [columns, W], from the last column to the first.
+        The waves are complex128 [columns, W], for the source columns from the last to the first. ``shape`` (h, w) is
+        the number of sources of a plane, ``columns`` the first column and the one after the last, ``positions`` the
+        index of the pixel row at each source row.
         """
         (height, width), stride = self.grid.shape, self.stride
         low, high = columns

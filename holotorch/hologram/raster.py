@@ -12,14 +12,9 @@ from holotorch.core.grid import Grid
 class Raster:
     """A periodic array of samples at the pixel pitch, which holds both the sources of a layer and the pixels.
 
-    The sources begin at sample 0 and lie ``stride`` samples apart. Their spectrum therefore has the period
-    (N_y / stride, N_x / stride), and an FFT of that size suffices.
-
-    Args:
-        grid: Pixels of the hologram.
-        shape: Number of sources (h, w) of a layer.
-        stride: Distance between neighbouring sources in pixels.
-        size: Number of samples (N_y, N_x) of the array, multiples of ``stride``.
+    ``grid`` holds the pixels, ``shape`` is the number of sources (h, w) and ``size`` the number of samples (N_y, N_x),
+    multiples of ``stride``. The sources begin at sample 0 and lie ``stride`` samples apart. Their spectrum therefore
+    has the period (N_y / stride, N_x / stride), and an FFT of that size suffices.
     """
 
     def __init__(self, grid: Grid, shape: tuple[int, int], stride: int, size: tuple[int, int]):

@@ -23,15 +23,9 @@ def extinction(opacity: Tensor) -> Tensor:
 def corrected_opacity(opacity: Tensor, length: Tensor | float) -> Tensor:
     """Opacity 1 - (1 - opacity)^length of a step, from the opacity per unit distance.
 
-    Through a homogeneous medium the total opacity then does not depend on the number of steps. The power is computed by
-    :func:`extinction`, since its gradient is infinite at opacity 1 for a length below 1.
-
-    Args:
-        opacity: In [0, 1], any shape.
-        length: Length of the step in unit distances, >= 0, any shape that broadcasts with ``opacity``.
-
-    Returns:
-        Values in [0, 1) of the broadcast shape.
+    ``opacity`` in [0, 1] and ``length`` >= 0, in unit distances, have any shapes that broadcast; the result is in
+    [0, 1). Through a homogeneous medium the total opacity does not depend on the number of steps. The power is computed
+    by :func:`extinction`, since its gradient is infinite at opacity 1 for a length below 1.
     """
     return -torch.expm1(extinction(opacity) * -length)
 

@@ -50,13 +50,10 @@ class Lighting:
             raise ValueError(f"shininess must be at least 1, got {self.shininess}")
 
     def shade(self, colour: Tensor, slopes: Tensor, rotation: Tensor, observer: float) -> Tensor:
-        """Shaded colour [3, n] of n points.
+        """Shaded colour [3, n] of n points from their ``colour`` without lighting, [3, n].
 
-        Args:
-            colour: Red, green and blue without lighting, [3, n].
-            slopes: Result of :func:`slopes` at the points, along the axes (z, y, x) of the volume, [3, n].
-            rotation: Rotation [3, 3] from the axes (z, y, x) of the volume to those of the scene.
-            observer: -1 if the observer is on the side of lower z, else 1.
+        ``slopes`` [3, n] are those of :func:`slopes` along the axes (z, y, x) of the volume, ``rotation`` [3, 3] leads
+        from these axes to those of the scene. ``observer`` is -1 if the observer is on the side of lower z, else 1.
         """
         light = rotation.new_tensor(self.towards)
         light = (light / light.norm()) @ rotation

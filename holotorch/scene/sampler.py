@@ -114,14 +114,9 @@ class DVRSampler(nn.Module):
         return SourceLayers(self.grid, self.depths, 3, amplitudes)
 
     def render(self, volume: Volume, rays: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Rendered picture of ``volume``: the sum of all contributions along each ray.
+        """Picture of ``volume``: red, green and blue [3, h, w], and opacity [h, w], summed along each ray.
 
-        Args:
-            volume: Scalar field.
-            rays: Mask of the rays to follow, bool [h, w], by default all; the other pixels stay black.
-
-        Returns:
-            Red, green, blue [3, h, w], and opacity [h, w]: 1 minus the transmittance behind the last plane.
+        ``rays``, bool [h, w], masks the rays that are followed, by default all; the other pixels stay black.
         """
         march = self._march(volume)
         image, opacity = march.zeros(3), march.zeros(1)

@@ -125,10 +125,8 @@ def _slicer(content: dict[str, Any]) -> tuple[Curve, Curve]:
     steep = _points(f"{where}.gradientOpacity", component, "y") if component.get("gradientOpacity") else []
     if not component.get("disableGradientOpacity") and any(value != [1.0] for _, _, value, _, _ in steep):
         raise ValueError(f"{where}.gradientOpacity must be 1 throughout: opacity here depends on the value alone")
-    return (
-        _curve(f"{where}.rgbTransferFunction", _points(f"{where}.rgbTransferFunction", component, "color")),
-        _curve(f"{where}.scalarOpacity", _points(f"{where}.scalarOpacity", component, "y")),
-    )
+    colours, opacities = f"{where}.rgbTransferFunction", f"{where}.scalarOpacity"
+    return _curve(colours, _points(colours, component, "color")), _curve(opacities, _points(opacities, component, "y"))
 
 
 def _points(where: str, component: dict[str, Any], key: str) -> list[Point]:
@@ -152,8 +150,7 @@ def _points(where: str, component: dict[str, Any], key: str) -> list[Point]:
 
 def _curve(where: str, points: list[Point]) -> Curve:
     """Rising positions and their values, with an additional point where a midpoint is not half-way."""
-    positions: list[float] = []
-    values: list[list[float]] = []
+    positions, values = list[float](), list[list[float]]()
     for k, (name, x, value, middle, sharp) in enumerate(points):
         # The transfer function stores float32, in which positions must still be distinct.
         x = float(np.float32(x))

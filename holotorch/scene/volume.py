@@ -38,7 +38,17 @@ class Volume:
     orientation: tuple[Triple, Triple, Triple] = IDENTITY
 
     def __post_init__(self) -> None:
-        _check_values(self.values)
+        values = self.values
+        if not isinstance(values, Tensor):
+            raise TypeError(f"volume values must be a torch.Tensor, got {type(values).__name__}; use torch.from_numpy")
+        if values.is_complex() or values.dtype in (torch.bool, torch.uint64):
+            raise TypeError(
+                f"volume values must be real numbers, got {values.dtype}; convert them, for instance to float32"
+            )
+        if values.ndim != 3:
+            raise ValueError(f"volume values must have three axes (z, y, x), got shape {tuple(values.shape)}")
+        if not values.numel():
+            raise ValueError(f"volume must hold at least one voxel, got shape {tuple(values.shape)}")
         if self.unit not in ("m", "relative"):
             raise ValueError(
                 f"volume unit must be 'm' or 'relative', got {self.unit!r}; convert other lengths to metres"
@@ -126,19 +136,6 @@ class Volume:
 def _comparable(values: Tensor) -> Tensor:
     """``values`` in a type that torch can compare."""
     return values.to(torch.int64) if values.dtype in (torch.uint16, torch.uint32) else values
-
-
-def _check_values(values: Tensor) -> None:
-    if not isinstance(values, Tensor):
-        raise TypeError(f"volume values must be a torch.Tensor, got {type(values).__name__}; use torch.from_numpy")
-    if values.is_complex() or values.dtype in (torch.bool, torch.uint64):
-        raise TypeError(
-            f"volume values must be real numbers, got {values.dtype}; convert them, for instance to float32"
-        )
-    if values.ndim != 3:
-        raise ValueError(f"volume values must have three axes (z, y, x), got shape {tuple(values.shape)}")
-    if not values.numel():
-        raise ValueError(f"volume must hold at least one voxel, got shape {tuple(values.shape)}")
 
 
 def _triple(name: str, values: Sequence[float]) -> Triple:

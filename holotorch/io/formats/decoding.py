@@ -77,9 +77,7 @@ def picture_size(path: Path, data: bytes) -> tuple[int, int]:
 def check_exr(path: Path, *, memory: int) -> None:
     """Raise ValueError for an EXR file that is damaged or needs more memory than the limit.
 
-    Args:
-        path: Path of the file.
-        memory: Bytes per pixel that the caller needs in addition to 4 bytes for each channel of the file.
+    ``memory`` is the number of bytes per pixel that the caller needs besides 4 bytes for each channel of the file.
     """
     import OpenEXR
 

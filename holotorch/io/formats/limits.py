@@ -17,14 +17,9 @@ _CHUNK = 1 << 20  # bytes decompressed at once
 
 
 def affordable(source: Path | str, needed: int, stored: int) -> None:
-    """Raise ValueError if a file needs more memory than is plausible for its size.
+    """Raise ValueError if the file ``source`` of ``stored`` bytes needs implausibly many bytes of memory to be read.
 
     The limit is :data:`MEMORY_LIMIT` bytes or :data:`RATIO` times the file's size, whichever is more.
-
-    Args:
-        source: Name of the file.
-        needed: Memory for reading the file in bytes.
-        stored: Size of the file in bytes.
     """
     try:
         limit = float(os.environ.get(VARIABLE, MEMORY_LIMIT))
@@ -44,16 +39,10 @@ def readable_at_once(size: int) -> bool:
 
 
 def unzipped(path: Path, size: int, offset: int = 0, *, kind: str = "gzip") -> bytearray:
-    """Decompress a file from ``offset`` on. Content shorter than ``size`` bytes is returned without an error.
+    """Decompress a file from byte ``offset`` on, to at most ``size`` bytes as stated by a header.
 
-    Args:
-        path: Path of the file.
-        size: Expected size of the content in bytes, usually stated by a header; decompression stops beyond it.
-        offset: Position in the file, in bytes, at which the compressed data begin.
-        kind: "gzip", which also accepts zlib streams, or "bzip2". The content of concatenated members is joined.
-
-    Raises:
-        ValueError: The data are damaged or cut short, have more than ``size`` bytes, or exceed the memory limit.
+    ``kind`` is "gzip", which also accepts zlib streams, or "bzip2". The content of concatenated members is joined.
+    ValueError if the data are damaged or cut short, have more than ``size`` bytes, or exceed the memory limit.
     """
     affordable(path, size, path.stat().st_size)
     content = bytearray()
