@@ -69,7 +69,7 @@ def plan_hologram(
     dtype: torch.dtype = torch.complex64,
     memory_limit: int | None = None,
 ) -> HologramPlan:
-    """Choose the method for a hologram of planes with h x w sources each.
+    """Choose the cheapest method for a hologram of planes with h x w sources each, within tolerance and memory limit.
 
     Args:
         grid: Pixels of the hologram.
@@ -77,11 +77,11 @@ def plan_hologram(
         depths: Distances of the planes from the hologram in metres, above 0.
         shape: Number of sources (h, w) of a plane. It need only cover the part of the scene that is not dark.
         stride: Distance between neighbouring sources in pixels.
-        tolerance: Largest permitted relative L2 error.
+        tolerance: Largest permitted relative L2 error of the field.
         cone: Definition of the waves; only methods that compute this wave are considered. The default is "taper", which
             is the cheapest and rings least, or "box" at pitches below 0.9 wavelengths. If the plan's ``near`` is False,
             all definitions but "band" give the same field within the tolerance.
-        dtype: Type of the field, complex64 or complex128.
+        dtype: dtype of the field, complex64 or complex128.
         memory_limit: Largest permitted extra memory in bytes; None for no limit.
 
     Raises:
@@ -107,17 +107,15 @@ def plan_hologram(
             f"no method reaches a tolerance of {tolerance:.1e} for cone={asked!r}: {best['method']} comes to "
             f"{best['predicted_error']:.1e}; use cone='taper' or a larger tolerance"
         )
-    ordered = sorted(adequate, key=lambda method: method["flops"])
-    if memory_limit is not None:
-        fitting = [method for method in ordered if method["memory_bytes"] <= memory_limit]
-        if not fitting:
-            least = min(method["memory_bytes"] for method in ordered)
-            raise ValueError(
-                f"the hologram needs {least / 1e9:.2f} GB and {memory_limit / 1e9:.2f} GB are allowed; use fewer "
-                "pixels or a larger tolerance"
-            )
-        ordered = fitting
-    best = ordered[0]
+    limit = math.inf if memory_limit is None else memory_limit
+    fitting = [method for method in adequate if method["memory_bytes"] <= limit]
+    if not fitting:
+        least = min(method["memory_bytes"] for method in adequate)
+        raise ValueError(
+            f"the hologram needs {least / 1e9:.2f} GB and {limit / 1e9:.2f} GB are allowed; use fewer pixels or a "
+            "larger tolerance"
+        )
+    best = min(fitting, key=lambda method: method["flops"])
     runner_up = "no other method computes this cone of light"
     for other in methods:
         if other is not best:
@@ -149,6 +147,7 @@ def _transform(samples: float) -> float:
 
 
 def _convolution(operator: ConvolutionHologram, shape: tuple[int, int], dtype: torch.dtype) -> dict:
+    """Attributes of a :class:`HologramPlan` that depend on the operator."""
     size, count = operator.padded(shape), len(operator.depths)
     samples, sources = math.prod(size), math.prod(size) / operator.stride**2
     waves = [math.prod(operator.kernel_samples(depth, shape, size)) for depth in operator.depths]
@@ -171,6 +170,7 @@ def _convolution(operator: ConvolutionHologram, shape: tuple[int, int], dtype: t
 
 
 def _axial(operator: AxialHologram, shape: tuple[int, int], dtype: torch.dtype) -> dict:
+    """As :func:`_convolution`."""
     design = operator.design(shape)
     samples, sources = math.prod(design.size), math.prod(design.size) / operator.stride**2
     nodes, planes = design.nodes.count, len(operator.depths)

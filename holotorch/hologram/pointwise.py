@@ -17,9 +17,9 @@ class DirectHologram(LayerHologram):
     """E(x) = sum_v A(v) exp(i phi(v)) exp(i k r) / r, thesis Eq. 5.1 and Algorithm 4, pair by pair in float64.
 
     Here v runs over the sources and r is the distance from source v to the pixel at x. Sources lie on a raster, so all
-    pairs with the same displacement share one value of the spherical wave: the matrix of the waves between two rows
-    serves all rows of sources and pixels at the same distance. There is no FFT, no wrap-around and no approximation.
-    Rows and columns of dark sources, and rows of pixels outside the cone, are skipped.
+    pairs with the same displacement share one value of the spherical wave. The waves from a row of sources to a row of
+    pixels form a matrix, which serves all pairs of rows at the same distance. There is no FFT, no wrap-around and no
+    approximation. Rows and columns of dark sources, and rows of pixels outside the cone, are skipped.
 
     Arguments and exceptions as for :class:`LayerHologram`. The waves of ``cone`` "taper" and "band" are integrated over
     frequency, exact to 1e-8.
@@ -48,10 +48,9 @@ class DirectHologram(LayerHologram):
                 low, high = int(columns[0]), int(columns[-1]) + 1
                 sources = plane[rows, low:high].flip(-1)
                 positions = self._positions(plane.shape[0], 0, rows.device)[rows]
-                for offset, matrix in self._row_matrices(depth, plane.shape, (low, high), positions):
+                for targets, matrix in self._row_matrices(depth, plane.shape, (low, high), positions):
                     product = sources @ matrix
-                    for sign in (1, -1) if offset else (1,):
-                        inside, target = self._rows_at(positions + sign * offset)
+                    for inside, target in targets:
                         field.index_add_(0, target, product[inside])
         return out.to(layers.dtype)
 
@@ -61,10 +60,9 @@ class DirectHologram(LayerHologram):
         for item, layers in zip(field.to(out.dtype), out, strict=True):
             for plane, depth in zip(layers, self.depths, strict=True):
                 back = torch.zeros_like(plane)
-                for offset, matrix in self._row_matrices(depth, shape, (0, shape[1]), positions):
+                for targets, matrix in self._row_matrices(depth, shape, (0, shape[1]), positions):
                     received = item.new_zeros(shape[0], self.grid.shape[1])
-                    for sign in (1, -1) if offset else (1,):
-                        inside, target = self._rows_at(positions + sign * offset)
+                    for inside, target in targets:
                         received[inside] += item[target]
                     back += received @ matrix.mH
                 plane.copy_(back.flip(-1))
@@ -74,19 +72,15 @@ class DirectHologram(LayerHologram):
         """Index of the pixel at each of the ``sources`` along an axis; may lie outside the hologram."""
         return (torch.arange(sources, device=device) - sources // 2) * self.stride + self.grid.shape[axis] // 2
 
-    def _rows_at(self, target: Tensor) -> tuple[Tensor, Tensor]:
-        """Mask of the elements of ``target`` that are pixel rows of the hologram, and these elements."""
-        inside = (target >= 0) & (target < self.grid.shape[0])
-        return inside, target[inside]
-
     def _row_matrices(
         self, depth: float, shape: Sequence[int], columns: tuple[int, int], positions: Tensor
-    ) -> Iterator[tuple[int, Tensor]]:
-        """Yield each distance of a source row and a pixel row in samples, and the waves from one to the other.
+    ) -> Iterator[tuple[list[tuple[Tensor, Tensor]], Tensor]]:
+        """For each distance of a source row and a pixel row, yield these pairs of rows, and the waves between them.
 
-        The waves are complex128 [columns, W], for the source columns from the last to the first. ``shape`` (h, w) is
-        the number of sources of a plane, ``columns`` the first column and the one after the last, ``positions`` the
-        index of the pixel row at each source row.
+        The pairs are given for both directions, as a mask of source rows and the indices of their pixel rows. The waves
+        are complex128 [columns, W], from the last source column to the first. ``shape`` (h, w) is the number of sources
+        of a plane, ``columns`` the first column and the one after the last, ``positions`` the index of the pixel row at
+        each source row.
         """
         (height, width), stride = self.grid.shape, self.stride
         low, high = columns
@@ -100,7 +94,10 @@ class DirectHologram(LayerHologram):
         for offset in range(farthest + 1):
             wave = wave_row(offset)[index.abs()]
             if wave.any():
-                yield offset, wave.as_strided((high - low, width), (stride, 1)).clone()
+                targets = [positions + offset, positions - offset] if offset else [positions]
+                masks = [(target >= 0) & (target < height) for target in targets]
+                pairs = [(mask, target[mask]) for mask, target in zip(masks, targets, strict=True)]
+                yield pairs, wave.as_strided((high - low, width), (stride, 1)).clone()
 
     def _wave_rows(self, depth: float, rows: int, columns: int, device: torch.device) -> Callable[[int], Tensor]:
         """Function that returns, for a row distance in samples, the wave at column distances 0 to ``columns``."""

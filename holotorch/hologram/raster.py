@@ -20,7 +20,7 @@ class Raster:
     def __init__(self, grid: Grid, shape: tuple[int, int], stride: int, size: tuple[int, int]):
         self.grid, self.shape, self.stride, self.size = grid, shape, stride, size
         self.period = size[0] // stride, size[1] // stride
-        # Sample of the first pixel along each axis.
+        # Index of the sample at the first pixel, along each axis.
         self.first = [
             (count // 2 * stride - pixels // 2) % length
             for count, pixels, length in zip(shape, grid.shape, size, strict=True)
@@ -58,13 +58,13 @@ class Raster:
         return fft2(padded) * (1 / math.prod(self.size))
 
     def layer(self, spectrum: Tensor) -> Tensor:
-        """Adjoint of :meth:`spectrum` repeated to all of [N_y, N_x]: a layer [h, w] from a whole spectrum."""
+        """Adjoint of :meth:`spectrum` with repetition of its period: a layer [h, w] from a whole spectrum."""
         folded = self.tiles(spectrum).sum((0, 2))
         return ifft2(folded, self.shape) * math.prod(self.period)
 
 
 def span(grid: Grid, shape: tuple[int, int], stride: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Largest displacement from a source to a pixel, and extent of the wider of the two, each (y, x) in samples."""
+    """Largest displacement from a source to a pixel, and larger extent of sources or pixels, each (y, x) in samples."""
     displacement, extent = [], []
     for count, pixels in zip(shape, grid.shape, strict=True):
         before, after = count // 2 * stride, (count - 1 - count // 2) * stride
