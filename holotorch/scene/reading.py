@@ -43,7 +43,7 @@ class Window:
         entry: Depth at which each ray enters the box, in metres from its centre, [h, w]; None if all rays are parallel
             to the axis and pass through the front and the back face.
         exit: Depth at which each ray leaves the box, as ``entry``.
-        oblique: Path length per depth, [h, w], or None for 1.
+        oblique: Length of the path of each ray per metre of depth, [h, w], or None for 1.
     """
 
     rows: range
@@ -114,7 +114,7 @@ class SliceReader:
         if not len(occupied):
             return None
         scale = self.rays.scale(place.distance + depth)
-        first, part = _taps(self.window.down * scale, place.shape[1], place.spacing[1])
+        first, row_weight = _taps(self.window.down * scale, place.shape[1], place.spacing[1])
         # The index of the voxel rises with the row of the ray, so the rows that meet occupied bricks are one range.
         limits = first.new_tensor([int(occupied[0]) * BRICK, (int(occupied[-1]) + 1) * BRICK])
         start, stop = (int(row) for row in torch.searchsorted(first, limits))
@@ -124,18 +124,18 @@ class SliceReader:
         mask = alive[start * width : stop * width]
         if isinstance(length, Tensor):
             mask = mask & (length > 0).flatten()
-        left, share = _taps(self.window.across * scale, place.shape[2], place.spacing[2])
+        left, column_weight = _taps(self.window.across * scale, place.shape[2], place.spacing[2])
         plane = self.channels(k)
         plane = plane if index == k else torch.lerp(plane, self.channels(k + 1), index - k)
-        lines = interpolate(plane, left, share, -1)
-        first, part = first[start:stop], part[start:stop]
-        values = interpolate(lines[:1], first, part, -2).flatten(1)
+        lines = interpolate(plane, left, column_weight, -1)
+        first, row_weight = first[start:stop], row_weight[start:stop]
+        values = interpolate(lines[:1], first, row_weight, -2).flatten(1)
         rays = (mask & _visible(values[0], self.support)).nonzero().flatten()
         if not rays.numel():
             return None
         samples = values.index_select(1, rays)
         if len(lines) > 1:
-            samples = torch.cat([samples, _between_rows(lines[1:], first, part, rays)])
+            samples = torch.cat([samples, _between_rows(lines[1:], first, row_weight, rays)])
         length = length.flatten().index_select(0, rays) if isinstance(length, Tensor) else length
         return RaySamples(rays + start * width, samples, length)
 
@@ -206,27 +206,27 @@ def _taps(offsets: Tensor, count: int, spacing: float) -> tuple[Tensor, Tensor]:
     return first, index - first
 
 
-def interpolate(values: Tensor, first: Tensor, share: Tensor, axis: int) -> Tensor:
+def interpolate(values: Tensor, first: Tensor, weight: Tensor, axis: int) -> Tensor:
     """Linear interpolation along ``axis`` (-2 or -1) to n positions, between the samples ``first`` and ``first`` + 1.
 
-    ``share`` [n] is the weight of the second of the two.
+    ``weight`` [n] is the weight of the second of the two.
     """
     one = values.index_select(axis, first)
     if values.shape[axis] == 1:
         return one
     other = values.index_select(axis, first + 1)
-    share = share.to(values.dtype)
-    return torch.lerp(one, other, share[:, None] if axis == -2 else share)
+    weight = weight.to(values.dtype)
+    return torch.lerp(one, other, weight[:, None] if axis == -2 else weight)
 
 
-def _between_rows(lines: Tensor, first: Tensor, share: Tensor, rays: Tensor) -> Tensor:
+def _between_rows(lines: Tensor, first: Tensor, weight: Tensor, rays: Tensor) -> Tensor:
     """As :func:`interpolate` along axis -2 of ``lines`` [c, H, w], only for m rays given by flat indices: [c, m]."""
     width = lines.shape[2]
     row = torch.div(rays, width, rounding_mode="floor")
     index = rays + (first.index_select(0, row) - row) * width
     following = index + width if lines.shape[1] > 1 else index
-    lines, share = lines.flatten(1), share.to(lines.dtype).index_select(0, row)
-    return torch.lerp(lines.index_select(1, index), lines.index_select(1, following), share)
+    lines, weight = lines.flatten(1), weight.to(lines.dtype).index_select(0, row)
+    return torch.lerp(lines.index_select(1, index), lines.index_select(1, following), weight)
 
 
 def _visible(values: Tensor, support: tuple[float, float]) -> Tensor:

@@ -2,7 +2,6 @@
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -27,22 +26,18 @@ def read_npz(path: Path, member: str | None = None) -> Scan:
     with archive:
         name = chosen(archive.files, member, path)
         with readable(path, ".npz archive"):
-            _check_member(path, archive, name)
+            # The stated size is checked before numpy allocates memory for it.
+            entry = next(item for item in archive.zip.infolist() if item.filename in (name, f"{name}.npy"))
+            with archive.zip.open(entry) as stream:
+                version = np.lib.format.read_magic(stream)
+                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+                shape, _, dtype = read(stream)
+                stated, present = math.prod(shape) * dtype.itemsize, entry.file_size - stream.tell()
+            if stated != present:
+                raise ValueError(f"its array {name} states {stated} bytes and holds {present}")
+            affordable(path, stated, path.stat().st_size)
             values = archive[name]
     return Scan(three_axes(values, path))
-
-
-def _check_member(path: Path, archive: Any, name: str) -> None:
-    """Raise ValueError if an array states another size than its data have, before numpy allocates memory."""
-    entry = next(item for item in archive.zip.infolist() if item.filename in (name, f"{name}.npy"))
-    with archive.zip.open(entry) as stream:
-        version = np.lib.format.read_magic(stream)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(stream)
-        stated, present = math.prod(shape) * dtype.itemsize, entry.file_size - stream.tell()
-    if stated != present:
-        raise ValueError(f"its array {name} states {stated} bytes and holds {present}")
-    affordable(path, stated, path.stat().st_size)
 
 
 def read_hdf5(path: Path, member: str | None = None) -> Scan:

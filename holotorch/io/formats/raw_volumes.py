@@ -74,7 +74,7 @@ def read_metaimage(path: Path) -> Scan:
     if fields.get("BinaryData", "True").lower() != "true":
         raise ValueError(f"{path} holds its voxels as text; write it with BinaryData = True")
     name, kind = fields["ElementDataFile"], fields.get("ElementType")
-    data = path if name == "LOCAL" else _data_file(path, name)
+    data = path if name == "LOCAL" else named(path, name)
     if kind not in _META_TYPES:
         raise ValueError(f"{path} has ElementType = {kind}; known are {', '.join(_META_TYPES)}")
     big = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", "False")).lower() == "true"
@@ -118,7 +118,7 @@ def read_nrrd(path: Path) -> Scan:
 def _nrrd_values(path: Path, header: dict[str, Any], shape: list[int], end: int) -> np.ndarray:
     encoding, dtype = header["encoding"].lower(), _nrrd_type(path, header)
     name = header.get("data file", header.get("datafile"))
-    data = _data_file(path, name) if name else path
+    data = named(path, name) if name else path
     with open(data, "rb") as stream:
         stream.seek(0 if name else end)
         for _ in range(int(header.get("line skip", header.get("lineskip", 0)))):
@@ -165,13 +165,6 @@ def _nrrd_placed(values: np.ndarray, header: dict[str, Any], path: Path) -> Scan
     origin = np.asarray(header.get("space origin", [0.0, 0, 0]), dtype=np.float64)
     origin = np.where(np.isfinite(origin), origin, 0) * scale
     return placed(values, axes * scale, origin, "m" if units else "relative")
-
-
-def _data_file(header: Path, name: str) -> Path:
-    """Path of the data file that a header names."""
-    if name.split()[:1] == ["LIST"] or "%" in name:
-        raise ValueError(f"{header} lists one file per slice; load the folder of the slices instead")
-    return named(header, name)
 
 
 def _metaimage_header(path: Path) -> tuple[dict[str, str], int]:

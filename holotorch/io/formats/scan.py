@@ -45,22 +45,18 @@ class Scan:
 def metres(unit: str, path: Path) -> float:
     """Length in metres of a ``unit`` that is named in the file at ``path``; ValueError if it is unknown."""
     name = unit.strip().lower()
-    if name not in _METRES:
-        name = name.removesuffix("s")
-    if name not in _METRES:
+    length = _METRES.get(name) or _METRES.get(name.removesuffix("s"))
+    if length is None:
         raise ValueError(f"{path} gives its spacing in {unit!r}; known are {', '.join(_METRES)}; pass spacing= instead")
-    return _METRES[name]
+    return length
 
 
 def placed(values: np.ndarray, axes: Any, origin: Any, unit: str, scale: float = 1.0) -> Scan:
-    """Scan of ``values`` from geometry in the order (x, y, z), without it if a step has length 0 or is not finite.
+    """Scan of ``values`` [D, H, W] from geometry in the order (x, y, z) and in a unit of ``scale`` ``unit``.
 
-    Args:
-        values: Voxels [D, H, W].
-        axes: Steps from one voxel to the next along x, y and z, as rows with components (x, y, z), [3, 3].
-        origin: Position (x, y, z) of the first voxel.
-        unit: "m" or "relative".
-        scale: Length of the file's unit in ``unit``.
+    The rows of ``axes`` [3, 3] are the steps from one voxel to the next along x, y and z, with components (x, y, z).
+    ``origin`` is the position (x, y, z) of the first voxel. A step that is not finite or of length 0 gives a scan
+    without geometry.
     """
     steps = np.asarray(axes, dtype=np.float64)[::-1, ::-1]
     lengths = np.linalg.norm(steps, axis=1)
@@ -103,6 +99,8 @@ def named(header: Path, name: str) -> Path:
         ValueError: The data file is missing, empty or no file; or it lies outside the folder, since a header from
             someone else must not choose which of the user's files are read.
     """
+    if name.split()[:1] == ["LIST"] or "%" in name:
+        raise ValueError(f"{header} lists one file per slice; load the folder of the slices instead")
     path = header.parent / name
     if not path.resolve().is_relative_to(header.parent.resolve()):
         raise ValueError(
