@@ -20,7 +20,7 @@ from holotorch.hologram.raster import Raster, has_light
 from holotorch.hologram.transfer import AxialDesign
 from holotorch.optics.free_space.padding import FINEST
 
-_GROUP = 16  # number of planes spread onto the nodes by one matrix product
+_GROUP = 16  # most planes that one matrix product spreads onto the nodes
 
 
 class AxialHologram(LayerHologram):
@@ -230,7 +230,7 @@ class Accumulator:
         if not self.block.is_complex():
             # Real planes: rows hold real and imaginary parts alternately.
             spread = torch.view_as_real(spread).movedim(-1, 1).flatten(0, 1)
-        # A batch of products, one per row of the planes, since one product would first copy them to another order.
+        # A batch of products, one per row of the planes: for a single product torch would first reorder them in memory.
         self.block.baddbmm_(spread.to(self.block).expand(height, -1, -1), planes.to(self.block.dtype))
 
     def _close(self, nodes: set[int]) -> None:

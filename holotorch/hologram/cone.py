@@ -7,7 +7,7 @@ aliases. The option ``cone`` of every hologram defines which part of the wave is
 - ``full``: the whole wave. It aliases where the cone is narrower than the hologram (Algorithm 4 as printed).
 - ``box``: a sharp pyramid in space, |x| <= z tan(theta) and |y| <= z tan(theta), the thesis's K_z of Sec. 5.6.1.
 - ``disc``: a sharp cone in space with the same half-widths, which is elliptical where the pitches differ.
-- ``band``: the spectrum is cut off sharply at 1 / (2 p) along each axis. No light of the grid's band is lost.
+- ``band``: the spectrum is cut off sharply at 1 / (2 p) along each axis, so all light that the pixels sample is kept.
 - ``taper``: the spectrum falls to 0 over the last 30 % of the frequencies of each axis, to suppress ringing.
 
 If every pixel lies well inside the cone of every source, ``full``, ``box``, ``disc`` and ``taper`` agree;
@@ -43,7 +43,7 @@ def taper_margin(half_width: float, error: float) -> float:
     The taper has two edges, at 0.7 and 1 times the highest frequency, where its second derivative jumps. In the wave
     of a cone of ``half_width`` samples this causes ringing around the positions that light of these two frequencies
     reaches. At n samples from such a position the relative amplitude of the ringing is about 2 sqrt(K) / n^3 with
-    K = 2 ``half_width``. Measured factors of sqrt(K) / n^3 range from 0.9 to 2.5.
+    K = 2 ``half_width``. In measurements the factor, here 2, is between 0.9 and 2.5.
     """
     return (2 * math.sqrt(2 * half_width) / error) ** (1 / 3)
 

@@ -15,8 +15,8 @@ from holotorch.hologram.raster import Raster, has_light, span, strided_length
 from holotorch.optics.free_space.plane_pair import plane_pair
 from holotorch.optics.free_space.transfer import transfer_function
 
-# Relative amplitude of the spherical wave that may wrap around the padded array. The closed form of the unlimited wave
-# replaces the tapered one if they differ by less.
+# Amplitude of wrapped light that is accepted, relative to the spherical wave. The closed form of the unlimited wave
+# replaces the tapered wave if the relative difference of the two is smaller than this.
 TAPER_ERROR = 2e-7
 
 

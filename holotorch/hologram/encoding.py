@@ -98,8 +98,8 @@ def iterated(
 def encoding_loss(field: Tensor, phase: Tensor, view: Callable[[Tensor], Tensor]) -> Tensor:
     """Relative squared error [...] of the intensity |view(exp(i phase))|^2 against |view(field)|^2.
 
-    The former is scaled to the least error. ``view`` maps holograms [..., H, W] to the image plane, including any
-    aperture.
+    The first intensity is multiplied by the factor of least error. ``view`` maps holograms [..., H, W] to the image
+    plane, including any aperture.
     """
     wanted, shown = intensity(view(field)), intensity(view(phasor(phase)))
     tiny = torch.finfo(shown.dtype).tiny
@@ -121,5 +121,5 @@ def _checked(field: Tensor) -> Tensor:
 def _phase(field: Tensor) -> Tensor:
     """Phase in rad, 0 where the field is 0."""
     amplitude = field.abs()
-    # Of the unit phasor, since the derivative of torch.angle squares the amplitude, which may underflow.
+    # The unit phasor is used, since the derivative of torch.angle squares the amplitude, which may underflow.
     return torch.angle(field / torch.where(amplitude > 0, amplitude, 1))

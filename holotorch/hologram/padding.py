@@ -61,8 +61,8 @@ class Axis:
     def fade(self, length: int) -> tuple[float, float]:
         """Tangents of the directions between which light is attenuated, from not at all to completely.
 
-        Light from the nearest plane reaches no pixel if it is steeper than the first. Light from the farthest plane
-        wraps onto no pixel, in FFTs of ``length`` samples, if it is less steep than the second.
+        Light from the nearest plane that is steeper than the first tangent reaches no pixel. In FFTs of ``length``
+        samples, light from the farthest plane wraps onto a pixel only if it is steeper than the second tangent.
         """
         begin = self.displacement * self.pitch / self.nearest
         end = (length - self.displacement) * self.pitch / self.farthest

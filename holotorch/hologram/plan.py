@@ -16,7 +16,7 @@ from holotorch.hologram.raster import span
 from holotorch.optics.free_space.padding import FINEST
 
 _ROUNDING = {torch.complex64: 5e-7, torch.complex128: 1e-12}  # relative rounding error of the sums
-# Costs in floating-point operations of an FFT that takes the same time (measured).
+# Computing times, as floating-point operations of an FFT that takes as long (measured).
 _WAVE = 150.0  # per sample of a spherical wave in float64
 _PASS = 12.0  # per sample of one pass over an array
 
@@ -34,7 +34,7 @@ class HologramPlan:
         size: Size (y, x) of the whole spectrum in samples.
         predicted_error: Expected relative L2 error for random sources, against the wave that ``cone`` defines.
         memory_bytes: Peak of the extra memory in bytes.
-        flops: Cost in floating-point operations of an FFT.
+        flops: Computing time, as the number of floating-point operations of an FFT that takes as long.
         reason: Short text that explains the choice.
         runner_up: Short text about the method that was not chosen.
         notes: Warnings where the scene is near a limit of validity.

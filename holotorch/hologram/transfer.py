@@ -47,10 +47,11 @@ class AxialDesign:
         return multiply_even(whole, turns_phasor(offset * (self.nodes.spacing * nodes)).to(like.dtype))
 
     def last(self, node: int, like: Tensor) -> Tensor:
-        """First quadrant of the factor that completes the sum over all nodes, whose phases are relative to ``node``.
+        """First quadrant of the factor from the sum over all nodes to the spectrum of the hologram.
 
-        It is the spectrum of the spherical wave from ``node`` times taper and attenuation, divided by the Fourier
-        transform of the window. dtype and device are those of ``like``.
+        The phases of the sum are relative to ``node``. The factor is the spectrum of the spherical wave from ``node``
+        times taper and attenuation, divided by the Fourier transform of the window. dtype and device are those of
+        ``like``.
         """
         axial, offset = self._axial_frequency(like.device)
         strength = 1 / (axial * math.prod(self.raster.grid.pitch) * self.nodes.response(offset))

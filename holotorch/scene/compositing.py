@@ -11,9 +11,9 @@ from torch import Tensor
 def extinction(opacity: Tensor) -> Tensor:
     """Extinction per unit distance, -ln(1 - opacity), of an opacity in [0, 1] per unit distance.
 
-    At opacity 1 the logarithm and its derivative are infinite. Above 1 - 2^-20 it is therefore replaced by its tangent
-    there, which is 14.9 at opacity 1: a fraction of 3.5e-7 of the light is left after the unit distance, and the
-    gradient is finite and not zero, in float32 as in float64.
+    At opacity 1 the logarithm and its derivative are infinite. Above 1 - 2^-20 the function is therefore replaced by its
+    tangent at this opacity. It reaches 14.9 at opacity 1: a fraction of 3.5e-7 of the light is left after the unit
+    distance. The gradient is finite and not zero, in float32 as in float64.
     """
     border = 1 - 2.0**-20
     # The excess is computed from the opacity, since in a difference of two terms slopes of 2^20 would have to cancel.

@@ -18,8 +18,8 @@ class Lighting:
     The shaded colour is colour * (ambient + diffuse * (n . l)) + specular * (r . v)^shininess. Here n is the direction
     of the gradient, oriented towards the observer, so that both sides of a surface are lit; l is the direction to the
     light, r is l mirrored at n, and v is the direction to the observer along the axis. Where the value is constant
-    there is no surface, and the result is colour * (ambient + diffuse). Between the two, shading fades in as
-    g^2 / (g^2 + 1) with the slope g of :func:`flat_steps`, so that the result and its gradient are always finite.
+    there is no surface, and the result is colour * (ambient + diffuse). With the length g of the gradient, in units of
+    :func:`flat_steps`, shading fades in as g^2 / (g^2 + 1), so that the result and its gradient are always finite.
 
     Attributes:
         towards: Direction to the light, (z, y, x) in the scene, of any length; z points away from the hologram.

@@ -50,7 +50,7 @@ def marschner_lobb(
 def gaussian_ball(
     shape: Shape = 64, *, sigma: float = 0.25, width: float | None = None, dtype: torch.dtype = torch.float32
 ) -> Volume:
-    """exp(-r^2 / (2 sigma^2)). The integral along a line is sqrt(2 pi) sigma times the value nearest to the centre."""
+    """exp(-r^2 / (2 sigma^2)); its integral along a line is sqrt(2 pi) sigma times the largest value on the line."""
     sigma = checks.positive("sigma", sigma)
     return _sampled(lambda z, y, x: torch.exp((z**2 + y**2 + x**2) / (-2 * sigma**2)), shape, width, dtype)
 
@@ -77,7 +77,7 @@ def homogeneous_slab(
 def exponential_medium(
     shape: Shape = 64, *, length: float = 1.0, width: float | None = None, dtype: torch.dtype = torch.float32
 ) -> Volume:
-    """exp(-(z + 1) / ``length``), from 1 on the face z = -1; its integral over z is length (1 - exp(-2 / length))."""
+    """exp(-(z + 1) / ``length``), which is 1 at z = -1 and has the integral length (1 - exp(-2 / length)) over z."""
     length = checks.positive("length", length)
     return _sampled(lambda z, y, x: torch.exp(-(z + 1) / length), shape, width, dtype)
 

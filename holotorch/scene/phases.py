@@ -1,7 +1,8 @@
 """Initial phases of light sources.
 
 A constant phase gives an image without speckle in focus, but sends the light in one direction only. A random phase per
-ray, as in the thesis, spreads the light over the whole eye box and causes speckle. A smooth random phase is between.
+ray, as in the thesis, spreads the light over the whole eye box and causes speckle. A smooth random phase is a
+compromise.
 """
 
 import math

@@ -113,7 +113,7 @@ class Placement:
         projected: list[list[float]] = [[], []]
         for depth, *lateral in self._corners(low, high):
             scale = rays.scale(depth)
-            if scale <= 0:  # any ray may meet a box that surrounds the eye
+            if scale <= 0:  # the box extends behind the eye, so any ray may meet it
                 return range(rays.grid.shape[0]), range(rays.grid.shape[1])
             for position, positions in zip(lateral, projected, strict=True):
                 positions.append(position / scale)

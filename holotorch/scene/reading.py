@@ -1,8 +1,8 @@
 """Samples of a volume at the intersections of rays and planes, for rays that meet a visible value there.
 
-Both readers interpolate trilinearly. The outermost half voxels have the value of the outermost sample. ``SliceReader``
-interpolates between two slices that are parallel to the hologram; ``PointReader`` interpolates each point of a rotated
-volume.
+A value is visible if its opacity is above 0. Both readers interpolate trilinearly. The outermost half voxels have the
+value of the outermost sample. ``SliceReader`` interpolates between two slices that are parallel to the hologram;
+``PointReader`` interpolates each point of a rotated volume.
 """
 
 from collections.abc import Callable

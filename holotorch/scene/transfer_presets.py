@@ -9,7 +9,7 @@ import numpy as np
 from holotorch.core import checks
 from holotorch.scene.transfer import TransferFunction
 
-UNIT_DISTANCE = 0.01  # fraction of the longest side of the volume
+UNIT_DISTANCE = 0.01  # default unit distance of the opacities, as a fraction of the longest side of the volume
 _STEP = 1e-6  # width of the slope that replaces a jump, as a fraction of the range of positions
 
 # Rows of the tables: position from 0 (the value ``low``) to 1 (the value ``high``), red, green, blue, opacity.

@@ -13,7 +13,7 @@ def read_npy(path: Path) -> Scan:
     """Read a NumPy array; a large one is memory-mapped."""
     with readable(path, ".npy array"):
         stored = np.load(path, mmap_mode="r", allow_pickle=False)
-    # Of the transpose if the file is in Fortran order.
+    # A file in Fortran order holds the transpose.
     values = stored if stored.flags.c_contiguous else stored.T
     values = uncompressed_from(path, values.shape, values.dtype, stored.offset)
     return Scan(three_axes(values if stored.flags.c_contiguous else values.T, path))
@@ -57,7 +57,7 @@ def read_hdf5(path: Path, member: str | None = None) -> Scan:
 
 
 def read_zarr(path: Path, member: str | None = None) -> Scan:
-    """Read the array ``member`` of a Zarr folder, its only array with three axes, or the folder that is an array."""
+    """Read the array ``member`` of a Zarr folder, by default the folder itself or its only array with three axes."""
     zarr = extra("zarr", "reading Zarr")
     with readable(path, "Zarr folder"):
         node = zarr.open(str(path), mode="r")

@@ -13,7 +13,7 @@ from holotorch.io.formats.limits import affordable
 
 PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
-_MOST_SCANS = 100  # accepted in a progressive JPEG, of which a scan of a few bytes can take as long as a whole picture
+_MOST_SCANS = 100  # of a progressive JPEG; decoding a scan of a few bytes can take as long as a whole picture
 
 
 def decode(path: Path, flags: int, *, data: bytes | None = None, memory: int = 8) -> np.ndarray:

@@ -12,14 +12,15 @@ from holotorch.core.memory import available_memory
 MEMORY_LIMIT = 1 << 30  # bytes of memory that any file may take
 # A file may take this many times its size. Photographs and scans expand less than 300-fold, zeros up to 1000-fold.
 RATIO = 500
-VARIABLE = "HOLOTORCH_MEMORY_LIMIT"  # environment variable with a number of bytes that replaces MEMORY_LIMIT
+VARIABLE = "HOLOTORCH_MEMORY_LIMIT"  # name of an environment variable, which holds a number of bytes
 _CHUNK = 1 << 20  # bytes decompressed at once
 
 
 def affordable(source: Path | str, needed: int, stored: int) -> None:
     """Raise ValueError if the file ``source`` of ``stored`` bytes needs implausibly many bytes of memory to be read.
 
-    The limit is :data:`MEMORY_LIMIT` bytes or :data:`RATIO` times the file's size, whichever is more.
+    The limit is :data:`MEMORY_LIMIT` or :data:`RATIO` times ``stored``, whichever is more. The environment variable
+    :data:`VARIABLE` replaces ``MEMORY_LIMIT``.
     """
     try:
         limit = float(os.environ.get(VARIABLE, MEMORY_LIMIT))

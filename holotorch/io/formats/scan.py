@@ -52,11 +52,11 @@ def metres(unit: str, path: Path) -> float:
 
 
 def placed(values: np.ndarray, axes: Any, origin: Any, unit: str, scale: float = 1.0) -> Scan:
-    """Scan of ``values`` [D, H, W] from geometry in the order (x, y, z) and in a unit of ``scale`` ``unit``.
+    """Scan of ``values`` [D, H, W] from geometry in the order (x, y, z), which ``scale`` converts to ``unit``.
 
     The rows of ``axes`` [3, 3] are the steps from one voxel to the next along x, y and z, with components (x, y, z).
-    ``origin`` is the position (x, y, z) of the first voxel. A step that is not finite or of length 0 gives a scan
-    without geometry.
+    ``origin`` is the position (x, y, z) of the first voxel. The scan has no geometry if the length of a step is 0, or
+    not finite.
     """
     steps = np.asarray(axes, dtype=np.float64)[::-1, ::-1]
     lengths = np.linalg.norm(steps, axis=1)
@@ -74,9 +74,9 @@ def triple(values: Sequence[float] | np.ndarray) -> Triple:
 
 
 def existing(path: Path, where: str = "", *, file: bool = False) -> Path:
-    """``path``; ValueError if it is missing, cannot be read, is an empty file or, with ``file``, a folder.
+    """Return ``path``; ValueError if it is missing, cannot be read, is an empty file or, with ``file``, no file.
 
-    ``where`` describes it in errors, by default as ``path``.
+    ``where`` describes the path in errors.
     """
     where = where or str(path)
     try:
@@ -138,9 +138,9 @@ def expect_bytes(path: Path, found: int, shape: Sequence[int], dtype: np.dtype) 
 
 
 def uncompressed(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int | None = 0) -> np.ndarray:
-    """Voxels of a file that has nothing else from ``offset`` bytes on; None for voxels at the end of the file.
+    """Voxels that take a file from ``offset`` bytes to its end, read as by :func:`uncompressed_from`.
 
-    They are read as by :func:`uncompressed_from`.
+    ``offset`` is None if it is unknown.
     """
     size = path.stat().st_size
     offset = max(0, size - math.prod(shape) * dtype.itemsize) if offset is None else offset
