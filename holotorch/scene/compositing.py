@@ -11,8 +11,8 @@ from torch import Tensor
 def extinction(opacity: Tensor) -> Tensor:
     """Extinction per unit distance, -ln(1 - opacity), of an opacity in [0, 1] per unit distance.
 
-    At opacity 1 the logarithm and its derivative are infinite. Above 1 - 2^-20 the function is therefore replaced by its
-    tangent at this opacity. It reaches 14.9 at opacity 1: a fraction of 3.5e-7 of the light is left after the unit
+    At opacity 1 the logarithm and its derivative are infinite. Above 1 - 2^-20 the function is therefore replaced by
+    its tangent at this opacity. It reaches 14.9 at opacity 1: a fraction of 3.5e-7 of the light is left after the unit
     distance. The gradient is finite and not zero, in float32 as in float64.
     """
     border = 1 - 2.0**-20

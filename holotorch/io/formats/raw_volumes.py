@@ -8,19 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
+from holotorch.io.formats import scan
 from holotorch.io.formats.limits import unzipped
-from holotorch.io.formats.scan import (
-    Scan,
-    from_text,
-    metres,
-    named,
-    number_type,
-    placed,
-    readable,
-    stated_bytes,
-    uncompressed,
-    unpacked,
-)
+from holotorch.io.formats.scan import Scan
 
 _HEADER = 1 << 20  # largest accepted header of unknown length within compressed data, in bytes
 _META_TYPES = {
@@ -57,10 +47,10 @@ def read_raw(path: Path, shape: Sequence[int] | None, dtype: DTypeLike | None) -
         raise ValueError(
             f"{path} has no header: pass shape=(D, H, W) and dtype=, such as 'uint8', or '>i2' if big-endian; or {hint}"
         )
-    kind = number_type(dtype)
+    kind = scan.number_type(dtype)
     if path.suffix == ".gz":
-        return Scan(unpacked(path, unzipped(path, stated_bytes(path, shape, kind)), shape, kind))
-    return Scan(uncompressed(path, shape, kind))
+        return Scan(scan.unpacked(path, unzipped(path, scan.stated_bytes(path, shape, kind)), shape, kind))
+    return Scan(scan.uncompressed(path, shape, kind))
 
 
 def read_metaimage(path: Path) -> Scan:
@@ -74,7 +64,7 @@ def read_metaimage(path: Path) -> Scan:
     if fields.get("BinaryData", "True").lower() != "true":
         raise ValueError(f"{path} holds its voxels as text; write it with BinaryData = True")
     name, kind = fields["ElementDataFile"], fields.get("ElementType")
-    data = path if name == "LOCAL" else named(path, name)
+    data = path if name == "LOCAL" else scan.named(path, name)
     if kind not in _META_TYPES:
         raise ValueError(f"{path} has ElementType = {kind}; known are {', '.join(_META_TYPES)}")
     big = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", "False")).lower() == "true"
@@ -83,16 +73,16 @@ def read_metaimage(path: Path) -> Scan:
     skip = _whole(fields, "HeaderSize", 1, path, least=-1, default="0")[0]
     offset = end if name == "LOCAL" else skip
     if fields.get("CompressedData", "False").lower() == "true":
-        values = unpacked(data, unzipped(data, stated_bytes(data, shape, dtype), offset), shape, dtype)
+        values = scan.unpacked(data, unzipped(data, scan.stated_bytes(data, shape, dtype), offset), shape, dtype)
     else:
-        values = uncompressed(data, shape, dtype, None if skip == -1 else offset)
+        values = scan.uncompressed(data, shape, dtype, None if skip == -1 else offset)
     if not {"ElementSpacing", "ElementSize"} & fields.keys():
         return Scan(values)
     spacing = _numbers(fields, ("ElementSpacing", "ElementSize"), 3, path)
     rows = _numbers(fields, ("TransformMatrix", "Orientation", "Rotation"), 9, path, default="1 0 0 0 1 0 0 0 1")
     origin = _numbers(fields, ("Offset", "Position", "Origin"), 3, path, default="0 0 0")
     axes = np.reshape(rows, (3, 3)) * np.reshape(spacing, (3, 1))
-    return placed(values, axes, origin, "m", metres(fields.get("DistanceUnits", "mm"), path))
+    return scan.placed(values, axes, origin, "m", scan.metres(fields.get("DistanceUnits", "mm"), path))
 
 
 def read_nrrd(path: Path) -> Scan:
@@ -100,7 +90,7 @@ def read_nrrd(path: Path) -> Scan:
     import nrrd
 
     with open(path, "rb") as stream:
-        with readable(path, "NRRD header"):
+        with scan.readable(path, "NRRD header"):
             header = nrrd.read_header(stream)
         end = stream.tell()
     missing = [field for field in ("type", "sizes", "encoding") if field not in header]
@@ -118,7 +108,7 @@ def read_nrrd(path: Path) -> Scan:
 def _nrrd_values(path: Path, header: dict[str, Any], shape: list[int], end: int) -> np.ndarray:
     encoding, dtype = header["encoding"].lower(), _nrrd_type(path, header)
     name = header.get("data file", header.get("datafile"))
-    data = named(path, name) if name else path
+    data = scan.named(path, name) if name else path
     with open(data, "rb") as stream:
         stream.seek(0 if name else end)
         for _ in range(int(header.get("line skip", header.get("lineskip", 0)))):
@@ -129,14 +119,14 @@ def _nrrd_values(path: Path, header: dict[str, Any], shape: list[int], end: int)
     if skip < -1:
         raise ValueError(f"{path} has byte skip {skip}; expected -1 or a number of bytes")
     if encoding == "raw":
-        return uncompressed(data, shape, dtype, None if skip == -1 else offset + skip)
+        return scan.uncompressed(data, shape, dtype, None if skip == -1 else offset + skip)
     if encoding in ("gzip", "gz", "bzip2", "bz2"):
-        size, kind = stated_bytes(data, shape, dtype), "gzip" if encoding[0] == "g" else "bzip2"
+        size, kind = scan.stated_bytes(data, shape, dtype), "gzip" if encoding[0] == "g" else "bzip2"
         content = unzipped(data, size + (_HEADER if skip == -1 else skip), offset, kind=kind)
         del content[: -size if skip == -1 else skip]
-        return unpacked(data, content, shape, dtype)
+        return scan.unpacked(data, content, shape, dtype)
     if encoding in ("ascii", "text", "txt"):
-        return from_text(data, data.read_bytes()[offset:], shape, dtype)
+        return scan.from_text(data, data.read_bytes()[offset:], shape, dtype)
     raise ValueError(f"{path} is encoded as {encoding!r}; known are raw, gzip, bzip2 and ascii")
 
 
@@ -161,10 +151,10 @@ def _nrrd_placed(values: np.ndarray, header: dict[str, Any], path: Path) -> Scan
     if len(units) not in (0, 3):
         raise ValueError(f"{path} gives units for {len(units)} of three axes; pass spacing= instead")
     # Each axis has a unit or, with space directions, each vector component. Both apply to the columns of ``axes``.
-    scale = np.array([metres(unit, path) for unit in units] if units else [1.0, 1, 1])
+    scale = np.array([scan.metres(unit, path) for unit in units] if units else [1.0, 1, 1])
     origin = np.asarray(header.get("space origin", [0.0, 0, 0]), dtype=np.float64)
     origin = np.where(np.isfinite(origin), origin, 0) * scale
-    return placed(values, axes * scale, origin, "m" if units else "relative")
+    return scan.placed(values, axes * scale, origin, "m" if units else "relative")
 
 
 def _metaimage_header(path: Path) -> tuple[dict[str, str], int]:

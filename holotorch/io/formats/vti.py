@@ -8,18 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from holotorch.io.formats import scan
 from holotorch.io.formats.limits import inflated
-from holotorch.io.formats.scan import (
-    Scan,
-    chosen,
-    expect_bytes,
-    from_text,
-    placed,
-    stated_bytes,
-    three_axes,
-    uncompressed_from,
-    unpacked,
-)
+from holotorch.io.formats.scan import Scan
 
 _TYPES = {
     "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4", "Int64": "i8",
@@ -56,7 +47,7 @@ def read_vti(path: Path, member: str | None = None) -> Scan:
             f"{path}: array {array.get('Name')!r} has {components} components per voxel, expected a scalar"
         )
     dtype = np.dtype((">" if root.get("byte_order") == "BigEndian" else "<") + _TYPES[kind])
-    values = three_axes(_values(path, root, array, shape, dtype, start, base64_coded), path)
+    values = scan.three_axes(_values(path, root, array, shape, dtype, start, base64_coded), path)
     if "Spacing" not in image.attrib:
         return Scan(values)
     spacing = np.array([float(word) for word in image.attrib["Spacing"].split()])
@@ -64,7 +55,7 @@ def read_vti(path: Path, member: str | None = None) -> Scan:
     axes = direction.T * spacing[:, None]  # the columns of Direction are unit vectors along the axes
     corner = np.array([float(word) for word in image.get("Origin", "0 0 0").split()])
     first = np.array(bounds[::2]) + (0.5 if cells else 0)
-    return placed(values, axes, corner + first @ axes, "relative")
+    return scan.placed(values, axes, corner + first @ axes, "relative")
 
 
 def _document(path: Path) -> tuple[ElementTree.Element, int, bool]:
@@ -87,7 +78,7 @@ def _array(piece: ElementTree.Element, member: str | None, path: Path) -> tuple[
         if holder is not None and arrays and (member is None or member in arrays or cells):
             active = holder.get("Scalars")
             wanted = member or (active if active in arrays else None)
-            return arrays[chosen(list(arrays), wanted, path)], cells
+            return arrays[scan.chosen(list(arrays), wanted, path)], cells
     raise ValueError(f"{path} holds no array{f' {member!r}' if member else ''}")
 
 
@@ -103,7 +94,7 @@ def _values(
     """Voxels of an array; ``start`` and ``base64_coded`` describe the appended data, see :func:`_document`."""
     form, compressor = array.get("format", "ascii"), root.get("compressor")
     if form == "ascii":
-        return from_text(path, array.text or "", shape, dtype)
+        return scan.from_text(path, array.text or "", shape, dtype)
     header_type = root.get("header_type", "UInt32")
     if header_type not in ("UInt32", "UInt64"):
         raise ValueError(f"{path} has header_type {header_type!r}, expected UInt32 or UInt64")
@@ -119,14 +110,14 @@ def _values(
                 stream.seek(offset)
                 size = _length(stream.read(count.itemsize), count)
             offset += count.itemsize
-            expect_bytes(path, max(0, min(size, path.stat().st_size - offset)), shape, dtype)
-            return uncompressed_from(path, shape, dtype, offset)
+            scan.expect_bytes(path, max(0, min(size, path.stat().st_size - offset)), shape, dtype)
+            return scan.uncompressed_from(path, shape, dtype, offset)
         data = path.read_bytes()[offset:]
     else:
         data = _decoded(array.text or "" if form == "binary" else path.read_bytes()[offset:].decode("latin-1"))
     if compressor:
-        return unpacked(path, _inflated(path, data, count, stated_bytes(path, shape, dtype)), shape, dtype)
-    return unpacked(path, data[count.itemsize : count.itemsize + _length(data, count)], shape, dtype)
+        return scan.unpacked(path, _inflated(path, data, count, scan.stated_bytes(path, shape, dtype)), shape, dtype)
+    return scan.unpacked(path, data[count.itemsize : count.itemsize + _length(data, count)], shape, dtype)
 
 
 def _length(data: bytes, count: np.dtype) -> int:
