@@ -25,23 +25,15 @@ def axial_range(wavelength: float, steepest: Iterable[float]) -> tuple[float, fl
 
 @dataclass(frozen=True)
 class Nodes:
-    """Evenly spaced nodes and the Kaiser-Bessel window that spreads planes onto them.
+    """Evenly spaced nodes and the Kaiser-Bessel window that spreads planes onto them."""
 
-    Attributes:
-        first: Depth of node 0 in metres, the smallest.
-        spacing: Distance between neighbouring nodes in metres.
-        count: Number of nodes.
-        width: Number of nodes that a plane is spread onto; 1 if the planes lie on the nodes.
-        oversampling: Sampling rate 1 / ``spacing`` over the width of the range of axial frequencies, above 1.
-        centre: Middle of that range in cycles per metre. The phase exp(2 pi i z ``centre``) is part of the weights of a
-            plane at z, so that the factors between nodes only hold axial frequencies relative to ``centre``.
-    """
-
-    first: float
-    spacing: float
-    count: int
-    width: int
-    oversampling: float
+    first: float  # depth of node 0 in metres, the smallest
+    spacing: float  # distance between neighbouring nodes in metres
+    count: int  # number of nodes
+    width: int  # number of nodes that a plane is spread onto; 1 if the planes lie on the nodes
+    oversampling: float  # sampling rate 1 / ``spacing`` over the width of the range of axial frequencies, above 1
+    # Middle of that range in cycles per metre. The phase exp(2 pi i z ``centre``) is part of the weights of a plane at
+    # z, so that the factors between nodes only hold axial frequencies relative to ``centre``.
     centre: float
 
     @property

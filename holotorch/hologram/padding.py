@@ -25,27 +25,16 @@ _LONGEST = 1 << 24  # samples; the kernel of one axis of that length takes 2 GB 
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis of sources and pixels.
+    """One axis of sources and pixels."""
 
-    Attributes:
-        sources: Extent of the sources in samples.
-        pixels: Number of pixels of the hologram.
-        stride: Distance between neighbouring sources in pixels.
-        pitch: Pixel pitch in metres.
-        wavelength: In metres.
-        nearest: Smallest depth of a plane in metres.
-        farthest: Largest depth of a plane in metres.
-        cone: "full", "taper" or "band", see ``holotorch.hologram.cone``.
-    """
-
-    sources: int
-    pixels: int
-    stride: int
-    pitch: float
-    wavelength: float
-    nearest: float
-    farthest: float
-    cone: Cone
+    sources: int  # extent of the sources in samples
+    pixels: int  # number of pixels of the hologram
+    stride: int  # distance between neighbouring sources in pixels
+    pitch: float  # pixel pitch in metres
+    wavelength: float  # in metres
+    nearest: float  # smallest depth of a plane in metres
+    farthest: float  # largest depth of a plane in metres
+    cone: Cone  # "full", "taper" or "band", see ``holotorch.hologram.cone``
 
     @property
     def displacement(self) -> int:

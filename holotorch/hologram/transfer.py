@@ -16,21 +16,13 @@ from holotorch.optics.free_space.kernels import turns_phasor
 
 @dataclass(frozen=True)
 class AxialDesign:
-    """Nodes and transforms of an ``AxialHologram`` for layers of one shape.
+    """Nodes and transforms of an ``AxialHologram`` for layers of one shape."""
 
-    Attributes:
-        axes: Sources and pixels along (y, x).
-        nodes: Nodes along the optical axis.
-        raster: Padded array that holds the sources and the pixels.
-        predicted_error: Expected relative L2 error for random sources, against the wave that ``cone`` defines.
-        adequate: Whether ``predicted_error`` is within the tolerance.
-    """
-
-    axes: tuple[Axis, Axis]
-    nodes: Nodes
-    raster: Raster
-    predicted_error: float
-    adequate: bool
+    axes: tuple[Axis, Axis]  # sources and pixels along (y, x)
+    nodes: Nodes  # nodes along the optical axis
+    raster: Raster  # padded array that holds the sources and the pixels
+    predicted_error: float  # expected relative L2 error for random sources, against the wave that ``cone`` defines
+    adequate: bool  # whether ``predicted_error`` is within the tolerance
 
     @property
     def size(self) -> tuple[int, int]:

@@ -36,30 +36,19 @@ class March:
     Only the rays of ``window`` are followed, which may meet visible voxels. ``visible`` is the range of depths in
     metres that contains visible voxels, rounded outwards to whole bricks, or None without visible voxels.
 
-    Attributes:
-        volume: Scalar field.
-        place: Position, size and rotation of the volume.
-        transfer: Colours and opacities.
-        lighting: Shading, or None.
-        rays: Geometry of the rays.
-        depths: Depths of the planes in metres, front to back.
-        spans: Smallest and largest depth in metres of the slab of each plane.
-        observer: -1 if the observer is on the side of smaller depths, else 1.
-        early: Transmittance below which a ray ends.
-
     Raises:
         ValueError: A voxel is NaN or infinite.
     """
 
-    volume: Volume
-    place: Placement
-    transfer: TransferFunction
-    lighting: Lighting | None
-    rays: Rays
-    depths: Sequence[float]
-    spans: Sequence[tuple[float, float]]
-    observer: float
-    early: float
+    volume: Volume  # scalar field
+    place: Placement  # position, size and rotation of the volume
+    transfer: TransferFunction  # colours and opacities
+    lighting: Lighting | None  # shading, or None
+    rays: Rays  # geometry of the rays
+    depths: Sequence[float]  # depths of the planes in metres, front to back
+    spans: Sequence[tuple[float, float]]  # smallest and largest depth in metres of the slab of each plane
+    observer: float  # -1 if the observer is on the side of smaller depths, else 1
+    early: float  # transmittance below which a ray ends
 
     def __post_init__(self) -> None:
         volume, place, transfer, rays = self.volume, self.place, self.transfer, self.rays

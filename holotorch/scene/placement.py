@@ -44,17 +44,12 @@ class Placement:
 
     Offsets (z, y, x) are in metres from the centre of the volume, which lies on the axis. The box of the volume ends
     half a spacing beyond the outermost samples. Index coordinates (z, y, x) count samples from sample [0, 0, 0].
-
-    Attributes:
-        shape: Number of samples (z, y, x).
-        spacing: Distance between samples along (z, y, x) in metres.
-        distance: Depth of the centre in metres.
-        rotation: Rows of a matrix over (z, y, x): offset in the scene = rotation @ offset along the volume's axes.
     """
 
-    shape: tuple[int, int, int]
-    spacing: Triple
-    distance: float
+    shape: tuple[int, int, int]  # number of samples (z, y, x)
+    spacing: Triple  # distance between samples along (z, y, x) in metres
+    distance: float  # depth of the centre in metres
+    # Rows of a matrix over (z, y, x): offset in the scene = rotation @ offset along the volume's axes.
     rotation: tuple[Triple, Triple, Triple]
 
     @property

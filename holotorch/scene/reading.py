@@ -18,41 +18,26 @@ BRICK = 16  # voxels along an edge of the bricks, which are skipped if they are 
 
 @dataclass(frozen=True)
 class RaySamples:
-    """Samples on one plane.
+    """Samples on one plane."""
 
-    Attributes:
-        rays: Flat indices of n rays into the window, [n].
-        samples: c channels of each ray, [c, n].
-        length: Length of the path of each ray through the slab in metres, [n], or one number for all rays.
-    """
-
-    rays: Tensor
-    samples: Tensor
-    length: Tensor | float
+    rays: Tensor  # flat indices of n rays into the window, [n]
+    samples: Tensor  # c channels of each ray, [c, n]
+    length: Tensor | float  # length of the path of each ray through the slab in metres, [n], or one number for all rays
 
 
 @dataclass(frozen=True)
 class Window:
-    """The h x w rays that may meet visible voxels, and their paths through the box of the volume.
+    """The h x w rays that may meet visible voxels, and their paths through the box of the volume."""
 
-    Attributes:
-        rows: Rows of the grid of rays.
-        columns: Columns of the grid of rays.
-        down: Positions of the rows in metres at the reference depth, float64 [h].
-        across: Positions of the columns in metres at the reference depth, float64 [w].
-        entry: Depth at which each ray enters the box, in metres from its centre, [h, w]; None if all rays are parallel
-            to the axis and pass through the front and the back face.
-        exit: Depth at which each ray leaves the box, as ``entry``.
-        oblique: Length of the path of each ray per metre of depth, [h, w], or None for 1.
-    """
-
-    rows: range
-    columns: range
-    down: Tensor
-    across: Tensor
+    rows: range  # rows of the grid of rays
+    columns: range  # columns of the grid of rays
+    down: Tensor  # positions of the rows in metres at the reference depth, float64 [h]
+    across: Tensor  # positions of the columns in metres at the reference depth, float64 [w]
+    # Depth at which each ray enters the box, in metres from its centre, [h, w]; None if all rays are parallel to the
+    # axis and pass through the front and the back face.
     entry: Tensor | None
-    exit: Tensor | None
-    oblique: Tensor | None
+    exit: Tensor | None  # depth at which each ray leaves the box, in metres from its centre, [h, w], or None
+    oblique: Tensor | None  # length of the path of each ray per metre of depth, [h, w], or None for 1
 
     @classmethod
     def of(cls, place: Placement, rays: Rays, rows: range, columns: range, like: Tensor) -> "Window":
@@ -83,22 +68,14 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class SliceReader:
-    """Reads a volume whose slices are parallel to the hologram: interpolates between slices, columns and rows in turn.
+    """Reads a volume whose slices are parallel to the hologram, by interpolation between slices, columns and rows."""
 
-    Attributes:
-        place: Position of the volume.
-        rays: Geometry of the rays.
-        window: Rays that are read.
-        occupied: Whether each brick of the volume contains a visible voxel, bool [Dz, Hy, Wx].
-        support: Limits of the visible values, see ``TransferFunction.support``.
-        channels: Function from the number of a slice to its channels [c, H, W], of which the first is the value.
-    """
-
-    place: Placement
-    rays: Rays
-    window: Window
-    occupied: Tensor
-    support: tuple[float, float]
+    place: Placement  # position of the volume
+    rays: Rays  # geometry of the rays
+    window: Window  # rays that are read
+    occupied: Tensor  # whether each brick of the volume contains a visible voxel, bool [Dz, Hy, Wx]
+    support: tuple[float, float]  # limits of the visible values, see ``TransferFunction.support``
+    # Function from the number of a slice to its channels [c, H, W], of which the first is the value.
     channels: Callable[[int], Tensor]
 
     def read(self, low: float, high: float, alive: Tensor) -> RaySamples | None:
@@ -142,7 +119,7 @@ class SliceReader:
 
 @dataclass(frozen=True, eq=False)
 class PointReader:
-    """Reads a rotated volume point by point; attributes as for :class:`SliceReader`, with channels [c, D, H, W]."""
+    """Reads a rotated volume point by point; attributes as of :class:`SliceReader`, but channels [c, D, H, W]."""
 
     place: Placement
     rays: Rays

@@ -25,20 +25,14 @@ _METRES = {
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Voxels and the geometry that their file states.
+    """Voxels and the geometry that their file states."""
 
-    Attributes:
-        values: [D, H, W] in the dtype of the file, possibly memory-mapped.
-        spacing: Distance between voxels along (z, y, x) in ``unit``, or None if the file states none.
-        unit: "m" or "relative".
-        origin: Position (z, y, x) of voxel [0, 0, 0] in ``unit``.
-        orientation: Unit vectors of the axes z, y, x as rows with components (z, y, x).
-    """
-
-    values: np.ndarray
+    values: np.ndarray  # [D, H, W] in the dtype of the file, possibly memory-mapped
+    # Distance between voxels along (z, y, x) in ``unit``, or None if the file states none.
     spacing: Triple | None = None
-    unit: str = "relative"
-    origin: Triple = (0.0, 0.0, 0.0)
+    unit: str = "relative"  # "m" or "relative"
+    origin: Triple = (0.0, 0.0, 0.0)  # position (z, y, x) of voxel [0, 0, 0] in ``unit``
+    # Unit vectors of the axes z, y, x as rows with components (z, y, x).
     orientation: tuple[Triple, Triple, Triple] = IDENTITY
 
 
