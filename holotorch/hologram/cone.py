@@ -86,9 +86,8 @@ def spherical_wave(dy: Tensor, dx: Tensor, pitch: tuple[float, float], wavelengt
 def check_scene(grid: Grid, wavelength: float, depths, stride: int) -> tuple[float, tuple[float, ...], int]:
     """Return wavelength (m), depths (m) and stride (pixels) of a hologram's sources.
 
-    Raises:
-        TypeError: Arguments that are not numbers.
-        ValueError: Several wavelengths, no depth, a depth that is not above zero or exceeds 100 m, or a stride below 1.
+    TypeError if one is not a number. ValueError for several wavelengths, no depth, a depth that is not above zero or
+    exceeds 100 m, or a stride below 1.
     """
     first, *others = checks.wavelengths(wavelength)
     if others:

@@ -18,15 +18,12 @@ from holotorch.scene.volume import Volume
 
 @dataclass(frozen=True)
 class Step:
-    """Contribution of plane number ``plane``: weight T alpha [n] and colour [3, n] of n rays.
+    """Contribution of a plane to n rays."""
 
-    ``rays`` [n] are flat indices into the window of rays.
-    """
-
-    plane: int
-    rays: Tensor
-    weight: Tensor
-    colour: Tensor
+    plane: int  # number of the plane
+    rays: Tensor  # flat indices of the rays into the window, [n]
+    weight: Tensor  # T alpha, [n]
+    colour: Tensor  # red, green, blue, [3, n]
 
 
 @dataclass(eq=False)
@@ -34,10 +31,8 @@ class March:
     """Front-to-back compositing of a volume along rays, slab by slab.
 
     Only the rays of ``window`` are followed, which may meet visible voxels. ``visible`` is the range of depths in
-    metres that contains visible voxels, rounded outwards to whole bricks, or None without visible voxels.
-
-    Raises:
-        ValueError: A voxel is NaN or infinite.
+    metres that contains visible voxels, rounded outwards to whole bricks, or None without visible voxels. ValueError if
+    a voxel is NaN or infinite.
     """
 
     volume: Volume  # scalar field

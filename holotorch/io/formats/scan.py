@@ -28,8 +28,7 @@ class Scan:
     """Voxels and the geometry that their file states."""
 
     values: np.ndarray  # [D, H, W] in the dtype of the file, possibly memory-mapped
-    # Distance between voxels along (z, y, x) in ``unit``, or None if the file states none.
-    spacing: Triple | None = None
+    spacing: Triple | None = None  # distance between voxels along (z, y, x) in ``unit``, None if the file states none
     unit: str = "relative"  # "m" or "relative"
     origin: Triple = (0.0, 0.0, 0.0)  # position (z, y, x) of voxel [0, 0, 0] in ``unit``
     # Unit vectors of the axes z, y, x as rows with components (z, y, x).
@@ -89,9 +88,8 @@ def existing(path: Path, where: str = "", *, file: bool = False) -> Path:
 def named(header: Path, name: str) -> Path:
     """Path of the data file that a header names, in the header's folder or below it.
 
-    Raises:
-        ValueError: The data file is missing, empty or no file; or it lies outside the folder, since a header from
-            someone else must not choose which of the user's files are read.
+    ValueError if it is missing, empty or no file, or lies elsewhere, since a header from someone else must not choose
+    which of the user's files are read.
     """
     if name.split()[:1] == ["LIST"] or "%" in name:
         raise ValueError(f"{header} lists one file per slice; load the folder of the slices instead")

@@ -107,8 +107,7 @@ def _stacked(slices: Iterable[np.ndarray], sources: Sequence[str]) -> Scan:
 def _tiff_pages(path: Path) -> int:
     """Number of pages from the TIFF directories, since OpenCV silently omits pages that it cannot decode.
 
-    Raises:
-        ValueError: A damaged file, or pages whose pixels need more than the memory limit.
+    ValueError for a damaged file, or pages whose pixels need more than the memory limit.
     """
     data = np.memmap(path, np.uint8, "r")
     mark, order = bytes(data[:2]), "big" if bytes(data[:2]) == b"MM" else "little"
