@@ -119,7 +119,7 @@ class AxialHologram(LayerHologram):
         return total.finish()
 
     def accumulator(self, shape: tuple[int, int], phase: Tensor | None = None) -> "Accumulator":
-        """Running sum to which planes of ``shape`` (h, w) are added one by one; ``phase`` as in :meth:`accumulate`."""
+        """Running sum over planes of ``shape`` (h, w); ``phase`` in rad, [h, w], is added to all planes."""
         return Accumulator(self, shape, phase)
 
     def _forward(self, layers: Tensor) -> Tensor:
@@ -161,7 +161,7 @@ class Accumulator:
         self.phasor = None if phase is None else phasor(phase)
         self.nodes = self.design.nodes
         self.begins, self.weights = self.nodes.weights(operator.depths)
-        # A plane needs ``width`` rows. Additional rows let a group hold several planes even if they are sparse.
+        # A plane needs ``width`` rows. Additional rows let a group hold several planes even if they are far apart.
         spare = round(_GROUP / 2 * self.nodes.count / len(operator.depths))
         self.rows = self.nodes.width + min(spare, self.nodes.width)
         self.last_depth: float | None = None

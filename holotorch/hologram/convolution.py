@@ -45,7 +45,7 @@ class ConvolutionHologram(LayerHologram):
         return y, x
 
     def _extent(self, depth: float, displacement: tuple[int, int]) -> tuple[int, int]:
-        """Half-width (y, x) in samples of the kernel of a depth, of which ``displacement`` is needed."""
+        """Half-width (y, x) in samples of the kernel of a depth, needed for displacements up to ``displacement``."""
         if self._in_frequency(depth, displacement):
             sines = [self.wavelength / (2 * pitch) for pitch in self.grid.pitch]
             path = depth / math.sqrt(1 - sines[0] ** 2 - sines[1] ** 2)  # path of the steepest light in metres
@@ -90,7 +90,10 @@ class ConvolutionHologram(LayerHologram):
         return even_fft2(wave.to(layers.dtype), raster.size)
 
     def _band_kernel(self, depth: float, raster: Raster, displacement: tuple[int, int]) -> Tensor:
-        """The quadrant for ``cone="band"``: a band-limited transfer function times i / w over the area of a pixel."""
+        """The quadrant for ``cone="band"``: the band-limited transfer function times i / (w A).
+
+        w is the axial frequency and A the area of a pixel.
+        """
         window = Grid((displacement[0] + 1, displacement[1] + 1), self.grid.pitch)
         planes = plane_pair(window, None, (0.0, 0.0), (0.0, 0.0), [self.wavelength])
         wavelength, distance = (torch.tensor(value, dtype=torch.float64) for value in (self.wavelength, depth))
