@@ -1,12 +1,13 @@
-"""Spherical waves limited to the band of a grid: their spectrum, and their values in space by quadrature.
+"""Spherical waves limited to the frequencies of a grid: their spectrum, and their values in space by quadrature.
 
-Weyl's expansion writes a spherical wave as a sum of plane waves, exp(ikr) / r = i int exp(2 pi i (f x + z w)) / w df
-with w = sqrt(1 / wavelength^2 - fx^2 - fy^2). The cones ``taper`` and ``band`` weight the integrand in frequency. The
-result has no closed form in space; it is integrated numerically, which is slow but exact to rounding.
+Weyl's expansion writes a spherical wave as an integral of plane waves over the frequencies f = (fx, fy),
+exp(ikr) / r = i int exp(2 pi i (f . x + z w)) / w df with w = sqrt(1 / wavelength^2 - fx^2 - fy^2). The cones ``taper``
+and ``band`` weight the integrand. The result has no closed form in space; it is integrated numerically, which is slow
+but exact to rounding.
 """
 
+import itertools
 import math
-from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -16,15 +17,15 @@ from holotorch.hologram.cone import TAPER_BEGIN, taper
 from holotorch.optics.free_space.kernels import carrier, turns_phasor
 
 _RULE = np.polynomial.legendre.leggauss(64)
-_CYCLES = 10.0  # cycles of the integrand per panel of 64 nodes; the rule is exact to rounding up to about 15
-_MOST_NODES = 30_000  # quadrature nodes per axis; a sum over more of them on both axes takes minutes
+_CYCLES = 10.0  # most cycles of the integrand per panel of 64 nodes; the rule is exact to rounding up to about 15
+_MOST_NODES = 30_000  # most quadrature nodes per axis, with which the sum over both axes takes minutes
 
 
 def point_spectrum(fy: Tensor, fx: Tensor, wavelength: float, depth: float) -> Tensor:
-    """Spectrum i exp(2 pi i z w) / w of a point source at z = ``depth`` metres, complex128.
+    """Spectrum i exp(2 pi i z w) / w of a point source at z = ``depth`` metres, complex128 of the broadcast shape.
 
-    Frequencies must stay below 1 / wavelength. The phase is written as z / wavelength - z f^2 / (w + 1 / wavelength),
-    to avoid the cancellation of w - 1 / wavelength.
+    ``fy`` and ``fx`` are float64 in cycles per metre, with f^2 = fy^2 + fx^2 < 1 / wavelength^2. The phase in cycles,
+    z w, is computed as z / wavelength - z f^2 / (w + 1 / wavelength), to avoid the cancellation of w - 1 / wavelength.
     """
     square = fy.square() + fx.square()
     axial = torch.sqrt(wavelength**-2 - square)
@@ -35,18 +36,11 @@ def point_spectrum(fy: Tensor, fx: Tensor, wavelength: float, depth: float) -> T
 def band_limited_wave(
     dy: Tensor, dx: Tensor, pitch: tuple[float, float], wavelength: float, depth: float, *, soft: bool
 ) -> Tensor:
-    """Spherical wave with its spectrum limited to the highest frequency of the pitch, complex128 [len(dy), len(dx)].
+    """Spherical wave whose spectrum is limited to frequencies up to 1 / (2 ``pitch``), complex128 [A, B].
 
-    Args:
-        dy: Displacements along y in metres, float64 [A].
-        dx: Displacements along x in metres, float64 [B].
-        pitch: (y, x) in metres, at least 0.9 wavelengths.
-        wavelength: In metres.
-        depth: In metres, above 0.
-        soft: True: the band ends with the taper of ``cone.taper``; False: it ends sharply.
-
-    Raises:
-        ValueError: The depth is so large that the quadrature needs too many nodes.
+    ``dy`` [A] and ``dx`` [B] are displacements in metres, float64. ``pitch`` (y, x) in metres is at least 0.9
+    wavelengths. The spectrum ends with the taper of ``cone.taper`` if ``soft``, else sharply. ValueError if ``depth``
+    in metres is so large that the quadrature needs too many nodes.
     """
     fy, fx = (
         _nodes(displacement, step, wavelength, depth, soft) for displacement, step in zip((dy, dx), pitch, strict=True)
@@ -63,27 +57,22 @@ def band_limited_wave(
 
 
 def _nodes(displacement: Tensor, pitch: float, wavelength: float, depth: float, soft: bool) -> tuple[Tensor, Tensor]:
-    """Quadrature nodes from frequency 0 to the highest one, and their weights, which include the taper."""
+    """Quadrature nodes from frequency 0 to the highest one of the pitch, and weights, which include the taper."""
     highest = 1 / (2 * pitch)
     sine = wavelength * highest
-    # Derivative of the phase by frequency: the displacement plus the lateral spread of the steepest light.
+    # Largest derivative of the phase in cycles by frequency: the displacement plus the spread of the steepest light.
     slope = displacement.abs().max().item() + depth * sine / math.sqrt(max(1 - 2 * sine**2, 0.1))
     if slope * highest / _CYCLES * 64 > _MOST_NODES:
         raise ValueError(
             f"depth {depth:g} m is too far for the sum over a band of pixels of {pitch:g} m: use a nearer plane, a "
             "larger pitch, cone='full', or AxialHologram"
         )
-    parts = list(_panels((0.0, TAPER_BEGIN, 1.0) if soft else (0.0, 1.0), slope * highest))
-    part, weight = (np.concatenate(each) for each in zip(*parts, strict=True))
-    part, weight = torch.from_numpy(part), torch.from_numpy(weight)
-    weight = weight * highest * (taper(part) if soft else 1.0)
-    return (part * highest).to(displacement.device), weight.to(displacement.device)
-
-
-def _panels(ends: tuple[float, ...], cycles: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Nodes and weights on panels between ``ends``, each with at most ``_CYCLES`` cycles of the integrand."""
-    for low, high in zip(ends, ends[1:], strict=False):
-        count = math.ceil(cycles * (high - low) / _CYCLES) or 1
-        half = (high - low) / count / 2
-        for panel in range(count):
-            yield low + half * (2 * panel + 1 + _RULE[0]), half * _RULE[1]
+    nodes, weights = [], []
+    for low, high in itertools.pairwise((0.0, TAPER_BEGIN, 1.0) if soft else (0.0, 1.0)):
+        panels = math.ceil(slope * highest * (high - low) / _CYCLES) or 1
+        half = (high - low) / panels / 2
+        nodes.append((low + half * (2 * np.arange(panels)[:, None] + 1 + _RULE[0])).ravel())
+        weights.append(np.tile(half * _RULE[1], panels))
+    fraction, weight = (torch.from_numpy(np.concatenate(parts)) for parts in (nodes, weights))
+    weight = weight * highest * (taper(fraction) if soft else 1.0)
+    return (fraction * highest).to(displacement.device), weight.to(displacement.device)

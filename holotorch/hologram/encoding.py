@@ -1,6 +1,10 @@
-"""Encodings of complex holograms as phases for phase-only modulators, and the error that they cause."""
+"""Encodings of complex holograms as phases for phase-only modulators, and the error that they cause.
 
-import math
+Each encoding raises TypeError unless the hologram is a complex tensor [..., H, W], and ValueError if it has no pixels,
+or values that are not finite. The phases are real [..., H, W] in radians.
+"""
+
+import cmath
 from collections.abc import Callable
 
 import torch
@@ -11,26 +15,20 @@ from holotorch.core.complex import intensity, phasor
 
 
 def kinoform(field: Tensor) -> Tensor:
-    """Phase of a complex hologram [..., H, W] in rad; the amplitude is discarded. Gradients as :func:`double_phase`.
-
-    Raises:
-        TypeError, ValueError: Not complex [..., H, W], no pixels, or values that are not finite.
-    """
+    """Phase of a complex hologram [..., H, W]; the amplitude is discarded. The gradient at a dark pixel is zero."""
     return _phase(_checked(field))
 
 
 def double_phase(field: Tensor) -> Tensor:
-    """Double-phase encoding: two phases in a checkerboard whose phasors average to the field, real [..., H, W] in rad.
+    """Double-phase encoding: two phases per pixel, arg(field) +- acos(amplitude), of which a checkerboard picks one.
 
-    The field is scaled to a largest amplitude of 1. The difference between neighbours lies at the highest frequencies,
-    which an aperture in the Fourier plane removes. A black hologram gives two phases that cancel. Source: Hsueh and
-    Sawchuk (1978), as used by Maimone et al. (2017).
+    The two phasors average to the field [..., H, W], scaled to a largest amplitude of 1. The differences between
+    neighbouring pixels lie at the highest frequencies, which an aperture in the Fourier plane removes. In a black
+    hologram the phases of neighbours differ by pi, so that they cancel. Source: Hsueh and Sawchuk (1978), as used by
+    Maimone et al. (2017).
 
     Gradients are finite everywhere. Two terms without a derivative have gradient zero: the phase of a dark pixel, and
     the arccosine of the pixel with the largest amplitude, whose scaled amplitude is always 1.
-
-    Raises:
-        TypeError, ValueError: Not complex [..., H, W], no pixels, or values that are not finite.
     """
     field = _checked(field)
     amplitude = field.abs()
@@ -38,65 +36,51 @@ def double_phase(field: Tensor) -> Tensor:
     scaled = amplitude / torch.where(peak > 0, peak, 1)
     below_peak = scaled < 1
     offset = torch.where(below_peak, torch.acos(torch.where(below_peak, scaled, 0)), 0)
-    height, width = field.shape[-2:]
-    rows, columns = torch.arange(height, device=field.device), torch.arange(width, device=field.device)
+    rows, columns = (torch.arange(count, device=field.device) for count in field.shape[-2:])
     sign = 1 - 2 * ((rows[:, None] + columns) % 2)
     return _phase(field) + sign * offset
 
 
 def error_diffused(field: Tensor) -> Tensor:
-    """Phase in rad of a complex hologram [..., H, W] by error diffusion to the four next neighbours of each pixel.
+    """Phase of a complex hologram [..., H, W] by diffusion of the error of each pixel to its four next neighbours.
 
     Rows are scanned in alternating direction. The error moves to high frequencies, where it is less visible. The scan
-    is sequential and takes half a second for 512 x 512 pixels. Source: Floyd and Steinberg (1976), applied to fields
-    by Tsang and Poon (2013).
-
-    Raises:
-        TypeError, ValueError: Not complex [..., H, W], no pixels, or values that are not finite.
+    is sequential and takes half a second for 512 x 512 pixels. It has no gradient. Source: Floyd and Steinberg (1976),
+    applied to fields by Tsang and Poon (2013).
     """
     field = _checked(field)
     peak = field.abs().amax((-2, -1), keepdim=True)
     flat = (field / torch.where(peak > 0, peak, 1)).reshape(-1, *field.shape[-2:]).cpu()
+    height, width = field.shape[-2:]
     encoded = []
     for item in flat:
-        rows, phases = [list(map(complex, row)) for row in item.tolist()], []
-        for i, row in enumerate(rows):
-            below = rows[i + 1] if i + 1 < len(rows) else None
-            step = 1 if i % 2 == 0 else -1
-            phase = [0.0] * len(row)
-            for j in range(len(row))[::step]:
-                value = row[j]
-                size = abs(value)
-                shown = value / size if size else 1.0
-                phase[j] = math.atan2(shown.imag, shown.real)
-                error = value - shown
-                ahead, behind = j + step, j - step
-                if 0 <= ahead < len(row):
-                    row[ahead] += error * (7 / 16)
-                if below is not None:
-                    below[j] += error * (5 / 16)
-                    if 0 <= behind < len(row):
-                        below[behind] += error * (3 / 16)
-                    if 0 <= ahead < len(row):
-                        below[ahead] += error * (1 / 16)
-            phases.append(phase)
-        encoded.append(phases)
+        # A margin on three sides receives the error that leaves the hologram.
+        rows = [[0j, *row, 0j] for row in item.tolist()] + [[0j] * (width + 2)]
+        for i in range(height):
+            row, below, step = rows[i], rows[i + 1], 1 if i % 2 == 0 else -1
+            for j in range(1, width + 1)[::step]:
+                size = abs(row[j])
+                unit = row[j] / size if size else 1.0
+                error = row[j] - unit
+                row[j] = cmath.phase(unit)
+                row[j + step] += error * (7 / 16)
+                below[j] += error * (5 / 16)
+                below[j - step] += error * (3 / 16)
+                below[j + step] += error * (1 / 16)
+        encoded.append([row[1:-1] for row in rows[:height]])
     return torch.tensor(encoded, dtype=field.real.dtype, device=field.device).reshape(field.shape)
 
 
 def iterated(
     field: Tensor, propagate: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor], *, steps: int = 30
 ) -> Tensor:
-    """Phase in rad whose propagated field has the amplitude of the propagated hologram, by Gerchberg-Saxton.
+    """Phase whose propagated field has about the amplitude of the propagated hologram, by Gerchberg-Saxton iterations.
 
     Args:
         field: Complex hologram [..., H, W].
         propagate: Propagation to the plane at which amplitudes are compared.
         adjoint: Conjugate transpose of ``propagate``, used as its approximate inverse.
         steps: Number of iterations.
-
-    Raises:
-        TypeError, ValueError: Not complex [..., H, W], no pixels, or values that are not finite.
     """
     field = _checked(field)
     if not field.numel():  # an empty batch, which transforms refuse
@@ -112,18 +96,20 @@ def iterated(
 
 
 def encoding_loss(field: Tensor, phase: Tensor, view: Callable[[Tensor], Tensor]) -> Tensor:
-    """Relative squared error [...] of the image |view(.)|^2 of a phase against that of the field, optimally scaled.
+    """Relative squared error [...] of the intensity |view(exp(i phase))|^2 against |view(field)|^2.
 
-    ``view`` maps holograms [..., H, W] to the image plane, including any aperture.
+    The first intensity is multiplied by the factor of least error. ``view`` maps holograms [..., H, W] to the image
+    plane, including any aperture.
     """
     wanted, shown = intensity(view(field)), intensity(view(phasor(phase)))
-    scale = (wanted * shown).sum((-2, -1)) / shown.square().sum((-2, -1)).clamp(min=torch.finfo(shown.dtype).tiny)
+    tiny = torch.finfo(shown.dtype).tiny
+    scale = (wanted * shown).sum((-2, -1)) / shown.square().sum((-2, -1)).clamp(min=tiny)
     error = (scale[..., None, None] * shown - wanted).square().sum((-2, -1))
-    return error / wanted.square().sum((-2, -1)).clamp(min=torch.finfo(shown.dtype).tiny)
+    return error / wanted.square().sum((-2, -1)).clamp(min=tiny)
 
 
 def _checked(field: Tensor) -> Tensor:
-    """The checked field, with subnormal values, whose derivatives overflow, set to zero."""
+    """``field``, checked, with subnormal values set to zero, since their derivatives overflow."""
     if not isinstance(field, Tensor) or not field.is_complex():
         raise TypeError(f"field must be a complex tensor (..., H, W), got {getattr(field, 'dtype', type(field))}")
     if field.ndim < 2 or 0 in field.shape[-2:]:
@@ -133,9 +119,7 @@ def _checked(field: Tensor) -> Tensor:
 
 
 def _phase(field: Tensor) -> Tensor:
-    """Phase in rad, 0 where the field is 0.
-
-    It is computed from the unit phasor, since the derivative of torch.angle squares the amplitude, which may underflow.
-    """
+    """Phase in rad, 0 where the field is 0."""
     amplitude = field.abs()
+    # The unit phasor is used, since the derivative of torch.angle squares the amplitude, which may underflow.
     return torch.angle(field / torch.where(amplitude > 0, amplitude, 1))

@@ -2,17 +2,19 @@
 
 import math
 from collections.abc import Callable, Sequence
+from typing import get_args
 
 from torch import Tensor, nn
 
 from holotorch.core import checks
 from holotorch.core.grid import Grid
 from holotorch.core.operator import linear
-from holotorch.hologram.cone import Cone, check_cone, check_layers, check_scene
+from holotorch.hologram.cone import Cone, check_scene
+from holotorch.optics.free_space.padding import FINEST
 
 
 class LayerHologram(nn.Module):
-    """A linear map from layers of point sources to the field on a hologram, with its conjugate transpose.
+    """A linear map from layers of point sources to the complex field on a hologram, with its conjugate transpose.
 
     A subclass implements ``_forward`` and ``_adjoint`` for one batch axis B; this class derives gradients of any order
     and ``vmap`` from the two.
@@ -28,29 +30,34 @@ class LayerHologram(nn.Module):
         TypeError, ValueError: Invalid arguments; in a call: layers that are not complex [..., D, h, w].
     """
 
-    def __init__(self, grid: Grid, wavelength: float, depths: Sequence[float], cone: Cone, stride: int):
+    def __init__(self, grid: Grid, wavelength: float, depths: Sequence[float], *, cone: Cone = "box", stride: int = 1):
         super().__init__()
         self.grid = grid
         self.wavelength, self.depths, self.stride = check_scene(grid, wavelength, depths, stride)
-        check_cone(cone, grid.pitch, self.wavelength)
+        if cone not in get_args(Cone):
+            raise ValueError(f"cone must be one of {', '.join(map(repr, get_args(Cone)))}, got {cone!r}")
+        if cone in ("taper", "band") and min(grid.pitch) < FINEST * self.wavelength:
+            raise ValueError(
+                f"cone={cone!r} needs a pitch of at least {FINEST} wavelengths, {FINEST * self.wavelength:.3g} m, got "
+                f"{min(grid.pitch):g} m: use cone='box' of ConvolutionHologram"
+            )
         self.cone: Cone = cone
 
     def forward(self, layers: Tensor) -> Tensor:
-        """Field [..., H, W] of ``layers``, complex [..., D, h, w], whose samples h // 2, w // 2 lie on the axis."""
-        check_layers(layers, len(self.depths))
-        shape = (layers.shape[-2], layers.shape[-1])
-        return linear(layers, *self._maps(shape))
+        """Field [..., H, W] of complex layers [..., D, h, w], one per depth; sample (h // 2, w // 2) is on the axis."""
+        if not isinstance(layers, Tensor) or not layers.is_complex():
+            kind = getattr(layers, "dtype", type(layers))
+            raise TypeError(f"layers must be a complex tensor (..., D, h, w), got {kind}")
+        count = len(self.depths)
+        if layers.ndim < 3 or layers.shape[-3] != count or 0 in layers.shape[-2:]:
+            raise ValueError(f"layers must end in (D, h, w) with D = {count} depths, got {tuple(layers.shape)}")
+        return linear(layers, *self._maps((layers.shape[-2], layers.shape[-1])))
 
     def adjoint(self, field: Tensor, shape: tuple[int, int] | None = None) -> Tensor:
-        """Apply the conjugate transpose to a field [..., H, W].
+        """Conjugate transpose: layers [..., D, h, w] from a complex field [..., H, W] on the grid of the hologram.
 
-        Args:
-            field: Complex field on the grid of the hologram.
-            shape: Number of sources (h, w) of a layer; by default the number of pixels along each axis divided by
-                ``stride`` and rounded up.
-
-        Returns:
-            Layers [..., D, h, w].
+        ``shape`` is the number of sources (h, w) of a layer; by default the number of pixels along each axis divided by
+        ``stride`` and rounded up.
         """
         checks.field("field", field, self.grid.shape)
         height, width = shape or (-(-n // self.stride) for n in self.grid.shape)
@@ -74,7 +81,7 @@ class LayerHologram(nn.Module):
 
 
 def _flattened(function: Callable[[Tensor], Tensor], x: Tensor, axes: int) -> Tensor:
-    """Apply ``function``, which expects one batch axis, to ``x`` with any number of batch axes before ``axes`` axes."""
+    """Apply ``function``, which expects one batch axis before ``axes`` axes, to ``x`` with any number of batch axes."""
     batch = x.shape[:-axes]
     out = function(x.reshape(math.prod(batch), *x.shape[-axes:]))
     return out.reshape(*batch, *out.shape[1:])

@@ -1,64 +1,48 @@
 """Nodes: evenly spaced planes along the axis that represent any number of source planes, as in a non-uniform FFT.
 
-The spectrum of a hologram is the three-dimensional transform of the volume on a cap of the Ewald sphere: a plane at
-depth z contributes exp(2 pi i z w), w = sqrt(1 / wavelength^2 - fx^2 - fy^2). Over the band of a grid the axial
-frequency w covers a short range, so the contributions of planes closer than the inverse of that range are linearly
-dependent. Any number of planes can therefore be represented by a few nodes: each plane is spread onto the nodes around
-it with a window function, and the sum is divided by the Fourier transform of the window.
+A plane at depth z contributes its spectrum times exp(2 pi i z w) to the spectrum of a hologram, where
+w = sqrt(1 / wavelength^2 - fx^2 - fy^2) is the axial frequency. Over the frequencies of a grid w covers only a short
+range, so planes closer together than the inverse of that range contribute nearly the same. A few nodes therefore
+represent any number of planes: each plane is spread onto the nodes around it with a window function, and the sum is
+divided by the Fourier transform of the window.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from holotorch.core.grid import Grid
 
-
-def axial_range(grid: Grid, wavelength: float, steepest: tuple[float, float] = (math.inf, math.inf)):
-    """Smallest and largest axial frequency w of the grid's band, in cycles per metre.
-
-    ``steepest`` is an additional limit of the tangents |fy| / w and |fx| / w.
-    """
-    tangents = []
-    for pitch, limit in zip(grid.pitch, steepest, strict=True):
-        sine = min(0.995, wavelength / (2 * pitch))  # below 1, so that w stays above 0
-        tangents.append(min(limit, sine / math.sqrt(1 - sine**2)))
-    sines = [tangent / math.sqrt(1 + tangent**2) for tangent in tangents]
-    lowest = math.sqrt(max(1 - sines[0] ** 2 - sines[1] ** 2, 0.005))
+def axial_range(wavelength: float, steepest: Iterable[float]) -> tuple[float, float]:
+    """Smallest and largest axial frequency w, in cycles per metre, of light up to the tangents ``steepest`` (y, x)."""
+    sines = [tangent / math.sqrt(1 + tangent**2) for tangent in steepest]
+    lowest = math.sqrt(max(1 - sines[0] ** 2 - sines[1] ** 2, 0.005))  # kept above 0 for the steepest light
     return lowest / wavelength, 1 / wavelength
 
 
 @dataclass(frozen=True)
 class Nodes:
-    """Evenly spaced nodes and the Kaiser-Bessel window that spreads planes onto them.
+    """Evenly spaced nodes and the Kaiser-Bessel window that spreads planes onto them."""
 
-    Attributes:
-        first: Depth of node 0 in metres, the smallest.
-        spacing: Distance between neighbouring nodes in metres.
-        count: Number of nodes.
-        width: Number of nodes that a plane is spread onto; 1 if the planes lie on the nodes.
-        oversampling: Ratio of the sampling rate 1 / ``spacing`` to the width of the axial band, above 1.
-        centre: Axial frequency in cycles per metre that is removed from the phases of the nodes.
-    """
-
-    first: float
-    spacing: float
-    count: int
-    width: int
-    oversampling: float
+    first: float  # depth of node 0 in metres, the smallest
+    spacing: float  # distance between neighbouring nodes in metres
+    count: int  # number of nodes
+    width: int  # number of nodes that a plane is spread onto; 1 if the planes lie on the nodes
+    oversampling: float  # sampling rate 1 / ``spacing`` over the width of the range of axial frequencies, above 1
+    # Middle of that range in cycles per metre. The phase exp(2 pi i z ``centre``) is part of the weights of a plane at
+    # z, so that the factors between nodes only hold axial frequencies relative to ``centre``.
     centre: float
 
     @property
     def _beta(self) -> float:
-        # The main lobe of the window's transform ends where the first alias of the band begins (Beatty et al. 2005).
+        # The main lobe of the window's transform ends where its first alias begins (Beatty et al. 2005).
         return math.pi * math.sqrt((self.width / self.oversampling * (self.oversampling - 0.5)) ** 2 - 0.8)
 
     def weights(self, depths: Sequence[float]) -> tuple[list[int], np.ndarray]:
-        """First node of each plane, and the weights of the ``width`` nodes from there on, complex128 [D, width]."""
+        """Index of the first node of each plane, and weights of ``width`` nodes from it on, complex128 [D, width]."""
         positions = (np.asarray(depths) - self.first) / self.spacing
         phasors = np.exp(2j * math.pi * np.fmod(np.asarray(depths) * self.centre, 1.0))[:, None]
         if self.width == 1:
@@ -68,7 +52,7 @@ class Nodes:
         return begin.tolist(), np.i0(self._beta * np.sqrt(np.clip(1 - offset**2, 0, None))) * phasors
 
     def response(self, frequency: Tensor) -> Tensor:
-        """Fourier transform of the window at axial frequencies relative to ``centre``, in cycles per metre."""
+        """Fourier transform of the window at axial frequencies minus ``centre``, in cycles per metre."""
         if self.width == 1:
             return torch.ones_like(frequency)
         square = self._beta**2 - (math.pi * self.width * self.spacing * frequency).square()
@@ -81,7 +65,7 @@ class Nodes:
         return self.first + index * self.spacing
 
     def error(self, low: float, high: float) -> float:
-        """Root-mean-square error of the represented exponentials over axial frequencies from ``low`` to ``high``."""
+        """Root-mean-square error of exp(2 pi i z w) on the nodes, for axial frequencies w from ``low`` to ``high``."""
         if self.width == 1:
             return 0.0
         frequency = np.linspace(low, high, 33) - self.centre
@@ -103,31 +87,30 @@ def choose_nodes(depths: tuple[float, ...], low: float, high: float, tolerance: 
     themselves if that is not more expensive.
     """
     nearest, farthest, centre = min(depths), max(depths), (low + high) / 2
-    best = None
+    best, best_cost = None, math.inf
     for width in (4, 5, 6, 8, 10, 12):
         for oversampling in (1.25, 1.5, 2.0):
             spacing = 1 / (oversampling * (high - low))
             count = math.ceil((farthest - nearest) / spacing) + width
-            first = nearest - (width // 2) * spacing
-            nodes = Nodes(first, spacing, count, width, oversampling, centre)
-            # Spreading a plane onto one more node costs about 1 us at 512 px on two cores, the transform and the
-            # propagation of a node 0.4 ms (measured): the ratio is 0.003.
+            nodes = Nodes(nearest - (width // 2) * spacing, spacing, count, width, oversampling, centre)
+            # The unit is the time of the transform and propagation of a node, 0.4 ms at 512 px on two cores (measured).
+            # Spreading a plane onto a node takes 1 us.
             cost = count + 0.003 * width * len(depths)
-            if nodes.error(low, high) <= tolerance and (best is None or cost < best[0]):
-                best = cost, nodes
-    even = _evenly_spaced(depths)
-    if even is not None and (best is None or len(depths) <= best[0]):
+            if cost < best_cost and nodes.error(low, high) <= tolerance:
+                best, best_cost = nodes, cost
+    even = _even_spacing(depths)
+    if even is not None and len(depths) <= best_cost:
         return Nodes(nearest, even, len(depths), 1, math.inf, centre)
     if best is None:
         raise ValueError(f"no spreading onto nodes reaches a tolerance of {tolerance:g}; 1e-7 is the least")
-    return best[1]
+    return best
 
 
-def _evenly_spaced(depths: tuple[float, ...]) -> float | None:
+def _even_spacing(depths: tuple[float, ...]) -> float | None:
     """Spacing of the sorted depths in metres, or None if they are uneven by more than 1e-12 of the largest depth."""
-    ordered = sorted(depths)
-    if len(ordered) == 1:
+    if len(depths) == 1:
         return 1e-3  # arbitrary for a single plane
-    step = (ordered[-1] - ordered[0]) / (len(ordered) - 1)
-    exact = all(abs(depth - ordered[0] - i * step) <= 1e-12 * ordered[-1] for i, depth in enumerate(ordered))
-    return step if exact and step > 0 else None
+    ordered = np.sort(depths)
+    step = float(ordered[-1] - ordered[0]) / (len(depths) - 1)
+    deviation = np.abs(ordered - ordered[0] - np.arange(len(depths)) * step)
+    return step if step > 0 and deviation.max() <= 1e-12 * ordered[-1] else None

@@ -16,9 +16,9 @@ from holotorch.hologram.raster import span
 from holotorch.optics.free_space.padding import FINEST
 
 _ROUNDING = {torch.complex64: 5e-7, torch.complex128: 1e-12}  # relative rounding error of the sums
-_WAVE = 150.0  # operations per sample of a spherical wave in float64; measured against the time of an FFT
-_PASS = 12.0  # operations per sample of one pass over an array; measured likewise
-_FEW_SAMPLES = 4  # pixels; a narrower cone is not sampled well enough to act as a spherical wave
+# Computing times, as floating-point operations of an FFT that takes as long (measured).
+_WAVE = 150.0  # per sample of a spherical wave in float64
+_PASS = 12.0  # per sample of one pass over an array
 
 
 @dataclass(frozen=True)
@@ -28,15 +28,15 @@ class HologramPlan:
     Attributes:
         method: "convolution" or "axial nodes".
         cone: Definition of the waves, see ``holotorch.hologram.cone``.
-        near: Whether some pixel lies so near the edge of the cone of some source, or beyond it, that the choice of
-            ``cone`` may change the field by more than the tolerance.
+        near: Whether the choice of ``cone`` may change the field by more than the tolerance, since a pixel lies near
+            the edge of the cone of a source, or outside it.
         transforms: Number of FFTs of sources, one per plane or per node.
         size: Size (y, x) of the whole spectrum in samples.
         predicted_error: Expected relative L2 error for random sources, against the wave that ``cone`` defines.
-        memory_bytes: Peak of the extra memory for one wavelength, in bytes.
-        flops: Floating-point operations for one wavelength, for FFTs and passes over arrays.
+        memory_bytes: Peak of the extra memory in bytes.
+        flops: Computing time, as the number of floating-point operations of an FFT that takes as long.
         reason: Short text that explains the choice.
-        runner_up: Short text about the other method.
+        runner_up: Short text about the method that was not chosen.
         notes: Warnings where the scene is near a limit of validity.
         adequate: Whether ``predicted_error`` is within the tolerance.
         operator: The module that computes the hologram.
@@ -69,7 +69,7 @@ def plan_hologram(
     dtype: torch.dtype = torch.complex64,
     memory_limit: int | None = None,
 ) -> HologramPlan:
-    """Choose the method for a hologram of planes with h x w sources each.
+    """Choose the cheapest method for a hologram of planes with h x w sources each, within tolerance and memory limit.
 
     Args:
         grid: Pixels of the hologram.
@@ -77,14 +77,15 @@ def plan_hologram(
         depths: Distances of the planes from the hologram in metres, above 0.
         shape: Number of sources (h, w) of a plane. It need only cover the part of the scene that is not dark.
         stride: Distance between neighbouring sources in pixels.
-        tolerance: Largest permitted relative L2 error.
+        tolerance: Largest permitted relative L2 error of the field.
         cone: Definition of the waves; only methods that compute this wave are considered. The default is "taper", which
-            is the cheapest and rings least, or "box" at pitches below 0.9 wavelengths. For distant planes, where
-            ``near`` is False, all definitions but "band" give the same field within the tolerance.
-        dtype: Type of the field, complex64 or complex128.
+            is the cheapest and rings least, or "box" at pitches below 0.9 wavelengths. If the plan's ``near`` is False,
+            all definitions but "band" give the same field within the tolerance.
+        dtype: dtype of the field, complex64 or complex128.
         memory_limit: Largest permitted extra memory in bytes; None for no limit.
 
     Raises:
+        TypeError: ``dtype`` is not a complex type.
         ValueError: Invalid arguments, no method within the tolerance, or none within the memory limit.
     """
     wavelength, listed, stride = check_scene(grid, wavelength, depths, stride)
@@ -94,10 +95,10 @@ def plan_hologram(
     asked: Cone = cone or ("taper" if min(grid.pitch) >= FINEST * wavelength else "box")
     exact = ConvolutionHologram(grid, wavelength, listed, cone=asked, stride=stride)
     methods = [_convolution(exact, shape, dtype)]
-    apart, _ = span(grid, shape, stride)
-    limited = _in_frequency(grid, wavelength, min(listed), apart, asked)
-    if limited:
-        axial = AxialHologram(grid, wavelength, listed, cone=limited, stride=stride, tolerance=tolerance)
+    displacement, _ = span(grid, shape, stride)
+    axial_cone = _axial_cone(grid, wavelength, min(listed), displacement, asked)
+    if axial_cone:
+        axial = AxialHologram(grid, wavelength, listed, cone=axial_cone, stride=stride, tolerance=tolerance)
         methods.append(_axial(axial, shape, dtype))
     adequate = [method for method in methods if method["predicted_error"] <= tolerance]
     if not adequate:
@@ -106,69 +107,70 @@ def plan_hologram(
             f"no method reaches a tolerance of {tolerance:.1e} for cone={asked!r}: {best['method']} comes to "
             f"{best['predicted_error']:.1e}; use cone='taper' or a larger tolerance"
         )
-    ordered = sorted(adequate, key=lambda method: method["flops"])
-    if memory_limit is not None:
-        fitting = [method for method in ordered if method["memory_bytes"] <= memory_limit]
-        if not fitting:
-            least = min(method["memory_bytes"] for method in ordered)
-            raise ValueError(
-                f"the hologram needs {least / 1e9:.2f} GB and {memory_limit / 1e9:.2f} GB are allowed; use fewer "
-                "pixels or a larger tolerance"
-            )
-        ordered = fitting
-    best, others = ordered[0], [method for method in methods if method is not ordered[0]]
+    limit = math.inf if memory_limit is None else memory_limit
+    fitting = [method for method in adequate if method["memory_bytes"] <= limit]
+    if not fitting:
+        least = min(method["memory_bytes"] for method in adequate)
+        raise ValueError(
+            f"the hologram needs {least / 1e9:.2f} GB and {limit / 1e9:.2f} GB are allowed; use fewer pixels or a "
+            "larger tolerance"
+        )
+    best = min(fitting, key=lambda method: method["flops"])
     runner_up = "no other method computes this cone of light"
-    if others:
-        other = others[0]
-        ratio = other["flops"] / best["flops"]
-        verdict = f"would take {ratio:.1f} times as long" if other in adequate else "is not accurate enough"
-        runner_up = f"{other['method']} (error {other['predicted_error']:.0e}) {verdict}"
-    near = not is_plain(grid, wavelength, min(listed), apart, tolerance)
-    notes = _notes(grid, wavelength, listed, near)
+    for other in methods:
+        if other is not best:
+            ratio = other["flops"] / best["flops"]
+            verdict = f"would take {ratio:.1f} times as long" if other in adequate else "is not accurate enough"
+            runner_up = f"{other['method']} (error {other['predicted_error']:.0e}) {verdict}"
+    near = not is_plain(grid, wavelength, min(listed), displacement, tolerance)
+    notes = _notes(grid, wavelength, min(listed), near)
     return HologramPlan(**best, cone=asked, near=near, runner_up=runner_up, notes=notes, adequate=True)
 
 
-def _in_frequency(grid: Grid, wavelength: float, nearest: float, apart: tuple[int, int], asked: Cone) -> Cone | None:
-    """Cone with which an axial hologram computes the wave that ``asked`` defines, or None if it cannot."""
+def _axial_cone(
+    grid: Grid, wavelength: float, nearest: float, displacement: tuple[int, int], cone: Cone
+) -> Cone | None:
+    """Cone with which an ``AxialHologram`` computes the wave that ``cone`` defines, or None if it cannot."""
     if min(grid.pitch) < FINEST * wavelength:
         return None
-    if asked in ("taper", "band"):
-        return asked
+    if cone in ("taper", "band"):
+        return cone
     # If every pixel lies inside the sharp cone of every source, the cone cuts nothing off: the wave is that of "full".
-    y, x = (distance / half for distance, half in zip(apart, cone_samples(grid, wavelength, nearest), strict=True))
-    return "full" if max(y, x) < 1 and (asked != "disc" or math.hypot(y, x) < 1) else None
+    half_widths = cone_samples(grid, wavelength, nearest)
+    y, x = (samples / half for samples, half in zip(displacement, half_widths, strict=True))
+    return "full" if max(y, x) < 1 and (cone != "disc" or math.hypot(y, x) < 1) else None
 
 
 def _transform(samples: float) -> float:
+    """Floating-point operations of an FFT."""
     return 5 * samples * math.log2(max(samples, 2))
 
 
 def _convolution(operator: ConvolutionHologram, shape: tuple[int, int], dtype: torch.dtype) -> dict:
+    """Attributes of a :class:`HologramPlan` that depend on the operator."""
     size, count = operator.padded(shape), len(operator.depths)
     samples, sources = math.prod(size), math.prod(size) / operator.stride**2
     waves = [math.prod(operator.kernel_samples(depth, shape, size)) for depth in operator.depths]
     flops = count * (_transform(sources) + _transform(samples) / 2 + 3 * _PASS * samples) + _WAVE * sum(waves)
-    bytes_ = dtype.itemsize
+    if operator.cone == "band":  # relative to the band-limited wave, for random sources; derived in ``CroppedKernel``
+        sine = operator.wavelength / (2 * min(operator.grid.pitch))
+        error = 2 * sine**2 / math.sqrt(min(size) / 2)
+    else:
+        error = math.hypot(_ROUNDING[dtype], TAPER_ERROR if operator.cone == "taper" else 0)
     return {
         "method": "convolution",
         "transforms": count,
         "size": size,
-        "predicted_error": _convolution_error(operator, size, dtype),
-        "memory_bytes": round(bytes_ * (3.3 * samples + sources) + 80 * max(waves)),
+        "predicted_error": error,
+        "memory_bytes": round(dtype.itemsize * (3.3 * samples + sources) + 80 * max(waves)),
         "flops": flops + _transform(samples),
         "reason": f"{count} planes, each with a transform of its sources and half of one for its wave; exact",
         "operator": operator,
     }
 
 
-def _convolution_error(operator: ConvolutionHologram, size: tuple[int, int], dtype: torch.dtype) -> float:
-    if operator.cone == "band":  # relative to the band-limited wave, for random sources; derived in ``CroppedKernel``
-        sine = operator.wavelength / (2 * min(operator.grid.pitch))
-        return 2 * sine**2 / math.sqrt(min(size) / 2)
-    return math.hypot(_ROUNDING[dtype], TAPER_ERROR if operator.cone == "taper" else 0)
-
-
 def _axial(operator: AxialHologram, shape: tuple[int, int], dtype: torch.dtype) -> dict:
+    """As :func:`_convolution`."""
     design = operator.design(shape)
     samples, sources = math.prod(design.size), math.prod(design.size) / operator.stride**2
     nodes, planes = design.nodes.count, len(operator.depths)
@@ -188,10 +190,10 @@ def _axial(operator: AxialHologram, shape: tuple[int, int], dtype: torch.dtype) 
     }
 
 
-def _notes(grid: Grid, wavelength: float, depths: Sequence[float], near: bool) -> tuple[str, ...]:
+def _notes(grid: Grid, wavelength: float, nearest: float, near: bool) -> tuple[str, ...]:
     notes = []
-    across = 2 * min(cone_samples(grid, wavelength, min(depths)))
-    if across < _FEW_SAMPLES:
+    across = 2 * min(cone_samples(grid, wavelength, nearest))
+    if across < 4:  # a narrower cone is not sampled well enough to act as a spherical wave
         notes.append(
             f"the nearest plane's light covers {across:.2g} pixels: closer than that a point is a pixel, not a wave"
         )

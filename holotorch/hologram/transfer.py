@@ -1,4 +1,4 @@
-"""Transfer factors of an axial hologram: propagation from node to node, and the spectrum of the spherical wave."""
+"""Design of an ``AxialHologram``, and the factors by which it multiplies spectra."""
 
 import math
 from dataclasses import dataclass
@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from holotorch.core.fourier import multiply_even
-from holotorch.core.grid import Grid
 from holotorch.hologram.cone import taper
 from holotorch.hologram.nodes import Nodes
 from holotorch.hologram.padding import Axis, faded_out
@@ -17,74 +16,50 @@ from holotorch.optics.free_space.kernels import turns_phasor
 
 @dataclass(frozen=True)
 class AxialDesign:
-    """Choices of an :class:`AxialHologram` for layers of one shape.
+    """Nodes and transforms of an ``AxialHologram`` for layers of one shape."""
 
-    Attributes:
-        nodes: Nodes along the axis.
-        size: Size (y, x) of the transforms in samples.
-        predicted_error: Expected relative L2 error for random sources, against the wave that ``cone`` defines.
-        adequate: Whether ``predicted_error`` is within the tolerance.
-    """
+    axes: tuple[Axis, Axis]  # sources and pixels along (y, x)
+    nodes: Nodes  # nodes along the optical axis
+    raster: Raster  # padded array that holds the sources and the pixels
+    predicted_error: float  # expected relative L2 error for random sources, against the wave that ``cone`` defines
+    adequate: bool  # whether ``predicted_error`` is within the tolerance
 
-    nodes: Nodes
-    size: tuple[int, int]
-    predicted_error: float
-    adequate: bool
+    @property
+    def size(self) -> tuple[int, int]:
+        """Size (N_y, N_x) of the spectra in samples."""
+        return self.raster.size
 
+    def step(self, nodes: int, like: Tensor) -> Tensor:
+        """Factor exp(2 pi i (w - centre) z), [N_y, N_x], for a distance z of ``nodes`` spacings of the nodes.
 
-class TransferFactors:
-    """Factors of the spectra in frequency, for layers of one shape.
-
-    Args:
-        grid: Pixels of the hologram.
-        wavelength: In metres.
-        design: Nodes and transform size.
-        axes: Sources and pixels along (y, x).
-        raster: Positions of both on the padded array.
-        dtype: Complex dtype of the factors.
-        device: Device of the factors.
-    """
-
-    def __init__(
-        self,
-        grid: Grid,
-        wavelength: float,
-        design: AxialDesign,
-        axes: tuple[Axis, Axis],
-        raster: Raster,
-        dtype: torch.dtype,
-        device: torch.device,
-    ):
-        self.grid, self.wavelength, self.design, self.axes, self.raster = grid, wavelength, design, axes, raster
-        self.dtype = dtype
-        height, width = design.size
-        self.fy = torch.arange(height // 2 + 1, dtype=torch.float64, device=device)[:, None] / (height * grid.pitch[0])
-        self.fx = torch.arange(width // 2 + 1, dtype=torch.float64, device=device)[None, :] / (width * grid.pitch[1])
-
-    def step(self, nodes: int) -> Tensor:
-        """Factor [N_y, N_x] from one node to the node that is ``nodes`` deeper."""
-        cycles = self._axial_offset() * (self.design.nodes.spacing * nodes)
-        whole = torch.ones(self.design.size, dtype=self.dtype, device=cycles.device)
-        return multiply_even(whole, turns_phasor(cycles).to(self.dtype))
-
-    def last(self, node: int) -> Tensor:
-        """Quadrant of the factor for the sum at ``node``.
-
-        It is the spectrum of the spherical wave times cone and attenuation, divided by the spectrum of the window.
+        w is the axial frequency, ``centre`` that of the nodes. dtype and device are those of ``like``.
         """
-        nodes, axial, offset = self.design.nodes, self._axial(), self._axial_offset()
-        strength = 1 / (axial * math.prod(self.grid.pitch) * nodes.response(offset))
-        strength = torch.where(axial > 0.07 / self.wavelength, strength, 0)
-        for axis, frequency, length in zip(self.axes, (self.fy, self.fx), self.design.size, strict=True):
+        _, offset = self._axial_frequency(like.device)
+        whole = torch.ones(self.size, dtype=like.dtype, device=like.device)
+        return multiply_even(whole, turns_phasor(offset * (self.nodes.spacing * nodes)).to(like.dtype))
+
+    def last(self, node: int, like: Tensor) -> Tensor:
+        """First quadrant of the factor from the sum over all nodes to the spectrum of the hologram.
+
+        The phases of the sum are relative to ``node``. The factor is the spectrum of the spherical wave from ``node``
+        times taper and attenuation, divided by the Fourier transform of the window. dtype and device are those of
+        ``like``.
+        """
+        axial, offset = self._axial_frequency(like.device)
+        strength = 1 / (axial * math.prod(self.raster.grid.pitch) * self.nodes.response(offset))
+        strength = torch.where(axial > 0.07 / self.axes[0].wavelength, strength, 0)
+        for axis, frequency, length in zip(self.axes, self.raster.frequencies(like.device), self.size, strict=True):
             if axis.cone == "taper":
                 strength = strength * taper(2 * axis.pitch * frequency)
             strength = strength * faded_out(frequency / axial, *axis.fade(length))
-        wave = turns_phasor(offset * nodes.depth(node) + 0.25)  # a quarter cycle is the factor i of Weyl's expansion
-        return (wave * strength).to(self.dtype)
+        # A quarter cycle is the factor i of Weyl's expansion.
+        wave = turns_phasor(offset * self.nodes.depth(node) + 0.25)
+        return (wave * strength).to(like.dtype)
 
-    def _axial(self) -> Tensor:
-        square = self.wavelength**-2 - self.fy.square() - self.fx.square()
-        return torch.sqrt(square.clamp(min=(0.05 / self.wavelength) ** 2))
-
-    def _axial_offset(self) -> Tensor:
-        return self._axial() - self.design.nodes.centre
+    def _axial_frequency(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Axial frequency w of the first quadrant in cycles per metre, and w minus the nodes' ``centre``."""
+        fy, fx = self.raster.frequencies(device)
+        wavelength = self.axes[0].wavelength
+        square = wavelength**-2 - fy.square() - fx.square()
+        axial = torch.sqrt(square.clamp(min=(0.05 / wavelength) ** 2))
+        return axial, axial - self.nodes.centre

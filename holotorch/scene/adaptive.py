@@ -1,6 +1,6 @@
-"""Adaptive ray sampling: a coarse lattice of rays first, all rays where neighbours differ (Section 6.4.3).
+"""Adaptive ray sampling: first a coarse lattice of rays, then all rays where neighbours differ (Section 6.4.3).
 
-The sampler skips empty space and finished rays in any case. Fewer rays therefore save time only where a ray is
+``DVRSampler`` skips empty space and ends opaque rays in any case. Fewer rays therefore save time only where a ray is
 expensive: in dense matter, with lighting, or in a rotated volume.
 """
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from holotorch.core import checks
 from holotorch.scene.reading import interpolate
@@ -21,8 +22,8 @@ class AdaptivePicture:
 
     Attributes:
         image: Red, green, blue, [3, h, w].
-        opacity: [h, w].
-        followed: Whether a ray was followed, bool [h, w]; the others are interpolated between their neighbours.
+        opacity: Opacity in [0, 1], [h, w].
+        followed: Whether a ray was followed, bool [h, w]; the other pixels are interpolated between their neighbours.
     """
 
     image: Tensor
@@ -41,8 +42,8 @@ class AdaptiveReport:
 
     Attributes:
         share: Fraction of the rays that were followed.
-        error: Relative L2 error of the image against that of all rays; 0 where both are black.
-        largest: Largest difference of a pixel's colour.
+        error: Relative L2 error of the image against the image of all rays; 0 if the latter is black.
+        largest: Largest absolute difference of a colour of a pixel.
     """
 
     share: float
@@ -51,18 +52,17 @@ class AdaptiveReport:
 
 
 def render_adaptively(sampler: DVRSampler, volume: Volume, *, step: int = 4, contrast: float = 0.05) -> AdaptivePicture:
-    """Picture from every ``step``-th ray of each axis, and from all rays in cells of high contrast between them.
+    """Picture from every ``step``-th ray along each axis, and from all rays in cells of high contrast between them.
 
-    A cell is refined if any colour or the opacity differs by more than ``contrast`` between its corners or those of
-    the adjacent cells; rays in the other cells are interpolated linearly. Details smaller than a cell that touch no
-    corner of it or of its neighbours are missed. The picture is differentiable; the choice of rays is not.
+    A cell is refined if a colour or the opacity differs by more than ``contrast`` among the corners of the cell and of
+    the adjacent cells. Pixels in the other cells are interpolated linearly, so details between these corners are
+    missed. The picture is differentiable; the choice of rays is not.
 
     Raises:
         ValueError: A step below 1 or a contrast below 0.
     """
     step = checks.whole("step", step, 1)
-    if checks.finite("contrast", contrast) < 0:
-        raise ValueError(f"contrast must be at least 0, got {contrast}")
+    checks.nonnegative("contrast", contrast)
     shape = sampler.grid.shape
     device = volume.values.device
     rows, columns = (_lattice(size, step, device) for size in shape)
@@ -81,7 +81,7 @@ def render_adaptively(sampler: DVRSampler, volume: Volume, *, step: int = 4, con
 
 @torch.no_grad()
 def adaptive_report(sampler: DVRSampler, volume: Volume, *, step: int = 4, contrast: float = 0.05) -> AdaptiveReport:
-    """Error of :func:`render_adaptively` against the picture of all rays, and the fraction of rays that it follows."""
+    """Render with a subset of the rays and with all of them, and compare; see :func:`render_adaptively`."""
     adaptive = render_adaptively(sampler, volume, step=step, contrast=contrast)
     whole, _ = sampler.render(volume)
     difference, norm = adaptive.image - whole, whole.norm().item()
@@ -90,24 +90,22 @@ def adaptive_report(sampler: DVRSampler, volume: Volume, *, step: int = 4, contr
 
 
 def _lattice(size: int, step: int, device: torch.device) -> Tensor:
+    """Indices of every ``step``-th ray and the last, so that every ray lies within a cell."""
     rays = torch.arange(0, size, step, device=device)
-    # The last ray is included, so that every ray lies within a cell.
     return rays if rays[-1] == size - 1 else torch.cat([rays, rays.new_tensor([size - 1])])
 
 
 def _refined(corners: Tensor, contrast: float) -> Tensor:
-    """Mask of the cells to refine, [n - 1, m - 1] but at least one per axis, from corners [c, n, m]."""
-    sizes = corners.shape[1:]
-    # An axis of one sample has one cell.
-    framed = torch.nn.functional.pad(corners[None], (0, int(sizes[1] == 1), 0, int(sizes[0] == 1)), mode="replicate")
-    highest, lowest = (torch.nn.functional.max_pool2d(sign * framed, 2, 1) for sign in (1, -1))
-    # Adjacent cells are included, since an edge may run just inside them.
-    spread = [torch.nn.functional.max_pool2d(part, 3, 1, 1) for part in (highest, lowest)]
-    return ((spread[0] + spread[1])[0] > contrast).any(0)
+    """Mask of the cells to refine, [n - 1, m - 1], from corners [c, n, m]; an axis of one corner has one cell."""
+    _, n, m = corners.shape
+    padded = functional.pad(corners[None], (0, int(m == 1), 0, int(n == 1)), mode="replicate")
+    # Extremes over the corners of a cell, then over the adjacent cells, since an edge may run just inside them.
+    highest, lowest = (functional.max_pool2d(functional.max_pool2d(sign * padded, 2, 1), 3, 1, 1) for sign in (1, -1))
+    return ((highest + lowest)[0] > contrast).any(0)
 
 
 def _cells(lattice: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Cell of every ray of an axis [size], and the position of the ray within it, 0 to 1."""
+    """Cell of every ray of an axis [size], and position of the ray within its cell, from 0 to 1."""
     rays = torch.arange(size, device=lattice.device)
     cell = (torch.searchsorted(lattice, rays, right=True) - 1).clamp(max=max(0, len(lattice) - 2))
     if len(lattice) == 1:

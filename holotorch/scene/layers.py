@@ -12,7 +12,7 @@ from holotorch.core.grid import Grid
 from holotorch.core.quantities import DEPTH
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class SourceLayers:
     """Light sources on planes parallel to the hologram.
 
@@ -21,9 +21,9 @@ class SourceLayers:
         depths: Distances of the planes from the hologram in metres, > 0; the first plane is nearest to the observer.
         channels: Number of colours C.
         amplitudes: Function that returns an iterator over the planes, [C, h, w] each: the square root of the radiance,
-            real, or complex where each point has its own phase. Every call yields the same planes.
+            real, or complex if it includes a phase. Every call yields the same planes.
         phase: Phase in radians, [h, w], common to all planes and colours (for instance one random phase per ray), or
-            None.
+            None for a phase of 0.
 
     Raises:
         TypeError: ``amplitudes`` cannot be called, or the phase is not real.
@@ -37,11 +37,10 @@ class SourceLayers:
     phase: Tensor | None = None
 
     def __post_init__(self) -> None:
-        depths = tuple(checks.quantity(DEPTH, depth, "depth of a layer") for depth in self.depths)
-        if not depths:
+        self.depths = tuple(checks.quantity(DEPTH, depth, "depth of a layer") for depth in self.depths)
+        if not self.depths:
             raise ValueError("depths must hold at least one distance from the hologram in metres, got none")
-        object.__setattr__(self, "depths", depths)
-        object.__setattr__(self, "channels", checks.whole("channels", self.channels, 1))
+        self.channels = checks.whole("channels", self.channels, 1)
         if not callable(self.amplitudes):
             raise TypeError(
                 f"amplitudes must be a function that returns an iterator over [C, h, w] planes, got "
@@ -53,29 +52,25 @@ class SourceLayers:
                 raise ValueError(f"phase of the layers must be one map (h, w), got shape {tuple(self.phase.shape)}")
 
     def planes(self) -> Iterator[Tensor]:
-        """The planes one after another, complex [C, h, w]: amplitude exp(i phase).
+        """The planes one after another, complex [C, h, w]: amplitude times exp(i phase).
 
         Raises:
             ValueError: A plane of another shape, or not as many planes as depths.
         """
         phase_factor = None if self.phase is None else phasor(self.phase)
-        count = 0
+        shape, expected, count = (self.channels, *self.grid.shape), len(self.depths), 0
         for count, amplitude in enumerate(self.amplitudes(), 1):
-            self._check(amplitude, count)
+            if (given := tuple(amplitude.shape)) != shape:
+                raise ValueError(f"plane {count} of the layers must be (C, h, w) = {shape}, got {given}")
+            if count > expected:
+                raise ValueError(f"layers must bring a plane for each of {expected} depths, got more")
             if phase_factor is not None:
                 yield amplitude * phase_factor
             else:
                 yield amplitude if amplitude.is_complex() else torch.complex(amplitude, torch.zeros_like(amplitude))
-        if count != len(self.depths):
-            raise ValueError(f"layers must bring a plane for each of {len(self.depths)} depths, got {count}")
+        if count != expected:
+            raise ValueError(f"layers must bring a plane for each of {expected} depths, got {count}")
 
     def stack(self) -> Tensor:
-        """All planes at once, complex [D, C, h, w]; takes 8 bytes per sample, plane and colour in complex64."""
+        """All planes at once, complex [D, C, h, w]."""
         return torch.stack(list(self.planes()))
-
-    def _check(self, amplitude: Tensor, count: int) -> None:
-        wanted = (self.channels, *self.grid.shape)
-        if tuple(amplitude.shape) != wanted:
-            raise ValueError(f"plane {count} of the layers must be (C, h, w) = {wanted}, got {tuple(amplitude.shape)}")
-        if count > len(self.depths):
-            raise ValueError(f"layers must bring a plane for each of {len(self.depths)} depths, got more")

@@ -10,19 +10,16 @@ from holotorch.core import checks
 from holotorch.scene.compositing import safe_sqrt
 from holotorch.scene.volume import Triple, Volume
 
-_FLAT = 1e-3  # difference between neighbouring voxels, relative to the range of values, at which shading fades in
-
 
 @dataclass(frozen=True)
 class Lighting:
     """A distant white light and the reflectance of the volume in the Phong model (1975).
 
-    The shaded colour is colour * (ambient + diffuse * (n . l)) + specular * (r . v)^shininess, where n is the direction
-    of the gradient, oriented towards the observer (both sides of a surface are lit), l the direction to the light, r
-    its reflection and v the direction to the observer along the axis. Where the value is constant there is no surface:
-    the colour is multiplied by ambient + diffuse, without highlight. In between, at differences of about a thousandth
-    of the range of values from voxel to voxel, shading fades in as |g|^2 / (|g|^2 + flat^2), so that the result and its
-    gradient stay finite for every volume.
+    The shaded colour is colour * (ambient + diffuse * (n . l)) + specular * (r . v)^shininess. Here n is the direction
+    of the gradient, oriented towards the observer, so that both sides of a surface are lit; l is the direction to the
+    light, r is l mirrored at n, and v is the direction to the observer along the axis. Where the value is constant
+    there is no surface, and the result is colour * (ambient + diffuse). With the length g of the gradient, in units of
+    :func:`flat_steps`, shading fades in as g^2 / (g^2 + 1), so that the result and its gradient are always finite.
 
     Attributes:
         towards: Direction to the light, (z, y, x) in the scene, of any length; z points away from the hologram.
@@ -48,19 +45,15 @@ class Lighting:
         if direction.norm() == 0:
             raise ValueError("towards must point to the light, got (0, 0, 0)")
         for name in ("ambient", "diffuse", "specular"):
-            if checks.finite(name, getattr(self, name)) < 0:
-                raise ValueError(f"{name} must be at least 0, got {getattr(self, name)}")
+            checks.nonnegative(name, getattr(self, name))
         if checks.finite("shininess", self.shininess) < 1:
             raise ValueError(f"shininess must be at least 1, got {self.shininess}")
 
     def shade(self, colour: Tensor, slopes: Tensor, rotation: Tensor, observer: float) -> Tensor:
-        """Shaded colour [3, n] of n points.
+        """Shaded colour [3, n] of n points from their ``colour`` without lighting, [3, n].
 
-        Args:
-            colour: Colour without lighting, red, green, blue, [3, n].
-            slopes: Result of :func:`slopes` at the points, along the axes (z, y, x) of the volume, [3, n].
-            rotation: Offset in the scene = rotation @ offset in the volume, [3, 3].
-            observer: Sign of the axial direction to the observer: -1 where the hologram is between volume and observer.
+        ``slopes`` [3, n] are those of :func:`slopes` along the axes (z, y, x) of the volume, ``rotation`` [3, 3] leads
+        from these axes to those of the scene. ``observer`` is -1 if the observer is on the side of lower z, else 1.
         """
         light = rotation.new_tensor(self.towards)
         light = (light / light.norm()) @ rotation
@@ -80,26 +73,27 @@ class Lighting:
 
 
 def flat_steps(volume: Volume) -> Triple:
-    """Differences between neighbours along (z, y, x) that count as a slope of 1.
+    """Difference between neighbouring samples along (z, y, x) that counts as a slope of 1.
 
-    They are a thousandth of the range of values along the axis of the smallest spacing, and proportional to the spacing
-    along the others. For a constant volume, whose slopes vanish, they are 1.
+    It is a thousandth of the range of values along the axis of the smallest spacing, and proportional to the spacing
+    along the other axes. For a constant volume, whose slopes vanish, it is 1 instead of a thousandth of the range.
     """
     least, most = volume.value_range()
-    z, y, x = (_FLAT * (most - least or 1 / _FLAT) * spacing / min(volume.spacing) for spacing in volume.spacing)
+    flat = 1e-3 * (most - least) or 1.0
+    z, y, x = (flat * spacing / min(volume.spacing) for spacing in volume.spacing)
     return z, y, x
 
 
 def slopes(values: Tensor, steps: Triple) -> Tensor:
-    """Central differences of ``values`` [D, H, W] along (z, y, x), in :func:`flat_steps`: [3, D, H, W].
+    """Central differences of ``values`` [D, H, W] along (z, y, x), divided by ``steps``: [3, D, H, W].
 
-    One-sided at the faces, zero along an axis of one sample.
+    They are one-sided at the faces, and zero along an axis of one sample. ``steps`` are those of :func:`flat_steps`.
     """
     return torch.stack([_difference(values, axis, step) for axis, step in enumerate(steps)])
 
 
 def slice_slopes(slices: Sequence[Tensor], k: int, steps: Triple, dtype: torch.dtype) -> Tensor:
-    """One slice of :func:`slopes`, [3, H, W], from the ``slices`` [H, W] of the values."""
+    """Slice ``k`` of :func:`slopes`, [3, H, W], from the slices [H, W] of the values, computed in ``dtype``."""
     before, after = max(k - 1, 0), min(k + 1, len(slices) - 1)
     along = (slices[after].to(dtype) - slices[before].to(dtype)) * (1 / (max(1, after - before) * steps[0]))
     here = slices[k].to(dtype)

@@ -1,13 +1,14 @@
 """Ray marching: front-to-back compositing of one volume along all rays, plane by plane."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
-from holotorch.scene.compositing import absorb, corrected_opacity
+from holotorch.scene.compositing import absorb, corrected_opacity, safe_sqrt
 from holotorch.scene.lighting import Lighting, flat_steps, slice_slopes, slopes
 from holotorch.scene.placement import Placement, Rays
 from holotorch.scene.reading import BRICK, PointReader, SliceReader, Window, interpolate, occupied_box
@@ -17,177 +18,130 @@ from holotorch.scene.volume import Volume
 
 @dataclass(frozen=True)
 class Step:
-    """Contribution of a plane: ``weight`` T alpha [n] and ``colour`` [3, n] of ``rays`` [n] (flat window indices)."""
+    """Contribution of a plane to n rays."""
 
-    plane: int
-    rays: Tensor
-    weight: Tensor
-    colour: Tensor
+    plane: int  # number of the plane
+    rays: Tensor  # flat indices of the rays into the window, [n]
+    weight: Tensor  # T alpha, [n]
+    colour: Tensor  # red, green, blue, [3, n]
 
 
+@dataclass(eq=False)
 class March:
-    """Front-to-back compositing of ``volume`` along ``rays``, slab by slab, for rays that may cross visible voxels.
+    """Front-to-back compositing of a volume along rays, slab by slab.
 
-    The attribute ``visible`` is the range of depths that contains visible voxels, rounded outwards to whole bricks;
-    None if there are none.
-
-    Args:
-        volume: Scalar field.
-        place: Position, size and rotation of the volume.
-        transfer: Colours and opacities.
-        lighting: Shading, or None.
-        rays: Geometry of the rays.
-        depths: Depths of the planes, front to back.
-        spans: Smallest and largest depth of the slab of each plane.
-        early: Transmittance below which a ray ends.
-
-    Raises:
-        ValueError: A voxel is NaN or infinite.
+    Only the rays of ``window`` are followed, which may meet visible voxels. ``visible`` is the range of depths in
+    metres that contains visible voxels, rounded outwards to whole bricks, or None without visible voxels. ValueError if
+    a voxel is NaN or infinite.
     """
 
-    def __init__(
-        self,
-        volume: Volume,
-        place: Placement,
-        transfer: TransferFunction,
-        lighting: Lighting | None,
-        rays: Rays,
-        depths: Sequence[float],
-        spans: Sequence[tuple[float, float]],
-        early: float,
-    ):
-        self.volume, self.place, self.transfer, self.lighting = volume, place, transfer, lighting
-        self.rays, self.depths, self.early = rays, depths, early
-        near, far = place.depth_range()
-        self.spans = [(max(low, near) - place.distance, min(high, far) - place.distance) for low, high in spans]
-        self.dtype = transfer.colours.dtype
+    volume: Volume  # scalar field
+    place: Placement  # position, size and rotation of the volume
+    transfer: TransferFunction  # colours and opacities
+    lighting: Lighting | None  # shading, or None
+    rays: Rays  # geometry of the rays
+    depths: Sequence[float]  # depths of the planes in metres, front to back
+    spans: Sequence[tuple[float, float]]  # smallest and largest depth in metres of the slab of each plane
+    observer: float  # -1 if the observer is on the side of smaller depths, else 1
+    early: float  # transmittance below which a ray ends
+
+    def __post_init__(self) -> None:
+        volume, place, transfer, rays = self.volume, self.place, self.transfer, self.rays
+        self.dtype, self.device = transfer.colours.dtype, volume.values.device
         if volume.values.is_floating_point():
             self.dtype = torch.promote_types(self.dtype, volume.values.dtype)
-        self.device = volume.values.device
-        self.unit = transfer.unit_distance * max(place.half) * 2
-        self.steps_of_slope = flat_steps(volume) if lighting is not None else None
         low, high = volume.bricks(BRICK)
-        # If the voxels are optimised, transparent ones have a gradient, too, so none may be skipped.
+        # No voxel is skipped if voxels are optimised, since transparent ones have a gradient as well.
         self.learned = volume.values.requires_grad
         self.occupied = torch.ones_like(low, dtype=torch.bool) if self.learned else transfer.visible(low, high)
         box = occupied_box(self.occupied, volume.shape)
         self.visible = place.depth_range(*box) if box is not None else None
         rows, columns = place.footprint(rays, *box) if box is not None else (range(0), range(0))
-        like = torch.empty((), dtype=self.dtype, device=self.device)
-        self.window = Window.of(place, rays, rows, columns, like)
+        self.window = Window.of(place, rays, rows, columns, torch.empty((), dtype=self.dtype, device=self.device))
 
     def steps(self, wanted: Tensor | None = None) -> Iterator[Step]:
         """Yield the contributions of the planes, front to back; planes without a contribution are left out.
 
-        Only rays where ``wanted``, bool [h, w], is true are followed; None means all.
+        ``wanted``, bool [h, w], masks the rays that are followed; None means all.
         """
         if not self.window.size:
             return
-        reader = self._reader()
+        reader, place = self._reader(), self.place
+        unit = self.transfer.unit_distance * max(place.half) * 2  # in metres
+        rotation = torch.tensor(place.rotation, dtype=torch.float64, device=self.device)
+        near, far = place.depth_range()
         transmittance = self.zeros(1)[0] + 1
         if wanted is not None:
             rows, columns = self.window.rows, self.window.columns
             transmittance = transmittance * wanted[rows.start : rows.stop, columns.start : columns.stop].flatten()
         for plane, (low, high) in enumerate(self.spans):
             alive = transmittance.detach() > self.early
-            if low >= high:
-                continue
-            sampled = reader.read(low, high, alive)
+            if not alive.any():
+                return
+            low, high = max(low, near) - place.distance, min(high, far) - place.distance
+            sampled = reader.read(low, high, alive) if low < high else None
             if sampled is None:
-                if not alive.any():
-                    return
                 continue
             colour, opacity = self.transfer(sampled.samples[0])
             if self.lighting is not None:
-                colour = self._shaded(colour, sampled.samples[1:])
+                colour = self.lighting.shade(colour, sampled.samples[1:], rotation, self.observer)
             before = transmittance.index_select(0, sampled.rays)
-            weight, after = absorb(before, corrected_opacity(opacity, sampled.length * (1 / self.unit)))
+            weight, after = absorb(before, corrected_opacity(opacity, sampled.length * (1 / unit)))
             transmittance.index_copy_(0, sampled.rays, after)
             yield Step(plane, sampled.rays, weight, colour)
 
-    def planes(self, after: Callable[[Tensor], Tensor]) -> Iterator[Tensor]:
-        """Yield ``after(radiance)``, [3, h, w], for every plane.
-
-        ``after`` must map zero to zero, since it is applied only where a plane has light.
-        """
+    def amplitudes(self) -> Iterator[Tensor]:
+        """Yield the square root of the radiance, [3, h, w], for every plane."""
+        # A single expanded zero, which takes no memory.
+        dark = torch.zeros((), dtype=self.dtype, device=self.device).expand(3, *self.rays.grid.shape)
         done = 0
         for step in self.steps():
-            yield from (self.empty() for _ in range(done, step.plane))
+            yield from [dark] * (step.plane - done)
             done = step.plane + 1
-            scale = self.rays.scale(self.depths[step.plane])
+            scale, radiance = self.rays.scale(self.depths[step.plane]), step.weight * step.colour
             if scale == 1:
-                yield self.whole_of(step.rays, after(step.weight * step.colour))
+                yield self.whole(self.zeros(3).index_copy_(1, step.rays, safe_sqrt(radiance)))
             else:
-                window = self.zeros(3).index_copy(1, step.rays, step.weight * step.colour)
-                yield after(self._resampled(window, scale))
-        yield from (self.empty() for _ in range(done, len(self.depths)))
+                yield safe_sqrt(self._resampled(self.zeros(3).index_copy_(1, step.rays, radiance), scale))
+        yield from [dark] * (len(self.depths) - done)
 
     def zeros(self, channels: int) -> Tensor:
         """Zeros [channels, rays of the window]."""
         return torch.zeros(channels, self.window.size, dtype=self.dtype, device=self.device)
 
-    def empty(self) -> Tensor:
-        """A dark plane [3, h, w]: a single expanded zero, which consumers recognise by its strides and skip."""
-        return torch.zeros((), dtype=self.dtype, device=self.device).expand(3, *self.rays.grid.shape)
-
     def whole(self, values: Tensor) -> Tensor:
-        """Place values [c, rays of the window] on the grid, [c, h, w], which is zero outside the window."""
+        """Values [c, rays of the window] on the grid, [c, h, w], which is zero outside the window."""
         (height, width), rows, columns = self.rays.grid.shape, self.window.rows, self.window.columns
         if not self.window.size:
             return values.new_zeros(len(values), height, width)
         framed = values.unflatten(1, (len(rows), len(columns)))
-        margins = (columns.start, width - columns.stop, rows.start, height - rows.stop)
-        return torch.nn.functional.pad(framed, margins)
-
-    def whole_of(self, rays: Tensor, values: Tensor) -> Tensor:
-        """Place values [3, n] of ``rays`` [n] (flat window indices) on the grid, [3, h, w], which is zero elsewhere."""
-        (height, width), rows, columns = self.rays.grid.shape, self.window.rows, self.window.columns
-        if len(columns) < width:
-            rays = rays + torch.div(rays, len(columns), rounding_mode="floor") * (width - len(columns))
-        rays = rays + (rows.start * width + columns.start)
-        plane = torch.zeros(3, height * width, dtype=values.dtype, device=values.device)
-        return plane.index_copy_(1, rays, values).unflatten(1, (height, width))
+        return functional.pad(framed, (columns.start, width - columns.stop, rows.start, height - rows.stop))
 
     def _reader(self) -> SliceReader | PointReader:
-        common = (self.place, self.rays, self.window)
+        """Reader of the values and, with lighting, their slopes as further channels."""
         support = (-math.inf, math.inf) if self.learned else self.transfer.support()
+        common = (self.place, self.rays, self.window, self.occupied, support)
+        steps = flat_steps(self.volume) if self.lighting is not None else None
         if self.place.turned:
-            return PointReader(*common, self._fields(), self.occupied, support)
-        return SliceReader(*common, self._slice_fields(), self.occupied, support)
-
-    def _fields(self) -> Tensor:
-        values = self.volume.values.to(self.dtype)
-        if self.steps_of_slope is None:
-            return values[None]
-        return torch.cat([values[None], slopes(values, self.steps_of_slope)])
-
-    def _slice_fields(self) -> Callable[[int], Tensor]:
+            values = self.volume.values.to(self.dtype)[None]
+            return PointReader(*common, values if steps is None else torch.cat([values, slopes(values[0], steps)]))
         # The backward pass of unbind makes one gradient for all slices; indexing would make a whole volume per slice.
         slices = self.volume.values.unbind(0)
-        steps = self.steps_of_slope
-        if steps is None:
-            return lambda k: slices[k].to(self.dtype)[None]
-        return lambda k: torch.cat([slices[k].to(self.dtype)[None], slice_slopes(slices, k, steps, self.dtype)])
 
-    def _shaded(self, colour: Tensor, slope: Tensor) -> Tensor:
-        assert self.lighting is not None
-        rotation = torch.tensor(self.place.rotation, dtype=torch.float64, device=self.device)
-        rising = self.depths[-1] > self.depths[0] if len(self.depths) > 1 else self._eye_is_in_front()
-        return self.lighting.shade(colour, slope, rotation, -1.0 if rising else 1.0)
+        def channels(k: int) -> Tensor:
+            values = slices[k].to(self.dtype)[None]
+            return values if steps is None else torch.cat([values, slice_slopes(slices, k, steps, self.dtype)])
 
-    def _eye_is_in_front(self) -> bool:
-        return self.rays.eye is None or self.rays.eye < self.depths[0]
+        return SliceReader(*common, channels)
 
     def _resampled(self, window: Tensor, scale: float) -> Tensor:
-        """Resample radiance [3, rays of the window] to the grid.
+        """Radiance [3, rays of the window], interpolated linearly to the grid, [3, h, w].
 
         At the depth of the plane the rays are ``scale`` times as far from the axis as the points of the grid.
         """
-        framed = window.unflatten(1, (len(self.window.rows), len(self.window.columns)))
-        framed = torch.nn.functional.pad(framed, (1, 1, 1, 1))
-        for axis, part, count in zip(
-            (-2, -1), (self.window.rows, self.window.columns), self.rays.grid.shape, strict=True
-        ):
+        rows, columns = self.window.rows, self.window.columns
+        framed = functional.pad(window.unflatten(1, (len(rows), len(columns))), (1, 1, 1, 1))
+        for axis, part, count in zip((-2, -1), (rows, columns), self.rays.grid.shape, strict=True):
             index = (torch.arange(count, dtype=torch.float64, device=window.device) - count // 2) / scale + count // 2
             # Index into the padded window, whose border is dark.
             index = (index - (part.start - 1)).clamp(0, len(part) + 1)

@@ -1,8 +1,9 @@
 """Analytic test volumes for renderers and holograms.
 
-All fill the cube [-1, 1]^3, coordinates (z, y, x), and are sampled at voxel centres: every shape (D, H, W) shows the
-same object, with unequal spacings where D, H and W differ. ``width`` is the edge length of the cube in metres; without
-it the volume is "relative", with edges of 2. Values lie in [0, 1]; torch.uint8 stores them times 255, rounded.
+All fill the cube [-1, 1]^3 with coordinates (z, y, x) and are sampled at voxel centres. Every ``shape`` (D, H, W) shows
+the same object, with unequal spacings where D, H and W differ. ``width`` is the edge length of the cube in metres;
+without ``width`` the volume is "relative", with edges of 2. Values lie in [0, 1]. ``dtype`` is a floating-point type or
+torch.uint8, which holds the values times 255, rounded.
 """
 
 import itertools
@@ -17,12 +18,11 @@ from holotorch.core.quantities import WIDTH
 from holotorch.scene.volume import Volume
 
 Shape = int | tuple[int, int, int]
-_GOLDEN = (1 + math.sqrt(5)) / 2
-_DOUBLE_BOND = 1.401  # angstrom; bond between two hexagons of C60 in the gas phase (Hedberg et al. 1991)
-_SINGLE_BOND = 1.458  # angstrom; bond around a pentagon (the same source)
-_ATOM_SIGMA = 0.35  # angstrom; width of the Gaussian at an atom
-_MOLECULE_BOX = 9.6  # angstrom; edge of the cube around the molecule
-_SHELLS = ((1 / 3, 0.9), (2 / 3, 0.6), (1.0, 0.3))  # peak and radius of the three shells, from outside in
+# Bonds of C60 in the gas phase in angstrom (Hedberg et al. 1991).
+_DOUBLE_BOND = 1.401  # between two hexagons
+_SINGLE_BOND = 1.458  # around a pentagon
+_ATOM_SIGMA = 0.35  # width of the Gaussian at an atom in angstrom
+_MOLECULE_BOX = 9.6  # edge of the cube around the molecule in angstrom
 
 
 def marschner_lobb(
@@ -33,10 +33,10 @@ def marschner_lobb(
     width: float | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Volume:
-    """Test signal of Marschner and Lobb (1994), hard for every interpolation near its Nyquist rate.
+    """Test signal of Marschner and Lobb (1994), which is hard to interpolate since it is sampled near its Nyquist rate.
 
-    (1 - sin(pi z / 2) + a (1 + cos(2 pi f cos(pi r / 2)))) / (2 (1 + a)), with r^2 = x^2 + y^2, f = ``frequency`` and
-    a = ``modulation``. The defaults are those of the paper.
+    It is (1 - sin(pi z / 2) + a (1 + cos(2 pi f cos(pi r / 2)))) / (2 (1 + a)), with r^2 = x^2 + y^2, f =
+    ``frequency`` and a = ``modulation``. The defaults are those of the paper.
     """
     frequency, modulation = checks.positive("frequency", frequency), checks.positive("modulation", modulation)
 
@@ -50,7 +50,7 @@ def marschner_lobb(
 def gaussian_ball(
     shape: Shape = 64, *, sigma: float = 0.25, width: float | None = None, dtype: torch.dtype = torch.float32
 ) -> Volume:
-    """exp(-r^2 / (2 sigma^2)); along a line at distance b from the centre it integrates to sqrt(2 pi) sigma f(b)."""
+    """exp(-r^2 / (2 sigma^2)); its integral along a line is sqrt(2 pi) sigma times the largest value on the line."""
     sigma = checks.positive("sigma", sigma)
     return _sampled(lambda z, y, x: torch.exp((z**2 + y**2 + x**2) / (-2 * sigma**2)), shape, width, dtype)
 
@@ -58,9 +58,9 @@ def gaussian_ball(
 def homogeneous_slab(
     shape: Shape = 64, *, thickness: float = 1.0, width: float | None = None, dtype: torch.dtype = torch.float32
 ) -> Volume:
-    """1 where abs(z) < ``thickness`` / 2, else 0; a voxel on an end face holds the fraction that lies inside.
+    """1 where abs(z) < ``thickness`` / 2, else 0; a voxel on a face of the slab holds the fraction that lies inside.
 
-    The sum over z times the spacing is therefore ``thickness`` at any resolution. With ``thickness`` = 2 all is 1.
+    The sum over z times the spacing is therefore ``thickness`` at any resolution. ``thickness`` is at most 2.
     """
     thickness = checks.positive("thickness", thickness)
     if thickness > 2:
@@ -77,33 +77,33 @@ def homogeneous_slab(
 def exponential_medium(
     shape: Shape = 64, *, length: float = 1.0, width: float | None = None, dtype: torch.dtype = torch.float32
 ) -> Volume:
-    """exp(-(z + 1) / ``length``), from 1 on the face z = -1; its integral over z is length (1 - exp(-2 / length))."""
+    """exp(-(z + 1) / ``length``), which is 1 at z = -1 and has the integral length (1 - exp(-2 / length)) over z."""
     length = checks.positive("length", length)
     return _sampled(lambda z, y, x: torch.exp(-(z + 1) / length), shape, width, dtype)
 
 
 def shells(shape: Shape = 128, *, width: float | None = None, dtype: torch.dtype = torch.float32) -> Volume:
-    """Three nested shells with peaks 1/3, 2/3 and 1 from outside in, at radii 0.9, 0.6 and 0.3.
+    """Three nested shells of peak values h = 1/3, 2/3 and 1 from outside in, at radii R = 0.9, 0.6 and 0.3.
 
-    Sum of h exp(-(r - R)^2 / (2 w^2)) with w = 0.04. Those of the outer two are multiplied by 1 - exp(-(x^2 + y^2) /
-    (2 g^2)), g = 0.2, where z < 0: a hole towards the first slices, through which the inner shell is visible.
+    The values are the sum of h exp(-(r - R)^2 / (2 w^2)) with w = 0.04. For z < 0 the outer two shells are multiplied
+    by 1 - exp(-(x^2 + y^2) / (2 g^2)) with g = 0.2: a hole through which the inner shell is visible.
     """
 
     def density(z: Tensor, y: Tensor, x: Tensor) -> Tensor:
-        radius = torch.sqrt(z**2 + y**2 + x**2)
-        walls = [h * torch.exp((radius - middle) ** 2 / (-2 * 0.04**2)) for h, middle in _SHELLS]
-        outer = walls[0] + walls[1]
-        if z < 0:
-            outer = outer * (1 - torch.exp((x**2 + y**2) / (-2 * 0.2**2)))
-        return outer + walls[2]
+        r = torch.sqrt(z**2 + y**2 + x**2)
+        outer, middle, inner = (
+            h * torch.exp((r - radius) ** 2 / (-2 * 0.04**2)) for h, radius in ((1 / 3, 0.9), (2 / 3, 0.6), (1.0, 0.3))
+        )
+        hole = 1 - torch.exp((x**2 + y**2) / (-2 * 0.2**2)) if z < 0 else 1
+        return (outer + middle) * hole + inner
 
     return _sampled(density, shape, width, dtype)
 
 
 def c60(shape: Shape = 128, *, width: float | None = None, dtype: torch.dtype = torch.float32) -> Volume:
-    """Buckminsterfullerene: a Gaussian of sigma 0.35 angstrom at each of the 60 atoms, in a box of 9.6 angstrom.
+    """Buckminsterfullerene: a Gaussian of sigma 0.35 angstrom at each of the 60 atoms, in a cube of 9.6 angstrom.
 
-    The density is divided by its value at an atom. ``width`` enlarges the box, which is 9.6e-10 m in nature.
+    The density is divided by its value at an atom. ``width`` is the edge of the enlarged cube.
     """
     atoms = c60_atoms() * (2 / _MOLECULE_BOX)
     scale = -1 / (2 * (_ATOM_SIGMA * 2 / _MOLECULE_BOX) ** 2)
@@ -120,28 +120,23 @@ def c60(shape: Shape = 128, *, width: float | None = None, dtype: torch.dtype = 
 
 
 def c60_atoms() -> Tensor:
-    """Nuclei of C60 about its centre, float64 [60, 3], (z, y, x) in angstrom.
+    """Positions (z, y, x) of the nuclei of C60 relative to its centre in angstrom, float64 [60, 3].
 
-    The shape is a truncated icosahedron: every edge of an icosahedron is cut at the length of a pentagon bond from
-    both ends; the remainder is the bond between two hexagons.
+    The shape is a truncated icosahedron: two nuclei lie on every edge of an icosahedron, each at the length of a
+    pentagon bond from an end. The distance between the two is the bond between two hexagons.
     """
-    signs = itertools.product((-1.0, 1.0), repeat=2)
-    corners = [_rotated((0.0, a, b * _GOLDEN), turn) for a, b in signs for turn in range(3)]
-    vertices = torch.tensor(corners, dtype=torch.float64)
-    gaps = torch.cdist(vertices, vertices)
-    # With these corners edges have length 2.
-    starts, ends = torch.nonzero((gaps - 2).abs() < 1e-9, as_tuple=True)
+    golden = (1 + math.sqrt(5)) / 2
+    points = [(0.0, a, b * golden) for a, b in itertools.product((-1.0, 1.0), repeat=2)]
+    vertices = torch.tensor([point[k:] + point[:k] for point in points for k in range(3)], dtype=torch.float64)
+    # The edges of this icosahedron have length 2.
+    starts, ends = torch.nonzero((torch.cdist(vertices, vertices) - 2).abs() < 1e-9, as_tuple=True)
     edge = 2 * _SINGLE_BOND + _DOUBLE_BOND
     atoms = vertices[starts] + (_SINGLE_BOND / edge) * (vertices[ends] - vertices[starts])
     return (atoms * (edge / 2)).flip(1)
 
 
-def _rotated(point: Sequence[float], turn: int) -> list[float]:
-    return [*point[turn:], *point[:turn]]
-
-
 def _sizes(shape: Shape) -> tuple[int, int, int]:
-    sizes = tuple(shape) if isinstance(shape, Sequence) else (shape, shape, shape)
+    sizes = shape if isinstance(shape, Sequence) else (shape, shape, shape)
     if len(sizes) != 3:
         raise ValueError(f"phantom shape must be one number or three (D, H, W), got {shape!r}")
     depth, height, width = (checks.whole("phantom shape", size, 1) for size in sizes)
@@ -157,7 +152,7 @@ def _sampled(
     scale = 1.0 if width is None else checks.quantity(WIDTH, width) / 2
     z, y, x = ((2 * torch.arange(n, dtype=torch.float64) + 1) / n - 1 for n in sizes)
     values = torch.empty(sizes, dtype=dtype)
-    # Computed slice by slice in float64, which keeps temporaries small.
+    # Slice by slice in float64, to keep temporary memory small.
     for index in range(sizes[0]):
         plane = density(z[index], y[:, None], x[None, :])
         values[index] = plane if dtype.is_floating_point else (255 * plane).round()

@@ -1,8 +1,8 @@
 """Initial phases of light sources.
 
-A constant phase (None means 0) gives an image without speckle in focus, but sends the light in one direction only. A
-random phase per ray, as in the thesis, spreads the light over the whole eye box and causes speckle. A smooth random
-phase is a compromise.
+A constant phase gives an image without speckle in focus, but sends the light in one direction only. A random phase per
+ray, as in the thesis, spreads the light over the whole eye box and causes speckle. A smooth random phase is a
+compromise.
 """
 
 import math
@@ -16,33 +16,33 @@ from holotorch.core.fourier import filter_real
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import WIDTH
 
-_WINDOWS = 64  # number of positions of a window along each axis
+_WINDOWS = 64  # number of positions along each axis of the windows of ``PointPhases``
 
 
 def random_phase(grid: Grid, *, generator: torch.Generator | None = None) -> Tensor:
     """Uniform in [0, 2 pi), independent for every ray: float32 [h, w] on the generator's device (Section 5.3.1)."""
-    return 2 * math.pi * torch.rand(grid.shape, generator=generator, device=_device(generator))
+    return 2 * math.pi * torch.rand(grid.shape, generator=generator, device=generator.device if generator else None)
 
 
 def smooth_phase(
     grid: Grid, length: float, *, spread: float = math.pi, generator: torch.Generator | None = None
 ) -> Tensor:
-    """Low-pass filtered Gaussian noise: float32 [h, w] in radians, smooth, also across the periodic border.
+    """Low-pass filtered Gaussian noise: float32 [h, w] in radians, periodic, on the generator's device.
 
     Args:
         grid: Grid of the rays.
         length: Correlation length in metres; the correlation is exp(-r^2 / (2 length^2)).
-        spread: Expected standard deviation in radians. The sines of the directions of the light have a standard
-            deviation of wavelength spread / (2 pi length).
+        spread: Expected standard deviation of the phase in radians. The sine of the direction of the light then has a
+            standard deviation of wavelength times ``spread`` / (2 pi ``length``).
         generator: Random generator of the noise.
     """
     length, spread = checks.quantity(WIDTH, length, "length"), checks.positive("spread", spread, "radians")
-    noise = torch.randn(grid.shape, generator=generator, device=_device(generator))
+    noise = torch.randn(grid.shape, generator=generator, device=generator.device if generator else None)
     fy, fx = grid.frequencies(noise.device)
     square = fy.square() + fx[:, : grid.shape[1] // 2 + 1].square()
-    # The root of the spectrum of the correlation, scaled to a variance of 1 over all frequencies.
-    whole = torch.exp(-2 * (math.pi * length) ** 2 * (fy.square() + fx.square())).mean().item()
-    kernel = torch.exp(-((math.pi * length) ** 2) * square) * (spread / math.sqrt(whole))
+    # The kernel is the root of the spectrum of the correlation, scaled to a standard deviation of ``spread``.
+    variance = torch.exp(-2 * (math.pi * length) ** 2 * (fy.square() + fx.square())).mean().item()
+    kernel = torch.exp(-((math.pi * length) ** 2) * square) * (spread / math.sqrt(variance))
     return filter_real(noise, kernel.to(noise.dtype))
 
 
@@ -51,34 +51,29 @@ class PointPhases:
     """Random phases for every point of every plane: each plane uses another window of one larger map.
 
     Points of one ray and of neighbouring planes have independent phases, so that the planes do not interfere
-    systematically; points with equal phases lie at random positions. Drawing new phases for every plane would take
-    longer than rendering it.
+    systematically. Drawing new phases for every plane would take longer than rendering the plane.
 
     Attributes:
-        phase: In [0, 2 pi), [h + 63, w + 63].
-        order: Random order of the 64 x 64 windows, whole numbers [4096]; it repeats after 4096 planes.
+        phase: Phases in [0, 2 pi), [h + 63, w + 63].
+        order: Random order of the 64 x 64 windows, as whole numbers [4096]; it repeats after 4096 planes.
     """
 
     phase: Tensor
     order: Tensor
 
     def window(self, values: Tensor, plane: int) -> Tensor:
-        """The part [h, w] of a map as large as ``phase`` that belongs to a plane; a view."""
+        """The window [h, w] of a plane in ``values``, which have the shape of ``phase``; a view."""
         y, x = divmod(int(self.order[plane % len(self.order)]), _WINDOWS)
         height, width = (size - _WINDOWS + 1 for size in self.phase.shape)
         return values[y : y + height, x : x + width]
 
     def __call__(self, plane: int) -> Tensor:
-        """Phases of a plane, [h, w]; the same every time."""
+        """Phases of a plane, [h, w]; a view."""
         return self.window(self.phase, plane)
 
 
 def point_phases(grid: Grid, *, generator: torch.Generator | None = None) -> PointPhases:
     """Uniform in [0, 2 pi), float32, for every point of every plane; see :class:`PointPhases`."""
     height, width = (size + _WINDOWS - 1 for size in grid.shape)
-    order = torch.randperm(_WINDOWS**2, generator=generator, device=_device(generator))
+    order = torch.randperm(_WINDOWS**2, generator=generator, device=generator.device if generator else None)
     return PointPhases(random_phase(Grid((height, width), grid.pitch), generator=generator), order)
-
-
-def _device(generator: torch.Generator | None) -> torch.device:
-    return torch.device("cpu") if generator is None else generator.device

@@ -1,4 +1,4 @@
-"""Position of a volume in front of the hologram, intersection with rays, and the slabs that the planes stand for."""
+"""Position of a volume in front of the hologram, its intersection with rays, and the slabs around the planes."""
 
 import itertools
 import math
@@ -11,17 +11,17 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import DEPTH, DISTANCE
-from holotorch.scene.volume import Triple, Volume
+from holotorch.scene.volume import IDENTITY, Triple, Volume
 
-_ON_FACE = 1e-9  # relative margin with which a ray in a face of the box counts as inside, in spite of rounding
+_ON_FACE = 1e-9  # relative margin within which a ray beside a face of the box counts as inside, because of rounding
 
 
 @dataclass(frozen=True)
 class Rays:
     """Straight rays, one through each sample of ``grid`` at depth ``reference``.
 
-    They are parallel to the axis (``eye`` is None), or pass through the point of the axis at depth ``eye``. Depths are
-    in metres from the hologram.
+    If ``eye`` is None, the rays are parallel to the axis, else they pass through the point of the axis at depth
+    ``eye``. Depths are in metres from the hologram.
     """
 
     grid: Grid
@@ -29,7 +29,7 @@ class Rays:
     eye: float | None
 
     def scale(self, depth: float) -> float:
-        """Distance from the axis at ``depth``, relative to that at the reference depth."""
+        """Ratio of the distances of a ray from the axis at ``depth`` and at the reference depth."""
         return 1.0 if self.eye is None else (depth - self.eye) / (self.reference - self.eye)
 
     @property
@@ -40,57 +40,43 @@ class Rays:
 
 @dataclass(frozen=True)
 class Placement:
-    """A volume of ``shape`` whose centre lies on the axis at depth ``distance``.
+    """Position, size and rotation of a volume in the scene.
 
-    Positions are offsets (z, y, x) from that centre in metres. A sample is the centre of a voxel; the volume ends half
-    a spacing beyond the outermost samples.
-
-    Attributes:
-        shape: Number of samples (z, y, x).
-        spacing: Distance between samples in metres, after scaling the longest side to ``width``.
-        distance: Depth of the centre in metres.
-        rotation: Row-major 3 x 3 over (z, y, x): offset in the scene = rotation @ offset in the volume.
+    Offsets (z, y, x) are in metres from the centre of the volume, which lies on the axis. The box of the volume ends
+    half a spacing beyond the outermost samples. Index coordinates (z, y, x) count samples from sample [0, 0, 0].
     """
 
-    shape: tuple[int, int, int]
-    spacing: Triple
-    distance: float
+    shape: tuple[int, int, int]  # number of samples (z, y, x)
+    spacing: Triple  # distance between samples along (z, y, x) in metres
+    distance: float  # depth of the centre in metres
+    # Rows of a matrix over (z, y, x): offset in the scene = rotation @ offset along the volume's axes.
     rotation: tuple[Triple, Triple, Triple]
-
-    @classmethod
-    def of(cls, volume: Volume, width: float, distance: float, rotation: tuple[Triple, Triple, Triple]) -> "Placement":
-        """Place ``volume`` with a longest side of ``width`` metres, whatever its unit."""
-        scale = width / max(volume.extent)
-        z, y, x = volume.spacing
-        return cls(volume.shape, (z * scale, y * scale, x * scale), distance, rotation)
 
     @property
     def turned(self) -> bool:
         """Whether the volume is rotated, so that its slices are not parallel to the hologram."""
-        return any(self.rotation[i][j] != (i == j) for i in range(3) for j in range(3))
+        return self.rotation != IDENTITY
 
     @property
     def half(self) -> Triple:
-        """Half the size of the box."""
+        """Half the size (z, y, x) of the box in metres."""
         (d, h, w), (z, y, x) = self.shape, self.spacing
         return d * z / 2, h * y / 2, w * x / 2
 
     def depth_range(
         self, low: Sequence[float] | None = None, high: Sequence[float] | None = None
     ) -> tuple[float, float]:
-        """Smallest and largest depth of the box, or of its part between index coordinates ``low`` and ``high``."""
+        """Smallest and largest depth of the box, or of its part between two index coordinates, in metres."""
         if low is None or high is None:
             low, high = (-0.5, -0.5, -0.5), tuple(n - 0.5 for n in self.shape)
         depths = [corner[0] for corner in self._corners(low, high)]
         return min(depths), max(depths)
 
     def offsets(self, rays: Rays, depth: float, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """Offsets in the volume of rays at ``depth``.
+        """Offsets of rays at ``depth`` along the axes of the volume, as a part [h, 3] per row and [w, 3] per column.
 
-        ``rows`` [h] and ``columns`` [w] are the positions of the rays in metres at the reference depth.
-
-        Returns:
-            [h, 3] and [w, 3]; the offset of a ray is the sum of those of its row and its column.
+        The offset of a ray is the sum of both. ``rows`` [h] and ``columns`` [w] are the positions of the rays in metres
+        at the reference depth.
         """
         axial, vertical, horizontal = (rows.new_tensor(row) for row in self.rotation)
         scale = rays.scale(depth)
@@ -100,10 +86,9 @@ class Placement:
         )
 
     def crossing(self, rays: Rays, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """Depths from the centre at which the rays at ``rows`` [h] and ``columns`` [w] enter and leave the box.
+        """Depths at which the rays at ``rows`` [h] and ``columns`` [w] enter and leave the box, float64 [h, w] each.
 
-        Returns:
-            Entry and exit, float64, [h, w] each; the entry is not below the exit where a ray misses the box.
+        They are in metres from the centre. Where a ray misses the box, the entry is not below the exit.
         """
         axial, vertical, horizontal = self.rotation
         near, far = rows.new_full((), -math.inf), rows.new_full((), math.inf)
@@ -112,18 +97,18 @@ class Placement:
             middle, slope = rays.scale(self.distance) * lateral, axial[axis] + rays.spread * lateral
             parallel = slope == 0
             one, other = ((end - middle) / torch.where(parallel, 1.0, slope) for end in (-half, half))
-            # A ray parallel to the face stays between the two faces, or outside, at all depths.
+            # A ray parallel to two faces lies between them at all depths, or at none.
             always = torch.where(middle.abs() <= half * (1 + _ON_FACE), math.inf, -math.inf)
             near = torch.maximum(near, torch.where(parallel, -always, torch.minimum(one, other)))
             far = torch.minimum(far, torch.where(parallel, always, torch.maximum(one, other)))
         return near, far
 
     def footprint(self, rays: Rays, low: Sequence[float], high: Sequence[float]) -> tuple[range, range]:
-        """Rows and columns of rays that may meet the part of the box between index coordinates ``low`` and ``high``."""
+        """Rows and columns of the rays that may meet the part of the box between two index coordinates."""
         projected: list[list[float]] = [[], []]
         for depth, *lateral in self._corners(low, high):
             scale = rays.scale(depth)
-            if scale <= 0:  # the eye lies within this range of depths, so any ray may meet it
+            if scale <= 0:  # the box extends behind the eye, so any ray may meet it
                 return range(rays.grid.shape[0]), range(rays.grid.shape[1])
             for position, positions in zip(lateral, projected, strict=True):
                 positions.append(position / scale)
@@ -137,23 +122,23 @@ class Placement:
         return rows, columns
 
     def _corners(self, low: Sequence[float], high: Sequence[float]) -> list[Triple]:
-        """Corners in the scene, (depth from the hologram, y, x), of the box between two index coordinates."""
+        """Corners (depth, y, x) in metres of the part of the box between two index coordinates."""
         ends = [
             [(index - (n - 1) / 2) * step for index in pair]
             for *pair, n, step in zip(low, high, self.shape, self.spacing, strict=True)
         ]
-        corners = []
-        for corner in itertools.product(*ends):
-            z, y, x = (sum(r * c for r, c in zip(row, corner, strict=True)) for row in self.rotation)
-            corners.append((z + self.distance, y, x))
-        return corners
+        turned = (
+            (sum(r * c for r, c in zip(row, corner, strict=True)) for row in self.rotation)
+            for corner in itertools.product(*ends)
+        )
+        return [(z + self.distance, y, x) for z, y, x in turned]
 
 
 def upright(volume: Volume, rotation: tuple[Triple, Triple, Triple]) -> tuple[Volume, tuple[Triple, Triple, Triple]]:
-    """Apply a rotation by right angles to the array of ``volume``, and return it with the identity as rotation.
+    """Apply a rotation by right angles to the array of ``volume``, and return the result and the identity.
 
-    Other rotations are returned with the unchanged volume. Slices parallel to the hologram are read several times
-    faster than points between them.
+    Slices parallel to the hologram are read several times faster than single points. Other rotations are returned with
+    the unchanged volume.
     """
     axes = [[j for j, cosine in enumerate(row) if abs(cosine) == 1] for row in rotation]
     if any(len(candidates) != 1 for candidates in axes):
@@ -165,35 +150,35 @@ def upright(volume: Volume, rotation: tuple[Triple, Triple, Triple]) -> tuple[Vo
     values = volume.values.permute(order)
     values = (values.flip(reverse) if reverse else values).contiguous()
     z, y, x = (volume.spacing[j] for j in order)
-    # Origin and orientation, the position in the world of the file, are not used in a scene.
-    return Volume(values, (z, y, x), volume.unit), check_rotation(None)
+    # A scene uses neither origin nor orientation.
+    return Volume(values, (z, y, x), volume.unit), IDENTITY
 
 
 def slabs(
     depths: Sequence[float], boundaries: Sequence[float] | None, whole: tuple[float, float]
 ) -> list[tuple[float, float]]:
-    """Smallest and largest depth of the slab that each plane stands for.
+    """Smallest and largest depth in metres of the slab around each plane.
 
-    Slabs meet half-way between planes. The first and the last extend equally far on both sides of their plane; a single
-    plane stands for ``whole``, the depth range of the volume. ``boundaries`` [D + 1] override this.
+    Slabs meet half-way between planes, unless ``boundaries`` [D + 1] are given. The first and the last slab extend
+    equally far on both sides of their plane; that of a single plane is ``whole``, the depth range of the volume.
     """
     if boundaries is None and len(depths) == 1:
         return [whole]
     if boundaries is None:
-        between = [(a + b) / 2 for a, b in zip(depths, depths[1:], strict=False)]
+        between = [(a + b) / 2 for a, b in itertools.pairwise(depths)]
         boundaries = [2 * depths[0] - between[0], *between, 2 * depths[-1] - between[-1]]
-    return [(min(pair), max(pair)) for pair in zip(boundaries, boundaries[1:], strict=False)]
+    return [(min(pair), max(pair)) for pair in itertools.pairwise(boundaries)]
 
 
 def check_planes(
     depths: Sequence[float], boundaries: Sequence[float] | None
 ) -> tuple[tuple[float, ...], tuple[float, ...] | None]:
-    """Depths and boundaries as tuples, or ValueError unless both rise or both fall and enclose one another."""
+    """``depths`` and ``boundaries`` as tuples; ValueError unless both rise or fall, with each plane in its slab."""
     planes = tuple(checks.quantity(DEPTH, depth, "depth of a plane") for depth in depths)
     if not planes:
         raise ValueError("depths must hold at least one distance from the hologram in metres, got none")
     sign = -1 if len(planes) > 1 and planes[1] < planes[0] else 1
-    for a, b in zip(planes, planes[1:], strict=False):
+    for a, b in itertools.pairwise(planes):
         if sign * (b - a) <= 0:
             raise ValueError(f"depths must rise or fall throughout, front to back, got {a:g} before {b:g} m")
     if boundaries is None:
@@ -203,18 +188,16 @@ def check_planes(
         raise ValueError(f"boundaries must be one more than the {len(planes)} depths, got {len(edges)}")
     if len(planes) == 1 and edges[1] < edges[0]:
         sign = -1
-    for k, depth in enumerate(planes):
-        if not sign * edges[k] <= sign * depth <= sign * edges[k + 1] or edges[k] == edges[k + 1]:
-            raise ValueError(
-                f"plane {k} at {depth:g} m must lie within its slab, got {edges[k]:g} to {edges[k + 1]:g} m"
-            )
+    for k, (depth, (begin, end)) in enumerate(zip(planes, itertools.pairwise(edges), strict=True)):
+        if not sign * begin <= sign * depth <= sign * end or begin == end:
+            raise ValueError(f"plane {k} at {depth:g} m must lie within its slab, got {begin:g} to {end:g} m")
     return planes, edges
 
 
 def check_rotation(rotation: Tensor | None) -> tuple[Triple, Triple, Triple]:
-    """A rotation matrix as rows of floats; ValueError unless it is orthonormal to 1e-6. Right angles become exact."""
+    """Rows of a rotation matrix, with right angles made exact; ValueError unless it is orthonormal to 1e-6."""
     if rotation is None:
-        return (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+        return IDENTITY
     if not isinstance(rotation, Tensor) or tuple(rotation.shape) != (3, 3):
         given = tuple(rotation.shape) if isinstance(rotation, Tensor) else type(rotation).__name__
         raise ValueError(f"rotation must be a (3, 3) tensor over (z, y, x), got {given}")

@@ -1,12 +1,10 @@
-"""Samples of a volume at the intersections of rays and planes, limited to rays with something visible there.
+"""Samples of a volume at the intersections of rays and planes, for rays that meet a visible value there.
 
-Both readers interpolate trilinearly at the depth of a plane, up to the faces of the volume (the outermost half voxels
-have the value of the outermost sample), for rays that have not ended and meet a visible value. ``SliceReader``
-interpolates between two slices that are parallel to the hologram; ``PointReader`` looks up each point of a rotated
-volume.
+A value is visible if its opacity is above 0. Both readers interpolate trilinearly. The outermost half voxels have the
+value of the outermost sample. ``SliceReader`` interpolates between two slices that are parallel to the hologram;
+``PointReader`` interpolates each point of a rotated volume.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -15,43 +13,31 @@ from torch import Tensor
 
 from holotorch.scene.placement import Placement, Rays
 
-BRICK = 16  # voxels along an edge of the bricks that are skipped as a whole where they are transparent
+BRICK = 16  # voxels along an edge of the bricks, which are skipped if they are transparent
 
 
 @dataclass(frozen=True)
 class RaySamples:
-    """Samples on one plane: ``samples`` [c, n] of ``rays`` [n], flat indices into the window.
+    """Samples on one plane."""
 
-    ``length`` is the length of the paths through the slab in metres, [n] or one number for all rays.
-    """
-
-    rays: Tensor
-    samples: Tensor
-    length: Tensor | float
+    rays: Tensor  # flat indices of n rays into the window, [n]
+    samples: Tensor  # c channels of each ray, [c, n]
+    length: Tensor | float  # length of the path of each ray through the slab in metres, [n], or one number for all rays
 
 
 @dataclass(frozen=True)
 class Window:
-    """The part of the ray grid that may meet something visible, and the paths of its rays through the volume.
+    """The h x w rays that may meet visible voxels, and their paths through the box of the volume."""
 
-    Attributes:
-        rows: Rows of the grid.
-        columns: Columns of the grid.
-        down: Positions of the rows in metres at the reference depth, float64 [h].
-        across: Positions of the columns in metres at the reference depth, float64 [w].
-        entry: Depth at which each ray enters the box, from its centre, [h, w]. None where all rays are parallel to the
-            axis and pass through the front and the back face.
-        exit: Depth at which each ray leaves the box, likewise.
-        oblique: Path length per depth, [h, w], or None for 1.
-    """
-
-    rows: range
-    columns: range
-    down: Tensor
-    across: Tensor
+    rows: range  # rows of the grid of rays
+    columns: range  # columns of the grid of rays
+    down: Tensor  # positions of the rows in metres at the reference depth, float64 [h]
+    across: Tensor  # positions of the columns in metres at the reference depth, float64 [w]
+    # Depth at which each ray enters the box, in metres from its centre, [h, w]; None if all rays are parallel to the
+    # axis and pass through the front and the back face.
     entry: Tensor | None
-    exit: Tensor | None
-    oblique: Tensor | None
+    exit: Tensor | None  # depth at which each ray leaves the box, in metres from its centre, [h, w], or None
+    oblique: Tensor | None  # length of the path of each ray per metre of depth, [h, w], or None for 1
 
     @classmethod
     def of(cls, place: Placement, rays: Rays, rows: range, columns: range, like: Tensor) -> "Window":
@@ -73,50 +59,41 @@ class Window:
         return len(self.rows) * len(self.columns)
 
     def length(self, low: float, high: float, rows: slice) -> Tensor | float:
-        """Path length within the box between two depths from its centre: [rows, w], or one number for all rays."""
+        """Path length in the box between two depths from its centre, in metres: [rows, w], or one number for all."""
         if self.entry is None or self.exit is None:
             return max(0.0, high - low)
         path = (self.exit[rows].clamp(max=high) - self.entry[rows].clamp(min=low)).clamp_(min=0)
         return path if self.oblique is None else path * self.oblique[rows]
 
 
+@dataclass(frozen=True, eq=False)
 class SliceReader:
-    """Reads a volume whose slices are parallel to the hologram: interpolates between slices, columns and rows in turn.
+    """Reads a volume whose slices are parallel to the hologram, by interpolation between slices, columns and rows."""
 
-    Args:
-        place: Position of the volume.
-        rays: Geometry of the rays.
-        window: Rays that are read.
-        fields: Function from a slice number to its channels [c, H, W]; the first channel is the value.
-        occupied: Whether a brick contains anything visible, bool [Dz, Hy, Wx].
-        support: See ``TransferFunction.support``.
-    """
-
-    def __init__(
-        self,
-        place: Placement,
-        rays: Rays,
-        window: Window,
-        fields: Callable[[int], Tensor],
-        occupied: Tensor,
-        support: tuple[float, float],
-    ):
-        self.place, self.rays, self.window, self.fields, self.support = place, rays, window, fields, support
-        self.bands = [_band(layer.any(1)) for layer in occupied]
+    place: Placement  # position of the volume
+    rays: Rays  # geometry of the rays
+    window: Window  # rays that are read
+    occupied: Tensor  # whether each brick of the volume contains a visible voxel, bool [Dz, Hy, Wx]
+    support: tuple[float, float]  # limits of the visible values, see ``TransferFunction.support``
+    # Function from the number of a slice to its channels [c, H, W], of which the first is the value.
+    channels: Callable[[int], Tensor]
 
     def read(self, low: float, high: float, alive: Tensor) -> RaySamples | None:
-        """Samples half-way between two depths from the centre, of the rays ``alive``, bool [rays of the window]."""
+        """Samples half-way between the depths ``low`` and ``high``, in metres from the centre of the volume.
+
+        ``alive``, bool [rays of the window], masks the rays that are read. None if no ray meets a visible value.
+        """
         place, width = self.place, len(self.window.columns)
         depth = (low + high) / 2
         index = min(max(depth / place.spacing[0] + (place.shape[0] - 1) / 2, 0.0), place.shape[0] - 1.0)
         k = min(int(index), max(0, place.shape[0] - 2))
-        band = self.bands[k // BRICK]
-        if band is None:
+        occupied = self.occupied[k // BRICK].any(1).nonzero()
+        if not len(occupied):
             return None
         scale = self.rays.scale(place.distance + depth)
-        first, part = _taps(self.window.down * scale, place.shape[1], place.spacing[1])
-        # The voxel index rises with the row of rays, so that the occupied rows are one range.
-        limits = first.new_tensor([band.start * BRICK, band.stop * BRICK])
+        first, row_weight = _taps(self.window.down * scale, place.shape[1], place.spacing[1])
+        # The index of the voxel rises with the row of the ray, so the rows that meet occupied bricks are one range.
+        limits = first.new_tensor([int(occupied[0]) * BRICK, (int(occupied[-1]) + 1) * BRICK])
         start, stop = (int(row) for row in torch.searchsorted(first, limits))
         if start >= stop:
             return None
@@ -124,56 +101,47 @@ class SliceReader:
         mask = alive[start * width : stop * width]
         if isinstance(length, Tensor):
             mask = mask & (length > 0).flatten()
-        left, share = _taps(self.window.across * scale, place.shape[2], place.spacing[2])
-        lines = interpolate(self._slice(k, index - k), left, share, -1)
-        first, part = first[start:stop], part[start:stop]
-        values = interpolate(lines[:1], first, part, -2).flatten(1)
-        rays = _visible(mask, values[0], self.support)
+        left, column_weight = _taps(self.window.across * scale, place.shape[2], place.spacing[2])
+        plane = self.channels(k)
+        plane = plane if index == k else torch.lerp(plane, self.channels(k + 1), index - k)
+        lines = interpolate(plane, left, column_weight, -1)
+        first, row_weight = first[start:stop], row_weight[start:stop]
+        values = interpolate(lines[:1], first, row_weight, -2).flatten(1)
+        rays = (mask & _visible(values[0], self.support)).nonzero().flatten()
         if not rays.numel():
             return None
         samples = values.index_select(1, rays)
         if len(lines) > 1:
-            samples = torch.cat([samples, _between_rows(lines[1:], first, part, rays)])
+            samples = torch.cat([samples, _between_rows(lines[1:], first, row_weight, rays)])
         length = length.flatten().index_select(0, rays) if isinstance(length, Tensor) else length
         return RaySamples(rays + start * width, samples, length)
 
-    def _slice(self, k: int, part: float) -> Tensor:
-        here = self.fields(k)
-        return here if part == 0 else torch.lerp(here, self.fields(k + 1), part)
 
-
+@dataclass(frozen=True, eq=False)
 class PointReader:
-    """Reads a rotated volume point by point with ``grid_sample``.
+    """Reads a rotated volume point by point; attributes as of :class:`SliceReader`, but channels [c, D, H, W]."""
 
-    Arguments as for :class:`SliceReader`, but ``fields`` holds all channels, [c, D, H, W].
-    """
-
-    def __init__(
-        self,
-        place: Placement,
-        rays: Rays,
-        window: Window,
-        fields: Tensor,
-        occupied: Tensor,
-        support: tuple[float, float],
-    ):
-        self.place, self.rays, self.window, self.fields, self.support = place, rays, window, fields, support
-        self.occupied = None if bool(occupied.all()) else occupied
+    place: Placement
+    rays: Rays
+    window: Window
+    occupied: Tensor
+    support: tuple[float, float]
+    channels: Tensor
 
     def read(self, low: float, high: float, alive: Tensor) -> RaySamples | None:
-        """As :meth:`SliceReader.read`."""
+        """Samples as of :meth:`SliceReader.read`."""
         place, window = self.place, self.window
         length = window.length(low, high, slice(None))
         assert isinstance(length, Tensor)  # one length for all rays occurs only without rotation
         length = length.flatten()
         rays = (alive & (length > 0)).nonzero().flatten()
         down, across = place.offsets(self.rays, place.distance + (low + high) / 2, window.down, window.across)
-        # In samples, counted from the centre.
+        # Offsets from the centre in samples.
         spacing = down.new_tensor(place.spacing)
-        down, across = ((offset / spacing).to(self.fields.dtype) for offset in (down, across))
+        down, across = ((offset / spacing).to(self.channels.dtype) for offset in (down, across))
         row = torch.div(rays, len(window.columns), rounding_mode="floor")
         points = down.index_select(0, row) + across.index_select(0, rays - row * len(window.columns))
-        if self.occupied is not None:
+        if not self.occupied.all():
             visible = self._in_bricks(points)
             rays, points = rays[visible], points.index_select(0, visible)
         if not rays.numel():
@@ -181,15 +149,15 @@ class PointReader:
         ends = points.new_tensor([max(1, n - 1) / 2 for n in place.shape])
         # With align_corners the coordinates -1 and 1 are the first and the last sample; the order is (x, y, z).
         samples = torch.nn.functional.grid_sample(
-            self.fields[None], (points / ends).flip(-1)[None, None, None], padding_mode="border", align_corners=True
+            self.channels[None], (points / ends).flip(-1)[None, None, None], padding_mode="border", align_corners=True
         )[0, :, 0, 0]
-        kept = _visible(None, samples[0], self.support)
+        kept = _visible(samples[0], self.support).nonzero().flatten()
         if kept.numel() < rays.numel():
             rays, samples = rays[kept], samples.index_select(1, kept)
         return RaySamples(rays, samples, length.index_select(0, rays)) if rays.numel() else None
 
     def _in_bricks(self, points: Tensor) -> Tensor:
-        assert self.occupied is not None
+        """Indices of the points [n, 3] that lie in occupied bricks."""
         flat = torch.zeros_like(points[:, 0], dtype=torch.int64)
         for axis, (n, bricks) in enumerate(zip(self.place.shape, self.occupied.shape, strict=True)):
             brick = ((points[:, axis] + (n - 1) / 2).clamp_(0, n - 1) * (1 / BRICK)).to(torch.int64)
@@ -198,57 +166,47 @@ class PointReader:
 
 
 def occupied_box(occupied: Tensor, shape: tuple[int, int, int]) -> tuple[list[float], list[float]] | None:
-    """Bounding box of all occupied bricks in index coordinates, within the volume; None if all are empty."""
-    low, high = [], []
-    for axis, n in enumerate(shape):
-        others = [other for other in range(3) if other != axis]
-        band = _band(occupied.any(others[1]).any(others[0]))
-        if band is None:
-            return None
-        low.append(band.start * BRICK if band.start else -0.5)
-        high.append(band.stop * BRICK if band.stop * BRICK < n else n - 0.5)
+    """Smallest and largest index coordinates (z, y, x) of the occupied bricks in a volume; None without any."""
+    bricks = occupied.nonzero()
+    if not len(bricks):
+        return None
+    first, last = bricks.amin(0).tolist(), bricks.amax(0).tolist()
+    low = [brick * BRICK if brick else -0.5 for brick in first]
+    high = [min((brick + 1) * BRICK, n - 0.5) for brick, n in zip(last, shape, strict=True)]
     return low, high
 
 
-def _band(occupied: Tensor) -> range | None:
-    """Range from the first to the last true element, or None."""
-    indices = occupied.nonzero().flatten().tolist()
-    return range(indices[0], indices[-1] + 1) if indices else None
-
-
 def _taps(offsets: Tensor, count: int, spacing: float) -> tuple[Tensor, Tensor]:
-    """First of two neighbouring samples [n] and weight of the second [n], for offsets from the centre in metres."""
+    """Index of the sample before each of n offsets in metres from the centre, and weight of the sample after it."""
     index = (offsets / spacing + (count - 1) / 2).clamp(0, count - 1)
     first = index.floor().clamp_(max=max(0, count - 2)).to(torch.int64)
     return first, index - first
 
 
-def interpolate(values: Tensor, first: Tensor, share: Tensor, axis: int) -> Tensor:
-    """Linear interpolation along ``axis`` (-2 or -1); ``share`` [n] is the weight of the sample after ``first`` [n]."""
+def interpolate(values: Tensor, first: Tensor, weight: Tensor, axis: int) -> Tensor:
+    """Linear interpolation along ``axis`` (-2 or -1) to n positions, between the samples ``first`` and ``first`` + 1.
+
+    ``weight`` [n] is the weight of the second of the two.
+    """
     one = values.index_select(axis, first)
     if values.shape[axis] == 1:
         return one
     other = values.index_select(axis, first + 1)
-    share = share.to(values.dtype)
-    return torch.lerp(one, other, share[:, None] if axis == -2 else share)
+    weight = weight.to(values.dtype)
+    return torch.lerp(one, other, weight[:, None] if axis == -2 else weight)
 
 
-def _between_rows(lines: Tensor, first: Tensor, share: Tensor, rays: Tensor) -> Tensor:
-    """As :func:`interpolate` along axis -2 of ``lines`` [c, n, w], for ``rays`` [m] (flat in [h, w]) only: [c, m]."""
+def _between_rows(lines: Tensor, first: Tensor, weight: Tensor, rays: Tensor) -> Tensor:
+    """As :func:`interpolate` along axis -2 of ``lines`` [c, H, w], only for m rays given by flat indices: [c, m]."""
     width = lines.shape[2]
     row = torch.div(rays, width, rounding_mode="floor")
     index = rays + (first.index_select(0, row) - row) * width
     following = index + width if lines.shape[1] > 1 else index
-    lines, share = lines.flatten(1), share.to(lines.dtype).index_select(0, row)
-    return torch.lerp(lines.index_select(1, index), lines.index_select(1, following), share)
+    lines, weight = lines.flatten(1), weight.to(lines.dtype).index_select(0, row)
+    return torch.lerp(lines.index_select(1, index), lines.index_select(1, following), weight)
 
 
-def _visible(mask: Tensor | None, values: Tensor, support: tuple[float, float]) -> Tensor:
-    """Flat indices at which ``mask`` is true and the value lies within ``support``, where opacity is above zero."""
+def _visible(values: Tensor, support: tuple[float, float]) -> Tensor:
+    """Mask of the values within ``support``, beyond which the opacity is zero."""
     low, high = support
-    values = values.detach()
-    if low > -math.inf:
-        mask = values > low if mask is None else mask & (values > low)
-    if high < math.inf:
-        mask = values < high if mask is None else mask & (values < high)
-    return torch.arange(values.numel(), device=values.device) if mask is None else mask.nonzero().flatten()
+    return (values.detach() > low) & (values.detach() < high)

@@ -10,7 +10,6 @@ from holotorch.core import checks
 from holotorch.core.complex import phasor
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import DEPTH, WIDTH
-from holotorch.scene.compositing import safe_sqrt
 from holotorch.scene.layers import SourceLayers
 from holotorch.scene.lighting import Lighting
 from holotorch.scene.march import March
@@ -20,50 +19,52 @@ from holotorch.scene.transfer import TransferFunction
 from holotorch.scene.volume import Volume
 
 PhaseMaps = Tensor | PointPhases
-_LOST = 1e-3  # fraction of the visible depth range outside the slabs from which a warning is issued
 
 
 class DVRSampler(nn.Module):
     """Light sources of a volume: each ray is composited front to back, and each step becomes a source on a plane.
 
-    A ray contributes C_j = T_j alpha_j c_j on plane j (Eq. 5.6). Colour and opacity are those of the transfer function
-    half-way through the slab of the plane; the opacity is corrected for the path length within slab and volume. A
-    homogeneous medium is therefore exact for any planes; elsewhere the error falls with the square of the slab
-    thickness. The source lies on the plane, and its amplitude is the square root of C_j.
+    A ray contributes C_j = T_j alpha_j c_j on plane j (Eq. 5.6): transmittance, opacity and colour. The source lies on
+    the plane, and its amplitude is the square root of C_j. Each plane stands for a slab of the volume. Colour and
+    opacity are those of the transfer function half-way through the slab; the opacity is corrected for the path length
+    within slab and volume. A homogeneous medium is therefore exact for any planes; elsewhere the error falls with the
+    square of the slab thickness.
 
     Slabs meet half-way between planes. The outermost slabs extend equally far on both sides of their plane; a single
-    plane stands for the whole volume. Outside its faces the volume is transparent. A SamplingWarning is issued where
-    the slabs leave out a visible part of the volume.
+    plane stands for the whole volume. Outside its faces the volume is transparent.
 
     Rays are parallel to the axis, or start at a point on it (``eye``). In the second case they pass through the points
-    of the grid on the first plane and diverge from there: each ray keeps its own transmittance, and on the other
-    planes, where its sources lie between the points of the grid, the radiance is interpolated linearly onto the grid
-    along each axis. Light beyond the grid is cut off. ``phase`` belongs to the points of the grid, not to the rays.
+    of the grid on the first plane and diverge from there. On the other planes their sources lie between the points of
+    the grid, so the radiance is interpolated linearly onto the grid along each axis, and light beyond the grid is cut
+    off. ``phase`` belongs to the points of the grid, not to the rays.
 
-    Transparent bricks of the volume are skipped, and a ray ends below a transmittance of ``early``, which bounds the
-    resulting error of an image.
+    Transparent parts of the volume are skipped, and a ray ends when its transmittance falls below ``early``, which is
+    also the largest error of an image that this causes.
 
     Args:
         transfer: Colour and opacity of the values of the volume.
         rays: Grid of the rays, centred on the axis, the same on all planes.
-        depths: Distances of the planes from the hologram in metres, front (towards the observer) to back: rising or
-            falling.
-        width: Length of the longest side of the volume in metres, whatever its unit.
+        depths: Distances of the planes from the hologram in metres, rising or falling; the first is nearest to the
+            observer.
+        width: Length of the longest side of the volume in metres; it replaces the volume's own size.
         distance: Distance of the centre of the volume from the hologram in metres; by default half-way between the
             first and the last plane.
-        rotation: 3 x 3 over (z, y, x), about the centre of the volume: offset in the scene = rotation @ offset in the
-            volume. Without it, index 0 of z is nearest to the hologram.
-        eye: Depth of the observer in metres, in front of all slabs (negative on the other side of the hologram); None
-            for an observer at infinity.
+        rotation: Rotation matrix about the centre of the volume, [3, 3] over (z, y, x): offset in the scene = rotation
+            @ offset in the volume. By default slice 0 of the volume is nearest to the hologram.
+        eye: Depth of the observer in metres, in front of all slabs, negative beyond the hologram; None for an observer
+            at infinity.
         lighting: Shading by the gradient of the volume; None for emission without shading.
-        phase: Function from the grid to phases in radians, [h, w] for every ray, or ``PointPhases``; see ``phases``.
-            None for a phase of 0.
+        phase: Function from the grid to the phases in radians, [h, w] for all planes or ``PointPhases``, see
+            ``holotorch.scene.phases``; None for a phase of 0.
         early: Transmittance below which a ray ends, in [0, 1).
         boundaries: Boundaries of the slabs in metres, [D + 1], if they are not half-way between the planes.
 
     Raises:
         TypeError: An argument of a wrong type.
         ValueError: Depths that are not monotonic, an eye that is not in front, or another number out of range.
+
+    Warns:
+        SamplingWarning: In a call without ``boundaries``, if the slabs leave out a visible part of the volume.
     """
 
     def __init__(
@@ -100,29 +101,22 @@ class DVRSampler(nn.Module):
             ValueError: A voxel is NaN or infinite, or the eye is not in front of the slabs.
         """
         march = self._march(volume)
-        maps = self.phase(self.grid) if self.phase is not None else None
-        common = maps.to(march.device, march.dtype) if isinstance(maps, Tensor) else None
-        per_point = maps if isinstance(maps, PointPhases) else None
-        factors = None if per_point is None else phasor(per_point.phase.to(march.device, march.dtype))
+        phase = self.phase(self.grid) if self.phase is not None else None
+        if not isinstance(phase, PointPhases):
+            common = phase if phase is None else phase.to(march.device, march.dtype)
+            return SourceLayers(self.grid, self.depths, 3, march.amplitudes, common)
+        factors = phasor(phase.phase.to(march.device, march.dtype))
 
         def amplitudes() -> Iterator[Tensor]:
-            for plane, amplitude in enumerate(march.planes(safe_sqrt)):
-                if per_point is None or factors is None:
-                    yield amplitude
-                else:
-                    yield _with_phase(amplitude, per_point.window(factors, plane))
+            for plane, amplitude in enumerate(march.amplitudes()):
+                yield _with_phase(amplitude, phase.window(factors, plane))
 
-        return SourceLayers(self.grid, self.depths, 3, amplitudes, common)
+        return SourceLayers(self.grid, self.depths, 3, amplitudes)
 
     def render(self, volume: Volume, rays: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Rendered picture of ``volume``: the sum of all contributions along each ray.
+        """Picture of ``volume``: red, green and blue [3, h, w], and opacity [h, w], summed along each ray.
 
-        Args:
-            volume: Scalar field.
-            rays: Mask of the rays to follow, bool [h, w]; the others stay black. All by default.
-
-        Returns:
-            Red, green, blue [3, h, w] and opacity [h, w], 1 - T behind the last plane; differentiable.
+        ``rays``, bool [h, w], masks the rays that are followed, by default all; the other pixels stay black.
         """
         march = self._march(volume)
         image, opacity = march.zeros(3), march.zeros(1)
@@ -132,7 +126,7 @@ class DVRSampler(nn.Module):
         return march.whole(image), march.whole(opacity)[0]
 
     def depth_map(self, volume: Volume) -> Tensor:
-        """Mean depth in metres along each ray, [h, w], weighted by the contributions to opacity; 0 without opacity."""
+        """Mean depth of each ray in metres, [h, w], weighted by the contributions to opacity; 0 without opacity."""
         march = self._march(volume)
         sums = march.zeros(2)
         for step in march.steps(None):
@@ -144,35 +138,34 @@ class DVRSampler(nn.Module):
         if not isinstance(volume, Volume):
             raise TypeError(f"volume must be a Volume, got {type(volume).__name__}; use Volume(values, spacing, unit)")
         volume, rotation = upright(volume, self.rotation)
-        place = Placement.of(volume, self.width, self.distance, rotation)
+        scale, (z, y, x) = self.width / max(volume.extent), volume.spacing
+        place = Placement(volume.shape, (z * scale, y * scale, x * scale), self.distance, rotation)
         spans = slabs(self.depths, self.boundaries, place.depth_range())
         near, far = min(span[0] for span in spans), max(span[1] for span in spans)
-        if self.eye is not None:
-            falling = self.depths[-1] < self.depths[0] or (len(self.depths) == 1 and self.eye > self.depths[0])
-            if not (self.eye > far if falling else self.eye < near):
-                where = f"beyond {far:g} m" if falling else f"before {near:g} m"
-                raise ValueError(f"eye must be in front of all slabs, {where} for these depths, got {self.eye:g} m")
-        rays = Rays(self.grid, self.depths[0], self.eye)
-        march = March(volume, place, self.transfer, self.lighting, rays, self.depths, spans, self.early)
-        if self.boundaries is None and march.visible is not None:
-            self._warn_if_cut(march.visible, near, far)
-        return march
-
-    def _warn_if_cut(self, visible: tuple[float, float], near: float, far: float) -> None:
-        start, end = visible
+        first, eye = self.depths[0], self.eye
+        falling = self.depths[-1] < first or (len(self.depths) == 1 and eye is not None and eye > first)
+        if eye is not None and not (eye > far if falling else eye < near):
+            where = f"beyond {far:g} m" if falling else f"before {near:g} m"
+            raise ValueError(f"eye must be in front of all slabs, {where} for these depths, got {eye:g} m")
+        rays, observer = Rays(self.grid, first, eye), 1.0 if falling else -1.0
+        march = March(volume, place, self.transfer, self.lighting, rays, self.depths, spans, observer, self.early)
+        if self.boundaries is not None or march.visible is None:
+            return march
+        start, end = march.visible
         lost = (max(0.0, min(near, end) - start) + max(0.0, end - max(far, start))) / (end - start)
-        if lost > _LOST:
+        if lost > 1e-3:
             warnings.warn(
                 f"the slabs of the planes extend from {near:g} to {far:g} m, but the visible part of the volume from "
                 f"{start:g} to {end:g} m: {lost:.0%} of that depth is cut off; add planes, or pass boundaries to cut "
                 "on purpose",
                 checks.SamplingWarning,
-                stacklevel=4,
+                stacklevel=3,
             )
+        return march
 
 
 def _with_phase(amplitude: Tensor, factor: Tensor) -> Tensor:
-    """Real [C, h, w] times complex [h, w], without a complex copy of the real one."""
-    if not any(amplitude.stride()):
-        return amplitude[0, 0, 0].to(factor.dtype).expand(amplitude.shape)  # a dark plane stays a single zero
+    """Real amplitude [C, h, w] times complex factor [h, w], without a complex copy of the amplitude."""
+    if not any(amplitude.stride()):  # a dark plane, which stays a single expanded zero
+        return amplitude[0, 0, 0].to(factor.dtype).expand(amplitude.shape)
     return torch.view_as_complex(amplitude[..., None] * torch.view_as_real(factor))

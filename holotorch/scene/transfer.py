@@ -1,4 +1,4 @@
-"""TransferFunction: colour and opacity as functions of a scalar."""
+"""TransferFunction: colour and opacity as functions of the value of a volume."""
 
 import math
 from collections.abc import Sequence
@@ -14,16 +14,17 @@ Numbers = Tensor | Sequence[float]
 class TransferFunction(nn.Module):
     """Piecewise-linear colour and opacity over the values of a volume; constant beyond the first and last position.
 
-    ``colours`` and ``opacities`` are parameters without gradient; ``transfer.requires_grad_()`` makes them learnable
-    (samplers then also evaluate transparent regions, which they skip otherwise). Values outside [0, 1] count as 0 or 1
-    and have gradient 0; call :meth:`clip_` after each optimiser step, so that no value stays outside.
+    ``colours`` and ``opacities`` are parameters without gradient; ``transfer.requires_grad_()`` makes them learnable.
+    Samplers then also evaluate transparent regions, which they skip otherwise. Parameters outside [0, 1] act as 0 or 1
+    and have gradient 0; call :meth:`clip_` after each optimiser step, so that no parameter stays outside.
 
     Args:
         positions: Values of the volume, rising, shape [K], K >= 2.
-        colours: Red, green, blue in [0, 1], shape [K, 3]: radiance of an opaque point.
-        opacities: In [0, 1], shape [K]: fraction of the light that is absorbed along ``unit_distance``.
-        unit_distance: As a fraction of the longest side of the volume, so that the picture does not depend on the size
-            at which the volume is placed. 1 / 256 is a voxel of a cube of 256 voxels.
+        colours: Red, green, blue in [0, 1] at the positions, shape [K, 3]: radiance of an opaque point.
+        opacities: Opacity in [0, 1] at the positions, shape [K]: fraction of the light that is absorbed along
+            ``unit_distance``.
+        unit_distance: Distance as a fraction of the longest side of the volume, so that the picture does not depend on
+            the size at which the volume is placed. 1 / 256 is a voxel of a cube of 256 voxels.
 
     Raises:
         TypeError: Not numbers.
@@ -41,21 +42,19 @@ class TransferFunction(nn.Module):
         unit_distance: float,
     ):
         super().__init__()
-        position, colour, opacity = (
-            _table(name, values)
-            for name, values in (("positions", positions), ("colours", colours), ("opacities", opacities))
-        )
-        count = position.numel()
+        position, colour = _table("positions", positions), _table("colours", colours)
+        opacity, count = _table("opacities", opacities), position.numel()
         if position.ndim != 1 or count < 2:
             raise ValueError(f"positions must be a list of at least 2 values, got shape {tuple(position.shape)}")
-        if tuple(colour.shape) != (count, 3):
-            raise ValueError(f"colours must be (K, 3) = {(count, 3)}, one per position, got {tuple(colour.shape)}")
-        if tuple(opacity.shape) != (count,):
-            raise ValueError(f"opacities must be (K,) = {(count,)}, one per position, got {tuple(opacity.shape)}")
-        for name, values in (("colours", colour), ("opacities", opacity)):
-            if values.detach().min() < 0 or values.detach().max() > 1:
-                ends = values.detach().aminmax()
-                raise ValueError(f"{name} must lie in [0, 1], got {ends.min.item():g} to {ends.max.item():g}")
+        for name, axes, values, shape in (
+            ("colours", "(K, 3)", colour, (count, 3)),
+            ("opacities", "(K,)", opacity, (count,)),
+        ):
+            if tuple(values.shape) != shape:
+                raise ValueError(f"{name} must be {axes} = {shape}, one per position, got {tuple(values.shape)}")
+            least, most = values.min().item(), values.max().item()
+            if least < 0 or most > 1:
+                raise ValueError(f"{name} must lie in [0, 1], got {least:g} to {most:g}")
         falls = (position.diff() <= 0).nonzero()
         if falls.numel():
             k = int(falls[0])
@@ -68,8 +67,8 @@ class TransferFunction(nn.Module):
     def forward(self, values: Tensor) -> tuple[Tensor, Tensor]:
         """Colour [3, ...] and opacity [...] per unit distance for ``values`` [...].
 
-        The result has the higher precision of the values and the table. It is differentiable in the values, too; at a
-        position the derivative is that of the interval above it.
+        The dtype is the more precise one of values and colours. The result is differentiable in the values as well; at
+        a position the derivative is that of the interval above it.
         """
         dtype = self.colours.dtype
         if values.is_floating_point():
@@ -84,9 +83,9 @@ class TransferFunction(nn.Module):
         return result[:3], result[3]
 
     def visible(self, low: Tensor, high: Tensor) -> Tensor:
-        """Whether any value between ``low`` and ``high`` [...] is not fully transparent, bool [...].
+        """Whether a value between ``low`` and ``high`` [...] has an opacity above 0, bool [...].
 
-        True everywhere while the opacities are learnable, since transparent values then have a gradient.
+        True everywhere while the opacities are learnable, since values of opacity 0 then have a gradient.
         """
         if self.opacities.requires_grad:
             return torch.ones_like(low, dtype=torch.bool)
@@ -99,7 +98,7 @@ class TransferFunction(nn.Module):
         return between | (self.forward(low)[1] > 0) | (self.forward(high)[1] > 0)
 
     def support(self) -> tuple[float, float]:
-        """Two numbers: values up to the first and from the second on are fully transparent."""
+        """Smallest interval of values outside of which the opacity is 0; all values while opacities are learnable."""
         if self.opacities.requires_grad:
             return -math.inf, math.inf
         visible = (self.opacities.detach() > 0).nonzero().flatten().tolist()
@@ -116,6 +115,7 @@ class TransferFunction(nn.Module):
 
 
 def _table(name: str, values: Numbers | Sequence[Sequence[float]]) -> Tensor:
+    """New tensor of finite numbers, float32 or float64."""
     try:
         table = torch.as_tensor(values)
     except (TypeError, ValueError) as error:

@@ -9,10 +9,10 @@ import numpy as np
 from holotorch.core import checks
 from holotorch.scene.transfer import TransferFunction
 
-UNIT_DISTANCE = 0.01  # fraction of the longest side of the volume
+UNIT_DISTANCE = 0.01  # default unit distance of the opacities, as a fraction of the longest side of the volume
 _STEP = 1e-6  # width of the slope that replaces a jump, as a fraction of the range of positions
 
-# Rows of the tables: position from 0 (``low``) to 1 (``high``), red, green, blue, opacity.
+# Rows of the tables: position from 0 (the value ``low``) to 1 (the value ``high``), red, green, blue, opacity.
 _BONE = [
     (0.00, 0.50, 0.10, 0.08, 0.00),
     (0.32, 0.60, 0.22, 0.16, 0.00),
@@ -45,7 +45,7 @@ _INDUSTRIAL = [
 
 
 def bone(low: float, high: float, *, unit_distance: float = UNIT_DISTANCE) -> TransferFunction:
-    """Ivory bone in computed tomography; softer tissue is transparent. ``low`` is air, ``high`` the densest bone."""
+    """Ivory bone in computed tomography; soft tissue is transparent. ``low`` is air, ``high`` the densest bone."""
     return _scaled(_BONE, low, high, unit_distance)
 
 
@@ -67,15 +67,15 @@ def industrial(low: float, high: float, *, unit_distance: float = UNIT_DISTANCE)
 def transfer_from_json(text: str, *, unit_distance: float = UNIT_DISTANCE) -> TransferFunction:
     """Transfer function saved by ParaView or 3D Slicer.
 
-    ParaView: the first map of the list, ``RGBPoints`` [x, r, g, b, ...] and ``Points`` [x, opacity, midpoint,
-    sharpness, ...]. 3D Slicer (volume property, schema 1): the first component's ``rgbTransferFunction`` and
-    ``scalarOpacity``. The positions of colours and opacities are merged; both are piecewise linear between them. A jump
-    becomes a steep slope over a millionth of the range of positions. Lighting is ignored.
+    Of a ParaView file the first map of the list is read: ``RGBPoints`` [x, r, g, b, ...] and ``Points`` [x, opacity,
+    midpoint, sharpness, ...]. Of a 3D Slicer file (volume property, schema 1) the only component is read:
+    ``rgbTransferFunction`` and ``scalarOpacity``. The result has the positions of both curves. A jump becomes a steep
+    slope over a millionth of the range of positions. Lighting is ignored.
 
     Args:
         text: Content of the file.
-        unit_distance: Unit distance of the opacities, as a fraction of the longest side of the volume. Neither format
-            states it: ``scalarOpacityUnitDistance`` of Slicer is in millimetres of a volume of unknown size.
+        unit_distance: Unit distance of the opacities, as a fraction of the longest side of the volume. It is not read
+            from the file: ParaView does not save it, and Slicer's is in millimetres of a volume of unknown size.
 
     Raises:
         ValueError: Another format, or a feature that a piecewise-linear function of one scalar cannot represent; the
@@ -83,7 +83,7 @@ def transfer_from_json(text: str, *, unit_distance: float = UNIT_DISTANCE) -> Tr
     """
     try:
         content = json.loads(text)
-    except (ValueError, RecursionError) as error:  # RecursionError: brackets nested too deeply
+    except (ValueError, RecursionError) as error:  # the latter for deeply nested brackets
         raise ValueError(f"a transfer function must be JSON text, got {text[:40]!r}: {error}") from None
     first = content[0] if isinstance(content, list) and content else content
     if isinstance(first, dict) and "RGBPoints" in first:
@@ -101,8 +101,8 @@ def transfer_from_json(text: str, *, unit_distance: float = UNIT_DISTANCE) -> Tr
     return TransferFunction(positions.tolist(), colour.tolist(), opacity.tolist(), unit_distance=unit_distance)
 
 
-Curve = tuple[np.ndarray, np.ndarray]  # positions [K] that rise, values [K, n]
-Point = tuple[str, float, list[float], float, float]  # name in messages, position, values, midpoint, sharpness
+Curve = tuple[np.ndarray, np.ndarray]  # rising positions [K] and their values [K, n]
+Point = tuple[str, float, list[float], float, float]  # name in errors, position, n values, midpoint, sharpness
 
 
 def _paraview(content: dict[str, Any]) -> tuple[Curve, Curve]:
@@ -125,13 +125,12 @@ def _slicer(content: dict[str, Any]) -> tuple[Curve, Curve]:
     steep = _points(f"{where}.gradientOpacity", component, "y") if component.get("gradientOpacity") else []
     if not component.get("disableGradientOpacity") and any(value != [1.0] for _, _, value, _, _ in steep):
         raise ValueError(f"{where}.gradientOpacity must be 1 throughout: opacity here depends on the value alone")
-    return (
-        _curve(f"{where}.rgbTransferFunction", _points(f"{where}.rgbTransferFunction", component, "color")),
-        _curve(f"{where}.scalarOpacity", _points(f"{where}.scalarOpacity", component, "y")),
-    )
+    colours, opacities = f"{where}.rgbTransferFunction", f"{where}.scalarOpacity"
+    return _curve(colours, _points(colours, component, "color")), _curve(opacities, _points(opacities, component, "y"))
 
 
 def _points(where: str, component: dict[str, Any], key: str) -> list[Point]:
+    """Points of a function of Slicer, whose values have the name ``key``."""
     function = component.get(where.rsplit(".", 1)[1])
     if not isinstance(function, dict):
         raise ValueError(f"{where} must be an object with 'points', got {_kind(function)}")
@@ -150,11 +149,10 @@ def _points(where: str, component: dict[str, Any], key: str) -> list[Point]:
 
 
 def _curve(where: str, points: list[Point]) -> Curve:
-    """Distinct positions and their values, with an additional point where a midpoint is not half-way."""
-    positions: list[float] = []
-    values: list[list[float]] = []
+    """Rising positions and their values, with an additional point where a midpoint is not half-way."""
+    positions, values = list[float](), list[list[float]]()
     for k, (name, x, value, middle, sharp) in enumerate(points):
-        # The transfer function stores float32, in which positions must be distinct, too.
+        # The transfer function stores float32, in which positions must still be distinct.
         x = float(np.float32(x))
         if k and x < float(np.float32(points[k - 1][1])):
             raise ValueError(f"{name} must not lie below the one before, got {points[k - 1][1]:g} before {x:g}")
@@ -183,6 +181,7 @@ def _curve(where: str, points: list[Point]) -> Curve:
 
 
 def _fours(name: str, content: dict[str, Any]) -> list[tuple[str, list[float]]]:
+    """Groups of four numbers in a list of ParaView, with a name for each in errors."""
     numbers = _list(name, content.get(name))
     if len(numbers) % 4:
         raise ValueError(f"{name} must hold four numbers per point, got {len(numbers)} in all")
@@ -204,17 +203,14 @@ def _objects(name: str, value: Any) -> list[dict[str, Any]]:
 
 
 def _number(name: str, value: Any) -> float:
-    # Python compares integers too large for a float exactly, and every comparison with NaN is False, so this test
-    # rejects both, and infinity.
+    # The comparison rejects infinity, integers too large for a float, and NaN, for which it is False.
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
         raise ValueError(f"{name} must be a number, got {value!r}")
     return float(value)
 
 
 def _kind(value: Any) -> str:
-    if value is None:
-        return "nothing"
-    return f"{type(value).__name__} {str(value)[:40]!r}"
+    return "nothing" if value is None else f"{type(value).__name__} {str(value)[:40]!r}"
 
 
 def _scaled(
@@ -223,6 +219,6 @@ def _scaled(
     low, high = checks.finite("low", low), checks.finite("high", high)
     if not low < high:
         raise ValueError(f"low must be below high, got {low:g} and {high:g}")
-    positions = [low + (high - low) * row[0] for row in rows]
-    colours, opacities = [list(row[1:4]) for row in rows], [row[4] for row in rows]
-    return TransferFunction(positions, colours, opacities, unit_distance=unit_distance)
+    table = np.array(rows)
+    positions = (low + (high - low) * table[:, 0]).tolist()
+    return TransferFunction(positions, table[:, 1:4].tolist(), table[:, 4].tolist(), unit_distance=unit_distance)

@@ -1,4 +1,4 @@
-"""Volume: a scalar field sampled on a box, with its spacing."""
+"""Volume: a scalar field sampled on a regular grid in a box."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -11,20 +11,19 @@ from holotorch.core.quantities import VOXEL
 
 Triple = tuple[float, float, float]
 IDENTITY: tuple[Triple, Triple, Triple] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-_SLAB = 1 << 22  # samples processed at once, which bounds temporary memory to tens of megabytes
-_RIGHT_ANGLE = 1e-3  # tolerance of direction cosines, which files give with three digits or more
+_SLAB = 1 << 22  # number of samples processed at once, which bounds temporary memory to tens of megabytes
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Volume:
-    """Samples of a scalar field on a box, with axes in the order (z, y, x).
+    """Samples of a scalar field (voxels) on a regular grid in a box, with axes in the order (z, y, x).
 
     Attributes:
-        values: Real [D, H, W], in the dtype of the file: a uint8 volume stays uint8. May be a memory-mapped file.
+        values: Real [D, H, W], of any type: the uint8 values of a file stay uint8. May be a memory-mapped file.
         spacing: Distance between samples along (z, y, x), in ``unit``.
         unit: "m", or "relative" for a volume that has proportions but no size until it is placed in a scene.
-        origin: World position (z, y, x) of sample [0, 0, 0], in ``unit``, as the file states it.
-        orientation: World directions of the axes z, y, x, as unit rows of (z, y, x), as the file states them.
+        origin: Position (z, y, x) of sample [0, 0, 0] in the coordinates of the file, in ``unit``.
+        orientation: Unit vectors (z, y, x) along the axes z, y and x in the coordinates of the file.
 
     Raises:
         TypeError: ``values`` is not a real tensor, or a spacing is not a number.
@@ -39,43 +38,52 @@ class Volume:
     orientation: tuple[Triple, Triple, Triple] = IDENTITY
 
     def __post_init__(self) -> None:
-        _check_values(self.values)
+        values = self.values
+        if not isinstance(values, Tensor):
+            raise TypeError(f"volume values must be a torch.Tensor, got {type(values).__name__}; use torch.from_numpy")
+        if values.is_complex() or values.dtype in (torch.bool, torch.uint64):
+            raise TypeError(
+                f"volume values must be real numbers, got {values.dtype}; convert them, for instance to float32"
+            )
+        if values.ndim != 3:
+            raise ValueError(f"volume values must have three axes (z, y, x), got shape {tuple(values.shape)}")
+        if not values.numel():
+            raise ValueError(f"volume must hold at least one voxel, got shape {tuple(values.shape)}")
         if self.unit not in ("m", "relative"):
             raise ValueError(
                 f"volume unit must be 'm' or 'relative', got {self.unit!r}; convert other lengths to metres"
             )
-        steps = _triple("volume spacing", self.spacing)
-        object.__setattr__(self, "spacing", tuple(map(self._checked_spacing, steps)))
-        object.__setattr__(self, "origin", _triple("volume origin", self.origin))
-        object.__setattr__(self, "orientation", _right_angled(self.orientation))
-
-    def _checked_spacing(self, step: float) -> float:
-        if self.unit == "m":
-            return checks.quantity(VOXEL, step)
-        return checks.positive("volume spacing", step, self.unit)
+        self.spacing = _triple("volume spacing", self.spacing)
+        for step in self.spacing:
+            if self.unit == "m":
+                checks.quantity(VOXEL, step)
+            else:
+                checks.positive("volume spacing", step, self.unit)
+        self.origin = _triple("volume origin", self.origin)
+        self.orientation = _right_angled(self.orientation)
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Voxels (D, H, W)."""
+        """Number of samples (D, H, W)."""
         depth, height, width = self.values.shape
         return depth, height, width
 
     @property
     def extent(self) -> Triple:
-        """Size (z, y, x) in ``unit``, one spacing per voxel."""
+        """Size (z, y, x) in ``unit``: number of samples times spacing."""
         (depth, height, width), (z, y, x) = self.shape, self.spacing
         return depth * z, height * y, width * x
 
     def value_range(self) -> tuple[float, float]:
-        """Smallest and largest value; ValueError as from :meth:`check_finite` where one is NaN or infinite."""
-        ends = [torch.stack(slab.aminmax()).to(torch.float64) for _, slab in self._slabs()]
-        least, most = torch.stack(ends)[:, 0].min().item(), torch.stack(ends)[:, 1].max().item()
+        """Smallest and largest value; ValueError as from :meth:`check_finite` if a value is NaN or infinite."""
+        ends = torch.stack([torch.stack(slab.aminmax()).to(torch.float64) for _, slab in self._slabs()])
+        least, most = ends[:, 0].min().item(), ends[:, 1].max().item()
         if not (abs(least) < float("inf") and abs(most) < float("inf")):
             self.check_finite()
         return least, most
 
     def check_finite(self) -> None:
-        """Raise ValueError with the position of the first NaN or infinite voxel and their number, if there are any."""
+        """Raise ValueError if a voxel is NaN or infinite, with the position of the first and the number of all."""
         if not self.values.is_floating_point():
             return
         first, count = "", 0
@@ -83,7 +91,7 @@ class Volume:
             bad = ~torch.isfinite(slab)
             bad_voxels = int(bad.sum())
             if bad_voxels and not count:
-                # argmax gives the first one without the memory that nonzero takes for all.
+                # argmax finds the first bad voxel without the memory that nonzero takes for all of them.
                 index = bad.flatten().to(torch.uint8).argmax()
                 z, y, x = (int(i) for i in torch.unravel_index(index, slab.shape))
                 first = f"voxel (z, y, x) = ({start + z}, {y}, {x}) is {slab[z, y, x].item()}"
@@ -97,10 +105,9 @@ class Volume:
     def bricks(self, size: int = 16) -> Tensor:
         """Smallest and largest value of every brick, [2, ceil(D / size), ceil(H / size), ceil(W / size)].
 
-        Brick b holds the samples from b ``size`` to (b + 1) ``size``, both included, so that a value interpolated
-        linearly at an index coordinate within these limits lies between the smallest and the largest of the brick. The
-        brick of a position is floor(position / size) along every axis. The dtype is that of the values, or int64 for
-        unsigned integers above 8 bits.
+        Along each axis brick b holds the samples from b ``size`` to (b + 1) ``size``, both included. A value that is
+        interpolated linearly within these limits therefore lies between the smallest and the largest of the brick. The
+        dtype is that of the values, or int64 for unsigned integers above 8 bits.
 
         Raises:
             ValueError: A voxel is NaN or infinite, as from :meth:`check_finite`.
@@ -127,21 +134,8 @@ class Volume:
 
 
 def _comparable(values: Tensor) -> Tensor:
-    # torch has no comparisons for the wide unsigned types.
+    """``values`` in a type that torch can compare."""
     return values.to(torch.int64) if values.dtype in (torch.uint16, torch.uint32) else values
-
-
-def _check_values(values: Tensor) -> None:
-    if not isinstance(values, Tensor):
-        raise TypeError(f"volume values must be a torch.Tensor, got {type(values).__name__}; use torch.from_numpy")
-    if values.is_complex() or values.dtype in (torch.bool, torch.uint64):
-        raise TypeError(
-            f"volume values must be real numbers, got {values.dtype}; convert them, for instance to float32"
-        )
-    if values.ndim != 3:
-        raise ValueError(f"volume values must have three axes (z, y, x), got shape {tuple(values.shape)}")
-    if not values.numel():
-        raise ValueError(f"volume must hold at least one voxel, got shape {tuple(values.shape)}")
 
 
 def _triple(name: str, values: Sequence[float]) -> Triple:
@@ -156,7 +150,8 @@ def _right_angled(rows: Sequence[Sequence[float]]) -> tuple[Triple, Triple, Trip
         raise TypeError(f"volume orientation must be three rows (z, y, x) of direction cosines, got {rows!r}")
     z, y, x = (_triple("row of the volume's orientation", row) for row in rows)
     axes = torch.tensor([z, y, x], dtype=torch.float64)
-    if (axes @ axes.T - torch.eye(3, dtype=torch.float64)).abs().max() > _RIGHT_ANGLE:
+    # Files give direction cosines with three digits or more.
+    if (axes @ axes.T - torch.eye(3, dtype=torch.float64)).abs().max() > 1e-3:
         raise ValueError(
             f"volume axes must be unit vectors at right angles, got {(z, y, x)}; resample a sheared volume (a tilted "
             "gantry, for instance) first"

@@ -82,5 +82,5 @@ def test_gradients_and_special_grids():
 def test_mistakes_are_named():
     with pytest.raises(ValueError, match="step must be at least 1"):
         render_adaptively(sampler(), ball(), step=0)
-    with pytest.raises(ValueError, match="contrast must be at least 0"):
+    with pytest.raises(ValueError, match="contrast must be at least zero"):
         render_adaptively(sampler(), ball(), contrast=-1.0)

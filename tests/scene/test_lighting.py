@@ -141,7 +141,7 @@ def test_lit_rendering_is_differentiable(turned):
     [
         ({"towards": (0.0, 0.0, 0.0)}, "towards must point to the light"),
         ({"towards": (1.0, 0.0)}, r"direction \(z, y, x\)"),
-        ({"ambient": -0.1}, "ambient must be at least 0"),
+        ({"ambient": -0.1}, "ambient must be at least zero"),
         ({"shininess": 0.5}, "shininess must be at least 1"),
     ],
 )

@@ -1,1 +1,1 @@
-"""Formats of volumes and pictures, and what a file may cost."""
+"""Readers of volume and picture formats, and the memory that a file may take."""

@@ -1,8 +1,7 @@
-"""General array files, which state no spacing: NumPy, HDF5 and Zarr, with axes (z, y, x)."""
+"""General array files, which state no spacing: NumPy, HDF5 and Zarr. Their axes are taken as (z, y, x)."""
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,9 +13,10 @@ def read_npy(path: Path) -> Scan:
     """Read a NumPy array; a large one is memory-mapped."""
     with readable(path, ".npy array"):
         stored = np.load(path, mmap_mode="r", allow_pickle=False)
-    if stored.flags.c_contiguous:
-        return Scan(three_axes(uncompressed_from(path, stored.shape, stored.dtype, stored.offset), path))
-    return Scan(three_axes(uncompressed_from(path, stored.shape[::-1], stored.dtype, stored.offset).T, path))
+    # A file in Fortran order holds the transpose.
+    values = stored if stored.flags.c_contiguous else stored.T
+    values = uncompressed_from(path, values.shape, values.dtype, stored.offset)
+    return Scan(three_axes(values if stored.flags.c_contiguous else values.T, path))
 
 
 def read_npz(path: Path, member: str | None = None) -> Scan:
@@ -26,35 +26,30 @@ def read_npz(path: Path, member: str | None = None) -> Scan:
     with archive:
         name = chosen(archive.files, member, path)
         with readable(path, ".npz archive"):
-            _check_member(path, archive, name)
+            # The stated size is checked before numpy allocates memory for it.
+            entry = next(item for item in archive.zip.infolist() if item.filename in (name, f"{name}.npy"))
+            with archive.zip.open(entry) as stream:
+                version = np.lib.format.read_magic(stream)
+                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+                shape, _, dtype = read(stream)
+                stated, present = math.prod(shape) * dtype.itemsize, entry.file_size - stream.tell()
+            if stated != present:
+                raise ValueError(f"its array {name} states {stated} bytes and holds {present}")
+            affordable(path, stated, path.stat().st_size)
             values = archive[name]
     return Scan(three_axes(values, path))
 
 
-def _check_member(path: Path, archive: Any, name: str) -> None:
-    """Raise ValueError if the stated size of an array differs from that of its data, before numpy allocates memory."""
-    entry = next(item for item in archive.zip.infolist() if item.filename in (name, f"{name}.npy"))
-    with archive.zip.open(entry) as stream:
-        version = np.lib.format.read_magic(stream)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(stream)
-        stated, present = math.prod(shape) * dtype.itemsize, entry.file_size - stream.tell()
-    if stated != present:
-        raise ValueError(f"its array {name} states {stated} bytes and holds {present}")
-    affordable(path, stated, path.stat().st_size)
-
-
 def read_hdf5(path: Path, member: str | None = None) -> Scan:
-    """Read a dataset of an HDF5 file, ``path::dataset``; the name is required if several datasets have three axes."""
+    """Read the dataset ``member`` of an HDF5 file, or its only dataset with three axes."""
     h5py = extra("h5py", "reading HDF5")
-    found: dict[str, int] = {}
+    axes: dict[str, int] = {}
     with readable(path, "HDF5 file"):
         file = h5py.File(path, "r")
     with file:
         with readable(path, "HDF5 file"):
-            file.visititems(lambda name, item: found.update({name: item.ndim}) if hasattr(item, "ndim") else None)
-        asked = member.strip("/") if member else None
-        name = chosen([name for name, axes in found.items() if axes == 3 or name == asked], asked, path)
+            file.visititems(lambda name, item: axes.update({name: item.ndim}) if hasattr(item, "ndim") else None)
+        name = chosen([name for name, count in axes.items() if count == 3 or name == member], member, path)
         with readable(path, "HDF5 file"):
             affordable(path, file[name].size * file[name].dtype.itemsize, path.stat().st_size)
             values = file[name][...]
@@ -62,17 +57,16 @@ def read_hdf5(path: Path, member: str | None = None) -> Scan:
 
 
 def read_zarr(path: Path, member: str | None = None) -> Scan:
-    """Read an array of a Zarr folder, ``path::array``, or the folder itself if it is an array."""
+    """Read the array ``member`` of a Zarr folder, by default the folder itself or its only array with three axes."""
     zarr = extra("zarr", "reading Zarr")
     with readable(path, "Zarr folder"):
         node = zarr.open(str(path), mode="r")
         single = hasattr(node, "ndim")
-        found = {} if single else {name: item for name, item in node.members(max_depth=None) if hasattr(item, "ndim")}
+        arrays = {} if single else {name: item for name, item in node.members(max_depth=None) if hasattr(item, "ndim")}
     if single and member:
         raise ValueError(f"{path} is a single array; load it without ::{member}")
     if not single:
-        asked = member.strip("/") if member else None
-        node = found[chosen([name for name in found if found[name].ndim == 3 or name == asked], asked, path)]
+        node = arrays[chosen([name for name in arrays if arrays[name].ndim == 3 or name == member], member, path)]
     with readable(path, "Zarr folder"):
         stored = sum(item.stat().st_size for item in path.rglob("*") if item.is_file())
         affordable(path, node.size * node.dtype.itemsize, stored)

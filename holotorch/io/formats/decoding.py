@@ -13,20 +13,18 @@ from holotorch.io.formats.limits import affordable
 
 PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
-_MOST_SCANS = 100  # in a progressive JPEG; decoding a scan of a few bytes can take as long as a whole picture
-_MARKER = re.compile(rb"\xff+([^\x00\xff])")
-_BARE = frozenset((0x01, *range(0xD0, 0xD9)))  # markers without a segment, such as restarts and the start of the image
-_DECODED = 8  # bytes per decoded pixel: four channels of 16 bits
+_MOST_SCANS = 100  # of a progressive JPEG; decoding a scan of a few bytes can take as long as a whole picture
 
 
-def decode(path: Path, flags: int, *, data: bytes | None = None, memory: int = _DECODED) -> np.ndarray:
-    """Pixels [H, W] or [H, W, C] of a PNG, JPEG, BMP, TIFF or WebP file, as ``cv2.imdecode`` gives them.
+def decode(path: Path, flags: int, *, data: bytes | None = None, memory: int = 8) -> np.ndarray:
+    """Pixels [H, W] or [H, W, C] of a PNG, JPEG, BMP, TIFF or WebP file, as ``cv2.imdecode`` returns them.
 
     Args:
         path: Path of the file.
         flags: Flags of ``cv2.imdecode``.
         data: Content of the file, if it has been read already.
-        memory: Bytes per pixel needed for decoding and for the further processing by the caller.
+        memory: Bytes per pixel needed for decoding and for the further processing by the caller; by default those of
+            four channels of 16 bits.
 
     Raises:
         ValueError: The file is no picture, is damaged, or exceeds the memory limit of
@@ -54,7 +52,7 @@ def decode(path: Path, flags: int, *, data: bytes | None = None, memory: int = _
 
 
 def picture_size(path: Path, data: bytes) -> tuple[int, int]:
-    """Size (H, W) of an encoded picture from its header, without decoding; ValueError if the header has none."""
+    """Size (H, W) of an encoded picture from its header, without decoding; ValueError if it is not readable."""
     from PIL.BmpImagePlugin import BmpImageFile
     from PIL.JpegImagePlugin import JpegImageFile
     from PIL.TiffImagePlugin import TiffImageFile
@@ -62,10 +60,12 @@ def picture_size(path: Path, data: bytes) -> tuple[int, int]:
     readers = {_JPEG: JpegImageFile, b"BM": BmpImageFile, b"II": TiffImageFile, b"MM": TiffImageFile}
     try:
         if data.startswith(PNG):
-            return _png_size(data)
+            _png_end(data)
+            width, height = struct.unpack_from(">II", data, len(PNG) + 8)
+            return height, width
         if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
             return _webp_size(data)
-        # The reader classes are used directly, since the size limit of Image.open does not depend on the file's size.
+        # The reader classes are used instead of Image.open, whose size limit does not depend on the file's size.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             picture = readers[data[:2]](io.BytesIO(data))
@@ -77,9 +77,7 @@ def picture_size(path: Path, data: bytes) -> tuple[int, int]:
 def check_exr(path: Path, *, memory: int) -> None:
     """Raise ValueError for an EXR file that is damaged or needs more memory than the limit.
 
-    Args:
-        path: Path of the file.
-        memory: Bytes per pixel that the caller needs in addition to 4 bytes for each channel of the file.
+    ``memory`` is the number of bytes per pixel that the caller needs besides 4 bytes for each channel of the file.
     """
     import OpenEXR
 
@@ -88,9 +86,8 @@ def check_exr(path: Path, *, memory: int) -> None:
         needed = 0
         for part in parts:
             low, high = part.header["dataWindow"]
-            needed += math.prod(int(b) - int(a) + 1 for a, b in zip(low, high, strict=True)) * (
-                memory + 4 * len(part.header["channels"])
-            )
+            pixels = math.prod(int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
+            needed += pixels * (memory + 4 * len(part.header["channels"]))
     except Exception as error:  # the library raises bare RuntimeError and others
         raise ValueError(f"{path} is not a readable EXR file: {error}") from None
     affordable(path, needed, path.stat().st_size)
@@ -98,33 +95,29 @@ def check_exr(path: Path, *, memory: int) -> None:
 
 def _scans(data: bytes) -> int:
     """Number of scans of a JPEG, without the scans of a thumbnail in its metadata."""
-    count, place = 0, 2
-    while (match := _MARKER.search(data, place)) and (kind := match[1][0]) != 0xD9:
+    marker = re.compile(rb"\xff+([^\x00\xff])")
+    without_segment = {0x01, *range(0xD0, 0xD9)}  # such as restarts and the start of the image
+    count, position = 0, 2
+    while (match := marker.search(data, position)) and (kind := match[1][0]) != 0xD9:
         count += kind == 0xDA
-        place = match.end()
-        if kind not in _BARE:  # the segment begins with its length, which includes these two bytes
-            place += max(2, int.from_bytes(data[place : place + 2], "big"))
+        position = match.end()
+        if kind not in without_segment:  # a segment begins with its length, which includes these two bytes
+            position += max(2, int.from_bytes(data[position : position + 2], "big"))
     return count
 
 
-def _png_size(data: bytes) -> tuple[int, int]:
-    _png_end(data)
-    width, height = struct.unpack_from(">II", data, len(PNG) + 8)
-    return height, width
-
-
 def _png_end(data: bytes) -> int:
-    """Length of a PNG in bytes up to the end of its last chunk; an exception if a chunk is longer than the data.
+    """Length of a PNG in bytes up to the end of its last chunk; raises if a chunk is longer than the data.
 
     Decoders allocate the stated size of a chunk before they read it, even for data after the last chunk.
     """
-    place, kind = len(PNG), b""
+    position, kind = len(PNG), b""
     while kind != b"IEND":
-        length, kind = struct.unpack_from(">I4s", data, place)
-        place += 12 + length
-    if place > len(data):
+        length, kind = struct.unpack_from(">I4s", data, position)
+        position += 12 + length
+    if position > len(data):
         raise ValueError("a chunk is longer than the file")
-    return place
+    return position
 
 
 def _webp_size(data: bytes) -> tuple[int, int]:

@@ -1,31 +1,26 @@
-"""Memory limits for reading files: data are decompressed only up to the stated size, which is itself limited."""
+"""Memory limits for reading files: data are decompressed only up to the size that a file states, which is limited."""
 
 import bz2
 import os
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from holotorch.core.memory import available_memory
 
-MEMORY_LIMIT = 1 << 30  # bytes of memory allowed for any file
-# Larger files may use this many times their size in memory. Photographs and scans expand less than 300-fold, a file of
-# zeros up to 1000-fold.
+MEMORY_LIMIT = 1 << 30  # bytes of memory that any file may take
+# A file may take this many times its size. Photographs and scans expand less than 300-fold, zeros up to 1000-fold.
 RATIO = 500
-VARIABLE = "HOLOTORCH_MEMORY_LIMIT"  # environment variable with a number of bytes that replaces MEMORY_LIMIT
+VARIABLE = "HOLOTORCH_MEMORY_LIMIT"  # name of an environment variable, which holds a number of bytes
 _CHUNK = 1 << 20  # bytes decompressed at once
 
 
 def affordable(source: Path | str, needed: int, stored: int) -> None:
-    """Raise ValueError if a file needs more memory than is plausible for its size.
+    """Raise ValueError if the file ``source`` of ``stored`` bytes needs implausibly many bytes of memory to be read.
 
-    The limit is :data:`MEMORY_LIMIT` bytes or :data:`RATIO` times the file's size, whichever is more. The environment
-    variable :data:`VARIABLE` replaces the former.
-
-    Args:
-        source: Name of the file.
-        needed: Memory for reading the file in bytes.
-        stored: Size of the file in bytes.
+    The limit is :data:`MEMORY_LIMIT` or :data:`RATIO` times ``stored``, whichever is more. The environment variable
+    :data:`VARIABLE` replaces ``MEMORY_LIMIT``.
     """
     try:
         limit = float(os.environ.get(VARIABLE, MEMORY_LIMIT))
@@ -40,25 +35,19 @@ def affordable(source: Path | str, needed: int, stored: int) -> None:
 
 
 def readable_at_once(size: int) -> bool:
-    """Whether data of ``size`` bytes are read at once, not mapped: up to MEMORY_LIMIT or half of the free memory."""
+    """Whether data of ``size`` bytes are read instead of mapped: up to MEMORY_LIMIT or half of the free memory."""
     return size <= max(MEMORY_LIMIT, (available_memory() or 0) // 2)
 
 
 def unzipped(path: Path, size: int, offset: int = 0, *, kind: str = "gzip") -> bytearray:
-    """Decompress a file from ``offset`` on. Content shorter than ``size`` bytes is returned without an error.
+    """Decompress a file from byte ``offset`` on, to at most ``size`` bytes as stated by a header.
 
-    Args:
-        path: Path of the file.
-        size: Expected size of the content in bytes, usually stated by a header; decompression stops beyond it.
-        offset: Position in the file, in bytes, at which the compressed data begin.
-        kind: "gzip", which also accepts zlib streams, or "bzip2". Concatenated members are joined.
-
-    Raises:
-        ValueError: The data are damaged or cut short, have more than ``size`` bytes, or exceed the memory limit.
+    ``kind`` is "gzip", which also accepts zlib streams, or "bzip2". The content of concatenated members is joined.
+    ValueError if the data are damaged or cut short, have more than ``size`` bytes, or exceed the memory limit.
     """
     affordable(path, size, path.stat().st_size)
     content = bytearray()
-    for piece in (_gzip if kind == "gzip" else _bzip2)(path, offset):
+    for piece in _decompressed(path, offset, kind):
         content += piece
         if len(content) > size:
             raise ValueError(f"{path} holds more than the expected {size} bytes; check shape and dtype, or its header")
@@ -66,7 +55,7 @@ def unzipped(path: Path, size: int, offset: int = 0, *, kind: str = "gzip") -> b
 
 
 def inflated(data: bytes, size: int) -> bytes:
-    """Decompress a zlib block of at most ``size`` bytes; ValueError if it has more, zlib.error if it is damaged."""
+    """Decompress a zlib block to at most ``size`` bytes; ValueError for more bytes, zlib.error for damaged data."""
     engine = zlib.decompressobj()
     content = engine.decompress(data, size + 1)
     if len(content) > size:
@@ -76,42 +65,28 @@ def inflated(data: bytes, size: int) -> bytes:
     return content
 
 
-def _gzip(path: Path, offset: int) -> Iterator[bytes]:
+def _decompressed(path: Path, offset: int, kind: str) -> Iterator[bytes]:
+    """Yield the content of all members of a compressed file in pieces of at most ``_CHUNK`` bytes."""
     rest, members, done = b"", 0, 0
     with open(path, "rb") as stream:
         stream.seek(offset)
-        # A gzip file may hold several members, one after another, and padding.
         while rest := rest or stream.read(_CHUNK):
-            if members and not rest.strip(b"\0"):
+            if members and not rest.strip(b"\0"):  # padding after the last member
                 rest = b""
                 continue
-            engine = zlib.decompressobj(32 + zlib.MAX_WBITS)  # accepts the headers of gzip and zlib
+            # The window bits accept the headers of both gzip and zlib.
+            engine: Any = zlib.decompressobj(32 + zlib.MAX_WBITS) if kind == "gzip" else bz2.BZ2Decompressor()
             try:
-                while rest and not engine.eof:
+                while not engine.eof and (rest or not getattr(engine, "needs_input", True)):
                     piece = engine.decompress(rest, _CHUNK)
                     done += len(piece)
                     yield piece
-                    rest = engine.unused_data if engine.eof else engine.unconsumed_tail or stream.read(_CHUNK)
-            except zlib.error as error:
-                raise ValueError(f"{path} holds damaged gzip data: {error}; fetch it again") from None
+                    # Of input that is not consumed yet, zlib returns the rest and bz2 keeps it.
+                    rest = engine.unused_data if engine.eof else getattr(engine, "unconsumed_tail", b"")
+                    if not rest and not engine.eof and getattr(engine, "needs_input", True):
+                        rest = stream.read(_CHUNK)
+            except (zlib.error, ValueError, OSError) as error:
+                raise ValueError(f"{path} holds damaged {kind} data: {error}; fetch it again") from None
             if not engine.eof:
-                raise ValueError(f"{path} is truncated: its gzip data stop after {done} bytes; fetch it again")
+                raise ValueError(f"{path} is truncated: its {kind} data stop after {done} bytes; fetch it again")
             members += 1
-
-
-def _bzip2(path: Path, offset: int) -> Iterator[bytes]:
-    rest, done = b"", 0
-    with open(path, "rb") as stream:
-        stream.seek(offset)
-        while rest := rest or stream.read(_CHUNK):
-            engine = bz2.BZ2Decompressor()
-            try:
-                while not engine.eof and (rest or not engine.needs_input):
-                    piece = engine.decompress(rest, _CHUNK)
-                    done += len(piece)
-                    yield piece
-                    rest = engine.unused_data if engine.eof else stream.read(_CHUNK) if engine.needs_input else b""
-            except (ValueError, OSError) as error:
-                raise ValueError(f"{path} holds damaged bzip2 data: {error}; fetch it again") from None
-            if not engine.eof:
-                raise ValueError(f"{path} is truncated: its bzip2 data stop after {done} bytes; fetch it again")

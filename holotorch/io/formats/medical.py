@@ -2,23 +2,21 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from holotorch.io.formats.limits import affordable, readable_at_once
-from holotorch.io.formats.scan import Scan, extra, placed, readable, three_axes
+from holotorch.io.formats.scan import Scan, extra, metres, placed, readable, three_axes
 
-_NIFTI_METRES = {"unknown": 1e-3, "mm": 1e-3, "meter": 1.0, "micron": 1e-6}
 _UNEVEN = 0.05  # tolerated deviation of a slice distance, relative to the median; files round positions to 0.01 mm
 
 
 def read_nifti(path: Path) -> Scan:
-    """Read NIfTI, .nii (mapped if large) or .nii.gz, in the dtype of the file, or as float32 if it states a scale.
+    """Read a NIfTI file, .nii or .nii.gz, in its own dtype, or as float32 if it states a scale for the values.
 
-    If a file states no unit, millimetres are assumed, as in other readers of the format.
+    A large .nii is memory-mapped. A file without a unit is taken to be in millimetres, as in other readers.
     """
     nibabel = extra("nibabel", "reading NIfTI")
     with readable(path, "NIfTI file"):
@@ -27,60 +25,66 @@ def read_nifti(path: Path) -> Scan:
         affordable(path, math.prod(image.shape) * scaled, path.stat().st_size)
         values = np.asanyarray(image.dataobj)
         matrix = np.asarray(image.affine, dtype=np.float64)
-        unit = image.header.get_xyzt_units()[0]
+        unit = image.header.get_xyzt_units()[0].replace("unknown", "mm")
     if values.dtype != image.get_data_dtype() and values.dtype.kind == "f":
         # nibabel scales in float64; float32 is precise enough for scaled integers.
         values = values.astype(np.float32)
     values = three_axes(values.T, path)
-    return placed(values, matrix[:3, :3].T, matrix[:3, 3], "m", _NIFTI_METRES[unit])
+    return placed(values, matrix[:3, :3].T, matrix[:3, 3], "m", metres(unit, path))
 
 
 def is_dicom(path: Path) -> bool:
-    """Whether the file has the DICOM signature; such files often have no extension."""
+    """Whether the file has the DICOM signature, since DICOM files often have no extension."""
     with open(path, "rb") as stream:
         return stream.read(132)[128:] == b"DICM"
 
 
-@dataclass(frozen=True, eq=False)
 class _Slice:
-    """Header of one DICOM slice, with lengths in millimetres and vectors (x, y, z)."""
+    """Header ``data`` of one DICOM slice, with lengths in millimetres and vectors (x, y, z)."""
 
-    path: Path
-    series: str
-    single: bool  # whether the file has one frame and one number per pixel
-    size: tuple[int, int]  # (rows, columns)
-    position: np.ndarray  # position of the first pixel
-    cosines: np.ndarray  # [2, 3]: unit vectors from column to column and from row to row
-    spacing: np.ndarray | None  # distances from row to row and from column to column
-    thickness: float | None
-    scale: tuple[float, float]  # slope and intercept
-    signed: bool
-    bits: tuple[int, int]  # bits allocated and bits stored per pixel
+    def __init__(self, path: Path, data: Any):
+        def numbers(tag: str, *shape: int) -> np.ndarray | None:
+            value = data.get(tag)
+            return None if value is None else np.array([float(x) for x in value]).reshape(shape)
 
-    @property
-    def normal(self) -> np.ndarray:
-        return np.cross(self.cosines[0], self.cosines[1])
-
-    @property
-    def height(self) -> float:
-        return float(self.normal @ self.position)
+        position, cosines = numbers("ImagePositionPatient", 3), numbers("ImageOrientationPatient", 2, 3)
+        if position is None or cosines is None:
+            raise ValueError("it lacks position or orientation, so that the place of the slice is unknown")
+        self.path = path
+        self.series = str(data.get("SeriesInstanceUID", ""))
+        # Whether the file has one frame and one number per pixel.
+        self.single = int(data.get("SamplesPerPixel", 1)) == 1 and int(data.get("NumberOfFrames", 1)) == 1
+        self.size = int(data.Rows), int(data.Columns)
+        self.position = position  # of the first pixel
+        self.cosines = cosines  # unit vectors from column to column and from row to row, [2, 3]
+        self.spacing = numbers("PixelSpacing", 2)  # distances from row to row and from column to column
+        thickness = data.get("SpacingBetweenSlices") or data.get("SliceThickness")
+        self.thickness = None if thickness is None else float(thickness)
+        self.scale = float(data.get("RescaleSlope", 1)), float(data.get("RescaleIntercept", 0))
+        self.signed = bool(data.get("PixelRepresentation", 0))
+        allocated = int(data.BitsAllocated)
+        self.bits = allocated, int(data.get("BitsStored", allocated))  # allocated and stored per pixel
+        self.normal = np.cross(cosines[0], cosines[1])
+        self.height = float(self.normal @ position)  # position along the normal
 
 
 def read_dicom(folder: Path) -> Scan:
     """Read one DICOM series of single slices, sorted by position and rescaled as stated in the headers.
 
-    The result has integers if slope and intercept are whole numbers and equal for all slices; otherwise float32.
+    The voxels are integers if slope and intercept are whole numbers and equal in all slices, else float32.
     """
     pydicom = extra("pydicom", "reading DICOM")
-    paths = sorted(path for path in folder.iterdir() if path.is_file() and is_dicom(path))
-    found = [_header(pydicom, path) for path in paths]
-    slices = [header for header in found if header is not None]
+    slices: list[_Slice] = []
+    for path in sorted(path for path in folder.iterdir() if path.is_file() and is_dicom(path)):
+        with readable(path, "DICOM file"):
+            data = pydicom.dcmread(path, stop_before_pixels=True)
+            if "Rows" in data:  # DICOM files without an image are skipped
+                slices.append(_Slice(path, data))
     if not slices:
         raise ValueError(f"{folder} holds no DICOM images")
     _one_series(slices, folder)
     slices.sort(key=lambda header: header.height)
-    across = _step(slices, folder)
-    kind = _rescaled_type(slices)
+    step, kind = _step(slices, folder), _rescaled_type(slices)
     stored = sum(header.path.stat().st_size for header in slices)
     affordable(folder, len(slices) * math.prod(slices[0].size) * kind.itemsize, stored)
     values = np.empty((len(slices), *slices[0].size), kind)
@@ -90,44 +94,14 @@ def read_dicom(folder: Path) -> Scan:
             plane = pydicom.dcmread(header.path).pixel_array
         values[index] = plane if header.scale == (1, 0) else plane * slope + intercept
     first = slices[0]
-    if first.spacing is None or across is None:
+    if first.spacing is None or step is None:
         return Scan(values)
-    axes = [first.cosines[0] * first.spacing[1], first.cosines[1] * first.spacing[0], across]
+    axes = [first.cosines[0] * first.spacing[1], first.cosines[1] * first.spacing[0], step]
     return placed(values, axes, first.position, "m", 1e-3)
 
 
-def _header(pydicom: Any, path: Path) -> _Slice | None:
-    """Header of a slice, or None for a DICOM file that holds no image."""
-
-    def numbers(tag: str, shape: tuple[int, ...]) -> np.ndarray | None:
-        value = data.get(tag)
-        return None if value is None else np.array([float(x) for x in value]).reshape(shape)
-
-    with readable(path, "DICOM file"):
-        data = pydicom.dcmread(path, stop_before_pixels=True)
-        if "Rows" not in data:
-            return None
-        position, cosines = numbers("ImagePositionPatient", (3,)), numbers("ImageOrientationPatient", (2, 3))
-        if position is None or cosines is None:
-            raise ValueError("it lacks position or orientation, so that the place of the slice is unknown")
-        thickness = data.get("SpacingBetweenSlices") or data.get("SliceThickness")
-        allocated = int(data.BitsAllocated)
-        return _Slice(
-            path,
-            str(data.get("SeriesInstanceUID", "")),
-            int(data.get("SamplesPerPixel", 1)) == 1 and int(data.get("NumberOfFrames", 1)) == 1,
-            (int(data.Rows), int(data.Columns)),
-            position,
-            cosines,
-            numbers("PixelSpacing", (2,)),
-            None if thickness is None else float(thickness),
-            (float(data.get("RescaleSlope", 1)), float(data.get("RescaleIntercept", 0))),
-            bool(data.get("PixelRepresentation", 0)),
-            (allocated, int(data.get("BitsStored", allocated))),
-        )
-
-
 def _one_series(slices: Sequence[_Slice], folder: Path) -> None:
+    """Raise ValueError unless all slices belong to one series and agree in their geometry and type."""
     series = sorted({header.series for header in slices})
     if len(series) > 1:
         raise ValueError(f"{folder} holds {len(series)} series, expected one; move each to its own folder: {series}")
@@ -139,13 +113,13 @@ def _one_series(slices: Sequence[_Slice], folder: Path) -> None:
                 f"{folder}: expected files of one grey slice each, but {name} has colour or several frames"
             )
         for what in ("size", "cosines", "spacing", "signed", "bits"):
-            here, there = (getattr(x, what) for x in (header, first))
-            if (here is None) != (there is None) or (here is not None and not np.allclose(here, there, atol=1e-4)):
-                raise ValueError(f"{folder}: slices must agree in {what}, but {name} has {here} and another {there}")
+            value, other = getattr(header, what), getattr(first, what)
+            if (value is None) != (other is None) or (value is not None and not np.allclose(value, other, atol=1e-4)):
+                raise ValueError(f"{folder}: slices must agree in {what}, but {name} has {value} and another {other}")
 
 
 def _step(slices: Sequence[_Slice], folder: Path) -> np.ndarray | None:
-    """Vector from one slice to the next in millimetres; None for a single slice that states no thickness."""
+    """Vector from one slice to the next in millimetres, or None for a single slice without a thickness."""
     first, last = slices[0], slices[-1]
     if len(slices) == 1:
         return None if first.thickness is None else first.normal * first.thickness
@@ -163,6 +137,7 @@ def _step(slices: Sequence[_Slice], folder: Path) -> np.ndarray | None:
 
 
 def _rescaled_type(slices: Sequence[_Slice]) -> np.dtype:
+    """Smallest type of the rescaled voxels that holds all values of the stored bits."""
     (slope, intercept), *others = {header.scale for header in slices}
     allocated, bits = slices[0].bits
     if others or not (slope.is_integer() and intercept.is_integer()):
@@ -171,6 +146,5 @@ def _rescaled_type(slices: Sequence[_Slice]) -> np.dtype:
         return np.dtype(f"{'i' if slices[0].signed else 'u'}{allocated // 8}")
     limits = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if slices[0].signed else (0, 2**bits - 1)
     ends = [int(slope) * limit + int(intercept) for limit in limits]
-    # The smallest signed type that holds both ends. min_scalar_type would return an unsigned type for a positive
-    # maximum, so -maximum - 1 is used, which needs the signed type that also holds the maximum.
+    # A signed type that holds a maximum also holds -maximum - 1. For a negative number min_scalar_type is signed.
     return np.min_scalar_type(min(-1, *ends, -max(ends) - 1))

@@ -1,6 +1,5 @@
 """Formats with raw or compressed voxels and a simple header or none: raw, MetaImage and NRRD."""
 
-import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,22 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
+from holotorch.io.formats import scan
 from holotorch.io.formats.limits import unzipped
-from holotorch.io.formats.scan import (
-    Scan,
-    expect_bytes,
-    from_words,
-    metres,
-    named,
-    number_type,
-    placed,
-    readable,
-    stated_bytes,
-    uncompressed,
-    unpacked,
-)
+from holotorch.io.formats.scan import Scan
 
-_HEADER = 1 << 20  # bytes; largest accepted header of unknown length within compressed data
+_HEADER = 1 << 20  # largest accepted header of unknown length within compressed data, in bytes
 _META_TYPES = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4",
     "MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4", "MET_DOUBLE": "f8",
@@ -44,9 +32,9 @@ _NRRD_TYPES = {
 
 
 def read_raw(path: Path, shape: Sequence[int] | None, dtype: DTypeLike | None) -> Scan:
-    """Read voxels without a header, x fastest; a missing shape or dtype is taken from the file name.
+    """Read voxels [D, H, W] without a header; a ``shape`` or ``dtype`` of None is taken from the file name.
 
-    The name then contains sizes (x, y, z) and the type, as in the Open SciVis Datasets, for example
+    The name must then contain the sizes (x, y, z) and the type, as in the Open SciVis Datasets, for example
     bonsai_256x256x256_uint8.raw. A file whose name ends in .gz is decompressed.
     """
     stated = re.search(r"_(\d+)x(\d+)x(\d+)_(u?int\d+|float\d+)\.", path.name)
@@ -59,14 +47,14 @@ def read_raw(path: Path, shape: Sequence[int] | None, dtype: DTypeLike | None) -
         raise ValueError(
             f"{path} has no header: pass shape=(D, H, W) and dtype=, such as 'uint8', or '>i2' if big-endian; or {hint}"
         )
-    kind = number_type(dtype)
+    kind = scan.number_type(dtype)
     if path.suffix == ".gz":
-        return Scan(unpacked(path, unzipped(path, stated_bytes(path, shape, kind)), shape, kind))
-    return Scan(uncompressed(path, shape, kind))
+        return Scan(scan.unpacked(path, unzipped(path, scan.stated_bytes(path, shape, kind)), shape, kind))
+    return Scan(scan.uncompressed(path, shape, kind))
 
 
 def read_metaimage(path: Path) -> Scan:
-    """Read MetaImage (.mhd with a data file, or .mha); in millimetres unless DistanceUnits states another unit."""
+    """Read MetaImage (.mhd with a data file, or .mha), in millimetres unless DistanceUnits states another unit."""
     fields, end = _metaimage_header(path)
     if fields.get("NDims", "3") != "3" or fields.get("ElementNumberOfChannels", "1") != "1":
         raise ValueError(
@@ -75,37 +63,34 @@ def read_metaimage(path: Path) -> Scan:
         )
     if fields.get("BinaryData", "True").lower() != "true":
         raise ValueError(f"{path} holds its voxels as text; write it with BinaryData = True")
-    name, kind = fields.get("ElementDataFile", ""), fields.get("ElementType")
-    if name.split()[:1] == ["LIST"] or "%" in name:
-        raise ValueError(f"{path} lists one file per slice; load the folder of the slices instead")
+    name, kind = fields["ElementDataFile"], fields.get("ElementType")
+    data = path if name == "LOCAL" else scan.named(path, name)
     if kind not in _META_TYPES:
         raise ValueError(f"{path} has ElementType = {kind}; known are {', '.join(_META_TYPES)}")
     big = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", "False")).lower() == "true"
     dtype = np.dtype((">" if big else "<") + _META_TYPES[kind])
     shape = _whole(fields, "DimSize", 3, path, least=1)[::-1]
-    skip = _whole(fields, "HeaderSize", 1, path, least=-1)[0] if "HeaderSize" in fields else 0
-    data = path if name == "LOCAL" else named(path, name)
+    skip = _whole(fields, "HeaderSize", 1, path, least=-1, default="0")[0]
     offset = end if name == "LOCAL" else skip
     if fields.get("CompressedData", "False").lower() == "true":
-        values = unpacked(data, unzipped(data, stated_bytes(data, shape, dtype), offset), shape, dtype)
+        values = scan.unpacked(data, unzipped(data, scan.stated_bytes(data, shape, dtype), offset), shape, dtype)
     else:
-        values = uncompressed(data, shape, dtype, _at_end(data, shape, dtype) if skip == -1 else offset)
-    spacing = _numbers(fields, ("ElementSpacing", "ElementSize"), 3, path, default=[])
-    if not spacing:
+        values = scan.uncompressed(data, shape, dtype, None if skip == -1 else offset)
+    if not {"ElementSpacing", "ElementSize"} & fields.keys():
         return Scan(values)
-    identity = [1.0, 0, 0, 0, 1, 0, 0, 0, 1]
-    rows = _numbers(fields, ("TransformMatrix", "Orientation", "Rotation"), 9, path, default=identity)
-    origin = _numbers(fields, ("Offset", "Position", "Origin"), 3, path, default=[0.0, 0, 0])
+    spacing = _numbers(fields, ("ElementSpacing", "ElementSize"), 3, path)
+    rows = _numbers(fields, ("TransformMatrix", "Orientation", "Rotation"), 9, path, default="1 0 0 0 1 0 0 0 1")
+    origin = _numbers(fields, ("Offset", "Position", "Origin"), 3, path, default="0 0 0")
     axes = np.reshape(rows, (3, 3)) * np.reshape(spacing, (3, 1))
-    return placed(values, axes, origin, "m", metres(fields.get("DistanceUnits", "mm"), path))
+    return scan.placed(values, axes, origin, "m", scan.metres(fields.get("DistanceUnits", "mm"), path))
 
 
 def read_nrrd(path: Path) -> Scan:
-    """Read NRRD, or NHDR with its data file, encoded as raw, gzip, bzip2 or ascii; without units it is "relative"."""
+    """Read NRRD (.nrrd, or .nhdr with a data file), encoded as raw, gzip, bzip2 or text; "relative" without units."""
     import nrrd
 
     with open(path, "rb") as stream:
-        with readable(path, "NRRD header"):
+        with scan.readable(path, "NRRD header"):
             header = nrrd.read_header(stream)
         end = stream.tell()
     missing = [field for field in ("type", "sizes", "encoding") if field not in header]
@@ -123,9 +108,7 @@ def read_nrrd(path: Path) -> Scan:
 def _nrrd_values(path: Path, header: dict[str, Any], shape: list[int], end: int) -> np.ndarray:
     encoding, dtype = header["encoding"].lower(), _nrrd_type(path, header)
     name = header.get("data file", header.get("datafile"))
-    if name and (name.startswith("LIST") or "%" in name):
-        raise ValueError(f"{path} lists one file per slice; load the folder of the slices instead")
-    data = named(path, name) if name else path
+    data = scan.named(path, name) if name else path
     with open(data, "rb") as stream:
         stream.seek(0 if name else end)
         for _ in range(int(header.get("line skip", header.get("lineskip", 0)))):
@@ -136,19 +119,14 @@ def _nrrd_values(path: Path, header: dict[str, Any], shape: list[int], end: int)
     if skip < -1:
         raise ValueError(f"{path} has byte skip {skip}; expected -1 or a number of bytes")
     if encoding == "raw":
-        return uncompressed(data, shape, dtype, _at_end(data, shape, dtype) if skip == -1 else offset + skip)
+        return scan.uncompressed(data, shape, dtype, None if skip == -1 else offset + skip)
     if encoding in ("gzip", "gz", "bzip2", "bz2"):
-        size = stated_bytes(data, shape, dtype)
-        most = size + (_HEADER if skip == -1 else skip)
-        content = unzipped(data, most, offset, kind="gzip" if encoding[0] == "g" else "bzip2")
+        size, kind = scan.stated_bytes(data, shape, dtype), "gzip" if encoding[0] == "g" else "bzip2"
+        content = unzipped(data, size + (_HEADER if skip == -1 else skip), offset, kind=kind)
         del content[: -size if skip == -1 else skip]
-        return unpacked(data, content, shape, dtype)
+        return scan.unpacked(data, content, shape, dtype)
     if encoding in ("ascii", "text", "txt"):
-        with readable(data, "text"), open(data, "rb") as stream:
-            stream.seek(offset)
-            values = from_words(stream.read().split(), dtype)
-        expect_bytes(data, values.nbytes, shape, dtype)
-        return values.reshape(shape)
+        return scan.from_text(data, data.read_bytes()[offset:], shape, dtype)
     raise ValueError(f"{path} is encoded as {encoding!r}; known are raw, gzip, bzip2 and ascii")
 
 
@@ -172,22 +150,18 @@ def _nrrd_placed(values: np.ndarray, header: dict[str, Any], path: Path) -> Scan
     units = [unit for unit in header.get("space units" if in_space else "units", []) if unit.strip()]
     if len(units) not in (0, 3):
         raise ValueError(f"{path} gives units for {len(units)} of three axes; pass spacing= instead")
-    # There is one unit per axis or, with space directions, per vector component. Both apply to the columns of ``axes``.
-    scale = np.array([metres(unit, path) for unit in units] if units else [1.0, 1, 1])
+    # Each axis has a unit or, with space directions, each vector component. Both apply to the columns of ``axes``.
+    scale = np.array([scan.metres(unit, path) for unit in units] if units else [1.0, 1, 1])
     origin = np.asarray(header.get("space origin", [0.0, 0, 0]), dtype=np.float64)
     origin = np.where(np.isfinite(origin), origin, 0) * scale
-    return placed(values, axes * scale, origin, "m" if units else "relative")
-
-
-def _at_end(path: Path, shape: list[int], dtype: np.dtype) -> int:
-    # If the length of the header is unknown, the data are located from the end. ``uncompressed`` rejects short files.
-    return max(0, path.stat().st_size - math.prod(shape) * dtype.itemsize)
+    return scan.placed(values, axes * scale, origin, "m" if units else "relative")
 
 
 def _metaimage_header(path: Path) -> tuple[dict[str, str], int]:
+    """Fields of a header, and its length in bytes."""
     fields: dict[str, str] = {}
     with open(path, "rb") as stream:
-        # The voxels may follow the header, so reading stops at its last field, which is always ElementDataFile.
+        # ElementDataFile is always the last field of the header, which the voxels may follow.
         while "ElementDataFile" not in fields and (line := stream.readline(1 << 16)):
             name, equals, value = line.decode("latin-1").partition("=")
             if equals:
@@ -197,23 +171,25 @@ def _metaimage_header(path: Path) -> tuple[dict[str, str], int]:
         return fields, stream.tell()
 
 
-def _whole(fields: dict[str, str], name: str, count: int, path: Path, *, least: int) -> list[int]:
-    numbers = _numbers(fields, (name,), count, path)
+def _whole(
+    fields: dict[str, str], name: str, count: int, path: Path, *, least: int, default: str | None = None
+) -> list[int]:
+    """As :func:`_numbers`, for whole numbers of at least ``least``."""
+    numbers = _numbers(fields, (name,), count, path, default)
     if not all(number.is_integer() and number >= least for number in numbers):
         raise ValueError(f"{path} must give whole numbers from {least} on as {name}, got {fields[name]!r}")
     return [int(number) for number in numbers]
 
 
 def _numbers(
-    fields: dict[str, str], names: Sequence[str], count: int, path: Path, default: list[float] | None = None
+    fields: dict[str, str], names: Sequence[str], count: int, path: Path, default: str | None = None
 ) -> list[float]:
-    name = next((name for name in names if name in fields), None)
-    if name is None and default is not None:
-        return default
+    """The ``count`` numbers of the first field of ``names`` that exists, or of ``default``."""
+    text = next((fields[name] for name in names if name in fields), default)
     try:
-        numbers = [float(word) for word in fields[name or names[0]].split()]
-    except (KeyError, ValueError):
+        numbers = [float(word) for word in (text or "").split()]
+    except ValueError:
         numbers = []
     if len(numbers) != count:
-        raise ValueError(f"{path} must give {count} numbers as {names[0]}, got {fields.get(name or names[0])!r}")
+        raise ValueError(f"{path} must give {count} numbers as {names[0]}, got {text!r}")
     return numbers

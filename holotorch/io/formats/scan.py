@@ -25,55 +25,39 @@ _METRES = {
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Voxels and the geometry that their file states.
+    """Voxels and the geometry that their file states."""
 
-    Attributes:
-        values: [D, H, W] in the dtype of the file, possibly memory-mapped.
-        spacing: Distance between voxels along (z, y, x) in ``unit``, or None if the file states none.
-        unit: "m" or "relative".
-        origin: Position (z, y, x) of voxel [0, 0, 0] in ``unit``.
-        orientation: Unit vectors of the axes z, y, x as rows with components (z, y, x).
-    """
-
-    values: np.ndarray
-    spacing: Triple | None = None
-    unit: str = "relative"
-    origin: Triple = (0.0, 0.0, 0.0)
+    values: np.ndarray  # [D, H, W] in the dtype of the file, possibly memory-mapped
+    spacing: Triple | None = None  # distance between voxels along (z, y, x) in ``unit``, None if the file states none
+    unit: str = "relative"  # "m" or "relative"
+    origin: Triple = (0.0, 0.0, 0.0)  # position (z, y, x) of voxel [0, 0, 0] in ``unit``
+    # Unit vectors of the axes z, y, x as rows with components (z, y, x).
     orientation: tuple[Triple, Triple, Triple] = IDENTITY
 
 
 def metres(unit: str, path: Path) -> float:
-    """Length in metres of a ``unit`` that the file at ``path`` names."""
+    """Length in metres of a ``unit`` that is named in the file at ``path``; ValueError if it is unknown."""
     name = unit.strip().lower()
-    if name not in _METRES:
-        name = name.removesuffix("s")
-    if name not in _METRES:
+    length = _METRES.get(name) or _METRES.get(name.removesuffix("s"))
+    if length is None:
         raise ValueError(f"{path} gives its spacing in {unit!r}; known are {', '.join(_METRES)}; pass spacing= instead")
-    return _METRES[name]
+    return length
 
 
 def placed(values: np.ndarray, axes: Any, origin: Any, unit: str, scale: float = 1.0) -> Scan:
-    """Scan of ``values`` for a file that lists geometry in the order (x, y, z), like medical formats.
+    """Scan of ``values`` [D, H, W] from geometry in the order (x, y, z), which ``scale`` converts to ``unit``.
 
-    Args:
-        values: Voxels [D, H, W].
-        axes: Steps from one voxel to the next along x, y and z, as rows with components (x, y, z), [3, 3].
-        origin: Position (x, y, z) of the first voxel.
-        unit: "m" or "relative".
-        scale: Length of the file's unit, expressed in ``unit``.
+    The rows of ``axes`` [3, 3] are the steps from one voxel to the next along x, y and z, with components (x, y, z).
+    ``origin`` is the position (x, y, z) of the first voxel. The scan has no geometry if the length of a step is 0, or
+    not finite.
     """
     steps = np.asarray(axes, dtype=np.float64)[::-1, ::-1]
     lengths = np.linalg.norm(steps, axis=1)
     if not (np.isfinite(lengths).all() and (lengths > 0).all()):
         return Scan(values)
-    rows = [triple(row) for row in steps / lengths[:, None]]
-    return Scan(
-        values,
-        triple(lengths * scale),
-        unit,
-        triple(np.asarray(origin, dtype=np.float64)[::-1] * scale),
-        (rows[0], rows[1], rows[2]),
-    )
+    z, y, x = (triple(row) for row in steps / lengths[:, None])
+    first = triple(np.asarray(origin, dtype=np.float64)[::-1] * scale)
+    return Scan(values, triple(lengths * scale), unit, first, (z, y, x))
 
 
 def triple(values: Sequence[float] | np.ndarray) -> Triple:
@@ -82,28 +66,12 @@ def triple(values: Sequence[float] | np.ndarray) -> Triple:
     return z, y, x
 
 
-def existing(path: Path) -> Path:
-    """``path``; ValueError if it does not exist, cannot be read or is an empty file."""
-    return _not_empty(path, str(path))
+def existing(path: Path, where: str = "", *, file: bool = False) -> Path:
+    """Return ``path``; ValueError if it is missing, cannot be read, is an empty file or, with ``file``, no file.
 
-
-def named(header: Path, name: str) -> Path:
-    """Path of the data file that a header names, in the header's folder or below it.
-
-    Raises:
-        ValueError: The data file is missing, empty or no file, or lies outside the folder: a header from someone else
-            must not choose which of the user's files are read.
+    ``where`` describes the path in errors.
     """
-    path = header.parent / name
-    if not path.resolve().is_relative_to(header.parent.resolve()):
-        raise ValueError(
-            f"{header} names the data file {name!r}, which lies outside the header's folder; move it (no link) beside "
-            "the header, or load it without its header, with shape=, dtype= and spacing="
-        )
-    return _not_empty(path, f"the data file {path}, which {header} names,", file=True)
-
-
-def _not_empty(path: Path, where: str, *, file: bool = False) -> Path:
+    where = where or str(path)
     try:
         path.stat()
     except FileNotFoundError:
@@ -115,6 +83,23 @@ def _not_empty(path: Path, where: str, *, file: bool = False) -> Path:
     if path.is_file() and not path.stat().st_size:
         raise ValueError(f"{where} is empty (0 bytes)")
     return path
+
+
+def named(header: Path, name: str) -> Path:
+    """Path of the data file that a header names, in the header's folder or below it.
+
+    ValueError if it is missing, empty or no file, or lies elsewhere, since a header from someone else must not choose
+    which of the user's files are read.
+    """
+    if name.split()[:1] == ["LIST"] or "%" in name:
+        raise ValueError(f"{header} lists one file per slice; load the folder of the slices instead")
+    path = header.parent / name
+    if not path.resolve().is_relative_to(header.parent.resolve()):
+        raise ValueError(
+            f"{header} names the data file {name!r}, which lies outside the header's folder; move it (no link) beside "
+            "the header, or load it without its header, with shape=, dtype= and spacing="
+        )
+    return existing(path, f"the data file {path}, which {header} names,", file=True)
 
 
 def number_type(dtype: DTypeLike) -> np.dtype:
@@ -132,11 +117,11 @@ def number_type(dtype: DTypeLike) -> np.dtype:
 
 def expect_bytes(path: Path, found: int, shape: Sequence[int], dtype: np.dtype) -> int:
     """Number of bytes of ``shape`` voxels; ValueError if ``found`` differs from it, or if a size is below 1."""
+    sizes = " x ".join(map(str, shape))
     if any(size < 1 for size in shape):
-        raise ValueError(f"{path} states {' x '.join(map(str, shape))} voxels (D x H x W); every size must be above 0")
+        raise ValueError(f"{path} states {sizes} voxels (D x H x W); every size must be above 0")
     wanted = math.prod(shape) * dtype.itemsize
     if found != wanted:
-        sizes = " x ".join(str(size) for size in shape)
         raise ValueError(
             f"{path}: expected {wanted} bytes = {sizes} (D x H x W) of {dtype.name}, found {found}; check shape and "
             "dtype, or the file is truncated"
@@ -144,18 +129,23 @@ def expect_bytes(path: Path, found: int, shape: Sequence[int], dtype: np.dtype) 
     return wanted
 
 
-def uncompressed(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int = 0) -> np.ndarray:
-    """Voxels of a file that contains only voxels after ``offset`` bytes; see :func:`uncompressed_from`."""
-    expect_bytes(path, path.stat().st_size - offset, shape, dtype)
+def uncompressed(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int | None = 0) -> np.ndarray:
+    """Voxels that take a file from ``offset`` bytes to its end, read as by :func:`uncompressed_from`.
+
+    ``offset`` is None if it is unknown.
+    """
+    size = path.stat().st_size
+    offset = max(0, size - math.prod(shape) * dtype.itemsize) if offset is None else offset
+    expect_bytes(path, size - offset, shape, dtype)
     return uncompressed_from(path, shape, dtype, offset)
 
 
 def uncompressed_from(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int) -> np.ndarray:
-    """Voxels of a file from ``offset`` bytes on.
+    """Voxels of a file from ``offset`` bytes on, writable.
 
-    They are memory-mapped if they take over 1 GiB and over half of the free memory, and otherwise read at once. A
-    mapped voxel is read on access, and the system terminates the program if the file has been truncated meanwhile; only
-    volumes that may exceed the memory are therefore mapped. Changes to mapped voxels are not written to the file.
+    The file is read at once, or memory-mapped if the voxels take over 1 GiB and over half of the free memory. Mapped
+    voxels are read on access, and the system terminates the program if the file has been truncated since. Only volumes
+    that may exceed the memory are therefore mapped. Changes to mapped voxels are not written to the file.
     """
     size = math.prod(shape) * dtype.itemsize
     if readable_at_once(size):
@@ -171,7 +161,7 @@ def uncompressed_from(path: Path, shape: Sequence[int], dtype: np.dtype, offset:
 
 
 def stated_bytes(path: Path, shape: Sequence[int], dtype: np.dtype) -> int:
-    """Number of bytes of the stated ``shape``; ValueError if a size is below 1 or the bytes exceed the memory limit."""
+    """Number of bytes of ``shape`` voxels; ValueError if a size is below 1 or the memory limit is exceeded."""
     size = expect_bytes(path, math.prod(shape) * dtype.itemsize, shape, dtype)
     affordable(path, size, path.stat().st_size)
     return size
@@ -184,11 +174,14 @@ def unpacked(path: Path, data: bytes | bytearray, shape: Sequence[int], dtype: n
     return np.frombuffer(data if isinstance(data, bytearray) else bytearray(data), dtype).reshape(tuple(shape))
 
 
-def from_words(words: Sequence[str] | Sequence[bytes], dtype: np.dtype) -> np.ndarray:
-    """Convert numbers written as text to an array of ``dtype`` in native byte order."""
+def from_text(path: Path, text: str | bytes, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
+    """Voxels [D, H, W] from numbers separated by white space, in native byte order."""
     # numpy's conversion from strings would store every word with the width of the longest.
     number = float if dtype.kind == "f" else int
-    return np.array([number(word) for word in words], dtype.newbyteorder("="))
+    with readable(path, "text of numbers"):
+        values = np.array([number(word) for word in text.split()], dtype.newbyteorder("="))
+    expect_bytes(path, values.nbytes, shape, dtype)
+    return values.reshape(tuple(shape))
 
 
 def three_axes(values: np.ndarray, path: Path) -> np.ndarray:
@@ -228,9 +221,9 @@ def extra(module: str, what: str) -> Any:
 
 
 def split_member(path: str | Path) -> tuple[Path, str | None]:
-    """Split ``file::name`` into the path of the file and the name of the array within it, or None."""
+    """Split ``file::name`` into the path of the file and the name of an array in it, or None without a name."""
     file, _, member = str(path).partition("::")
-    return Path(file), member or None
+    return Path(file), member.strip("/") or None
 
 
 def chosen(names: Sequence[str], member: str | None, path: Path) -> str:

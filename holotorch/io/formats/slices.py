@@ -10,23 +10,24 @@ from holotorch.io.formats.decoding import decode
 from holotorch.io.formats.limits import affordable
 from holotorch.io.formats.scan import Scan, readable
 
-_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES = 256, 257, 258, 277  # tags
+_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES = 256, 257, 258, 277  # tags of a page
 SLICE_SUFFIXES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg")
 
 
 def read_tiff(path: Path) -> Scan:
-    """Read the grey pages of a TIFF file as slices, the first page at z = 0. TIFF states no spacing between pages."""
+    """Read the grey pages of a TIFF file as slices. TIFF states no spacing between pages."""
     import cv2
 
     pages = _tiff_pages(path)
     with readable(path, "TIFF file"):
-        fine, found = cv2.imdecodemulti(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    if not fine or len(found) != pages:
+        success, slices = cv2.imdecodemulti(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    decoded = len(slices) if success else 0
+    if decoded != pages:
         raise ValueError(
-            f"{path}: {len(found) if fine else 0} of {pages} pages could be decoded; it is truncated, or in a TIFF "
-            "variant that OpenCV does not read"
+            f"{path}: {decoded} of {pages} pages could be decoded; it is truncated, or in a TIFF variant that OpenCV "
+            "does not read"
         )
-    return _stacked(found, [f"page {index} of {path}" for index in range(pages)])
+    return _stacked(slices, [f"page {index} of {path}" for index in range(pages)])
 
 
 def read_folder(folder: Path) -> Scan:
@@ -42,13 +43,14 @@ def read_folder(folder: Path) -> Scan:
         if (number := int(numbers[-1])) in numbered:
             raise ValueError(f"{folder} holds slice {number} twice: {numbered[number].name} and {path.name}")
         numbered[number] = path
-    first, last = min(numbered), max(numbered)
-    missing = [number for number in range(first, last + 1) if number not in numbered]
+    numbers = range(min(numbered), max(numbered) + 1)
+    missing = len(numbers) - len(numbered)
     if missing:
+        first = next(number for number in numbers if number not in numbered)
         raise ValueError(
-            f"{folder}: slices {first} to {last}, but {len(missing)} missing, the first being {missing[0]}"
+            f"{folder}: slices {numbers[0]} to {numbers[-1]}, but {missing} missing, the first being {first}"
         )
-    ordered = [numbered[number] for number in range(first, last + 1)]
+    ordered = [numbered[number] for number in numbers]
     return _stacked((_picture(path) for path in ordered), [str(path) for path in ordered])
 
 
@@ -87,6 +89,7 @@ def _grey(pixels: np.ndarray, source: str) -> np.ndarray:
 
 
 def _stacked(slices: Iterable[np.ndarray], sources: Sequence[str]) -> Scan:
+    """Scan of grey slices; ``sources`` names them in errors."""
     values = np.empty(0)
     for index, (pixels, source) in enumerate(zip(slices, sources, strict=True)):
         plane = _grey(pixels, source)
@@ -104,43 +107,44 @@ def _stacked(slices: Iterable[np.ndarray], sources: Sequence[str]) -> Scan:
 def _tiff_pages(path: Path) -> int:
     """Number of pages from the TIFF directories, since OpenCV silently omits pages that it cannot decode.
 
-    Raises:
-        ValueError: A damaged file, or pages whose pixels need more than the memory limit.
+    ValueError for a damaged file, or pages whose pixels need more than the memory limit.
     """
     data = np.memmap(path, np.uint8, "r")
-    order = "big" if data[:2].tobytes() == b"MM" else "little"
-    # Version 42 (TIFF) has offsets of 4 bytes, version 43 (BigTIFF) of 8 bytes.
-    version = int.from_bytes(data[2:4].tobytes(), order)
-    if data[:2].tobytes() not in (b"II", b"MM") or version not in (42, 43):
+    mark, order = bytes(data[:2]), "big" if bytes(data[:2]) == b"MM" else "little"
+    version = int.from_bytes(bytes(data[2:4]), order)
+    if mark not in (b"II", b"MM") or version not in (42, 43):
         raise ValueError(f"{path} is not a TIFF file")
-    wide = version == 43
+    wide = version == 43  # BigTIFF
+    # Bytes of an offset, of the number of entries of a directory, and of an entry.
     length, counter, entry = (8, 8, 20) if wide else (4, 2, 12)
 
-    def number(place: int, size: int) -> int:
-        if place + size > data.size:
+    def number(position: int, size: int) -> int:
+        if position + size > data.size:
             raise ValueError(f"{path} is truncated: it ends at byte {data.size}, before its page directory")
-        return int.from_bytes(data[place : place + size].tobytes(), order)
+        return int.from_bytes(bytes(data[position : position + size]), order)
 
-    def fact(directory: int, tag: int, default: int) -> int:
-        """First value of the entry ``tag``, or ``default``; the entry's type gives its size of 1, 2, 4 or 8 bytes."""
-        for place in range(directory + counter, directory + counter + entry * number(directory, counter), entry):
-            if number(place, 2) == tag:
-                size = {3: 2, 4: 4, 16: 8}.get(number(place + 2, 2), 1)
-                count, value = number(place + 4, length), place + 4 + length
+    def first_value(directory: int, tag: int) -> int:
+        """First value of the entry ``tag`` of a directory, 1 if there is none."""
+        begin = directory + counter
+        for position in range(begin, begin + entry * number(directory, counter), entry):
+            if number(position, 2) == tag:
+                size = {3: 2, 4: 4, 16: 8}.get(number(position + 2, 2), 1)  # bytes of a value, from the entry's type
+                count, value = number(position + 4, length), position + 4 + length
                 return number(value if count * size <= length else number(value, length), size)
-        return default
+        return 1
 
-    place, directories, entries, needed = number(8 if wide else 4, length), set[int](), 0, 0
-    while place:
-        if place in directories:
+    position, directories, entries, needed = number(8 if wide else 4, length), set[int](), 0, 0
+    while position:
+        if position in directories:
             raise ValueError(f"{path} is damaged: its pages point at each other in a circle")
-        directories.add(place)
-        entries += number(place, counter)
+        directories.add(position)
+        count = number(position, counter)
+        entries += count
         if entries * entry > data.size:
             raise ValueError(f"{path} is damaged: the directories of its pages overlap")
-        bits = max(8, fact(place, _TIFF_BITS, 1)) * fact(place, _TIFF_SAMPLES, 1)
-        needed += fact(place, _TIFF_WIDTH, 1) * fact(place, _TIFF_HEIGHT, 1) * bits // 8
-        place = number(place + counter + entry * number(place, counter), length)
+        bits = max(8, first_value(position, _TIFF_BITS)) * first_value(position, _TIFF_SAMPLES)
+        needed += first_value(position, _TIFF_WIDTH) * first_value(position, _TIFF_HEIGHT) * bits // 8
+        position = number(position + counter + entry * count, length)
     # Memory for the decoded pages and for the volume that they are copied to.
     affordable(path, 2 * needed, data.size)
     return len(directories)

@@ -8,19 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from holotorch.io.formats import scan
 from holotorch.io.formats.limits import inflated
-from holotorch.io.formats.scan import (
-    Scan,
-    chosen,
-    expect_bytes,
-    from_words,
-    placed,
-    readable,
-    stated_bytes,
-    three_axes,
-    uncompressed_from,
-    unpacked,
-)
+from holotorch.io.formats.scan import Scan
 
 _TYPES = {
     "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4", "Int64": "i8",
@@ -33,7 +23,7 @@ _APPENDED = re.compile(
 
 
 def read_vti(path: Path, member: str | None = None) -> Scan:
-    """Read a scalar array of a file with one piece: ``member``, else the active array, else the only one.
+    """Read the scalar array ``member`` of a file with one piece, by default the active array or the only one.
 
     VTK states no units, so the volume is "relative". Large raw appended data without compression are memory-mapped.
     """
@@ -57,20 +47,19 @@ def read_vti(path: Path, member: str | None = None) -> Scan:
             f"{path}: array {array.get('Name')!r} has {components} components per voxel, expected a scalar"
         )
     dtype = np.dtype((">" if root.get("byte_order") == "BigEndian" else "<") + _TYPES[kind])
-    values = three_axes(_values(path, root, array, shape, dtype, start, base64_coded), path)
+    values = scan.three_axes(_values(path, root, array, shape, dtype, start, base64_coded), path)
     if "Spacing" not in image.attrib:
         return Scan(values)
     spacing = np.array([float(word) for word in image.attrib["Spacing"].split()])
-    # Columns of Direction are the axes.
     direction = np.reshape([float(word) for word in image.get("Direction", "1 0 0 0 1 0 0 0 1").split()], (3, 3))
-    axes = direction.T * spacing[:, None]
+    axes = direction.T * spacing[:, None]  # the columns of Direction are unit vectors along the axes
     corner = np.array([float(word) for word in image.get("Origin", "0 0 0").split()])
     first = np.array(bounds[::2]) + (0.5 if cells else 0)
-    return placed(values, axes, corner + first @ axes, "relative")
+    return scan.placed(values, axes, corner + first @ axes, "relative")
 
 
 def _document(path: Path) -> tuple[ElementTree.Element, int, bool]:
-    """Parse XML without the appended data; also return their offset in the file, or -1, and whether it is base64."""
+    """Root of the XML without the appended data, the offset of these data or -1, and whether they are in base64."""
     data = np.memmap(path, np.uint8, "r")
     match = _APPENDED.search(data)  # type: ignore[arg-type]
     text = bytes(data[: match.start()]) + b"</VTKFile>" if match else bytes(data)
@@ -82,14 +71,14 @@ def _document(path: Path) -> tuple[ElementTree.Element, int, bool]:
 
 
 def _array(piece: ElementTree.Element, member: str | None, path: Path) -> tuple[ElementTree.Element, int]:
-    """The selected array, and 1 for cell data, which have one value fewer per axis than point data, else 0."""
+    """The selected array, and by how many values per axis it is smaller than the points: 1 for cell data, else 0."""
     for name, cells in (("PointData", 0), ("CellData", 1)):
         holder = piece.find(name)
         arrays = {item.get("Name", ""): item for item in (holder if holder is not None else ())}
         if holder is not None and arrays and (member is None or member in arrays or cells):
             active = holder.get("Scalars")
             wanted = member or (active if active in arrays else None)
-            return arrays[chosen(list(arrays), wanted, path)], cells
+            return arrays[scan.chosen(list(arrays), wanted, path)], cells
     raise ValueError(f"{path} holds no array{f' {member!r}' if member else ''}")
 
 
@@ -102,12 +91,10 @@ def _values(
     start: int,
     base64_coded: bool,
 ) -> np.ndarray:
+    """Voxels of an array; ``start`` and ``base64_coded`` describe the appended data, see :func:`_document`."""
     form, compressor = array.get("format", "ascii"), root.get("compressor")
     if form == "ascii":
-        with readable(path, "text of numbers"):
-            values = from_words((array.text or "").split(), dtype)
-        expect_bytes(path, values.nbytes, shape, dtype)
-        return values.reshape(shape)
+        return scan.from_text(path, array.text or "", shape, dtype)
     header_type = root.get("header_type", "UInt32")
     if header_type not in ("UInt32", "UInt64"):
         raise ValueError(f"{path} has header_type {header_type!r}, expected UInt32 or UInt64")
@@ -119,39 +106,36 @@ def _values(
     offset = start + int(array.get("offset", 0))
     if form == "appended" and not base64_coded:
         if compressor is None:
-            return _mapped(path, shape, dtype, offset, count)
+            with open(path, "rb") as stream:
+                stream.seek(offset)
+                size = _length(stream.read(count.itemsize), count)
+            offset += count.itemsize
+            scan.expect_bytes(path, max(0, min(size, path.stat().st_size - offset)), shape, dtype)
+            return scan.uncompressed_from(path, shape, dtype, offset)
         data = path.read_bytes()[offset:]
     else:
         data = _decoded(array.text or "" if form == "binary" else path.read_bytes()[offset:].decode("latin-1"))
     if compressor:
-        return unpacked(path, _inflated(path, data, count, stated_bytes(path, shape, dtype)), shape, dtype)
-    return unpacked(path, data[count.itemsize : count.itemsize + _length(data, count)], shape, dtype)
-
-
-def _mapped(path: Path, shape: list[int], dtype: np.dtype, offset: int, count: np.dtype) -> np.ndarray:
-    with open(path, "rb") as stream:
-        stream.seek(offset)
-        size = _length(stream.read(count.itemsize), count)
-    present = max(0, min(size, path.stat().st_size - offset - count.itemsize))
-    expect_bytes(path, present, shape, dtype)
-    return uncompressed_from(path, shape, dtype, offset + count.itemsize)
+        return scan.unpacked(path, _inflated(path, data, count, scan.stated_bytes(path, shape, dtype)), shape, dtype)
+    return scan.unpacked(path, data[count.itemsize : count.itemsize + _length(data, count)], shape, dtype)
 
 
 def _length(data: bytes, count: np.dtype) -> int:
+    """Number of bytes of uncompressed data, which is stated before them as a ``count``."""
     return int.from_bytes(data[: count.itemsize], "big" if count.byteorder == ">" else "little")
 
 
 def _decoded(text: str) -> bytes:
-    # The length at the beginning is encoded separately, so padding "=" may occur inside; the data end at "<".
+    # The data end at "<". Their length is encoded before them as a separate part, which may end with "=".
     parts = re.findall(r"[A-Za-z0-9+/]+=*", "".join(text.partition("<")[0].split()))
-    # A truncated file may end within a group of four characters.
+    # In a truncated file the last group of four characters may be incomplete.
     return b"".join(base64.b64decode(part[: len(part) // 4 * 4]) for part in parts)
 
 
 def _inflated(path: Path, data: bytes, count: np.dtype, size: int) -> bytearray:
-    """Decompress blocks, which follow a table: their number, full size, size of the last one, and compressed sizes.
+    """Decompress ``data`` to at most ``size`` bytes.
 
-    More than ``size`` bytes of content are an error.
+    A table precedes the blocks: their number, their size, the size of the last block, and the compressed sizes.
     """
     try:
         blocks = int(np.frombuffer(data, count, 1)[0])
