@@ -39,13 +39,13 @@ def srgb_matrix(
     """Matrix [3, K] from intensities at ``wavelengths`` to linear sRGB, float64, with one column per wavelength.
 
     The colours are not adapted to a white point: equal intensities of three sources give the colour of their sum, which
-    is not D65. With weights from :func:`white_balance` they give D65.
+    is not D65. With the weights of :func:`white_balance`, equal intensities give D65.
 
     Args:
         wavelengths: K wavelengths in metres.
         weights: Power of each wavelength, 1 by default; for example the weights of the quadrature rules of
             :class:`~holotorch.optics.light.spectrum.Spectrum`.
-        white: Intensities [K] of the white of a picture, which gets a luminance of 1; all ones by default.
+        white: Intensities [K] that get a luminance of 1; all ones by default.
 
     Raises:
         ValueError: Wavelengths outside the table, weights that do not match or are negative, or a white without light.
@@ -54,13 +54,15 @@ def srgb_matrix(
 
     matching = tristimulus(wavelengths)
     count = matching.shape[1]
-    power = torch.ones(count, dtype=torch.float64) if weights is None else torch.as_tensor(weights, dtype=torch.float64)
-    shown = torch.ones(count, dtype=torch.float64) if white is None else white.to(torch.float64)
-    for name, part in (("weights", power), ("white", shown)):
-        if tuple(part.shape) != (count,) or not (part >= 0).all():
-            raise ValueError(f"{name} must be {count} nonnegative numbers, one per wavelength, got {part.tolist()}")
+    power, white = (
+        torch.ones(count).double() if given is None else torch.as_tensor(given, dtype=torch.float64)
+        for given in (weights, white)
+    )
+    for name, values in (("weights", power), ("white", white)):
+        if tuple(values.shape) != (count,) or not (values >= 0).all():
+            raise ValueError(f"{name} must be {count} nonnegative numbers, one per wavelength, got {values.tolist()}")
     matrix = matching * power
-    luminance = matrix[1] @ shown
+    luminance = matrix[1] @ white
     if luminance <= 0:
         raise ValueError("white has no luminance; give positive weights within the visible range")
     return torch.from_numpy(np.array(RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB)) @ matrix / luminance
@@ -79,8 +81,8 @@ def white_balance(wavelengths: Sequence[float]) -> Tensor:
     matching = tristimulus(wavelengths)
     if matching.shape[1] != 3:
         raise ValueError(f"white balance needs three wavelengths, got {matching.shape[1]}")
-    wanted = torch.from_numpy(np.linalg.inv(RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB) @ np.ones(3))
-    powers = torch.linalg.solve(matching, wanted) if torch.linalg.matrix_rank(matching) == 3 else -torch.ones(3)
+    white = torch.from_numpy(np.linalg.inv(RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB) @ np.ones(3))
+    powers = torch.linalg.solve(matching, white) if torch.linalg.matrix_rank(matching) == 3 else -torch.ones(3)
     if (powers <= 0).any():
         listed = ", ".join(f"{value * 1e9:g}" for value in wavelengths)
         raise ValueError(f"{listed} nm cannot mix the white D65; take one red, one green and one blue source")

@@ -57,9 +57,9 @@ def load_volume(
 
     Returns:
         Voxels [D, H, W]. If they take over 1 GiB and over half of the free memory, and the file holds them in native
-        byte order without compression, they are memory-mapped: the file is read on access and never written. It must
-        not be truncated while in use, because the system then ends the program.
-        Floating-point values are not checked for NaN, which would read the whole file: see :meth:`Volume.check_finite`.
+        byte order without compression, they are memory-mapped: the file is read on access and never written. Do not
+        truncate such a file while it is in use: the system would end the program. Floating-point values are not checked
+        for NaN, which would read the whole file; :meth:`Volume.check_finite` checks them.
 
     Raises:
         ValueError: No such file, an unknown format, geometry that is unknown or not stated, a file whose size differs
@@ -109,7 +109,8 @@ def _read(file: Path, member: str | None, shape: Sequence[int] | None, dtype: DT
     if member is not None:
         raise ValueError(f"only {', '.join(_MEMBER_READERS)} hold named arrays, got {file}::{member}")
     if file.is_dir():
-        return _read_folder(file)
+        is_series = any(path.is_file() and medical.is_dicom(path) for path in file.iterdir())
+        return medical.read_dicom(file) if is_series else slices.read_folder(file)
     if name.endswith((".raw", ".raw.gz")):
         return raw_volumes.read_raw(file, shape, dtype)
     if name.endswith(".png"):
@@ -128,12 +129,6 @@ def _read(file: Path, member: str | None, shape: Sequence[int] | None, dtype: DT
     )
 
 
-def _read_folder(folder: Path) -> Scan:
-    if any(path.is_file() and medical.is_dicom(path) for path in folder.iterdir()):
-        return medical.read_dicom(folder)
-    return slices.read_folder(folder)
-
-
 def _check_expected(file: Path, values: np.ndarray, shape: Sequence[int] | None, dtype: DTypeLike | None) -> None:
     if shape is not None and shape != values.shape:
         raise ValueError(f"{file} holds {values.shape} voxels (D, H, W), but shape={shape} was asked for")
@@ -150,8 +145,7 @@ def _tensor(values: np.ndarray, file: Path) -> torch.Tensor:
         if values.size and int(values.max()) > np.iinfo(np.int64).max:
             raise ValueError(f"{file} holds unsigned 64-bit values above 2^63; divide or convert them first")
         values = values.astype(np.int64)
-    if not values.dtype.isnative:
-        # torch supports only the native byte order, so other arrays are converted here.
+    if not values.dtype.isnative:  # torch supports only the native byte order
         values = values.astype(values.dtype.newbyteorder("="))
     if not values.flags.writeable or any(stride < 0 for stride in values.strides):
         values = values.copy()
