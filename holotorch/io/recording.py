@@ -177,11 +177,9 @@ def open_recording(folder: Path) -> Frames:
 
 
 def free_bytes(folder: Path) -> int:
-    """Free bytes on the disk of ``folder``; if it does not exist, on the disk of its nearest existing parent."""
+    """Free bytes on the disk of ``folder``, which need not exist yet."""
     folder = folder.resolve()
-    while not folder.exists():
-        folder = folder.parent
-    return shutil.disk_usage(folder).free
+    return shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.exists())).free
 
 
 def _header(folder: Path) -> dict[str, Any]:
