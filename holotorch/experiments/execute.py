@@ -28,8 +28,8 @@ def execute(settings: Any, out: Path | None, name: str = "run") -> tuple[Path, b
         The folder, and whether the run is complete. The folder of an interrupted run holds the results so far.
 
     Raises:
-        ConfigError: The folder holds files already or cannot be written, an input cannot be used, the run does not fit
-            into memory, or it cannot start.
+        ConfigError: The folder holds other files already or cannot be written, an input cannot be used, or the run does
+            not fit into memory or cannot start.
     """
     kind = find_kind(settings.experiment)
     experiment = kind.build(settings)
@@ -76,8 +76,8 @@ def resume(folder: Path) -> tuple[Path, bool]:
         if tidied(folder):
             write_report([folder], folder / "report.html")
         return folder, True
-    held = read_source(config, []).data
-    name = held.get("experiment")
-    if isinstance(name, str) and name in KINDS and (instead := find_kind(name).restart(folder, held)):
-        raise ConfigError([f"{folder} holds an interrupted run of kind {name}, which cannot be continued: {instead}"])
+    data = read_source(config, []).data
+    name = data.get("experiment")
+    if isinstance(name, str) and name in KINDS and (advice := find_kind(name).restart(folder, data)):
+        raise ConfigError([f"{folder} holds an interrupted run of kind {name}, which cannot be continued: {advice}"])
     return execute(load_config(config), folder, folder.resolve().name)

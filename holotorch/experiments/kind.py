@@ -39,7 +39,7 @@ class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
     example: ClassVar[str]
 
     def contradictions(self, settings: SettingsT) -> list[tuple[Key, str]]:
-        """Settings that are valid one by one but contradict each other: the key and the message for each."""
+        """Key and message for each setting that is valid by itself but contradicts another setting."""
         return []
 
     @abstractmethod
@@ -58,11 +58,11 @@ class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
         """Compute the results and write all files of the folder; returns whether the run is complete."""
 
     def restart(self, folder: Path, config: Mapping[str, Any]) -> str | None:
-        """Advice if an interrupted run cannot be continued; None for the kinds whose runs can be continued.
+        """What to do instead if an interrupted run of this kind cannot be continued, otherwise None.
 
         Args:
             folder: Folder of the run.
-            config: Configuration of the run, as read from the folder.
+            config: Configuration of the run, as plain values.
         """
         return None
 
@@ -72,8 +72,8 @@ class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
 
     @abstractmethod
     def section(self, record: RunRecord) -> list[str]:
-        """The section of a report page for a run, as HTML, from the files of its folder alone."""
+        """The section of a report page for a run, as parts of HTML, from the files of the run folder alone."""
 
     def comparison(self, records: Sequence[RunRecord]) -> list[str]:
-        """HTML that compares several runs of this kind, placed before their sections on a page."""
+        """Parts of HTML that compare several runs of this kind; a page shows them before the sections of the runs."""
         return []

@@ -16,7 +16,7 @@ def write_report(folders: Sequence[Path], path: Path, more: Mapping[str, str] | 
     Args:
         folders: Folders of runs.
         path: File to write.
-        more: Further pages to link to: the text of each link, and its address relative to ``path``.
+        more: Further pages to link to: address relative to ``path`` by the text of the link.
 
     Raises:
         ConfigError: A folder holds no run, or a run that cannot be read.

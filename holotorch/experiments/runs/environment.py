@@ -4,13 +4,13 @@ import datetime
 import platform
 import subprocess
 import sys
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import torch
 
 import holotorch
+from holotorch.experiments.doctor import installed_version
 
 _PACKAGES = ("torch", "numpy", "kornia", "scikit-image", "opencv-contrib-python-headless")
 
@@ -22,7 +22,7 @@ def environment(seed: int, device: torch.device) -> dict[str, Any]:
         "holotorch": holotorch.__version__,
         "git": _git_state(Path(holotorch.__file__).parents[1]),
         "python": platform.python_version(),
-        "packages": {name: _version(name) for name in _PACKAGES},
+        "packages": {name: installed_version(name) for name in _PACKAGES},
         "platform": platform.platform(),
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else cpu,
         "seed": seed,
@@ -31,20 +31,12 @@ def environment(seed: int, device: torch.device) -> dict[str, Any]:
     }
 
 
-def _version(name: str) -> str | None:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None
-
-
 def _git_state(checkout: Path) -> str | None:
     """Commit of this checkout, with "-dirty" if files have changed; None for an installed package."""
     if not (checkout / ".git").exists():
         return None
+    command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=12"]
     try:
-        words = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=12"]
-        answer = subprocess.run(words, capture_output=True, text=True, timeout=5)
+        return subprocess.run(command, capture_output=True, text=True, timeout=5).stdout.strip() or None
     except (OSError, subprocess.TimeoutExpired):
         return None
-    return answer.stdout.strip() or None

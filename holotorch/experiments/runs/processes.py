@@ -1,4 +1,4 @@
-"""Several processes, started by ``torchrun``, that share one run."""
+"""Sharing of a run between several processes that ``torchrun`` has started."""
 
 import os
 from collections.abc import Iterator
@@ -10,7 +10,7 @@ from torch import Tensor
 
 @contextmanager
 def joined_processes(parallel: bool = True) -> Iterator[int]:
-    """Connect the processes that ``torchrun`` has started, within this block; yields the rank of this process.
+    """Context manager that connects the processes and yields the rank of this process.
 
     With ``parallel`` False, the processes do not share a run, and each has rank 0.
     """

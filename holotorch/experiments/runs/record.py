@@ -33,7 +33,7 @@ class RunRecord:
         self.kind = str(self.summary["experiment"])
 
     def load(self) -> None:
-        """Read the files that a section of a page needs into ``plan`` (empty if there is none), ``env``, ``config``."""
+        """Set ``plan`` (empty if there is none), ``env`` and ``config``, from the files of these names."""
         plan = self.folder / "plan.json"
         self.plan: dict[str, Any] = read_json(plan) if plan.is_file() else {}
         self.env: dict[str, Any] = read_json(self.folder / "env.json")
@@ -51,6 +51,4 @@ class RunRecord:
     def picture(self, name: str) -> str:
         """A picture in the folder as a data URL; empty if there is no such file."""
         path = self.folder / "images" / f"{name}.png"
-        if not path.is_file():
-            return ""
-        return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
+        return f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}" if path.is_file() else ""
