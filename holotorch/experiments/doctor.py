@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 from packaging.requirements import Requirement
 
+from holotorch.experiments.runs.environment import installed_version
+
 
 def diagnose() -> bool:
     """Print the results of all checks and return whether all of them passed."""
@@ -25,14 +27,6 @@ def diagnose() -> bool:
             all_passed &= passed
             print(f"{'OK  ' if passed else 'FAIL'}  {name}: {text}")
     return all_passed
-
-
-def installed_version(name: str) -> str | None:
-    """Version of an installed package, or None."""
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None
 
 
 def _python() -> Iterator[tuple[bool, str]]:

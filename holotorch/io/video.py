@@ -4,7 +4,7 @@ import math
 import os
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
@@ -215,7 +215,7 @@ def _camera(index: int, rate: float | None) -> Frames:
     return Frames(f"camera {index}", first.shape[:2], None, stated, frames(), notes, live=True, close=capture.release)
 
 
-def check_pixels(pixels: Tensor, shape: tuple[int, int], target: str) -> None:
+def check_pixels(pixels: Tensor, shape: Sequence[int], target: str) -> None:
     """ValueError unless ``pixels`` are uint8 [3, H, W] for the ``shape`` (H, W) of the ``target``, such as "video"."""
     if pixels.dtype != torch.uint8 or tuple(pixels.shape) != (3, *shape):
         raise ValueError(f"frames of this {target} are uint8 {[3, *shape]}, got {pixels.dtype} {list(pixels.shape)}")

@@ -31,6 +31,7 @@ from holotorch.correction.run import State
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.pec.config import APGSettings, LBFGSSettings, NearFieldSettings, PECSettings
 from holotorch.experiments.pec.weight import weight_map
+from holotorch.experiments.runs.environment import find_device
 from holotorch.io.images import fit_image, frame_image, load_image, with_channels
 from holotorch.modulator import PhasedArray, ThermalCrosstalk, quantised
 from holotorch.optics import AngularSpectrum, CroppedKernel, DepthStack, Fraunhofer, Fresnel
@@ -271,7 +272,7 @@ def build(settings: PECSettings) -> PECExperiment:
     wavelengths = [length for length, on in zip(settings.wavelengths, lit.tolist(), strict=True) if on]
     array = PhasedArray(wavelengths, ThermalCrosstalk(settings.modulator.sigma_px, settings.modulator.kernel_size))
     start = settings.solver.start or _start_for(settings)
-    return PECExperiment(settings, source, lit, array, start, _device(settings.device))
+    return PECExperiment(settings, source, lit, array, start, find_device(settings.device))
 
 
 def _start_for(settings: PECSettings) -> str:
@@ -279,9 +280,3 @@ def _start_for(settings: PECSettings) -> str:
     # 4 to 25 % of the light and an SSIM of 0.5 to 0.75. From a flat start it has half of the light and an SSIM of 0.9.
     light = settings.propagator
     return "flat" if isinstance(light, NearFieldSettings) and light.boundary == "isolated" else "hot"
-
-
-def _device(name: str) -> torch.device:
-    if name == "cuda" and not torch.cuda.is_available():
-        raise ConfigError(["device: cuda was asked for, but torch finds no CUDA device; use device: auto or cpu"])
-    return torch.device("cuda" if name == "cuda" or (name == "auto" and torch.cuda.is_available()) else "cpu")

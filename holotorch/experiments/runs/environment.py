@@ -1,22 +1,28 @@
-"""Versions, device, seed and git state, which are needed to repeat a run."""
+"""The device of a run, and what is needed to repeat the run. This module loads torch only when torch is needed."""
+
+from __future__ import annotations
 
 import datetime
 import platform
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
-from typing import Any
-
-import torch
+from typing import TYPE_CHECKING, Any
 
 import holotorch
-from holotorch.experiments.doctor import installed_version
+from holotorch.experiments.config.errors import ConfigError
+
+if TYPE_CHECKING:
+    import torch
 
 _PACKAGES = ("torch", "numpy", "kornia", "scikit-image", "opencv-contrib-python-headless")
 
 
 def environment(seed: int, device: torch.device) -> dict[str, Any]:
     """Contents of env.json, as plain JSON values."""
+    import torch
+
     cpu = f"CPU, {torch.get_num_threads()} threads"
     return {
         "holotorch": holotorch.__version__,
@@ -29,6 +35,24 @@ def environment(seed: int, device: torch.device) -> dict[str, Any]:
         "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "command": ["holotorch", *sys.argv[1:]],
     }
+
+
+def installed_version(name: str) -> str | None:
+    """Version of an installed package, or None."""
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def find_device(name: str) -> torch.device:
+    """The device for a setting "auto", "cpu" or "cuda". ConfigError if there is no CUDA device for "cuda"."""
+    import torch
+
+    available = torch.cuda.is_available()
+    if name == "cuda" and not available:
+        raise ConfigError(["device: cuda was asked for, but torch finds no CUDA device; use device: auto or cpu"])
+    return torch.device("cuda" if name != "cpu" and available else "cpu")
 
 
 def _git_state(checkout: Path) -> str | None:

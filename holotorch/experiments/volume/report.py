@@ -5,7 +5,7 @@ from typing import Any
 
 from holotorch.experiments.runs.page import element, figure, heading, plain, table
 
-_FIGURES = {
+_CAPTIONS = {
     "rendering": "Direct volume rendering",
     "in_focus": "Hologram, every ray refocused at its own depth",
 }
@@ -14,23 +14,28 @@ _FIGURES = {
 def volume_section(
     title: str, summary: dict[str, Any], plan: dict[str, Any], picture: Callable[[str], str]
 ) -> list[str]:
-    """HTML of a run: pictures side by side, scores, time and plan; ``picture`` gives an image's data URL or nothing."""
+    """HTML of a run: pictures side by side, scores, time and plan.
+
+    Args:
+        title: Name of the run.
+        summary: Numbers of summary.json.
+        plan: Values of plan.json.
+        picture: Function from the name of an image to its data URL, which is empty if there is no such image.
+    """
     parts = [heading(title, summary["status"])]
     if summary["synthetic"]:
         parts.append(element("p", f"Synthetic volume: {summary['synthetic']}.", "warn"))
     depths: list[float] = summary["refocused_m"]
-    captions = _FIGURES | {f"focus_{f}": f"Refocused at {depth * 1e3:.4g} mm" for f, depth in enumerate(depths)}
+    captions = _CAPTIONS | {f"focus_{f}": f"Refocused at {depth * 1e3:.4g} mm" for f, depth in enumerate(depths)}
     synthetic = ", synthetic" if summary["synthetic"] else ""
-    sources = {caption: picture(name) for name, caption in captions.items()}
+    images = [(caption + synthetic, picture(name)) for name, caption in captions.items()]
     parts.append('<div class="row">')
-    parts += [figure(source, caption + synthetic, "picture") for caption, source in sources.items() if source]
+    parts += [figure(source, caption, "picture") for caption, source in images if source]
     parts.append("</div>")
     if source := picture("depth"):
         parts.append(figure(source, "Mean depth along each ray", "wide"))
-    parts.append(_scores(summary, depths))
-    parts.append(element("p", _cost(summary)))
-    shown = {name.replace("_", " "): value for name, value in plan.items() if name not in ("notes", "holograms")}
-    rows = [[name, plain(value)] for name, value in shown.items()]
+    parts += [_scores(summary, depths), element("p", _cost(summary))]
+    rows = [[name.replace("_", " "), plain(plan[name])] for name in plan if name not in ("notes", "holograms")]
     rows += [[f"{each['wavelength_nm']:.0f} nm", plain(each)] for each in plan["holograms"]]
     parts += [element("h2", "Plan"), table(["", ""], rows, head=False)]
     return parts + [element("p", note, "warn") for note in plan["notes"]]
