@@ -62,14 +62,13 @@ def read_source(path: Path, overrides: list[str], wanted: str = "settings such a
     source = Source(path, {})
     mistakes: list[str] = []
     data = _parse(text, str(path), source.positions, (), mistakes)
-    if data is None and not mistakes:
-        mistakes.append(f"{path}:1:1: the file is empty; expected {wanted}")
-    elif not isinstance(data, dict) and not mistakes:
-        mistakes.append(f"{path}:1:1: expected {wanted}, got {short(data)}")
-    if not mistakes and isinstance(data, dict):
+    if isinstance(data, dict) and not mistakes:
         source.data = data
         for word in overrides:
             _override(source, word, mistakes)
+    elif not mistakes:
+        problem = f"the file is empty; expected {wanted}" if data is None else f"expected {wanted}, got {short(data)}"
+        mistakes.append(f"{path}:1:1: {problem}")
     if mistakes:
         more = [f"{path}: and {len(mistakes) - MOST_MISTAKES} more mistakes"] if len(mistakes) > MOST_MISTAKES else []
         raise ConfigError([*mistakes[:MOST_MISTAKES], *more])

@@ -225,7 +225,7 @@ def conclude(
     """
     with deferred(run.pressed):
         if not done and checkpoint is not None:
-            results.fail(checkpoint.failure)
+            results.failure = results.failure or checkpoint.failure
         complete = done and results.failure is None
         summary["status"] = "complete" if complete else "interrupted"
         if results.failure is not None:

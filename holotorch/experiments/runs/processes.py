@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
-from torch import Tensor
 
 
 @contextmanager
@@ -29,9 +28,3 @@ def process_count() -> tuple[int, int]:
     if torch.distributed.is_available() and torch.distributed.is_initialized():
         return torch.distributed.get_rank(), torch.distributed.get_world_size()
     return 0, 1
-
-
-def from_first(value: Tensor) -> Tensor:
-    """Broadcast the value of the first process to all processes."""
-    torch.distributed.broadcast(value, 0)
-    return value

@@ -17,7 +17,20 @@ from holotorch.experiments.runs.fingerprint import Fingerprint, differences
 from holotorch.io.files import replacing
 
 
-class Checkpoint:
+class _Writer:
+    """Base class of writers that report each kind of error, by its ``errno``, once."""
+
+    def __init__(self):
+        self.failure: OSError | None = None
+        self._reported: set[int | None] = set()
+
+    def _warn(self, error: OSError, problem: str) -> None:
+        if error.errno not in self._reported:
+            self._reported.add(error.errno)
+            tqdm.write(f"warning: {problem}", file=sys.stderr)  # leaves progress bars intact
+
+
+class Checkpoint(_Writer):
     """The file from which a run can be resumed. An error in writing it is reported once and does not stop the run.
 
     Attributes:
@@ -27,9 +40,8 @@ class Checkpoint:
     """
 
     def __init__(self, path: Path, fingerprint: Fingerprint):
+        super().__init__()
         self.path, self.fingerprint = path, fingerprint
-        self.failure: OSError | None = None
-        self._reported: set[int | None] = set()
 
     def load(self) -> dict[str, Any] | None:
         """The last saved content, or None. ConfigError if the file is damaged or belongs to another configuration."""
@@ -72,27 +84,18 @@ class Checkpoint:
                     raise error.__context__ if isinstance(error.__context__, OSError) else error from None
         except (OSError, RuntimeError) as error:
             self.failure = error if isinstance(error, OSError) else OSError(None, str(error), str(self.path))
-            if self.failure.errno not in self._reported:
-                self._reported.add(self.failure.errno)
-                left = "the previous one stays" if self.path.is_file() else "there is no previous one"
-                _warn(f"{self.path} cannot be written: {self.failure.strerror}; {left}, and the run goes on")
+            left = "the previous one stays" if self.path.is_file() else "there is no previous one"
+            problem = f"{self.path} cannot be written: {self.failure.strerror}"
+            self._warn(self.failure, f"{problem}; {left}, and the run goes on")
         return self.failure is None
 
 
-class Results:
+class Results(_Writer):
     """Writer of result files. An error in writing one is reported once, and the other files are still written.
 
     Attributes:
         failure: The first error, or None.
     """
-
-    def __init__(self):
-        self.failure: OSError | None = None
-        self._reported: set[int | None] = set()
-
-    def fail(self, error: OSError | None) -> None:
-        """Record an error that has already been reported; the first recorded error is kept."""
-        self.failure = self.failure or error
 
     def write(self, write: Callable[..., Any], *arguments: Any) -> bool:
         """Call ``write(*arguments)``; returns False if that raises an OSError."""
@@ -100,10 +103,8 @@ class Results:
             write(*arguments)
             return True
         except OSError as error:
-            if error.errno not in self._reported:
-                self._reported.add(error.errno)
-                _warn(f"{error.filename} cannot be written: {error.strerror}; the other results are written")
-            self.fail(error)
+            self._warn(error, f"{error.filename} cannot be written: {error.strerror}; the other results are written")
+            self.failure = self.failure or error
             return False
 
 
@@ -133,10 +134,6 @@ def checksum(content: Any, most: float = math.inf) -> str:
 
     add(content)
     return total.hexdigest()
-
-
-def _warn(text: str) -> None:
-    tqdm.write(f"warning: {text}", file=sys.stderr)  # leaves progress bars intact
 
 
 def _bytes(content: Any) -> int:

@@ -1,9 +1,9 @@
 """The section of a report page for a volume's run."""
 
-from collections.abc import Callable
 from typing import Any
 
 from holotorch.experiments.runs.page import element, figure, heading, plain, table
+from holotorch.experiments.runs.record import RunRecord
 
 _CAPTIONS = {
     "rendering": "Direct volume rendering",
@@ -11,28 +11,21 @@ _CAPTIONS = {
 }
 
 
-def volume_section(
-    title: str, summary: dict[str, Any], plan: dict[str, Any], picture: Callable[[str], str]
-) -> list[str]:
-    """HTML of a run: pictures side by side, scores, time and plan.
-
-    Args:
-        title: Name of the run.
-        summary: Numbers of summary.json.
-        plan: Values of plan.json.
-        picture: Function from the name of an image to its data URL, which is empty if there is no such image.
-    """
-    parts = [heading(title, summary["status"])]
+def volume_section(record: RunRecord) -> list[str]:
+    """HTML of a run: pictures side by side, scores, time and plan."""
+    summary, plan = record.summary, record.plan
+    parts = [heading(record.title, summary["status"])]
     if summary["synthetic"]:
         parts.append(element("p", f"Synthetic volume: {summary['synthetic']}.", "warn"))
     depths: list[float] = summary["refocused_m"]
     captions = _CAPTIONS | {f"focus_{f}": f"Refocused at {depth * 1e3:.4g} mm" for f, depth in enumerate(depths)}
     synthetic = ", synthetic" if summary["synthetic"] else ""
-    images = [(caption + synthetic, picture(name)) for name, caption in captions.items()]
     parts.append('<div class="row">')
-    parts += [figure(source, caption, "picture") for caption, source in images if source]
+    for name, caption in captions.items():
+        if source := record.picture(name):
+            parts.append(figure(source, caption + synthetic, "picture"))
     parts.append("</div>")
-    if source := picture("depth"):
+    if source := record.picture("depth"):
         parts.append(figure(source, "Mean depth along each ray", "wide"))
     parts += [_scores(summary, depths), element("p", _cost(summary))]
     rows = [[name.replace("_", " "), plain(plan[name])] for name in plan if name not in ("notes", "holograms")]

@@ -14,7 +14,7 @@ from holotorch.experiments.runs.fingerprint import fingerprint
 from holotorch.experiments.runs.folder import RunFolder, conclude
 from holotorch.experiments.runs.memory import peak_memory
 from holotorch.experiments.runs.pictures import save_picture
-from holotorch.experiments.runs.processes import from_first, process_count
+from holotorch.experiments.runs.processes import process_count
 from holotorch.experiments.runs.saving import Checkpoint, Results
 from holotorch.experiments.runs.signals import deferred
 from holotorch.experiments.runs.tables import write_table
@@ -29,9 +29,11 @@ def run_volume(experiment: VolumeExperiment, opened: RunFolder) -> bool:
     rank, count = process_count()
     planes, seeds, pressed = len(experiment.depths), experiment.settings.report.seeds, opened.pressed
     state = _State(opened.path, experiment) if rank == 0 else None  # only the first process has results
-    start, part = state.evaluation.count if state else 0, None
+    start, part = torch.tensor(state.evaluation.count if state else 0), None
     if count > 1:
-        start, part = int(from_first(torch.tensor(start))), Part(rank, count, planes)
+        torch.distributed.broadcast(start, 0)  # all processes go on where the first process stopped
+        part = Part(rank, count, planes)
+    start = int(start)
     total, done = planes * seeds, planes * start
     with tqdm(total=total, initial=done, desc="rendering", unit="plane", disable=not state, dynamic_ncols=True) as bar:
 
