@@ -64,9 +64,7 @@ def check(settings: Any) -> RunPlan:
 def resume(folder: Path) -> tuple[Path, bool]:
     """Continue an interrupted run in its folder, as if it had never stopped; returns the same as :func:`execute`.
 
-    Raises:
-        ConfigError: The folder holds no run of this program, or its configuration is no longer valid or no longer
-            matches its checkpoint.
+    ConfigError if the folder holds no run, or if its configuration is no longer valid or contradicts its checkpoint.
     """
     config = folder / "config.yaml"
     if not config.is_file() or not (folder / "env.json").is_file():

@@ -58,12 +58,7 @@ class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
         """Compute the results and write all files of the folder; returns whether the run is complete."""
 
     def restart(self, folder: Path, config: Mapping[str, Any]) -> str | None:
-        """What to do instead if an interrupted run of this kind cannot be continued, otherwise None.
-
-        Args:
-            folder: Folder of the run.
-            config: Configuration of the run, as plain values.
-        """
+        """What to do instead if the interrupted run in ``folder`` cannot be continued, otherwise None."""
         return None
 
     def device(self, experiment: Experiment) -> str:

@@ -29,8 +29,7 @@ def find_kind(name: str) -> ExperimentKind[Any, Any]:
 def load_config(path: Path | str, overrides: list[str] | None = None) -> Any:
     """Read a configuration, apply overrides ``key=value`` and validate it; returns the settings of its kind.
 
-    Raises:
-        ConfigError: All mistakes, one line each with file, line and column.
+    ConfigError with all mistakes, one line each with file, line and column.
     """
     source = read_source(Path(path), overrides or [])
     name = source.data.get("experiment")

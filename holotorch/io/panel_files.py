@@ -56,8 +56,7 @@ def write_levels(path: Path, levels: Tensor, metadata: Mapping[str, Any]) -> Non
 def read_levels(path: Path) -> tuple[Tensor, dict[str, Any]]:
     """Read a frame of grey levels, uint8 or uint16 [H, W], and its metadata, which are empty if the file has none.
 
-    Raises:
-        ValueError: The file is missing, damaged, or not a grey picture of 8 or 16 bits.
+    ValueError if the file is missing, damaged, or not a grey picture of 8 or 16 bits.
     """
     import cv2
 
@@ -97,10 +96,9 @@ def write_phases(path: Path, phase: Tensor, metadata: Mapping[str, Any]) -> None
 
 
 def read_phases(path: Path) -> tuple[Tensor, dict[str, Any]]:
-    """Read phases in rad, float32 [H, W], and their metadata from an EXR file with a channel Y.
+    """Read phases in rad, float32 [H, W], and their metadata from an EXR file.
 
-    Raises:
-        ValueError: The file is missing, damaged, or has no float32 channel Y.
+    ValueError if the file is missing, damaged, or has no float32 channel Y.
     """
     header, channels = read_exr(_existing(path), memory=8)
     if "Y" not in channels or channels["Y"].dtype != np.float32:

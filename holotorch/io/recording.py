@@ -88,12 +88,7 @@ class Recorder:
         self._row(_COLUMNS)
 
     def write(self, frame: Frame) -> None:
-        """Append a frame: first its pixels to ``frames.rgb``, then its line to ``times.csv``.
-
-        Raises:
-            ValueError: Pixels of another shape or dtype.
-            OSError: The disk is full; the recording is unchanged.
-        """
+        """Append a frame. ValueError for another shape or dtype; OSError, without a change, if the disk is full."""
         import cv2
 
         seconds = repr(checks.finite("time of a frame", frame.seconds, "seconds"))  # repr keeps all digits of a float
@@ -134,11 +129,8 @@ def open_recording(folder: Path) -> Frames:
     """Open a recording to replay its frames with their times.
 
     A truncated recording yields all complete frames and a remark in ``notes``. A frame whose checksum does not match
-    has a problem instead of pixels.
-
-    Raises:
-        ValueError: The folder holds no recording, or the recording is damaged, has a later format, or contains no
-            complete frame.
+    has a problem instead of pixels. ValueError if the folder holds no recording, or if the recording is damaged, has a
+    later format, or contains no complete frame.
     """
     if not is_recording(folder):
         raise ValueError(f"{folder} holds no recording: recording.json and times.csv are not both there")

@@ -72,10 +72,7 @@ def open_frames(source: str | Path, rate: float | None = None) -> Frames:
 
     Times come from the file or from the camera's driver. Frames without times, such as pictures, are spaced by
     1 / ``rate`` seconds (30 per second by default), and ``notes`` says so. A frame that cannot be read has a problem
-    instead of pixels.
-
-    Raises:
-        ValueError: No such file, folder or camera, no frame that can be decoded, or a rate that is not positive.
+    instead of pixels. ValueError if there is no such source, no frame can be decoded, or the rate is not positive.
     """
     if rate is not None:
         checks.positive("rate", rate, "frames per second")

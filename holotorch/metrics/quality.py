@@ -26,9 +26,8 @@ def ssim(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
     windows inside the image. The terms for luminance, contrast and structure are multiplied; thesis Eq. 4.39 prints a
     sum, for which an image would score 3 against itself.
 
-    Raises:
-        TypeError: Images that are not real floating-point tensors.
-        ValueError: Unequal shapes, a side below 11 px, or a range that is not positive.
+    TypeError for images that are not real floating-point tensors; ValueError for unequal shapes, a side below 11 px, or
+    a range that is not positive.
     """
     return ssim_map(image, reference, data_range=data_range).mean((-2, -1))
 
@@ -52,11 +51,8 @@ def ssim_map(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
 class PerceptualSimilarity(nn.Module):
     """Similarity exp(-d) for the learned distance d (LPIPS) of two images, as in thesis Fig. 4.17; 1 for equal images.
 
-    Needs the extra ``lpips`` and AlexNet's published weights; the first use downloads them to torch's cache.
-
-    Raises:
-        ImportError: The extra is missing.
-        OSError: The weights are not in the cache and cannot be downloaded.
+    Needs the extra ``lpips`` (otherwise ImportError) and AlexNet's published weights, which the first use downloads to
+    torch's cache (OSError if that fails).
 
     Source: Zhang et al. (2018).
     """
@@ -71,10 +67,9 @@ class PerceptualSimilarity(nn.Module):
         self.distance = LPIPS(net="alex", verbose=False).requires_grad_(False)
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """Similarity [...] of images [..., C, H, W] with values in 0..1. C is 3 (red, green, blue) or 1 (grey).
+        """Similarity [...] of images [..., C, H, W] with values in 0..1.
 
-        Raises:
-            ValueError: Unequal shapes or another C.
+        C is 3 (red, green, blue) or 1 (grey); ValueError for another C and for unequal shapes.
         """
         _checked_pair(image, reference, 1.0)
         if image.ndim < 3 or image.shape[-3] not in (1, 3):

@@ -31,10 +31,7 @@ def seed_statistics(pictures: Tensor) -> SeedStatistics:
 
     The mean of S pictures keeps 1 / S of their variance, which increases its mean square. That share is subtracted, so
     that ``contrast`` does not depend on S (thesis Sec. 6.4.2). It is 0 for a black scene. Computed in float32 at least.
-
-    Raises:
-        TypeError: Pictures that are not real floating-point.
-        ValueError: Fewer than two seeds.
+    TypeError for pictures that are not real floating-point, ValueError for fewer than two seeds.
     """
     checks.real("pictures", pictures)
     if pictures.ndim < 3 or pictures.shape[0] < 2:

@@ -84,10 +84,8 @@ def grain_size(intensity: Tensor, *, level: float = 0.5) -> Tensor:
     Divide pictures of scenes that are not uniform by their speckle-free mean first.
 
     At half height a square pupil of side D at distance z gives 0.8859 wavelength z / D, a round pupil of diameter D
-    1.0290 wavelength z / D; ``level=1/e`` gives the other usual width.
-
-    Raises:
-        ValueError: A level outside 0 to 1, or a picture without speckle.
+    1.0290 wavelength z / D; ``level=1/e`` gives the other usual width. ValueError for a level outside 0 to 1, and for a
+    picture without speckle.
 
     Source: Goodman, Speckle Phenomena in Optics, Sec. 4.4.
     """
@@ -130,9 +128,7 @@ def sharpness(intensity: Tensor, reference: Tensor, *, band: tuple[float, float]
     Regression coefficient of the picture on the reference, Re sum F(I) conj(F(R)) / sum |F(R)|^2, with the DFT F and
     sums over radial frequencies in ``band``, in cycles per sample. Speckle does not bias it, but would bias a ratio of
     powers. Noise of the reference, such as the residual speckle of a mean over a few seeds, makes it too small.
-
-    Raises:
-        ValueError: Unequal shapes, a band that is not 0 <= low < high, or a reference without detail in that band.
+    ValueError for unequal shapes, a band that is not 0 <= low < high, or a reference without detail in that band.
     """
     intensity = _picture("intensity", intensity)
     reference = _picture("reference", reference)

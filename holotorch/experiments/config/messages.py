@@ -25,11 +25,7 @@ _EXPECTED = {
 
 
 def validated(source: Source, model: type[Model]) -> Model:
-    """Validate the data of a file and return its settings.
-
-    Raises:
-        ConfigError: All mistakes, one line each, in the order of the file.
-    """
+    """Settings from the data of a file. ConfigError with all mistakes, one line each, in the order of the file."""
     try:
         return model.model_validate(source.data)
     except ValidationError as error:

@@ -82,12 +82,7 @@ def several(value: Any) -> Any:
 
 
 def existing(there: Callable[[str], object], missing: Callable[[str], str]) -> BeforeValidator:
-    """A validator of paths that exist.
-
-    Args:
-        there: Function of a path whose result is true if the path exists.
-        missing: Function of a path that returns the message if the path does not exist.
-    """
+    """A validator of paths: ``there(path)`` tells whether a path exists; if not, ``missing(path)`` is the message."""
 
     def check(value: Any) -> Any:
         reason = ""

@@ -17,13 +17,7 @@ MOST_MISTAKES = 50  # mistakes that are listed
 
 @dataclass
 class Source:
-    """Data of a configuration, and the position of each of its keys.
-
-    Attributes:
-        path: The file.
-        data: Plain values.
-        positions: ``file:line:column`` of each key, or the argument that sets it.
-    """
+    """Plain ``data`` of a file, and the position of each key: ``file:line:column``, or the argument that sets it."""
 
     path: Path
     data: dict[str, Any]
@@ -39,15 +33,9 @@ class Source:
 
 
 def read_source(path: Path, overrides: list[str], wanted: str = "settings such as 'experiment: pec'") -> Source:
-    """Read a YAML file and apply overrides to it.
+    """Read a YAML file and apply overrides ``key.sub=value`` to it. ConfigError with all mistakes that prevent reading.
 
-    Args:
-        path: The file.
-        overrides: Arguments ``key.sub=value``.
-        wanted: What such a file contains, for messages.
-
-    Raises:
-        ConfigError: All mistakes that prevent reading.
+    ``wanted`` says in messages what such a file contains.
     """
     try:
         with open(path, "rb") as stream:

@@ -59,7 +59,7 @@ class RunFolder:
     """The folder of a running experiment.
 
     Attributes:
-        path: The folder.
+        path: The folder itself.
         name: Name of the run.
         plan: Plan of the run.
         pressed: Signals that have been received.
@@ -134,11 +134,7 @@ def _unfinished(folder: Path, settings: BaseModel) -> bool:
 
 
 def tidied(folder: Path) -> bool:
-    """Remove temporary files of a run that was killed after its last result; returns whether its page is missing.
-
-    Raises:
-        ConfigError: A run is using the folder.
-    """
+    """Remove temporary files of a complete run; returns whether its page is missing. ConfigError if a run uses it."""
     with _locked(folder):
         for path in (*folder.rglob(".*.partial"), folder / "checkpoint.pt", folder / "interrupted.json"):
             with suppress(OSError):  # a remaining file does no harm

@@ -11,16 +11,13 @@ from holotorch.io.files import read_json
 
 
 class RunRecord:
-    """The files of a run, complete or interrupted.
+    """The files of a run, complete or interrupted. ConfigError if the folder holds no run.
 
     Attributes:
         folder: The run folder.
         title: Name of the folder.
         summary: Numbers of summary.json, or of interrupted.json.
         kind: Name of the kind of experiment.
-
-    Raises:
-        ConfigError: The folder holds no run.
     """
 
     def __init__(self, folder: Path):

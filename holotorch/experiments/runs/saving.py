@@ -91,10 +91,9 @@ class Checkpoint(_Writer):
 
 
 class Results(_Writer):
-    """Writer of result files. An error in writing one is reported once, and the other files are still written.
+    """Writer of result files. An error in writing one file is reported once, and the other files are still written.
 
-    Attributes:
-        failure: The first error, or None.
+    ``failure`` is the first error, or None.
     """
 
     def write(self, write: Callable[..., Any], *arguments: Any) -> bool:
@@ -111,8 +110,7 @@ class Results(_Writer):
 def checksum(content: Any, most: float = math.inf) -> str:
     """Checksum of nested tensors and plain values, since torch does not detect damaged numbers when it loads a file.
 
-    Raises:
-        ValueError: Other types, or a tensor of more than ``most`` bytes.
+    ValueError for values of other types, and for a tensor of more than ``most`` bytes.
     """
     total = hashlib.blake2b(digest_size=16)
 

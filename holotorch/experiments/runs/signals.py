@@ -8,11 +8,7 @@ from typing import Any
 
 
 class Pressed(list[int]):
-    """Numbers of the signals that have been received.
-
-    Attributes:
-        settled: Whether all results are on the disk, so that signals are ignored.
-    """
+    """Numbers of the signals received. Once all results are on the disk (``settled``), signals are only recorded."""
 
     settled = False
 

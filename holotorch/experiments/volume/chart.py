@@ -36,16 +36,10 @@ BASE, READY = "thesis's convolutions (Algorithm 5)", "the same, waves at hand"
 
 @dataclass(frozen=True)
 class Scene:
-    """Planes of random sources that fill a ball as wide as the hologram; a ray for every second pixel of an axis.
+    """Planes of random sources that fill a ball as wide as the hologram; a ray for every second pixel of an axis."""
 
-    Attributes:
-        side: Pixels along each side of the hologram.
-        distance: Distance of the ball's centre from the hologram, in metres.
-        planes: Number of planes.
-    """
-
-    side: int
-    distance: float
+    side: int  # pixels along each side of the hologram
+    distance: float  # of the ball's centre from the hologram, in metres
     planes: int
 
     @property

@@ -173,17 +173,11 @@ class VolumeExperiment:
 
 @dataclass(frozen=True)
 class Part:
-    """The share of one of several processes: the processes divide the three colours, then the planes of a colour.
+    """The share of one of several processes: the processes divide the three colours, then the planes of a colour."""
 
-    Attributes:
-        rank: Index of this process.
-        count: Number of processes.
-        planes: Number of planes in the scene.
-    """
-
-    rank: int
-    count: int
-    planes: int
+    rank: int  # index of this process
+    count: int  # number of processes
+    planes: int  # number of planes in the scene
 
     def takes(self, colour: int, plane: int) -> bool:
         """Whether this process adds ``plane`` of ``colour``."""
