@@ -109,15 +109,13 @@ def _video(path: Path, rate: float | None) -> Frames:
     if not (math.isfinite(stated) and stated > 0):
         stated = _ASSUMED_RATE if rate is None else rate
         notes.append(f"{path.name} states no rate; {stated:g} frames per second assumed")
-    decoded, first = _try(capture.read)
-    if not decoded:
+    first = _decoded(capture.read)
+    if first is None:
         code = int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
         codec = code.to_bytes(4, "little").decode("ascii", "replace").strip("\0 ") or "unknown"
         capture.release()
-        raise ValueError(
-            f"{path}: no frame could be decoded (codec {codec}); it is empty or damaged, or OpenCV lacks the codec: "
-            "convert it, for example with ffmpeg -i IN -c:v ffv1 OUT.avi"
-        )
+        reason = f"no frame could be decoded (codec {codec}); it is empty or damaged, or OpenCV lacks the codec"
+        raise ValueError(f"{path}: {reason}: convert it, for example with ffmpeg -i IN -c:v ffv1 OUT.avi")
 
     def frames() -> Iterator[Frame]:
         pixels, seconds, count, guessed = first, 0.0, 0, 0
@@ -129,25 +127,25 @@ def _video(path: Path, rate: float | None) -> Frames:
             yield _frame(seconds, pixels)
             if not capture.grab():
                 break
-            decoded, pixels = _try(capture.retrieve)
-            pixels = pixels if decoded else None
+            pixels = _decoded(capture.retrieve)
         if guessed:
             notes.append(f"{guessed} of {count} frames have no time of their own; counted at {stated:g} per second")
         if count < announced:
             notes.append(f"{path.name} announces {announced} frames and {count} could be read")
 
-    total = announced if announced > 0 else None
-    return Frames(path.name, first.shape[:2], total, stated, frames(), notes, close=capture.release)
+    total, shape = announced if announced > 0 else None, first.shape[:2]
+    return Frames(path.name, shape, total, stated, frames(), notes, close=capture.release)
 
 
-def _try(read: Callable[[], tuple[bool, Any]]) -> tuple[bool, Any]:
-    """Result of ``read``, or (False, None) if OpenCV raises an error, as for a damaged file."""
+def _decoded(read: Callable[[], tuple[bool, Any]]) -> Any:
+    """Pixels from ``read``, a method of an OpenCV capture; None if that fails, as for a damaged file."""
     import cv2
 
     try:
-        return read()
+        success, pixels = read()
     except cv2.error:
-        return False, None
+        return None
+    return pixels if success else None
 
 
 def _frame(seconds: float, pixels: np.ndarray | None) -> Frame:
@@ -155,15 +153,14 @@ def _frame(seconds: float, pixels: np.ndarray | None) -> Frame:
 
 
 def _folder(folder: Path, rate: float | None) -> Frames:
-    paths = sorted((p for p in folder.iterdir() if p.suffix.lower() in PICTURES), key=lambda p: _natural(p.name))
+    paths = sorted((p for p in folder.iterdir() if p.suffix.lower() in PICTURES), key=_natural)
     if not paths:
         raise ValueError(f"{folder} holds no pictures ({', '.join(PICTURES)})")
     first = next((pixels for pixels in map(_picture, paths) if pixels is not None), None)
     if first is None:
         raise ValueError(f"none of the {len(paths)} pictures in {folder} could be decoded")
-    shape = first.shape[:2]
+    shape, stated = first.shape[:2], rate or _ASSUMED_RATE
     notes = [] if rate else [f"pictures have no times; {_ASSUMED_RATE:g} frames per second assumed"]
-    stated = rate or _ASSUMED_RATE
 
     def frames() -> Iterator[Frame]:
         for index, path in enumerate(paths):
@@ -186,8 +183,8 @@ def _camera(index: int, rate: float | None) -> Frames:
     capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # deliver the newest frame, not the oldest one in a queue
     if rate is not None:
         capture.set(cv2.CAP_PROP_FPS, rate)
-    decoded, first = capture.read() if capture.isOpened() else (False, None)
-    if not decoded or first is None:
+    first = _decoded(capture.read) if capture.isOpened() else None
+    if first is None:
         capture.release()
         raise ValueError(f"no frame from camera {index}; is it plugged in, free, and may this user read it?")
     stated = capture.get(cv2.CAP_PROP_FPS)
@@ -199,14 +196,12 @@ def _camera(index: int, rate: float | None) -> Frames:
     def now() -> float:
         return capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3 if driver else time.monotonic()
 
-    began = now()
+    start = now()
 
     def frames() -> Iterator[Frame]:
-        yield _frame(began, first)
+        yield _frame(start, first)
         while capture.grab():
-            seconds = now()
-            decoded, pixels = capture.retrieve()
-            yield _frame(seconds, pixels if decoded else None)
+            yield _frame(now(), _decoded(capture.retrieve))
         notes.append("the camera stopped giving frames")
 
     return Frames(f"camera {index}", first.shape[:2], None, stated, frames(), notes, live=True, close=capture.release)
@@ -293,6 +288,6 @@ def _rgb(pixels: np.ndarray) -> Tensor:
     return torch.from_numpy(planes)
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
+def _natural(path: Path) -> list[tuple[int, str]]:
     """Sort key by which frame2 comes before frame10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
