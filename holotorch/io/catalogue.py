@@ -74,10 +74,8 @@ def fetch_volume(name: str, directory: str | Path | None = None) -> Volume:
     """
     if name not in PUBLISHED:
         near = difflib.get_close_matches(str(name), PUBLISHED, 1)
-        hint = f"did you mean {near[0]!r}? " if near else ""
-        raise ValueError(
-            f"no such published volume: {name!r}; {hint}known are {', '.join(PUBLISHED)}. Load others with load_volume"
-        )
+        known = f"{f'did you mean {near[0]!r}? ' if near else ''}known are {', '.join(PUBLISHED)}"
+        raise ValueError(f"no such published volume: {name!r}; {known}. Load others with load_volume")
     import pooch
 
     entry = PUBLISHED[name]

@@ -8,27 +8,22 @@ from torch import Tensor
 
 from holotorch.core import checks
 
-_OBSERVER = "CIE 1931 2 Degree Standard Observer"
-
 
 def tristimulus(wavelengths: float | Sequence[float]) -> Tensor:
-    """CIE 1931 colour-matching functions (2 degrees) for X, Y and Z at wavelengths in metres, float64 [3, K].
+    """CIE 1931 colour-matching functions (2 degrees) for X, Y and Z at K wavelengths in metres, float64 [3, K].
 
-    The table has steps of 1 nm; values in between are interpolated by Sprague's method, as CIE 167 recommends.
-
-    Raises:
-        ValueError: A wavelength outside the range of the table, 360 to 830 nm.
+    The table covers 360 to 830 nm (ValueError outside) in steps of 1 nm; values in between are interpolated by
+    Sprague's method, as CIE 167 recommends.
     """
     from colour import MSDS_CMFS, SpragueInterpolator
 
-    table = MSDS_CMFS[_OBSERVER]
+    table = MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
     nanometres = np.array(checks.wavelengths(wavelengths)) * 1e9
     first, last = float(table.wavelengths[0]), float(table.wavelengths[-1])
     wrong = nanometres[(nanometres < first) | (nanometres > last)]
     if wrong.size:
-        raise ValueError(
-            f"wavelength {wrong[0]:g} nm has no colour: the CIE 1931 table covers {first:g} to {last:g} nm"
-        )
+        covered = f"the CIE 1931 table covers {first:g} to {last:g} nm"
+        raise ValueError(f"wavelength {wrong[0]:g} nm has no colour: {covered}")
     columns = [SpragueInterpolator(table.wavelengths, table.values[:, i])(nanometres) for i in range(3)]
     return torch.from_numpy(np.stack(columns).reshape(3, -1))
 
@@ -71,10 +66,8 @@ def srgb_matrix(
 def white_balance(wavelengths: Sequence[float]) -> Tensor:
     """Powers of three sources whose sum is D65, the white of sRGB, relative to the strongest source, float64 [3].
 
-    A display with these powers shows equal values of its three channels as neutral grey.
-
-    Raises:
-        ValueError: Not three wavelengths, or three that cannot mix D65.
+    A display with these powers shows equal values of its three channels as neutral grey. ValueError unless there are
+    three wavelengths that can mix D65.
     """
     from colour.models import RGB_COLOURSPACE_sRGB
 

@@ -78,10 +78,8 @@ def load_volume(
         return _as_stated(file, scan, unit)
     steps = (spacing,) * 3 if isinstance(spacing, int | float | np.number) else tuple(spacing)
     if unit is None and any(checks.positive("spacing", step, "metres") > VOXEL.high for step in steps):
-        raise ValueError(
-            f"spacing between voxels must be in metres, got {spacing!r}; 1 mm is 1e-3. For a volume without a size add "
-            "unit='relative'"
-        )
+        hint = "1 mm is 1e-3. For a volume without a size add unit='relative'"
+        raise ValueError(f"spacing between voxels must be in metres, got {spacing!r}; {hint}")
     unit = unit or "m"
     # The origin is meaningful only in the unit of the spacing.
     origin = scan.origin if scan.spacing is not None and scan.unit == unit else (0.0, 0.0, 0.0)
@@ -92,10 +90,8 @@ def _as_stated(file: Path, scan: Scan, unit: str | None) -> Volume:
     if unit is not None:
         raise ValueError(f"unit={unit!r} is that of spacing=, which was not given")
     if scan.spacing is None or not all(np.isfinite(scan.spacing)) or min(scan.spacing) <= 0:
-        raise ValueError(
-            f"{file} does not state the spacing of its voxels: pass spacing=(z, y, x) in metres, such as (1e-3, 5e-4, "
-            "5e-4), or spacing=1, unit='relative' for cubes without a size"
-        )
+        hint = "such as (1e-3, 5e-4, 5e-4), or spacing=1, unit='relative' for cubes without a size"
+        raise ValueError(f"{file} does not state the spacing of its voxels: pass spacing=(z, y, x) in metres, {hint}")
     return Volume(_tensor(scan.values, file), triple(scan.spacing), scan.unit, scan.origin, scan.orientation)
 
 
@@ -123,10 +119,9 @@ def _read(file: Path, member: str | None, shape: Sequence[int] | None, dtype: DT
     if shape is not None and dtype is not None:
         return raw_volumes.read_raw(file, shape, dtype)
     known = ", ".join((".raw", ".raw.gz", ".png", *_READERS, *_MEMBER_READERS))
-    raise ValueError(
-        f"{file} has no known extension; known are {known}, and folders of DICOM files or numbered pictures. Pass "
-        "shape=(D, H, W) and dtype= if it is raw under another name"
-    )
+    known += ", and folders of DICOM files or numbered pictures"
+    hint = "Pass shape=(D, H, W) and dtype= if it is raw under another name"
+    raise ValueError(f"{file} has no known extension; known are {known}. {hint}")
 
 
 def _check_expected(file: Path, values: np.ndarray, shape: Sequence[int] | None, dtype: DTypeLike | None) -> None:

@@ -82,11 +82,9 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
         divided = "pixels, rays, distances, width and a given number of planes"
         lines.append(f"Scale      1 / {settings.scale} of the configuration: {divided} are divided by {settings.scale}")
     for each in values["holograms"]:
-        cone = f", {each['cone']} cone of light" if each["near"] else ""
-        lines.append(
-            f"{each['wavelength_nm']:.0f} nm     method: {each['method']}{cone} (predicted error "
-            f"{each['predicted_error']:.1e}); {each['runner_up']}"
-        )
+        method = each["method"] + (f", {each['cone']} cone of light" if each["near"] else "")
+        error = f"predicted error {each['predicted_error']:.1e}"
+        lines.append(f"{each['wavelength_nm']:.0f} nm     method: {method} ({error}); {each['runner_up']}")
     lines.append(
         f"Cost       about {values['predicted_seconds']:.2g} s on two idle cores for {settings.report.seeds} "
         "realisation(s) of the random phases, without start-up, refocusing and figures; "
