@@ -46,7 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _interruption_message(options: argparse.Namespace) -> str:
-    """Message for an interruption before the command saved any result."""
+    """Message for an interruption before the command has saved a result."""
     folder = options.folder if options.action is _resume else getattr(options, "out", None)
     if folder is not None and (folder / "config.yaml").is_file() and not (folder / "summary.json").is_file():
         return f"interrupted before it went on; start it again with: holotorch resume {folder}"

@@ -7,8 +7,8 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.runs.tables import write_table
 from holotorch.io.files import write_bytes, write_text
 
-# By subject: the module whose function of that name draws the chart, and the name of its second table, unless that
-# function returns several further tables by name.
+# The module whose function ``subject`` draws the chart, and the name of its second table. The function for tracking
+# returns several further tables by name instead.
 CHARTS = {
     "eye": ("holotorch.experiments.eye.chart", "tradeoff"),
     "pec": ("holotorch.experiments.pec_study.chart", "comparison"),

@@ -1,4 +1,4 @@
-"""Checks of an installation. Each prints lines that say OK, or FAIL and the command that repairs it."""
+"""Checks of an installation, with the command that repairs what has failed."""
 
 import platform
 import re

@@ -48,7 +48,7 @@ class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
 
     @abstractmethod
     def plan(self, experiment: Experiment) -> RunPlan:
-        """The methods and the cost of a run; computes nothing."""
+        """The methods and the cost of a run, without computing its results."""
 
     def prepare(self, experiment: Experiment) -> None:
         """Raise ConfigError if the run cannot start; called before its folder is created."""

@@ -1,4 +1,4 @@
-"""Loading of volumes: one call for all formats, which raises an error for geometry that a file does not state."""
+"""Loading of volumes of all formats by one function, which guesses no geometry that a file does not state."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path

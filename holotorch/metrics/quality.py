@@ -33,7 +33,7 @@ def ssim(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
 
 
 def ssim_map(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
-    """Structural similarity of each window inside the image, [..., H - 10, W - 10]; see :func:`ssim`, its mean."""
+    """Structural similarity of each window inside the image, [..., H - 10, W - 10]; :func:`ssim` is their mean."""
     from kornia.metrics import ssim as kornia_ssim
 
     image, reference = _checked_pair(image, reference, data_range)

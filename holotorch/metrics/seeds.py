@@ -1,4 +1,4 @@
-"""Statistics over pictures of a scene with several seeds of its random phases, and errors without residual speckle."""
+"""Statistics over pictures of a scene with several random phases, and errors with the residual speckle subtracted."""
 
 from typing import NamedTuple
 

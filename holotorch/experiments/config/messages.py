@@ -12,7 +12,7 @@ from holotorch.experiments.config.source import MOST_MISTAKES, Key, Source
 
 Model = TypeVar("Model", bound=BaseModel)
 
-# What a field expects, by the start of the type of a pydantic error.
+# What a field expects, by the beginning of the type of the error that pydantic reports.
 _EXPECTED = {
     "int_": "a whole number",
     "float_": "a number",
@@ -91,7 +91,7 @@ def position(mistake: str) -> tuple[int, int]:
 
 
 def _written_key(source: Source, location: tuple[str | int, ...]) -> Key:
-    """The key of a pydantic location, which also contains the tag of a union between a section and its settings."""
+    """The key in the file for a location in a pydantic error, which also contains the tags of unions."""
     key: list[str | int] = []
     value: Any = source.data
     for i, part in enumerate(location):

@@ -9,15 +9,15 @@ import yaml
 from holotorch.experiments.config.errors import ConfigError, short
 
 Key = tuple[str | int, ...]
-_MAX_BYTES = 1 << 17  # of a file; parsing that many takes up to 4 s
-_MAX_VALUES = 100_000  # a file of _MAX_BYTES can exceed this only through YAML aliases
+_MAX_BYTES = 1 << 17  # limit for a file; parsing that many bytes takes up to 4 s
+_MAX_VALUES = 100_000  # a file of _MAX_BYTES can have more values only through YAML aliases
 _MAX_DEPTH = 50  # levels of nested keys; configurations have fewer than ten
-MOST_MISTAKES = 50  # mistakes that are listed
+MOST_MISTAKES = 50  # limit for the number of mistakes that are listed
 
 
 @dataclass
 class Source:
-    """Plain ``data`` of a file, and the position of each key: ``file:line:column``, or the argument that sets it."""
+    """Plain ``data`` of a file, and ``positions`` by key: ``file:line:column``, or the argument that sets the key."""
 
     path: Path
     data: dict[str, Any]
@@ -35,7 +35,7 @@ class Source:
 def read_source(path: Path, overrides: list[str], wanted: str = "settings such as 'experiment: pec'") -> Source:
     """Read a YAML file and apply overrides ``key.sub=value`` to it. ConfigError with all mistakes that prevent reading.
 
-    ``wanted`` says in messages what such a file contains.
+    ``wanted`` describes in messages what such a file contains.
     """
     try:
         with open(path, "rb") as stream:

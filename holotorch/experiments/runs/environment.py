@@ -1,4 +1,4 @@
-"""The device of a run, and what is needed to repeat the run. This module loads torch only when torch is needed."""
+"""The device of a run, and what is needed to repeat the run. torch is loaded only by functions that need it."""
 
 from __future__ import annotations
 

@@ -9,8 +9,8 @@ import torch
 from pydantic import BaseModel
 from torch import Tensor
 
-_HASHED_BYTES = 64 << 20  # of a tensor, which takes 0.1 s
-_PREFIX = "blake2b:"  # of digests
+_HASHED_BYTES = 64 << 20  # limit for a tensor; hashing that many bytes takes 0.1 s
+_PREFIX = "blake2b:"  # distinguishes digests from other values
 
 Fingerprint = dict[str, Any]
 
@@ -44,7 +44,7 @@ def differences(before: Fingerprint, now: Fingerprint) -> list[str]:
 
 
 def _digest(parts: tuple[Tensor | bytes | str, ...]) -> str:
-    """Digest of inputs; only evenly spaced slices [i] of a tensor of more than 64 MiB are hashed."""
+    """Digest of inputs; of a tensor above 64 MiB, only evenly spaced slices along the first axis are hashed."""
     total = hashlib.blake2b(digest_size=16)
     for part in parts:
         if isinstance(part, Tensor):

@@ -24,12 +24,12 @@ def page(title: str, body: str) -> str:
 
 
 def render(macro: str, *values: Any) -> str:
-    """HTML of a macro of the template with these arguments, which the template escapes."""
+    """HTML from a macro of the template; ``values`` are its arguments, which the template escapes."""
     return str(getattr(_template().module, macro)(*values))
 
 
 def element(tag: str, text: Any, kind: str = "") -> str:
-    """An element with text in it; ``kind`` is its CSS class."""
+    """An HTML element ``tag`` that contains ``text``; ``kind`` is its CSS class."""
     return render("element", tag, text, kind)
 
 

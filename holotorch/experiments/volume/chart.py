@@ -30,7 +30,7 @@ TABLE = {
     "Bonsai": (70, 232, 129.93),
 }
 ALL_PLANES = ("Tooth", "Teapot", "Hand", "Bonsai")  # scenes that are also measured with all planes and at full size
-SMALL, WHOLE = 512, 2048  # pixels along each side of a hologram, in a quarter of the thesis's size and in full size
+SMALL, WHOLE = 512, 2048  # pixels along each side of a hologram; the thesis has WHOLE
 BASE, READY = "thesis's convolutions (Algorithm 5)", "the same, waves at hand"
 
 

@@ -58,7 +58,7 @@ class VolumeExperiment:
 
     @property
     def stride(self) -> int:
-        """Pixels between neighbouring rays."""
+        """Pitch of the rays in pixels."""
         rays = self.settings.hologram.rays
         return 1 if rays is None else self.settings.hologram.shape[0] // rays
 
@@ -76,7 +76,7 @@ class VolumeExperiment:
 
     @cached_property
     def rotation(self) -> Tensor:
-        """Rotation matrix of the volume about its middle, over (z, y, x)."""
+        """Rotation matrix of the volume about its middle, for vectors (z, y, x)."""
         view = self.settings.view
         a, e = math.radians(view.azimuth_deg), math.radians(view.elevation_deg)
         about_y = torch.tensor([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
@@ -110,7 +110,7 @@ class VolumeExperiment:
 
     @cached_property
     def transfer(self) -> TransferFunction:
-        """Colour and opacity."""
+        """Transfer function from a value of the volume to colour and opacity."""
         return _transfer(self.settings.transfer).to(self.device)
 
     def sampler(self, seed: int = 0) -> DVRSampler:

@@ -14,8 +14,8 @@ from holotorch.scene import DVRSampler
 # Times were measured on two CPU cores.
 _FLOP_SECONDS = 4.2e-11  # seconds per operation of a HologramPlan
 _RAY_SECONDS = 1.5e-8  # seconds of rendering per ray and plane
-_BASE_BYTES = 500e6  # of the libraries
-_RAY_BYTES = 120  # per ray, in the renderer
+_BASE_BYTES = 500e6  # memory of the libraries
+_RAY_BYTES = 120  # memory of the renderer per ray
 _SLAB = 42  # rendered planes held in memory before they are spread onto the nodes of an axial hologram
 _COARSE = 64  # rays along each side of the rendering that estimates how much light is cut off
 
@@ -101,7 +101,7 @@ def _physics(experiment: VolumeExperiment) -> dict[str, Any]:
     return {
         "field_of_view_deg": [2 * math.degrees(angle) for angle in angles],
         "spot_um": [wavelength * middle / min(grid.extent) * 1e6 for wavelength in wavelengths],
-        # The smallest distance at which the light of every source covers the whole hologram (region III).
+        # The smallest distance at which the light of every source covers the whole hologram (region III of the thesis).
         "whole_cone_from_mm": [
             (experiment.width + min(grid.extent)) / 2 / math.tan(angle) * 1e3 if angle < math.pi / 2 else 0.0
             for angle in angles
