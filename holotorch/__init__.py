@@ -1,8 +1,9 @@
 """Differentiable optics for VR and AR displays, in PyTorch.
 
-Units: metres, radians, seconds; temperatures are differences in kelvin. A field is a complex tensor ``[..., C, H, W]`` with one
-channel per wavelength; axes are (y, x); the optical axis lies on sample ``n // 2``; frequencies are in FFT order.
-``exp(+ikz)`` travels towards +z, a converging lens is ``exp(-i k r^2 / 2f)``, and the far field is a unitary DFT.
+Units are metres, radians and seconds; temperatures are differences in kelvin. A field is a complex tensor
+``[..., C, H, W]`` with one channel per wavelength and axes (y, x); the optical axis lies on sample ``n // 2``;
+frequencies are in FFT order. ``exp(+ikz)`` travels towards +z, a converging lens is ``exp(-i k r^2 / 2f)``, and the far
+field is a unitary DFT.
 
 This module offers the names that most scripts need first. Each name loads its module, and ``torch``, when it is first
 used. Importing the package opens no file and changes no global state.

@@ -15,17 +15,10 @@ from holotorch.io.files import write_json
 
 
 def execute(settings: Any, out: Path | None, name: str = "run") -> tuple[Path, bool]:
-    """Carry out a run and fill its folder: ``out``, or the next free ``runs/NAME-001``.
+    """Carry out a run with settings of any kind; returns its folder, and whether the run is complete.
 
-    If ``out`` holds an unfinished run of the same settings, that run is continued.
-
-    Args:
-        settings: Settings of any kind, as from :func:`~holotorch.experiments.registry.load_config`.
-        out: Folder of the run.
-        name: Name of the run; without ``out`` it also names the folder.
-
-    Returns:
-        The folder, and whether the run is complete. The folder of an interrupted run holds the results so far.
+    The folder is ``out``, or the next free ``runs/NAME-001``. If ``out`` holds an unfinished run of the same settings,
+    that run is continued. The folder of an interrupted run holds the results so far.
 
     Raises:
         ConfigError: The folder holds other files already or cannot be written, an input cannot be used, or the run does

@@ -25,18 +25,12 @@ class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
     To add a kind, write a folder whose module ``kind`` defines an instance ``KIND``, and add a line to the registry;
     the commands ``check``, ``run``, ``resume`` and ``report`` then work for it. Methods import heavy modules when they
     are called, so that a configuration is checked before torch is loaded.
-
-    Attributes:
-        settings: Pydantic model of the configuration.
-        parallel: Whether several processes, started by ``torchrun``, share one run.
-        announces: Whether the plan is printed before the run begins.
-        example: Path of the bundled configuration that ``holotorch new`` copies.
     """
 
-    settings: type[SettingsT]
-    parallel: ClassVar[bool] = False
-    announces: ClassVar[bool] = True
-    example: ClassVar[str]
+    settings: type[SettingsT]  # pydantic model of the configuration
+    parallel: ClassVar[bool] = False  # whether several processes, started by ``torchrun``, share one run
+    announces: ClassVar[bool] = True  # whether the plan is printed before the run begins
+    example: ClassVar[str]  # path of the bundled configuration that ``holotorch new`` copies
 
     def contradictions(self, settings: SettingsT) -> list[tuple[Key, str]]:
         """Key and message for each setting that is valid by itself but contradicts another setting."""

@@ -14,19 +14,14 @@ _ORIGIN = "http://klacansky.com/open-scivis-datasets"
 class Published:
     """A volume of the Open SciVis Datasets: raw cubic voxels of unknown size, x fastest.
 
-    Attributes:
-        url: Address of the raw file; its name contains the size (x, y, z) and the type.
-        shape: Number of voxels (D, H, W).
-        dtype: Type of a voxel.
-        sha512: Checksum of the raw file, as the catalogue publishes it.
-        acknowledgement: Sources that the catalogue credits. It states no licence: do not redistribute the data.
+    The catalogue states no licence: do not redistribute the data.
     """
 
-    url: str
-    shape: tuple[int, int, int]
+    url: str  # of the raw file, whose name contains the size (x, y, z) and the type
+    shape: tuple[int, int, int]  # number of voxels (D, H, W)
     dtype: str
-    sha512: str
-    acknowledgement: str
+    sha512: str  # checksum of the raw file, as the catalogue publishes it
+    acknowledgement: str  # sources that the catalogue credits
 
 
 PUBLISHED = {

@@ -56,23 +56,14 @@ def claim(out: Path | None, name: str) -> Path:
 
 @dataclass
 class RunFolder:
-    """The folder of a running experiment.
-
-    Attributes:
-        path: The folder itself.
-        name: Name of the run.
-        plan: Plan of the run.
-        pressed: Signals that have been received.
-        resumes: Whether the run can be continued after an interruption.
-        write_page: Function that writes the report of the folder to a path; None if there is no report.
-    """
+    """The folder of a running experiment."""
 
     path: Path
     name: str
     plan: RunPlan
-    pressed: Pressed
-    resumes: bool = True
-    write_page: Callable[[Path], Any] | None = None
+    pressed: Pressed  # signals that have been received
+    resumes: bool = True  # whether the run can be continued after an interruption
+    write_page: Callable[[Path], Any] | None = None  # writes the report to a path; None if there is no report
 
 
 @contextmanager
@@ -84,10 +75,8 @@ def open_run(
     The folder is new, or is ``out`` if that holds an unfinished run of the same settings. A run that cannot be
     continued (``resumes`` False) always needs a new folder. The folder is locked against other runs if the system
     supports this. Within the block, the first signal raises KeyboardInterrupt. If the block fails, the folder keeps all
-    results; a new folder without results is removed, so that a corrected run can use it.
-
-    Raises:
-        ConfigError: The folder is in use, holds other files, or cannot be written.
+    results; a new folder without results is removed, so that a corrected run can use it. ConfigError if the folder is
+    in use, holds other files, or cannot be written.
     """
     with interruptible() as pressed, ExitStack() as stack:
         if out is not None:
@@ -203,21 +192,12 @@ def _remove_folders(*folders: Path) -> None:
 def conclude(
     run: RunFolder, summary: dict[str, Any], results: Results, *, done: bool, checkpoint: Checkpoint | None = None
 ) -> bool:
-    """Write the numbers of a run as its last file: summary.json if it is complete, otherwise interrupted.json.
+    """Write the numbers of a run as its last file, summary.json or interrupted.json; returns whether it is complete.
 
-    Args:
-        run: The run; its signals are ignored once it is complete.
-        summary: Numbers; this function adds ``status``.
-        results: Writer of the other files.
-        done: Whether everything was computed.
-        checkpoint: Checkpoint of the run. If not everything was computed, an error in writing the checkpoint is raised
-            like an error in any other file. The checkpoint of a complete run is removed.
-
-    Returns:
-        Whether the run is complete.
-
-    Raises:
-        OSError: A file could not be written; all other files are written nevertheless, if possible.
+    A run is complete if everything was computed (``done``) and ``results``, the writer of its other files, has no
+    error; from then on its signals are ignored, and its checkpoint is removed. This function adds ``status`` to the
+    ``summary``. An error in writing a file, or the checkpoint if the run is not done, is raised as OSError after all
+    other files are written.
     """
     with deferred(run.pressed):
         if not done and checkpoint is not None:

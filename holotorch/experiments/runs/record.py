@@ -11,13 +11,10 @@ from holotorch.io.files import read_json
 
 
 class RunRecord:
-    """The files of a run, complete or interrupted. ConfigError if the folder holds no run.
+    """The files in the ``folder`` of a run, complete or interrupted. ConfigError if the folder holds no run.
 
-    Attributes:
-        folder: The run folder.
-        title: Name of the folder.
-        summary: Numbers of summary.json, or of interrupted.json.
-        kind: Name of the kind of experiment.
+    ``title`` is the name of the folder, ``summary`` the content of summary.json or interrupted.json, and ``kind`` the
+    name of the kind of experiment.
     """
 
     def __init__(self, folder: Path):

@@ -33,10 +33,8 @@ class _Writer:
 class Checkpoint(_Writer):
     """The file from which a run can be resumed. An error in writing it is reported once and does not stop the run.
 
-    Attributes:
-        path: Path of the file, which is replaced only when a new checkpoint is complete.
-        fingerprint: Fingerprint of the configuration and inputs; a checkpoint with another fingerprint is refused.
-        failure: The error of the last :meth:`save`, or None.
+    The file at ``path`` is replaced only when a new checkpoint is complete. A checkpoint whose ``fingerprint`` (of
+    configuration and inputs) differs is refused. ``failure`` is the error of the last :meth:`save`, or None.
     """
 
     def __init__(self, path: Path, fingerprint: Fingerprint):

@@ -31,18 +31,11 @@ _SMOOTH = 8  # correlation length of smooth phases, in rays
 
 @dataclass(frozen=True)
 class VolumeExperiment:
-    """The volume, geometry and operators that a configuration describes.
-
-    Attributes:
-        settings: The configuration.
-        volume: The volume to show.
-        synthetic: The reason why the volume is a phantom; empty for real data.
-        device: Device of the computation.
-    """
+    """The volume, geometry and operators that a configuration describes."""
 
     settings: VolumeSettings
     volume: Volume
-    synthetic: str
+    synthetic: str  # the reason why the volume is a phantom; empty for real data
     device: torch.device
 
     @property
@@ -136,15 +129,10 @@ class VolumeExperiment:
     def hologram(
         self, seed: int = 0, advance: Callable[[], object] = lambda: None, part: "Part | None" = None
     ) -> tuple[Tensor, float]:
-        """Holograms [3, H, W] of one realisation, rendered plane by plane into all colours at once.
+        """Fields [3, H, W] of the holograms of one realisation, and the seconds spent on rendering.
 
-        Args:
-            seed: Number of the realisation of the phases.
-            advance: Function that is called after every plane.
-            part: Planes and colours to add up; all by default.
-
-        Returns:
-            The fields, and the seconds spent on rendering.
+        Each plane is rendered once and added to all colours. ``seed`` is the number of the realisation of the phases;
+        ``advance`` is called after every plane; ``part`` selects planes and colours, all by default.
         """
         layers = self.sampler(seed)(self.volume)
         sums = []
