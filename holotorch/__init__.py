@@ -1,11 +1,12 @@
 """Differentiable optics for VR and AR displays, in PyTorch.
 
-Units: metres, radians, seconds, kelvin differences. A field is a complex tensor ``[..., C, H, W]`` with one channel
-per wavelength; axes are (y, x); the optical axis lies on sample ``n // 2``; frequencies stay in FFT order.
-``exp(+ikz)`` travels towards +z, a converging lens is ``exp(-i k r^2 / 2f)``, the far field is the unitary DFT.
+Units are metres, radians and seconds; temperatures are differences in kelvin. A field is a complex tensor
+``[..., C, H, W]`` with one channel per wavelength and axes (y, x); the optical axis lies on sample ``n // 2``;
+frequencies are in FFT order. ``exp(+ikz)`` travels towards +z, a converging lens is ``exp(-i k r^2 / 2f)``, and the far
+field is a unitary DFT.
 
-The names that most scripts begin with are here; each loads its module, and ``torch``, when it is first used. Importing
-the package opens no file and sets no global.
+This module offers the names that most scripts need first. Each name loads its module, and ``torch``, when it is first
+used. Importing the package opens no file and changes no global state.
 """
 
 from importlib import import_module

@@ -1,4 +1,4 @@
-"""``python -m holotorch``, which torchrun needs."""
+"""Entry point of ``python -m holotorch``, the form in which ``torchrun`` starts the program."""
 
 import sys
 

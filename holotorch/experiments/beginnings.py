@@ -13,9 +13,9 @@ from holotorch.io.files import write_text
 
 
 def write_example(name: str, path: Path) -> None:
-    """Write an example configuration of a kind. ConfigError for an unknown kind, or for a file that exists already."""
+    """Write an example configuration of a kind. ConfigError for an unknown kind, or if the file exists already."""
     source = find_config(_kind(name).example)
-    assert source is not None  # bundled with the package
+    assert source is not None  # the package contains the example of each kind
     if path.exists():
         raise ConfigError([f"{path} is there already; choose another --out"])
     try:
@@ -25,10 +25,10 @@ def write_example(name: str, path: Path) -> None:
 
 
 def schema(name: str) -> str:
-    """JSON Schema of the configurations of a kind. ConfigError for an unknown kind.
+    """JSON Schema of the configurations of a kind, with which editors complete keys. ConfigError for an unknown kind.
 
-    Editors use it to complete keys; only ``holotorch check`` validates fully. Numbers may be text with a unit, and a
-    single value may replace a list.
+    It accepts any text as a number, since lengths have units, and a single value instead of a list; only
+    ``holotorch check`` validates fully.
     """
     return json.dumps(_loosened(_kind(name).settings.model_json_schema()), indent=2)
 
@@ -42,7 +42,7 @@ _ACCEPTED = {
 
 
 def _loosened(value: Any) -> Any:
-    """Rename pydantic's limits to those of JSON Schema, and allow all types that the validators of settings accept."""
+    """A schema with pydantic's limits renamed as JSON Schema names them, and with all types that settings accept."""
     if isinstance(value, list):
         return [_loosened(each) for each in value]
     if not isinstance(value, dict):

@@ -7,7 +7,8 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.runs.tables import write_table
 from holotorch.io.files import write_bytes, write_text
 
-# The module that draws each chart, and the name of its second table. The chart of tracking names its further tables.
+# The module whose function ``subject`` draws the chart, and the name of its second table. The function for tracking
+# returns several further tables by name instead.
 CHARTS = {
     "eye": ("holotorch.experiments.eye.chart", "tradeoff"),
     "pec": ("holotorch.experiments.pec_study.chart", "comparison"),
@@ -18,7 +19,7 @@ CHARTS = {
 
 
 def chart(subject: str, out: Path) -> list[str]:
-    """Draw the chart of a subject into the folder ``out``; returns the lines of its verdict."""
+    """Write the figures, tables and verdict of a chart into the folder ``out``; returns the lines of the verdict."""
     if subject not in CHARTS:
         raise ConfigError([f"no chart of {subject!r}; known: {', '.join(CHARTS)}"])
     module, second = CHARTS[subject]
@@ -27,11 +28,11 @@ def chart(subject: str, out: Path) -> list[str]:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError([f"cannot write to {out}: {error.strerror}; choose another place with --out"]) from None
-    rows, compared, pictures, verdict = draw()
+    rows, further, figures, verdict = draw()
     write_table(out / "chart.csv", rows)
-    for name, table in (compared if isinstance(compared, dict) else {second: compared}).items():
+    for name, table in (further if isinstance(further, dict) else {second: further}).items():
         write_table(out / f"{name}.csv", table)
-    for name, data in pictures.items():
+    for name, data in figures.items():
         write_bytes(out / f"{name}.png", data)
     write_text(out / "verdict.txt", "\n".join(verdict) + "\n")
     return verdict

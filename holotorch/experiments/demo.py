@@ -10,15 +10,16 @@ from holotorch.io.bundled import find_config
 
 
 def demo(out: Path | None) -> tuple[Path, bool]:
-    """Carry out the runs and write one page for all; returns the folder, and whether all are complete."""
-    changes = {"demo": [], "demo_volume": [], "tracking/track": ["frames=10"], "perception/layout": []}
-    paths = [(find_config(f"configs/{name}.yaml"), overrides) for name, overrides in changes.items()]
-    image, scene, tracking, layout = (load_config(path, words) for path, words in paths if path is not None)
+    """Carry out the runs and write one page for all of them; returns the folder, and whether all runs are complete."""
+    configs = {"demo": [], "demo_volume": [], "tracking/track": ["frames=10"], "perception/layout": []}
+    correction, volume, tracking, layout = (
+        load_config(find_config(f"configs/{name}.yaml") or name, overrides) for name, overrides in configs.items()
+    )
     folder = claim(out, "demo")
     if (folder / "images").is_dir():
-        (folder / "images").rmdir()  # created by ``claim``; each run has a folder of its own inside
+        (folder / "images").rmdir()  # ``claim`` creates it, but each run has its own folder of images
     parts, complete = [], True
-    for settings, name in ((image, "correction"), (scene, "volume")):
+    for settings, name in ((correction, "correction"), (volume, "volume")):
         if complete:
             part, complete = execute(settings, folder / name, name)
             parts.append(part)

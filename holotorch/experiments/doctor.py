@@ -1,4 +1,4 @@
-"""Checks of an installation: each prints one line, OK or the command that repairs it."""
+"""Checks of an installation, with the command that repairs what has failed."""
 
 import platform
 import re
@@ -12,19 +12,21 @@ from pathlib import Path
 import numpy as np
 from packaging.requirements import Requirement
 
+from holotorch.experiments.runs.environment import installed_version
+
 
 def diagnose() -> bool:
-    """Print one line per check and return whether all of them passed."""
-    sound = True
+    """Print the results of all checks and return whether all of them passed."""
+    all_passed = True
     for name, check in _CHECKS.items():
         try:
-            lines = list(check())
+            results = list(check())
         except Exception as error:  # any failure is reported as a failed check
-            lines = [(False, f"{type(error).__name__}: {error}")]
-        for passed, text in lines:
-            sound &= passed
+            results = [(False, f"{type(error).__name__}: {error}")]
+        for passed, text in results:
+            all_passed &= passed
             print(f"{'OK  ' if passed else 'FAIL'}  {name}: {text}")
-    return sound
+    return all_passed
 
 
 def _python() -> Iterator[tuple[bool, str]]:
@@ -37,7 +39,7 @@ def _packages() -> Iterator[tuple[bool, str]]:
         wanted = Requirement(line)
         if wanted.marker and "extra" in str(wanted.marker):
             continue
-        version = _version(wanted.name)
+        version = installed_version(wanted.name)
         if version and wanted.specifier.contains(version, prereleases=True):
             yield True, f"{wanted.name} {version}"
         else:
@@ -73,9 +75,8 @@ def _fft() -> Iterator[tuple[bool, str]]:
     for size in ((60, 75), (2048, 2048)):
         x = torch.randn(size, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
         error = (ifft2(fft2(x)) - x).abs().max().item()
-        fine = error < 1e-5
-        advice = "" if fine else "; run: pip install --force-reinstall torch"
-        yield fine, f"round trip of {size[0]} x {size[1]} samples errs by {error:.1e}{advice}"
+        advice = "" if error < 1e-5 else "; run: pip install --force-reinstall torch"
+        yield not advice, f"round trip of {size[0]} x {size[1]} samples errs by {error:.1e}{advice}"
     if (torch.fft.ifft2(torch.fft.fft2(x)) - x).abs().max() > 1e-3:
         yield True, "torch.fft.ifft2 itself is wrong at 2048 x 2048 here (pytorch#169670); holotorch avoids it"
 
@@ -105,19 +106,12 @@ def _extras() -> Iterator[tuple[bool, str]]:
     for line in metadata.requires("holotorch") or []:
         wanted = Requirement(line)
         match = re.search(r"""extra == ['"](\w+)['"]""", str(wanted.marker))
-        if match and _version(wanted.name) is None:
+        if match and installed_version(wanted.name) is None:
             missing.setdefault(match[1], []).append(wanted.name)
     for extra, names in missing.items():
         yield True, f"{', '.join(names)} not installed (optional); to add: pip install 'holotorch[{extra}]'"
     if not missing:
         yield True, "all installed"
-
-
-def _version(name: str) -> str | None:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None
 
 
 _CHECKS: dict[str, Callable[[], Iterator[tuple[bool, str]]]] = {

@@ -15,21 +15,14 @@ from holotorch.io.files import write_json
 
 
 def execute(settings: Any, out: Path | None, name: str = "run") -> tuple[Path, bool]:
-    """Carry out a run and fill its folder: ``out``, or the next free ``runs/NAME-001``.
+    """Carry out a run with settings of any kind; returns its folder, and whether the run is complete.
 
-    If ``out`` holds an unfinished run of the same settings, that run is continued.
-
-    Args:
-        settings: Settings of any kind, as from :func:`~holotorch.experiments.registry.load_config`.
-        out: Folder of the run.
-        name: Name of the run; without ``out`` it also names the folder.
-
-    Returns:
-        The folder, and whether the run is complete. The folder of an interrupted run holds the results so far.
+    The folder is ``out``, or the next free ``runs/NAME-001``. If ``out`` holds an unfinished run of the same settings,
+    that run is continued. The folder of an interrupted run holds the results so far.
 
     Raises:
-        ConfigError: The folder holds files already or cannot be written, an input cannot be used, the run does not fit
-            into memory, or it cannot start.
+        ConfigError: The folder holds other files already or cannot be written, an input cannot be used, or the run does
+            not fit into memory or cannot start.
     """
     kind = find_kind(settings.experiment)
     experiment = kind.build(settings)
@@ -64,9 +57,7 @@ def check(settings: Any) -> RunPlan:
 def resume(folder: Path) -> tuple[Path, bool]:
     """Continue an interrupted run in its folder, as if it had never stopped; returns the same as :func:`execute`.
 
-    Raises:
-        ConfigError: The folder holds no run of this program, or its configuration is no longer valid or no longer
-            matches its checkpoint.
+    ConfigError if the folder holds no run, or if its configuration is no longer valid or contradicts its checkpoint.
     """
     config = folder / "config.yaml"
     if not config.is_file() or not (folder / "env.json").is_file():
@@ -76,8 +67,8 @@ def resume(folder: Path) -> tuple[Path, bool]:
         if tidied(folder):
             write_report([folder], folder / "report.html")
         return folder, True
-    held = read_source(config, []).data
-    name = held.get("experiment")
-    if isinstance(name, str) and name in KINDS and (instead := find_kind(name).restart(folder, held)):
-        raise ConfigError([f"{folder} holds an interrupted run of kind {name}, which cannot be continued: {instead}"])
+    data = read_source(config, []).data
+    name = data.get("experiment")
+    if isinstance(name, str) and name in KINDS and (advice := find_kind(name).restart(folder, data)):
+        raise ConfigError([f"{folder} holds an interrupted run of kind {name}, which cannot be continued: {advice}"])
     return execute(load_config(config), folder, folder.resolve().name)

@@ -25,21 +25,15 @@ class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
     To add a kind, write a folder whose module ``kind`` defines an instance ``KIND``, and add a line to the registry;
     the commands ``check``, ``run``, ``resume`` and ``report`` then work for it. Methods import heavy modules when they
     are called, so that a configuration is checked before torch is loaded.
-
-    Attributes:
-        settings: Pydantic model of the configuration.
-        parallel: Whether several processes, started by ``torchrun``, share one run.
-        announces: Whether the plan is printed before the run begins.
-        example: Path of the bundled configuration that ``holotorch new`` copies.
     """
 
-    settings: type[SettingsT]
-    parallel: ClassVar[bool] = False
-    announces: ClassVar[bool] = True
-    example: ClassVar[str]
+    settings: type[SettingsT]  # pydantic model of the configuration
+    parallel: ClassVar[bool] = False  # whether several processes, started by ``torchrun``, share one run
+    announces: ClassVar[bool] = True  # whether the plan is printed before the run begins
+    example: ClassVar[str]  # path of the bundled configuration that ``holotorch new`` copies
 
     def contradictions(self, settings: SettingsT) -> list[tuple[Key, str]]:
-        """Settings that are valid one by one but contradict each other: the key and the message for each."""
+        """Key and message for each setting that is valid by itself but contradicts another setting."""
         return []
 
     @abstractmethod
@@ -48,7 +42,7 @@ class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
 
     @abstractmethod
     def plan(self, experiment: Experiment) -> RunPlan:
-        """The methods and the cost of a run; computes nothing."""
+        """The methods and the cost of a run, without computing its results."""
 
     def prepare(self, experiment: Experiment) -> None:
         """Raise ConfigError if the run cannot start; called before its folder is created."""
@@ -58,12 +52,7 @@ class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
         """Compute the results and write all files of the folder; returns whether the run is complete."""
 
     def restart(self, folder: Path, config: Mapping[str, Any]) -> str | None:
-        """Advice if an interrupted run cannot be continued; None for the kinds whose runs can be continued.
-
-        Args:
-            folder: Folder of the run.
-            config: Configuration of the run, as read from the folder.
-        """
+        """What to do instead if the interrupted run in ``folder`` cannot be continued, otherwise None."""
         return None
 
     def device(self, experiment: Experiment) -> str:
@@ -72,8 +61,8 @@ class ExperimentKind(ABC, Generic[SettingsT, Experiment]):
 
     @abstractmethod
     def section(self, record: RunRecord) -> list[str]:
-        """The section of a report page for a run, as HTML, from the files of its folder alone."""
+        """The section of a report page for a run, as parts of HTML, from the files of the run folder alone."""
 
     def comparison(self, records: Sequence[RunRecord]) -> list[str]:
-        """HTML that compares several runs of this kind, placed before their sections on a page."""
+        """Parts of HTML that compare several runs of this kind; a page shows them before the sections of the runs."""
         return []

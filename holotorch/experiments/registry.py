@@ -1,4 +1,4 @@
-"""The registry of the kinds of experiments by their names in YAML, and the reader of their configurations."""
+"""The registry of the kinds of experiments, and the reader of their configurations."""
 
 from importlib import import_module
 from pathlib import Path
@@ -9,7 +9,7 @@ from holotorch.experiments.config.messages import nearest, validated
 from holotorch.experiments.config.source import read_source
 from holotorch.experiments.kind import ExperimentKind
 
-# Package that holds the module ``kind`` of each; loaded on demand.
+# Name of a kind in YAML, and the package whose module ``kind`` defines that kind; the module is loaded on demand.
 KINDS = {
     "pec": "holotorch.experiments.pec",
     "pec_study": "holotorch.experiments.pec_study",
@@ -22,15 +22,14 @@ KINDS = {
 
 
 def find_kind(name: str) -> ExperimentKind[Any, Any]:
-    """The kind of this name. KeyError for one that is not in ``KINDS``."""
+    """The kind of this name. KeyError for a name that is not in ``KINDS``."""
     return import_module(f"{KINDS[name]}.kind").KIND
 
 
 def load_config(path: Path | str, overrides: list[str] | None = None) -> Any:
-    """Read, override and check a configuration; returns the settings of its kind.
+    """Read a configuration, apply overrides ``key=value`` and validate it; returns the settings of its kind.
 
-    Raises:
-        ConfigError: All mistakes, one line each with file, line and column.
+    ConfigError with all mistakes, one line each with file, line and column.
     """
     source = read_source(Path(path), overrides or [])
     name = source.data.get("experiment")

@@ -11,15 +11,9 @@ from holotorch.io.files import write_text
 
 
 def write_report(folders: Sequence[Path], path: Path, more: Mapping[str, str] | None = None) -> None:
-    """Write the page of ``folders`` to ``path``.
+    """Write the page of run folders to ``path``. ConfigError for a folder without a run, or a run that cannot be read.
 
-    Args:
-        folders: Folders of runs.
-        path: File to write.
-        more: Further pages to link to: the text of each link, and its address relative to ``path``.
-
-    Raises:
-        ConfigError: A folder holds no run, or a run that cannot be read.
+    ``more`` are further pages to link to: addresses relative to ``path`` by the texts of the links.
     """
     runs = [_read(folder) for folder in folders]
     parts = []

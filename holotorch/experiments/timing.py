@@ -1,4 +1,4 @@
-"""Timing of one call, or of several calls in alternation, so that the load of the machine affects all of them alike."""
+"""Timing of one call, or of several calls in alternation, so that the load of the machine affects all calls equally."""
 
 import statistics
 import time
@@ -21,7 +21,7 @@ def timed(call: Callable[[], Result]) -> tuple[Result, float]:
 
 
 def interleaved(calls: dict[str, Callable[[], Any]], rounds: int = ROUNDS) -> dict[str, float]:
-    """Median seconds of each call over ``rounds``; each round makes every call once, after one round of warming up."""
+    """Median seconds of each call over ``rounds`` of one call each, after one round of warming up."""
     times: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(rounds + 1):
         for name, call in calls.items():

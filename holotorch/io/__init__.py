@@ -1,1 +1,1 @@
-"""Reading and writing of files; other packages open none. Import from the modules: the package itself loads nothing."""
+"""Reading and writing of files. Import from the modules of this package; the package itself imports none of them."""

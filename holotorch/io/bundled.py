@@ -1,9 +1,9 @@
-"""Bundled pictures and configurations. Imports no torch, so that configurations can be checked before it loads."""
+"""Bundled pictures and configurations, in a module without torch, so that configurations are checked quickly."""
 
 import difflib
 from pathlib import Path
 
-# Photographs that are part of the scikit-image package, so that no network is needed.
+# Photographs that the scikit-image package contains.
 BUNDLED_IMAGES = ("astronaut", "brick", "camera", "chelsea", "coffee", "coins", "grass", "moon", "page", "text")
 
 
@@ -21,6 +21,6 @@ def find_config(name: str | Path) -> Path | None:
     Bundled configurations lie inside an installed package, or beside the package in a checkout.
     """
     path, package = Path(name), Path(__file__).parents[1]
-    below = Path(*path.parts[1:]) if path.parts[:1] == ("configs",) else path
-    candidates = (path, package / "configs" / below, package.parent / "configs" / below)
+    inside = Path(*path.parts[1:]) if path.parts[:1] == ("configs",) else path
+    candidates = (path, package / "configs" / inside, package.parent / "configs" / inside)
     return next((candidate for candidate in candidates if candidate.is_file()), None)

@@ -1,4 +1,4 @@
-"""Download of published volumes: the volumes of Table 5.2 of the thesis whose checksum is known."""
+"""Download of the volumes of Table 5.2 of the thesis whose checksum is published."""
 
 import difflib
 from dataclasses import dataclass
@@ -14,19 +14,14 @@ _ORIGIN = "http://klacansky.com/open-scivis-datasets"
 class Published:
     """A volume of the Open SciVis Datasets: raw cubic voxels of unknown size, x fastest.
 
-    Attributes:
-        url: Address of the raw file; its name contains the size (x, y, z) and the type.
-        shape: Number of voxels (D, H, W).
-        dtype: Type of a voxel.
-        sha512: Checksum of the raw file, as the catalogue publishes it.
-        acknowledgement: Sources to be credited, by the catalogue. It states no licence: do not redistribute the data.
+    The catalogue states no licence: do not redistribute the data.
     """
 
-    url: str
-    shape: tuple[int, int, int]
+    url: str  # of the raw file, whose name contains the size (x, y, z) and the type
+    shape: tuple[int, int, int]  # number of voxels (D, H, W)
     dtype: str
-    sha512: str
-    acknowledgement: str
+    sha512: str  # checksum of the raw file, as the catalogue publishes it
+    acknowledgement: str  # sources that the catalogue credits
 
 
 PUBLISHED = {
@@ -61,8 +56,8 @@ def fetch_volume(name: str, directory: str | Path | None = None) -> Volume:
     """Download a volume of the thesis, verify its checksum and load it; later calls use the downloaded file.
 
     Args:
-        name: One of :data:`PUBLISHED`. Engine, C60 and hand of Table 5.2 are missing, because their checksums are not
-            known. Download them and use :func:`load_volume`; ``scene.c60`` computes a molecule.
+        name: One of :data:`PUBLISHED`. For the engine, C60 and the hand of Table 5.2 no checksum is published: download
+            them and use :func:`load_volume`. ``scene.c60`` computes a C60 molecule.
         directory: Folder in which the file is kept; the user's cache by default.
 
     Returns:
@@ -74,10 +69,8 @@ def fetch_volume(name: str, directory: str | Path | None = None) -> Volume:
     """
     if name not in PUBLISHED:
         near = difflib.get_close_matches(str(name), PUBLISHED, 1)
-        hint = f"did you mean {near[0]!r}? " if near else ""
-        raise ValueError(
-            f"no such published volume: {name!r}; {hint}known are {', '.join(PUBLISHED)}. Load others with load_volume"
-        )
+        known = f"{f'did you mean {near[0]!r}? ' if near else ''}known are {', '.join(PUBLISHED)}"
+        raise ValueError(f"no such published volume: {name!r}; {known}. Load others with load_volume")
     import pooch
 
     entry = PUBLISHED[name]
@@ -85,6 +78,6 @@ def fetch_volume(name: str, directory: str | Path | None = None) -> Volume:
     file = folder / entry.url.rsplit("/", 1)[1]
     try:
         pooch.retrieve(entry.url, known_hash=f"sha512:{entry.sha512}", fname=file.name, path=folder)
-    except OSError as error:  # errors of the requests library are OSErrors, too
+    except OSError as error:  # includes the errors of the requests library
         raise OSError(f"could not fetch {entry.url}: {error}; download it and put it at {file}") from error
     return load_volume(file, spacing=1, unit="relative", shape=entry.shape, dtype=entry.dtype)

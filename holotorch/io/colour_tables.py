@@ -8,27 +8,22 @@ from torch import Tensor
 
 from holotorch.core import checks
 
-_OBSERVER = "CIE 1931 2 Degree Standard Observer"
-
 
 def tristimulus(wavelengths: float | Sequence[float]) -> Tensor:
-    """CIE 1931 colour-matching functions (2 degrees) for X, Y and Z at wavelengths in metres, float64 [3, K].
+    """CIE 1931 colour-matching functions (2 degrees) for X, Y and Z at K wavelengths in metres, float64 [3, K].
 
-    The table has steps of 1 nm; values in between are interpolated by Sprague's method, as CIE 167 recommends.
-
-    Raises:
-        ValueError: A wavelength outside the range of the table, 360 to 830 nm.
+    The table covers 360 to 830 nm (ValueError outside) in steps of 1 nm; values in between are interpolated by
+    Sprague's method, as CIE 167 recommends.
     """
     from colour import MSDS_CMFS, SpragueInterpolator
 
-    table = MSDS_CMFS[_OBSERVER]
+    table = MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
     nanometres = np.array(checks.wavelengths(wavelengths)) * 1e9
     first, last = float(table.wavelengths[0]), float(table.wavelengths[-1])
     wrong = nanometres[(nanometres < first) | (nanometres > last)]
     if wrong.size:
-        raise ValueError(
-            f"wavelength {wrong[0]:g} nm has no colour: the CIE 1931 table covers {first:g} to {last:g} nm"
-        )
+        covered = f"the CIE 1931 table covers {first:g} to {last:g} nm"
+        raise ValueError(f"wavelength {wrong[0]:g} nm has no colour: {covered}")
     columns = [SpragueInterpolator(table.wavelengths, table.values[:, i])(nanometres) for i in range(3)]
     return torch.from_numpy(np.stack(columns).reshape(3, -1))
 
@@ -39,13 +34,13 @@ def srgb_matrix(
     """Matrix [3, K] from intensities at ``wavelengths`` to linear sRGB, float64, with one column per wavelength.
 
     The colours are not adapted to a white point: equal intensities of three sources give the colour of their sum, which
-    is not D65. With weights from :func:`white_balance` they give D65.
+    is not D65. With the weights of :func:`white_balance`, equal intensities give D65.
 
     Args:
         wavelengths: K wavelengths in metres.
         weights: Power of each wavelength, 1 by default; for example the weights of the quadrature rules of
             :class:`~holotorch.optics.light.spectrum.Spectrum`.
-        white: Intensities [K] of the white of a picture, which gets a luminance of 1; all ones by default.
+        white: Intensities [K] that get a luminance of 1; all ones by default.
 
     Raises:
         ValueError: Wavelengths outside the table, weights that do not match or are negative, or a white without light.
@@ -54,13 +49,15 @@ def srgb_matrix(
 
     matching = tristimulus(wavelengths)
     count = matching.shape[1]
-    power = torch.ones(count, dtype=torch.float64) if weights is None else torch.as_tensor(weights, dtype=torch.float64)
-    shown = torch.ones(count, dtype=torch.float64) if white is None else white.to(torch.float64)
-    for name, part in (("weights", power), ("white", shown)):
-        if tuple(part.shape) != (count,) or not (part >= 0).all():
-            raise ValueError(f"{name} must be {count} nonnegative numbers, one per wavelength, got {part.tolist()}")
+    power, white = (
+        torch.ones(count).double() if given is None else torch.as_tensor(given, dtype=torch.float64)
+        for given in (weights, white)
+    )
+    for name, values in (("weights", power), ("white", white)):
+        if tuple(values.shape) != (count,) or not (values >= 0).all():
+            raise ValueError(f"{name} must be {count} nonnegative numbers, one per wavelength, got {values.tolist()}")
     matrix = matching * power
-    luminance = matrix[1] @ shown
+    luminance = matrix[1] @ white
     if luminance <= 0:
         raise ValueError("white has no luminance; give positive weights within the visible range")
     return torch.from_numpy(np.array(RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB)) @ matrix / luminance
@@ -69,18 +66,16 @@ def srgb_matrix(
 def white_balance(wavelengths: Sequence[float]) -> Tensor:
     """Powers of three sources whose sum is D65, the white of sRGB, relative to the strongest source, float64 [3].
 
-    A display with these powers shows equal values of its three channels as neutral grey.
-
-    Raises:
-        ValueError: Not three wavelengths, or three that cannot mix D65.
+    A display with these powers shows equal values of its three channels as neutral grey. ValueError unless there are
+    three wavelengths that can mix D65.
     """
     from colour.models import RGB_COLOURSPACE_sRGB
 
     matching = tristimulus(wavelengths)
     if matching.shape[1] != 3:
         raise ValueError(f"white balance needs three wavelengths, got {matching.shape[1]}")
-    wanted = torch.from_numpy(np.linalg.inv(RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB) @ np.ones(3))
-    powers = torch.linalg.solve(matching, wanted) if torch.linalg.matrix_rank(matching) == 3 else -torch.ones(3)
+    white = torch.from_numpy(np.linalg.inv(RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB) @ np.ones(3))
+    powers = torch.linalg.solve(matching, white) if torch.linalg.matrix_rank(matching) == 3 else -torch.ones(3)
     if (powers <= 0).any():
         listed = ", ".join(f"{value * 1e9:g}" for value in wavelengths)
         raise ValueError(f"{listed} nm cannot mix the white D65; take one red, one green and one blue source")

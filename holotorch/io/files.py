@@ -18,9 +18,11 @@ from torch import Tensor
 def replacing(path: Path, *, buffering: int = -1, needed: int | None = None) -> Iterator[IO[bytes]]:
     """Context manager that opens a temporary file beside ``path`` and renames it to ``path`` if the block succeeds.
 
-    With ``buffering`` 0 and :func:`append`, a block that handles the error of a full disk can end normally, since no
-    buffered data remain whose writing could fail again. ``needed`` is the number of bytes to be written, which the
-    message about a full disk states.
+    Args:
+        path: The file to replace.
+        buffering: As for ``open``. 0 allows a block to handle the error of a full disk and end normally, since no
+            buffered data remain whose writing could fail again.
+        needed: Number of bytes to be written; the message about a full disk states it.
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -30,25 +32,19 @@ def replacing(path: Path, *, buffering: int = -1, needed: int | None = None) -> 
             os.fsync(stream.fileno())
         os.replace(partial, path)
     except OSError as error:
-        with suppress(OSError):  # removed here, before ``_reason`` measures the free space
+        with suppress(OSError):  # removed before the free space is measured
             partial.unlink()
-        # The message names the final path, since the temporary one means nothing to the user.
-        raise OSError(error.errno, _reason(error, path, needed), str(path)) from None
+        reason = error.strerror or str(error)
+        if needed is not None and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            free = shutil.disk_usage(path.parent).free
+            reason += f" ({needed / 1e6:.3f} MB needed, {free / 1e6:.3f} MB free)"
+        raise OSError(error.errno, reason, str(path)) from None  # the user does not know the temporary path
     finally:
         partial.unlink(missing_ok=True)
 
 
-def _reason(error: OSError, path: Path, needed: int | None) -> str:
-    """Error message of the system; for a full disk it adds the needed and the free space."""
-    reason = error.strerror or str(error)
-    if needed is None or error.errno not in (errno.ENOSPC, errno.EDQUOT):
-        return reason
-    free = shutil.disk_usage(path.parent).free
-    return f"{reason} ({needed / 1e6:.3f} MB needed, {free / 1e6:.3f} MB free)"
-
-
 def append(stream: IO[bytes], data: bytes | memoryview) -> None:
-    """Append ``data`` to an unbuffered file; if an OSError is raised, the file has its previous length."""
+    """Append ``data`` to an unbuffered file; an OSError leaves the file with its previous length."""
     start, done = stream.tell(), 0
     try:
         while done < len(data):  # a single call may write only a part

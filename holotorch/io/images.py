@@ -1,6 +1,7 @@
 """Loading of bundled pictures and image files, fitting to a grid, and PNG encoding."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,9 +10,9 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.io.bundled import BUNDLED_IMAGES, no_such_picture
 from holotorch.io.formats.decoding import check_exr, decode
+from holotorch.metrics.quality import SSIM_WINDOW
 
 _MEMORY = 56  # bytes per pixel in load_image: three float64 values, a copy of them, and the decoded pixel
-SMALLEST_SIDE = 11  # pixels; side of the window of ssim
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of red, green and blue, ITU-R BT.709
 
 
@@ -20,8 +21,8 @@ def load_image(source: str | Path) -> Tensor:
 
     Returns:
         float64 [C, H, W] in [0, 1], C = 3 (red, green, blue) or 1. 8 and 16 bit integers are divided by 255 and 65535
-        and not linearised: as in the thesis, pixel values are interpreted as intensities. Other types are divided by
-        their maximum if it exceeds 1. Transparent pixels are composited over black.
+        and not linearised: like the thesis, this function takes pixel values as intensities. Other types are divided by
+        their maximum if that exceeds 1. Transparent pixels are composited over black.
 
     Raises:
         ValueError: The picture does not exist, cannot be decoded, exceeds the memory limit of
@@ -30,14 +31,16 @@ def load_image(source: str | Path) -> Tensor:
     """
     path = Path(source)
     if str(source) in BUNDLED_IMAGES:
-        pixels = _bundled(str(source))
-    elif path.suffix.lower() == ".exr":
-        pixels = _read_exr(_existing(path))
+        import skimage.data
+
+        pixels = getattr(skimage.data, str(source))()
+    elif not path.is_file():
+        raise ValueError(no_such_picture(str(path)))
     else:
-        pixels = _decode(_existing(path))
+        pixels = _exr_pixels(path) if path.suffix.lower() == ".exr" else _decode(path)
     if pixels.ndim == 2:
         pixels = pixels[..., None]
-    if pixels.shape[-1] in (2, 4):
+    if pixels.shape[-1] in (2, 4):  # the last channel is the opacity
         values = _unit_range(pixels[..., :-1]) * _unit_range(pixels[..., -1:])
     else:
         values = _unit_range(pixels)
@@ -47,8 +50,8 @@ def load_image(source: str | Path) -> Tensor:
 def fit_image(image: Tensor, shape: tuple[int, int], fit: str = "crop") -> Tensor:
     """Resize ``image`` [C, h, w] to ``shape`` (H, W); a picture of that size is returned unchanged.
 
-    The picture gets the new aspect ratio by :func:`frame_image` and is then resampled bilinearly with antialiasing,
-    which does not overshoot and therefore creates no negative values.
+    :func:`frame_image` changes the aspect ratio. Bilinear resampling with antialiasing follows; it does not overshoot,
+    so it creates no negative values.
     """
     if tuple(image.shape[-2:]) == tuple(shape):
         return image
@@ -95,23 +98,23 @@ def encode_png(image: Tensor) -> bytes:
     return data.tobytes()
 
 
-def _existing(path: Path) -> Path:
-    if not path.is_file():
-        raise ValueError(no_such_picture(str(path)))
-    return path
+def read_exr(path: Path, *, memory: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and channels [H, W] of an EXR file by name; arguments and errors as for :func:`check_exr`."""
+    import OpenEXR
 
-
-def _bundled(name: str) -> np.ndarray:
-    import skimage.data
-
-    return getattr(skimage.data, name)()
+    check_exr(path, memory=memory)
+    try:
+        file = OpenEXR.File(str(path), separate_channels=True)
+        return file.header(), {name: channel.pixels for name, channel in file.channels().items()}
+    except Exception as error:  # the library raises bare RuntimeError and others
+        raise ValueError(f"{path} is not a readable EXR file: {error}") from None
 
 
 def _decode(path: Path) -> np.ndarray:
     import cv2
 
     data = path.read_bytes()
-    # JPEG is read in colour mode, in which OpenCV applies the orientation tag.
+    # OpenCV applies the orientation tag of a JPEG only in colour mode.
     flags = cv2.IMREAD_COLOR if data.startswith(b"\xff\xd8") else cv2.IMREAD_UNCHANGED
     pixels = decode(path, flags, data=data, memory=_MEMORY)
     if pixels.ndim == 3 and pixels.shape[2] >= 3:
@@ -119,30 +122,24 @@ def _decode(path: Path) -> np.ndarray:
     return pixels
 
 
-def _read_exr(path: Path) -> np.ndarray:
-    import OpenEXR
-
-    try:
-        check_exr(path, memory=_MEMORY)
-        channels = OpenEXR.File(str(path), separate_channels=True).channels()
-    except Exception as error:  # the library raises bare RuntimeError and others
-        raise ValueError(f"{path} is not a readable EXR file: {error}") from None
-    names = next((wanted for wanted in (("R", "G", "B"), ("Y",)) if all(name in channels for name in wanted)), None)
+def _exr_pixels(path: Path) -> np.ndarray:
+    _, channels = read_exr(path, memory=_MEMORY)
+    names = next((names for names in ("RGB", "Y") if channels.keys() >= {*names}), None)
     if names is None:
         raise ValueError(f"{path} must have channels R, G, B or Y, got {', '.join(sorted(channels))}")
     if "RY" in channels:
         raise ValueError(f"{path} stores colour as luminance and differences; convert it to R, G, B")
-    names = [*names, "A"] if "A" in channels else names
-    return np.stack([channels[name].pixels for name in names], axis=-1)
+    names += "A" if "A" in channels else ""
+    return np.stack([channels[name] for name in names], axis=-1)
 
 
 def _unit_range(pixels: np.ndarray) -> np.ndarray:
-    if pixels.dtype == bool:
-        return pixels.astype(np.float64)
+    """Pixels as float64, divided by the largest value of 8 and 16 bit integers, or else by a maximum above 1."""
     values = pixels.astype(np.float64)
-    whole = pixels.dtype in (np.uint8, np.uint16)
-    peak = np.iinfo(pixels.dtype).max if whole else values.max()
-    return np.divide(values, peak, out=values) if np.isfinite(peak) and peak > 1 else values
+    peak = np.iinfo(pixels.dtype).max if pixels.dtype in (np.uint8, np.uint16) else values.max()
+    if np.isfinite(peak) and peak > 1:
+        values /= peak
+    return values
 
 
 def _checked(image: Tensor, source: str) -> Tensor:
@@ -152,12 +149,10 @@ def _checked(image: Tensor, source: str) -> Tensor:
         raise ValueError(f"{error}; repair the picture, every pixel [C, H, W] must be a number") from None
     if image.min() < 0:
         raise ValueError(f"picture {source} holds negative intensities, down to {image.min().item():g}; clip it first")
-    if min(image.shape[-2:]) < SMALLEST_SIDE:
-        height, width = image.shape[-2:]
-        raise ValueError(
-            f"picture {source} is {height} x {width} px, less than the {SMALLEST_SIDE} x {SMALLEST_SIDE} px window "
-            "of ssim; use a larger one"
-        )
+    height, width = image.shape[-2:]
+    if min(height, width) < SSIM_WINDOW:
+        window = f"{SSIM_WINDOW} x {SSIM_WINDOW} px window of ssim"
+        raise ValueError(f"picture {source} is {height} x {width} px, less than the {window}; use a larger one")
     if image.max() == 0:
         raise ValueError(f"picture {source} is black: there is no light to form; use another picture")
     return image.contiguous()

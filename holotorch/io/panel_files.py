@@ -14,16 +14,19 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.io.files import write_bytes
-from holotorch.io.formats.decoding import PNG, check_exr, decode
+from holotorch.io.formats.decoding import PNG, decode
+from holotorch.io.images import read_exr
 
 _KEY = "holotorch"  # key of the PNG text chunk and of the EXR attribute that contain the metadata as JSON
+_CHUNK = b"iTXt"  # type of a PNG chunk with UTF-8 text
+_CHUNK_START = _KEY.encode() + bytes(5)  # key, then flags and empty fields of a text that is not compressed
 
 
 def write_levels(path: Path, levels: Tensor, metadata: Mapping[str, Any]) -> None:
     """Write a frame of grey levels, uint8 or uint16 [H, W], as ``.png`` or (uint8 only) ``.bmp``, atomically.
 
-    Levels are stored without scaling: levels of a 10-bit panel are 0 to 1023 in a 16-bit file. The metadata, a mapping
-    to JSON values, are stored in a text chunk of a PNG, or in ``NAME.bmp.json`` beside a BMP, which has no text chunks.
+    Levels are stored without scaling: levels of a 10-bit panel are 0 to 1023 in a 16-bit file. The metadata, which must
+    be JSON values, go into a text chunk of a PNG, or into ``NAME.bmp.json`` beside a BMP.
 
     Raises:
         TypeError: Levels of another dtype, or metadata that cannot be written as JSON.
@@ -33,7 +36,7 @@ def write_levels(path: Path, levels: Tensor, metadata: Mapping[str, Any]) -> Non
 
     if not isinstance(levels, Tensor) or levels.dtype not in (torch.uint8, torch.uint16):
         raise TypeError(f"levels must be a tensor of uint8 or uint16, got {getattr(levels, 'dtype', type(levels))}")
-    _two_axes("levels", levels)
+    _check_frame("levels", levels)
     suffix = path.suffix.lower()
     if suffix not in (".png", ".bmp"):
         raise ValueError(f"{path}: levels are written as .png or .bmp, got {suffix or 'no ending'}")
@@ -46,15 +49,14 @@ def write_levels(path: Path, levels: Tensor, metadata: Mapping[str, Any]) -> Non
     if suffix == ".png":
         write_bytes(path, _with_text(data.tobytes(), text))
         return
-    write_bytes(_beside(path), text.encode() + b"\n")
+    write_bytes(_json_file(path), text.encode() + b"\n")
     write_bytes(path, data.tobytes())
 
 
 def read_levels(path: Path) -> tuple[Tensor, dict[str, Any]]:
     """Read a frame of grey levels, uint8 or uint16 [H, W], and its metadata, which are empty if the file has none.
 
-    Raises:
-        ValueError: The file is missing, damaged, or no grey picture of 8 or 16 bits.
+    ValueError if the file is missing, damaged, or not a grey picture of 8 or 16 bits.
     """
     import cv2
 
@@ -64,9 +66,9 @@ def read_levels(path: Path) -> tuple[Tensor, dict[str, Any]]:
         pixels = pixels[..., 0]  # a grey BMP is read as three equal channels
     if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{path} must be grey with 8 or 16 bits, got {pixels.shape} of {pixels.dtype}")
-    text = _text_of(data) if data.startswith(PNG) else None
-    if text is None and _beside(path).is_file():
-        text = _beside(path).read_bytes().decode("utf-8", "replace")
+    text = _png_text(data) if data.startswith(PNG) else None
+    if text is None and _json_file(path).is_file():
+        text = _json_file(path).read_bytes().decode("utf-8", "replace")
     return torch.from_numpy(pixels.copy()), _metadata(path, text)
 
 
@@ -74,61 +76,52 @@ def write_phases(path: Path, phase: Tensor, metadata: Mapping[str, Any]) -> None
     """Write phases in rad, float32 [H, W], as the channel Y of an ``.exr``, bit-exactly and atomically.
 
     Raises:
-        TypeError: Phases that are not float32, the type of the channel, or metadata that cannot be written as JSON.
+        TypeError: Phases that are not float32, or metadata that cannot be written as JSON.
         ValueError: Another shape or file extension, or NaN or infinity in the phases or the metadata.
     """
     import OpenEXR
 
     if not isinstance(phase, Tensor) or phase.dtype != torch.float32:
         raise TypeError(f"EXR keeps float32 phases, got {getattr(phase, 'dtype', type(phase))}; use phase.float()")
-    _two_axes("phase", phase)
+    _check_frame("phase", phase)
     checks.all_finite("phase", phase)
     if path.suffix.lower() != ".exr":
         raise ValueError(f"{path}: phases are written as .exr, got {path.suffix or 'no ending'}")
-    # OpenEXR ignores the strides of its arrays, so it needs a contiguous copy.
-    pixels = np.array(phase.detach().cpu().numpy(), dtype=np.float32, order="C", copy=True)
+    pixels = np.array(phase.detach().cpu().numpy(), order="C")  # OpenEXR ignores strides
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, _KEY: _json(metadata)}
     with tempfile.TemporaryDirectory() as folder:  # the library writes only to a path
-        made = Path(folder) / "phase.exr"
-        OpenEXR.File(header, {"Y": pixels}).write(str(made))
-        data = made.read_bytes()
-    write_bytes(path, data)
+        temporary = Path(folder) / "phase.exr"
+        OpenEXR.File(header, {"Y": pixels}).write(str(temporary))
+        write_bytes(path, temporary.read_bytes())
 
 
 def read_phases(path: Path) -> tuple[Tensor, dict[str, Any]]:
-    """Read phases in rad, float32 [H, W], and their metadata from an EXR file with a channel Y.
+    """Read phases in rad, float32 [H, W], and their metadata from an EXR file.
 
-    Raises:
-        ValueError: The file is missing, damaged, or has no float32 channel Y.
+    ValueError if the file is missing, damaged, or has no float32 channel Y.
     """
-    import OpenEXR
-
-    check_exr(_existing(path), memory=8)
-    try:
-        file = OpenEXR.File(str(path), separate_channels=True)
-        header, channels = file.header(), file.channels()
-    except Exception as error:  # the library raises bare RuntimeError and others
-        raise ValueError(f"{path} is not a readable EXR file: {error}") from None
-    if "Y" not in channels or channels["Y"].pixels.dtype != np.float32:
+    header, channels = read_exr(_existing(path), memory=8)
+    if "Y" not in channels or channels["Y"].dtype != np.float32:
         raise ValueError(f"{path} must have a float32 channel Y, got {', '.join(sorted(channels))}")
-    return torch.from_numpy(np.array(channels["Y"].pixels)), _metadata(path, header.get(_KEY))
+    return torch.from_numpy(np.array(channels["Y"])), _metadata(path, header.get(_KEY))
 
 
 def _with_text(png: bytes, text: str) -> bytes:
-    """The PNG with ``text`` in an international text chunk (UTF-8, not compressed) after its header."""
-    end = len(PNG) + 12 + struct.unpack(">I", png[8:12])[0]
-    body = b"iTXt" + _KEY.encode() + b"\0\0\0\0\0" + text.encode()
+    """The PNG with ``text`` in a text chunk after its header."""
+    end = len(PNG) + 12 + struct.unpack_from(">I", png, len(PNG))[0]
+    body = _CHUNK + _CHUNK_START + text.encode()
     return png[:end] + struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body)) + png[end:]
 
 
-def _text_of(png: bytes) -> str | None:
-    place = len(PNG)
-    while place + 12 <= len(png):
-        length = struct.unpack(">I", png[place : place + 4])[0]
-        kind, body = png[place + 4 : place + 8], png[place + 8 : place + 8 + length]
-        if kind == b"iTXt" and body.startswith(_KEY.encode() + b"\0\0\0\0\0"):
-            return body[len(_KEY) + 5 :].decode("utf-8", "replace")
-        place += 12 + length
+def _png_text(png: bytes) -> str | None:
+    """The text that :func:`_with_text` has stored, or None."""
+    offset = len(PNG)
+    while offset + 12 <= len(png):
+        length, kind = struct.unpack_from(">I4s", png, offset)
+        body = png[offset + 8 : offset + 8 + length]
+        if kind == _CHUNK and body.startswith(_CHUNK_START):
+            return body.removeprefix(_CHUNK_START).decode("utf-8", "replace")
+        offset += 12 + length
     return None
 
 
@@ -140,15 +133,15 @@ def _metadata(path: Path, text: str | None) -> dict[str, Any]:
     if text is None:
         return {}
     try:
-        found = json.loads(text)
-    except (ValueError, TypeError, RecursionError):  # TypeError: no text; RecursionError: nested too deeply
+        metadata = json.loads(text)
+    except (ValueError, TypeError, RecursionError):  # TypeError: an EXR attribute that is no text
         raise ValueError(f"{path}: its metadata are damaged: not JSON") from None
-    if not isinstance(found, dict):
-        raise ValueError(f"{path}: its metadata are damaged: expected settings, got {found!r}")
-    return found
+    if not isinstance(metadata, dict):
+        raise ValueError(f"{path}: its metadata are damaged: expected settings, got {metadata!r}")
+    return metadata
 
 
-def _beside(path: Path) -> Path:
+def _json_file(path: Path) -> Path:
     return path.with_name(path.name + ".json")
 
 
@@ -158,6 +151,6 @@ def _existing(path: Path) -> Path:
     return path
 
 
-def _two_axes(name: str, value: Tensor) -> None:
+def _check_frame(name: str, value: Tensor) -> None:
     if value.ndim != 2 or 0 in value.shape:
         raise ValueError(f"{name} must be one frame (H, W), got {tuple(value.shape)}")

@@ -5,8 +5,8 @@ A recording is a folder::
     recording.json   format, frame size, rate, source, order of channels, names of the copied files; written first
     camera.yaml ...  exact copies of the files that the recording was made with
     frames.rgb       the frames without any bytes between them, each with H rows of W pixels of 8-bit red, green, blue
-    times.csv        frame,seconds,crc32,problem: a line per frame, written after the frame; a frame that could not be
-                     read has a problem, but no checksum and no bytes in frames.rgb
+    times.csv        frame,seconds,crc32,problem: a line per frame, written after the pixels of the frame; the line of a
+                     frame that the source could not deliver has a problem but no checksum, and the frame has no pixels
 
 ``frames.rgb`` and ``times.csv`` are only appended to, so that frames recorded before a crash of the program can be
 replayed. If the disk is full, an incomplete frame is removed. The pixels are not compressed, since encoding a 1080p
@@ -25,11 +25,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.io.files import append, read_json, write_bytes, write_json
-from holotorch.io.video import Frame, Frames
+from holotorch.io.video import Frame, Frames, check_pixels
 
 _FORMAT = 1
 _CHANNELS = "RGB"  # channel order of every recording; files of older versions do not state it
@@ -74,7 +73,7 @@ class Recorder:
         self.folder, self.shape, self.frames = folder, tuple(shape), 0
         for name, path in (copies or {}).items():
             write_bytes(folder / name, path.read_bytes())
-        facts = {
+        header = {
             "format": _FORMAT,
             "height": shape[0],
             "width": shape[1],
@@ -83,34 +82,26 @@ class Recorder:
             "source": source,
             "copies": sorted(copies or {}),
         }
-        write_json(folder / "recording.json", facts)
+        write_json(folder / "recording.json", header)
         self._pixels = open(folder / "frames.rgb", "ab", buffering=0)  # noqa: SIM115
         self._times = open(folder / "times.csv", "ab", buffering=0)  # noqa: SIM115
         self._row(_COLUMNS)
 
     def write(self, frame: Frame) -> None:
-        """Append a frame: first its pixels to ``frames.rgb``, then its line to ``times.csv``.
+        """Append a frame. ValueError for another shape or dtype; OSError, without a change, if the disk is full."""
+        import cv2
 
-        Raises:
-            ValueError: Pixels of another shape or dtype.
-            OSError: The disk is full; the recording is unchanged.
-        """
-        checks.finite("time of a frame", frame.seconds, "seconds")
-        # The text that repr gives for a float is read back as exactly the same float.
+        seconds = repr(checks.finite("time of a frame", frame.seconds, "seconds"))  # repr keeps all digits of a float
         if frame.pixels is None:
             problem = " ".join(frame.problem.split())  # removes line breaks
-            self._row((str(self.frames), repr(float(frame.seconds)), "", problem or "not readable"))
+            self._row((str(self.frames), seconds, "", problem or "not readable"))
         else:
-            if frame.pixels.dtype != torch.uint8 or tuple(frame.pixels.shape) != (3, *self.shape):
-                raise ValueError(
-                    f"frames of this recording are uint8 {[3, *self.shape]}, got {frame.pixels.dtype} "
-                    f"{list(frame.pixels.shape)}"
-                )
-            data = _interleaved(frame.pixels).data.cast("B")
+            check_pixels(frame.pixels, self.shape, "recording")
+            data = cv2.merge(list(frame.pixels.cpu().numpy())).data.cast("B")
             start = self._pixels.tell()
             append(self._pixels, data)
             try:
-                self._row((str(self.frames), repr(float(frame.seconds)), f"{zlib.crc32(data):08x}", ""))
+                self._row((str(self.frames), seconds, f"{zlib.crc32(data):08x}", ""))
             except OSError:
                 self._pixels.seek(start)
                 self._pixels.truncate()
@@ -138,78 +129,70 @@ def open_recording(folder: Path) -> Frames:
     """Open a recording to replay its frames with their times.
 
     A truncated recording yields all complete frames and a remark in ``notes``. A frame whose checksum does not match
-    has a problem instead of pixels.
-
-    Raises:
-        ValueError: The folder holds no recording, one of a later format, a damaged one, or one without a complete
-            frame.
+    has a problem instead of pixels. ValueError if the folder holds no recording, or if the recording is damaged, has a
+    later format, or contains no complete frame.
     """
     if not is_recording(folder):
         raise ValueError(f"{folder} holds no recording: recording.json and times.csv are not both there")
-    facts = _facts(folder)
-    shape = (facts["height"], facts["width"])
+    header = _header(folder)
+    shape = (header["height"], header["width"])
     size = recording_bytes(shape, 1)
     rows = _rows(folder)
-    present = (folder / "frames.rgb").stat().st_size if (folder / "frames.rgb").is_file() else 0
-    # The line of a frame is written after its pixels: an interruption can leave pixels without a line, not the reverse.
-    kept, place = [], 0
-    for seconds, crc, problem in rows:
-        if crc is not None and place + size > present:
+    available = (folder / "frames.rgb").stat().st_size if (folder / "frames.rgb").is_file() else 0
+    # A frame's line is written after its pixels, so an interruption can leave pixels without a line.
+    complete, used = [], 0
+    for row in rows:
+        used += size if row[1] is not None else 0
+        if used > available:
             break
-        kept.append((seconds, crc, problem, place))
-        place += size if crc is not None else 0
-    if not any(crc is not None for _, crc, _, _ in kept):
+        complete.append(row)
+    if not any(crc is not None for _, crc, _ in complete):
         raise ValueError(f"{folder} holds no whole frame; the recording was cut off before its first")
     notes = []
-    if len(kept) < len(rows):
-        notes.append(f"frames.rgb is cut off: {len(kept)} of {len(rows)} frames are there")
-    elif present > place:
-        notes.append(f"the recording was cut off while a frame was written; the {len(kept)} before it are there")
+    if len(complete) < len(rows):
+        notes.append(f"frames.rgb is cut off: {len(complete)} of {len(rows)} frames are there")
+    elif available > used:
+        notes.append(f"the recording was cut off while a frame was written; the {len(complete)} before it are there")
 
     def frames() -> Iterator[Frame]:
         with open(folder / "frames.rgb", "rb") as stream:
-            for seconds, crc, problem, place in kept:
+            for seconds, crc, problem in complete:
                 if crc is None:
                     yield Frame(seconds, None, problem)
-                    continue
-                stream.seek(place)
-                data = bytearray(stream.read(size))
-                if zlib.crc32(data) != crc:
+                elif zlib.crc32(data := bytearray(stream.read(size))) != crc:
                     yield Frame(seconds, None, "its bytes have changed since it was recorded")
-                    continue
-                pixels = np.frombuffer(data, np.uint8).reshape(*shape, 3)
-                yield Frame(seconds, torch.from_numpy(pixels).permute(2, 0, 1).contiguous())
+                else:
+                    pixels = np.frombuffer(data, np.uint8).reshape(*shape, 3)
+                    yield Frame(seconds, torch.from_numpy(pixels).permute(2, 0, 1).contiguous())
 
-    return Frames(folder.name, shape, len(kept), facts["rate_hz"], frames(), notes)
+    return Frames(folder.name, shape, len(complete), header["rate_hz"], frames(), notes)
 
 
 def free_bytes(folder: Path) -> int:
-    """Free bytes on the disk of ``folder``; if it does not exist, on the disk of its nearest existing parent."""
+    """Free bytes on the disk of ``folder``, which need not exist yet."""
     folder = folder.resolve()
-    while not folder.exists():
-        folder = folder.parent
-    return shutil.disk_usage(folder).free
+    return shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.exists())).free
 
 
-def _facts(folder: Path) -> dict[str, Any]:
+def _header(folder: Path) -> dict[str, Any]:
     path = folder / "recording.json"
     try:
-        facts = read_json(path)
-        version = checks.whole("format", facts["format"], 1)
+        header = read_json(path)
+        version = checks.whole("format", header["format"], 1)
         for name in ("height", "width"):
-            checks.whole(name, facts[name], 1)
-        checks.positive("rate_hz", facts["rate_hz"])
+            checks.whole(name, header[name], 1)
+        checks.positive("rate_hz", header["rate_hz"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is damaged: {type(error).__name__} {error}") from None
-    if (channels := facts.get("channels", _CHANNELS)) != _CHANNELS:
+    if (channels := header.get("channels", _CHANNELS)) != _CHANNELS:
         raise ValueError(f"{path} states channels {channels!r}; frames of a recording are {_CHANNELS}: convert them")
     if version > _FORMAT:
         raise ValueError(f"{path} is of format {version}; this version reads up to {_FORMAT}: use a newer one")
-    return facts
+    return header
 
 
 def _rows(folder: Path) -> list[tuple[float, int | None, str]]:
-    """Time, checksum and problem of each line. A last line without a line break is incomplete and is ignored."""
+    """Time, checksum and problem of each frame. A last line without a line break is incomplete and is ignored."""
     path = folder / "times.csv"
     text = path.read_bytes().decode("utf-8", "replace")
     reader = csv.reader(text[: text.rfind("\n") + 1].split("\n")[:-1])
@@ -218,9 +201,8 @@ def _rows(folder: Path) -> list[tuple[float, int | None, str]]:
     except csv.Error as error:  # a carriage return within a line, or a cell too long for csv
         raise ValueError(f"{path}:{reader.line_num} is damaged: {error}") from None
     if not lines or tuple(lines[0]) != _COLUMNS:
-        raise ValueError(
-            f"{path} must begin with {','.join(_COLUMNS)}, got {','.join(lines[0]) if lines else 'nothing'}"
-        )
+        got = ",".join(lines[0]) if lines else "nothing"
+        raise ValueError(f"{path} must begin with {','.join(_COLUMNS)}, got {got}")
     rows: list[tuple[float, int | None, str]] = []
     for number, cells in enumerate(lines[1:]):
         try:
@@ -232,9 +214,3 @@ def _rows(folder: Path) -> list[tuple[float, int | None, str]]:
             raise ValueError(f"{path}:{number + 2} is damaged: {','.join(cells)!r}") from None
         rows.append(row)
     return rows
-
-
-def _interleaved(pixels: Tensor) -> np.ndarray:
-    import cv2
-
-    return cv2.merge(list(pixels.cpu().numpy()))

@@ -4,8 +4,9 @@ import math
 import os
 import re
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +30,7 @@ class Frame(NamedTuple):
     problem: str = ""
 
 
+@dataclass(eq=False)
 class Frames:
     """The frames of a source, which can be iterated over once; also a context manager that closes the source.
 
@@ -37,48 +39,40 @@ class Frames:
         shape: Size (H, W) of the frames in pixels.
         total: Number of frames that the source states, or None if it states none, like a camera.
         rate: Frames per second that the source states, or an assumed rate.
-        live: Whether the source is a camera, which does not end.
+        frames: Iterator over the frames.
         notes: Remarks about the source for the user, such as an assumed rate; complete after the last frame.
+        live: Whether the source is a camera, which does not end.
+        close: Function that closes the source; None if ``frames`` does so itself.
     """
 
-    def __init__(
-        self,
-        name: str,
-        shape: tuple[int, int],
-        total: int | None,
-        rate: float,
-        frames: Iterator[Frame],
-        notes: list[str],
-        *,
-        live: bool = False,
-        close: Callable[[], None] | None = None,
-    ):
-        self.name, self.shape, self.total, self.rate, self.notes, self.live = name, shape, total, rate, notes, live
-        self._frames, self._close = frames, close
+    name: str
+    shape: tuple[int, int]
+    total: int | None
+    rate: float
+    frames: Iterator[Frame]
+    notes: list[str]
+    _: KW_ONLY
+    live: bool = False
+    close: Callable[[], None] | None = None
 
     def __iter__(self) -> Iterator[Frame]:
-        return self._frames
+        return self.frames
 
     def __enter__(self) -> "Frames":
         return self
 
     def __exit__(self, *_: object) -> None:
-        close = getattr(self._frames, "close", None)
-        if close is not None:
-            close()
-        if self._close is not None:
-            self._close()  # needed because closing a generator that has not started runs none of its cleanup
+        for close in (getattr(self.frames, "close", None), self.close):
+            if close is not None:
+                close()
 
 
 def open_frames(source: str | Path, rate: float | None = None) -> Frames:
     """Open a video file, a folder of pictures (ordered by the numbers in their names), or a camera (by its number).
 
-    Times are taken from the file or from the camera's driver. If there are none, as for pictures, the frames are spaced
-    by 1 / ``rate`` seconds (30 per second by default), and ``notes`` says so. A frame that cannot be read has a problem
-    instead of pixels.
-
-    Raises:
-        ValueError: No such file, folder or camera, no frame that can be decoded, or a rate that is not positive.
+    Times come from the file or from the camera's driver. Frames without times, such as pictures, are spaced by
+    1 / ``rate`` seconds (30 per second by default), and ``notes`` says so. A frame that cannot be read has a problem
+    instead of pixels. ValueError if there is no such source, no frame can be decoded, or the rate is not positive.
     """
     if rate is not None:
         checks.positive("rate", rate, "frames per second")
@@ -115,58 +109,58 @@ def _video(path: Path, rate: float | None) -> Frames:
     if not (math.isfinite(stated) and stated > 0):
         stated = _ASSUMED_RATE if rate is None else rate
         notes.append(f"{path.name} states no rate; {stated:g} frames per second assumed")
-    fine, first = _taken(capture.read)
-    if not fine:
+    first = _decoded(capture.read)
+    if first is None:
         code = int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
         codec = code.to_bytes(4, "little").decode("ascii", "replace").strip("\0 ") or "unknown"
         capture.release()
-        raise ValueError(
-            f"{path}: no frame could be decoded (codec {codec}); it is empty or damaged, or OpenCV lacks the codec: "
-            "convert it, for example with ffmpeg -i IN -c:v ffv1 OUT.avi"
-        )
+        reason = f"no frame could be decoded (codec {codec}); it is empty or damaged, or OpenCV lacks the codec"
+        raise ValueError(f"{path}: {reason}: convert it, for example with ffmpeg -i IN -c:v ffv1 OUT.avi")
 
     def frames() -> Iterator[Frame]:
-        picture, seconds, count, guessed = first, 0.0, 0, 0
+        pixels, seconds, count, guessed = first, 0.0, 0, 0
         while True:
             now = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
             if count and not now > seconds:  # the stream states no time for this frame
                 now, guessed = seconds + 1 / stated, guessed + 1
             seconds, count = now, count + 1
-            yield Frame(seconds, _rgb(picture)) if picture is not None else Frame(seconds, None, "not decodable")
+            yield _frame(seconds, pixels)
             if not capture.grab():
                 break
-            fine, picture = _taken(capture.retrieve)
-            picture = picture if fine else None
+            pixels = _decoded(capture.retrieve)
         if guessed:
             notes.append(f"{guessed} of {count} frames have no time of their own; counted at {stated:g} per second")
         if count < announced:
             notes.append(f"{path.name} announces {announced} frames and {count} could be read")
 
-    total = announced if announced > 0 else None
-    return Frames(path.name, first.shape[:2], total, stated, frames(), notes, close=capture.release)
+    total, shape = announced if announced > 0 else None, first.shape[:2]
+    return Frames(path.name, shape, total, stated, frames(), notes, close=capture.release)
 
 
-def _taken(take: Callable[[], tuple[bool, Any]]) -> tuple[bool, Any]:
-    """Result of ``take``, or (False, None) if OpenCV raises an error, as for a damaged file."""
+def _decoded(read: Callable[[], tuple[bool, Any]]) -> Any:
+    """Pixels from ``read``, a method of an OpenCV capture; None if that fails, as for a damaged file."""
     import cv2
 
     try:
-        return take()
+        success, pixels = read()
     except cv2.error:
-        return False, None
+        return None
+    return pixels if success else None
+
+
+def _frame(seconds: float, pixels: np.ndarray | None) -> Frame:
+    return Frame(seconds, None, "not decodable") if pixels is None else Frame(seconds, _rgb(pixels))
 
 
 def _folder(folder: Path, rate: float | None) -> Frames:
-    paths = sorted((p for p in folder.iterdir() if p.suffix.lower() in PICTURES), key=lambda p: _natural(p.name))
+    paths = sorted((p for p in folder.iterdir() if p.suffix.lower() in PICTURES), key=_natural)
     if not paths:
         raise ValueError(f"{folder} holds no pictures ({', '.join(PICTURES)})")
-    readable = (pixels for pixels in map(_picture, paths) if pixels is not None)
-    first = next(readable, None)
+    first = next((pixels for pixels in map(_picture, paths) if pixels is not None), None)
     if first is None:
         raise ValueError(f"none of the {len(paths)} pictures in {folder} could be decoded")
-    shape = first.shape[:2]
+    shape, stated = first.shape[:2], rate or _ASSUMED_RATE
     notes = [] if rate else [f"pictures have no times; {_ASSUMED_RATE:g} frames per second assumed"]
-    stated = rate or _ASSUMED_RATE
 
     def frames() -> Iterator[Frame]:
         for index, path in enumerate(paths):
@@ -174,8 +168,8 @@ def _folder(folder: Path, rate: float | None) -> Frames:
             if pixels is None:
                 yield Frame(index / stated, None, f"{path.name} is not a readable picture, or is cut off")
             elif pixels.shape[:2] != shape:
-                found = f"{pixels.shape[1]} x {pixels.shape[0]}"
-                yield Frame(index / stated, None, f"{path.name} is {found} px and the first {shape[1]} x {shape[0]} px")
+                size = f"{pixels.shape[1]} x {pixels.shape[0]}"
+                yield Frame(index / stated, None, f"{path.name} is {size} px and the first {shape[1]} x {shape[0]} px")
             else:
                 yield Frame(index / stated, _rgb(pixels))
 
@@ -189,8 +183,8 @@ def _camera(index: int, rate: float | None) -> Frames:
     capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # deliver the newest frame, not the oldest one in a queue
     if rate is not None:
         capture.set(cv2.CAP_PROP_FPS, rate)
-    fine, first = capture.read() if capture.isOpened() else (False, None)
-    if not fine or first is None:
+    first = _decoded(capture.read) if capture.isOpened() else None
+    if first is None:
         capture.release()
         raise ValueError(f"no frame from camera {index}; is it plugged in, free, and may this user read it?")
     stated = capture.get(cv2.CAP_PROP_FPS)
@@ -202,17 +196,21 @@ def _camera(index: int, rate: float | None) -> Frames:
     def now() -> float:
         return capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3 if driver else time.monotonic()
 
-    began = now()
+    start = now()
 
     def frames() -> Iterator[Frame]:
-        yield Frame(began, _rgb(first))
+        yield _frame(start, first)
         while capture.grab():
-            seconds = now()
-            fine, picture = capture.retrieve()
-            yield Frame(seconds, _rgb(picture)) if fine else Frame(seconds, None, "not decodable")
+            yield _frame(now(), _decoded(capture.retrieve))
         notes.append("the camera stopped giving frames")
 
     return Frames(f"camera {index}", first.shape[:2], None, stated, frames(), notes, live=True, close=capture.release)
+
+
+def check_pixels(pixels: Tensor, shape: Sequence[int], target: str) -> None:
+    """ValueError unless ``pixels`` are uint8 [3, H, W] for the ``shape`` (H, W) of the ``target``, such as "video"."""
+    if pixels.dtype != torch.uint8 or tuple(pixels.shape) != (3, *shape):
+        raise ValueError(f"frames of this {target} are uint8 {[3, *shape]}, got {pixels.dtype} {list(pixels.shape)}")
 
 
 class VideoWriter:
@@ -231,10 +229,7 @@ class VideoWriter:
         """Append one RGB frame, uint8 [3, H, W]; OSError if it cannot be written, as on a full disk."""
         import cv2
 
-        if pixels.dtype != torch.uint8 or tuple(pixels.shape) != (3, *self.shape):
-            raise ValueError(
-                f"frames of this video are uint8 {[3, *self.shape]}, got {pixels.dtype} {list(pixels.shape)}"
-            )
+        check_pixels(pixels, self.shape, "video")
         red, green, blue = pixels.cpu().numpy()
         if self._writer.write(cv2.merge([blue, green, red])) is False:
             raise OSError(0, "OpenCV could not write a frame; is the disk full?", str(self.path))
@@ -262,16 +257,14 @@ def replacing_video(path: Path, shape: tuple[int, int], rate: float) -> Iterator
     checks.positive("rate", rate, "frames per second")
     for side in shape:
         checks.whole("side of a frame", side, 2)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")  # its extension sets the container
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")  # OpenCV needs the extension
     try:
         try:
             writer = VideoWriter(partial, shape, rate)
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(path)) from None
-        try:
+        with closing(writer):
             yield writer
-        finally:
-            writer.close()
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
@@ -295,6 +288,6 @@ def _rgb(pixels: np.ndarray) -> Tensor:
     return torch.from_numpy(planes)
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
+def _natural(path: Path) -> list[tuple[int, str]]:
     """Sort key by which frame2 comes before frame10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]

@@ -1,4 +1,4 @@
-"""Loading of volumes: one call for all formats, which raises an error for geometry that a file does not state."""
+"""Loading of volumes of all formats by one function, which guesses no geometry that a file does not state."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -57,9 +57,9 @@ def load_volume(
 
     Returns:
         Voxels [D, H, W]. If they take over 1 GiB and over half of the free memory, and the file holds them in native
-        byte order without compression, they are memory-mapped: the file is read on access and never written. It must
-        not be truncated while in use, because the system then ends the program.
-        Floating-point values are not checked for NaN, which would read the whole file: see :meth:`Volume.check_finite`.
+        byte order without compression, they are memory-mapped: the file is read on access and never written. Do not
+        truncate such a file while it is in use: the system would end the program. Floating-point values are not checked
+        for NaN, which would read the whole file; :meth:`Volume.check_finite` checks them.
 
     Raises:
         ValueError: No such file, an unknown format, geometry that is unknown or not stated, a file whose size differs
@@ -78,10 +78,8 @@ def load_volume(
         return _as_stated(file, scan, unit)
     steps = (spacing,) * 3 if isinstance(spacing, int | float | np.number) else tuple(spacing)
     if unit is None and any(checks.positive("spacing", step, "metres") > VOXEL.high for step in steps):
-        raise ValueError(
-            f"spacing between voxels must be in metres, got {spacing!r}; 1 mm is 1e-3. For a volume without a size add "
-            "unit='relative'"
-        )
+        hint = "1 mm is 1e-3. For a volume without a size add unit='relative'"
+        raise ValueError(f"spacing between voxels must be in metres, got {spacing!r}; {hint}")
     unit = unit or "m"
     # The origin is meaningful only in the unit of the spacing.
     origin = scan.origin if scan.spacing is not None and scan.unit == unit else (0.0, 0.0, 0.0)
@@ -92,10 +90,8 @@ def _as_stated(file: Path, scan: Scan, unit: str | None) -> Volume:
     if unit is not None:
         raise ValueError(f"unit={unit!r} is that of spacing=, which was not given")
     if scan.spacing is None or not all(np.isfinite(scan.spacing)) or min(scan.spacing) <= 0:
-        raise ValueError(
-            f"{file} does not state the spacing of its voxels: pass spacing=(z, y, x) in metres, such as (1e-3, 5e-4, "
-            "5e-4), or spacing=1, unit='relative' for cubes without a size"
-        )
+        hint = "such as (1e-3, 5e-4, 5e-4), or spacing=1, unit='relative' for cubes without a size"
+        raise ValueError(f"{file} does not state the spacing of its voxels: pass spacing=(z, y, x) in metres, {hint}")
     return Volume(_tensor(scan.values, file), triple(scan.spacing), scan.unit, scan.origin, scan.orientation)
 
 
@@ -109,7 +105,8 @@ def _read(file: Path, member: str | None, shape: Sequence[int] | None, dtype: DT
     if member is not None:
         raise ValueError(f"only {', '.join(_MEMBER_READERS)} hold named arrays, got {file}::{member}")
     if file.is_dir():
-        return _read_folder(file)
+        is_series = any(path.is_file() and medical.is_dicom(path) for path in file.iterdir())
+        return medical.read_dicom(file) if is_series else slices.read_folder(file)
     if name.endswith((".raw", ".raw.gz")):
         return raw_volumes.read_raw(file, shape, dtype)
     if name.endswith(".png"):
@@ -122,16 +119,9 @@ def _read(file: Path, member: str | None, shape: Sequence[int] | None, dtype: DT
     if shape is not None and dtype is not None:
         return raw_volumes.read_raw(file, shape, dtype)
     known = ", ".join((".raw", ".raw.gz", ".png", *_READERS, *_MEMBER_READERS))
-    raise ValueError(
-        f"{file} has no known extension; known are {known}, and folders of DICOM files or numbered pictures. Pass "
-        "shape=(D, H, W) and dtype= if it is raw under another name"
-    )
-
-
-def _read_folder(folder: Path) -> Scan:
-    if any(path.is_file() and medical.is_dicom(path) for path in folder.iterdir()):
-        return medical.read_dicom(folder)
-    return slices.read_folder(folder)
+    known += ", and folders of DICOM files or numbered pictures"
+    hint = "Pass shape=(D, H, W) and dtype= if it is raw under another name"
+    raise ValueError(f"{file} has no known extension; known are {known}. {hint}")
 
 
 def _check_expected(file: Path, values: np.ndarray, shape: Sequence[int] | None, dtype: DTypeLike | None) -> None:
@@ -150,8 +140,7 @@ def _tensor(values: np.ndarray, file: Path) -> torch.Tensor:
         if values.size and int(values.max()) > np.iinfo(np.int64).max:
             raise ValueError(f"{file} holds unsigned 64-bit values above 2^63; divide or convert them first")
         values = values.astype(np.int64)
-    if not values.dtype.isnative:
-        # torch supports only the native byte order, so other arrays are converted here.
+    if not values.dtype.isnative:  # torch supports only the native byte order
         values = values.astype(values.dtype.newbyteorder("="))
     if not values.flags.writeable or any(stride < 0 for stride in values.strides):
         values = values.copy()

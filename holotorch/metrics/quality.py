@@ -6,45 +6,41 @@ from torch import Tensor, nn
 from holotorch.core import checks
 from holotorch.core.precision import at_least_single
 
-SSIM_WINDOW = 11
+SSIM_WINDOW = 11  # pixels along each side of the window of ssim
 
 
 def psnr(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
     """Peak signal-to-noise ratio in dB, [...] for images [..., H, W]; infinite for equal images.
 
-    The peak is ``data_range``, not the maximum of the reference as printed in thesis Eq. 4.37. ValueError for unequal
-    shapes or a range that is not positive. Computed in float32 at least.
+    The peak is ``data_range``; thesis Eq. 4.37 prints the maximum of the reference instead. Computed in float32 at
+    least. Raises TypeError and ValueError as :func:`ssim`, but has no minimum size.
     """
     image, reference = _checked_pair(image, reference, data_range)
-    error = (image - reference).square().mean((-2, -1))
-    return 10 * torch.log10(data_range**2 / error)
+    return 10 * torch.log10(data_range**2 / (image - reference).square().mean((-2, -1)))
 
 
 def ssim(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
     """Structural similarity, mean over the image, [...] for images [..., H, W].
 
-    With the settings of Wang et al. (2004): 11 x 11 Gaussian window of sigma 1.5, K = (0.01, 0.03), border dropped. The
-    three terms are multiplied; thesis Eq. 4.39 prints a sum, for which an image would score 3 against itself.
+    The settings are those of Wang et al. (2004): 11 x 11 Gaussian window with sigma = 1.5 px, K = (0.01, 0.03), only
+    windows inside the image. The terms for luminance, contrast and structure are multiplied; thesis Eq. 4.39 prints a
+    sum, for which an image would score 3 against itself.
 
-    Raises:
-        TypeError: Images that are not real floating-point tensors.
-        ValueError: Unequal shapes, a side below 11 px, or a range that is not positive.
+    TypeError for images that are not real floating-point tensors; ValueError for unequal shapes, a side below 11 px, or
+    a range that is not positive.
     """
-    scores = ssim_map(image, reference, data_range=data_range)
-    return scores.mean((-2, -1))
+    return ssim_map(image, reference, data_range=data_range).mean((-2, -1))
 
 
 def ssim_map(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
-    """:func:`ssim` before its mean, [..., H - 10, W - 10]: the value of each window that lies within the image."""
+    """Structural similarity of each window inside the image, [..., H - 10, W - 10]; :func:`ssim` is their mean."""
     from kornia.metrics import ssim as kornia_ssim
 
     image, reference = _checked_pair(image, reference, data_range)
     height, width = image.shape[-2:]
     if min(height, width) < SSIM_WINDOW:
-        raise ValueError(
-            f"ssim needs images of at least {SSIM_WINDOW} x {SSIM_WINDOW} px, got {height} x {width}; "
-            "psnr has no such limit"
-        )
+        least = f"{SSIM_WINDOW} x {SSIM_WINDOW} px"
+        raise ValueError(f"ssim needs images of at least {least}, got {height} x {width}; psnr has no such limit")
     if not image.numel():  # an empty batch has empty scores
         return image[..., SSIM_WINDOW - 1 :, SSIM_WINDOW - 1 :]
     images, references = (tensor.reshape(-1, 1, height, width) for tensor in (image, reference))
@@ -53,13 +49,10 @@ def ssim_map(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
 
 
 class PerceptualSimilarity(nn.Module):
-    """s = exp(-d) of the learned distance d (LPIPS) of two images, 1 for equal ones, as in the thesis's Fig. 4.17.
+    """Similarity exp(-d) for the learned distance d (LPIPS) of two images, as in thesis Fig. 4.17; 1 for equal images.
 
-    Needs the extra ``lpips`` and AlexNet's published weights, which its first use downloads to torch's cache.
-
-    Raises:
-        ImportError: The extra is missing.
-        OSError: The weights are not in the cache and cannot be downloaded.
+    Needs the extra ``lpips`` (otherwise ImportError) and AlexNet's published weights, which the first use downloads to
+    torch's cache (OSError if that fails).
 
     Source: Zhang et al. (2018).
     """
@@ -69,24 +62,20 @@ class PerceptualSimilarity(nn.Module):
         try:
             from lpips import LPIPS  # pyright: ignore[reportMissingImports]
         except ImportError as error:
-            raise ImportError(
-                "LPIPS is an extra of holotorch; install it with: pip install 'holotorch[lpips]'"
-            ) from error
+            install = "pip install 'holotorch[lpips]'"
+            raise ImportError(f"LPIPS is an extra of holotorch; install it with: {install}") from error
         self.distance = LPIPS(net="alex", verbose=False).requires_grad_(False)
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """Similarity [...] of images [..., C, H, W] with values in 0..1; C is 3, or 1, which is repeated as grey.
+        """Similarity [...] of images [..., C, H, W] with values in 0..1.
 
-        Raises:
-            ValueError: Unequal shapes or another C.
+        C is 3 (red, green, blue) or 1 (grey); ValueError for another C and for unequal shapes.
         """
         _checked_pair(image, reference, 1.0)
         if image.ndim < 3 or image.shape[-3] not in (1, 3):
             raise ValueError(f"images must be grey or red, green, blue, [..., 1 or 3, H, W], got {tuple(image.shape)}")
-        pair = (
-            part.expand(*part.shape[:-3], 3, -1, -1).reshape(-1, 3, *part.shape[-2:]) for part in (image, reference)
-        )
-        distances = self.distance(*(2 * part.float() - 1 for part in pair))
+        batches = (x.expand(*x.shape[:-3], 3, -1, -1).reshape(-1, 3, *x.shape[-2:]) for x in (image, reference))
+        distances = self.distance(*(2 * batch.float() - 1 for batch in batches))
         return torch.exp(-distances).reshape(image.shape[:-3]).to(image.dtype)
 
 

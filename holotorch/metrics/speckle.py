@@ -1,4 +1,4 @@
-"""Speckle of a single picture: contrast, power spectrum, grain size, anisotropy and sharpness; float32 at least."""
+"""Speckle of a single picture: contrast, power spectrum, grain size, anisotropy, sharpness, all in float32 at least."""
 
 import math
 from collections.abc import Sequence
@@ -11,12 +11,12 @@ from holotorch.core import checks
 from holotorch.core.fourier import fft2
 from holotorch.core.precision import at_least_single
 
-_BAND = (0.05, 0.25)  # cycles per sample; the middle of the band of a sampled picture
-_FINE = 16  # lags per sample at which a correlation is evaluated
+_BAND = (0.05, 0.25)  # cycles per sample, without the coarsest and finest detail of a picture
+_LAGS = 16  # lags per sample at which a correlation is evaluated
 
 
 class Anisotropy(NamedTuple):
-    """``ratio`` of length to width of the grains, at least 1, and ``angle`` of the length, x to y, in (-pi/2, pi/2]."""
+    """Length / width ``ratio`` of the grains, at least 1; ``angle`` of the length, from x towards y, (-pi/2, pi/2]."""
 
     ratio: Tensor
     angle: Tensor
@@ -29,10 +29,10 @@ def speckle_contrast(intensity: Tensor, *, reference: Tensor | None = None, mask
         intensity: Real, not negative.
         reference: Speckle-free picture [..., H, W] for scenes that are not uniform. The contrast is then
             rms(intensity - reference) / rms(reference); a uniform reference of the same mean gives the same number.
-        mask: Region of pixels, bool [..., H, W]; all by default.
+        mask: Pixels to measure, bool [..., H, W]; all by default.
 
     Returns:
-        Contrast, 0 for a black region. Differentiable; the gradient is 0 where there is no speckle.
+        Contrast; 0 for a black region. Differentiable; the gradient is 0 where there is no speckle.
 
     Raises:
         TypeError: An intensity that is not real floating-point, or a mask that is not bool.
@@ -46,27 +46,25 @@ def speckle_contrast(intensity: Tensor, *, reference: Tensor | None = None, mask
     elif mask.dtype != torch.bool:
         raise TypeError(f"mask must be bool, got {mask.dtype}")
     for name, part in (("mask", mask), ("reference", reference)):
-        if part is not None and not _fits(part.shape, intensity.shape):
+        if part is not None and not _expandable(part.shape, intensity.shape):
             raise ValueError(f"{name} must match intensity {tuple(intensity.shape)}, got {tuple(part.shape)}")
     weight = mask.to(intensity.dtype).expand(intensity.shape)
     count = weight.sum((-2, -1), keepdim=True)
     if not torch.compiler.is_compiling() and (count == 0).any():
         raise ValueError("mask leaves no pixel to measure")
-    if reference is not None:
-        reference = at_least_single(reference)
-    else:
-        reference = (intensity * weight).sum((-2, -1), keepdim=True) / count
-    square = ((intensity - reference).square() * weight).sum((-2, -1)) / count[..., 0, 0]
-    scale = (reference.square() * weight).sum((-2, -1)) / count[..., 0, 0]
-    black = scale == 0
-    return _root(torch.where(black, 0.0, square / torch.where(black, 1.0, scale)))
+
+    def mean(values: Tensor) -> Tensor:
+        return (values * weight).sum((-2, -1), keepdim=True) / count
+
+    reference = mean(intensity) if reference is None else at_least_single(reference)
+    return root_ratio(mean((intensity - reference).square()), mean(reference.square()))[..., 0, 0]
 
 
 def power_spectrum(intensity: Tensor) -> Tensor:
     """Contribution of each frequency to the squared contrast, [..., H, W] in FFT order; 0 at frequency 0.
 
-    |DFT(I - mean)|^2 / (H W mean)^2, which adds up to ``speckle_contrast(I)**2``. The picture is treated as periodic: a
-    step between opposite borders appears as a cross. The spectrum of a black picture is 0.
+    |DFT(I - mean)|^2 / (H W mean)^2, which adds up to ``speckle_contrast(I)**2``. The DFT treats the picture as
+    periodic, so a step between opposite borders appears as a cross. The spectrum of a black picture is 0.
 
     Source: Goodman, Speckle Phenomena in Optics, Sec. 4.3; Parseval's theorem.
     """
@@ -80,16 +78,14 @@ def power_spectrum(intensity: Tensor) -> Tensor:
 def grain_size(intensity: Tensor, *, level: float = 0.5) -> Tensor:
     """Full width (y, x) of the speckle's autocorrelation at ``level``, in samples: [..., 2] for [..., H, W].
 
-    The autocorrelation of I - mean is taken along each axis, without wrap-around; each lag is divided by the number of
-    its pairs. It is interpolated between the lags as a band-limited function, so that grains of two samples can be
-    measured. The width is infinite where the correlation does not fall to ``level`` within half the picture. Divide
-    pictures of scenes that are not uniform by their speckle-free mean first.
+    The autocorrelation of I - mean along each axis, without wrap-around, is divided by the number of pairs of pixels
+    at each lag and by its value at lag 0. Band-limited interpolation between whole lags makes grains of two samples
+    measurable. The width is infinite where the autocorrelation does not fall to ``level`` within half the picture.
+    Divide pictures of scenes that are not uniform by their speckle-free mean first.
 
-    At half height a square pupil of side D at distance z gives 0.8859 wavelength z / D, a round one of that diameter
-    1.0290 wavelength z / D; ``level=1/e`` gives the other usual width.
-
-    Raises:
-        ValueError: A level outside 0 to 1, or a picture without speckle.
+    At half height a square pupil of side D at distance z gives 0.8859 wavelength z / D, a round pupil of diameter D
+    1.0290 wavelength z / D; ``level=1/e`` gives the other usual width. ValueError for a level outside 0 to 1, and for a
+    picture without speckle.
 
     Source: Goodman, Speckle Phenomena in Optics, Sec. 4.4.
     """
@@ -105,12 +101,11 @@ def grain_size(intensity: Tensor, *, level: float = 0.5) -> Tensor:
 
 
 def anisotropy(intensity: Tensor) -> Anisotropy:
-    """Elongation of the grains in any direction, from second moments of the power spectrum under a Hann window.
+    """Elongation of the grains in any direction, from second moments of the power spectrum of a Hann-windowed picture.
 
-    Returns:
-        ``ratio`` and ``angle``, each [...] for [..., H, W]. For an elliptical pupil the ratio is that of its diameters,
-        and the grains are long in the direction of the shorter one. A ratio of 1 has no direction. White noise is
-        isotropic and strong at high frequencies, so it biases the ratio towards 1.
+    ``ratio`` and ``angle`` are [...] for intensities [..., H, W]. For an elliptical pupil the ratio is that of the
+    diameters, and the grains are long in the direction of the shorter diameter. At a ratio of 1 the angle has no
+    meaning. White noise biases the ratio towards 1, since its spectrum is isotropic and extends to high frequencies.
     """
     intensity = _picture("intensity", intensity)
     windows = [torch.hann_window(n, dtype=intensity.dtype, device=intensity.device) for n in intensity.shape[-2:]]
@@ -120,7 +115,7 @@ def anisotropy(intensity: Tensor) -> Anisotropy:
     fy, fx = _frequencies(intensity)
     yy, xx, xy = ((power * part).sum((-2, -1)) for part in (fy.square(), fx.square(), fx * fy))
     half, split = (xx + yy) / 2, torch.hypot((xx - yy) / 2, xy)
-    # A grain is long at right angles to the direction in which its spectrum is widest.
+    # A grain is long at right angles to the direction in which the spectrum is widest.
     angle = torch.atan2(2 * xy, xx - yy) / 2 + math.pi / 2
     angle = torch.where(angle > math.pi / 2, angle - math.pi, angle)
     least = (half - split).clamp_min(torch.finfo(intensity.dtype).tiny)
@@ -128,14 +123,12 @@ def anisotropy(intensity: Tensor) -> Anisotropy:
 
 
 def sharpness(intensity: Tensor, reference: Tensor, *, band: tuple[float, float] = _BAND) -> Tensor:
-    """How much of a sharp ``reference``'s detail a picture transfers: 1 for all of it, [...] for [..., H, W].
+    """Fraction of a sharp ``reference``'s detail that a picture keeps, [...] for [..., H, W]; 1 for all of the detail.
 
-    Re sum I^ conj(R^) / sum |R^|^2 over radial frequencies in ``band``, cycles per sample: the regression of the
-    picture on the reference, to which speckle adds no bias, as it does to the picture's own power. A reference that is
-    itself a mean of S seeds has noise, by which the result is too small.
-
-    Raises:
-        ValueError: Unequal shapes, a band that is not 0 <= low < high, or a reference without detail in it.
+    Regression coefficient of the picture on the reference, Re sum F(I) conj(F(R)) / sum |F(R)|^2, with the DFT F and
+    sums over radial frequencies in ``band``, in cycles per sample. Speckle does not bias it, but would bias a ratio of
+    powers. Noise of the reference, such as the residual speckle of a mean over a few seeds, makes it too small.
+    ValueError for unequal shapes, a band that is not 0 <= low < high, or a reference without detail in that band.
     """
     intensity = _picture("intensity", intensity)
     reference = _picture("reference", reference)
@@ -153,27 +146,25 @@ def sharpness(intensity: Tensor, reference: Tensor, *, band: tuple[float, float]
     return (observed * true.conj()).real.sum((-2, -1)) / power
 
 
-def _fits(shape: Sequence[int], whole: Sequence[int]) -> bool:
+def _expandable(shape: Sequence[int], whole: Sequence[int]) -> bool:
     pairs = zip(reversed(shape), reversed(whole), strict=False)
     return len(shape) <= len(whole) and all(size in (1, full) for size, full in pairs)
 
 
 def _width(power: Tensor, level: float) -> Tensor:
-    """Full width at ``level`` of the correlation whose spectrum over twice the window is ``power`` [..., 2n]."""
-    double = power.shape[-1]
-    window = double // 2
-    lag = torch.arange(1, _FINE * window // 2 + 1, dtype=power.dtype, device=power.device) / _FINE
-    frequency = torch.fft.fftfreq(double, dtype=power.dtype, device=power.device)
-    # The number of pairs at a lag is proportional to the overlap.
-    correlation = power @ torch.cos(2 * math.pi * frequency[:, None] * lag) / (1 - lag / window)
+    """Full width at ``level`` of the autocorrelation of n samples with the zero-padded power spectrum [..., 2n]."""
+    size = power.shape[-1] // 2
+    lag = torch.arange(1, _LAGS * size // 2 + 1, dtype=power.dtype, device=power.device) / _LAGS
+    frequency = torch.fft.fftfreq(2 * size, dtype=power.dtype, device=power.device)
+    # 1 - lag / size is the share of the samples that overlap at a lag.
+    correlation = power @ torch.cos(2 * math.pi * frequency[:, None] * lag) / (1 - lag / size)
     correlation = correlation / power.sum(-1, keepdim=True)
     below = correlation <= level
     first = below.int().argmax(-1, keepdim=True)
-    here = correlation.gather(-1, first)
+    after = correlation.gather(-1, first)
     before = torch.where(first > 0, correlation.gather(-1, (first - 1).clamp_min(0)), 1.0)
-    part = (before - level) / (before - here).clamp_min(torch.finfo(power.dtype).tiny)
-    width = 2 * (first + part)[..., 0] / _FINE
-    return torch.where(below.any(-1), width, math.inf)
+    fraction = (before - level) / (before - after).clamp_min(torch.finfo(power.dtype).tiny)
+    return torch.where(below.any(-1), 2 * (first + fraction)[..., 0] / _LAGS, math.inf)
 
 
 def _frequencies(image: Tensor) -> tuple[Tensor, Tensor]:
@@ -181,14 +172,14 @@ def _frequencies(image: Tensor) -> tuple[Tensor, Tensor]:
     return fy[:, None], fx[None, :]
 
 
-def _root(square: Tensor) -> Tensor:
-    """Square root with gradient 0 at 0."""
-    positive = square > 0
-    return torch.where(positive, torch.sqrt(torch.where(positive, square, 1.0)), 0.0)
+def root_ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
+    """sqrt(numerator / denominator); 0, with gradient 0, where one of them is not positive."""
+    defined = (numerator > 0) & (denominator > 0)
+    ratio = torch.where(defined, numerator, 1.0) / torch.where(defined, denominator, 1.0)
+    return torch.where(defined, torch.sqrt(ratio), 0.0)
 
 
 def _picture(name: str, image: Tensor) -> Tensor:
-    """The picture in float32 at least."""
     checks.real(name, image)
     if image.ndim < 2:
         raise ValueError(f"{name} must be [..., H, W], got {tuple(image.shape)}")

@@ -2,11 +2,9 @@
 
 from typing import Any
 
-_LONGEST = 200  # characters of a value that a message repeats
-
 
 class ConfigError(ValueError):
-    """Mistakes in the input, one line each; those in a file read ``file:line:column: key: what is wrong``."""
+    """Mistakes in the input, one line each; a mistake in a file reads ``file:line:column: key: what is wrong``."""
 
     def __init__(self, mistakes: list[str]):
         super().__init__("\n".join(mistakes))
@@ -14,6 +12,6 @@ class ConfigError(ValueError):
 
 
 def short(value: Any) -> str:
-    """A value as a message repeats it, cut off after 200 characters."""
+    """``repr`` of a value for a message, cut off after 200 characters."""
     text = repr(value)
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}... ({len(text)} characters)"
+    return text if len(text) <= 200 else f"{text[:200]}... ({len(text)} characters)"

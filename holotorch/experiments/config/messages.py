@@ -12,6 +12,7 @@ from holotorch.experiments.config.source import MOST_MISTAKES, Key, Source
 
 Model = TypeVar("Model", bound=BaseModel)
 
+# What a field expects, by the beginning of the type of the error that pydantic reports.
 _EXPECTED = {
     "int_": "a whole number",
     "float_": "a number",
@@ -24,11 +25,7 @@ _EXPECTED = {
 
 
 def validated(source: Source, model: type[Model]) -> Model:
-    """Validate the data of a file and return its settings.
-
-    Raises:
-        ConfigError: All mistakes, one line each, in the order of the file.
-    """
+    """Settings from the data of a file. ConfigError with all mistakes, one line each, in the order of the file."""
     try:
         return model.model_validate(source.data)
     except ValidationError as error:
@@ -41,9 +38,9 @@ def validated(source: Source, model: type[Model]) -> Model:
 
 
 def _follows(entry: Any, others: list[Any]) -> bool:
-    """Whether an error "too short" only follows from other errors, since pydantic does not count invalid entries."""
+    """Whether an error "too short" is due to invalid entries, which pydantic does not count and reports separately."""
     location = entry["loc"]
-    inside = (len(other["loc"]) > len(location) and other["loc"][: len(location)] == location for other in others)
+    inside = (other["loc"][: len(location)] == location != other["loc"] for other in others)
     return entry["type"] == "too_short" and any(inside)
 
 
@@ -71,33 +68,30 @@ def describe(source: Source, model: type[BaseModel], entry: Any) -> str:
     wanted = next((text for start, text in _EXPECTED.items() if kind.startswith(start)), None)
     wanted = wanted or entry["msg"].replace("Input should be ", "").removeprefix("expected ")
     near = difflib.get_close_matches(str(given)[:100].lower(), re.findall(r"'([^']+)'", wanted), 1)
-    # Only numbers get the hint that a unit is missing; texts have a unit already.
+    # A text has a unit already, so only numbers get the hint that a unit is missing.
     hint = entry["ctx"]["hint"] if kind == "quantity" and not isinstance(given, str) else ""
     shown = "nothing" if given is None else "NaN" if isinstance(given, float) and math.isnan(given) else short(given)
     return source.mistake(key, f"expected {wanted}, got {shown}" + (f"; did you mean {near[0]!r}?" if near else hint))
 
 
 def _unknown(model: type[BaseModel], location: tuple[str | int, ...], name: str) -> str:
-    others = [
-        tag for option in _options_at(model, location[:-2]) if name in option.model_fields for tag in _tags(option)
-    ]
-    if others and len(location) > 2:
-        section, kind = location[-3], location[-2]
-        whole = f"to change the kind give the whole section, as in '{section}={{kind: {kind}}}'"
-        return f"a setting of kind {' and '.join(others)}, not of {kind}; {whole}"
-    return "unknown setting" + nearest(
-        name, [name for option in _options_at(model, location[:-1]) for name in option.model_fields]
-    )
+    sections = _options_at(model, location[:-2])
+    kinds = [tag for section in sections if name in section.model_fields for tag in _tags(section)]
+    if kinds and len(location) > 2:
+        whole = f"to change the kind give the whole section, as in '{location[-3]}={{kind: {location[-2]}}}'"
+        return f"a setting of kind {' and '.join(kinds)}, not of {location[-2]}; {whole}"
+    known = [key for section in _options_at(model, location[:-1]) for key in section.model_fields]
+    return "unknown setting" + nearest(name, known)
 
 
 def position(mistake: str) -> tuple[int, int]:
-    """Line and column of a mistake, to sort by; mistakes of arguments come after those of the file."""
+    """Sort key of a mistake: its line and column; mistakes in arguments come after those in the file."""
     match = re.search(r":(\d+):(\d+): ", mistake)
     return (int(match[1]), int(match[2])) if match else (2**31, 0)
 
 
 def _written_key(source: Source, location: tuple[str | int, ...]) -> Key:
-    """The location without the union tags that pydantic inserts between a section and its settings."""
+    """The key in the file for a location in a pydantic error, which also contains the tags of unions."""
     key: list[str | int] = []
     value: Any = source.data
     for i, part in enumerate(location):
@@ -105,7 +99,7 @@ def _written_key(source: Source, location: tuple[str | int, ...]) -> Key:
         if tagged and part not in value:
             continue
         if isinstance(part, int) and not isinstance(value, list):
-            break  # a single value instead of a list
+            break  # a single value where a list is allowed
         key.append(part)
         try:
             value = value[part]  # type: ignore[index]
@@ -115,16 +109,16 @@ def _written_key(source: Source, location: tuple[str | int, ...]) -> Key:
 
 
 def _options_at(model: type[BaseModel], location: tuple[str | int, ...]) -> list[type[BaseModel]]:
-    """The sections that are possible at ``location``: several if ``kind`` selects one and is not in the location."""
+    """The models that the section at ``location`` may have: several for a union whose tag is not in the location."""
     options: list[type[BaseModel]] = [model]
     for part in location:
         fields = [option.model_fields[str(part)] for option in options if str(part) in option.model_fields]
-        if not fields:  # a union tag
+        if fields:
+            annotation = fields[0].annotation
+            types = getattr(annotation, "__args__", (annotation,))
+            options = [each for each in types if isinstance(each, type) and issubclass(each, BaseModel)]
+        else:  # the tag of a union
             options = [option for option in options if part in _tags(option)]
-            continue
-        annotation = fields[0].annotation
-        parts = getattr(annotation, "__args__", (annotation,))
-        options = [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
     return options
 
 
@@ -133,6 +127,6 @@ def _tags(option: type[BaseModel]) -> tuple[str, ...]:
 
 
 def nearest(word: str, options: list[str]) -> str:
-    """A hint: the option most similar to ``word`` (ignoring case), or all options."""
+    """A hint that names the option most similar to ``word``, ignoring case, or else all options."""
     near = difflib.get_close_matches(word, options, 1) or difflib.get_close_matches(word.lower(), options, 1)
     return f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(options)}" if options else ""

@@ -14,8 +14,7 @@ from holotorch.core.quantities import PITCH, PLANE, WAVELENGTH, Quantity
 from holotorch.experiments.config.errors import short
 
 _POWERS = {"m": 0, "cm": -2, "mm": -3, "um": -6, "µm": -6, "μm": -6, "nm": -9}  # powers of ten, in metres
-_UNITS = ("nm", "um", "mm", "cm")  # units that are suggested for a number without a unit
-# No two parts of the pattern match the same characters, so that a text without a match takes linear time.
+# No two neighbouring parts of the pattern match the same characters, so a text without a match takes linear time.
 _LENGTH = re.compile(r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-zµμ]*)")
 
 
@@ -24,25 +23,24 @@ def metres(value: Any) -> Any:
     if isinstance(value, str):
         match = _LENGTH.fullmatch(value.strip())
         if not match or (match[2] and match[2] not in _POWERS):
-            raise PydanticCustomError(
-                "length", "expected a length such as 530 nm, 3.74 um, 100 mm or a number of metres"
-            )
+            wanted = "expected a length such as 530 nm, 3.74 um, 100 mm or a number of metres"
+            raise PydanticCustomError("length", wanted)
         try:
-            return float(Decimal(match[1]).scaleb(_POWERS[match[2] or "m"]))  # rounded only once: 0.57 um is 5.7e-07
+            return float(Decimal(match[1]).scaleb(_POWERS[match[2] or "m"]))  # decimal, so that 0.57 um is 5.7e-07
         except ArithmeticError:  # the exponent is too large
             raise PydanticCustomError("length", "expected a length that a number can hold, such as 100 mm") from None
     return number(value)
 
 
 def number(value: Any) -> Any:
-    """Any value except true and false, which Python takes as numbers."""
+    """The value itself; an error for true and false, which Python takes as numbers."""
     if isinstance(value, bool):
         raise PydanticCustomError("number", "expected a number")
     return value
 
 
 def within(least: float, most: float, words: str) -> AfterValidator:
-    """A validator of a range; ``words`` describe the range in the message."""
+    """A validator of the range from ``least`` to ``most``, which ``words`` describe in the message."""
 
     def check(value: float) -> float:
         if not least <= value <= most:
@@ -53,7 +51,7 @@ def within(least: float, most: float, words: str) -> AfterValidator:
 
 
 def plausible(kind: Quantity) -> AfterValidator:
-    """A validator of the range of a quantity, see :mod:`holotorch.core.quantities`."""
+    """A validator of the range of a quantity; see :mod:`holotorch.core.quantities`."""
 
     def check(value: float) -> float:
         if kind.problem(value):
@@ -66,30 +64,25 @@ def plausible(kind: Quantity) -> AfterValidator:
 
 
 def _missing_unit(kind: Quantity, value: float) -> str:
-    """A hint for a number of metres outside of the range: the unit that makes it a usual length."""
-    for unit in _UNITS:
+    """A hint for a number of metres outside the range: a unit with which the same number is a usual length."""
+    for unit in ("nm", "um", "mm", "cm"):
         if math.isfinite(value) and kind.usual[0] <= abs(metres(f"{value!r} {unit}")) <= kind.usual[1]:
             return f"; {value:g} means metres: did you mean '{value:g} {unit}'?"
     return kind.cure(value)
 
 
 def pair(value: Any) -> Any:
-    """A single value as a pair for both axes."""
+    """A single value becomes a pair for both axes."""
     return value if isinstance(value, list | tuple) else (value, value)
 
 
 def several(value: Any) -> Any:
-    """A single value as a sequence of one."""
+    """A single value becomes a sequence of one value."""
     return value if isinstance(value, list | tuple) else (value,)
 
 
 def existing(there: Callable[[str], object], missing: Callable[[str], str]) -> BeforeValidator:
-    """A validator of paths that exist.
-
-    Args:
-        there: Function whose result is true if a path exists.
-        missing: The message for a path that does not exist or cannot exist, such as a name that is too long.
-    """
+    """A validator of paths: ``there(path)`` tells whether a path exists; if not, ``missing(path)`` is the message."""
 
     def check(value: Any) -> Any:
         reason = ""
@@ -113,7 +106,7 @@ Number = Annotated[float, BeforeValidator(number), Field(allow_inf_nan=False)]
 Count = Annotated[int, BeforeValidator(number), Field(ge=1)]
 Length = Annotated[float, BeforeValidator(metres), Field(allow_inf_nan=False)]
 Wavelength = Annotated[Length, plausible(WAVELENGTH)]
-Distance = Annotated[Length, plausible(PLANE)]  # distance of an image or a plane on either side of the hologram
+Distance = Annotated[Length, plausible(PLANE)]  # from the hologram to an image or a plane, on either side
 Pitch = Annotated[Length, plausible(PITCH)]
 ExistingPath = Annotated[str, existing(lambda value: Path(value).exists(), _no_path)]
 ExistingArray = Annotated[str, existing(lambda value: Path(value.split("::")[0]).exists(), _no_path)]

@@ -9,28 +9,22 @@ import yaml
 from holotorch.experiments.config.errors import ConfigError, short
 
 Key = tuple[str | int, ...]
-_LARGEST = 1 << 17  # largest file in bytes; it takes up to 4 s to parse
-_MOST = 100_000  # largest number of values; a file within the size limit can only have more through YAML aliases
-_DEEPEST = 50  # largest depth of nested keys; configurations have fewer than ten levels
-MOST_MISTAKES = 50  # largest number of mistakes that are listed
+_MAX_BYTES = 1 << 17  # limit for a file; parsing that many bytes takes up to 4 s
+_MAX_VALUES = 100_000  # a file of _MAX_BYTES can have more values only through YAML aliases
+_MAX_DEPTH = 50  # levels of nested keys; configurations have fewer than ten
+MOST_MISTAKES = 50  # limit for the number of mistakes that are listed
 
 
 @dataclass
 class Source:
-    """Data of a configuration, and the position of each of its keys.
-
-    Attributes:
-        path: The file.
-        data: Plain values.
-        positions: ``file:line:column`` of each key, or the argument that sets it.
-    """
+    """Plain ``data`` of a file, and ``positions`` by key: ``file:line:column``, or the argument that sets the key."""
 
     path: Path
     data: dict[str, Any]
     positions: dict[Key, str] = field(default_factory=dict)
 
     def mistake(self, key: Key, message: str) -> str:
-        """A line with the position of ``key``, or of its nearest parent in the file, and the message."""
+        """A line with the position of ``key``, or else of its nearest parent, and the message."""
         parent = key
         while parent and parent not in self.positions:
             parent = parent[:-1]
@@ -39,38 +33,30 @@ class Source:
 
 
 def read_source(path: Path, overrides: list[str], wanted: str = "settings such as 'experiment: pec'") -> Source:
-    """Read a YAML file and apply overrides to it.
+    """Read a YAML file and apply overrides ``key.sub=value`` to it. ConfigError with all mistakes that prevent reading.
 
-    Args:
-        path: The file.
-        overrides: Arguments ``key.sub=value``.
-        wanted: What such a file contains, for messages.
-
-    Raises:
-        ConfigError: All mistakes that prevent reading.
+    ``wanted`` describes in messages what such a file contains.
     """
     try:
         with open(path, "rb") as stream:
-            data = stream.read(_LARGEST + 1)
+            data = stream.read(_MAX_BYTES + 1)
         text = data.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a UTF-8 text file"
         raise ConfigError([f"{path}: cannot read the configuration: {reason}"]) from None
-    if len(data) > _LARGEST:
-        raise ConfigError(
-            [f"{path}: more than {_LARGEST} bytes; expected {wanted}, with long tables in files of their own"]
-        )
+    if len(data) > _MAX_BYTES:
+        size = f"more than {_MAX_BYTES} bytes"
+        raise ConfigError([f"{path}: {size}; expected {wanted}, with long tables in files of their own"])
     source = Source(path, {})
     mistakes: list[str] = []
     data = _parse(text, str(path), source.positions, (), mistakes)
-    if data is None and not mistakes:
-        mistakes.append(f"{path}:1:1: the file is empty; expected {wanted}")
-    elif not isinstance(data, dict) and not mistakes:
-        mistakes.append(f"{path}:1:1: expected {wanted}, got {short(data)}")
-    if not mistakes and isinstance(data, dict):
+    if isinstance(data, dict) and not mistakes:
         source.data = data
         for word in overrides:
             _override(source, word, mistakes)
+    elif not mistakes:
+        problem = f"the file is empty; expected {wanted}" if data is None else f"expected {wanted}, got {short(data)}"
+        mistakes.append(f"{path}:1:1: {problem}")
     if mistakes:
         more = [f"{path}: and {len(mistakes) - MOST_MISTAKES} more mistakes"] if len(mistakes) > MOST_MISTAKES else []
         raise ConfigError([*mistakes[:MOST_MISTAKES], *more])
@@ -85,11 +71,10 @@ def _override(source: Source, word: str, mistakes: list[str]) -> None:
         return
     parent = source.data
     for part in key[:-1]:
-        child = parent.setdefault(part, {})
-        if not isinstance(child, dict):
+        parent = parent.setdefault(part, {})
+        if not isinstance(parent, dict):
             mistakes.append(f"argument {word!r}: {part!r} is a single value and has no settings inside")
             return
-        parent = child
     position = f"argument {word!r}"
     for replaced in [other for other in source.positions if other[: len(key)] == key]:
         del source.positions[replaced]
@@ -110,25 +95,24 @@ def _parse(text: str, name: str, positions: dict[Key, str], key: Key, mistakes: 
         mistakes.append(f"{position}: not valid YAML: {error.problem or error.context}")
     except yaml.YAMLError as error:
         mistakes.append(f"{name}: not valid YAML: {' '.join(str(error).split())}")
-    except _Expanded as error:
-        mistakes.append(
-            f"{error}: its aliases (*name) stand for more than {_MOST} values in all; write out what is needed"
-        )
+    except _TooManyValues as error:
+        many = f"more than {_MAX_VALUES} values in all"
+        mistakes.append(f"{error}: its aliases (*name) stand for {many}; write out what is needed")
     except RecursionError:
         mistakes.append(f"{name}: not a configuration: nested without end")
     return None
 
 
-class _Expanded(Exception):
-    """Aliases expand to too many values; the message is the position of the first value too many."""
+class _TooManyValues(Exception):
+    """Aliases stand for too many values; the message is the position at which the limit is exceeded."""
 
 
 def _construct(loader, node: yaml.Node, name: str, positions: dict[Key, str], key: Key, mistakes: list[str]) -> Any:
-    if len(key) > _DEEPEST:
+    if len(key) > _MAX_DEPTH:
         raise RecursionError
     positions.setdefault(key, f"{name}:{node.start_mark.line + 1}:{node.start_mark.column + 1}")
-    if len(positions) > _MOST:  # every value has a position
-        raise _Expanded(positions[key])
+    if len(positions) > _MAX_VALUES:  # every value has a position
+        raise _TooManyValues(positions[key])
     if isinstance(node, yaml.MappingNode):
         result: dict[str, Any] = {}
         for key_node, value_node in node.value:
@@ -144,6 +128,6 @@ def _construct(loader, node: yaml.Node, name: str, positions: dict[Key, str], ke
     try:
         return loader.construct_object(node)
     except (ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as error:
-        # For example an impossible date, a number that is too large, or a tag that does not fit.
+        # Examples are an impossible date, a number that is too large, and a tag that does not fit its value.
         mistakes.append(f"{positions[key]}: {'.'.join(map(str, key))}: not a value: {error}")
         return None

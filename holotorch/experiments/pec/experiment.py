@@ -30,6 +30,7 @@ from holotorch.correction.run import Callback, State
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.pec.config import PECSettings
 from holotorch.experiments.pec.weight import weight_map
+from holotorch.experiments.runs.environment import find_device
 from holotorch.io.images import fit_image, frame_image, load_image, with_channels
 from holotorch.modulator import PhasedArray, ThermalCrosstalk, quantised
 from holotorch.optics import AngularSpectrum, CroppedKernel, DepthStack, Fraunhofer, Fresnel
@@ -262,10 +263,4 @@ def build(settings: PECSettings) -> PECExperiment:
     # 4 to 25 % of the light and an SSIM of 0.5 to 0.75. From a flat start it has half of the light and an SSIM of 0.9.
     isolated = getattr(settings.propagator, "boundary", None) == "isolated"
     start = settings.solver.start or ("flat" if isolated else "hot")
-    return PECExperiment(settings, source, lit, array, start, _device(settings.device))
-
-
-def _device(name: str) -> torch.device:
-    if name == "cuda" and not torch.cuda.is_available():
-        raise ConfigError(["device: cuda was asked for, but torch finds no CUDA device; use device: auto or cpu"])
-    return torch.device("cuda" if name == "cuda" or (name == "auto" and torch.cuda.is_available()) else "cpu")
+    return PECExperiment(settings, source, lit, array, start, find_device(settings.device))

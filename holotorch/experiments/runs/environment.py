@@ -1,4 +1,6 @@
-"""Versions, device, seed and git state, which are needed to repeat a run."""
+"""The device of a run, and what is needed to repeat the run. torch is loaded only by functions that need it."""
+
+from __future__ import annotations
 
 import datetime
 import platform
@@ -6,23 +8,27 @@ import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
-from typing import Any
-
-import torch
+from typing import TYPE_CHECKING, Any
 
 import holotorch
+from holotorch.experiments.config.errors import ConfigError
+
+if TYPE_CHECKING:
+    import torch
 
 _PACKAGES = ("torch", "numpy", "kornia", "scikit-image", "opencv-contrib-python-headless")
 
 
 def environment(seed: int, device: torch.device) -> dict[str, Any]:
     """Contents of env.json, as plain JSON values."""
+    import torch
+
     cpu = f"CPU, {torch.get_num_threads()} threads"
     return {
         "holotorch": holotorch.__version__,
         "git": _git_state(Path(holotorch.__file__).parents[1]),
         "python": platform.python_version(),
-        "packages": {name: _version(name) for name in _PACKAGES},
+        "packages": {name: installed_version(name) for name in _PACKAGES},
         "platform": platform.platform(),
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else cpu,
         "seed": seed,
@@ -31,20 +37,30 @@ def environment(seed: int, device: torch.device) -> dict[str, Any]:
     }
 
 
-def _version(name: str) -> str | None:
+def installed_version(name: str) -> str | None:
+    """Version of an installed package, or None."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
         return None
 
 
+def find_device(name: str) -> torch.device:
+    """The device for a setting "auto", "cpu" or "cuda". ConfigError if there is no CUDA device for "cuda"."""
+    import torch
+
+    available = torch.cuda.is_available()
+    if name == "cuda" and not available:
+        raise ConfigError(["device: cuda was asked for, but torch finds no CUDA device; use device: auto or cpu"])
+    return torch.device("cuda" if name != "cpu" and available else "cpu")
+
+
 def _git_state(checkout: Path) -> str | None:
     """Commit of this checkout, with "-dirty" if files have changed; None for an installed package."""
     if not (checkout / ".git").exists():
         return None
+    command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=12"]
     try:
-        words = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=12"]
-        answer = subprocess.run(words, capture_output=True, text=True, timeout=5)
+        return subprocess.run(command, capture_output=True, text=True, timeout=5).stdout.strip() or None
     except (OSError, subprocess.TimeoutExpired):
         return None
-    return answer.stdout.strip() or None

@@ -12,7 +12,7 @@ from torch import Tensor
 
 
 def channel_maps(values: Tensor, names: Sequence[str], label: str, colormap: str, limits=(None, None)) -> bytes:
-    """PNG of maps [C, H, W] side by side with one colour bar each, ``label`` giving the unit."""
+    """PNG of maps [C, H, W] side by side, each with a colour bar; ``label`` names the quantity and its unit."""
     figure = Figure(figsize=(3.6 * len(names), 3.2), layout="constrained")
     for i, (name, panel) in enumerate(zip(names, values.numpy(), strict=True)):
         axes = figure.add_subplot(1, len(names), i + 1)
@@ -25,7 +25,7 @@ def channel_maps(values: Tensor, names: Sequence[str], label: str, colormap: str
 
 
 def visual_field(values: Tensor, eccentricity: Tensor, field_deg: float, rings: Sequence[float], label: str) -> bytes:
-    """PNG of a map [H, W] that is ``field_deg`` wide, with rings of equal eccentricity (deg)."""
+    """PNG of a map [H, W], ``field_deg`` degrees wide, with lines at the eccentricities ``rings``, in degrees."""
     height, width = values.shape
     x, y = field_deg / 2, field_deg / 2 * height / width
     figure = Figure(figsize=(7.2, 1.0 + 6.0 * height / width), layout="constrained")
@@ -33,11 +33,9 @@ def visual_field(values: Tensor, eccentricity: Tensor, field_deg: float, rings: 
     drawn = axes.imshow(values.numpy(), cmap="magma", extent=(-x, x, -y, y), interpolation="nearest")
     inside = [ring for ring in rings if eccentricity.min() < ring < eccentricity.max()]
     if inside:
-        # Coordinates of pixel centres.
-        across, up = ((np.arange(n) + 0.5) / n * 2 - 1 for n in (width, height))
-        lines = axes.contour(
-            x * across, -y * up, eccentricity.numpy(), inside, colors="white", linewidths=1, linestyles=":"
-        )
+        columns, rows = ((np.arange(n) + 0.5) / n * 2 - 1 for n in (width, height))  # pixel centres, in -1 .. 1
+        style = {"colors": "white", "linewidths": 1, "linestyles": ":"}
+        lines = axes.contour(x * columns, -y * rows, eccentricity.numpy(), inside, **style)
         axes.clabel(lines, fmt=lambda ring: f"{ring:g} deg", fontsize=8)
     axes.set_xlabel("right of the middle (deg)")
     axes.set_ylabel("above the middle (deg)")
@@ -47,18 +45,17 @@ def visual_field(values: Tensor, eccentricity: Tensor, field_deg: float, rings: 
 
 
 def comparison(images: Sequence[Tensor], captions: Sequence[str]) -> bytes:
-    """PNG of pictures [C, H, W] in [0, 1] side by side with captions; a score stands on a separate line."""
-    height, width = images[0].shape[-2:]
+    """PNG of pictures [C, H, W] in [0, 1] side by side with captions; a score in a caption gets its own line."""
     titles = [_title(caption) for caption in captions]
     wide, gap, top = 3.1, 0.1, 0.14 + 0.18 * max(title.count("\n") + 1 for title in titles)  # inches
-    tall = wide * height / width
-    whole = (wide + gap) * len(images) + gap, tall + gap + top
-    figure = Figure(figsize=whole, dpi=120)
+    tall = wide * images[0].shape[-2] / images[0].shape[-1]
+    size = (wide + gap) * len(images) + gap, tall + gap + top
+    figure = Figure(figsize=size, dpi=120)
     for i, (image, title) in enumerate(zip(images, titles, strict=True)):
         left = gap + i * (wide + gap)
-        axes = figure.add_axes((left / whole[0], gap / whole[1], wide / whole[0], tall / whole[1]))
-        shown = image.clamp(0, 1).permute(1, 2, 0).squeeze(-1).numpy()
-        axes.imshow(shown, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        axes = figure.add_axes((left / size[0], gap / size[1], wide / size[0], tall / size[1]))
+        pixels = image.clamp(0, 1).permute(1, 2, 0).squeeze(-1).numpy()
+        axes.imshow(pixels, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
         axes.set_title(title, fontsize=10)
         axes.set_axis_off()
     return figure_png(figure)
@@ -70,13 +67,13 @@ def _title(caption: str) -> str:
 
 
 def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[int, float]], metric: str) -> bytes:
-    """PNG of the loss per colour [steps + 1, C] (left axis, relative to the start) and of a metric (right axis)."""
+    """PNG of the loss of each colour [steps + 1, C] relative to its start, and of a metric at the steps ``checked``."""
     figure = Figure(figsize=(7.2, 3.4), layout="constrained")
     axes = figure.add_subplot()
     relative = np.maximum((losses / losses[0].clamp(min=1e-30)).cpu().numpy(), 1e-16)
     stage, steps = _next_stage(relative), np.arange(len(relative))
     for i, name in enumerate(names):
-        style = {"linewidth": 1.2, "color": _COLOURS[i % len(_COLOURS)]}
+        style = {"linewidth": 1.2, "color": ("#c0392b", "#27864a", "#2867b2")[i % 3]}
         axes.semilogy(steps[:stage], relative[:stage, i], label=name, **style)
         if stage:
             axes.semilogy(steps[stage:], relative[stage:, i], **style)
@@ -101,13 +98,13 @@ def _next_stage(losses: np.ndarray) -> int | None:
     """First step whose losses [steps + 1, C] belong to a second objective, or None.
 
     L-BFGS first minimises the error of the amplitude and then that of the intensity. At the change, the losses of all
-    colours rise in the same step, after falling in every step before. With Adam, the losses of single colours rise from
-    the start because of its momentum.
+    colours rise in the same step, after falling in every step before. With Adam, whose momentum makes the losses of
+    single colours rise from the start, there is no second objective.
     """
     change = losses[1:] / losses[:-1]
     jumps = np.flatnonzero((change > 1.5).all(1))
-    fell = len(jumps) > 0 and jumps[0] > 4 and bool((change[: jumps[0]] < 1.01).all())
-    return int(jumps[0]) + 1 if fell else None
+    falls_before = len(jumps) > 0 and jumps[0] > 4 and bool((change[: jumps[0]] < 1.01).all())
+    return int(jumps[0]) + 1 if falls_before else None
 
 
 def curves(rows: Sequence[dict[str, Any]], title: str) -> bytes:
@@ -121,9 +118,9 @@ def curves(rows: Sequence[dict[str, Any]], title: str) -> bytes:
         # The study sweeps a setting if it has one, otherwise sigma.
         positions = list(dict.fromkeys((row["setting"], row["sigma_px"]) for row in selected))
         for k, method in enumerate(dict.fromkeys(row["method"] for row in selected)):
-            rows_of = [row for row in selected if row["method"] == method]
-            points = [(positions.index((row["setting"], row["sigma_px"])), row["ssim"]) for row in rows_of]
-            axes.plot(*zip(*points, strict=True), "os^vD*PhX"[k % 9] + "-", label=method, markersize=5)
+            curve = [row for row in selected if row["method"] == method]
+            x = [positions.index((row["setting"], row["sigma_px"])) for row in curve]
+            axes.plot(x, [row["ssim"] for row in curve], "os^vD*PhX"[k % 9] + "-", label=method, markersize=5)
         step = max(1, len(positions) // 12)
         words = [f"{setting}\n{sigma:g} px" if setting else f"{sigma:g} px" for setting, sigma in positions]
         axes.set_xticks(range(0, len(positions), step), words[::step], fontsize=7, rotation=30 if step > 1 else 0)
@@ -133,9 +130,6 @@ def curves(rows: Sequence[dict[str, Any]], title: str) -> bytes:
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)
     return figure_png(figure)
-
-
-_COLOURS = ("#c0392b", "#27864a", "#2867b2")
 
 
 def figure_png(figure: Figure) -> bytes:

@@ -1,4 +1,4 @@
-"""Fingerprint of a run: the configuration and the inputs to which its checkpoint belongs."""
+"""Fingerprint of a run: the settings and digests of the inputs to which its checkpoint belongs."""
 
 import hashlib
 import json
@@ -9,8 +9,8 @@ import torch
 from pydantic import BaseModel
 from torch import Tensor
 
-_MOST = 64 << 20  # bytes of a tensor that are hashed; takes 0.1 s
-_MARK = "blake2b:"  # prefix of digests
+_HASHED_BYTES = 64 << 20  # limit for a tensor; hashing that many bytes takes 0.1 s
+_PREFIX = "blake2b:"  # distinguishes digests from other values
 
 Fingerprint = dict[str, Any]
 
@@ -22,13 +22,13 @@ def fingerprint(
 
     Args:
         settings: The resolved configuration.
-        inputs: Contents of input files by the key of the setting that names the file. These settings themselves are
-            left out, since the content of a file matters and not its path.
+        inputs: Contents of input files by the key of the setting that names the file. The digest of the contents
+            replaces that setting, since the path of a file does not matter.
         free: Keys that may change before a run is resumed.
     """
-    excluded = {*inputs, *free}
+    excluded = tuple(f"{key}." for key in (*inputs, *free))
     flat = _flat(settings.model_dump(mode="json"))
-    kept = {key: value for key, value in flat.items() if not any(f"{key}.".startswith(f"{name}.") for name in excluded)}
+    kept = {key: value for key, value in flat.items() if not f"{key}.".startswith(excluded)}
     return json.loads(json.dumps(kept | {key: _digest(parts) for key, parts in inputs.items()}))
 
 
@@ -38,25 +38,25 @@ def differences(before: Fingerprint, now: Fingerprint) -> list[str]:
     for key in sorted({*before, *now}):
         old, new = (each.get(key, "nothing") for each in (before, now))
         if old != new:
-            is_file = str(old).startswith(_MARK)
+            is_file = str(old).startswith(_PREFIX)
             lines.append(f"{key} has other contents" if is_file else f"{key} was {_short(old)} and is {_short(new)}")
     return lines
 
 
 def _digest(parts: tuple[Tensor | bytes | str, ...]) -> str:
-    """Digest of inputs; of a tensor of more than 64 MiB, only evenly spaced slices along the first axis are hashed."""
+    """Digest of inputs; of a tensor above 64 MiB, only evenly spaced slices along the first axis are hashed."""
     total = hashlib.blake2b(digest_size=16)
     for part in parts:
         if isinstance(part, Tensor):
             total.update(f"{tuple(part.shape)} {part.dtype}".encode())
             tensor = part.detach().reshape(1) if part.ndim == 0 else part.detach()
-            count = min(len(tensor), max(2, _MOST // max(1, tensor.nbytes // max(1, len(tensor)))))
+            count = min(len(tensor), max(2, _HASHED_BYTES // max(1, tensor.nbytes // max(1, len(tensor)))))
             for i in torch.linspace(0, len(tensor) - 1, count, dtype=torch.float64).round().long().tolist():
                 total.update(tensor[i].contiguous().reshape(-1).cpu().view(torch.uint8).numpy().data)
         else:
             total.update(part.encode() if isinstance(part, str) else part)
         total.update(b"\0")
-    return _MARK + total.hexdigest()
+    return _PREFIX + total.hexdigest()
 
 
 def _flat(value: Any, key: str = "") -> dict[str, Any]:

@@ -23,7 +23,7 @@ from holotorch.experiments.runs.saving import Checkpoint, Results
 from holotorch.experiments.runs.signals import Pressed, deferred, interruptible
 from holotorch.io.files import write_json, write_text
 
-_HALF = re.compile(r"\.(env\.json|config\.yaml)\.\d+\.partial")  # the first files of a run, half written
+_HALF_WRITTEN = re.compile(r"\.(env\.json|config\.yaml)\.\d+\.partial")  # temporary names of the first files of a run
 _SETUP = {"config.yaml", "env.json", "plan.json"}  # files written before the computation starts
 
 
@@ -37,11 +37,9 @@ def claim(out: Path | None, name: str) -> Path:
             while True:
                 matches = [pattern.fullmatch(path.name) for path in parent.iterdir()]
                 folder = parent / f"{name}-{max((int(match[1]) for match in matches if match), default=0) + 1:03d}"
-                try:
+                with suppress(FileExistsError):  # another run has just created it
                     folder.mkdir()
                     return folder
-                except FileExistsError:
-                    continue  # another run has just created it
         except OSError as error:
             raise ConfigError([f"cannot write to {parent}: {error.strerror}; choose a place with --out"]) from None
     try:
@@ -58,40 +56,27 @@ def claim(out: Path | None, name: str) -> Path:
 
 @dataclass
 class RunFolder:
-    """The folder of a running experiment.
-
-    Attributes:
-        path: The folder.
-        name: Name of the run.
-        plan: Plan of the run.
-        pressed: Signals that have been received.
-        resumes: Whether the run can be continued after an interruption.
-        write_page: Writes the report of the folder to a path; None if there is nothing to show yet.
-    """
+    """The folder of a running experiment."""
 
     path: Path
     name: str
     plan: RunPlan
-    pressed: Pressed
-    resumes: bool = True
-    write_page: Callable[[Path], Any] | None = None
+    pressed: Pressed  # signals that have been received
+    resumes: bool = True  # whether the run can be continued after an interruption
+    write_page: Callable[[Path], Any] | None = None  # writes the report to a path; None if there is no report
 
 
 @contextmanager
 def open_run(
     out: Path | None, name: str, settings: BaseModel, plan: RunPlan, device: str, *, resumes: bool = True
 ) -> Iterator[RunFolder]:
-    """Context manager that provides the folder of a run.
+    """Context manager that provides the folder of a run, with config.yaml and env.json.
 
     The folder is new, or is ``out`` if that holds an unfinished run of the same settings. A run that cannot be
-    continued (``resumes`` False) always needs a new folder.
-
-    The folder is locked against other runs if the system supports this; config.yaml and env.json are written at once.
-    Within the block, the first signal raises KeyboardInterrupt. If the block fails, the folder keeps all results; a new
-    folder without results is removed, so that a corrected run can use it.
-
-    Raises:
-        ConfigError: The folder is in use, holds other files, or cannot be written.
+    continued (``resumes`` False) always needs a new folder. The folder is locked against other runs if the system
+    supports this. Within the block, the first signal raises KeyboardInterrupt. If the block fails, the folder keeps all
+    results; a new folder without results is removed, so that a corrected run can use it. ConfigError if the folder is
+    in use, holds other files, or cannot be written.
     """
     with interruptible() as pressed, ExitStack() as stack:
         if out is not None:
@@ -116,24 +101,20 @@ def _unfinished(folder: Path, settings: BaseModel) -> bool:
 
     Half-written files and empty folders of a killed run are removed.
     """
-    if not folder.is_dir():
-        return False
     files = {path.name for path in folder.rglob("*") if not path.is_dir()}
-    halves = {name for name in files if _HALF.fullmatch(name)}
-    if files - halves <= {"env.json"}:
+    half_written = {name for name in files if _HALF_WRITTEN.fullmatch(name)}
+    if files - half_written <= {"env.json"}:
         with suppress(OSError):  # ``claim`` reports the error
-            for name in (*halves, "env.json"):
+            for name in (*half_written, "env.json"):
                 (folder / name).unlink(missing_ok=True)
-            for path in (folder / "arrays", folder / "images"):
-                if path.is_dir():
-                    path.rmdir()
+            _remove_folders(folder / "arrays", folder / "images")
     if "summary.json" in files or not files >= {"env.json", "config.yaml"}:
         return False
     try:
-        held = validated(read_source(folder / "config.yaml", []), type(settings))
+        previous = validated(read_source(folder / "config.yaml", []), type(settings))
     except ConfigError:
         return False
-    if changed := differences(fingerprint(held, {}), fingerprint(settings, {})):
+    if changed := differences(fingerprint(previous, {}), fingerprint(settings, {})):
         hint = f"choose another --out, or go on with that one: holotorch resume {folder}"
         raise ConfigError([f"{folder} holds an unfinished run of another configuration: {', '.join(changed)}; {hint}"])
     for path in folder.rglob(".*.partial"):
@@ -142,11 +123,7 @@ def _unfinished(folder: Path, settings: BaseModel) -> bool:
 
 
 def tidied(folder: Path) -> bool:
-    """Remove temporary files of a run that was killed after its last result; returns whether its page is missing.
-
-    Raises:
-        ConfigError: A run is using the folder.
-    """
+    """Remove temporary files of a complete run; returns whether its page is missing. ConfigError if a run uses it."""
     with _locked(folder):
         for path in (*folder.rglob(".*.partial"), folder / "checkpoint.pt", folder / "interrupted.json"):
             with suppress(OSError):  # a remaining file does no harm
@@ -176,6 +153,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _keep_results(folder: Path, new: bool, resumes: bool) -> Iterator[None]:
+    """If the block fails, say where its results are and how to go on; remove a new folder without results."""
     try:
         yield
     except KeyboardInterrupt:
@@ -185,8 +163,7 @@ def _keep_results(folder: Path, new: bool, resumes: bool) -> Iterator[None]:
             _remove_setup(folder)
         raise
     except BaseException as error:
-        removed = new and _remove_setup(folder)
-        if not removed and not isinstance(error, ConfigError):
+        if not (new and _remove_setup(folder)) and not isinstance(error, ConfigError):
             hint = f"; once the cause is removed, go on with: holotorch resume {folder}" if resumes else ""
             if (folder / "summary.json").is_file():
                 hint = f"; make its page with: holotorch report {folder}"
@@ -202,39 +179,29 @@ def _remove_setup(folder: Path) -> bool:
     with suppress(OSError):  # a remaining file does no harm
         for path in files:
             path.unlink()
-        for path in (folder / "arrays", folder / "images", folder):
-            if path.is_dir():
-                path.rmdir()
+        _remove_folders(folder / "arrays", folder / "images", folder)
     return True
 
 
+def _remove_folders(*folders: Path) -> None:
+    for folder in folders:
+        if folder.is_dir():
+            folder.rmdir()
+
+
 def conclude(
-    run: RunFolder,
-    summary: dict[str, Any],
-    results: Results,
-    *,
-    done: bool,
-    checkpoint: Checkpoint | None = None,
+    run: RunFolder, summary: dict[str, Any], results: Results, *, done: bool, checkpoint: Checkpoint | None = None
 ) -> bool:
-    """Write the numbers of a run as its last file: summary.json if it is complete, otherwise interrupted.json.
+    """Write the numbers of a run as its last file, summary.json or interrupted.json; returns whether it is complete.
 
-    Args:
-        run: The run; its signals are ignored once it is complete.
-        summary: Numbers; ``status`` is set here.
-        results: The files written so far.
-        done: Whether everything was computed.
-        checkpoint: Checkpoint of the run. If the run is not done, an error in writing it is raised like that of any
-            other file. If the run is complete, such an error is ignored and the file is removed.
-
-    Returns:
-        Whether the run is complete.
-
-    Raises:
-        OSError: A file could not be written; writing of all other files was attempted before.
+    A run is complete if everything was computed (``done``) and ``results``, the writer of its other files, has no
+    error; from then on its signals are ignored, and its checkpoint is removed. This function adds ``status`` to the
+    ``summary``. An error in writing a file, or the checkpoint if the run is not done, is raised as OSError after all
+    other files are written.
     """
     with deferred(run.pressed):
         if not done and checkpoint is not None:
-            results.fail(checkpoint.failure)
+            results.failure = results.failure or checkpoint.failure
         complete = done and results.failure is None
         summary["status"] = "complete" if complete else "interrupted"
         if results.failure is not None:

@@ -1,4 +1,4 @@
-"""The page of a report, one static HTML file without scripts, and the elements of its body."""
+"""The page of a report, which is one static HTML file without scripts, and the elements of its body."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -13,9 +13,8 @@ if TYPE_CHECKING:
 def _template() -> "Template":
     from jinja2 import Environment, FileSystemLoader  # only a report needs it
 
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True, keep_trailing_newline=True
-    )
+    loader = FileSystemLoader(Path(__file__).parent)
+    environment = Environment(loader=loader, autoescape=True, trim_blocks=True, keep_trailing_newline=True)
     return environment.get_template("report.html.jinja")
 
 
@@ -25,12 +24,12 @@ def page(title: str, body: str) -> str:
 
 
 def render(macro: str, *values: Any) -> str:
-    """HTML of a macro of the template; the template escapes every value."""
+    """HTML from a macro of the template; ``values`` are its arguments, which the template escapes."""
     return str(getattr(_template().module, macro)(*values))
 
 
 def element(tag: str, text: Any, kind: str = "") -> str:
-    """An element with text in it; ``kind`` is its CSS class."""
+    """An HTML element ``tag`` that contains ``text``; ``kind`` is its CSS class."""
     return render("element", tag, text, kind)
 
 
@@ -45,7 +44,7 @@ def figure(source: str, caption: str, kind: str) -> str:
 
 
 def table(names: Sequence[str], rows: Sequence[Sequence[str]], *, head: bool = True) -> str:
-    """A table of text without the columns that are empty in every row; ``head`` False leaves out the names."""
+    """A table of text. Columns that are empty in every row are left out, and so are the names if ``head`` is False."""
     kept = [i for i in range(len(names)) if any(row[i] for row in rows)]
     return render("table", [names[i] for i in kept] if head else [], [[row[i] for i in kept] for row in rows])
 

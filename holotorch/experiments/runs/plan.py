@@ -6,14 +6,8 @@ from typing import Any
 
 @dataclass(frozen=True)
 class RunPlan:
-    """The plan of a run, made before anything is computed.
+    """The plan of a run, made before anything is computed."""
 
-    Attributes:
-        text: Lines to print.
-        values: Choices with their reasons, cost and physics, as plain JSON values; written to plan.json unless empty.
-        shortage: The reason why this machine cannot carry out the run, or None.
-    """
-
-    text: str
-    values: dict[str, Any] = field(default_factory=dict)
-    shortage: str | None = None
+    text: str  # lines to print
+    values: dict[str, Any] = field(default_factory=dict)  # choices with reasons, cost and physics, as JSON values
+    shortage: str | None = None  # the reason why this machine cannot carry out the run

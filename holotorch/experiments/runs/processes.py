@@ -1,16 +1,15 @@
-"""Several processes, started by ``torchrun``, that share one run."""
+"""Sharing of a run between several processes that ``torchrun`` has started."""
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
-from torch import Tensor
 
 
 @contextmanager
 def joined_processes(parallel: bool = True) -> Iterator[int]:
-    """Connect the processes that ``torchrun`` has started, within this block; yields the rank of this process.
+    """Context manager that connects the processes and yields the rank of this process.
 
     With ``parallel`` False, the processes do not share a run, and each has rank 0.
     """
@@ -29,9 +28,3 @@ def process_count() -> tuple[int, int]:
     if torch.distributed.is_available() and torch.distributed.is_initialized():
         return torch.distributed.get_rank(), torch.distributed.get_world_size()
     return 0, 1
-
-
-def from_first(value: Tensor) -> Tensor:
-    """Broadcast the value of the first process to all processes."""
-    torch.distributed.broadcast(value, 0)
-    return value

@@ -11,16 +11,10 @@ from holotorch.io.files import read_json
 
 
 class RunRecord:
-    """The files of a run, complete or interrupted.
+    """The files in the ``folder`` of a run, complete or interrupted. ConfigError if the folder holds no run.
 
-    Attributes:
-        folder: The run folder.
-        title: Name of the folder.
-        summary: Numbers of summary.json, or of interrupted.json.
-        kind: Name of the kind of experiment.
-
-    Raises:
-        ConfigError: The folder holds no run.
+    ``title`` is the name of the folder, ``summary`` the content of summary.json or interrupted.json, and ``kind`` the
+    name of the kind of experiment.
     """
 
     def __init__(self, folder: Path):
@@ -33,7 +27,7 @@ class RunRecord:
         self.kind = str(self.summary["experiment"])
 
     def load(self) -> None:
-        """Read the files that a section of a page needs into ``plan`` (empty if there is none), ``env``, ``config``."""
+        """Set ``plan`` (empty if there is none), ``env`` and ``config``, from the files of these names."""
         plan = self.folder / "plan.json"
         self.plan: dict[str, Any] = read_json(plan) if plan.is_file() else {}
         self.env: dict[str, Any] = read_json(self.folder / "env.json")
@@ -51,6 +45,4 @@ class RunRecord:
     def picture(self, name: str) -> str:
         """A picture in the folder as a data URL; empty if there is no such file."""
         path = self.folder / "images" / f"{name}.png"
-        if not path.is_file():
-            return ""
-        return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
+        return f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}" if path.is_file() else ""

@@ -1,4 +1,4 @@
-"""Checkpoints and results on a disk that may be full: errors are reported, and the other files are still written."""
+"""Writing of checkpoints and results. An error, as on a full disk, is reported, and other files are still written."""
 
 import hashlib
 import math
@@ -17,22 +17,32 @@ from holotorch.experiments.runs.fingerprint import Fingerprint, differences
 from holotorch.io.files import replacing
 
 
-class Checkpoint:
-    """The state from which a run can be resumed. An error in writing it is reported once and does not stop the run.
+class _Writer:
+    """Base class of writers that report each kind of error, by its ``errno``, once."""
 
-    Attributes:
-        path: The file; it is replaced only when a new checkpoint is complete.
-        fingerprint: Fingerprint of the configuration and inputs; a checkpoint with another fingerprint is refused.
-        failure: The error of the last :meth:`save`, or None.
-    """
-
-    def __init__(self, path: Path, fingerprint: Fingerprint):
-        self.path, self.fingerprint = path, fingerprint
+    def __init__(self):
         self.failure: OSError | None = None
         self._reported: set[int | None] = set()
 
+    def _warn(self, error: OSError, problem: str) -> None:
+        if error.errno not in self._reported:
+            self._reported.add(error.errno)
+            tqdm.write(f"warning: {problem}", file=sys.stderr)  # leaves progress bars intact
+
+
+class Checkpoint(_Writer):
+    """The file from which a run can be resumed. An error in writing it is reported once and does not stop the run.
+
+    The file at ``path`` is replaced only when a new checkpoint is complete. A checkpoint whose ``fingerprint`` (of
+    configuration and inputs) differs is refused. ``failure`` is the error of the last :meth:`save`, or None.
+    """
+
+    def __init__(self, path: Path, fingerprint: Fingerprint):
+        super().__init__()
+        self.path, self.fingerprint = path, fingerprint
+
     def load(self) -> dict[str, Any] | None:
-        """The last saved content, or None. ConfigError for a checkpoint of another configuration, or a damaged one."""
+        """The last saved content, or None. ConfigError if the file is damaged or belongs to another configuration."""
         if not self.path.is_file():
             return None
         try:
@@ -45,21 +55,18 @@ class Checkpoint:
                 raise ValueError("changed after it was written")
         except Exception as error:  # unpickling damaged bytes can raise anything
             raise self.unreadable(error) from None
-        self._check(content.get("fingerprint"))
-        return content
-
-    def _check(self, before: Fingerprint | None) -> None:
         config = self.path.parent / "config.yaml"
         hint = f"run into a new folder: holotorch run {config} --out NEW"
-        if not isinstance(before, dict):
-            words = f"{self.path} does not say which configuration it belongs to, as those of older versions do not"
-            raise ConfigError([f"{words}; {hint}"])
+        if not isinstance(before := content.get("fingerprint"), dict):
+            problem = f"{self.path} does not say which configuration it belongs to, as those of older versions do not"
+            raise ConfigError([f"{problem}; {hint}"])
         if changed := differences(before, self.fingerprint):
-            words = f"{self.path} belongs to another configuration: {', '.join(changed)}"
-            raise ConfigError([f"{words}; undo that in {config}, or {hint}"])
+            problem = f"{self.path} belongs to another configuration: {', '.join(changed)}"
+            raise ConfigError([f"{problem}; undo that in {config}, or {hint}"])
+        return content
 
     def unreadable(self, error: Exception) -> ConfigError:
-        """The error for a checkpoint that cannot be read or has unexpected content."""
+        """The ConfigError for a checkpoint that cannot be read or has unexpected content."""
         reason = error.strerror if isinstance(error, OSError) else "it is damaged"
         return ConfigError([f"{self.path} cannot be read: {reason}; delete the folder and run again"])
 
@@ -71,51 +78,37 @@ class Checkpoint:
                 try:
                     content = content | {"fingerprint": self.fingerprint}
                     torch.save(content | {"checksum": checksum(content)}, stream)
-                except RuntimeError as error:  # torch's, with the OSError of the failed write as context
+                except RuntimeError as error:  # torch raises it, with the OSError of the failed write as context
                     raise error.__context__ if isinstance(error.__context__, OSError) else error from None
         except (OSError, RuntimeError) as error:
-            is_disk = isinstance(error, OSError)
-            self.failure = error if is_disk else OSError(None, str(error), str(self.path))
-            if self.failure.errno not in self._reported:
-                self._reported.add(self.failure.errno)
-                left = "the previous one stays" if self.path.is_file() else "there is no previous one"
-                _warn(f"{self.path} cannot be written: {self.failure.strerror}; {left}, and the run goes on")
+            self.failure = error if isinstance(error, OSError) else OSError(None, str(error), str(self.path))
+            left = "the previous one stays" if self.path.is_file() else "there is no previous one"
+            problem = f"{self.path} cannot be written: {self.failure.strerror}"
+            self._warn(self.failure, f"{problem}; {left}, and the run goes on")
         return self.failure is None
 
 
-class Results:
-    """Writer of result files. An error in writing one is reported once, and the other files are still written.
+class Results(_Writer):
+    """Writer of result files. An error in writing one file is reported once, and the other files are still written.
 
-    Attributes:
-        failure: The first error, or None.
+    ``failure`` is the first error, or None.
     """
 
-    def __init__(self):
-        self.failure: OSError | None = None
-        self._reported: set[int | None] = set()
-
-    def fail(self, error: OSError | None) -> None:
-        """Record an error that has already been reported; the first recorded error is kept."""
-        self.failure = self.failure or error
-
-    def write(self, write: Callable[..., Any], *words: Any) -> bool:
-        """Call ``write(*words)``; returns False if the disk refuses it."""
+    def write(self, write: Callable[..., Any], *arguments: Any) -> bool:
+        """Call ``write(*arguments)``; returns False if that raises an OSError."""
         try:
-            write(*words)
+            write(*arguments)
             return True
         except OSError as error:
-            if error.errno not in self._reported:
-                self._reported.add(error.errno)
-                _warn(f"{error.filename} cannot be written: {error.strerror}; the other results are written")
-            self.fail(error)
+            self._warn(error, f"{error.filename} cannot be written: {error.strerror}; the other results are written")
+            self.failure = self.failure or error
             return False
 
 
 def checksum(content: Any, most: float = math.inf) -> str:
-    """Checksum of nested tensors and plain values; torch itself does not detect damaged numbers when it loads a file.
+    """Checksum of nested tensors and plain values, since torch does not detect damaged numbers when it loads a file.
 
-    Raises:
-        ValueError: Other types, or a tensor of more than ``most`` bytes.
+    ValueError for values of other types, and for a tensor of more than ``most`` bytes.
     """
     total = hashlib.blake2b(digest_size=16)
 
@@ -139,12 +132,8 @@ def checksum(content: Any, most: float = math.inf) -> str:
     return total.hexdigest()
 
 
-def _warn(text: str) -> None:
-    tqdm.write(f"warning: {text}", file=sys.stderr)  # does not break a progress bar
-
-
 def _bytes(content: Any) -> int:
-    """Size of the tensors in a checkpoint; everything else in it is small."""
+    """Size of the tensors in a checkpoint; all else in a checkpoint is small."""
     if isinstance(content, Tensor):
         return content.nbytes
     values = content.values() if isinstance(content, dict) else content if isinstance(content, list | tuple) else ()

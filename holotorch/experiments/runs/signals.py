@@ -1,4 +1,4 @@
-"""Handling of Ctrl-C, SIGTERM and SIGHUP: they end the computation of a run, but not the saving of its results."""
+"""Handling of Ctrl-C, SIGTERM and SIGHUP, which end the computation of a run but not the saving of its results."""
 
 import signal
 import threading
@@ -8,11 +8,7 @@ from typing import Any
 
 
 class Pressed(list[int]):
-    """Numbers of the signals that have been received.
-
-    Attributes:
-        settled: The results are on the disk, so signals are ignored.
-    """
+    """Numbers of the signals received. Once all results are on the disk (``settled``), signals are only recorded."""
 
     settled = False
 
@@ -24,9 +20,9 @@ _current: Pressed | None = None  # the list of the outermost open block of the m
 def interruptible() -> Iterator[Pressed]:
     """Treat SIGTERM and SIGHUP (a closed terminal) like Ctrl-C within this block, and record the signals in a list.
 
-    Only the first signal raises KeyboardInterrupt, so that a second one does not interrupt saving. No signal raises it
-    once the list is ``settled``. A nested block shares the list of the outer one, and raises KeyboardInterrupt at its
-    start if a signal has been received before.
+    Only the first signal raises KeyboardInterrupt, and only before the list is ``settled``; a second signal does not
+    interrupt saving. A nested block shares the list of the outer block, and raises KeyboardInterrupt at its start if a
+    signal has been received before.
     """
     global _current
     if threading.current_thread() is not threading.main_thread():  # signals reach the main thread only
@@ -59,13 +55,13 @@ def deferred(pressed: list[int]) -> Iterator[None]:
 
 @contextmanager
 def handling(handler: Callable[[int, Any], object]) -> Iterator[None]:
-    """Call ``handler`` for each signal within this block, with its number as first argument."""
+    """Call ``handler`` for each signal within this block, with the number of the signal and the stack frame."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     numbers = [signal.SIGINT, signal.SIGTERM]
     hangup = getattr(signal, "SIGHUP", None)  # does not exist on Windows
-    if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:  # nohup ignores it, so the run continues
+    if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:  # under nohup, SIGHUP stays ignored
         numbers.append(hangup)
     before = [signal.signal(number, handler) for number in numbers]
     try:

@@ -1,9 +1,10 @@
-"""Chart of volume holograms: error against time for every method, and time against planes, pixels and distance."""
+"""Chart of volume holograms: error and time of every method, and time against planes, pixels and distance."""
 
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from typing import Any
 
 import torch
@@ -19,7 +20,7 @@ from holotorch.hologram import AxialHologram, ConvolutionHologram, DirectHologra
 from holotorch.hologram.cone import cone_samples, spherical_wave
 
 PITCH, WAVELENGTHS = 3.74e-6, (636e-9, 520e-9, 455e-9)  # metres
-# Thesis Table 5.2: distance in mm, planes, and seconds by its convolution method.
+# Thesis Table 5.2: distance in mm, number of planes, and seconds that its convolution method takes for three colours.
 TABLE = {
     "Tooth": (20, 90, 5.09),
     "C60": (30, 58, 11.56),
@@ -29,16 +30,16 @@ TABLE = {
     "Bonsai": (70, 232, 129.93),
 }
 ALL_PLANES = ("Tooth", "Teapot", "Hand", "Bonsai")  # scenes that are also measured with all planes and at full size
-SMALL, WHOLE = 512, 2048  # pixels along each side
-BASE = "thesis's convolutions (Algorithm 5)"
+SMALL, WHOLE = 512, 2048  # pixels along each side of a hologram; the thesis has WHOLE
+BASE, READY = "thesis's convolutions (Algorithm 5)", "the same, waves at hand"
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Planes of random sources in a ball as wide as the hologram; a ray for every second pixel along each axis."""
+    """Planes of random sources that fill a ball as wide as the hologram; a ray for every second pixel of an axis."""
 
-    side: int
-    distance: float
+    side: int  # pixels along each side of the hologram
+    distance: float  # of the ball's centre from the hologram, in metres
     planes: int
 
     @property
@@ -54,7 +55,7 @@ class Scene:
 
     @property
     def phase(self) -> Tensor:
-        """Random phase of each ray, float32 [r, r]."""
+        """Random phase of each ray, float32 [r, r] for r rays along each side."""
         generator = torch.Generator().manual_seed(1)
         return 2 * math.pi * torch.rand(self.side // 2, self.side // 2, generator=generator)
 
@@ -76,12 +77,12 @@ class Scene:
 
 
 class ThesisConvolution:
-    """Algorithm 5 of the thesis: for each plane, transforms of sources and spherical wave, and an inverse transform.
+    """Algorithm 5 of the thesis: each plane is convolved with a spherical wave by transforms of H + K samples per axis.
 
-    For H pixels along an axis and a spherical wave of K samples, the transforms have H + K samples. K is at most 2 V
-    for a volume of V samples; here V = H. The wave is evaluated anew for each plane; with ``ready``, one wave is
-    transformed in advance and used for all planes. Phases are float64 (the thesis does not specify this); waves are
-    clipped to the sharp cone of its Sec. 5.6.1.
+    H is the number of pixels of the hologram and K that of samples of the wave, at most 2 H for a volume as wide as the
+    hologram. The wave is computed and transformed for each plane; with ``ready``, one wave is transformed in advance
+    and used for all planes. The phase of the wave is float64 (the thesis does not specify this), and the wave is
+    clipped to the sharp cone of thesis Sec. 5.6.1.
     """
 
     def __init__(self, scene: Scene, wavelength: float, *, ready: bool = False):
@@ -96,12 +97,10 @@ class ThesisConvolution:
         return fft2(wave.to(torch.complex64))
 
     def __call__(self, planes: int | None = None) -> Tensor:
-        """The hologram of the first ``planes``; of all planes by default."""
-        side, total = self.scene.side, torch.zeros(self.scene.side, self.scene.side, dtype=torch.complex64)
-        phasor = torch.polar(torch.ones_like(self.scene.phase), self.scene.phase)
-        for j, amplitude in enumerate(self.scene.amplitudes()):
-            if j == planes:
-                break
+        """The hologram of the first ``planes`` planes; of all planes by default."""
+        side, phase = self.scene.side, self.scene.phase
+        total, phasor = torch.zeros(side, side, dtype=torch.complex64), torch.polar(torch.ones_like(phase), phase)
+        for j, amplitude in enumerate(islice(self.scene.amplitudes(), planes)):
             spread = torch.zeros(self.length, self.length, dtype=torch.complex64)
             spread[:side:2, :side:2] = amplitude * phasor
             wave = self._wave(self.scene.depths[j]) if self.ready is None else self.ready
@@ -111,8 +110,7 @@ class ThesisConvolution:
 
 def volume() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
     """Rows of methods, rows of scaling, pictures by name, and the verdict."""
-    rows = _methods()
-    scaling = _scaling()
+    rows, scaling = _methods(), _scaling()
     return rows, scaling, {"chart": _draw(rows, scaling)}, _verdict(rows, scaling)
 
 
@@ -120,21 +118,20 @@ def _calls(scene: Scene, wavelength: float) -> dict[str, Callable[[], Any]]:
     """Calls that compute the hologram of a colour; the operators are built in advance, as for a sequence of frames."""
     layers, planes, phase = scene.layers(), torch.stack([*scene.amplitudes()]), scene.phase
     exact = ConvolutionHologram(scene.grid, wavelength, scene.depths, stride=2)
-    soft, fine = (AxialHologram(scene.grid, wavelength, scene.depths, stride=2, tolerance=t) for t in (3e-3, 1e-4))
-    for operator in (soft, fine):
-        operator.design((scene.side // 2, scene.side // 2))
-    thesis, ready = ThesisConvolution(scene, wavelength), ThesisConvolution(scene, wavelength, ready=True)
-    return {
-        BASE: thesis,
-        "the same, waves at hand": ready,
+    calls = {
+        BASE: ThesisConvolution(scene, wavelength),
+        READY: ThesisConvolution(scene, wavelength, ready=True),
         "convolutions, exact": lambda: exact(layers),
-        "axial nodes, 3e-3": lambda: soft.accumulate(planes, phase),
-        "axial nodes, 1e-4": lambda: fine.accumulate(planes, phase),
     }
+    for name, tolerance in (("3e-3", 3e-3), ("1e-4", 1e-4)):
+        axial = AxialHologram(scene.grid, wavelength, scene.depths, stride=2, tolerance=tolerance)
+        axial.design((scene.side // 2, scene.side // 2))
+        calls[f"axial nodes, {name}"] = partial(axial.accumulate, planes, phase)
+    return calls
 
 
 def _methods() -> list[dict]:
-    """Every scene of Table 5.2 at a quarter of its size in three colours; some with all planes in one colour."""
+    """Rows of every scene at a quarter of its size and planes in 3 colours; of some with all planes in one colour."""
     rows = []
     cases = [(name, mm / 4e3, planes // 4, WAVELENGTHS) for name, (mm, planes, _) in TABLE.items()]
     cases += [(f"{name}, all planes", TABLE[name][0] / 4e3, TABLE[name][1], WAVELENGTHS[:1]) for name in ALL_PLANES]
@@ -147,56 +144,52 @@ def _methods() -> list[dict]:
                 times[method] = times.get(method, 0.0) + seconds
         errors = _errors(scene, wavelengths[0])
         pairs, direct = _direct(scene, wavelengths[0])
-        for method, seconds in times.items():
-            rows.append(
-                {
-                    "scene": name,
-                    "distance_mm": distance * 1e3,
-                    "planes": planes,
-                    "colours": len(wavelengths),
-                    "method": method,
-                    "seconds": f"{seconds:.4f}",
-                    "error": "" if math.isnan(errors[method]) else f"{errors[method]:.1e}",
-                    "over_thesis": round(times[BASE] / seconds, 2),
-                    "over_direct": round(direct * len(wavelengths) / seconds),
-                    "direct_pairs_per_s": f"{pairs:.2e}",
-                }
-            )
+        rows += [
+            {
+                "scene": name,
+                "distance_mm": distance * 1e3,
+                "planes": planes,
+                "colours": len(wavelengths),
+                "method": method,
+                "seconds": f"{seconds:.4f}",
+                "error": f"{errors[method]:.1e}" if method in errors else "",
+                "over_thesis": round(times[BASE] / seconds, 2),
+                "over_direct": round(direct * len(wavelengths) / seconds),
+                "direct_pairs_per_s": f"{pairs:.2e}",
+            }
+            for method, seconds in times.items()
+        ]
     return rows
 
 
 def _errors(scene: Scene, wavelength: float) -> dict[str, float]:
-    """Relative L2 error of each method with respect to the same cone of light computed in complex128."""
+    """Relative L2 error of each method but READY, compared with the same cone of light computed in complex128."""
     layers = scene.layers(torch.complex128)
     box = ConvolutionHologram(scene.grid, wavelength, scene.depths, stride=2)(layers)
     soft = AxialHologram(scene.grid, wavelength, scene.depths, stride=2, tolerance=1e-6)(layers)
     errors = {}
-    for method, work in _calls(scene, wavelength).items():
-        wanted = soft if method.startswith("axial") else box
-        errors[method] = math.nan if "at hand" in method else _relative(work(), wanted)
+    for method, call in _calls(scene, wavelength).items():
+        if method != READY:
+            reference = soft if method.startswith("axial") else box
+            errors[method] = ((call().to(reference.dtype) - reference).norm() / reference.norm()).item()
     return errors
 
 
-def _relative(got: Tensor, wanted: Tensor) -> float:
-    return ((got.to(wanted.dtype) - wanted).norm() / wanted.norm()).item()
-
-
 def _direct(scene: Scene, wavelength: float) -> tuple[float, float]:
-    """Pairs of source and pixel per second of the direct sum on one plane, and the seconds for all planes."""
+    """Pairs of source and pixel per second of the direct sum, measured on one plane, and its seconds for all planes."""
     middle = scene.planes // 2
     plane = scene.layers(torch.complex128)[middle : middle + 1]
     operator = DirectHologram(scene.grid, wavelength, [scene.depths[middle]], stride=2)
-    _, seconds = timed(lambda: operator(plane))
-    rate = operator.pairs(plane) / seconds
-    lit = sum(int((amplitude > 0).sum()) for amplitude in scene.amplitudes())
-    per_source = operator.pairs(plane) / max(1, int((plane != 0).sum()))
-    return rate, lit * per_source / rate
+    rate = operator.pairs(plane) / timed(lambda: operator(plane))[1]
+    sources = sum(int((amplitude > 0).sum()) for amplitude in scene.amplitudes())
+    pairs_per_source = operator.pairs(plane) / max(1, int((plane != 0).sum()))
+    return rate, sources * pairs_per_source / rate
 
 
 def _scaling() -> list[dict]:
-    """Time of one colour against planes, pixels and distance (Fig. 5.10).
+    """Rows of the time of one colour against planes, pixels and distance (thesis Fig. 5.10).
 
-    The thesis's method is measured on three planes, and its time is scaled to all planes.
+    The thesis's method is timed on three planes, and the time is scaled to all planes.
     """
     groups = {
         "planes": [Scene(SMALL, 7.5e-3, planes) for planes in (58, 145, 290, 580, 1160)],
@@ -206,17 +199,16 @@ def _scaling() -> list[dict]:
     groups |= {f"whole: {name}": [Scene(WHOLE, TABLE[name][0] / 1e3, TABLE[name][1])] for name in ALL_PLANES}
     rows = []
     for what, scenes in tqdm(groups.items(), desc="volume, scaling", unit="series"):
-        operators = [AxialHologram(s.grid, WAVELENGTHS[0], s.depths, stride=2, tolerance=3e-3) for s in scenes]
+        operators = {s: AxialHologram(s.grid, WAVELENGTHS[0], s.depths, stride=2, tolerance=3e-3) for s in scenes}
         calls = {
             str(scene): partial(operator.accumulate, torch.stack([*scene.amplitudes()]), scene.phase)
-            for scene, operator in zip(scenes, operators, strict=True)
+            for scene, operator in operators.items()
         }
         times = interleaved(calls, rounds=1 if scenes[-1].side == WHOLE else 15)
-        for scene, operator in zip(scenes, operators, strict=True):
+        for scene, operator in operators.items():
             thesis = ThesisConvolution(scene, WAVELENGTHS[0])
             thesis(1)  # warms up
-            _, base = timed(lambda thesis=thesis: thesis(3))
-            base *= scene.planes / 3
+            base = timed(partial(thesis, 3))[1] * scene.planes / 3
             design = operator.design((scene.side // 2, scene.side // 2))
             seconds = times[str(scene)]
             rows.append(
@@ -244,13 +236,10 @@ def _verdict(rows: list[dict], scaling: list[dict]) -> list[str]:
         f"speed relative to {BASE} in the same process (relative L2 error to the same cone of light in complex128)"
     ]
     for name in TABLE:
-        selected = [row for row in rows if row["scene"] == name]
-        parts = [
-            f"{row['method']} {row['over_thesis']}" + (f" ({row['error']})" if row["error"] else "")
-            for row in selected
-            if row["method"] != BASE
-        ]
-        lines.append(f"{name}, {SMALL} px, {selected[0]['planes']} planes, 3 colours: " + "; ".join(parts))
+        base, *others = (row for row in rows if row["scene"] == name)
+        errors = [f" ({row['error']})" if row["error"] else "" for row in others]
+        parts = [f"{row['method']} {row['over_thesis']}{error}" for row, error in zip(others, errors, strict=True)]
+        lines.append(f"{name}, {SMALL} px, {base['planes']} planes, 3 colours: " + "; ".join(parts))
     for name in ALL_PLANES:
         small = next(r for r in rows if r["scene"] == f"{name}, all planes" and r["method"] == "axial nodes, 3e-3")
         big = next(row for row in scaling if row["against"] == f"whole: {name}")

@@ -43,12 +43,11 @@ Depth = Annotated[Distance, AfterValidator(_in_front)]
 
 
 class VolumeSource(Settings):
-    """A file, a scene of the public catalogue, or a synthetic phantom, in this order of precedence.
+    """A file (``path``), a scene of the public catalogue, or a synthetic phantom, in this order of precedence.
 
-    If both a scene and a phantom are given, the phantom is used only if the scene cannot be fetched.
-
-    ``spacing`` (z, y, x), ``shape`` (D, H, W), ``dtype`` and ``unit`` supply values that a file does not state, see
-    ``load_volume``. ``directory``: cache of fetched scenes.
+    If both a scene and a phantom are given, the phantom is used only if the scene cannot be fetched. ``spacing``
+    (z, y, x), ``shape`` (D, H, W), ``dtype`` and ``unit`` supply what a file does not state; see ``load_volume``.
+    ``directory`` is the cache of fetched scenes.
     """
 
     path: ExistingArray | None = None
@@ -63,10 +62,10 @@ class VolumeSource(Settings):
 
 
 class TransferSettings(Settings):
-    """Colour and opacity: a preset between two values of the volume, a JSON file, or a list of points.
+    """Colour and opacity: a preset between the values ``low`` and ``high`` of the volume, a JSON file, or ``points``.
 
-    ``points``: each is [value, red, green, blue, opacity]; all but the value are in 0..1. The opacity is that of a path
-    of length ``unit_distance``, in units of the longest side of the volume.
+    Each point is [value, red, green, blue, opacity]; all but the value are in 0..1. The opacity is that of a path of
+    length ``unit_distance``, in units of the longest side of the volume.
     """
 
     preset: Literal["bone", "soft_tissue", "vessels", "industrial"] | None = None
@@ -78,10 +77,11 @@ class TransferSettings(Settings):
 
 
 class ViewSettings(Settings):
-    """Orientation and size of the volume: rotations in degrees about the vertical axis (y), then the horizontal (x).
+    """Orientation and size of the volume.
 
-    ``width``: length of its longest side in metres; by default that of the hologram. ``front``: the end of the volume
-    that faces the observer. ``lighting``: shade points by the gradient of the volume; otherwise they are not shaded.
+    The volume is rotated by ``azimuth_deg`` about the vertical axis (y), then by ``elevation_deg`` about the horizontal
+    axis (x). ``width`` is the length of its longest side in metres, by default the longest side of the hologram.
+    ``front`` says which end of the volume faces the observer. ``lighting`` shades points by the gradient of the volume.
     """
 
     azimuth_deg: Number = 0.0
@@ -92,10 +92,10 @@ class ViewSettings(Settings):
 
 
 class HologramSettings(GridSettings):
-    """Pixels, distance of the volume's middle, number (or distances) of the planes, and rays along each side.
+    """Pixels of the hologram, ``distance`` of the volume's middle, and number or distances of the planes (``depths``).
 
-    ``cone``: type of the edge of a point's cone of light, see ``holotorch.hologram.cone``; by default the cheapest soft
-    edge.
+    ``rays`` is the number of rays along each side, by default one per pixel. ``cone`` is the type of the edge of a
+    point's cone of light, see ``holotorch.hologram.cone``; by default the cheapest soft edge.
     """
 
     distance: Depth
@@ -107,7 +107,7 @@ class HologramSettings(GridSettings):
 class VolumeReport(Settings):
     """Depths of the refocused pictures, and number of realisations of the random phases to average.
 
-    The default depths are the 10, 50 and 90 % quantiles of the depths of the rays.
+    The default depths are the 10, 50 and 90 % quantiles of the depths that the rays show.
     """
 
     refocus: Annotated[tuple[Depth, ...], BeforeValidator(several)] | None = None
@@ -117,9 +117,10 @@ class VolumeReport(Settings):
 class VolumeSettings(Settings):
     """The hologram of a volume, which is rendered directly into light sources, and its refocused pictures.
 
-    ``phase`` of the sources: ``point``, random for each source, so that planes do not interfere on average; ``ray``,
-    random for each ray, as in the thesis, so that the planes of a colour interfere; ``smooth``; ``constant``. ``scale``
-    divides pixels, rays, distances, the volume's width and a given number of planes, for a small version of a scene.
+    ``phase`` is the phase of the sources: ``point``, random for each source, so that planes do not interfere on
+    average; ``ray``, random for each ray, as in the thesis, so that the planes of a colour interfere; ``smooth``, a
+    smooth random function of the ray; or ``constant``. ``scale`` divides pixels, rays, distances, the volume's width
+    and a given number of planes, which makes a small version of a scene.
     """
 
     experiment: Literal["volume"]
@@ -157,8 +158,8 @@ def contradictions(settings: VolumeSettings) -> list[tuple[tuple[str | int, ...]
         problems.append((("wavelengths",), f"expected 3 (red, green, blue), got {len(settings.wavelengths)}"))
     side, rays = hologram.shape, hologram.rays
     if rays is not None and (side[0] % rays or side[1] % rays or side[0] // rays != side[1] // rays):
-        words = f"expected a number that divides the hologram's sides {side}, got {rays}"
-        problems.append((("hologram", "rays"), words))
+        message = f"expected a number that divides the hologram's sides {side}, got {rays}"
+        problems.append((("hologram", "rays"), message))
     width = settings.view.width or max(side[0] * hologram.pitch[0], side[1] * hologram.pitch[1])
     if isinstance(hologram.depths, int) and hologram.distance <= width / 2:
         hint = f"a volume {width:.3g} m wide needs more than {width / 2:.3g} m"

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from holotorch.core.grid import Grid
 from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.runs.environment import find_device
 from holotorch.experiments.volume.config import TransferSettings, VolumeSettings, VolumeSource
 from holotorch.hologram import AxialHologram, ConvolutionHologram, HologramPlan, plan_hologram
 from holotorch.io.catalogue import PUBLISHED, fetch_volume
@@ -30,18 +31,11 @@ _SMOOTH = 8  # correlation length of smooth phases, in rays
 
 @dataclass(frozen=True)
 class VolumeExperiment:
-    """The volume, geometry and operators that a configuration describes.
-
-    Attributes:
-        settings: The configuration.
-        volume: The volume to show.
-        synthetic: The reason why the volume is a phantom; empty for real data.
-        device: Device of the computation.
-    """
+    """The volume, geometry and operators that a configuration describes."""
 
     settings: VolumeSettings
     volume: Volume
-    synthetic: str
+    synthetic: str  # the reason why the volume is a phantom; empty for real data
     device: torch.device
 
     @property
@@ -57,7 +51,7 @@ class VolumeExperiment:
 
     @property
     def stride(self) -> int:
-        """Pixels between neighbouring rays."""
+        """Pitch of the rays in pixels."""
         rays = self.settings.hologram.rays
         return 1 if rays is None else self.settings.hologram.shape[0] // rays
 
@@ -71,11 +65,11 @@ class VolumeExperiment:
     def width(self) -> float:
         """Length of the volume's longest side, in metres."""
         width = self.settings.view.width
-        return max(self.grid.extent) if width is None else width / self.settings.scale
+        return width / self.settings.scale if width else max(self.grid.extent)
 
     @cached_property
     def rotation(self) -> Tensor:
-        """Rotation matrix of the volume about its middle, over (z, y, x)."""
+        """Rotation matrix of the volume about its middle, for vectors (z, y, x)."""
         view = self.settings.view
         a, e = math.radians(view.azimuth_deg), math.radians(view.elevation_deg)
         about_y = torch.tensor([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
@@ -97,26 +91,19 @@ class VolumeExperiment:
     @cached_property
     def plans(self) -> list[HologramPlan]:
         """The plan of each colour's hologram."""
-        hologram = self.settings.hologram
+        settings = self.settings
+        options = {"stride": self.stride, "tolerance": settings.tolerance, "cone": settings.hologram.cone}
         try:
             return [
-                plan_hologram(
-                    self.grid,
-                    wavelength,
-                    self.depths,
-                    self.rays.shape,
-                    stride=self.stride,
-                    tolerance=self.settings.tolerance,
-                    cone=hologram.cone,
-                )
-                for wavelength in self.settings.wavelengths
+                plan_hologram(self.grid, wavelength, self.depths, self.rays.shape, **options)
+                for wavelength in settings.wavelengths
             ]
         except ValueError as error:
             raise ConfigError([f"hologram: {error}"]) from error
 
     @cached_property
     def transfer(self) -> TransferFunction:
-        """Colour and opacity."""
+        """Transfer function from a value of the volume to colour and opacity."""
         return _transfer(self.settings.transfer).to(self.device)
 
     def sampler(self, seed: int = 0) -> DVRSampler:
@@ -142,133 +129,100 @@ class VolumeExperiment:
     def hologram(
         self, seed: int = 0, advance: Callable[[], object] = lambda: None, part: "Part | None" = None
     ) -> tuple[Tensor, float]:
-        """Holograms [3, H, W] of one realisation, rendered plane by plane into all colours at once.
+        """Fields [3, H, W] of the holograms of one realisation, and the seconds spent on rendering.
 
-        Args:
-            seed: Number of the realisation of the phases.
-            advance: Called after every plane.
-            part: Planes and colours to add up; all by default.
-
-        Returns:
-            The fields, and the seconds spent on rendering.
+        Each plane is rendered once and added to all colours. ``seed`` is the number of the realisation of the phases;
+        ``advance`` is called after every plane; ``part`` selects planes and colours, all by default.
         """
         layers = self.sampler(seed)(self.volume)
         sums = []
         for plan in self.plans:
             assert isinstance(plan.operator, AxialHologram | ConvolutionHologram)
             sums.append(plan.operator.accumulator(self.rays.shape, layers.phase))
-        rendering, started = 0.0, time.perf_counter()
+        rendering_seconds, started = 0.0, time.perf_counter()
         with torch.no_grad():
             for j, plane in enumerate(layers.amplitudes()):
-                rendering += time.perf_counter() - started
+                rendering_seconds += time.perf_counter() - started
                 for colour, total in enumerate(sums):
                     if part is None or part.takes(colour, j):
                         total.add(j, plane[colour])
                 advance()
                 started = time.perf_counter()
         fields = []
-        while sums:  # one at a time, so that the memory of a spectrum is freed before the next is transformed
+        while sums:  # one by one, so that the memory of each spectrum is freed before the next is transformed
             fields.append(sums.pop(0).finish().to(self.device))
-        return torch.stack(fields), rendering
+        return torch.stack(fields), rendering_seconds
 
     @property
-    def refocus(self) -> list[float] | None:
-        """Depths of the refocused pictures in metres, if they are configured."""
-        depths = self.settings.report.refocus
-        return None if depths is None else [depth / self.settings.scale for depth in depths]
+    def refocus(self) -> list[float]:
+        """Configured depths of the refocused pictures, in metres; empty if there are none."""
+        return [depth / self.settings.scale for depth in self.settings.report.refocus or ()]
 
 
 @dataclass(frozen=True)
 class Part:
-    """The work of one of several processes: the colours are divided first, then blocks of planes.
+    """The share of one of several processes: the processes divide the three colours, then the planes of a colour."""
 
-    Attributes:
-        rank: Index of this process.
-        count: Number of processes.
-        planes: Number of planes.
-    """
-
-    rank: int
-    count: int
-    planes: int
+    rank: int  # index of this process
+    count: int  # number of processes
+    planes: int  # number of planes in the scene
 
     def takes(self, colour: int, plane: int) -> bool:
         """Whether this process adds ``plane`` of ``colour``."""
         if self.count <= 3:
             return colour % self.count == self.rank
-        blocks = (self.count - colour + 2) // 3  # processes whose rank modulo 3 is this colour
+        blocks = (self.count - colour + 2) // 3  # number of processes whose rank modulo 3 is this colour
         return self.rank % 3 == colour and plane * blocks // self.planes == self.rank // 3
 
 
 def build(settings: VolumeSettings) -> VolumeExperiment:
-    """Read the volume. ConfigError for a volume that cannot be read or used."""
+    """Load the inputs. ConfigError for a volume or transfer function that cannot be read or used."""
     volume, synthetic = _volume(settings.volume)
     try:
         volume.check_finite()
-        experiment = VolumeExperiment(settings, volume, synthetic, _device(settings.device))
-        _ = experiment.transfer
+        experiment = VolumeExperiment(settings, volume, synthetic, find_device(settings.device))
+        _ = experiment.transfer  # read now, so that its errors are reported
     except ValueError as error:
         raise ConfigError([f"volume: {error}"]) from error
     except OSError as error:
         raise ConfigError([f"transfer.file: {error.filename}: {error.strerror}"]) from error
-    if min(experiment.depths) <= 0:
-        raise ConfigError(
-            [f"hologram.distance: the volume extends behind the hologram, to {min(experiment.depths):g} m"]
-        )
+    if (nearest := min(experiment.depths)) <= 0:
+        raise ConfigError([f"hologram.distance: the volume extends behind the hologram, to {nearest:g} m"])
     return experiment
 
 
 def _volume(source: VolumeSource) -> tuple[Volume, str]:
+    """The volume, and the reason why it is a phantom, which is empty for real data."""
     spacing = source.spacing[0] if source.spacing and len(source.spacing) == 1 else source.spacing
     try:
         if source.path:
             options = {"spacing": spacing, "shape": source.shape, "dtype": source.dtype, "unit": source.unit}
             return load_volume(source.path, **options), ""
-        reason = "a phantom was asked for"
-        if source.scene:
-            name = _CATALOGUE.get(source.scene, source.scene)
-            if name in PUBLISHED:
-                try:
-                    return fetch_volume(name, source.directory), ""
-                except (OSError, ValueError) as error:
-                    cause = " ".join(str(error).split())
-                    reason = f"{source.scene} could not be fetched ({cause}); give its file as volume.path=FILE"
-            else:
-                reason = f"no checksum of {source.scene} is published; give its file as volume.path=FILE"
-            if not source.phantom:
-                raise ConfigError([f"volume.scene: {reason}, or volume.phantom to stand in for it"])
     except ValueError as error:
         raise ConfigError([f"volume: {error}"]) from error
     except OSError as error:
         raise ConfigError([f"volume.path: {source.path}: {error.strerror or error}"]) from error
-    make = {
-        "shells": phantoms.shells,
-        "c60": phantoms.c60,
-        "marschner_lobb": phantoms.marschner_lobb,
-        "gaussian_ball": phantoms.gaussian_ball,
-    }
+    reason = "a phantom was asked for"
+    if source.scene:
+        name = _CATALOGUE.get(source.scene, source.scene)
+        reason = f"no checksum of {source.scene} is published; give its file as volume.path=FILE"
+        if name in PUBLISHED:
+            try:
+                return fetch_volume(name, source.directory), ""
+            except (OSError, ValueError) as error:
+                cause = " ".join(str(error).split())
+                reason = f"{source.scene} could not be fetched ({cause}); give its file as volume.path=FILE"
+        if not source.phantom:
+            raise ConfigError([f"volume.scene: {reason}, or volume.phantom to stand in for it"])
     assert source.phantom is not None
-    return make[source.phantom](source.samples, dtype=torch.uint8), reason
+    return getattr(phantoms, source.phantom)(source.samples, dtype=torch.uint8), reason
 
 
 def _transfer(settings: TransferSettings) -> TransferFunction:
     if settings.preset:
-        assert settings.low is not None and settings.high is not None
-        make = {
-            "bone": transfer_presets.bone,
-            "soft_tissue": transfer_presets.soft_tissue,
-            "vessels": transfer_presets.vessels,
-            "industrial": transfer_presets.industrial,
-        }
-        return make[settings.preset](settings.low, settings.high)
+        return getattr(transfer_presets, settings.preset)(settings.low, settings.high)
     if settings.file:
         return transfer_presets.transfer_from_json(read_bytes(Path(settings.file)).decode("utf-8"))
     assert settings.points is not None
     table = torch.tensor(settings.points)
     return TransferFunction(table[:, 0], table[:, 1:4], table[:, 4], unit_distance=settings.unit_distance)
-
-
-def _device(name: str) -> torch.device:
-    if name == "cuda" and not torch.cuda.is_available():
-        raise ConfigError(["device: cuda was asked for, but torch finds no CUDA device; use device: auto or cpu"])
-    return torch.device("cuda" if name == "cuda" or (name == "auto" and torch.cuda.is_available()) else "cpu")

@@ -48,7 +48,7 @@ class VolumeKind(ExperimentKind[VolumeSettings, "VolumeExperiment"]):
     def section(self, record: RunRecord) -> list[str]:
         from holotorch.experiments.volume.report import volume_section
 
-        return volume_section(record.title, record.summary, record.plan, record.picture)
+        return volume_section(record)
 
 
 KIND = VolumeKind()

@@ -11,11 +11,11 @@ from holotorch.optics import diffraction_angle
 from holotorch.optics.light.coherence import depth_of_focus
 from holotorch.scene import DVRSampler
 
-# Cost on two CPU cores, as measured.
+# Times were measured on two CPU cores.
 _FLOP_SECONDS = 4.2e-11  # seconds per operation of a HologramPlan
 _RAY_SECONDS = 1.5e-8  # seconds of rendering per ray and plane
-_BASE_BYTES = 500e6  # libraries
-_RAY_BYTES = 120  # bytes per ray of the renderer
+_BASE_BYTES = 500e6  # memory of the libraries
+_RAY_BYTES = 120  # memory of the renderer per ray
 _SLAB = 42  # rendered planes held in memory before they are spread onto the nodes of an axial hologram
 _COARSE = 64  # rays along each side of the rendering that estimates how much light is cut off
 
@@ -26,11 +26,11 @@ def plan_values(experiment: VolumeExperiment) -> dict[str, Any]:
     rays = math.prod(experiment.rays.shape)
     flops = sum(each.flops for each in plans)
     seconds = settings.report.seeds * (_FLOP_SECONDS * flops + _RAY_SECONDS * rays * len(depths))
-    samples = [8 * math.prod(each.size) for each in plans]
-    # While planes are added, each colour holds a sum and a step; at the end, one more spectrum is transformed.
+    spectra = [8 * math.prod(each.size) for each in plans]  # bytes
+    # While planes are added, each colour holds a sum and a summand; at the end, one spectrum is transformed as well.
     slab = 8 * rays * _SLAB * len(plans)
-    peak = _BASE_BYTES + 2 * sum(samples) + 1.5 * max(samples) + slab + _RAY_BYTES * rays
-    peak += experiment.volume.values.numel() * experiment.volume.values.element_size()
+    peak = _BASE_BYTES + 2 * sum(spectra) + 1.5 * max(spectra) + slab + _RAY_BYTES * rays
+    peak += experiment.volume.values.nbytes
     return {
         "volume": {
             "shape": list(experiment.volume.shape),
@@ -70,11 +70,11 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
     source = settings.volume.path or settings.volume.scene or settings.volume.phantom
     if volume["synthetic"]:
         source = f"{settings.volume.phantom} (synthetic: {volume['synthetic']})"
-    near, far = values["depths_mm"]
+    nearest, farthest = values["depths_mm"]
     lines = [
         f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, {volume['width_mm']:.4g} mm wide",
         f"Rays       {values['rays'][0]} x {values['rays'][1]}, {settings.phase} phases; {values['planes']} planes "
-        f"from {near:.4g} to {far:.4g} mm, the {settings.view.front} end first",
+        f"from {nearest:.4g} to {farthest:.4g} mm, the {settings.view.front} end first",
         f"Hologram   {grid.shape[0]} x {grid.shape[1]} px of {grid.pitch[1] * 1e6:.4g} um; field of view "
         f"{', '.join(f'{angle:.2f}' for angle in physics['field_of_view_deg'])} deg",
     ]
@@ -82,11 +82,9 @@ def plan_text(experiment: VolumeExperiment, values: dict[str, Any]) -> str:
         divided = "pixels, rays, distances, width and a given number of planes"
         lines.append(f"Scale      1 / {settings.scale} of the configuration: {divided} are divided by {settings.scale}")
     for each in values["holograms"]:
-        cone = f", {each['cone']} cone of light" if each["near"] else ""
-        lines.append(
-            f"{each['wavelength_nm']:.0f} nm     method: {each['method']}{cone} (predicted error "
-            f"{each['predicted_error']:.1e}); {each['runner_up']}"
-        )
+        method = each["method"] + (f", {each['cone']} cone of light" if each["near"] else "")
+        error = f"predicted error {each['predicted_error']:.1e}"
+        lines.append(f"{each['wavelength_nm']:.0f} nm     method: {method} ({error}); {each['runner_up']}")
     lines.append(
         f"Cost       about {values['predicted_seconds']:.2g} s on two idle cores for {settings.report.seeds} "
         "realisation(s) of the random phases, without start-up, refocusing and figures; "
@@ -103,7 +101,7 @@ def _physics(experiment: VolumeExperiment) -> dict[str, Any]:
     return {
         "field_of_view_deg": [2 * math.degrees(angle) for angle in angles],
         "spot_um": [wavelength * middle / min(grid.extent) * 1e6 for wavelength in wavelengths],
-        # From this distance on, the light of every source covers the whole hologram (region III).
+        # The smallest distance at which the light of every source covers the whole hologram (region III of the thesis).
         "whole_cone_from_mm": [
             (experiment.width + min(grid.extent)) / 2 / math.tan(angle) * 1e3 if angle < math.pi / 2 else 0.0
             for angle in angles
@@ -116,42 +114,36 @@ def _notes(experiment: VolumeExperiment) -> list[str]:
     lost = _lost_light(experiment)
     if lost > 0.005:
         notes.append(f"{100 * lost:.1f} % of the volume's light lies beside the rays and is cut off")
-    near, far = min(experiment.depths), max(experiment.depths)
-    half_angle = math.atan(min(experiment.grid.extent) / 2 / near)
+    nearest, depth = min(experiment.depths), max(experiment.depths) - min(experiment.depths)
+    half_angle = math.atan(min(experiment.grid.extent) / 2 / nearest)
     wavelength = min(experiment.settings.wavelengths)
     aperture = min(math.sin(half_angle), wavelength / (2 * max(experiment.rays.pitch)))
-    if 0 < far - near < (depth := depth_of_focus(wavelength, aperture)):
+    if 0 < depth < (focus := depth_of_focus(wavelength, aperture)):
         notes.append(
-            f"the scene is {(far - near) * 1e3:.3g} mm deep and the depth of focus {depth * 1e3:.3g} mm: refocusing "
+            f"the scene is {depth * 1e3:.3g} mm deep and the depth of focus {focus * 1e3:.3g} mm: refocusing "
             "makes no visible difference; use a deeper scene, a smaller distance, or a wider hologram with finer rays"
         )
     return notes
 
 
 def _lost_light(experiment: VolumeExperiment) -> float:
-    """Share of the volume's light outside the area of the rays, from a coarse rendering of the whole volume."""
+    """Fraction of the volume's light outside the area of the rays, from a coarse rendering of the whole volume."""
     extent = torch.tensor(experiment.volume.extent, dtype=torch.float64)
     sides = (experiment.rotation.abs() @ extent / extent.max() * experiment.width).tolist()
-    if all(size >= side for size, side in zip(experiment.rays.extent, sides[1:], strict=True)):
+    height, width = experiment.rays.extent
+    if height >= sides[1] and width >= sides[2]:
         return 0.0
     middle, half, planes = experiment.distance, sides[0] / 2, 24
     coarse = Grid(_COARSE, (sides[1] / _COARSE, sides[2] / _COARSE))
     depths = [middle + half * ((j + 0.5) * 2 / planes - 1) for j in range(planes)]
-    sampler = DVRSampler(
-        experiment.transfer,
-        coarse,
-        depths[::-1] if experiment.settings.view.front == "far" else depths,
-        width=experiment.width,
-        distance=middle,
-        rotation=experiment.rotation,
-    )
+    geometry = {"width": experiment.width, "distance": middle, "rotation": experiment.rotation}
+    front_to_back = depths[::-1] if experiment.settings.view.front == "far" else depths
+    sampler = DVRSampler(experiment.transfer, coarse, front_to_back, **geometry)
     with torch.no_grad():
         light = sampler.render(experiment.volume)[0].sum(0)
     total = light.sum().item()
     if total == 0:
         return 0.0
-    y, x = (
-        (position.abs() <= size / 2).to(light)
-        for position, size in zip(coarse.coordinates(light.device), experiment.rays.extent, strict=True)
-    )
-    return 1 - (light * y * x).sum().item() / total
+    y, x = coarse.coordinates(light.device)
+    inside = (y.abs() <= height / 2) & (x.abs() <= width / 2)
+    return 1 - (light * inside).sum().item() / total

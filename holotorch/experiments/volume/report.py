@@ -1,36 +1,34 @@
 """The section of a report page for a volume's run."""
 
-from collections.abc import Callable
 from typing import Any
 
 from holotorch.experiments.runs.page import element, figure, heading, plain, table
+from holotorch.experiments.runs.record import RunRecord
 
-_FIGURES = {
+_CAPTIONS = {
     "rendering": "Direct volume rendering",
     "in_focus": "Hologram, every ray refocused at its own depth",
 }
 
 
-def volume_section(
-    title: str, summary: dict[str, Any], plan: dict[str, Any], picture: Callable[[str], str]
-) -> list[str]:
-    """HTML of a run: pictures side by side, scores, time and plan; ``picture`` gives an image's data URL or nothing."""
-    parts = [heading(title, summary["status"])]
+def volume_section(record: RunRecord) -> list[str]:
+    """HTML of a run: pictures side by side, scores, time and plan."""
+    summary, plan = record.summary, record.plan
+    parts = [heading(record.title, summary["status"])]
     if summary["synthetic"]:
         parts.append(element("p", f"Synthetic volume: {summary['synthetic']}.", "warn"))
     depths: list[float] = summary["refocused_m"]
-    captions = _FIGURES | {f"focus_{f}": f"Refocused at {depth * 1e3:.4g} mm" for f, depth in enumerate(depths)}
+    captions = _CAPTIONS | {f"focus_{f}": f"Refocused at {depth * 1e3:.4g} mm" for f, depth in enumerate(depths)}
     synthetic = ", synthetic" if summary["synthetic"] else ""
-    sources = {caption: picture(name) for name, caption in captions.items()}
     parts.append('<div class="row">')
-    parts += [figure(source, caption + synthetic, "picture") for caption, source in sources.items() if source]
+    for name, caption in captions.items():
+        if source := record.picture(name):
+            parts.append(figure(source, caption + synthetic, "picture"))
     parts.append("</div>")
-    if source := picture("depth"):
+    if source := record.picture("depth"):
         parts.append(figure(source, "Mean depth along each ray", "wide"))
-    parts.append(_scores(summary, depths))
-    parts.append(element("p", _cost(summary)))
-    shown = {name.replace("_", " "): value for name, value in plan.items() if name not in ("notes", "holograms")}
-    rows = [[name, plain(value)] for name, value in shown.items()]
+    parts += [_scores(summary, depths), element("p", _cost(summary))]
+    rows = [[name.replace("_", " "), plain(plan[name])] for name in plan if name not in ("notes", "holograms")]
     rows += [[f"{each['wavelength_nm']:.0f} nm", plain(each)] for each in plan["holograms"]]
     parts += [element("h2", "Plan"), table(["", ""], rows, head=False)]
     return parts + [element("p", note, "warn") for note in plan["notes"]]

@@ -184,7 +184,7 @@ def assert_same_arrays(one: Path, other: Path) -> None:
 
 
 def test_large_inputs_are_sampled_from_end_to_end(monkeypatch):
-    monkeypatch.setattr(module, "_MOST", 40)
+    monkeypatch.setattr(module, "_HASHED_BYTES", 40)
     settings = load_config(CONFIGS / "pec" / "fourier.yaml")
     values = torch.arange(100.0).reshape(10, 10)  # 40 bytes a row
     marks = {}
