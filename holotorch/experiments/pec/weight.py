@@ -32,9 +32,9 @@ def zone_scores(
 ) -> list[dict[str, Any]]:
     """PSNR and SSIM of a picture against ``image``, both [C, H, W] in 0 .. 1, one row for each of ``ZONES``.
 
-    Only the colours in the mask ``lit`` [C] count. The PSNR of a zone is that of its pixels. The SSIM is the mean over the
-    windows centred in the zone, or None without such a window. ``error`` is the share of the zone in the total squared
-    error. Zones without pixels are left out.
+    Only the colours in the mask ``lit`` [C] count. The PSNR of a zone is that of its pixels. The SSIM is the mean over
+    the windows centred in the zone, or None without such a window. ``error`` is the share of the zone in the total
+    squared error. Zones without pixels are left out.
     """
     picture, image = picture[lit].clamp(0, 1), image[lit]
     angles, edge = eccentricities(settings, (image.shape[-2], image.shape[-1])), SSIM_WINDOW // 2
