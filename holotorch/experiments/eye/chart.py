@@ -33,7 +33,7 @@ DISTANCES = (10e-3, 20e-3, 30e-3)  # from the hologram to the scene, in metres
 FOCUS = 30e-3  # from the hologram to the depth in focus, in metres
 HOLOGRAM = f"hologram={{shape: [{SIDE}, {SIDE}], pitch: 3.74 um, distance: 30 mm, depths: 58, rays: {SIDE // 2}}}"
 SCENE = f"scene={{config: configs/volume/c60.yaml, change: ['{HOLOGRAM}']}}"
-FACTORS = (1.0, 2.0, 4.0)  # pitch of the hologram / pitch on eyepiece and eye, in element-by-element propagation
+FACTORS = (1.0, 2.0, 4.0)  # oversampling by elements: pitch of the hologram / pitch on eyepiece and eye
 
 
 def eye() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
@@ -51,7 +51,7 @@ def eye() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
 
 
 def _quarter_size(settings: ObserverSettings, scene: VolumeSettings) -> Observer:
-    """The observer with all lengths of display, eye and scene divided by 4; at full size, the elements need 11 GB."""
+    """Observer with a quarter of the distances; at full size, element-by-element propagation needs 11 GB."""
     display, eye = settings.display, settings.eye
     lengths = {name: value / 4 for name, value in display.model_dump().items() if isinstance(value, float)}
     smaller = {

@@ -95,11 +95,10 @@ class ObserverSettings(Settings):
 
     ``focus``: depths of the scene at which the eye is focused; by default, the 10, 50 and 90 % quantiles of the visible
     depths. ``seeds``: number of realisations of the random phases; they are compared with the mean of eight times as
-    many other realisations.
-    ``tolerance``: allowed relative L2 error of the intensity on the retina. If collapsed propagation exceeds it, light
-    is propagated element by element, which takes 10 to 300 times as long and needs much memory.
-    ``sweep``: sweep of the focus over the scene, which finds the focus at which each part looks sharpest.
-    ``tradeoff``: distances from hologram to scene at which the best spectral width of each colour is determined.
+    many other realisations. ``tolerance``: allowed relative L2 error of the intensity on the retina. If the error of
+    collapsed propagation is larger, light is propagated element by element, which takes 10 to 300 times as long and
+    needs much memory. ``sweep``: sweep of the focus, which finds the focus at which each part of the scene looks
+    sharpest. ``tradeoff``: distances of the scene at which the best spectral width of each colour is determined.
     """
 
     experiment: Literal["eye"]

@@ -25,7 +25,7 @@ from holotorch.optics.viewing.display_geometry import eyepiece_distance, image_d
 from holotorch.optics.viewing.eye import Eye
 from holotorch.optics.viewing.retina import RetinaPlan, plan_retina
 
-PRESETS: dict[str, Callable[[float], Spectrum]] = {  # spectrum with a given central wavelength in metres
+PRESETS: dict[str, Callable[[float], Spectrum]] = {  # functions of the central wavelength in metres
     "laser": Spectrum.laser,
     "narrow_sled": Spectrum.narrow_sled,
     "sled": Spectrum.sled,
@@ -100,7 +100,7 @@ class Observer:
     def samples(self, source: str, wavelength: float, depth: float) -> tuple[Tensor, Tensor, int]:
         """Wavelengths [K] in metres and weights [K] that represent a source, and the number N <= K to propagate.
 
-        Results are cached, since computing them may take a second. ConfigError if no light reaches the pupil.
+        Pictures at the other wavelengths are derived. Results are cached. ConfigError if no light reaches the pupil.
         """
         key = (source, wavelength, depth)
         if key not in self._samples:

@@ -117,7 +117,7 @@ def draw(eye: Observer) -> bytes:
 
 
 def _draw_display(axes: Any, eye: Observer) -> None:
-    """Hologram, scene, eyepiece and eye, with rays from the ends of the scene to the edges of the pupil."""
+    """Draw hologram, scene, eyepiece and eye, with rays from the ends of the scene to the edges of the pupil."""
     scene, display = eye.scene, eye.settings.display
     half, pupil = 1e3 * scene.grid.extent[0] / 2, 1e3 * eye.settings.eye.pupil_radius
     lens, back = (1e3 * float(value) for value in (eye.display.lens_distance, eye.display.eye_distance))

@@ -25,7 +25,7 @@ from holotorch.optics.viewing.imaging import propagate_collapsed
 
 WIDTHS = tuple(1e-9 * width for width in (1.4, 2.5, 4, 6, 9, 13, 19, 28, 40, 56))  # FWHM in metres, to be compared
 # Offsets in metres from the central wavelength at which pictures are computed, on both sides. Up to 10 nm the step is
-# 0.5 nm, half the period in wavelength of the picture's oscillation at the corner of a scene; beyond, it is 1 nm.
+# 0.5 nm, since the picture at the corner of a scene oscillates with a period of 1 nm; beyond, it is 1 nm.
 _OFFSETS = 1e-9 * np.concatenate([np.arange(0, 10, 0.5), np.arange(10, 85.0)])
 # Number of wavelengths of a colour that are propagated; the pictures at the others are derived from theirs. For an LED,
 # even a single propagated wavelength of 61 has an error of only 0.4 % (``holotorch chart eye``).
@@ -41,7 +41,7 @@ class Case:
     Attributes:
         distance: Distance of the scene from the hologram in metres.
         wavelength: Central wavelength in metres.
-        aperture: Sine of a half angle, ``Observer.detail``.
+        aperture: Sine of the half angle of the light cone, from ``Observer.detail``.
         ssim: SSIM against the mean picture of other realisations, for each of ``WIDTHS``.
         contrast: Speckle contrast for each of ``WIDTHS``.
         best: FWHM in metres with the highest SSIM, see :func:`parabola_peak`.

@@ -19,9 +19,7 @@ from holotorch.io.files import read_bytes
 from holotorch.modulator.dispersion import Birefringence, BirefringenceTable, Cauchy, phase_scale
 from holotorch.modulator.panel import PhaseModulator, checked_lut, even_lut
 
-# Relative tolerance within which two wavelengths are the same. A calibration then applies unchanged to the light of a
-# laser whose wavelength differs slightly from the nominal value.
-_SAME = 1e-3
+_SAME = 1e-3  # relative deviation of a laser from the calibration wavelength up to which the calibration is unchanged
 
 
 def _rises(points: Sequence[tuple[float, float]]) -> bool:
@@ -40,9 +38,9 @@ Points = Annotated[tuple[tuple[Number, Number], ...], Field(min_length=2), After
 class CalibrationSettings(Settings):
     """Phases of the grey levels at one wavelength: evenly spaced, or from a table of [level, phase in rad].
 
-    ``full_turn``: level at which the phase is 2 pi, not necessarily an integer; 2^bits by default. ``lut``: the
-    table from level 0 to the top level; other levels are interpolated linearly. ``lut_file``: text file with a line
-    ``level, phase`` for each row of the table; its path is relative to the folder of the description.
+    ``full_turn``: level at which the phase is 2 pi, not necessarily an integer; 2^bits by default. ``lut``: rows of
+    the table, the first at level 0 and the last at the top level; phases between are interpolated linearly.
+    ``lut_file``: the table as a text file of ``level, phase`` lines, relative to the folder of the description.
     """
 
     wavelength: Wavelength
@@ -77,7 +75,7 @@ def load_panel(path: Path | str, overrides: Sequence[str] = ()) -> PanelSettings
     """Read the description of a panel, apply ``key=value`` overrides, and check it.
 
     Raises:
-        ConfigError: The description has mistakes. Each has a line with file, line and column.
+        ConfigError: The description has mistakes; the message gives file, line and column of each.
     """
     source = read_source(Path(path), list(overrides))
     settings = validated(source, PanelSettings)
@@ -113,7 +111,7 @@ def build_panel(settings: PanelSettings, wavelengths: Sequence[float]) -> PhaseM
     by more than 0.1 %, the phases are scaled by the dispersion of the liquid crystal.
 
     Raises:
-        ConfigError: A wavelength has no calibration and the panel no dispersion, or the dispersion table excludes it.
+        ConfigError: A wavelength without calibration if the panel has no dispersion, or outside the dispersion table.
     """
     law = _law(settings.dispersion) if settings.dispersion is not None else None
     rows = []

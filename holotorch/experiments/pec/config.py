@@ -42,7 +42,7 @@ SIGMA_MEANING = (
 
 
 class PeripheralWeightSettings(Settings):
-    """Weight (1 + E / e2_deg)^-2 on the squared error of a pixel, where E is the eccentricity, its angle to the gaze.
+    """Weight (1 + E / e2_deg)^-2 on the squared error of a pixel, where E is the angle between the pixel and the gaze.
 
     ``field_deg``: angle that the picture spans from left to right; every pixel spans the same angle. ``gaze_deg``:
     elevation and azimuth of the gaze from the middle of the picture. ``least``: lower limit of the weight, relative to
@@ -105,7 +105,7 @@ class NearFieldSettings(Settings):
 
 
 class _SolverSettings(Settings):
-    """Settings of any solver, which stops after ``patience`` relative changes of the loss below ``tolerance``."""
+    """Solver settings. A run stops after ``patience`` successive relative changes of the loss below ``tolerance``."""
 
     kind: Any  # name of the solver, stated by each of the classes below
     max_steps: Count = 400
@@ -115,7 +115,7 @@ class _SolverSettings(Settings):
 
 
 class APGSettings(_SolverSettings):
-    """Accelerated proximal gradient, thesis Algorithm 2."""
+    """Accelerated proximal gradient, thesis Algorithm 2; options as in ``holotorch.correction.APG``."""
 
     kind: Literal["apg"]
     step: Annotated[Number, Field(ge=1e-6, le=1e6)] = 1.0

@@ -81,7 +81,7 @@ class PECExperiment:
 
     @property
     def scale_free(self) -> bool:
-        """Whether light may leave the picture, so that the image is scaled to fit the target best before comparison."""
+        """Whether light may leave the picture. The image is then scaled to fit the target best before comparison."""
         return self.isolated or self.settings.target.region is not None
 
     @property
@@ -91,14 +91,14 @@ class PECExperiment:
 
     @cached_property
     def image(self) -> Tensor:
-        """The picture resampled to the grid, or to the region, float64 [all colours, H, W]; computed on first use."""
+        """The picture resampled to the grid, or to the region, float64 [all colours, h, w]; computed on first use."""
         settings = self.settings
         fitted = fit_image(self.source, settings.target.region or settings.grid.shape, settings.target.fit)
         return with_channels(fitted, len(settings.wavelengths)).contiguous()
 
     @property
     def wanted(self) -> Tensor:
-        """Intensity of the lit colours of the picture, each scaled to mean 1, float64 [C, H, W]."""
+        """Intensity of the lit colours of the picture, each scaled to mean 1, float64 [C, h, w]."""
         image = self.image[self.lit]
         return image / image.mean((-2, -1), keepdim=True)
 
@@ -122,7 +122,7 @@ class PECExperiment:
 
     @property
     def mask(self) -> Tensor | None:
-        """1 at image samples that are compared with the target, otherwise 0, float64; None if all are compared."""
+        """1 where the image is compared with the target, else 0; float64, broadcasts to [C, *image]. None for all 1."""
         depths, width = len(self.distances), self.grid.shape[1]
         if self.settings.target.region:
             mask = torch.zeros(1, *self.grid.shape, dtype=torch.float64)
@@ -225,7 +225,7 @@ class PECExperiment:
         limit, bits = self.settings.modulator.max_phase, self.settings.modulator.bits
         if bits is not None:
             phase = quantised(phase, bits)
-        # Rounding may exceed the limit, so scaling comes last. It multiplies all levels by one factor.
+        # Rounded phases may exceed the limit, so they are scaled last, all levels by the same factor.
         return phase if limit is None else limit_peak_phase(limit, phase, self.array.crosstalk)
 
     def stages(self) -> list[Stage]:

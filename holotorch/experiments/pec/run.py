@@ -73,10 +73,10 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
 def _fingerprint(experiment: PECExperiment) -> Fingerprint:
     """Settings and inputs that must not change before a run is resumed."""
     free = {"device", "report.baselines"}  # baselines are computed after the solver
-    if experiment.settings.solver.kind != "lbfgs":  # L-BFGS divides max_steps among its stages
+    if experiment.settings.solver.kind != "lbfgs":  # the stages of L-BFGS depend on max_steps
         free.add("solver.max_steps")
     kept = fingerprint(experiment.settings, {"target.image": (experiment.source,)}, free)
-    # This entry refuses checkpoints of version 0.1.0, whose joint frames are [C, F, H, W]; if F = C, shapes are equal.
+    # This entry refuses checkpoints of version 0.1.0, whose joint frames are [C, F, H, W], the same shape if F = C.
     return kept | ({"axes of joint frames": "F, C, H, W"} if experiment.joint else {})
 
 

@@ -31,8 +31,7 @@ from holotorch.metrics import PerceptualSimilarity, psnr, ssim
 from holotorch.modulator import PhasedArray, ThermalCrosstalk
 
 PHOTOGRAPHS = ("camera", "astronaut", "coffee", "page")
-WAVELENGTH = 530e-9  # metres
-EXTENT, DISTANCE = 2e-3, 0.1  # width of the chip and distance of the image in metres, as in the thesis
+WAVELENGTH, EXTENT, DISTANCE = 530e-9, 2e-3, 0.1  # metres; width of the chip and distance of the image of the thesis
 # Settings of the propagator for each value of ``Bench.kind``.
 _PROPAGATORS = {
     "fourier": {"kind": "fraunhofer"},

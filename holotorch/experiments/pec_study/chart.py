@@ -47,7 +47,7 @@ def pec() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
 
 
 def _solvers(bench: Bench) -> dict[str, Callable[[Callback], Any]]:
-    """Functions that run a solver with a callback. The start is hot (thesis) unless the name states another."""
+    """Functions by name that run a solver with a callback. The start is hot (thesis) unless the name states another."""
     hot, quadratic, problem = bench.start("hot"), bench.start("quadratic"), bench.experiment.problem()
     apg = APG(max_steps=STEPS, tolerance=0.0)
     plain = LBFGS(max_steps=STEPS // 2, tolerance=0.0)

@@ -1,4 +1,4 @@
-"""Thesis Fig. 4.18: a volume as slices with a corrected hologram each, shown in turn, and the error by focus."""
+"""Thesis Fig. 4.18: holograms of the slices of a volume, shown in turn, and the error of their picture by focus."""
 
 import math
 from dataclasses import replace
