@@ -29,8 +29,8 @@ from holotorch.optics.viewing.imaging import propagate_collapsed
 from holotorch.optics.viewing.retina import plan_retina
 
 SIDE = 512  # pixels along each side of the hologram
-DISTANCES = (10e-3, 20e-3, 30e-3)  # from the hologram to the scene, in metres
-FOCUS = 30e-3  # from the hologram to the depth in focus, in metres
+DISTANCES = (10e-3, 20e-3, 30e-3)  # distances from hologram to scene, in metres
+FOCUS = 30e-3  # distance from hologram to the depth in focus, in metres
 HOLOGRAM = f"hologram={{shape: [{SIDE}, {SIDE}], pitch: 3.74 um, distance: 30 mm, depths: 58, rays: {SIDE // 2}}}"
 SCENE = f"scene={{config: configs/volume/c60.yaml, change: ['{HOLOGRAM}']}}"
 FACTORS = (1.0, 2.0, 4.0)  # oversampling by elements: pitch of the hologram / pitch on eyepiece and eye

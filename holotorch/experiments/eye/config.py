@@ -65,8 +65,8 @@ class LightSettings(Settings):
     """Sources to compare; laser, narrow_sled, sled and led have an FWHM of 1.4, 5, 10 and 20 nm.
 
     ``tolerance``: allowed error from summing over a few wavelengths instead of the whole spectrum, relative to the rms
-    intensity of a picture. ``extent``: each source is a disc; ``extent`` is the sine of the half angle that it subtends
-    at the hologram, 0 for a point source.
+    intensity of a picture. ``extent``: sine of the half angle that each source, a disc, subtends at the hologram;
+    0 for a point source.
     """
 
     sources: Annotated[tuple[Source, ...], BeforeValidator(several), Field(min_length=1)] = (

@@ -20,7 +20,7 @@ _REGIONS = (  # meanings of the regions
     "the hologram holds part of the cone of light",
     "the cone of light covers the whole hologram, so spots grow with distance",
 )
-_INVISIBLE = 0.005  # share of the light of the scene's edge that enters the pupil, below which the edge is invisible
+_INVISIBLE = 0.005  # the edge of the scene is invisible if a smaller fraction of its light enters the pupil
 
 
 def geometry(eye: Observer) -> dict[str, Any]:

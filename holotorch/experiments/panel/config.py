@@ -19,7 +19,7 @@ from holotorch.io.files import read_bytes
 from holotorch.modulator.dispersion import Birefringence, BirefringenceTable, Cauchy, phase_scale
 from holotorch.modulator.panel import PhaseModulator, checked_lut, even_lut
 
-_SAME = 1e-3  # relative deviation of a laser from the calibration wavelength up to which the calibration is unchanged
+_SAME = 1e-3  # largest relative difference of the wavelengths at which a calibration is used unchanged
 
 
 def _rises(points: Sequence[tuple[float, float]]) -> bool:
