@@ -36,7 +36,7 @@ class Quantity:
     infinite: bool = False
 
     def problem(self, value: float) -> str | None:
-        """Why ``value`` is refused, as the end of a sentence that begins with a name; None if accepted."""
+        """Why ``value`` is refused, as the end of a sentence whose subject is its name; None if it is accepted."""
         size = abs(value)
         if math.isnan(value) or (math.isinf(value) and not self.infinite):
             return f"must be finite in {self.words}{', or infinite' * self.infinite}, got {value!r}"

@@ -48,8 +48,8 @@ def deconvolve(crosstalk: Crosstalk, phase: Tensor, *, max_steps: int = 30, star
         max_steps: Number of iterations.
         start: X of the first iteration; ``phase`` by default.
 
-    Source: thesis Eqs. 4.32-4.35, with P^T phi in the gradient. The step length is 1 / (sum K)^2, since (sum K)^2 is an
-    upper bound of the Lipschitz constant of the gradient.
+    Source: thesis Eqs. 4.32-4.35, with P^T(phase) in the gradient. The step length is 1 / (sum K)^2, since (sum K)^2
+    is an upper bound of the Lipschitz constant of the gradient.
     """
     checks.real("phase", phase)
     checks.all_finite("phase", phase)

@@ -191,7 +191,7 @@ def spread_preconditioner(kernel: Tensor, floor: float = 0.1) -> Callable[[Tenso
     """Approximate inverse Hessian for unknowns that a ``kernel`` spreads: 1 / (|K|^2 / max |K|^2 + floor) in frequency.
 
     K is the transform of the kernel. The kernel attenuates high frequencies of the unknown and thus of the gradient;
-    this operator amplifies them again. It assumes a periodic convolution, which suffices for an initial Hessian.
+    this operator amplifies them again. The convolution is treated as periodic, which is accurate enough here.
 
     Args:
         kernel: Real, [h, w], such as ``ThermalCrosstalk.kernel``.

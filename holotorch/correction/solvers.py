@@ -13,9 +13,9 @@ from holotorch.correction.run import Run, Solver, State
 class APG(Solver):
     """Accelerated proximal gradient with a backtracking step: thesis Algorithm 2 and Eq. 4.14.
 
-    Departure from the thesis: the step test, printed as g(Z) < g', is relaxed by the rounding error of g. Else it fails
-    near convergence for any step length, and the step length shrinks to zero. As printed, the step length only shrinks
-    and the momentum only grows; ``grow`` and ``restart`` change that.
+    Departure from the thesis: the step test, printed as g(Z) < g', is relaxed by the rounding error of g. Otherwise it
+    fails near convergence for any step length, and the step length shrinks to zero. As printed, the step length only
+    shrinks and the momentum only grows; ``grow`` and ``restart`` change that.
 
     Attributes:
         step: First step length tau.

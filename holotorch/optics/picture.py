@@ -28,7 +28,7 @@ def linear_srgb(intensity: Tensor, matrix: Tensor) -> Tensor:
 
 
 def gamut_map(colour: Tensor) -> Tensor:
-    """Map linear sRGB [..., 3, H, W] into the gamut: mix it with grey of equal luminance until none is negative.
+    """Map linear sRGB [..., 3, H, W] into the gamut: mix in grey of equal luminance until no component is negative.
 
     This keeps the luminance and the hue in the chromaticity diagram. Clipping would change both: light of 455 nm would
     become 3.2 times as bright. Values above 1 are kept. The result is black where the luminance is not positive.

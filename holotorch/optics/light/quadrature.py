@@ -110,7 +110,7 @@ class SpeckleIntegral:
 
         Raises ValueError if more than 512 wavelengths would be needed.
         """
-        # The count that suffices with Gauss's rule is an upper bound. Fewer nodes than this start have large errors.
+        # A count that suffices for Gauss's rule is an upper bound. The search for it starts where errors are large.
         count = max(1, int(self.beat * float(self.nodes.abs().max()) * 0.75))
         most = min(_MOST, len(self.nodes))
         while count <= most:

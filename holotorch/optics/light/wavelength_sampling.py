@@ -1,4 +1,4 @@
-"""Selection of the wavelengths to propagate, from whose images those at the other wavelengths are derived."""
+"""Selection of the wavelengths to propagate; images at the other wavelengths are derived from their images."""
 
 import math
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class SeenLight:
 
 
 def seen_light(grid: Grid, wavelength: float, display: Display, eye: Eye, *, reach: float | None = None) -> SeenLight:
-    """Trace rays from points of the plane in focus forward to the pupil and back to the hologram.
+    """The light that enters an eye, by rays from points of the plane in focus to the pupil and back to the hologram.
 
     Args:
         grid: Sampling of the hologram.
@@ -149,7 +149,7 @@ def flawless(eye: Eye) -> bool:
 
 
 def inseparable(grid: Grid, centre: float, display: Display, eye: Eye) -> bool:
-    """Whether the errors of an eye cannot be removed from an image, as its pupil exceeds the band of ``grid``."""
+    """Whether the pupil of an eye with errors exceeds the band of ``grid``, so that they cannot be removed."""
     if flawless(eye):
         return False
     second = number(display.matrix(number(display.focus_plane(eye.accommodation)))[1])
