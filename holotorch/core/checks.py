@@ -54,7 +54,7 @@ def quantity(kind: Quantity, value: float, name: str = "") -> float:
 
     Args:
         kind: The quantity, with its unit and plausible range.
-        value: A number, or a tensor of one element without gradient.
+        value: A number, or a tensor of one element that does not require gradients.
         name: Name of the argument; by default that of the quantity.
 
     Raises:
@@ -83,7 +83,7 @@ def plausible(kind: Quantity, value: Tensor | float, name: str = "") -> None:
 
 
 def precise(wavelength: Tensor | float, distance: Tensor | float) -> None:
-    """Warn if an argument is a tensor below float64 whose rounding can change the phase of exp(ikz) by 0.01 rad."""
+    """Warn if the rounding of a tensor that is not float64 can change the phase of exp(ikz) by 0.01 rad or more."""
     given = {"wavelength": wavelength, "distance": distance}
     tensors = {name: value for name, value in given.items() if isinstance(value, Tensor)}
     coarse = {name: t.dtype for name, t in tensors.items() if t.is_floating_point() and t.dtype != torch.float64}

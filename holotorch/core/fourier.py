@@ -1,8 +1,8 @@
 """Discrete Fourier transforms, zero-padded spectral filtering and linear convolution.
 
 The two-dimensional transforms here call torch without scaling and multiply by the scale afterwards. The reason is that
-torch's scaled transform of 2048 x 2048 complex64 samples is wrong on Intel CPUs with several threads, by a factor of
-about the size (pytorch/pytorch#169670). Unscaled transforms and their gradients are right.
+torch's scaled transform of 2048 x 2048 complex64 samples loses the scale on Intel CPUs with several threads
+(pytorch/pytorch#169670). Unscaled transforms and their gradients are right.
 """
 
 import math
@@ -94,8 +94,8 @@ def multiplied(spectrum: Tensor, kernel: Tensor) -> Tensor:
 def even_fft2(quadrant: Tensor, size: tuple[int, int]) -> Tensor:
     """First quadrant [H // 2 + 1, W // 2 + 1] of the DFT of an array of ``size`` (H, W) that is even along both axes.
 
-    ``quadrant`` [h, w], h <= H // 2 + 1 and w <= W // 2 + 1, is the part of the first quadrant of the array that is not
-    zero. This takes half the time of the whole transform.
+    ``quadrant`` [h, w], h <= H // 2 + 1 and w <= W // 2 + 1, is the nonzero part of the first quadrant of the array.
+    This takes half the time of the whole transform.
     """
     (height, width), (rows, columns) = size, quadrant.shape[-2:]
     whole = quadrant.new_zeros(*quadrant.shape[:-1], width)
@@ -158,7 +158,7 @@ def filter_real(image: Tensor, kernel: Tensor) -> Tensor:
 
 
 def _resized(batch: Tensor, size: tuple[int, int] | None) -> Tensor:
-    """The empty complex result, of the given ``size``, of transforming an empty batch, for which MKL fails."""
+    """Result of transforming an empty batch, on which MKL fails: empty and complex, of the given ``size``."""
     height, width = batch.shape[-2:]
     to = size or (height, width)
     values = batch if batch.is_complex() else torch.complex(batch, torch.zeros_like(batch))

@@ -27,9 +27,9 @@ class LinearOperator(Protocol):
 class FieldOperator(nn.Module):
     """Base class of operators from fields [..., C, H, W] on ``grid`` to fields [..., C, H', W'] on ``out_grid``.
 
-    Fields are complex64 or complex128 and keep their dtype. Kernels are float64 buffers; ``.to``
-    moves them to another device, but neither ``.to`` nor ``.float()`` changes their dtype. Each call converts them to
-    the precision of its field. Subclasses implement ``_forward`` and ``_adjoint`` for a field that is already checked.
+    Fields are complex64 or complex128 and keep their dtype. Kernels are float64 buffers; ``.to`` moves
+    them to another device, but neither ``.to`` nor ``.float()`` changes their dtype. Each call converts them to the
+    precision of its field. Subclasses implement ``_forward`` and ``_adjoint``, which receive a checked field.
 
     Args:
         grid: Sampling of the field.

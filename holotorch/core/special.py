@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-FRESNEL_BORDER = 1.3  # argument up to which the power series is used, and the quadrature above it
+FRESNEL_BORDER = 1.3  # the power series is exact to rounding up to this argument, and the quadrature above it
 _TERMS = 34  # number of terms of the series
 _SERIES = [
     [sign / (math.factorial(n) * (2 * n + 1)) if n % 2 == part else 0.0 for part in (0, 1)]

@@ -1,4 +1,4 @@
-"""Gerchberg-Saxton phase retrieval, also with crosstalk and with deconvolution of the phase (iterative PEC)."""
+"""Gerchberg-Saxton phase retrieval, optionally with crosstalk and deconvolution of the phase (iterative PEC)."""
 
 from collections.abc import Callable
 
@@ -89,7 +89,7 @@ def iterative_pec(
 ) -> Solution:
     """Iterative PEC (IPEC), thesis Algorithm 1: Gerchberg-Saxton that deconvolves the phase in every pass.
 
-    With a Fresnel propagator it is the thesis's iterative Fresnel PEC (IFPEC). Arguments and result are those of
+    With a Fresnel propagator this is the iterative Fresnel PEC (IFPEC) of the thesis. Arguments and result are those of
     :func:`gerchberg_saxton`. The deconvolution is :func:`deconvolve` with ``inner_steps``, starting at the wanted
     phase.
     """

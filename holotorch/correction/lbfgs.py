@@ -60,7 +60,7 @@ class LBFGS(Solver):
         direction = free * run.from_rows(rows)
         ascending = ~(run.total(direction * gradient) < 0)
         if ascending.any():
-            # The memory no longer describes the loss, for example after a change of the held elements: forget it.
+            # Forget a memory that no longer describes the loss, for example because other elements are held.
             memory.forget(ascending.reshape(-1))
             direction = torch.where(run.each(ascending), -free * guess, direction)
         largest = run.rows(direction.abs()).amax(-1)
@@ -168,7 +168,7 @@ class _Memory:
         self.scale = torch.where(newest > 0, curvature.double() / newest.clamp(min=1e-300), self.scale)
 
     def direction(self, gradient: Tensor, preconditioned: Tensor) -> Tensor:
-        """-H g for gradients g [items, length] and for their H0 g, by the compact form of H (Byrd et al. 1994)."""
+        """-H g from the gradients g [items, length] and H0 g, by the compact form of H (Byrd et al. 1994)."""
         scale = self.scale[:, None, None]
         curvature = self.sy.diagonal(dim1=-2, dim2=-1)
         upper = self.sy.triu() + torch.diag_embed((curvature == 0).double())

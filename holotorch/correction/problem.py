@@ -26,7 +26,7 @@ class PECProblem(nn.Module):
             signal region.
         scale_free: Compare s U with I instead, where s = <U, I> / <U, U> is the best scale of each hologram and colour.
             Use it if light may leave the window or the mask.
-        amplitude: Compare sqrt(U) with sqrt(I) instead, whose gradient does not vanish where U is dark.
+        amplitude: Compare sqrt(U) with sqrt(I) instead; this loss has a nonzero gradient where U is dark.
         frames: X has an axis of F frames that are shown one after another; U is the mean of their intensities.
         limit: Phase P(X) in rad above which a penalty is added, a number or [C]. The penalty alone does not enforce the
             limit; ``penalty_schedule`` with ``limit_peak_phase`` does.
@@ -38,7 +38,7 @@ class PECProblem(nn.Module):
         ValueError: A target that is not [C, *image], not finite, negative somewhere or black in a channel; a mask that
             is negative somewhere or 0 in all of a channel; a negative weight; in a call: a phase of another shape.
 
-    Source: thesis Eqs. 4.9, 4.10 (Fourier) and 4.50, 4.51 (Fresnel; printed with H inside the transform by mistake).
+    Source: thesis Eqs. 4.9, 4.10 (Fourier) and 4.50, 4.51 (Fresnel; the transfer function is misplaced in print).
     """
 
     target: Tensor

@@ -1,7 +1,7 @@
 """Base class of the solvers, the result they return, the set they project onto, and the bookkeeping of a run.
 
-An objective maps the unknown x to one nonnegative loss for each item, which is a part of x such as a hologram. Items
-are independent: each has a separate step length and stops separately, so a batch gives the same results as its items.
+An objective maps the unknown x to one nonnegative loss for each item, a part of x such as one hologram. The items are
+independent: each has its own step length and stops separately, so a batch gives the same results as single items.
 
 An objective may have an attribute ``unknown_axes``: the axes of x, counted from the end, that hold the elements of one
 item. They are (-2, -1) where each hologram [H, W] has a loss, and (-4, -2, -1) where all frames of each colour of
@@ -91,7 +91,7 @@ class Run:
         checks.all_finite("loss at the start", loss)
         if loss.numel() and loss.min() < 0:
             raise ValueError(f"the objective must not be negative, got {loss.min().item():g} at the start")
-        # Stuck: to first order, a change of every element by 1 rad changes the loss by less than its rounding error.
+        # Stuck: to first order, a change of all elements by 1 rad changes the loss by less than 1000 rounding errors.
         rounding = 1e3 * torch.finfo(loss.dtype).eps * loss
         stuck = (self.total(self.gradient.abs()) <= rounding) & (loss > 0)
         if stuck.any():

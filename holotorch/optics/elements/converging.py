@@ -180,7 +180,7 @@ class ConvergingFresnel(FieldOperator):
         return columns[..., :, None] * rows[..., None, :]
 
     def _choose_grid(self, out_grid: Grid | None) -> tuple[Grid, bool]:
-        """``out_grid`` or by default the scaled grid, and whether FFTs compute the result on it."""
+        """``out_grid``, by default the scaled grid, and whether the result is computed by FFTs."""
         grid, size = self.grid, abs(self.magnification)
         y, x = spots = [max(self.wavelengths) * abs(self.distance) / extent for extent in grid.extent]
         windows = zip(grid.extent, grid.pitch, spots, strict=True)
@@ -207,7 +207,7 @@ class ConvergingFresnel(FieldOperator):
         return torch.fft.fft(fresnel_taps(position, pitch, wavelength, distance))
 
     def _curvature(self, axis: int, wavelength: Tensor) -> Tensor:
-        """exp(-i pi x^2 / (wavelength (focus - distance))) on the output's samples, complex128 [C, n']."""
+        """exp(-i pi x^2 / (wavelength (focus - distance))) on the samples of the result, complex128 [C, n']."""
         position = self.out_grid.coordinates()[axis].reshape(-1) + self.offset[axis]
         return turns_phasor(-position.square() / (2 * wavelength[:, None] * (self.focus - self.distance)))
 

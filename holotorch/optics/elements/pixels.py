@@ -29,7 +29,7 @@ class PixelShape(FieldOperator):
 
     The centre of pixel i of n on an axis is output sample s i for even n and s i + ``orders`` for odd n, at the same
     coordinate in both grids. Both grids have the same extent, so for even n the grid of the result begins at the centre
-    of pixel 0: the light on the other side of it is cut off, as is all light outside the grid. No light wraps around.
+    of pixel 0: the light before this centre is cut off, as is all light outside the grid. No light wraps around.
 
     Args:
         grid: Sampling of the panel, one sample per pixel.

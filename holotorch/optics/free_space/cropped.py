@@ -22,7 +22,7 @@ class CroppedKernel(SpectralFilter):
     transfer function divided by the paraxial one, is applied in frequency. It moves light at an angle a by
     z (tan a - sin a), a few samples, for which the padding has room.
 
-    For fields of random phase the error relative to the field is at most about 2 s^2 / sqrt(N) at every distance, with
+    For fields of random phase the relative L2 error is at most about 2 s^2 / sqrt(N) at every distance, with
     s the sine of the steepest angle, wavelength / (2 pitch), and N the samples of an axis: with 512 samples, 1e-4 for a
     pitch of 8 um and 5e-4 for 3.74 um. For smooth fields, and with ``paraxial``, the only error is rounding.
 

@@ -77,7 +77,7 @@ def resampling_factors(
 
 
 def resample(field: Tensor, factors: Factors) -> Tensor:
-    """Apply the result of :func:`resampling_factors` to a field [..., H, W]; returns [..., H', W']."""
+    """Apply the ``factors`` of :func:`resampling_factors` to a field [..., H, W]; returns [..., H', W']."""
     columns, rows, remainder = factors
     if remainder is not None:
         top, left = _margins(columns, rows, field.shape)

@@ -59,7 +59,7 @@ def transfer_function(
         for frequency, pitch, position in zip((fy, fx), padded.pitch, positions, strict=True):
             cycles = cycles + frequency * pitch * position[..., None, None]
         return turns_phasor(cycles).to(dtype) * carrier_factor[..., None, None]
-    shifts_beyond = []  # shifts in samples that are moved from the factor beyond Fresnel into the taps
+    shifts_beyond = []  # per axis, in samples, moved from the factor beyond Fresnel into the taps
     if tilted:
         nyquist = 0.5 / padded.pitch[0], 0.5 / padded.pitch[1]
         for axis in (0, 1):

@@ -120,7 +120,7 @@ class Spectrum:
 
     @classmethod
     def lorentzian_as_printed(cls, centre: float, gamma: float, *, cutoff: float = CUTOFF) -> "Spectrum":
-        """Eq. 5.15 as printed. The thesis calls ``gamma`` the FWHM, but in the equation it is half of the FWHM."""
+        """Eq. 5.15 as printed. The thesis calls ``gamma`` the full width, but in the equation it is half of it."""
         return cls.lorentzian(centre, 2 * checks.quantity(BANDWIDTH, gamma, "gamma"), cutoff=cutoff)
 
     @classmethod

@@ -21,7 +21,7 @@ class SeenLight:
     Attributes:
         rim: Fraction of the edge of the pupil that is illuminated, 0 to 1; 0 if only the window or the highest
             frequency of the hologram limits the light.
-        path_difference: ``coherence.path_difference`` in metres, the maximum over points on and off the axis.
+        path_difference: As in ``coherence.path_difference``, in metres; the maximum over points on and off the axis.
         bend: Standard deviation in metres, over the rays of a point, of the part z slope^4 / 8 of their paths that the
             Fresnel model neglects.
     """
@@ -32,7 +32,7 @@ class SeenLight:
 
 
 def seen_light(grid: Grid, wavelength: float, display: Display, eye: Eye, *, reach: float | None = None) -> SeenLight:
-    """The light that enters an eye, by rays from points of the plane in focus to the pupil and back to the hologram.
+    """The light that enters an eye, from rays traced from the plane in focus to the pupil and to the hologram.
 
     Args:
         grid: Sampling of the hologram.
