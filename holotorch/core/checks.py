@@ -13,8 +13,8 @@ from torch import Tensor
 from holotorch.core import memory
 from holotorch.core.quantities import OFFSET, WAVELENGTH, Quantity
 
-_SMALL = 64 << 20  # bytes that are assumed to be available; reading the available memory takes 0.1 ms
-_PHASE_ERROR = 0.01  # rad: error of the phase by rounding above which a warning is due; changes a field by 1 %
+_SMALL = 64 << 20  # bytes: smaller requests skip the check, since reading the available memory takes 0.1 ms
+_PHASE_ERROR = 0.01  # rad: a rounding error of the phase this large causes a warning; it changes a field by 1 %
 
 
 class SamplingWarning(UserWarning):
@@ -22,7 +22,7 @@ class SamplingWarning(UserWarning):
 
 
 class PrecisionWarning(UserWarning):
-    """A number has too few digits for the phase of light; the message names a sufficient dtype."""
+    """The dtype of a wavelength or distance is too coarse for the phase k z; the message names a sufficient dtype."""
 
 
 def positive(name: str, value: float, unit: str = "") -> float:
@@ -54,7 +54,7 @@ def quantity(kind: Quantity, value: float, name: str = "") -> float:
 
     Args:
         kind: The quantity, with its unit and plausible range.
-        value: A number, or a tensor of one element without gradient.
+        value: A number, or a tensor of one element that does not require gradients.
         name: Name of the argument; by default that of the quantity.
 
     Raises:
@@ -71,9 +71,9 @@ def quantity(kind: Quantity, value: float, name: str = "") -> float:
 
 
 def plausible(kind: Quantity, value: Tensor | float, name: str = "") -> None:
-    """Raise as :func:`quantity` for a number and as :func:`quantities` for a tensor, which may require gradients.
+    """Check a number as :func:`quantity` does, and a tensor, which may require gradients, as :func:`quantities` does.
 
-    Tensors under ``compile`` and ``vmap``, which have no values yet, and tensors on other devices are not checked.
+    Tensors under ``compile`` and ``vmap``, which have no values yet, and tensors on a GPU are not checked.
     """
     if not isinstance(value, Tensor):
         quantity(kind, value, name)
@@ -83,7 +83,7 @@ def plausible(kind: Quantity, value: Tensor | float, name: str = "") -> None:
 
 
 def precise(wavelength: Tensor | float, distance: Tensor | float) -> None:
-    """Warn if the rounding of a tensor of lower precision than float64 changes the phase of exp(ikz) by 0.01 rad."""
+    """Warn if the rounding of a tensor that is not float64 can change the phase of exp(ikz) by 0.01 rad or more."""
     given = {"wavelength": wavelength, "distance": distance}
     tensors = {name: value for name, value in given.items() if isinstance(value, Tensor)}
     coarse = {name: t.dtype for name, t in tensors.items() if t.is_floating_point() and t.dtype != torch.float64}
@@ -103,7 +103,7 @@ def precise(wavelength: Tensor | float, distance: Tensor | float) -> None:
 
 
 def quantities(kind: Quantity, values: Tensor, name: str = "") -> None:
-    """Raise ValueError as :func:`quantity` for the first implausible element of ``values``, of any shape."""
+    """Raise ValueError, as :func:`quantity` does, for the first implausible element of ``values``, of any shape."""
     size = values.detach().abs() if kind.negative else values.detach()
     if bool(((size >= kind.low) & (size <= kind.high)).all()):
         return  # the usual case, without a loop over all elements
@@ -130,7 +130,7 @@ def port(value: int, least: int = 0) -> int:
 
 
 def pair(name: str, values: Sequence[float], unit: str = "") -> tuple[float, float]:
-    """Return two numbers (y, x) as floats, or raise TypeError unless it is a pair, and ValueError unless finite."""
+    """Return ``values`` (y, x) as floats, or raise TypeError unless they are two numbers, ValueError unless finite."""
     items = values if isinstance(values, Sequence) and not isinstance(values, str) else ()
     if len(items) != 2:
         raise TypeError(f"{name} must be two numbers (y, x){_in(unit)}, got {values!r}")
@@ -144,7 +144,7 @@ def offset(values: Sequence[float]) -> tuple[float, float]:
 
 
 def wavelengths(values: float | Sequence[float]) -> tuple[float, ...]:
-    """Return wavelengths in metres as a tuple, one per channel, or raise; a number is a single channel."""
+    """Return wavelengths in metres as a tuple, one per channel, or raise; a single number stands for one channel."""
     single = isinstance(values, str | numbers.Real) or (isinstance(values, Tensor) and values.ndim == 0)
     items: list[Any] = [values] if single else list(values)  # type: ignore[arg-type]
     if not items:
@@ -153,9 +153,9 @@ def wavelengths(values: float | Sequence[float]) -> tuple[float, ...]:
 
 
 def field(name: str, value: Tensor, shape: tuple[int, ...], *, complex_valued: bool = True) -> None:
-    """Raise TypeError unless ``value`` is a complex (or real) tensor, and ValueError unless it ends in ``shape``.
+    """Raise TypeError unless ``value`` is a complex tensor, and ValueError unless its shape ends in ``shape``.
 
-    ``shape`` is (C, H, W) or (H, W).
+    ``shape`` is (C, H, W) or (H, W). With ``complex_valued=False`` the tensor must be real instead.
     """
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
@@ -207,7 +207,7 @@ def _number(name: str, value: Any, unit: str) -> float:
         if isinstance(value, bool | str):
             raise TypeError
         return float(value)
-    except OverflowError:  # an integer beyond all floats
+    except OverflowError:  # an integer too large for a float
         return math.inf if int(value) > 0 else -math.inf
     except (TypeError, ValueError):
         raise TypeError(f"{name} must be a number{_in(unit)}, got {type(value).__name__} {value!r}") from None

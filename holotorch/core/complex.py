@@ -12,7 +12,7 @@ def phasor(phase: Tensor) -> Tensor:
 
 
 def intensity(field: Tensor) -> Tensor:
-    """Squared magnitude, real. Unlike that of ``abs() ** 2``, the gradient is exact at zero too."""
+    """Squared magnitude of ``field``, real. Its gradient is exact at 0 too, unlike that of ``field.abs() ** 2``."""
     return field.real.square() + field.imag.square()
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 
 def renamed(module: str, names: Mapping[str, str]) -> Callable[[str], object]:
-    """Module-level ``__getattr__`` that resolves old names of ``module`` with a DeprecationWarning.
+    """Return a ``__getattr__`` for ``module`` that resolves its old names with a DeprecationWarning.
 
     Args:
         module: ``__name__`` of the module, which defines the new names.

@@ -1,8 +1,8 @@
 """Discrete Fourier transforms, zero-padded spectral filtering and linear convolution.
 
 The two-dimensional transforms here call torch without scaling and multiply by the scale afterwards. The reason is that
-torch's scaled transform of 2048 x 2048 complex64 samples is wrong on Intel CPUs with several threads, by a factor of
-about the size (pytorch/pytorch#169670). Unscaled transforms and their gradients are right.
+torch's scaled transform of 2048 x 2048 complex64 samples loses the scale on Intel CPUs with several threads
+(pytorch/pytorch#169670). Unscaled transforms and their gradients are right.
 """
 
 import math
@@ -20,7 +20,7 @@ def fft2(field: Tensor, size: tuple[int, int] | None = None) -> Tensor:
 
 
 def ifft2(spectrum: Tensor, size: tuple[int, int] | None = None, first: tuple[int, int] = (0, 0)) -> Tensor:
-    """Inverse of :func:`fft2`; with ``size``, the samples from ``first`` on of the periodically continued field."""
+    """Inverse of :func:`fft2`; with ``size``, only that many samples of the periodic field, beginning at ``first``."""
     if 0 in spectrum.shape[:-2]:
         return _resized(spectrum, size)
     field = torch.fft.ifft2(spectrum, norm="forward")
@@ -48,8 +48,8 @@ def ifft_unscaled(lines: Tensor) -> Tensor:
 def good_length(minimum: int, *, odd: bool = False) -> int:
     """Smallest length >= ``minimum`` with no prime factor above 5; FFTs of such lengths are up to twice as fast.
 
-    With ``odd`` it is the smallest odd length with no prime factor above 7. Odd lengths have no frequency that
-    represents both ends of the band.
+    With ``odd`` it is the smallest odd length with no prime factor above 7. An odd length has no sample at the Nyquist
+    frequency, which would represent both ends of the band.
     """
     if minimum < 1:
         raise ValueError(f"an FFT length must be at least 1, got {minimum}")
@@ -85,7 +85,7 @@ def filter_spectrum(field: Tensor, kernel: Tensor, out: tuple[int, int] | None =
 def multiplied(spectrum: Tensor, kernel: Tensor) -> Tensor:
     """Product of ``spectrum`` and ``kernel``, which overwrites ``spectrum`` if dtype, shape and gradients allow it.
 
-    A new array would take 10 to 20 % of the time of a propagation.
+    Overwriting saves 10 to 20 % of the time of a propagation.
     """
     fits = spectrum.dtype == kernel.dtype and torch.broadcast_shapes(spectrum.shape, kernel.shape) == spectrum.shape
     return spectrum.mul_(kernel) if fits and not kernel.requires_grad else spectrum * kernel
@@ -94,8 +94,8 @@ def multiplied(spectrum: Tensor, kernel: Tensor) -> Tensor:
 def even_fft2(quadrant: Tensor, size: tuple[int, int]) -> Tensor:
     """First quadrant [H // 2 + 1, W // 2 + 1] of the DFT of an array of ``size`` (H, W) that is even along both axes.
 
-    ``quadrant`` [h, w], h <= H // 2 + 1 and w <= W // 2 + 1, is the part of the first quadrant of the array that is not
-    zero. This takes half the time of the whole transform.
+    ``quadrant`` [h, w], h <= H // 2 + 1 and w <= W // 2 + 1, is the nonzero part of the first quadrant of the array.
+    This takes half the time of the whole transform.
     """
     (height, width), (rows, columns) = size, quadrant.shape[-2:]
     whole = quadrant.new_zeros(*quadrant.shape[:-1], width)
@@ -111,7 +111,7 @@ def even_fft2(quadrant: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def multiply_even(spectrum: Tensor, quadrant: Tensor) -> Tensor:
-    """Multiply ``spectrum`` [..., H, W] in place by an even array, given by its first ``quadrant``."""
+    """Multiply ``spectrum`` [..., H, W] by an even array in place; ``quadrant`` is its part from index 0 to n // 2."""
     height, width = spectrum.shape[-2:]
     right = quadrant[..., 1 : (width + 1) // 2].flip(-1)
     for part, columns in ((quadrant, slice(0, width // 2 + 1)), (right, slice(width // 2 + 1, width))):
@@ -158,7 +158,7 @@ def filter_real(image: Tensor, kernel: Tensor) -> Tensor:
 
 
 def _resized(batch: Tensor, size: tuple[int, int] | None) -> Tensor:
-    """The transform of an empty batch, for which MKL fails: complex, padded or cropped to ``size``."""
+    """Result of transforming an empty batch, on which MKL fails: empty and complex, of the given ``size``."""
     height, width = batch.shape[-2:]
     to = size or (height, width)
     values = batch if batch.is_complex() else torch.complex(batch, torch.zeros_like(batch))

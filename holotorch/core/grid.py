@@ -16,7 +16,7 @@ Pair = tuple[float, float]  # (y, x)
 
 @dataclass(frozen=True)
 class Grid:
-    """``shape`` (H, W) samples of a plane that are ``pitch`` (y, x) metres apart; one number serves both axes.
+    """``shape`` (H, W) samples of a plane that are ``pitch`` (y, x) metres apart; one number applies to both axes.
 
     The optical axis is at sample ``n // 2`` of each axis, so a grid of even size has one sample more on the negative
     side than on the positive side.

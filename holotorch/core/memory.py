@@ -10,7 +10,7 @@ import torch
 def available_memory(device: torch.device | str = "cpu") -> int | None:
     """Bytes that can be allocated on ``device`` without swapping, or None if the system does not tell.
 
-    On Linux this is MemAvailable, or the rest of the memory limit of a container if that is less. Elsewhere it is the
+    On Linux this is MemAvailable, or what is left of the limit of a container if that is less. Elsewhere it is the
     physical memory of the machine, an upper bound.
     """
     device = torch.device(device)
@@ -30,7 +30,7 @@ def available_memory(device: torch.device | str = "cpu") -> int | None:
 
 
 def _container_limit(folder: Path = Path("/sys/fs/cgroup")) -> int:
-    """Bytes that the memory limit of this control group (version 2) leaves; 2^62 without a limit."""
+    """Bytes left of the memory limit of this control group (version 2); 2^62 without a limit."""
     try:
         limit, used = (folder / "memory.max").read_text().strip(), (folder / "memory.current").read_text()
         cache = re.search(r"^inactive_file (\d+)", (folder / "memory.stat").read_text(), re.MULTILINE)

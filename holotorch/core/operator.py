@@ -1,4 +1,4 @@
-"""Linear operators: their protocol, the base class of those on fields, and a function with a given derivative."""
+"""Linear operators: their protocol, a base class for operators on fields, and autograd with a given adjoint."""
 
 from collections.abc import Callable, Sequence
 from typing import Protocol
@@ -27,9 +27,9 @@ class LinearOperator(Protocol):
 class FieldOperator(nn.Module):
     """Base class of operators from fields [..., C, H, W] on ``grid`` to fields [..., C, H', W'] on ``out_grid``.
 
-    Fields are complex64 or complex128 and keep their dtype. Kernels are float64 buffers; ``.to`` and ``.float()`` move
-    them to another device but do not round them. Each call converts them to the precision of its field. Subclasses
-    implement ``_forward`` and ``_adjoint``, whose argument is checked already.
+    Fields are complex64 or complex128 and keep their dtype. Kernels are float64 buffers; ``.to`` moves
+    them to another device, but neither ``.to`` nor ``.float()`` changes their dtype. Each call converts them to the
+    precision of its field. Subclasses implement ``_forward`` and ``_adjoint``, which receive a checked field.
 
     Args:
         grid: Sampling of the field.
@@ -55,7 +55,7 @@ class FieldOperator(nn.Module):
         return self._forward(field)
 
     def adjoint(self, field: Tensor) -> Tensor:
-        """Apply the conjugate transpose to ``field`` [..., C, H', W'] of ``out_grid``; otherwise as :meth:`forward`."""
+        """Apply the conjugate transpose to ``field`` [..., C, H', W']; the result [..., C, H, W] is on ``grid``."""
         self.check_field(field, self.out_grid)
         return self._adjoint(field)
 
@@ -66,16 +66,16 @@ class FieldOperator(nn.Module):
         raise NotImplementedError
 
     def register_complex(self, name: str, values: Tensor | None) -> None:
-        """Keep a complex tensor as a buffer of real pairs, since ``Module.to(dtype)`` drops imaginary parts."""
+        """Register a complex tensor as a buffer of real pairs, since ``Module.to(dtype)`` drops imaginary parts."""
         pairs = None if values is None else torch.view_as_real(values).contiguous()
         self.register_buffer(name, pairs, persistent=False)
 
     def complex_buffer(self, name: str, field: Tensor) -> Tensor:
-        """The complex tensor kept as ``name``, in the precision of ``field``."""
+        """The complex tensor registered as ``name``, in the precision of ``field``."""
         return torch.view_as_complex(self.get_buffer(name).to(field.real.dtype))
 
     def check_field(self, field: Tensor, grid: Grid) -> None:
-        """TypeError unless ``field`` is complex, ValueError unless it ends in [C, H, W] of ``grid``."""
+        """Raise TypeError unless ``field`` is complex, and ValueError unless it ends in [C, H, W] of ``grid``."""
         channels = (len(self.wavelengths),) if hasattr(self, "wavelengths") else ()
         checks.field("field", field, (*channels, *grid.shape))
 
@@ -89,7 +89,7 @@ class FieldOperator(nn.Module):
 
 
 def linear(x: Tensor, apply: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor]) -> Tensor:
-    """``apply(x)``, differentiated by ``adjoint``, to any order and without saving a tensor for the backward pass.
+    """Return ``apply(x)``. Its derivatives of any order use ``adjoint`` and save no tensor for the backward pass.
 
     Both functions are linear and accept leading batch axes.
     """

@@ -10,11 +10,11 @@ class Plan:
     Attributes:
         method: Name of the method.
         pad: Padding factor (y, x).
-        padded: Samples (y, x) of the transforms.
+        padded: Number of samples (y, x) of the transforms.
         precision: Dtype of the fields, "complex64" or "complex128".
-        window: Samples (y, x), pitch and centre of the result, in metres.
+        window: Number of samples, pitch in metres and centre in metres of the result, each (y, x).
         predicted_error: Expected relative L2 error of the result.
-        memory_bytes: Largest extra memory of one call, including the kernel, for one channel.
+        memory_bytes: Peak of the extra memory of one call, including the kernel, for one channel.
         flops: Arithmetic operations of one call without those for the kernel, for one channel.
         reason: One sentence that says why this method was chosen.
         runner_up: One sentence that says which method came next and why it was not chosen.

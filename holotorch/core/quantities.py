@@ -36,7 +36,7 @@ class Quantity:
     infinite: bool = False
 
     def problem(self, value: float) -> str | None:
-        """Why ``value`` is refused, as the end of a sentence that begins with its name; None if it is accepted."""
+        """Why ``value`` is refused, as the end of a sentence whose subject is its name; None if it is accepted."""
         size = abs(value)
         if math.isnan(value) or (math.isinf(value) and not self.infinite):
             return f"must be finite in {self.words}{', or infinite' * self.infinite}, got {value!r}"
@@ -88,7 +88,7 @@ WAVELENGTH = Quantity("wavelength", "m", 10e-9, 300e-6, (200e-9, 20e-6))
 # Full widths of spectra, from the line of a stabilised laser to white light, and differences of wavelengths.
 BANDWIDTH = Quantity("fwhm", "m", 1e-15, 100e-6, (0.1e-9, 500e-9))
 WAVELENGTH_CHANGE = Quantity("change", "m", 0.0, 100e-6, (0.1e-9, 500e-9), zero=True, negative=True)
-# Sample pitches, from fine detail of a wave to a distant wall; the range excludes pixels given in millimetres (8e-3).
+# Sample pitches, from part of a wavelength to a distant wall; the range excludes pixels given in millimetres (8e-3).
 PITCH = Quantity("pitch", "m", 1e-9, 2e-3, (100e-9, 200e-6))
 # Lengths along the optical axis: of a propagation, to an image plane, to an object in front of a hologram or an eye.
 DISTANCE = Quantity("distance", "m", 0.0, 1e3, (1e-3, 3.0), zero=True, negative=True)
@@ -102,15 +102,15 @@ OFFSET = Quantity("offset", "m", 0.0, 10.0, (1e-6, 0.1), zero=True, negative=Tru
 FOCAL_LENGTH = Quantity("focal_length", "m", 1e-6, 100.0, (1e-3, 1.0), negative=True, infinite=True)
 APERTURE_RADIUS = Quantity("aperture radius", "m", 10e-9, 0.5, (10e-6, 50e-3))
 SPACING = Quantity("distance", "m", 0.0, 10.0, (1e-3, 0.5), zero=True)
-# Eyes and cameras that represent them.
+# Eyes, and cameras in place of eyes.
 PUPIL_RADIUS = Quantity("pupil_radius", "m", 10e-6, 50e-3, (0.5e-3, 10e-3))
 EYE_LENGTH = Quantity("axial_length", "m", 1e-3, 0.2, (10e-3, 50e-3))
 ACCOMMODATION = Quantity("accommodation", "m", 1e-3, math.inf, (0.05, 10.0), infinite=True)
 WAVEFRONT_ERROR = Quantity("wavefront error", "m", 0.0, 1e-3, (1e-9, 10e-6), zero=True, negative=True)
 SOFTNESS = Quantity("softness", "m", 0.0, 10e-3, (1e-6, 1e-3), zero=True)
-VOXEL = Quantity("volume spacing", "m", 1e-12, 0.1, (1e-6, 5e-3))  # from atoms to rooms
-CAUCHY_B = Quantity("b", "square metres", 0.0, 1e-12, (1e-16, 1e-13), zero=True, negative=True)  # of a birefringence
-SIGMA_PX = Quantity("sigma_px", "pixels", 0.0, 100.0, (0.1, 5.0), zero=True)  # of heat crosstalk; singular above
+VOXEL = Quantity("volume spacing", "m", 1e-12, 0.1, (1e-6, 5e-3))  # from atomic to room-sized volumes
+CAUCHY_B = Quantity("b", "square metres", 0.0, 1e-12, (1e-16, 1e-13), zero=True, negative=True)  # birefringence
+SIGMA_PX = Quantity("sigma_px", "pixels", 0.0, 100.0, (0.1, 5.0), zero=True)  # of heat crosstalk
 # Catheters and other tools that are tracked, and their positions.
 TOOL_RADIUS = Quantity("radius", "m", 10e-6, 50e-3, (0.2e-3, 20e-3))
 TOOL_LENGTH = Quantity("length", "m", 1e-3, 3.0, (10e-3, 2.0))

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-FRESNEL_BORDER = 1.3  # the power series is exact to rounding for arguments up to this, the quadrature from this on
+FRESNEL_BORDER = 1.3  # the power series is exact to rounding up to this argument, and the quadrature above it
 _TERMS = 34  # number of terms of the series
 _SERIES = [
     [sign / (math.factorial(n) * (2 * n + 1)) if n % 2 == part else 0.0 for part in (0, 1)]
@@ -24,7 +24,7 @@ def fresnel_integral(u: Tensor) -> Tensor:
 
 
 def fresnel_auxiliary(u: Tensor) -> tuple[Tensor, Tensor]:
-    """f(u) and g(u) for u >= 1.3, float64, with C - iS = (1 - i)/2 + (i f - g) exp(-i pi u^2 / 2).
+    """Auxiliary functions f, g of C(u) - i S(u) = (1 - i)/2 + (i f - g) exp(-i pi u^2 / 2), float64, for u >= 1.3.
 
     f and g vary slowly where C and S oscillate, so that the caller can compute the phase pi u^2 / 2, which may be
     large, without loss of precision. Both are Laplace integrals (Abramowitz and Stegun 7.3.24-25), here with the

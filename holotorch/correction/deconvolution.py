@@ -15,7 +15,7 @@ class Crosstalk(LinearOperator, Protocol):
 
     @property
     def kernel(self) -> Tensor:
-        """Real [h, w], of odd sizes."""
+        """The kernel, real [h, w] with odd h and w."""
         ...
 
 
@@ -48,8 +48,8 @@ def deconvolve(crosstalk: Crosstalk, phase: Tensor, *, max_steps: int = 30, star
         max_steps: Number of iterations.
         start: X of the first iteration; ``phase`` by default.
 
-    Source: thesis Eqs. 4.32-4.35, with M^T phi in the gradient. The step length is 1 / (sum K)^2, since (sum K)^2 is an
-    upper bound of the Lipschitz constant of the gradient.
+    Source: thesis Eqs. 4.32-4.35, with P^T(phase) in the gradient. The step length is 1 / (sum K)^2, since (sum K)^2
+    is an upper bound of the Lipschitz constant of the gradient.
     """
     checks.real("phase", phase)
     checks.all_finite("phase", phase)
@@ -63,7 +63,7 @@ def deconvolve(crosstalk: Crosstalk, phase: Tensor, *, max_steps: int = 30, star
 
 
 def deconvolve_admm(crosstalk: Crosstalk, phase: Tensor, *, max_steps: int = 30, weight: float = 1.0) -> Tensor:
-    """The minimiser of :func:`deconvolve` by ADMM, whose linear system is solved in the eigenvectors of each axis.
+    """The X of :func:`deconvolve`, computed by ADMM; its linear system is solved in the eigenvectors of each axis.
 
     ``weight`` is the penalty rho relative to the mean square of the eigenvalues of P. Raises ValueError for a kernel
     that is not separable and symmetric. Source: Parikh and Boyd (2014), Sec. 4.4 and 5.

@@ -1,4 +1,4 @@
-"""Gerchberg-Saxton phase retrieval, also with crosstalk and with deconvolution of the phase (iterative PEC)."""
+"""Gerchberg-Saxton phase retrieval, optionally with crosstalk and deconvolution of the phase (iterative PEC)."""
 
 from collections.abc import Callable
 
@@ -28,7 +28,7 @@ def gerchberg_saxton(
 
     Without ``crosstalk`` this is the classical algorithm; its result on an array with crosstalk is the case "no
     correction". With ``crosstalk`` P, each pass propagates exp(i P(phase of A)), where A is the field propagated back
-    from the image: the basic iterative PEC of Persson et al. and Gemayel et al. (thesis Sec. 4.4.3.3). With a
+    from the image. This is the basic iterative PEC of Persson et al. and Gemayel et al. (thesis Sec. 4.4.3.3). With a
     ``deconvolution`` as well it is the thesis's Algorithm 1, :func:`iterative_pec`.
 
     Args:
@@ -37,14 +37,14 @@ def gerchberg_saxton(
         start: Random phase phi_0 of the image in rad, real [..., C, H, W] (Algorithm 1).
         max_steps: Number of passes after the initial one.
         crosstalk: Operator on phases, or None.
-        deconvolution: Function of the phase wanted after spreading, in [0, 2 pi), and of the heater phases of the last
-            pass (None in the first pass), that returns the new heater phases. If None, the wanted phase is used.
+        deconvolution: Function (wanted, last) that returns heater phases: ``wanted`` is the phase wanted after
+            spreading, in [0, 2 pi), ``last`` the last heater phases, None at first. If None, ``wanted`` is used.
         mask: 1 in the signal region, 0 in the background, where the field is not constrained (Eqs. 4.7, 4.8).
         callback: Called with the solution so far after every pass.
 
     Returns:
         Solution whose ``x`` are heater phases, in [0, 2 pi) without a ``deconvolution``. The losses are
-        || T - |C| ||^2 of each pass within the mask, where T is the target amplitude and C the propagated field.
+        || T - |V| ||^2 of each pass within the mask, where T is the target amplitude and V the propagated field.
         ``converged`` is always False, as there is no stop rule.
     """
     check_target(target, mask)
@@ -89,7 +89,7 @@ def iterative_pec(
 ) -> Solution:
     """Iterative PEC (IPEC), thesis Algorithm 1: Gerchberg-Saxton that deconvolves the phase in every pass.
 
-    With a Fresnel propagator it is the thesis's iterative Fresnel PEC (IFPEC). Arguments and result are those of
+    With a Fresnel propagator this is the iterative Fresnel PEC (IFPEC) of the thesis. Arguments and result are those of
     :func:`gerchberg_saxton`. The deconvolution is :func:`deconvolve` with ``inner_steps``, starting at the wanted
     phase.
     """

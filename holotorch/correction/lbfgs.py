@@ -1,4 +1,4 @@
-"""LBFGS: projected, preconditioned, limited-memory quasi-Newton steps for many items at once."""
+"""LBFGS: projected, preconditioned, limited-memory quasi-Newton steps for many independent losses at once."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,20 +10,20 @@ from holotorch.core import checks
 from holotorch.core.fourier import fft2, filter_real
 from holotorch.correction.run import Box, Projection, Run, Solver, State
 
-_ARMIJO = 1e-4  # least fraction of the decrease predicted by the slope (Nocedal and Wright, Eq. 3.4)
+_ARMIJO = 1e-4  # least accepted decrease of the loss relative to its linear prediction (Nocedal and Wright, Eq. 3.4)
 _SHRINK = 0.5  # factor on the length of a refused step
 _SHORTEST = 2.0**-12  # shortest step relative to the first trial
-_MEMORY = ("s", "y", "z", "sy", "yz", "scale")  # tensors of _Memory
+_MEMORY = ("s", "y", "z", "sy", "yz", "scale")  # names of the tensors of _Memory
 
 
 @dataclass(frozen=True)
 class LBFGS(Solver):
-    """L-BFGS within a box; each item of a batch has a separate memory, step length and stop.
+    """L-BFGS within a box; each item of a batch has a separate memory and step length and stops separately.
 
-    Elements on a bound whose descent direction leaves the box are held. The others take the quasi-Newton step and are
-    projected; the step is halved until the loss falls enough (Bertsekas 1982). The initial inverse Hessian is
-    ``precondition``, scaled. Products with the memory are computed for all items at once from inner products of the
-    stored vectors, so that a step needs only a few passes over these vectors, whatever the number of items.
+    Elements of x on a bound are held if their descent direction leaves the box. The others take the quasi-Newton step
+    and are projected; the step is halved until the loss falls enough (Bertsekas 1982). The initial inverse Hessian is
+    ``precondition`` times a scalar. The step is computed for all items at once from inner products of the stored
+    vectors, so that it needs only a few passes over these vectors, whatever the number of items.
 
     Attributes:
         memory: Number of stored pairs of a step and its change of gradient. A larger memory does not help for holograms
@@ -60,14 +60,14 @@ class LBFGS(Solver):
         direction = free * run.from_rows(rows)
         ascending = ~(run.total(direction * gradient) < 0)
         if ascending.any():
-            # The memory no longer describes the loss, for example after a change of the held elements: forget it.
+            # Forget a memory that no longer describes the loss, for example because other elements are held.
             memory.forget(ascending.reshape(-1))
             direction = torch.where(run.each(ascending), -free * guess, direction)
         largest = run.rows(direction.abs()).amax(-1)
         first_length = self.first / largest.clamp(min=torch.finfo(largest.dtype).tiny)
         length = torch.where(memory.empty.reshape(run.loss.shape), first_length, 1.0)
         x, loss, after, failed = self._search(run, direction, gradient, length)
-        # A step that fails with a memory may succeed without it; a step that fails without a memory has stalled.
+        # A step that fails with a memory may succeed without it; an item whose step fails without a memory has stalled.
         stalled = failed & memory.empty.reshape(run.loss.shape)
         if failed.any():
             memory.forget(failed.reshape(-1))
@@ -117,7 +117,7 @@ class LBFGS(Solver):
 
 
 class _Memory:
-    """The last m steps s, changes of gradient y, and z = H0 y of every item, oldest first, H0 being the preconditioner.
+    """The last m steps s, changes of gradient y, and z = H0 y of every item, oldest first; H0 is the preconditioner.
 
     The inner products sy = s_i y_j and yz = y_i z_j are float64, since triangular systems are solved with them. A pair
     without positive curvature along s is stored as zeros for that item, and has no effect. Tensors are not modified.
@@ -128,7 +128,7 @@ class _Memory:
 
     @staticmethod
     def empty_state(size: int, run: Run) -> State:
-        """State of a memory for ``size`` pairs that has none yet."""
+        """State of an empty memory for ``size`` pairs."""
         items, make = max(1, run.loss.numel()), run.x.new_zeros
         vectors = make(items, size, run.x.numel() // items)
         products = make(items, size, size, dtype=torch.float64)
@@ -168,7 +168,7 @@ class _Memory:
         self.scale = torch.where(newest > 0, curvature.double() / newest.clamp(min=1e-300), self.scale)
 
     def direction(self, gradient: Tensor, preconditioned: Tensor) -> Tensor:
-        """-H g for gradients [items, length] and their H0 g, by the compact form of the inverse (Byrd et al. 1994)."""
+        """-H g from the gradients g [items, length] and H0 g, by the compact form of H (Byrd et al. 1994)."""
         scale = self.scale[:, None, None]
         curvature = self.sy.diagonal(dim1=-2, dim2=-1)
         upper = self.sy.triu() + torch.diag_embed((curvature == 0).double())
@@ -191,7 +191,7 @@ def spread_preconditioner(kernel: Tensor, floor: float = 0.1) -> Callable[[Tenso
     """Approximate inverse Hessian for unknowns that a ``kernel`` spreads: 1 / (|K|^2 / max |K|^2 + floor) in frequency.
 
     K is the transform of the kernel. The kernel attenuates high frequencies of the unknown and thus of the gradient;
-    this operator amplifies them again. It assumes a periodic convolution, which suffices for an initial estimate.
+    this operator amplifies them again. The convolution is treated as periodic, which is accurate enough here.
 
     Args:
         kernel: Real, [h, w], such as ``ThermalCrosstalk.kernel``.

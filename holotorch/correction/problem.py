@@ -10,7 +10,7 @@ from holotorch.core.complex import intensity, phasor
 
 
 class PECProblem(nn.Module):
-    """g(X) = || U(X) - I ||^2 with U(X) = | F(exp(i P(X))) |^2, one value per hologram and colour.
+    """Loss g(X) = || U(X) - I ||^2 with U(X) = | F(exp(i P(X))) |^2, one value per hologram and colour.
 
     The unknown X are heater phases in rad, [..., C, H, W]. With ``frames`` they are [..., F, C, H, W], and the F frames
     of a colour share one loss. Solvers read from :attr:`unknown_axes` which axes of X belong to one loss; a function
@@ -19,14 +19,14 @@ class PECProblem(nn.Module):
     Args:
         crosstalk: Real linear operator P on heater phases [..., H, W], such as ``ThermalCrosstalk``.
         propagator: Complex linear operator F on fields [..., C, H, W], to [..., C, *image].
-        target: Wanted intensity I, real [C, *image], >= 0. If F is unitary, it must be scaled to mean 1 per channel,
+        target: Wanted intensity I, real [C, *image], >= 0. If F is unitary, I must be scaled to mean 1 per channel,
             the mean of U by Parseval's theorem. The image is [H, W], or [D, H, W] for a propagator to several depths,
             such as ``DepthStack``.
         mask: Weights >= 0 of U - I that broadcast to the target; 0 where the image is unconstrained, such as outside a
             signal region.
         scale_free: Compare s U with I instead, where s = <U, I> / <U, U> is the best scale of each hologram and colour.
-            This suits light that may leave the window or the mask.
-        amplitude: Compare sqrt(U) with sqrt(I) instead, whose gradient does not vanish where U is dark.
+            Use it if light may leave the window or the mask.
+        amplitude: Compare sqrt(U) with sqrt(I) instead; this loss has a nonzero gradient where U is dark.
         frames: X has an axis of F frames that are shown one after another; U is the mean of their intensities.
         limit: Phase P(X) in rad above which a penalty is added, a number or [C]. The penalty alone does not enforce the
             limit; ``penalty_schedule`` with ``limit_peak_phase`` does.
@@ -38,7 +38,7 @@ class PECProblem(nn.Module):
         ValueError: A target that is not [C, *image], not finite, negative somewhere or black in a channel; a mask that
             is negative somewhere or 0 in all of a channel; a negative weight; in a call: a phase of another shape.
 
-    Source: thesis Eqs. 4.9, 4.10 (Fourier) and 4.50, 4.51 (Fresnel; there H stands inside the transform by mistake).
+    Source: thesis Eqs. 4.9, 4.10 (Fourier) and 4.50, 4.51 (Fresnel; the transfer function is misplaced in print).
     """
 
     target: Tensor
@@ -101,7 +101,7 @@ class PECProblem(nn.Module):
         return self._image(self.crosstalk(phase))
 
     def misfit(self, formed: Tensor) -> Tensor:
-        """Squared difference [..., C] of an intensity [..., C, *image] and the target, subject to the options."""
+        """Squared difference [..., C] of an intensity [..., C, *image] and the target, as the options define it."""
         if formed.shape[-self.target.ndim :] != self.target.shape:
             wanted = "end in (C, H, W)" if self.target.ndim == 3 else "give an image that ends in (C, *image)"
             raise ValueError(f"phase must {wanted} = {tuple(self.target.shape)}, got {tuple(formed.shape)}")

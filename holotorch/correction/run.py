@@ -1,11 +1,11 @@
 """Base class of the solvers, the result they return, the set they project onto, and the bookkeeping of a run.
 
-An objective maps the unknown x to one loss per item, which is at least 0, as a sum of squares is. The items are
-independent: each has a separate step length and stop, so a batch gives the same results as its items alone.
+An objective maps the unknown x to one nonnegative loss for each item, a part of x such as one hologram. The items are
+independent: each has its own step length and stops separately, so a batch gives the same results as single items.
 
 An objective may have an attribute ``unknown_axes``: the axes of x, counted from the end, that hold the elements of one
 item. They are (-2, -1) where each hologram [H, W] has a loss, and (-4, -2, -1) where all frames of each colour of
-[F, C, H, W] have one. The losses have the remaining axes of x. Without the attribute the losses have the first axes of
+[F, C, H, W] share one. The losses have the remaining axes of x. Without the attribute the losses have the first axes of
 x: losses [...] for x [..., *unknown].
 """
 
@@ -22,7 +22,7 @@ Objective = Callable[[Tensor], Tensor]
 Projection = Callable[[Tensor], Tensor]
 Callback = Callable[["Solution"], None]
 State = dict[str, Tensor]
-_STATE = ("x", "active", "steps", "calm", "stalled")  # attributes of a Run to resume from
+_STATE = ("x", "active", "steps", "calm", "stalled")  # attributes of a Run that are saved to resume it
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Box:
         return torch.minimum(torch.maximum(x, lower), upper)
 
 
-nonnegative = Box()  # x >= 0, since heaters cannot cool: the proximal operator of Eq. 4.13
+nonnegative = Box()  # x >= 0, since heaters cannot cool; calling it is the proximal operator of thesis Eq. 4.13
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Run:
         checks.all_finite("loss at the start", loss)
         if loss.numel() and loss.min() < 0:
             raise ValueError(f"the objective must not be negative, got {loss.min().item():g} at the start")
-        # Stuck: to first order, a change of every element by 1 rad changes the loss by less than its rounding error.
+        # Stuck: to first order, a change of all elements by 1 rad changes the loss by less than 1000 rounding errors.
         rounding = 1e3 * torch.finfo(loss.dtype).eps * loss
         stuck = (self.total(self.gradient.abs()) <= rounding) & (loss > 0)
         if stuck.any():
@@ -148,7 +148,7 @@ class Run:
         return losses.detach(), gradient
 
     def advance(self, x: Tensor, loss: Tensor, stalled: Tensor) -> None:
-        """Take ``x`` for the active items, and stop those that have converged (Eq. 4.36) or stalled."""
+        """Move the active items to ``x``, and stop those that have converged (thesis Eq. 4.36) or stalled."""
         last = self.loss
         self.stalled = self.stalled | (self.active & stalled)
         self.active = self.active & ~stalled
@@ -183,7 +183,7 @@ class Run:
 
 
 def _split_axes(objective: Objective, x: Tensor, loss: Tensor) -> tuple[list[int], list[int]]:
-    """Axes of ``x`` that the losses have, and those of the elements of one item; ValueError if the losses differ."""
+    """Axes of ``x`` that count items, and those within an item; ValueError if the shape of ``loss`` does not match."""
     size = x.ndim
     named = getattr(objective, "unknown_axes", None)
     unknown = [axis % size for axis in (range(loss.ndim - size, 0) if named is None else named)]
@@ -201,12 +201,12 @@ class Solver:
 
     Attributes:
         max_steps: Largest number of steps.
-        tolerance: An item stops once its relative change of loss (Eq. 4.36) has stayed below this ...
-        patience: ... for this number of steps in a row.
+        tolerance: Relative change of the loss (thesis Eq. 4.36) below which a step counts towards ``patience``.
+        patience: Number of such steps in a row after which an item stops.
 
     Raises:
-        ValueError: A field out of range; in a call: a start that is not finite, or at which a loss is negative or not
-            finite, or at which a gradient vanishes although its loss does not, as at X = 0 for a Fourier hologram.
+        ValueError: An attribute out of range; in a call: a start that is not finite, or at which a loss is negative or
+            not finite, or at which the gradient of a positive loss vanishes, as at X = 0 for a Fourier hologram.
     """
 
     max_steps: int

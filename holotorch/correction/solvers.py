@@ -1,4 +1,4 @@
-"""First-order solvers."""
+"""First-order solvers: accelerated proximal gradient and projected Adam."""
 
 from dataclasses import dataclass
 
@@ -13,9 +13,9 @@ from holotorch.correction.run import Run, Solver, State
 class APG(Solver):
     """Accelerated proximal gradient with a backtracking step: thesis Algorithm 2 and Eq. 4.14.
 
-    Departure from the thesis: the printed test g(Z) < g' is relaxed by the rounding error of g. Without that it fails
-    near convergence for any step length, and the step length shrinks to zero. As printed, the step length only shrinks
-    and the momentum only grows; ``grow`` and ``restart`` change that.
+    Departure from the thesis: the step test, printed as g(Z) < g', is relaxed by the rounding error of g. Otherwise it
+    fails near convergence for any step length, and the step length shrinks to zero. As printed, the step length only
+    shrinks and the momentum only grows; ``grow`` and ``restart`` change that.
 
     Attributes:
         step: First step length tau.
@@ -86,7 +86,7 @@ class ProjectedAdam(Solver):
     once.
 
     Attributes:
-        learning_rate: In the unit of the unknown.
+        learning_rate: Step length in the unit of the unknown.
         betas: Decay rates of the running means of the gradient and of its square.
 
     The other attributes, the call and the errors are those of :class:`Solver`.

@@ -27,7 +27,7 @@ class Stage:
 def run_stages(
     stages: Sequence[Stage], start: Tensor, *, callback: Callback | None = None, resume: State | None = None
 ) -> Solution:
-    """Run ``stages`` one after another from ``start``; ``callback`` and ``resume`` as for :class:`Solver`.
+    """Run ``stages`` one after another from ``start``; ``callback`` and ``resume`` are those of :class:`Solver`.
 
     The losses of the solution are those of all stages in sequence, each computed by the objective of its stage;
     ``converged`` and ``stalled`` are those of the last stage.
@@ -62,7 +62,7 @@ def penalty_schedule(
     growing weight on P(X) above 98.5 % of the limit, so that ``limit_peak_phase`` has to scale down little afterwards.
 
     Args:
-        make: Function of the keywords ``amplitude``, ``limit`` and ``limit_weight`` of ``PECProblem`` to a problem.
+        make: Function that builds a ``PECProblem`` from its keywords ``amplitude``, ``limit`` and ``limit_weight``.
         solver: L-BFGS, whose ``max_steps`` is the sum over all stages.
         spread: Sum of the kernel K.
         limit: Largest P(X) in rad, or None.

@@ -9,7 +9,7 @@ from holotorch.core.precision import at_least_single
 
 # Luminance of the primaries of linear sRGB (IEC 61966-2-1), the Y row of the matrix to CIE XYZ.
 _LUMINANCE = (0.2126390058715103, 0.7151686787677559, 0.0721923153607337)
-GAMMA = 0.5  # exponent of Eq. 5.16
+GAMMA = 0.5  # exponent of thesis Eq. 5.16
 
 
 def linear_srgb(intensity: Tensor, matrix: Tensor) -> Tensor:
@@ -28,7 +28,7 @@ def linear_srgb(intensity: Tensor, matrix: Tensor) -> Tensor:
 
 
 def gamut_map(colour: Tensor) -> Tensor:
-    """Map linear sRGB [..., 3, H, W] into the gamut: mix it with grey of equal luminance until nothing is negative.
+    """Map linear sRGB [..., 3, H, W] into the gamut: mix in grey of equal luminance until no component is negative.
 
     This keeps the luminance and the hue in the chromaticity diagram. Clipping would change both: light of 455 nm would
     become 3.2 times as bright. Values above 1 are kept. The result is black where the luminance is not positive.
@@ -47,8 +47,8 @@ def equal_power(intensity: Tensor, reference: Tensor) -> Tensor:
     """Scale each channel of ``intensity`` [..., C, H, W] to the total of the same channel of ``reference``.
 
     Images under different sources are compared at equal power, because the power that may enter the eye is limited
-    (text below Eq. 5.16). Black channels stay black. ``reference`` may have another H and W on an equal extent, since
-    the means are made equal. Raises ValueError if the leading axes differ.
+    (text below Eq. 5.16). Black channels stay black. ``reference`` may have another H and W if it covers the
+    same extent, since the means are made equal. Raises ValueError if the leading axes differ.
     """
     for name, part in (("intensity", intensity), ("reference", reference)):
         checks.real(name, part)

@@ -1,4 +1,4 @@
-"""Chart of an observer's view: error against time, error against number of wavelengths, speckle against sharpness."""
+"""Chart of an observer's view: image error by method and by number of wavelengths, and speckle against sharpness."""
 
 import math
 import warnings
@@ -28,15 +28,16 @@ from holotorch.optics.viewing.elementwise import ElementSampling, least_oversamp
 from holotorch.optics.viewing.imaging import propagate_collapsed
 from holotorch.optics.viewing.retina import plan_retina
 
-SIDE, DISTANCES = 512, (10e-3, 20e-3, 30e-3)  # pixels of the hologram; distances of the scene in metres
-FOCUS = 30e-3  # metres from the hologram
+SIDE = 512  # pixels along each side of the hologram
+DISTANCES = (10e-3, 20e-3, 30e-3)  # distances from hologram to scene, in metres
+FOCUS = 30e-3  # distance from hologram to the depth in focus, in metres
 HOLOGRAM = f"hologram={{shape: [{SIDE}, {SIDE}], pitch: 3.74 um, distance: 30 mm, depths: 58, rays: {SIDE // 2}}}"
 SCENE = f"scene={{config: configs/volume/c60.yaml, change: ['{HOLOGRAM}']}}"
-FACTORS = (1.0, 2.0, 4.0)  # oversampling of the element-by-element propagation
+FACTORS = (1.0, 2.0, 4.0)  # oversampling by elements: pitch of the hologram / pitch on eyepiece and eye
 
 
 def eye() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
-    """Rows of methods and sources, rows of the trade-off, pictures by name, and the verdict."""
+    """Table rows of methods and sources, table rows of the trade-off, PNG pictures by name, and lines of text."""
     path = find_config("configs/eye/teapot.yaml")
     assert path is not None  # bundled with the package
     settings = load_config(path, [SCENE])
@@ -50,7 +51,7 @@ def eye() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
 
 
 def _quarter_size(settings: ObserverSettings, scene: VolumeSettings) -> Observer:
-    """Observer with display, eye and distances scaled by 1/4: propagation by elements takes 11 GB at full size."""
+    """Observer with a quarter of the distances; at full size, element-by-element propagation needs 11 GB."""
     display, eye = settings.display, settings.eye
     lengths = {name: value / 4 for name, value in display.model_dump().items() if isinstance(value, float)}
     smaller = {
@@ -63,9 +64,9 @@ def _quarter_size(settings: ObserverSettings, scene: VolumeSettings) -> Observer
 
 
 def _methods(observer: Observer) -> list[dict]:
-    """Rows of collapsed and element-by-element propagation of green light, both paraxial.
+    """Table rows with time and error of collapsed and element-by-element propagation of green light, both paraxial.
 
-    Their errors are relative to element-by-element propagation with 1.3 times the least oversampling.
+    The reference is element-by-element propagation with 1.3 times the least oversampling that avoids aliasing.
     """
     grid, depth, wavelength = observer.scene.grid, observer.focus[0], observer.scene.settings.wavelengths[1]
     hologram, _ = observer.scene.hologram(0)
@@ -101,10 +102,10 @@ def _scaled(least: ElementSampling, factor: float) -> ElementSampling:
 
 
 def _counts(observer: Observer) -> list[dict]:
-    """Error of a picture in green light by the number of wavelengths, relative to one wavelength every nanometre.
+    """Table rows with the error of a green picture by number of wavelengths; the reference has one every nanometre.
 
-    "followed": all wavelengths are in the sum, but only this number is propagated, and the pictures at the others are
-    derived from those. "alone": only this number of wavelengths is in the sum.
+    "followed": the picture is the sum over all wavelengths, but only this number of them is propagated; the pictures at
+    the other wavelengths are derived from the propagated ones. "alone": the sum is over this number of wavelengths.
     """
     depth, wavelength, grid = observer.focus[0], observer.scene.settings.wavelengths[1], observer.scene.grid
     hologram, _ = observer.scene.hologram(0)
@@ -137,7 +138,7 @@ def _counts(observer: Observer) -> list[dict]:
 
 
 def _error(picture: Tensor, reference: Tensor) -> str:
-    """Relative L2 error."""
+    """Relative L2 error of a picture, as text."""
     return f"{((picture - reference).square().mean() / reference.square().mean()).sqrt().item():.1e}"
 
 

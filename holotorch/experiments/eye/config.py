@@ -23,7 +23,7 @@ Positive = Annotated[Length, AfterValidator(_above_zero)]
 
 
 class SceneSettings(Settings):
-    """The hologram to look at: the configuration of a volume, and changes to it, written as on the command line."""
+    """The volume: ``config`` is its configuration file, ``change`` holds ``key=value`` overrides of that file."""
 
     config: Annotated[
         str,
@@ -35,8 +35,8 @@ class SceneSettings(Settings):
 class MagnifyingSettings(Settings):
     """The display of the thesis (Fig. 5.5): the eye sees the volume magnified by an eyepiece.
 
-    ``lens_distance``: distance from hologram to eyepiece; by default, that for which the middle of the volume appears
-    at ``focus_distance`` from the eye.
+    ``eye_distance``: from eyepiece to eye. ``lens_distance``: from hologram to eyepiece; by default, it is chosen such
+    that the middle of the volume appears at ``focus_distance`` from the eye.
     """
 
     kind: Literal["magnifying"]
@@ -64,9 +64,9 @@ class EyeSettings(Settings):
 class LightSettings(Settings):
     """Sources to compare; laser, narrow_sled, sled and led have an FWHM of 1.4, 5, 10 and 20 nm.
 
-    ``tolerance``: error of the sum over a few wavelengths in place of the whole spectrum, relative to the rms
-    brightness of a picture. ``extent``: the sources are discs, and this is the sine of the half angle that they subtend
-    at the hologram, 0 for point sources.
+    ``tolerance``: allowed error from summing over a few wavelengths instead of the whole spectrum, relative to the rms
+    intensity of a picture. ``extent``: sine of the half angle that each source, a disc, subtends at the hologram;
+    0 for a point source.
     """
 
     sources: Annotated[tuple[Source, ...], BeforeValidator(several), Field(min_length=1)] = (
@@ -80,9 +80,9 @@ class LightSettings(Settings):
 
 
 class SweepSettings(Settings):
-    """A sweep of the focus over the scene in ``steps``; the surface of the scene is divided into ``bands`` of depth.
+    """A sweep of the eye's focus over ``steps`` depths of the scene, whose surface is divided into ``bands`` of depth.
 
-    ``realisations``: number of random phases over which each picture is averaged.
+    ``realisations``: number of holograms with different random phases over which each picture is averaged.
     """
 
     bands: Annotated[Count, Field(le=64)] = 5
@@ -93,13 +93,12 @@ class SweepSettings(Settings):
 class ObserverSettings(Settings):
     """An observer's view of the hologram of a volume, for several light sources and depths of focus.
 
-    ``focus``: depths of the scene at which the eye is focused; by default, the 10, 50 and 90 % quantiles of the depths
-    of the rays. ``seeds``: number of realisations of the random phases; they are compared with the mean of eight times
-    as many other realisations.
-    ``tolerance``: relative L2 error of the intensity on the retina. If the error of collapsed propagation is larger,
-    light is propagated element by element, which takes 10 to 300 times as long and much memory.
-    ``sweep``: also sweep the focus over the scene, to find the focus at which each part looks sharpest.
-    ``tradeoff``: distances of the scene at which the best spectral width of each colour is determined as well.
+    ``focus``: depths of the scene at which the eye is focused; by default, the 10, 50 and 90 % quantiles of the visible
+    depths. ``seeds``: number of realisations of the random phases; they are compared with the mean of eight times as
+    many other realisations. ``tolerance``: allowed relative L2 error of the intensity on the retina. If the error of
+    collapsed propagation is larger, light is propagated element by element, which takes 10 to 300 times as long and
+    needs much memory. ``sweep``: sweep of the focus, which finds the focus at which each part of the scene looks
+    sharpest. ``tradeoff``: distances of the scene at which the best spectral width of each colour is determined.
     """
 
     experiment: Literal["eye"]

@@ -1,4 +1,4 @@
-"""Observer: the view of a volume's hologram in the light of real sources, through a display and a focused eye."""
+"""Observer: the hologram of a volume under light of a real spectrum, seen by a focused eye through a display."""
 
 import math
 from collections.abc import Callable
@@ -25,16 +25,16 @@ from holotorch.optics.viewing.display_geometry import eyepiece_distance, image_d
 from holotorch.optics.viewing.eye import Eye
 from holotorch.optics.viewing.retina import RetinaPlan, plan_retina
 
-PRESETS: dict[str, Callable[[float], Spectrum]] = {
+PRESETS: dict[str, Callable[[float], Spectrum]] = {  # functions of the central wavelength in metres
     "laser": Spectrum.laser,
     "narrow_sled": Spectrum.narrow_sled,
     "sled": Spectrum.sled,
     "led": Spectrum.led,
 }
-# Prefactor of the closed form for the best FWHM (``optimum_fwhm``), fitted to the CT scan of a teapot. Smooth scenes
-# need a larger one (C60: 0.8).
+# Prefactor ``defocus`` of ``optimum_fwhm`` for the aperture ``Observer.detail``, fitted to the CT scan of a teapot.
+# Smooth scenes need a larger one (C60: 0.8).
 BEST = 0.46
-_MAX_RINGS = 16  # rings of directions of an extended source; 16 rings take 1024 times as long as a point source
+_MAX_RINGS = 16  # largest number of rings of directions of an extended source; 16 rings have 1024 directions
 LIT = 0.05  # speckle is measured on pixels brighter than this fraction of the brightest pixel of the reference
 
 
@@ -42,9 +42,9 @@ LIT = 0.05  # speckle is measured on pixels brighter than this fraction of the b
 class Observer:
     """A scene, a display and an eye, as a configuration describes them.
 
-    The hologram is computed for light that diverges from a scene behind it (exp(+ikr)/r). The display shows its complex
-    conjugate, whose light converges to the scene in front of the hologram, towards the observer. Every wavelength of a
-    source is modulated with the same amplitude and phase, as in the thesis; the dispersion of a panel is not modelled.
+    The hologram is computed for light that diverges from a scene behind it (exp(+ikr)/r). The display shows the
+    complex conjugate of the hologram, whose light converges to a scene between hologram and observer. All wavelengths
+    of a source are modulated with the same amplitude and phase, as in the thesis, without the dispersion of a panel.
 
     Attributes:
         settings: The configuration.
@@ -78,33 +78,33 @@ class Observer:
         return image_distance(to_lens, settings.focal_length) + settings.eye_distance
 
     def eye(self, depth: float) -> Eye:
-        """The eye, focused at a depth of the scene."""
+        """The eye, focused at a depth of the scene in metres."""
         pupil, length = self.settings.eye.pupil_radius, self.settings.eye.axial_length
         reference = self.reference_wavelength if self.settings.eye.chromatic else None
         return Eye(pupil, length, self.accommodation(depth), chromatic_reference=reference)
 
     @property
     def reference_wavelength(self) -> float:
-        """The middle wavelength in metres, for which an eye with chromatic aberration is in focus."""
+        """The middle one of the three wavelengths in metres, for which an eye with chromatic aberration is in focus."""
         return sorted(self.scene.settings.wavelengths)[1]
 
     def aperture(self, depth: float) -> float:
-        """Sine of the half angle of the light from a depth that reaches the retina, limited by pupil or hologram."""
+        """Sine of the half angle of the light cone from a point at a depth to the eye, limited by pupil or hologram."""
         pupil = self.settings.eye.pupil_radius / abs(float(self.display.matrix(depth)[1]))
         return min(pupil, math.sin(math.atan(min(self.scene.grid.extent) / 2 / depth)))
 
     def detail(self, depth: float, wavelength: float) -> float:
-        """Sine of the half angle of the light that carries detail: :meth:`aperture`, or the limit by the ray pitch."""
+        """The smaller of :meth:`aperture` and the sine wavelength / (2 ray pitch) of the finest detail of the scene."""
         return min(self.aperture(depth), wavelength / (2 * max(self.scene.rays.pitch)))
 
     def samples(self, source: str, wavelength: float, depth: float) -> tuple[Tensor, Tensor, int]:
-        """Wavelengths (metres) and weights that represent a source within the tolerance, and how many to propagate.
+        """Wavelengths [K] in metres and weights [K] that represent a source, and the number N <= K to propagate.
 
-        Results are kept, since computing them may take a second. ConfigError if no light reaches the pupil.
+        Pictures at the other wavelengths are derived. Results are cached. ConfigError if no light reaches the pupil.
         """
         key = (source, wavelength, depth)
         if key not in self._samples:
-            # Shared by two independent errors: of the sum over wavelengths, and of deriving most pictures from a few.
+            # The error of the sum and that of deriving pictures are independent; each may be tolerance / sqrt(2).
             eye, tolerance = self.eye(depth), self.settings.light.tolerance / math.sqrt(2)
             half_width = self.scene.width / 2
             light = seen_light(self.scene.grid, wavelength, self.display, eye, reach=half_width)
@@ -121,8 +121,8 @@ class Observer:
     def points(self, wavelength: float, depth: float) -> tuple[list[tuple[float, float]], list[float]]:
         """Directions (sines y, x) and weights of the points that represent an extended source.
 
-        A tilt of the light by an angle shifts the picture by the depth times the sine of the angle. The rings of
-        directions are so dense that the pictures of neighbouring rings are at most half a diffraction spot apart.
+        A tilt of the light by an angle shifts the picture by the depth times the sine of the angle. From one ring of
+        directions to the next, the shift is at most half a diffraction spot, wavelength / (2 aperture).
 
         Raises:
             ConfigError: More than 16 rings (1024 directions) are needed.
@@ -160,7 +160,7 @@ class Observer:
         return self._retina_plans[depth]
 
     def image(self, hologram: Tensor, source: str | None, depth: float) -> Tensor:
-        """Intensity on the retina of an eye focused at a depth (metres), mapped to the rays of the scene, [3, h, w].
+        """Intensity on the retina of an eye focused at a depth (metres), averaged around each scene ray, [3, h, w].
 
         ``hologram`` is complex [3, H, W]. Without a source, each colour has a single wavelength.
         """
@@ -206,7 +206,7 @@ class Observer:
 
 
 def observer(settings: ObserverSettings, scene_settings) -> Observer:
-    """Build the scene and choose the depths of focus. ConfigError for a scene that the display cannot show."""
+    """Build the scene and resolve the depths of focus. ConfigError if nothing is visible or the eye cannot focus."""
     scene = build(scene_settings)
     focus = settings.focus
     if focus is None:

@@ -24,16 +24,16 @@ _ENDS = (0.02, 0.98)  # quantiles of the depth of the surface at which the first
 
 @dataclass(frozen=True)
 class Band:
-    """The part of a scene within a range of depths, and its similarity to the rendering at each focus.
+    """The part of a scene within a range of depths, and the sharpness of its picture at each focus.
 
     Attributes:
         depth: Mean depth in metres from the hologram.
         spread: Standard deviation of the depth in metres.
         rays: Number of rays that show the band.
-        correlation: Correlation of the fine detail of the band with that of the rendering, for each focus of the sweep.
+        correlation: Correlation between the fine detail of the picture and that of the rendering, for each focus.
         sharpest: Focus in metres with the largest correlation, interpolated between the steps; NaN if the largest
             correlation is at an end of the sweep.
-        depth_of_focus: wavelength / aperture^2 of the middle colour, in metres.
+        depth_of_focus: wavelength / ``Observer.detail``^2 in metres, at the middle wavelength.
     """
 
     depth: float
@@ -61,9 +61,9 @@ class FocusSweep:
     """The result of a sweep.
 
     Attributes:
-        depths: Depths of the focus in metres from the hologram.
-        pictures: Mean pictures over realisations [F, 3, h, w] on the rays.
-        bands: Bands of depth, nearest first.
+        depths: F depths of the focus in metres from the hologram.
+        pictures: Intensity at the rays for each focus, [F, 3, h, w], mean over the realisations.
+        bands: Bands in order of increasing depth.
     """
 
     depths: tuple[float, ...]
@@ -79,7 +79,7 @@ class Surface:
         rendering: Rendering of the scene, [3, h, w].
         opaque: Whether a ray shows the surface, [h, w].
         depth: Depth of the surface along each ray in metres from the hologram, [h, w].
-        ends: Depths in metres at which the surface begins and ends, without outliers.
+        ends: 2 and 98 % quantiles of the depth of the surface in metres.
     """
 
     rendering: Tensor
@@ -109,8 +109,8 @@ def focus_sweep(eye: Observer, settings: SweepSettings, surface: Surface | None 
     """Compute the observer's view for one focus after another, with one wavelength per colour.
 
     The visible surface of the scene is divided into bands of depth. The fine detail of each band is correlated with
-    that of the rendering, which is sharp everywhere: the correlation should be largest when the eye is focused at the
-    depth of the band. Without ``surface``, :func:`visible_surface` is called, which may raise ValueError.
+    that of the rendering, which is sharp everywhere. The correlation is expected to be largest when the eye is focused
+    at the depth of the band. Without ``surface``, :func:`visible_surface` is called, which may raise ValueError.
     """
     scene, surface = eye.scene, surface or visible_surface(eye)
     depth, (low, high) = surface.depth, surface.ends
@@ -141,7 +141,7 @@ def focus_sweep(eye: Observer, settings: SweepSettings, surface: Surface | None 
 
 
 def in_words(sweep: FocusSweep) -> list[str]:
-    """A line for each band."""
+    """A line of text for each band."""
     return [
         f"Focus      the part at {1e3 * band.depth:.3f} mm looks sharpest with the eye focused at "
         f"{1e3 * band.sharpest:.3f} mm (depth of focus {1e3 * band.depth_of_focus:.3f} mm)"

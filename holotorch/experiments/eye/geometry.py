@@ -13,18 +13,18 @@ from holotorch.experiments.runs.figures import figure_png
 from holotorch.optics.viewing import display_geometry as viewing
 
 _COLOURS = ("tab:red", "tab:green", "tab:blue")  # colours of the curves of the three wavelengths
-_ROMAN = ("none", "I", "II", "III")  # names of the regions of points
-_REGIONS = (
+_ROMAN = ("none", "I", "II", "III")  # names of the regions 0 to 3 of ``display_geometry.region``
+_REGIONS = (  # meanings of the regions
     "no light of the point reaches the hologram",
     "the hologram holds the whole cone of light of a point, so spots are smallest",
     "the hologram holds part of the cone of light",
     "the cone of light covers the whole hologram, so spots grow with distance",
 )
-_INVISIBLE = 0.005  # the edge of the scene is invisible if a smaller share of its light enters the pupil
+_INVISIBLE = 0.005  # the edge of the scene is invisible if a smaller fraction of its light enters the pupil
 
 
 def geometry(eye: Observer) -> dict[str, Any]:
-    """Fields of view, eye box, regions and spots of an observer's display, as JSON values in degrees and mm."""
+    """Fields of view, eye box, regions and spots of an observer's display as JSON values; each key names its unit."""
     scene, display = eye.scene, eye.settings.display
     width, pitch, wavelengths = scene.grid.extent[1], scene.grid.pitch[1], scene.settings.wavelengths
     near, far = min(scene.depths), max(scene.depths)
@@ -39,11 +39,11 @@ def geometry(eye: Observer) -> dict[str, Any]:
             [1e6 * viewing.smallest_spot(w, z, viewing.section(0.0, z, width, pitch, w)) for w in wavelengths]
             for z in (near, far)
         ],
-        "accommodation_mm": [_accommodation_mm(eye, z) for z in (far, near)],
+        "accommodation_mm": [_accommodation_mm(eye, z) for z in (far, near)],  # ``far`` appears nearer to the eye
     }
     first, second, _, _ = (float(value) for value in eye.display.matrix(scene.distance))
     pupil = eye.settings.eye.pupil_radius
-    # The pitch limits the cone of light of a point, and so does the width of the hologram.
+    # The pitch or the width of the hologram limits the half angle of the light cone of a point.
     sines = [min(w / (2 * pitch), math.sin(math.atan(width / 2 / scene.distance))) for w in wavelengths]
     values["eye_box_mm"] = [1e3 * viewing.eye_box(scene.width, first, second, sine) for sine in sines]
     values["light_of_edge"] = [viewing.vignetting(scene.width / 2, first, second, pupil, sine) for sine in sines]
@@ -89,7 +89,7 @@ def in_words(values: dict[str, Any]) -> list[str]:
 
 
 def _accommodation_mm(eye: Observer, depth: float) -> float | None:
-    """Distance in mm at which a depth appears; None beyond the eyepiece's focal length, where no eye can focus."""
+    """Distance in mm from the eye at which a depth appears; None if it lies beyond the eyepiece's focal length."""
     try:
         return 1e3 * eye.accommodation(depth)
     except ValueError:
@@ -117,7 +117,7 @@ def draw(eye: Observer) -> bytes:
 
 
 def _draw_display(axes: Any, eye: Observer) -> None:
-    """Hologram, scene, eyepiece and eye, with rays from the ends of the scene to the edges of the pupil."""
+    """Draw hologram, scene, eyepiece and eye, with rays from the ends of the scene to the edges of the pupil."""
     scene, display = eye.scene, eye.settings.display
     half, pupil = 1e3 * scene.grid.extent[0] / 2, 1e3 * eye.settings.eye.pupil_radius
     lens, back = (1e3 * float(value) for value in (eye.display.lens_distance, eye.display.eye_distance))
@@ -130,7 +130,7 @@ def _draw_display(axes: Any, eye: Observer) -> None:
     focal = display.focal_length if isinstance(display, MagnifyingSettings) else math.inf
     for height in (-scene.width / 2, 0.0, scene.width / 2):
         for side in (-1, 1):
-            # The ray matrix to the pupil gives the slope of the ray from this height to the edge of the pupil.
+            # The ray transfer matrix to the pupil gives the slope of the ray that ends at the edge of the pupil.
             slope = (side * pupil / 1e3 - first * height) / second
             at_lens = height + slope * (lens / 1e3 - scene.distance)
             behind_lens = slope - at_lens / focal
@@ -153,7 +153,7 @@ def _draw_display(axes: Any, eye: Observer) -> None:
 
 
 def _draw_regions(axes: Any, eye: Observer) -> None:
-    """Regions of points at the shortest wavelength, whose cone of light is the narrowest, and the scene in them."""
+    """Draw the regions at the shortest wavelength, whose light cone is the narrowest, and the outline of the scene."""
     scene = eye.scene
     width, pitch, wavelength = scene.grid.extent[0], scene.grid.pitch[0], min(scene.settings.wavelengths)
     apex = viewing.region_apex(width, pitch, wavelength)

@@ -10,17 +10,17 @@ from holotorch.experiments.runs.page import plain
 from holotorch.experiments.volume import plan as volume_plan
 from holotorch.optics.viewing.imaging import retinal_scale
 
-# Cost on two CPU cores, as measured.
-_FLOP_SECONDS = {"collapse": 2e-10, "elements": 4e-10}  # seconds per operation of a RetinaPlan
-_DERIVED_SECONDS = 1e-9  # seconds to derive the picture of one wavelength from another, per n log2(n) of n samples
-_BASE_BYTES = 600e6  # libraries, holograms of 512 px, and pictures of the report
-_MARGIN = 1.1  # factor on the memory of a propagation, because derived wavelengths need a margin around the picture
-_DERIVED_BYTES = 96.0  # bytes per sample of the fields from which wavelengths are derived
-_RETINA = ("method", "predicted_error", "adequate", "reason", "runner_up")  # values of a RetinaPlan that are reported
+# Costs measured on two CPU cores.
+_FLOP_SECONDS = {"collapse": 2e-10, "elements": 4e-10}  # seconds per floating-point operation, by method
+_DERIVED_SECONDS = 1e-9  # seconds / (n log2 n) to derive a picture of n samples from that at another wavelength
+_BASE_BYTES = 600e6  # bytes of libraries, holograms of 512 px, and pictures of the report
+_MARGIN = 1.1  # factor on the memory of a propagation: derived pictures need a margin around the picture
+_DERIVED_BYTES = 96.0  # bytes per sample of the fields from which pictures at other wavelengths are derived
+_RETINA = ("method", "predicted_error", "adequate", "reason", "runner_up")  # reported attributes of a RetinaPlan
 
 
 def plan_values(eye: Observer) -> dict[str, Any]:
-    """Choices with their reasons, cost and physics, as plain JSON values."""
+    """The plan as JSON values: choices with their reasons, predicted cost, and geometry."""
     settings, scene, display = eye.settings, eye.scene, eye.display
     wavelengths, deepest = scene.settings.wavelengths, max(eye.focus)
     samples = {name: [eye.samples(name, each, deepest) for each in wavelengths] for name in settings.light.sources}
@@ -108,7 +108,7 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
 
 
 def too_large(values: dict[str, Any]) -> str | None:
-    """A message if the run does not fit into the free memory, otherwise None."""
+    """Error message if the run does not fit into the free memory, otherwise None."""
     text = shortage(values)
     elements = any(each["method"] == "elements" for each in values["retina"])
     return f"{text}, or a larger tolerance" if text and elements else text

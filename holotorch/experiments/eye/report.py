@@ -12,7 +12,7 @@ _PREDICTED = (
 
 
 def by_wavelength(row: dict[str, Any], wavelengths: list[float]) -> dict[str, Any]:
-    """Replace each list in a table row by one column per wavelength (nm), such as ``contrast_636nm``; keep the rest."""
+    """Replace each list in a table row by columns such as ``contrast_636nm``, one for each of ``wavelengths`` in nm."""
     flat = {}
     for key, value in row.items():
         columns = [f"{key}_{wavelength:.0f}nm" for wavelength in wavelengths] if isinstance(value, list) else [key]

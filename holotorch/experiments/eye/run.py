@@ -35,7 +35,7 @@ from holotorch.io.files import save_array, write_bytes
 from holotorch.optics.picture import equal_power, gamut_map, linear_srgb, tone_map
 
 _SAVE_EVERY = 30.0  # seconds between two checkpoints
-_REFERENCE_SEED = 100_000  # first seed of the realisations that form the reference
+_REFERENCE_SEED = 100_000  # first seed of the realisations whose mean is the reference
 
 
 def scene_settings(settings: ObserverSettings) -> VolumeSettings:
@@ -102,8 +102,8 @@ class _Views:
     Attributes:
         total: Sum of the pictures of the reference for each focus, [F, 3, h, w].
         references: Number of realisations in ``total``.
-        pictures: Pictures of each realisation for each source and focus, [sources, F, 3, h, w].
-        checkpoint: The file that stores them.
+        pictures: For each realisation, the pictures of all sources and foci, [sources, F, 3, h, w].
+        checkpoint: The file that stores these pictures.
     """
 
     def __init__(self, eye: Observer, checkpoint: Checkpoint):
@@ -123,7 +123,7 @@ class _Views:
 
     @property
     def seconds(self) -> float:
-        """Time spent so far, including that before an interruption."""
+        """Seconds spent so far, including those before an interruption."""
         return time.perf_counter() - self._started
 
     @property
@@ -132,9 +132,9 @@ class _Views:
         return self.total / self.references
 
     def compute(self, pressed: list[int]) -> None:
-        """Compute the remaining pictures. A signal raises KeyboardInterrupt after all whole realisations are saved."""
+        """Compute the remaining pictures. A signal saves the complete realisations and raises KeyboardInterrupt."""
         sources, seeds = self.eye.settings.light.sources, self.eye.settings.seeds
-        # Steps of the progress bar in a realisation: one for the hologram, and one for each picture.
+        # A realisation has one step of the progress bar for the hologram, and one for each picture.
         reference, measured = 1 + len(self.eye.focus), 1 + len(self.eye.focus) * len(sources)
         done, total = self.references * reference + len(self.pictures) * measured, seeds * (8 * reference + measured)
         with tqdm(total=total, initial=done, desc="imaging", unit="picture", dynamic_ncols=True) as bar:
@@ -143,10 +143,10 @@ class _Views:
                     pictures = self._pictures(seed, (None,), bar)[0]
                     with deferred(pressed):
                         self.total, self.references = self.total + pictures, self.references + 1
-                    self._save_in_time(pressed)
+                    self._save_if_due(pressed)
                 for seed in range(len(self.pictures), seeds):
                     self.pictures.append(self._pictures(seed, sources, bar))
-                    self._save_in_time(pressed)
+                    self._save_if_due(pressed)
             finally:
                 with deferred(pressed):
                     self._save()
@@ -164,8 +164,8 @@ class _Views:
             bar.update()
         return torch.stack(pictures).unflatten(0, (len(sources), -1))
 
-    def _save_in_time(self, pressed: list[int]) -> None:
-        if pressed:  # the signal came while signals were deferred
+    def _save_if_due(self, pressed: list[int]) -> None:
+        if pressed:  # a signal arrived while signals were deferred
             raise KeyboardInterrupt
         if time.perf_counter() - self._saved > _SAVE_EVERY:
             self._save()
@@ -178,12 +178,12 @@ class _Views:
 
 
 def _write(out: Path, eye: Observer, views: _Views, values: dict[str, Any], files: Results) -> dict[str, Any]:
-    """Write arrays, pictures and the table; returns numbers for the summary."""
+    """Write arrays, pictures and the table. Returns entries of the summary."""
     reference, images = views.reference, torch.stack(views.pictures)  # [F, 3, h, w], [S, sources, F, 3, h, w]
     sources, focus = eye.settings.light.sources, eye.focus
     files.write(save_array, out / "arrays" / "retina.npy", images[0])
     files.write(save_array, out / "arrays" / "reference.npy", reference)
-    # The sources are balanced so that equal values are neutral grey, and each colour has the power of the rendering.
+    # Equal values of the three colours are shown as neutral grey. Each colour has the power of the rendering.
     wavelengths = eye.scene.settings.wavelengths
     matrix = srgb_matrix(wavelengths, white_balance(wavelengths)).float()
     with torch.no_grad():

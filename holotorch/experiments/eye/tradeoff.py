@@ -25,10 +25,10 @@ from holotorch.optics.viewing.imaging import propagate_collapsed
 
 WIDTHS = tuple(1e-9 * width for width in (1.4, 2.5, 4, 6, 9, 13, 19, 28, 40, 56))  # FWHM in metres, to be compared
 # Offsets in metres from the central wavelength at which pictures are computed, on both sides. Up to 10 nm the step is
-# 0.5 nm, half the period with which the picture at the corner of a scene oscillates; beyond, it is 1 nm.
+# 0.5 nm, since the picture at the corner of a scene oscillates with a period of 1 nm; beyond, it is 1 nm.
 _OFFSETS = 1e-9 * np.concatenate([np.arange(0, 10, 0.5), np.arange(10, 85.0)])
-# Number of wavelengths of a colour that are propagated; the others are derived from them. If 1 of 60 wavelengths is
-# propagated, the error is 0.4 % (``holotorch chart eye``).
+# Number of wavelengths of a colour that are propagated; the pictures at the others are derived from theirs. For an LED,
+# even a single propagated wavelength of 61 has an error of only 0.4 % (``holotorch chart eye``).
 _PROPAGATED = 16
 _REFERENCE_SEED = 1000  # first seed of the realisations of the reference
 WHITE = 0.995  # quantile of the brightness of the reference that is shown as white
@@ -41,8 +41,8 @@ class Case:
     Attributes:
         distance: Distance of the scene from the hologram in metres.
         wavelength: Central wavelength in metres.
-        aperture: Sine of the half angle of the light that carries detail, see ``Observer.detail``.
-        ssim: SSIM for each of ``WIDTHS``, relative to the mean of other realisations.
+        aperture: Sine of the half angle of the light cone, from ``Observer.detail``.
+        ssim: SSIM against the mean picture of other realisations, for each of ``WIDTHS``.
         contrast: Speckle contrast for each of ``WIDTHS``.
         best: FWHM in metres with the highest SSIM, see :func:`parabola_peak`.
         inside: Whether ``best`` lies inside the range of ``WIDTHS``.
@@ -57,12 +57,12 @@ class Case:
     inside: bool
 
     def formula(self, prefactor: float) -> float:
-        """Best FWHM in metres by the closed form; NaN for a prefactor of NaN."""
+        """Best FWHM in metres by the closed form ``optimum_fwhm``; NaN for a prefactor of NaN."""
         defined = not math.isnan(prefactor)
         return optimum_fwhm(self.wavelength, self.aperture, self.distance, defocus=prefactor) if defined else math.nan
 
     def row(self, prefactor: float) -> dict[str, Any]:
-        """A row of the table; ``prefactor`` is that of the closed form for the best FWHM."""
+        """A row of the table; ``prefactor`` is the argument of :meth:`formula`."""
         difference = path_difference(self.distance, self.aperture)
         spectra = (Spectrum.lorentzian(self.wavelength, width) for width in WIDTHS)
         predicted = [predicted_contrast(spectrum, difference) for spectrum in spectra]
@@ -91,8 +91,8 @@ def tradeoff(
 ) -> list[Case]:
     """Compute a case for every distance (metres) and colour, with the eye focused on the middle of the scene.
 
-    ``seeds`` realisations of the random phases are compared with the mean of ``others`` more. All light is propagated
-    by ``propagate_collapsed``, because each hologram needs 189 wavelengths per colour.
+    ``seeds`` realisations of the random phases are compared with the mean picture of ``others`` further realisations.
+    Propagation is always collapsed, because each hologram needs many propagations per colour.
     """
     cases = []
     for distance in tqdm(distances, desc="speckle against sharpness", unit="distance"):
@@ -141,11 +141,11 @@ def _case(eye: Observer, colour: int, wavelength: float, holograms: list[Tensor]
 
 
 def _weights(wavelengths: np.ndarray, spectrum: Spectrum) -> np.ndarray:
-    """Weights of the trapezoidal rule over the band of a spectrum, whose ends are interpolated linearly."""
+    """Weights of ``wavelengths`` by the trapezoidal rule over the band of a spectrum; their sum is 1."""
     low, high = (float(np.clip(end, wavelengths[0], wavelengths[-1])) for end in spectrum.band())
     inside = (wavelengths > low + 1e-13) & (wavelengths < high - 1e-13)
     nodes = np.concatenate([[low], wavelengths[inside], [high]])
-    basis = np.stack([np.interp(nodes, wavelengths, picture) for picture in np.eye(len(wavelengths))])
+    basis = np.stack([np.interp(nodes, wavelengths, unit) for unit in np.eye(len(wavelengths))])
     weights = trapezoid(spectrum.power(torch.from_numpy(nodes)).numpy() * basis, nodes)
     return weights / weights.sum()
 
@@ -165,13 +165,13 @@ def parabola_peak(positions: Sequence[float], values: Sequence[float]) -> tuple[
 
 
 def fitted_prefactor(cases: list[Case]) -> float:
-    """Prefactor of the closed form that fits the optima best (mean of logarithms); NaN without an optimum inside."""
+    """Prefactor of ``Case.formula`` fitted to the best widths (mean of logarithms); NaN if no case is ``inside``."""
     ratios = [np.log(case.best / case.formula(1.0)) for case in cases if case.inside]
     return float(np.exp(np.mean(ratios))) if ratios else math.nan
 
 
 def in_words(cases: list[Case]) -> list[str]:
-    """Lines of text: the fitted closed form, its deviation from the optima, and the best source of each case."""
+    """Lines of text: the fitted formula, its deviation from the best widths, and the best source of each case."""
     prefactor = fitted_prefactor(cases)
     inside = [case for case in cases if case.inside]
     off = [case.best / case.formula(prefactor) - 1 for case in inside]

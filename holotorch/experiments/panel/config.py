@@ -1,4 +1,4 @@
-"""Description of a phase panel: its settings, and the panel that is built from them."""
+"""Description of a phase panel: the settings of its YAML file, and the panel that is built from them."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -19,9 +19,7 @@ from holotorch.io.files import read_bytes
 from holotorch.modulator.dispersion import Birefringence, BirefringenceTable, Cauchy, phase_scale
 from holotorch.modulator.panel import PhaseModulator, checked_lut, even_lut
 
-# Largest relative difference between the wavelengths of light and calibration at which the calibration is used
-# unchanged, because the wavelength of a laser differs from its nominal value.
-_SAME = 1e-3
+_SAME = 1e-3  # largest relative difference of the wavelengths at which a calibration is used unchanged
 
 
 def _rises(points: Sequence[tuple[float, float]]) -> bool:
@@ -38,11 +36,11 @@ Points = Annotated[tuple[tuple[Number, Number], ...], Field(min_length=2), After
 
 
 class CalibrationSettings(Settings):
-    """Phases of the grey levels at one wavelength: evenly spaced, or a table of [level, phase in rad].
+    """Phases of the grey levels at one wavelength: evenly spaced, or from a table of [level, phase in rad].
 
-    ``full_turn``: level at which the phase is 2 pi, not necessarily an integer; 2^bits by default. ``lut``: rows from
-    level 0 to the top level, interpolated linearly. ``lut_file``: the same table as a text file of ``level, phase``
-    lines; its path is relative to the folder of the description.
+    ``full_turn``: level at which the phase is 2 pi, not necessarily an integer; 2^bits by default. ``lut``: rows of
+    the table, the first at level 0 and the last at the top level; phases between are interpolated linearly.
+    ``lut_file``: the table as a text file of ``level, phase`` lines, relative to the folder of the description.
     """
 
     wavelength: Wavelength
@@ -52,7 +50,7 @@ class CalibrationSettings(Settings):
 
 
 class DispersionSettings(Settings):
-    """Birefringence a + b / wavelength^2 with b in m^2, or a measured ``table`` of [wavelength, birefringence]."""
+    """Birefringence: a + b / wavelength^2 with b in m^2, or a measured ``table`` of [wavelength, birefringence]."""
 
     a: Number | None = None
     b: Number | None = None
@@ -74,10 +72,10 @@ class PanelSettings(GridSettings):
 
 
 def load_panel(path: Path | str, overrides: Sequence[str] = ()) -> PanelSettings:
-    """Read the description of a panel, apply ``overrides``, and check it.
+    """Read the description of a panel, apply ``key=value`` overrides, and check it.
 
     Raises:
-        ConfigError: All mistakes, one line each with file, line and column.
+        ConfigError: The description has mistakes; the message gives file, line and column of each.
     """
     source = read_source(Path(path), list(overrides))
     settings = validated(source, PanelSettings)
@@ -109,11 +107,11 @@ def load_panel(path: Path | str, overrides: Sequence[str] = ()) -> PanelSettings
 def build_panel(settings: PanelSettings, wavelengths: Sequence[float]) -> PhaseModulator:
     """Build the panel for light of ``wavelengths`` in metres, one per channel.
 
-    The phases of the levels in each channel are those of the calibration at its wavelength (to 0.1 %), or those of the
-    nearest calibration, scaled by the dispersion of the liquid crystal.
+    A channel takes the phases of the levels from the calibration with the nearest wavelength. If the wavelengths differ
+    by more than 0.1 %, the phases are scaled by the dispersion of the liquid crystal.
 
     Raises:
-        ConfigError: A wavelength has no calibration and the panel no dispersion, or it is outside the dispersion table.
+        ConfigError: A wavelength without calibration if the panel has no dispersion, or outside the dispersion table.
     """
     law = _law(settings.dispersion) if settings.dispersion is not None else None
     rows = []

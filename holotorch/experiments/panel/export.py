@@ -1,4 +1,4 @@
-"""Frames for a phase panel from a finished run, and a simulation of the picture that the written files form."""
+"""Files for a phase panel from a finished run, and a simulation of the picture that these files form."""
 
 import hashlib
 import math
@@ -37,10 +37,10 @@ def export_slm(
     form: str = "png",
     overrides: Sequence[str] = (),
 ) -> tuple[Path, dict[str, Any]]:
-    """Write one file for each frame and colour of a run, read the files back and simulate their picture.
+    """Write one file for each frame and colour of a run, read the files back and simulate the picture they form.
 
-    A hologram smaller than the panel is centred on the optical axis, with phase 0 around it; the simulation assumes
-    that no light comes from the pixels around it. The files of a run of kind ``pec`` hold the phases after the heat has
+    A hologram smaller than the panel is centred on the optical axis and surrounded by pixels of phase 0; the simulation
+    assumes that these pixels emit no light. The files of a run of kind ``pec`` hold the phases after the heat has
     spread, modulo 2 pi: they suit a liquid crystal, which has no thermal crosstalk, but not a thermal chip. The files
     of a run of kind ``volume`` hold the encoded field of its first realisation.
 
@@ -56,8 +56,8 @@ def export_slm(
         The folder of the files, and the content of its ``export.json``.
 
     Raises:
-        ConfigError: There is no such run, it contains NaN, the panel has another pitch or too few pixels, or the folder
-            for the files is not empty.
+        ConfigError: There is no such run, its result contains NaN, the panel has another pitch or too few pixels, or
+            the folder for the files is not empty.
     """
     if form not in FORMATS:
         raise ConfigError([f"expected one of {', '.join(FORMATS)} as the format, got {form!r}"])
@@ -83,7 +83,7 @@ def export_slm(
         }
         write_json(place / "export.json", report)
     except BaseException:
-        shutil.rmtree(place)  # it was empty before, so it holds only files of this export
+        shutil.rmtree(place)  # the folder was empty before, so all files are of this export
         raise
     return place, report
 
@@ -91,14 +91,14 @@ def export_slm(
 def resimulate(
     place: Path, names: list[list[str]], source: PanelPhases, panel: PhaseModulator, window: tuple, form: str
 ) -> dict[str, Any]:
-    """Errors of the written files, computed from the files and the panel, one value per colour.
+    """Compare the phases in the written files, and the picture that they form, with those of the run.
 
-    They are the rms error of the phase in rad, with its expected value for uniformly distributed phases, and two errors
-    of the picture: its relative L2 change at the best scale, and its correlation with the picture of the run. The
-    errors of the picture are given for the levels alone, and for the whole panel with fringing fields and gaps.
+    The results have one value per colour: the rms error of the phase in rad, its expected value for uniformly
+    distributed phases, the relative L2 change of the picture at the best scale, and the correlation of the two
+    pictures. Change and correlation are given for the levels alone, and for the panel with fringing fields and gaps.
 
-    ``names`` are the names of the files in the folder ``place``, a list of colours for each frame; ``window`` is the
-    index of the hologram in frames [..., H, W] of the panel. ConfigError for a file of another table of levels.
+    ``names`` are the names of the files in the folder ``place``, a list over colours for each frame; ``window`` are the
+    slices of the hologram in frames [..., H, W] of the panel. ConfigError if a file was made for another level table.
     """
     square = torch.zeros(len(source.wavelengths), dtype=torch.float64)
     fields: dict[str, list[Tensor]] = {"levels": [], "panel": []}  # one field [C, H, W] for each frame
@@ -150,7 +150,7 @@ def export_text(report: dict[str, Any]) -> str:
 
 
 def _window(hologram: Grid, panel: Grid, name: str) -> tuple:
-    """Index of the hologram in frames [..., H, W] of the panel."""
+    """Slices of the hologram in frames [..., H, W] of the panel."""
     if any(abs(a / b - 1) > 1e-4 for a, b in zip(hologram.pitch, panel.pitch, strict=True)):
         run, has = (" x ".join(f"{step * 1e6:g}" for step in grid.pitch) for grid in (hologram, panel))
         words = f"the run was computed for pixels of {run} um, the panel {name} has {has} um"
@@ -159,13 +159,13 @@ def _window(hologram: Grid, panel: Grid, name: str) -> tuple:
         run, has = (" x ".join(map(str, grid.shape)) for grid in (hologram, panel))
         words = f"the hologram has {run} pixels, more than the {has} of the panel {name}"
         raise ConfigError([f"{words}; use a smaller grid"])
-    # The optical axis, sample n // 2 of an axis of n samples, is that of the panel.
+    # Hologram and panel share the optical axis, which is at sample n // 2 of n samples.
     begin = [large // 2 - small // 2 for large, small in zip(panel.shape, hologram.shape, strict=True)]
     return (..., *(slice(start, start + part) for start, part in zip(begin, hologram.shape, strict=True)))
 
 
 def _claim(place: Path) -> None:
-    """Create a folder; ConfigError if it has files or cannot be created."""
+    """Create a folder. ConfigError if it has files or cannot be created."""
     try:
         place.mkdir(parents=True, exist_ok=True)
         if any(place.iterdir()):
@@ -177,7 +177,7 @@ def _claim(place: Path) -> None:
 def _write(
     place: Path, source: PanelPhases, panel: PhaseModulator, window: tuple, form: str, folder: Path, panel_name: str
 ) -> list[list[str]]:
-    """Write all files; returns their names, a list of colours for each frame."""
+    """Write all files. Returns their names, a list over colours for each frame."""
     write = write_phases if form == "exr" else write_levels
     common = {
         "program": f"holotorch {__version__}",
@@ -204,7 +204,7 @@ def _write(
 
 
 def _compared(after: Tensor, before: Tensor) -> tuple[float, float]:
-    """Relative L2 change from ``before`` to ``after`` at the best scale, and correlation of the two pictures."""
+    """Relative L2 change of a picture from ``before`` to the best-scaled ``after``, and correlation of the two."""
     a, b, tiny = after.double().flatten(), before.double().flatten(), torch.finfo(torch.float64).tiny
     scale = (a @ b) / (a @ a).clamp(min=tiny)
     change = (scale * a - b).norm() / b.norm().clamp(min=tiny)

@@ -1,4 +1,4 @@
-"""PanelPhases: the phases that a panel shows for a finished run, and the picture that they form."""
+"""PanelPhases: the phases that a panel must show for the result of a run, and the picture that they form."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -32,14 +32,14 @@ class PanelPhases:
     """Phases for a panel, and the picture that they form.
 
     Attributes:
-        phase: float32 [F, C, H, W] in rad, not wrapped.
+        phase: Phases in rad, not wrapped, float32 [F, C, H, W].
         wavelengths: Wavelengths of the C colours in metres.
         grid: Pixels of the hologram.
-        encoding: Encoding of the field as phases; "phase" if the result of the run is phases.
+        encoding: Name of the encoding of a complex field as phases; "phase" if the run computed phases.
         picture: Function from fields [F, C, H, W] to the intensity [C, ...] of the picture that they form, the mean
             over the F frames.
-        losses: Relative squared error of the picture for this encoding and for a kinoform, without an aperture, one
-            value per colour; empty if the result of the run is phases.
+        losses: Relative squared error of the picture by name of the encoding, for ``encoding`` and the kinoform,
+            without an aperture, one value per colour; empty if the run computed phases.
     """
 
     phase: Tensor
@@ -92,7 +92,7 @@ def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> Panel
     shape = (len(settings.wavelengths), height, width)
     hologram = _array(folder / "arrays" / "hologram.npy", shape, "(C, H, W)", "complex64")
     checks.all_finite("hologram", torch.view_as_real(hologram))
-    # The losses contain fourth powers, which may overflow float32. A power of two scales the field without rounding.
+    # The losses contain fourth powers of the field, which may overflow float32. The scale is a power of two, so exact.
     hologram = hologram * 2.0 ** -torch.frexp(hologram.abs().amax()).exponent.double().item()
     depth = _depth(folder, settings)
 
@@ -111,9 +111,9 @@ def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> Panel
 
 
 def _check_axes(folder: Path, experiment: PECExperiment, heaters: Tensor) -> None:
-    """Raise ValueError for a phase.npy of F = C whose first two axes were exchanged, which its shape does not show.
+    """Raise ValueError if the first two axes of phase.npy are exchanged.
 
-    The heating power of each colour in the run's summary identifies the order of the axes.
+    If F = C, the shape does not show this, but the heating power of each colour in the summary of the run does.
     """
     try:
         numbers = _summary(folder).get("methods", {}).get("corrected", {}).get("heating_power_K_per_pixel")
@@ -145,7 +145,7 @@ def _depth(folder: Path, settings: VolumeSettings) -> float:
 
 
 def _summary(folder: Path) -> dict[str, Any]:
-    """Summary of a complete or interrupted run; empty for a run without either."""
+    """Summary of a complete or interrupted run; an empty dictionary if there is neither file."""
     for name in ("summary.json", "interrupted.json"):
         if (folder / name).is_file():
             return read_json(folder / name)
@@ -153,7 +153,7 @@ def _summary(folder: Path) -> dict[str, Any]:
 
 
 def _array(path: Path, shape: tuple[int, ...], axes: str, dtype: str) -> Tensor:
-    """An array of the run; ValueError if it is missing, damaged or of another shape or dtype."""
+    """An array of the run. ValueError if it is missing, damaged or of another shape or dtype."""
     if not path.is_file():
         raise ValueError(f"{path.name} is not in its arrays; finish the run first: holotorch resume")
     try:

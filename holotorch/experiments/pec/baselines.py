@@ -14,15 +14,15 @@ IPEC_PASSES = 30  # passes of IPEC, each with 30 steps of deconvolution
 
 
 def baseline(experiment: PECExperiment, name: str) -> Solution:
-    """Heater phases [C, H, W] of the lit colours, one frame, by a method of the thesis's comparisons.
+    """Solution whose ``x`` are heater phases [C, H, W] of the lit colours, one frame, by a method of the thesis.
 
     "none": phases of Gerchberg-Saxton, without any correction. "chopping" and "shifting": these phases deconvolved by
     the matrix inverse, with negative entries set to 0, or with the smallest entry subtracted. "nonnegative": these
     phases deconvolved by non-negative least squares. "basic_ipec": Gerchberg-Saxton with the crosstalk in its loop.
     "ipec": iterative proximity effect correction, which also deconvolves in the loop (Algorithm 1).
 
-    All methods begin with the phase of the image that the solver's start phases form, so that the same share of light
-    is in the window. ValueError for a crosstalk that has no inverse.
+    Every method starts with the phase of the image that is formed by the solver's start phases; the share of the light
+    in the window is then the same. ValueError for a crosstalk that has no inverse.
     """
     propagator, crosstalk = experiment.propagator, experiment.array.crosstalk
     assert not isinstance(propagator, DepthStack)

@@ -33,7 +33,7 @@ def _not_zero(value: float) -> float:
 
 
 Picture = Annotated[str, existing(lambda name: name in BUNDLED_IMAGES or Path(name).is_file(), no_such_picture)]
-# The heater phases at which the solver starts; plan.py describes each of them.
+# Kinds of start phases of the solver; ``plan._START_REASONS`` describes them.
 Start = Literal["hot", "cool", "flat", "quadratic", "retrieved"]
 SIGMA_MEANING = (
     "a pixel heated alone warms one d px away by exp(-d^2/sigma^2) of its own rise; sigma is the usual Gaussian sigma "
@@ -42,7 +42,7 @@ SIGMA_MEANING = (
 
 
 class PeripheralWeightSettings(Settings):
-    """Weight of the squared error that falls with the eccentricity E as visual acuity does: (1 + E / e2_deg)^-2.
+    """Weight (1 + E / e2_deg)^-2 on the squared error of a pixel, where E is the angle between the pixel and the gaze.
 
     ``field_deg``: angle that the picture spans from left to right; every pixel spans the same angle. ``gaze_deg``:
     elevation and azimuth of the gaze from the middle of the picture. ``least``: lower limit of the weight, relative to
@@ -52,17 +52,17 @@ class PeripheralWeightSettings(Settings):
     kind: Literal["peripheral"]
     field_deg: Annotated[Number, Field(gt=0, le=360)]
     gaze_deg: tuple[Annotated[Number, Field(ge=-90, le=90)], Annotated[Number, Field(ge=-180, le=180)]] = (0.0, 0.0)
-    e2_deg: Annotated[Number, Field(gt=0, le=180)] = 1.746  # value of Cowey and Rolls
+    e2_deg: Annotated[Number, Field(gt=0, le=180)] = 1.746  # cortical magnification by Cowey and Rolls
     least: Annotated[Number, Field(ge=0, le=1)] = 0.0
 
 
 class TargetSettings(Settings):
-    """A bundled photograph or a picture file, cropped or padded to the aspect ratio of the grid or of a region of it.
+    """A bundled photograph or a picture file, cropped or padded to the aspect ratio of the grid or of ``region``.
 
     ``region``: size in pixels of the middle part of the image that shows the picture; the rest of the image is free
     (thesis Eqs. 4.7, 4.8). ``depths``: ``bands`` divides the picture into as many vertical bands as there are
     distances, and each band is the target at one distance only; with ``full`` the whole picture is the target at every
-    distance. ``weight``: weight of the squared error over the picture.
+    distance. ``weight``: weights of the squared errors of the pixels.
     """
 
     image: Picture
@@ -75,10 +75,10 @@ class TargetSettings(Settings):
 class ModulatorSettings(Settings):
     """The phased array and the heat that spreads between its pixels.
 
-    ``sigma_px``: width of the heat kernel. ``kernel_size``: its number of taps, by default as many as the width needs.
-    ``max_phase``: upper limit in rad on the phase of every pixel after spreading (4 pi is 700 degC at 630 nm); no limit
-    by default, as in the thesis. ``bits``: resolution of the heaters, whose levels are evenly spaced from 0 to the
-    largest phase. ``power_weight``: weight of the sum of the heater phases, which is added to the squared error.
+    ``sigma_px``: width of the heat kernel. ``kernel_size``: taps of the kernel along each axis, by default as many as
+    its width needs. ``max_phase``: upper limit in rad on the phase of every pixel after the heat has spread (4 pi is
+    700 degC at 630 nm); no limit by default, as in the thesis. ``bits``: resolution of the heaters, whose levels
+    are evenly spaced from 0 to the largest phase. ``power_weight``: weight of the sum of the heater phases in the loss.
     """
 
     sigma_px: Annotated[Number, plausible(SIGMA_PX), Field(description=SIGMA_MEANING)]
@@ -105,7 +105,7 @@ class NearFieldSettings(Settings):
 
 
 class _SolverSettings(Settings):
-    """Settings of any solver. It stops after ``patience`` steps with a relative change of loss below ``tolerance``."""
+    """Solver settings. A run stops after ``patience`` successive relative changes of the loss below ``tolerance``."""
 
     kind: Any  # name of the solver, stated by each of the classes below
     max_steps: Count = 400
@@ -115,7 +115,7 @@ class _SolverSettings(Settings):
 
 
 class APGSettings(_SolverSettings):
-    """Accelerated proximal gradient, thesis Algorithm 2."""
+    """Accelerated proximal gradient, thesis Algorithm 2; options as in ``holotorch.correction.APG``."""
 
     kind: Literal["apg"]
     step: Annotated[Number, Field(ge=1e-6, le=1e6)] = 1.0
@@ -132,7 +132,7 @@ class AdamSettings(_SolverSettings):
 
 
 class LBFGSSettings(_SolverSettings):
-    """Preconditioned L-BFGS in stages: first the loss of the amplitude, then that of the intensity with any limit."""
+    """Preconditioned L-BFGS in stages: the first compares amplitudes, the others intensities under any limit."""
 
     kind: Literal["lbfgs"]
     memory: Annotated[Count, Field(le=100)] = 3
@@ -140,7 +140,7 @@ class LBFGSSettings(_SolverSettings):
     tolerance: Annotated[Number, Field(ge=0)] = 1e-4
 
 
-# Methods to compare with; "unweighted" is the solver of the run without target.weight.
+# Methods that the result is compared with; "unweighted" is the solver of the configuration without target.weight.
 Baseline = Literal["none", "basic_ipec", "ipec", "chopping", "shifting", "nonnegative", "unweighted"]
 
 
@@ -172,7 +172,7 @@ class PECSettings(Settings):
 
 
 def contradictions(settings: PECSettings) -> Iterator[tuple[Key, str]]:
-    """Settings that are valid one by one but contradict each other: the key and the message for each."""
+    """Key and message of each setting that is valid by itself but contradicts another one."""
     shape, light, size = settings.grid.shape, settings.propagator, settings.modulator.kernel_size
     region, weight, scored_by_ssim = settings.target.region, settings.target.weight, "ssim" in settings.report.metrics
     if len(settings.wavelengths) not in (1, 3):

@@ -1,4 +1,4 @@
-"""Scores of heater phases, from a simulation in float64 that uses nothing of the solver but the phases."""
+"""Scores of heater phases from a simulation in float64."""
 
 import math
 from dataclasses import dataclass
@@ -21,8 +21,8 @@ class Result:
 
     Attributes:
         phase: Heater phases in rad, [F, C, H, W] for F frames.
-        picture: Intensity in the pixels of the target and on its scale, float64 [C, h, w].
-        isolated: The same for a single chip without periodic repetition; None in the far field.
+        picture: Intensity at the pixels of the target, scaled to the values of the target, float64 [C, h, w].
+        isolated: ``picture`` of a single chip, without periodic repetition; None in the far field.
         numbers: Entry of summary.json for the method.
     """
 
@@ -42,7 +42,7 @@ def quality(experiment: PECExperiment, phase: Tensor) -> float:
 def evaluate(experiment: PECExperiment, phase: Tensor) -> Result:
     """Score heater phases [F, C, H, W] of the lit colours.
 
-    The image is scored at its samples, half a sample off them, and for a single chip without periodic repetition.
+    The scores are those at the image samples, midway between them, and, in the near field, those of a single chip.
     """
     phase = phase.detach().double()
     spread = experiment.array.crosstalk(phase)
@@ -74,19 +74,19 @@ def evaluate(experiment: PECExperiment, phase: Tensor) -> Result:
 
 
 def _efficiency(experiment: PECExperiment, formed: Tensor) -> list[float]:
-    """Share of the array's light that falls in the picture, for each colour."""
+    """Fraction of the array's light that falls in the picture, for each colour."""
     return _per_colour(experiment, formed.sum((-2, -1)) / math.prod(experiment.grid.shape))
 
 
 def _scale(experiment: PECExperiment, formed: Tensor) -> Tensor:
-    """Factors [C, 1, 1] by which an intensity fits the target best."""
+    """Factors [C, 1, 1] that fit an intensity [C, h, w] to the target by least squares."""
     return best_scale(formed, experiment.wanted)[:, None, None]
 
 
 def _isolated(experiment: PECExperiment, phase: Tensor) -> tuple[Tensor, dict[str, Any], Tensor]:
-    """Picture of a single chip by the exact kernel, its scores, and the intensity half a sample off its samples."""
+    """Picture of a single chip by the exact kernel, scores of the picture, and intensity midway between samples."""
     grid, axes = experiment.grid, (2, len(experiment.wavelengths), len(experiment.distances))
-    images = torch.zeros(*axes, *grid.shape, dtype=torch.float64)  # at the samples, and half a sample off them
+    images = torch.zeros(*axes, *grid.shape, dtype=torch.float64)  # [at samples or midway, C, D, H, W]
     for i, wavelength in enumerate(experiment.wavelengths):  # one kernel at a time, since float64 kernels are large
         for j, distance in enumerate(experiment.distances):
             for k, offset in enumerate(((0.0, 0.0), (grid.pitch[0] / 2, grid.pitch[1] / 2))):
@@ -101,7 +101,7 @@ def _isolated(experiment: PECExperiment, phase: Tensor) -> tuple[Tensor, dict[st
 
 
 def _between_scores(experiment: PECExperiment, between: Tensor) -> dict[str, Any]:
-    """Scores half a sample off the image's samples, against the mean of the four nearest pixels of the target."""
+    """Scores of the intensity midway between four samples, against the mean of the four pixels of the target."""
     picture = _as_picture(experiment, between, at_best_scale=False)[..., :-1, :-1]
     image = experiment.image
     wanted = (image[..., 1:, 1:] + image[..., 1:, :-1] + image[..., :-1, 1:] + image[..., :-1, :-1]) / 4
@@ -119,7 +119,7 @@ def _scores(experiment: PECExperiment, picture: Tensor, image: Tensor) -> dict[s
 
 
 def _as_picture(experiment: PECExperiment, formed: Tensor, *, at_best_scale: bool) -> Tensor:
-    """Intensity of the lit colours [C, h, w] scaled to the target's mean in each; zeros for the other colours."""
+    """Intensity [C, h, w] of each lit colour times the mean of its target; zeros for the other colours."""
     mean = experiment.image[experiment.lit].mean((-2, -1), keepdim=True)
     return _all_colours(experiment, (formed * _scale(experiment, formed) if at_best_scale else formed) * mean)
 

@@ -46,10 +46,10 @@ class PECExperiment:
 
     Attributes:
         settings: The configuration.
-        source: The picture as loaded, float64 [C', h, w].
+        source: The picture as loaded, float64 [channels of the file, h, w].
         lit: Mask of the colours that are not black, bool [all colours].
         array: The phased array, over the lit colours.
-        start: Kind of the phases at the start, as in ``solver.start``.
+        start: Kind of the start phases, as in ``solver.start``.
         device: Device of the solver.
     """
 
@@ -77,12 +77,12 @@ class PECExperiment:
 
     @property
     def isolated(self) -> bool:
-        """Whether the model is a single chip with an image at a distance, where light may leave the window."""
+        """Whether the model is a single chip with a near-field image; light may then leave the window."""
         return getattr(self.settings.propagator, "boundary", None) == "isolated"
 
     @property
     def scale_free(self) -> bool:
-        """Whether light may leave the picture, so that the image is scaled to fit the target best before comparison."""
+        """Whether light may leave the picture. The image is then scaled to fit the target best before comparison."""
         return self.isolated or self.settings.target.region is not None
 
     @property
@@ -92,14 +92,14 @@ class PECExperiment:
 
     @cached_property
     def image(self) -> Tensor:
-        """The picture resampled to the grid, or to the region, float64 [all colours, H, W]; a plan does not need it."""
+        """The picture resampled to the grid, or to the region, float64 [all colours, h, w]; computed on first use."""
         settings = self.settings
         fitted = fit_image(self.source, settings.target.region or settings.grid.shape, settings.target.fit)
         return with_channels(fitted, len(settings.wavelengths)).contiguous()
 
     @property
     def wanted(self) -> Tensor:
-        """Intensity of the lit colours of the picture, each scaled to mean 1, float64 [C, H, W]."""
+        """Intensity of the lit colours of the picture, each scaled to mean 1, float64 [C, h, w]."""
         image = self.image[self.lit]
         return image / image.mean((-2, -1), keepdim=True)
 
@@ -110,20 +110,20 @@ class PECExperiment:
         if region := self.settings.target.region:
             whole = wanted.new_zeros(len(wanted), *self.grid.shape)
             whole[self.window] = wanted
-            # About half of the light falls in the region; the exact share does not matter, as the scale is free.
+            # The factor puts half of the light in the region. Its value is not critical, since the scale is fitted.
             return whole * (math.prod(self.grid.shape) / math.prod(region) / 2)
         return wanted[:, None].repeat(1, len(self.distances), 1, 1) if len(self.distances) > 1 else wanted
 
     @property
     def window(self) -> tuple[Any, ...]:
-        """Index of the picture in a tensor [..., H, W] on the grid."""
+        """Slices that cut the picture out of a tensor [..., H, W] on the grid."""
         size = self.settings.target.region or self.grid.shape
         first = [whole // 2 - part // 2 for whole, part in zip(self.grid.shape, size, strict=True)]
         return (..., *(slice(start, start + part) for start, part in zip(first, size, strict=True)))
 
     @property
     def mask(self) -> Tensor | None:
-        """1 where the image is compared with the target and 0 elsewhere, float64; None if it is compared everywhere."""
+        """1 where the image is compared with the target, else 0; float64, broadcasts to [C, *image]. None for all 1."""
         depths, width = len(self.distances), self.grid.shape[1]
         if self.settings.target.region:
             mask = torch.zeros(1, *self.grid.shape, dtype=torch.float64)
@@ -138,7 +138,7 @@ class PECExperiment:
 
     @property
     def weights(self) -> Tensor | None:
-        """Factor on the error: the mask, or the square root of ``target.weight``; None for a factor of 1."""
+        """Factor on the error before squaring: :attr:`mask` or the square root of ``target.weight``; None for 1."""
         if self.settings.target.weight is None:
             return self.mask
         return weight_map(self.settings.target.weight, self.grid.shape).sqrt()[None]
@@ -152,7 +152,7 @@ class PECExperiment:
     def picture_in(self, formed: Tensor) -> Tensor:
         """Cut the picture [..., C, h, w] out of an image intensity [..., C, *image].
 
-        It consists of the region, of the bands in focus at each distance, or else of the mean over the distances.
+        For several distances, the picture consists of the band at each distance, or is the mean over the distances.
         """
         if len(self.distances) < 2:
             return formed[self.window]
@@ -161,7 +161,7 @@ class PECExperiment:
 
     @cached_property
     def propagator(self) -> SpectralFilter | Fraunhofer | DepthStack:
-        """Propagator from the array to the image; built on first use, as its kernel is the first large allocation."""
+        """Propagator from the array to the image; built on first use, because its kernel takes much memory."""
         if not self.distances:
             return Fraunhofer(self.grid, self.wavelengths).to(self.device)
         filters = [self._to_distance(distance).to(self.device) for distance in self.distances]
@@ -209,7 +209,7 @@ class PECExperiment:
         if self.start == "quadratic":
             (y, x), (height, width) = self.grid.coordinates(self.device), self.grid.shape
             y, x = y / self.grid.pitch[0], x / self.grid.pitch[1]
-            lens = math.pi * (y.square() / height + x.square() / width)  # its slope at the edge is pi per pixel
+            lens = math.pi * (y.square() / height + x.square() / width)  # slope at the edge: pi rad per pixel
             return (lens / spread + 0.01 * uniform).to(uniform.dtype)
         if self.start == "retrieved":
             if isinstance(self.propagator, DepthStack):
@@ -221,16 +221,16 @@ class PECExperiment:
         return uniform * {"hot": 2 * math.pi, "cool": 2 * math.pi / spread, "flat": 1.0}[self.start]
 
     def heater_phases(self, solution: Tensor) -> Tensor:
-        """Phases [F, C, H, W] for the heaters: the solver's result, rounded to their levels and scaled to the limit."""
+        """Heater phases [F, C, H, W]: the solver's result, rounded to the heater levels and scaled below the limit."""
         phase = solution.detach() if self.settings.frames > 1 else solution.detach()[None]
         limit, bits = self.settings.modulator.max_phase, self.settings.modulator.bits
         if bits is not None:
             phase = quantised(phase, bits)
-        # The limit is applied after rounding to levels, which may exceed it. A common scale keeps the number of levels.
+        # Rounded phases may exceed the limit, so they are scaled last, all levels by the same factor.
         return phase if limit is None else limit_peak_phase(limit, phase, self.array.crosstalk)
 
     def stages(self) -> list[Stage]:
-        """The runs of the configured solver, one after another."""
+        """The stages of the configured solver in order."""
         kind, crosstalk = self.settings.solver.kind, self.array.crosstalk
         options = self.settings.solver.model_dump(exclude={"kind", "start"})
         if kind == "lbfgs":
@@ -247,7 +247,7 @@ class PECExperiment:
 
 
 def build(settings: PECSettings) -> PECExperiment:
-    """Load the picture, and choose device and start if the configuration does not. ConfigError for a bad picture."""
+    """Load the picture, and choose the device and start that are not configured. ConfigError for a bad picture."""
     shape = settings.target.region or settings.grid.shape
     try:
         source = load_image(settings.target.image)
@@ -259,7 +259,7 @@ def build(settings: PECSettings) -> PECExperiment:
         raise ConfigError([f"target.image: {settings.target.image} is black inside its crop; use target.fit: pad"])
     wavelengths = [length for length, on in zip(settings.wavelengths, lit.tolist(), strict=True) if on]
     array = PhasedArray(wavelengths, ThermalCrosstalk(settings.modulator.sigma_px, settings.modulator.kernel_size))
-    # From a hot start most of the light of an isolated chip misses the window: at 128 px and sigma 0.66 the result has
+    # From a hot start most of the light of an isolated chip misses the window: at 128 px and sigma 0.66 the picture has
     # 4 to 25 % of the light and an SSIM of 0.5 to 0.75. From a flat start it has half of the light and an SSIM of 0.9.
     isolated = getattr(settings.propagator, "boundary", None) == "isolated"
     start = settings.solver.start or ("flat" if isolated else "hot")

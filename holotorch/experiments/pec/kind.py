@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class PECKind(ExperimentKind[PECSettings, "PECExperiment"]):
-    """See :mod:`holotorch.experiments.kind`."""
+    """Proximity effect correction of one picture; see :mod:`holotorch.experiments.kind`."""
 
     settings = PECSettings
     example = "configs/pec/fourier.yaml"

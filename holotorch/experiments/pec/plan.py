@@ -9,18 +9,18 @@ from holotorch.experiments.pec.config import SIGMA_MEANING
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.optics import diffraction_angle, plan_propagation, unaliased_distance
 
-# Seconds of one evaluation on two CPU cores, and bytes, measured in runs of 128 to 1024 px. The predicted seconds are
-# right within a factor of 2 on an idle machine, the predicted bytes within 30 %.
-_PIXEL_SECONDS = 8e-9  # per pixel, colour and frame
-_FFT_SECONDS = 0.8e-9  # per padded sample, times log2 of the number of padded samples
-_BASE_BYTES = 450e6  # the interpreter with its libraries
-_PIXEL_BYTES = 240  # per pixel, colour and frame
-_SOLVER_BYTES = 60  # per padded sample of the solver
-_EVALUATION_BYTES = 112  # per sample of the grid of one colour in the float64 evaluation
+# Costs measured on two idle CPU cores, with 128 to 1024 px. An evaluation is one computation of the loss and its
+# gradient. Predicted times are right within a factor of 2, predicted memory within 30 %.
+_PIXEL_SECONDS = 8e-9  # seconds of an evaluation per pixel, colour and frame
+_FFT_SECONDS = 0.8e-9  # seconds of an evaluation / (n log2 n) for n padded samples
+_BASE_BYTES = 450e6  # bytes of the interpreter with its libraries
+_PIXEL_BYTES = 240  # bytes per pixel, colour and frame
+_SOLVER_BYTES = 60  # bytes per padded sample in the solver
+_EVALUATION_BYTES = 112  # bytes per grid sample of one colour in the float64 simulation of the result
 
 
 def plan_values(experiment: PECExperiment) -> dict[str, Any]:
-    """Choices with their reasons, cost and physics, as values of plan.json."""
+    """Values of plan.json: choices with their reasons, predicted cost, and physics of the setup."""
     settings, grid = experiment.settings, experiment.grid
     padded, channels = grid.padded(2 if experiment.isolated else 1), len(experiment.wavelengths) * settings.frames
     pixels, samples = channels * math.prod(grid.shape), channels * math.prod(padded.shape)
@@ -121,7 +121,7 @@ def _listed(values: list[float], form: str = ".3g") -> str:
 
 
 def _heat(experiment: PECExperiment) -> str:
-    """Text about the temperature limit and the resolution of the heaters."""
+    """Text on the temperature limit and the resolution of the heaters."""
     limit, bits = experiment.settings.modulator.max_phase, experiment.settings.modulator.bits
     steps = "" if bits is None else f"; heaters with {2**bits} steps"
     if limit is None:

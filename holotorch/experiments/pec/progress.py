@@ -14,7 +14,7 @@ from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.experiments.runs.memory import peak_memory
 from holotorch.experiments.runs.saving import Checkpoint
 
-_CHECK_STEPS = 10  # steps between two measurements of the quality; a measurement takes about as long as a step
+_CHECK_STEPS = 10  # solver steps between two scores of the hologram; scoring takes about as long as a step
 _SAVE_EVERY = 30.0  # seconds between two checkpoints
 
 
@@ -22,9 +22,9 @@ class Log:
     """Callback of the solver that draws the progress bar and writes a checkpoint every 30 seconds.
 
     Attributes:
-        last: The solution after the last step, or None.
+        last: The solution after the latest step, or None before the first.
         rows: Rows of metrics.csv.
-        checked: Steps at which the quality of the hologram was measured, with its value.
+        checked: (step, score) for each time the hologram was scored by :attr:`metric`.
         resume: State of the solver in the checkpoint, or None.
     """
 
@@ -46,12 +46,12 @@ class Log:
 
     @property
     def metric(self) -> str:
-        """Name of the metric that is measured during the run."""
+        """Name of the metric by which the hologram is scored during the run."""
         return self.experiment.settings.report.metrics[0]
 
     @property
     def seconds(self) -> float:
-        """Time that the solver has taken, including that before an interruption and excluding that of this log."""
+        """Seconds spent in the solver, including those before an interruption, without those spent in this log."""
         return time.perf_counter() - self._started
 
     def __call__(self, solution: Solution) -> None:
@@ -75,12 +75,12 @@ class Log:
         self._started += time.perf_counter() - entered
 
     def save(self) -> bool:
-        """Write a checkpoint of the last step, if there is one; False if the disk refuses it."""
+        """Write a checkpoint of :attr:`last`, if there is one. False if the file cannot be written."""
         if self.last is None:
             return True
         content: dict[str, Any] = {
             "state": self.last.state,
-            "rows": self.rows[: len(self.last.losses) - 1],  # a signal may arrive between a row and its solution
+            "rows": self.rows[: len(self.last.losses) - 1],  # without the row of a step that a signal interrupted
             "checked": self.checked,
             "seconds": self.seconds,
         }
@@ -89,7 +89,7 @@ class Log:
 
     @contextmanager
     def saved_on_failure(self) -> Iterator[None]:
-        """Save the last step if the block raises an exception, so that ``holotorch resume`` repeats no steps."""
+        """Save the latest step if the block raises an exception, so that ``holotorch resume`` repeats no steps."""
         try:
             yield
         except Exception:

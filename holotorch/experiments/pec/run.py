@@ -73,15 +73,15 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
 def _fingerprint(experiment: PECExperiment) -> Fingerprint:
     """Settings and inputs that must not change before a run is resumed."""
     free = {"device", "report.baselines"}  # baselines are computed after the solver
-    if experiment.settings.solver.kind != "lbfgs":  # its stages divide the number of steps among them
+    if experiment.settings.solver.kind != "lbfgs":  # the stages of L-BFGS depend on max_steps
         free.add("solver.max_steps")
     kept = fingerprint(experiment.settings, {"target.image": (experiment.source,)}, free)
-    # Checkpoints of version 0.1.0 are refused: their joint frames are [C, F, H, W], the same shape if F = C.
+    # This entry refuses checkpoints of version 0.1.0, whose joint frames are [C, F, H, W], the same shape if F = C.
     return kept | ({"axes of joint frames": "F, C, H, W"} if experiment.joint else {})
 
 
 def _result(experiment: PECExperiment, solution: Solution, seconds: float, *, single: bool = False) -> Result:
-    """Scores of a solution; ``single`` if its phases are one frame [C, H, W] even in a run of several frames."""
+    """Scores of a solution; ``single`` if it has one frame [C, H, W] although the run has several."""
     result = evaluate(experiment, solution.x[None] if single else experiment.heater_phases(solution.x))
     result.numbers.update(
         evaluations=solution.evaluations,

@@ -1,4 +1,4 @@
-"""Weight of the error over a wide picture, and scores by zones of the visual field."""
+"""Weights of the squared error by eccentricity, and scores of a picture by zone of the visual field."""
 
 import math
 from typing import Any
@@ -10,7 +10,7 @@ from holotorch.experiments.pec.config import PeripheralWeightSettings
 from holotorch.metrics import SSIM_WINDOW, ssim_map
 from holotorch.perception import Headset, LinearMagnification, peripheral_weight, separation
 
-# Limits in degrees of eccentricity of central vision and of the near, middle and far periphery: thesis Sec. 2.1.
+# Limits in degrees of eccentricity of central vision and of the near, middle and far periphery (thesis Sec. 2.1).
 ZONES = {"central": (0, 8), "near": (8, 30), "middle": (30, 60), "far": (60, 180)}
 
 
@@ -30,16 +30,16 @@ def weight_map(settings: PeripheralWeightSettings, shape: tuple[int, int]) -> Te
 def zone_scores(
     settings: PeripheralWeightSettings, picture: Tensor, image: Tensor, lit: Tensor
 ) -> list[dict[str, Any]]:
-    """PSNR and SSIM of a picture [C, H, W] in 0 .. 1, one row for each zone of the visual field, central zone first.
+    """PSNR and SSIM of a picture against ``image``, both [C, H, W] in 0 .. 1, one row for each of ``ZONES``.
 
-    The PSNR of a zone is computed over its pixels and all lit colours. The SSIM is the mean over the windows centred in
-    the zone, or None without such a window. ``error`` is the share of the zone in the total squared error. Zones
-    without pixels are left out.
+    Only the colours in the mask ``lit`` [C] count. The PSNR of a zone is that of its pixels. The SSIM is the mean over
+    the windows centred in the zone, or None without such a window. ``error`` is the share of the zone in the total
+    squared error. Zones without pixels are left out.
     """
     picture, image = picture[lit].clamp(0, 1), image[lit]
     angles, edge = eccentricities(settings, (image.shape[-2], image.shape[-1])), SSIM_WINDOW // 2
     square = (picture - image).double().square().mean(0)
-    centres = angles[edge:-edge, edge:-edge]  # of the windows of SSIM
+    centres = angles[edge:-edge, edge:-edge]  # eccentricities of the centres of the SSIM windows
     has_windows = min(angles.shape) >= SSIM_WINDOW
     windows = ssim_map(picture, image, data_range=1.0).mean(0) if has_windows else torch.zeros_like(centres)
     rows: list[dict[str, Any]] = []

@@ -1,4 +1,4 @@
-"""Bench: photographs that are corrected as one batch on one array, for the chart and the studies of PEC."""
+"""Bench: a batch of photographs on one array, for the chart and the studies of proximity effect correction (PEC)."""
 
 import math
 import time
@@ -31,7 +31,7 @@ from holotorch.metrics import PerceptualSimilarity, psnr, ssim
 from holotorch.modulator import PhasedArray, ThermalCrosstalk
 
 PHOTOGRAPHS = ("camera", "astronaut", "coffee", "page")
-WAVELENGTH, EXTENT, DISTANCE = 530e-9, 2e-3, 0.1  # metres: the thesis's chip of 2 mm and its image at 100 mm
+WAVELENGTH, EXTENT, DISTANCE = 530e-9, 2e-3, 0.1  # metres; width of the chip and distance of the image of the thesis
 # Settings of the propagator for each value of ``Bench.kind``.
 _PROPAGATORS = {
     "fourier": {"kind": "fraunhofer"},
@@ -42,7 +42,7 @@ _PROPAGATORS = {
 
 
 def grey(name: str, size: tuple[int, int]) -> Tensor:
-    """Luminance of a photograph, float64 [1, H, W]."""
+    """Luminance of a photograph cropped and resampled to ``size`` (H, W), float64 [1, H, W]."""
     return with_channels(fit_image(load_image(name), size, "crop"), 1)
 
 
@@ -60,7 +60,7 @@ class Bench:
         distances: Distances of the image in metres, except in the far field. Several distances divide the image into as
             many vertical bands.
         lowpass: Cut-off of a Butterworth filter on the targets in cycles per pixel, or 0 for no filter.
-        perceptual: Learned similarity that also scores the pictures, or None.
+        perceptual: Learned perceptual similarity (LPIPS) as a further score, or None.
         pictures: Targets [C, h, w] in place of the photographs.
     """
 
@@ -76,9 +76,9 @@ class Bench:
 
     @cached_property
     def experiment(self) -> PECExperiment:
-        """The array, the light and the targets as an experiment of kind ``pec`` with C colours.
+        """An experiment of kind ``pec`` whose C colours are the photographs.
 
-        The crosstalk has seven taps, as in the thesis, or one tap if no heat spreads.
+        The heat kernel has seven taps per axis, as in the thesis, or one tap if no heat spreads.
         """
         pictures, side = self.pictures, self.region or self.size
         if pictures is None:
@@ -103,7 +103,7 @@ class Bench:
 
     @property
     def crosstalk(self) -> ThermalCrosstalk:
-        """Spreading of the heat."""
+        """Operator that spreads the heat between pixels."""
         return self.experiment.array.crosstalk
 
     def start(self, kind: str, frames: int = 1, seed: int = 7) -> Tensor:
@@ -113,7 +113,7 @@ class Bench:
         if kind != "quadratic":
             return phase
         n = torch.arange(self.size) - self.size // 2
-        lens = math.pi * n.square() / self.size  # in float32, as when the committed charts were measured
+        lens = math.pi * n.square() / self.size  # float32, as in the committed charts
         return (lens[:, None] + lens) / self.crosstalk.total + 0.01 * phase
 
     def lbfgs(
@@ -125,18 +125,18 @@ class Bench:
         power_weight: float = 0.0,
         callback: Callback | None = None,
     ) -> Solution:
-        """L-BFGS in stages; frames [F, C, H, W] share the image. ``limit`` in rad bounds the phase after spreading."""
+        """L-BFGS in stages, jointly for frames [F, C, H, W]. ``limit`` in rad bounds the phase after spreading."""
         make = partial(self.experiment.problem, frames=start.ndim == 4, power_weight=power_weight)
         solver = LBFGS(precondition=spread_preconditioner(self.crosstalk.kernel), max_steps=steps, tolerance=1e-4)
         solution = run_stages(penalty_schedule(make, solver, self.crosstalk.total, limit), start, callback=callback)
         return solution if limit is None else replace(solution, x=limit_peak_phase(limit, solution.x, self.crosstalk))
 
     def algorithm2(self, start: Tensor, *, steps: int = 400, callback: Callback | None = None) -> Solution:
-        """Algorithm 2 of the thesis, proximal proximity effect correction (PPEC)."""
+        """Thesis Algorithm 2, proximal proximity effect correction (PPEC)."""
         return APG(max_steps=steps)(self.experiment.problem(), start, callback=callback)
 
     def retrieved(self, kind: str, seed: int = 7) -> Solution:
-        """Gerchberg-Saxton: "none" (plain), "basic" (with the crosstalk in the loop) or "ipec" (deconvolution too)."""
+        """Gerchberg-Saxton; ``kind`` is "none", "basic" (crosstalk in the loop) or "ipec" (deconvolution as well)."""
         problem, propagator = self.experiment.problem(), self.experiment.propagator
         target, mask = problem.target, problem.mask
         begin = 2 * math.pi * torch.rand(target.shape, generator=torch.Generator().manual_seed(seed))
@@ -146,15 +146,15 @@ class Bench:
         return gerchberg_saxton(propagator, target, begin, max_steps=PASSES, crosstalk=spread, mask=mask)
 
     def formed(self, phase: Tensor) -> Tensor:
-        """Picture [C, h, w] in the mean intensity of the frames of ``phase`` [C, H, W] or [F, C, H, W], float64."""
+        """Intensity of the picture, float64 [C, h, w], that the frames of ``phase`` ([F,] C, H, W) form on average."""
         return self.experiment.picture_in(self.experiment.intensity(phase.double().reshape(-1, *phase.shape[-3:])))
 
     def scores(self, phase: Tensor, formed: Tensor | None = None) -> dict[str, float]:
-        """Scores of heater phases by name, each the mean over the photographs unless stated otherwise.
+        """Scores of heater phases by name.
 
-        They are ``ssim``, ``psnr``, ``perceptual`` if it is installed, ``efficiency`` (share of the light in the
-        picture, least over the photographs), ``peak_rad`` (largest phase after spreading) and ``power_rad`` (mean
-        heater phase). ``formed`` replaces the picture that the phases form.
+        ``ssim``, ``psnr``, ``power_rad`` (heater phase) and, if the bench has it, ``perceptual`` are means over the
+        photographs. ``efficiency`` is the fraction of the light in the picture, smallest over the photographs, and
+        ``peak_rad`` the largest phase after spreading. ``formed`` replaces the picture that the phases form.
         """
         formed = self.formed(phase) if formed is None else formed
         image, light = self.experiment.image, formed.sum((-2, -1)) / self.size**2
@@ -174,11 +174,11 @@ class Bench:
 
 
 class Track:
-    """Callback that scores every few steps of a solver; the recorded times exclude the scoring."""
+    """Solver callback that scores every few steps; the recorded times exclude the scoring."""
 
     def __init__(self, bench: Bench, every: int = 5):
         self.bench, self.every, self.started = bench, every, time.perf_counter()
-        self.rows: list[tuple[float, int, float, float]] = []  # seconds, evaluations, SSIM, largest phase in rad
+        self.rows: list[tuple[float, int, float, float]] = []  # seconds, evaluations, SSIM, peak_rad
 
     def __call__(self, solution: Solution) -> None:
         """Score the phases if the step is a multiple of ``every``."""
@@ -194,7 +194,7 @@ class Track:
 
 
 def butterworth(images: Tensor, cutoff: float) -> Tensor:
-    """Low-pass H = 1 / (1 + (f / cutoff)^4) of thesis Eqs. 4.43, 4.44; frequencies f in cycles per pixel."""
+    """Images after the low-pass filter 1 / (1 + (f / cutoff)^4), f in cycles per pixel (thesis Eqs. 4.43, 4.44)."""
     fy, fx = (torch.fft.fftfreq(size, dtype=torch.float64) for size in images.shape[-2:])
     square = fy[:, None] ** 2 + fx**2
     spectrum = fft2(images.to(torch.complex128))

@@ -1,4 +1,4 @@
-"""Cases of a study with a checkpoint, so that a resumed study computes only the missing cases."""
+"""Cases of a study with a checkpoint: a resumed study computes only the missing cases."""
 
 import time
 from collections.abc import Iterable, Iterator
@@ -15,7 +15,7 @@ class Cases:
     """Progress of a study: the table rows computed so far, and the cases that remain.
 
     Attributes:
-        rows: Rows of all cases so far; the run appends the rows of each case to this list.
+        rows: Rows of all cases so far; the caller of :meth:`each` appends the rows of each case.
         saved: Number of cases whose rows are in the checkpoint.
         checkpoint: The file that stores the rows.
     """
@@ -32,11 +32,11 @@ class Cases:
 
     @property
     def seconds(self) -> float:
-        """Seconds so far, including the runs before an interruption."""
+        """Seconds spent so far, including those before an interruption."""
         return time.perf_counter() - self._started
 
     def each(self, cases: Iterable[Case], desc: str, unit: str) -> Iterator[Case]:
-        """Yield the cases that are not in the checkpoint; all rows so far are saved when the next case is requested."""
+        """Yield the cases that are not in the checkpoint. A request for the next case first saves all rows so far."""
         for case in tqdm(cases, desc=desc, unit=unit):
             self._count += 1
             if self._count <= self.saved:

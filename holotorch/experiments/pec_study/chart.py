@@ -1,4 +1,4 @@
-"""Chart of PEC: SSIM by time and by evaluations of every solver, on the same photographs in one process."""
+"""Chart of proximity effect correction (PEC): SSIM of every solver against time and number of evaluations."""
 
 import csv
 import math
@@ -21,18 +21,18 @@ from holotorch.experiments.pec.config import SIGMA_MEANING
 from holotorch.experiments.pec_study.bench import Bench, Track
 from holotorch.experiments.runs.figures import figure_png
 
-SIGMAS = (0.66, 1.0, 1.5, 2.0)
+SIGMAS = (0.66, 1.0, 1.5, 2.0)  # widths of the heat kernel in pixels
 KINDS = ("fourier", "fresnel")
-SIZE, STEPS = 128, 400
-# Values of SSIM at which times and evaluations are compared, for each sigma; Algorithm 2 reaches all of them.
+SIZE, STEPS = 128, 400  # pixels of the array along each axis; solver steps, half as many for L-BFGS
+# Values of SSIM at which solvers are compared, for each sigma; Algorithm 2 reaches all of them.
 LEVELS = {0.66: (0.9, 0.95, 0.98), 1.0: (0.8, 0.9, 0.92), 1.5: (0.35, 0.4, 0.45), 2.0: (0.15, 0.2, 0.25)}
-BASE = "Algorithm 2 (APG)"
-# The goals are in a checkout, beside the committed charts; an installed package has none.
+BASE = "Algorithm 2 (APG)"  # the solver that the others are compared with
+# Goals of the comparison. The file is part of the repository but not of an installed package.
 GOALS = Path(__file__).parents[3] / "scripts" / "charts" / "pec" / "goals.yaml"
 
 
 def pec() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
-    """Rows of the curves, rows of the comparisons, pictures by name, and the verdict."""
+    """Table rows of the curves, table rows of the comparisons, PNG pictures by name, and lines of text."""
     rows, compared = [], []
     for kind in KINDS:
         for sigma in tqdm(SIGMAS, desc=f"pec, {kind}", unit="sigma"):
@@ -47,7 +47,7 @@ def pec() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
 
 
 def _solvers(bench: Bench) -> dict[str, Callable[[Callback], Any]]:
-    """Solvers by name, which take a callback; they use the thesis's hot start unless their name states another."""
+    """Functions by name that run a solver with a callback. The start is hot (thesis) unless the name states another."""
     hot, quadratic, problem = bench.start("hot"), bench.start("quadratic"), bench.experiment.problem()
     apg = APG(max_steps=STEPS, tolerance=0.0)
     plain = LBFGS(max_steps=STEPS // 2, tolerance=0.0)
@@ -59,7 +59,7 @@ def _solvers(bench: Bench) -> dict[str, Callable[[Callback], Any]]:
         "projected Adam": ([Stage(problem, ProjectedAdam(max_steps=STEPS, tolerance=0.0))], hot),
         "L-BFGS": ([Stage(problem, plain)], hot),
         "L-BFGS, preconditioned": ([Stage(problem, lbfgs)], hot),
-        # The quadratic start helps Algorithm 2 too; this row separates the effect of the start from that of the solver.
+        # This run separates the effect of the quadratic start from that of the solver.
         "APG, quadratic start": ([Stage(problem, apg)], quadratic),
         "L-BFGS, amplitude first": (staged, hot),
         "L-BFGS, amplitude first, quadratic start": (staged, quadratic),
@@ -73,7 +73,7 @@ def _solvers(bench: Bench) -> dict[str, Callable[[Callback], Any]]:
 
 
 def _tracks(bench: Bench) -> dict[str, Track]:
-    """Track of each solver: the run with the median time of three, after one run that warms up."""
+    """Track of the run with the median time of three, for each solver, after one run that warms up."""
     solvers = _solvers(bench)
     tracks: dict[str, list[Track]] = {name: [] for name in solvers}
     for _ in range(4):
@@ -84,7 +84,7 @@ def _tracks(bench: Bench) -> dict[str, Track]:
 
 
 def _compared(kind: str, sigma: float, tracks: dict[str, Track]) -> list[dict]:
-    """Rows that compare every solver with the solver ``BASE`` at each level of SSIM, empty if it is not reached."""
+    """Rows that compare every solver with ``BASE`` at each level of SSIM. Cells are empty if a level is not reached."""
     rows = []
     for name, track in tracks.items():
         for level in LEVELS[sigma]:
@@ -140,7 +140,7 @@ def _tables(goals: dict[str, list[dict[str, Any]]]) -> list[str]:
 
 
 def _statistic(rows: list[dict[str, str]], statement: dict[str, Any]) -> float:
-    """Mean, range or ratio of means that a statement of goals.yaml is about; NaN if the table has no such rows."""
+    """Mean, range or ratio of means of a table column, as a statement of goals.yaml says; NaN without matching rows."""
 
     def column(cells: dict[str, Any]) -> list[float]:
         allowed = {key: list(map(str, cell if isinstance(cell, list) else [cell])) for key, cell in cells.items()}

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class StudyKind(ExperimentKind[StudySettings, "Study"]):
-    """See :mod:`holotorch.experiments.kind`."""
+    """A comparison of methods over several photographs; see :mod:`holotorch.experiments.kind`."""
 
     settings = StudySettings
     example = "configs/pec/studies/targets.yaml"

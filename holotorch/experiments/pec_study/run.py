@@ -1,4 +1,4 @@
-"""Run of kind ``pec_study``: its table as CSV and text, and a picture."""
+"""Run of kind ``pec_study``: writes the table of a study as CSV and text, and as a picture."""
 
 import sys
 from dataclasses import dataclass
@@ -20,19 +20,19 @@ from holotorch.metrics import PerceptualSimilarity
 
 @dataclass(frozen=True)
 class Study:
-    """A study and its photographs."""
+    """A study and the bench with its photographs."""
 
     settings: StudySettings
     bench: Bench
 
 
 def build_study(settings: StudySettings) -> Study:
-    """Load the photographs."""
+    """A study with the bench for its photographs."""
     return Study(settings, Bench(images=settings.images, size=settings.size, perceptual=_perceptual()))
 
 
 def run_study(study: Study, opened: RunFolder) -> bool:
-    """Run a study without its complete cases, fill the folder and print the table. True if the study is complete."""
+    """Run the missing cases of a study, fill the folder and print the table. True if the study is complete."""
     settings, bench = study.settings, study.bench
     folder, files = opened.path, Results()
     inputs = {"images": (bench.experiment.image,), "perceptual": ("none" if bench.perceptual is None else "LPIPS",)}
@@ -57,7 +57,7 @@ def run_study(study: Study, opened: RunFolder) -> bool:
 
 
 def _perceptual() -> PerceptualSimilarity | None:
-    """The learned similarity, or None if its extra is not installed or its weights cannot be read."""
+    """LPIPS, or None if the optional package is not installed or its weights cannot be read."""
     try:
         return PerceptualSimilarity()
     except ImportError:

@@ -1,7 +1,7 @@
-"""Studies of proximity effect correction as tables: the comparisons of the thesis, and further ones.
+"""Studies of proximity effect correction as tables: comparisons of the thesis, and further ones.
 
 Every study yields table rows with the same keys. Its arguments are the bench, the values of ``sweep`` (sigmas in
-pixels unless stated otherwise), the largest number of solver steps, and the :class:`Cases` that store its progress.
+pixels unless stated otherwise), the largest number of solver steps, and the :class:`Cases` that store the progress.
 The chart ``pec`` compares the committed tables with the thesis.
 """
 
@@ -23,13 +23,13 @@ from holotorch.modulator import quantised
 
 Row = dict[str, Any]
 PI = math.pi
-SIZES = (64, 128, 256, 512)  # pixels along a side of the arrays in the study of the time
+SIZES = (64, 128, 256, 512)  # pixels of the array along each axis in the study ``scaling``
 VOLUME = f"synthetic volume, {SLICES} slices in turn"
-DEPTHS = (0.08, 0.10, 0.12)  # distances in metres of a scene at three depths
+DEPTHS = (0.08, 0.10, 0.12)  # distances in metres of the three depths of a scene
 
 
 def reproduction(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> Iterator[Row]:
-    """Sec. 4.4.3.3, 4.4.5.3, 4.5.2.2: SSIM of every method by sigma, in the far field and the periodic near field."""
+    """Thesis Sec. 4.4.3.3, 4.4.5.3, 4.5.2.2: SSIM of every method by sigma, in far field and periodic near field."""
     for kind in ("fourier", "fresnel"):
         for sigma in cases.each(sigmas, desc=f"reproduction, {kind}", unit="sigma"):
             setup = replace(bench, sigma_px=sigma, kind=kind)
@@ -38,13 +38,13 @@ def reproduction(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases
 
 
 def lowpass(bench: Bench, cutoffs: Sequence[float], steps: int, cases: Cases) -> Iterator[Row]:
-    """Fig. 4.12: targets whose fine detail a low-pass filter has removed, by its cut-off in cycles per pixel."""
+    """Thesis Fig. 4.12: targets after a low-pass filter, by the cut-off of the filter in cycles per pixel."""
     for cutoff in cases.each(cutoffs, desc="low-pass targets", unit="cut-off"):
         yield from _methods(replace(bench, lowpass=cutoff), steps, setting=f"cut-off {cutoff:g} cycles/px")
 
 
 def multiplexing(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> Iterator[Row]:
-    """Figs. 4.13, 4.14: ten IPEC holograms shown one after another, a signal region, and jointly solved frames."""
+    """Thesis Figs. 4.13, 4.14: ten IPEC holograms shown in turn, a signal region, and jointly solved frames."""
     for sigma in cases.each(sigmas, desc="multiplexing", unit="sigma"):
         setup = replace(bench, sigma_px=sigma)
         region = replace(setup, region=setup.size // 2)
@@ -64,7 +64,7 @@ def multiplexing(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases
 
 
 def iterations(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> Iterator[Row]:
-    """Fig. 4.15: SSIM by the number of steps, of Algorithm 2 and of L-BFGS ("ours")."""
+    """Thesis Fig. 4.15: SSIM by the number of steps, of Algorithm 2 and of L-BFGS ("ours")."""
     every = max(1, steps // 40)
     for sigma in cases.each(sigmas, desc="iterations", unit="sigma"):
         setup = replace(bench, sigma_px=sigma)
@@ -77,14 +77,14 @@ def iterations(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) 
 
 
 def scaling(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> Iterator[Row]:
-    """Figs. 4.10, 4.11: seconds by sigma and by resolution, in one process."""
+    """Thesis Figs. 4.10, 4.11: seconds by sigma and by resolution."""
     settings = [(bench.size, sigma) for sigma in sigmas] + [(size, bench.sigma_px) for size in SIZES]
     for size, sigma in cases.each(settings, desc="time", unit="case"):
         yield from _methods(replace(bench, size=size, sigma_px=sigma), steps, setting=f"{size} px")
 
 
 def focus(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> Iterator[Row]:
-    """Fig. 4.18 and Sec. 6.3.2: a scene at three depths, as one hologram per slice (thesis) and as one hologram."""
+    """Thesis Fig. 4.18, Sec. 6.3.2: a scene at three depths as one hologram per depth (thesis) or one hologram."""
     for sigma in cases.each(sigmas, desc="depths", unit="sigma"):
         setup = replace(bench, kind="fresnel", distances=DEPTHS, sigma_px=sigma)
         yield _slices(setup, steps)
@@ -105,7 +105,7 @@ def focus(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> It
 
 
 def limits(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> Iterator[Row]:
-    """SSIM under a limit on the temperature, a wrong sigma, a weight on heating power, and heaters of few bits."""
+    """SSIM with limited temperature, a wrong sigma, a weight on the heating power, or heaters of few bits."""
     for sigma in cases.each(sigmas, desc="limits", unit="sigma"):
         setup = replace(bench, sigma_px=sigma)
         for multiple in (1, 2, 4, 8):
@@ -125,7 +125,7 @@ def limits(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> I
 
 
 def targets(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> Iterator[Row]:
-    """Quality of holograms with a limit on the heat, frames, a region or depths; ``sigmas`` is not used."""
+    """Scores with limited heat, joint frames, a signal region or several depths; the argument ``sigmas`` is unused."""
     near, alone = replace(bench, kind="fresnel"), replace(bench, kind="isolated")
     depths, region = replace(near, distances=DEPTHS), replace(bench, region=bench.size // 2)
     every = (0.66, 1.0, 1.5, 2.0)
@@ -169,7 +169,7 @@ _CORRECTED = ("basic IPEC", "IPEC", "PPEC", "ours")  # all methods with a correc
 
 
 def _methods(bench: Bench, steps: int, names: Sequence[str] = _CORRECTED, setting: str = "") -> Iterator[Row]:
-    """A row for each method; solvers use the thesis's hot start unless their name states another."""
+    """A row for each method. The start of a solver is hot (thesis) unless the name states another."""
     solvers: dict[str, Callable[[], Solution]] = {
         "none": lambda: bench.retrieved("none"),
         "basic IPEC": lambda: bench.retrieved("basic"),
@@ -182,7 +182,7 @@ def _methods(bench: Bench, steps: int, names: Sequence[str] = _CORRECTED, settin
 
 
 def _slices(bench: Bench, steps: int) -> Row:
-    """Row of the thesis's stack of holograms: one for each depth and the slice of the picture there, shown in turn."""
+    """Row of the thesis's method: one hologram for the slice of the picture at each depth, shown in turn."""
     started, mask, wanted = time.perf_counter(), bench.experiment.mask, bench.experiment.wanted
     assert mask is not None
     phases, formed = [], torch.zeros((), dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Thesis Fig. 4.18: a volume as slices, each corrected for the heat at its depth, shown in turn and refocused."""
+"""Thesis Fig. 4.18: holograms of the slices of a volume, shown in turn, and the error of their picture by focus."""
 
 import math
 from dataclasses import replace
@@ -10,15 +10,16 @@ from holotorch.core.grid import Grid
 from holotorch.experiments.pec_study.bench import Bench
 from holotorch.scene import DVRSampler, TransferFunction, Volume, phantoms
 
-NEAR, FAR, SLICES = 0.08, 0.12, 24  # distances of the volume's faces in metres, and slices between them
-_LIT = 0.05  # intensity above which a pixel counts in the error, relative to the brightest
+NEAR, FAR = 0.08, 0.12  # distances of the faces of the volume in metres
+SLICES = 24  # number of slices between the faces
+_LIT = 0.05  # least intensity of the pixels that count in the error, relative to the brightest
 
 
 def slices_of_a_volume(grid: Grid) -> tuple[list[float], Tensor, Tensor]:
-    """Depths [D] and intensities [D, h, w] of the slices of a synthetic C60 molecule, and its depth map [h, w].
+    """Depths [D] and intensities [D, h, w] of slices of a synthetic C60 molecule, and the depth map [h, w] of it.
 
-    Depths are in metres. The phantom is as wide as ``grid`` and stretched along the optical axis to 40 mm, because its
-    true depth of 2 mm would lie within the depth of focus.
+    Depths are in metres. The molecule is as wide as ``grid`` and stretched along the optical axis to 40 mm, because an
+    unstretched one, 2 mm deep, would lie within the depth of focus.
     """
     width, step = grid.extent[1], (FAR - NEAR) / SLICES
     volume = Volume(phantoms.c60(64).values, ((FAR - NEAR) / 64, width / 64, width / 64), "m")
@@ -33,7 +34,7 @@ def slices_of_a_volume(grid: Grid) -> tuple[list[float], Tensor, Tensor]:
 
 
 def focal_sweep(bench: Bench, steps: int) -> list[tuple[float, float, float]]:
-    """(focus, depth of a part of the scene, its relative error) for three foci and three parts, by Algorithm 2."""
+    """Rows (focus, depth, relative error of the scene part at that depth) for three foci; lengths in metres."""
     depths, light, depth_map = slices_of_a_volume(bench.experiment.grid)
     foci = [NEAR + (FAR - NEAR) * part for part in (1 / 6, 1 / 2, 5 / 6)]
     shown = torch.zeros(len(foci), *light.shape[1:], dtype=torch.float64)

@@ -1,1 +1,1 @@
-"""Propagators side by side."""
+"""Comparison of the methods of free-space propagation."""

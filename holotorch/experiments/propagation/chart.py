@@ -1,4 +1,4 @@
-"""Chart of free-space propagation: error against time of every method, and predicted against true error."""
+"""Chart of free-space propagation: error and time of every method, and a test of the predicted errors."""
 
 import math
 import platform
@@ -28,19 +28,19 @@ from holotorch.optics.planning.propagate import kernel_of
 
 WAVELENGTH = 530e-9  # metres
 DISTANCES = (1e-3, 5e-3, 20e-3, 60e-3, 200e-3, 2.0)  # metres
-# Pixels along each side, and pitch in metres.
+# Test grids: pixels along each side, and pitch in metres.
 CASES = ((256, 8e-6), (512, 8e-6), (1024, 8e-6), (2048, 8e-6), (256, 3.74e-6), (512, 3.74e-6), (1024, 3.74e-6))
-SHOWN = (512, 8e-6)  # the case whose error is drawn against time
-LARGE = 2000  # px from which only FEW_DISTANCES are measured
+SHOWN = (512, 8e-6)  # the grid whose error is drawn against time
+LARGE = 2000  # pixels along a side from which only FEW_DISTANCES are measured
 FEW_DISTANCES = (5e-3, 60e-3, 2.0)  # metres
-PEER_LIMIT = 512  # px up to which torchoptics is measured; larger grids take minutes
-SOURCES = ("smooth", "slm", "white", "hard edge")
-PREDICTION_CASES = 40
-TOLERANCE = 1e-3  # relative L2 error of the planned method
+PEER_LIMIT = 512  # pixels along a side up to which torchoptics is measured; larger grids take minutes
+SOURCES = ("smooth", "slm", "white", "hard edge")  # test fields, see ``source``
+PREDICTION_CASES = 40  # number of random cases that test the predicted errors
+TOLERANCE = 1e-3  # allowed relative L2 error of the planned method
 
 
 def propagation() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
-    """Rows of the chart, rows of the prediction test, pictures by name, and the verdict."""
+    """Table rows of the chart, table rows of the test of predictions, PNG pictures by name, and lines of text."""
     with warnings.catch_warnings(action="ignore", category=SamplingWarning):
         rows = [row for size, pitch in CASES for row in _measure(size, pitch)]
         prediction = _predictions()
@@ -51,8 +51,8 @@ def propagation() -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
 def source(kind: str, grid: Grid) -> Tensor:
     """A test field, complex128 [H, W].
 
-    ``kind``: "smooth", a Gaussian amplitude; "slm", smooth random phase; "white", random phase that is independent in
-    every sample; "hard edge", a disc.
+    ``kind``: "smooth" is a Gaussian amplitude, "slm" a smooth random phase, "white" a random phase that is independent
+    in every sample, "hard edge" a disc.
     """
     generator = torch.Generator().manual_seed(1)
     y, x = grid.coordinates()
@@ -63,7 +63,7 @@ def source(kind: str, grid: Grid) -> Tensor:
     if kind == "hard edge":
         return (square < (0.3 * grid.extent[0]) ** 2).to(torch.complex128)
     if kind == "slm":
-        # White noise, blurred to a quarter of the band.
+        # White noise times a Gaussian spectrum that falls to 1/e at 0.06 cycles per pixel.
         fy, fx = grid.frequencies()
         low = torch.exp(-((fy * grid.pitch[0]) ** 2 + (fx * grid.pitch[1]) ** 2) / 0.06**2)
         smooth = ifft2(fft2(random - 0.5) * low).real
@@ -72,7 +72,7 @@ def source(kind: str, grid: Grid) -> Tensor:
 
 
 def _measure(size: int, pitch: float) -> list[dict[str, Any]]:
-    """Rows of every method, source and distance on one grid."""
+    """Table rows of every method, source and distance on one grid; ``pitch`` in metres."""
     grid, wide, rows = Grid(size, pitch), Grid(2 * size, pitch), []
     fields = {kind: source(kind, grid) for kind in SOURCES}
     distances = [z for z in DISTANCES if size < LARGE or z in FEW_DISTANCES]
@@ -102,19 +102,19 @@ def _measure(size: int, pitch: float) -> list[dict[str, Any]]:
 
 
 def _exact(reference: CroppedKernel, field: Tensor) -> Tensor:
-    """Propagate a field [H, W] by the exact kernel ``reference`` of a larger window."""
+    """Propagate a field [H, W], padded with zeros to the larger window of ``reference``; the result is [H, W]."""
     (height, width), (rows, columns) = field.shape, reference.grid.shape
     padded = torch.nn.functional.pad(field, (0, columns - width, 0, rows - height))
     return reference(padded[None])[0, :height, :width]
 
 
 def _error(field: Tensor, exact: Tensor) -> str:
-    """Relative L2 error."""
+    """Relative L2 error of a field, as text."""
     return f"{((field.to(torch.complex128) - exact).norm() / exact.norm()).item():.3e}"
 
 
 def _methods(grid: Grid, distance: float) -> dict[str, Callable[[Tensor], Tensor]]:
-    """Propagations of a field [H, W], with kernels computed in advance."""
+    """Functions that propagate a field [H, W] by each method, with kernels computed in advance."""
     height, width = grid.shape
     padded = grid.padded(2)
     fy, fx = (f.float() for f in padded.frequencies())
@@ -123,7 +123,7 @@ def _methods(grid: Grid, distance: float) -> dict[str, Callable[[Tensor], Tensor
     naive = torch.exp(2j * math.pi * distance * root) / math.prod(padded.shape)
 
     def bare(field: Tensor) -> Tensor:
-        # The kernel contains the scale 1 / N of the inverse transform, as in core.fourier.
+        # ``naive`` contains the factor 1 / N of the inverse transform, as the kernels of core.fourier do.
         return torch.fft.ifft2(torch.fft.fft2(field, s=padded.shape) * naive, norm="forward")[:height, :width]
 
     setup = grid, WAVELENGTH, distance
@@ -150,7 +150,7 @@ def _methods(grid: Grid, distance: float) -> dict[str, Callable[[Tensor], Tensor
 
 
 def _predictions() -> list[dict[str, Any]]:
-    """True and predicted error of every method, for random grids, distances and bands of noise."""
+    """True and predicted error of every method for band-limited noise; grid, distance and band are random."""
     generator, rows = np.random.default_rng(11), []
     for case in tqdm(range(PREDICTION_CASES), desc="predictions", unit="case"):
         pitch, share = float(generator.choice([3.74e-6, 8e-6])), float(generator.uniform(0.2, 1.0))
@@ -177,7 +177,7 @@ def _predictions() -> list[dict[str, Any]]:
 
 
 def _noise(grid: Grid, share: float, seed: int) -> Tensor:
-    """Noise, complex128 [H, W], that fills ``share`` of the band of the grid."""
+    """Complex noise that fills ``share`` of the band of the grid along each axis, complex128 [H, W]."""
     generator = torch.Generator().manual_seed(seed)
     wide = [8 * size for size in grid.shape]
     fy, fx = (torch.fft.fftfreq(size, dtype=torch.float64).abs() <= share / 2 for size in wide)
@@ -245,7 +245,7 @@ def _draw(rows: list[dict]) -> bytes:
 
 
 def _draw_validity(rows: list[dict]) -> bytes:
-    """PNG of error against distance in cross-over distances; bars at the top mark where a method becomes inaccurate."""
+    """PNG of error against distance / cross-over distance; bars at the top mark where a method becomes inaccurate."""
     names = list(dict.fromkeys(row["method"] for row in rows))
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     panels = figure.subplots(1, 2)
@@ -270,11 +270,11 @@ def _with_legend(figure: Figure, axes: Any) -> bytes:
 
 
 def _borders(name: str) -> list[float]:
-    """Distances, in cross-over distances z_c of each grid, at which a method becomes inaccurate by its error model.
+    """Distances at which a method becomes inaccurate in theory, divided by the cross-over distance z_c of each grid.
 
-    Padding by a factor P suffices up to (P - 1) z_c. The other limits are where an error of the phase reaches the
-    tolerance: the Fresnel approximation neglects pi z s^4 / (4 wavelength) for light of sine s, here at the corner of
-    the band, and float32 rounds the phase k z by a relative 6e-8.
+    Padding by a factor P suffices up to (P - 1) z_c. Other methods are inaccurate once the error of the phase reaches
+    the tolerance. The Fresnel approximation neglects a phase pi z s^4 / (4 wavelength) for light of sine s, which is
+    evaluated at the corner of the band. Rounding to float32 changes the phase k z by a relative 6e-8.
     """
     if name.startswith("angular spectrum"):
         return [float(name.split()[-1]) - 1]

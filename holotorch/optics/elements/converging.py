@@ -16,7 +16,7 @@ from holotorch.optics.elements.lens_response import lens_matrices
 from holotorch.optics.free_space.impulse_response import fresnel_taps, tap_indices
 from holotorch.optics.free_space.kernels import carrier, turns_phasor
 
-_TRUSTED = 0.1  # rad: phase neglected by the paraxial model above which a warning is due
+_TRUSTED = 0.1  # rad: a warning is emitted if the paraxial model neglects a larger phase
 
 
 def converging_fresnel(
@@ -38,7 +38,7 @@ def converging_fresnel(
         grid: Sampling of ``field``.
         wavelength: In metres.
         distance: In metres, not 0.
-        focus: In metres, not 0; infinite for no lens.
+        focus: Focal length in metres, not 0; infinite for no lens.
         out_grid: Sampling of the result.
         offset: Position (y, x) in metres of the axis of the result relative to the axis of the lens.
 
@@ -96,8 +96,8 @@ class ConvergingFresnel(FieldOperator):
             result; 0 if there is no such ray.
 
     Raises:
-        ValueError: A number outside its range, or no ``out_grid`` so close to the focus that the scaled window is
-            smaller than a sample of the field and than a diffraction-limited spot.
+        ValueError: A number outside its range, or a missing ``out_grid`` for a result so close to the focus that the
+            scaled window is smaller than a sample of the field and than a diffraction-limited spot.
         MemoryError: An ``out_grid`` whose matrices need more memory than is available.
 
     Warns SamplingWarning if ``beyond_fresnel`` exceeds 0.1 rad.
@@ -132,7 +132,7 @@ class ConvergingFresnel(FieldOperator):
         else:
             weights = sum(n * m for n, m in zip(grid.shape, self.out_grid.shape, strict=True)) * len(wavelength)
             checks.affordable(
-                35 * weights,  # measured
+                35 * weights,  # bytes, measured
                 f"ConvergingFresnel from {grid.shape[0]} x {grid.shape[1]} to {self.out_grid.shape[0]} x "
                 f"{self.out_grid.shape[1]} samples, by dense matrices,",
                 "use a smaller grid or out_grid",
@@ -180,7 +180,7 @@ class ConvergingFresnel(FieldOperator):
         return columns[..., :, None] * rows[..., None, :]
 
     def _choose_grid(self, out_grid: Grid | None) -> tuple[Grid, bool]:
-        """``out_grid`` or by default the scaled grid, and whether FFTs compute the result on it."""
+        """``out_grid``, by default the scaled grid, and whether the result is computed by FFTs."""
         grid, size = self.grid, abs(self.magnification)
         y, x = spots = [max(self.wavelengths) * abs(self.distance) / extent for extent in grid.extent]
         windows = zip(grid.extent, grid.pitch, spots, strict=True)
@@ -207,7 +207,7 @@ class ConvergingFresnel(FieldOperator):
         return torch.fft.fft(fresnel_taps(position, pitch, wavelength, distance))
 
     def _curvature(self, axis: int, wavelength: Tensor) -> Tensor:
-        """exp(-i pi x^2 / (wavelength (focus - distance))) on the output's samples, complex128 [C, n']."""
+        """exp(-i pi x^2 / (wavelength (focus - distance))) on the samples of the result, complex128 [C, n']."""
         position = self.out_grid.coordinates()[axis].reshape(-1) + self.offset[axis]
         return turns_phasor(-position.square() / (2 * wavelength[:, None] * (self.focus - self.distance)))
 

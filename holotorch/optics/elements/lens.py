@@ -59,7 +59,7 @@ def pupil(grid: Grid, radius: Tensor | float, *, softness: float = 0.0) -> Tenso
 
 
 def opening(square: Tensor, radius: Tensor, softness: float) -> Tensor:
-    """:func:`pupil` at given squared distances from the axis."""
+    """Transmission of :func:`pupil` at squared distances ``square`` from the axis, in square metres."""
     if softness > 0:
         # The addend keeps the gradient of the root finite on the axis.
         return torch.sigmoid((radius - torch.sqrt(square + 1e-30)) / softness)
@@ -69,11 +69,11 @@ def opening(square: Tensor, radius: Tensor, softness: float) -> Tensor:
 
 
 def lens_limit(pitch: float, wavelength: float, focal_length: float, *, paraxial: bool = True) -> float:
-    """Distance in metres from the axis up to which samples ``pitch`` apart hold the phase of a lens.
+    """Distance in metres from the axis up to which samples ``pitch`` apart represent the phase of a lens.
 
     There the phase changes by pi per sample: at wavelength f / (2 pitch) for the parabola, and at
-    f tan(asin(wavelength / (2 pitch))) for the spherical phase. Light that arrives at angles with sines up to s adds a
-    slope of its own, which reduces the paraxial limit to (wavelength / (2 pitch) - s) f.
+    f tan(asin(wavelength / (2 pitch))) for the spherical phase. The phase slope of light that arrives at angles with
+    sines up to s adds to that of the lens and reduces the paraxial limit to (wavelength / (2 pitch) - s) f.
     """
     sine = checks.quantity(WAVELENGTH, wavelength) / (2 * checks.quantity(PITCH, pitch))
     checks.quantity(FOCAL_LENGTH, focal_length)
@@ -180,7 +180,7 @@ class Aperture(Transmission):
 
 
 def affordable(what: str, grid: Grid, channels: int) -> None:
-    """MemoryError unless memory suffices for a thin element: 48 bytes per sample and channel (measured)."""
+    """Raise MemoryError unless memory suffices for a thin element: 48 bytes per sample and channel (measured)."""
     height, width = grid.shape
     checks.affordable(
         48 * channels * height * width,
@@ -205,7 +205,7 @@ def _phase_cycles(grid: Grid, wavelength: Tensor | float, focal_length: Tensor |
 def warn_if_coarse(
     grid: Grid, wavelengths: Sequence[float], lengths: Sequence[float], radius: float | None, *, paraxial: bool = True
 ) -> None:
-    """SamplingWarning if ``grid`` is too coarse for lenses of these focal lengths within ``radius``."""
+    """Emit a SamplingWarning if ``grid`` is too coarse for lenses of these focal lengths within ``radius``."""
     for wavelength, length in zip(wavelengths, lengths, strict=True):
         for size, pitch in zip(grid.shape, grid.pitch, strict=True):
             outermost = min(size // 2 * pitch, radius or math.inf)

@@ -7,7 +7,7 @@ from holotorch.core.grid import Grid, Pair
 from holotorch.core.special import chirped_fresnel_integral
 from holotorch.optics.free_space.kernels import carrier, turns_phasor
 
-_CHUNK = 50_000  # weights computed at a time, each by a quadrature of 42 numbers
+_CHUNK = 50_000  # weights computed at a time, each by a quadrature with 42 nodes
 
 
 def lens_taps(
@@ -24,7 +24,7 @@ def lens_taps(
     u+- = sqrt(2 wavelength |z / m|) (B -+ f0). F = C - iS for z / m > 0 and C + iS otherwise, times -i sign(z) for
     m < 0, with the Fresnel integrals C and S. This is ``fresnel_taps`` over z / m at the position x / m, arranged so
     that all terms are bounded as m -> 0. At m = 0 the weights have a step at abs(x) = wavelength |z| B, with the mean
-    value on the step. Gradients near m = 0 are those of a steep edge and large; at m = 0 they omit the step.
+    value on the step. Near m = 0 this step is a steep edge with large gradients; at m = 0 gradients omit it.
 
     Args:
         targets: Positions x in metres from the axis of the lens, float64, shape [n'].

@@ -15,7 +15,7 @@ from holotorch.optics.free_space.impulse_response import tap_indices
 
 
 class PixelShape(FieldOperator):
-    """Pixel values, complex [..., C, H, W], to the band-limited field that they emit, [..., C, sH, sW].
+    """Map pixel values, complex [..., C, H, W], to the band-limited field that they emit, [..., C, sH, sW].
 
     Every pixel is a uniformly bright rectangle of ``fill`` times the pitch with dark gaps between. The spectrum of the
     panel repeats with the period 1 / pitch, once for each diffraction order, under the envelope sinc(fill pitch f) per
@@ -28,8 +28,8 @@ class PixelShape(FieldOperator):
     fill[0] fill[1]; inside its rectangle a pixel of value 1 therefore has the amplitude 1 / (fill[0] fill[1]).
 
     The centre of pixel i of n on an axis is output sample s i for even n and s i + ``orders`` for odd n, at the same
-    coordinate in both grids. Both grids have the same extent, so for even n the grid of the result begins at the
-    centre of pixel 0: the light on the other side of it is cut off, as is all light outside the grid. Nothing wraps.
+    coordinate in both grids. Both grids have the same extent, so for even n the grid of the result begins at the centre
+    of pixel 0: the light before this centre is cut off, as is all light outside the grid. No light wraps around.
 
     Args:
         grid: Sampling of the panel, one sample per pixel.
@@ -106,7 +106,7 @@ def _fill_pair(fill: float | Pair) -> Pair:
 
 
 def _axis_kernel(size: int, fill: float, finer: int) -> Tensor:
-    """DFT of the field of a pixel of value 1 at ``finer`` samples per pitch, divided by its length: [finer, padded].
+    """DFT of the field of a pixel of value 1 at ``finer`` samples per pitch, divided by ``padded``: [finer, padded].
 
     The field at t pitches from the centre of the pixel is int_{-s/2}^{s/2} sinc(fill u) exp(2 pi i u t) du with
     s = ``finer``: the mean of s sinc(s x) over the bright width around t, computed by Gauss's rule to rounding error.

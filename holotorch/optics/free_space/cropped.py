@@ -17,14 +17,14 @@ class CroppedKernel(SpectralFilter):
     """Exact scalar propagation of band-limited samples over ``distance``; includes the carrier exp(ikz).
 
     The paraxial kernel in space is known exactly on every sample (:func:`fresnel_taps` per axis). Cropped to the
-    displacements that occur inside the window, it is a linear convolution with transforms of twice the window; a
-    sampled transfer function would wrap the light that leaves the window or lose it. The factor beyond Fresnel, the
-    exact transfer function divided by the paraxial one, is applied in frequency. It moves light by z (tan - sin) of its
-    angle, a few samples, for which the padding has room.
+    displacements that occur inside the window, it gives a linear convolution by FFTs of twice the window. A sampled
+    transfer function would wrap around or remove the light that leaves the window. The factor beyond Fresnel, the exact
+    transfer function divided by the paraxial one, is applied in frequency. It moves light at an angle a by
+    z (tan a - sin a), a few samples, for which the padding has room.
 
-    For fields of random phase the error relative to the field is at most about 2 s^2 / sqrt(N) at every distance, with
+    For fields of random phase the relative L2 error is at most about 2 s^2 / sqrt(N) at every distance, with
     s the sine of the steepest angle, wavelength / (2 pitch), and N the samples of an axis: with 512 samples, 1e-4 for a
-    pitch of 8 um and 5e-4 for 3.74 um. For smooth fields, and with ``paraxial``, there is only rounding error.
+    pitch of 8 um and 5e-4 for 3.74 um. For smooth fields, and with ``paraxial``, the only error is rounding.
 
     Args:
         grid, wavelengths: As for :class:`FieldOperator`.

@@ -18,7 +18,7 @@ class DepthStack(nn.Module):
 
     Raises:
         TypeError: A propagator that is not a ``SpectralFilter``.
-        ValueError: No filters, filters of different grids, wavelengths or padded sizes, or a filter whose result has
+        ValueError: No filters, filters that differ in grid, wavelengths or padded size, or a filter whose result has
             another grid than the field.
     """
 

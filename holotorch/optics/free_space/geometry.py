@@ -10,7 +10,7 @@ from holotorch.core.quantities import DISTANCE, WAVELENGTH
 def diffraction_angle(grid: Grid, wavelength: float) -> Pair:
     """Largest angle (y, x) from the axis, in radians, that the pitch can sample: its sine is wavelength / (2 pitch).
 
-    It is pi / 2 where the pitch is at most half a wavelength.
+    It is pi / 2 if the pitch is at most half a wavelength.
     """
     wavelength = checks.quantity(WAVELENGTH, wavelength)
     y, x = (math.asin(min(1.0, wavelength / (2 * pitch))) for pitch in grid.pitch)
@@ -20,7 +20,7 @@ def diffraction_angle(grid: Grid, wavelength: float) -> Pair:
 def lateral_spread(grid: Grid, wavelength: float, distance: float, *, paraxial: bool = False) -> Pair:
     """Lateral shift (y, x) in metres of light at the angle of :func:`diffraction_angle`: abs(distance) tan(angle).
 
-    It is infinite where the pitch is at most half a wavelength. With ``paraxial`` it is abs(distance) sin(angle), the
+    It is infinite if the pitch is at most half a wavelength. With ``paraxial`` it is abs(distance) sin(angle), the
     shift by a Fresnel kernel.
     """
     wavelength, distance = checks.quantity(WAVELENGTH, wavelength), checks.quantity(DISTANCE, distance)
@@ -36,10 +36,10 @@ def least_padding(grid: Grid, wavelength: float, distance: float, *, paraxial: b
     """Least padding factor (y, x) for which light of any frequency of the grid does not wrap around into the window.
 
     Padding by P leaves (P - 1) times the extent for light that leaves the window. So P = 1 + shift / extent, where the
-    shift is :func:`lateral_spread` plus 3 sqrt(wavelength distance) for diffraction at the edges of the window. For
-    P >= 2 the phase of the kernel is also sampled finely enough, which requires shift <= P extent / 2. About 1 % of a
-    field that contains all frequencies still wraps, in the tails of its samples; ``CroppedKernel`` avoids that. The
-    factor is infinite where the pitch is at most half a wavelength, and 1 at distance 0.
+    shift is :func:`lateral_spread` plus 3 sqrt(wavelength distance) for diffraction at the edges of the window. The
+    phase of the kernel is sampled finely enough where shift <= P extent / 2; light that moves farther leaves the window
+    if P >= 2. About 1 % of a field that contains all frequencies still wraps around, in the sinc tails of its samples;
+    ``CroppedKernel`` avoids that. P is infinite if the pitch is at most half a wavelength, and 1 at distance 0.
     """
     spread = lateral_spread(grid, wavelength, distance, paraxial=paraxial)
     edge = 3 * math.sqrt(wavelength * abs(distance))

@@ -44,8 +44,8 @@ def fresnel_taps(displacement: Tensor, pitch: float, wavelength: Tensor, distanc
 def tap_indices(padded: int, size: int, out: int) -> Tensor:
     """Displacements from ``size`` source samples to ``out`` samples of the result, float64 [padded], in FFT order.
 
-    From 0 to out - 1 and then from -(size - 1) to -1. If ``padded`` exceeds their number, size + out - 1, both ranges
-    are extended equally.
+    They run from 0 to out - 1 and then from -(size - 1) to -1. If ``padded`` exceeds their number, size + out - 1, both
+    ranges are extended equally.
     """
     index = torch.arange(padded, dtype=torch.float64)
     return torch.where(index > out - 1 + (padded - (size + out - 1)) // 2, index - padded, index)

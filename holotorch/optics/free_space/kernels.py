@@ -1,4 +1,4 @@
-"""Transfer functions of free space: pure functions, float64 inside, differentiable in wavelength and distance.
+"""Transfer functions of free space: pure functions, computed in float64, differentiable in wavelength and distance.
 
 Numbers and tensors outside the range of their quantity raise ValueError, except under ``compile`` and ``vmap``.
 """
@@ -96,7 +96,7 @@ def window_taper(grid: Grid, wavelength: float, distance: float, reach: Pair, *,
         wavelength: In metres.
         distance: In metres.
         reach: Half the extent of the window plus half the extent of the field, in metres (y, x).
-        paraxial: Light moves sideways by the sine of its angle, as in the Fresnel model, instead of the tangent.
+        paraxial: Light moves sideways by distance times the sine of its angle, as in the Fresnel model.
 
     Raises ValueError for a padded extent below twice ``reach``.
     """
@@ -106,7 +106,7 @@ def window_taper(grid: Grid, wavelength: float, distance: float, reach: Pair, *,
         if size == 1:
             continue
         sine, other = sines[axis], sines[1 - axis].square()
-        # For sines up to 0.1 on the other axis, its effect on the tangent is at most half a percent and is neglected.
+        # Sines up to 0.1 on the other axis change the tangent by at most half a percent and are neglected.
         other = other if float(other.max()) > 0.01 else 0.0
         cosine = 1.0 if paraxial else (1 - sine.square() - other).clamp_min(1e-12).sqrt()
         if extent < 2 * start * (1 - 1e-9):

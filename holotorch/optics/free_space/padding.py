@@ -1,4 +1,4 @@
-"""Lengths of the transforms that apply cropped taps and the factor beyond Fresnel."""
+"""FFT lengths for cropped taps and for the factor beyond Fresnel (exact divided by paraxial transfer function)."""
 
 import math
 
@@ -6,11 +6,11 @@ from holotorch.core.fourier import good_length
 from holotorch.optics.free_space.plane_pair import PlanePair
 
 FINEST = 0.9  # smallest pitch, in wavelengths, at which the factor beyond Fresnel may be applied separately
-CROP_PAD = 2.25  # padding of CroppedKernel, as a multiple of half the samples of source and result together
+CROP_PAD = 2.25  # FFT length of CroppedKernel, as a multiple of the mean number of samples of source and result
 
 
 def resampled_padding(planes: PlanePair, wavelength: float, distance: float, tails: float = 0.125) -> tuple[int, int]:
-    """Samples (y, x) of the transforms that apply the factor beyond Fresnel before resampling.
+    """Number of samples (y, x) of the FFTs that apply the factor beyond Fresnel before resampling.
 
     They hold the source window and, on each side, the lateral shift by the factor and the tails of its impulse
     response, for which ``tails`` times the window is reserved.
@@ -27,16 +27,16 @@ def resampled_padding(planes: PlanePair, wavelength: float, distance: float, tai
 def crop_length(
     size: int, window: int, pitch: float, wavelength: float, distance: float, shift: float = 0.0, pad: float = CROP_PAD
 ) -> int:
-    """Samples of a transform that holds the taps of one axis and the lateral shift by the factor beyond Fresnel.
+    """Number of samples of an FFT that holds the taps of one axis and the lateral shift beyond Fresnel.
 
     Args:
-        size: Samples of the source.
-        window: Samples of the result.
+        size: Number of samples of the source.
+        window: Number of samples of the result.
         pitch: In metres.
         wavelength: In metres.
         distance: In metres, >= 0.
         shift: Position of sample 0 of the result relative to sample 0 of the source, in samples.
-        pad: Length as a multiple of half the samples of source and result together. With 2 it holds the taps alone.
+        pad: Length as a multiple of the mean number of samples of source and result. 2 holds the taps alone.
     """
     lateral = (size + window) * pitch + abs(shift) * pitch
     steepest = math.sqrt(2) * wavelength * 0.5 / pitch  # in the corner of the band
@@ -45,6 +45,6 @@ def crop_length(
 
 
 def _shift_beyond_fresnel(steepest: float, lateral: float, distance: float) -> float:
-    """Shift in metres by the factor beyond Fresnel, for sines up to ``steepest`` and rays that move by ``lateral``."""
+    """Shift in metres by the factor beyond Fresnel, for sines up to ``steepest`` and moves up to ``lateral``."""
     sine = min(steepest, lateral / math.hypot(lateral, distance), 0.99)
     return distance * (sine / math.sqrt(1 - sine * sine) - sine)

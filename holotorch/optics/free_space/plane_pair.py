@@ -41,11 +41,11 @@ class PlanePair:
 def plane_pair(
     grid: Grid, out: Grid | None, offset: Sequence[float], tilt: Sequence[float] | Tensor, wavelengths: Sequence[float]
 ) -> PlanePair:
-    """PlanePair of checked arguments; ``out`` is ``grid`` by default.
+    """Check the arguments and return their PlanePair; ``out`` is ``grid`` by default.
 
     Raises:
         TypeError: An argument of a wrong type.
-        ValueError: A tilt that brings part of the band to a sine of 0.98 or more.
+        ValueError: A tilt about which the band of ``grid`` contains directions with a sine of 0.98 or more.
     """
     if out is not None and not isinstance(out, Grid):
         raise TypeError(f"out_grid must be a Grid, such as Grid((256, 256), pitch=8e-6), got {out!r}")

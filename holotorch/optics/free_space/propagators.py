@@ -52,12 +52,12 @@ class SpectralFilter(FieldOperator):
         return torch.view_as_complex(self.single if field.dtype == torch.complex64 else self.kernel)
 
     def extra_repr(self) -> str:
-        """Samplings and wavelengths, for ``print(module)``."""
+        """Samplings, wavelengths and padded size, for ``print(module)``."""
         return f"{super().extra_repr()}, padded={tuple(self.kernel.shape[-3:-1])}"
 
 
 class _PaddedKernel(SpectralFilter):
-    """A transfer function sampled on a padded grid, which takes ``bytes_each`` per sample to compute (measured)."""
+    """Transfer function sampled on a padded grid; computing it takes ``bytes_each`` bytes per sample (measured)."""
 
     def __init__(
         self,
@@ -142,7 +142,7 @@ class Fresnel(_PaddedKernel):
 class Fraunhofer(FieldOperator):
     """Far field: the unitary DFT with the origin of both planes on sample ``n // 2``. The adjoint is the inverse.
 
-    Output sample m (counted from the centre) of an axis with n samples is the direction
+    Output sample m (counted from the centre) of an axis with n samples belongs to the direction
     sin(angle) = m wavelength / (n pitch). Source: thesis Eq. 4.10.
     """
 

@@ -18,7 +18,7 @@ _CHUNK = 4_000_000  # kernel values at a time: 64 MB of complex128
 
 
 class RayleighSommerfeld(FieldOperator):
-    """First Rayleigh-Sommerfeld integral over point samples, summed pair by pair in float64: H W H' W' terms, slow.
+    """First Rayleigh-Sommerfeld integral over point samples, summed pair by pair in float64, slow: H W H' W' terms.
 
     u(p) = sum_q u(q) dA z / (2 pi r^2) (1 / r - i k) exp(i k r), where r is the distance from q to p and dA the area of
     a sample. For a negative distance the kernel is the complex conjugate, which is time reversal. The sum over point

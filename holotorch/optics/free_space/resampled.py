@@ -40,15 +40,15 @@ def resampling_factors(
         dtype: Of the result.
 
     Returns:
-        Columns [..., H', H + margins] with the carrier exp(ikz), rows [..., W', W + margins], and the factor
-        [..., P, Q] in FFT order or None.
+        Matrix along y, [..., H', H + margins], with the carrier exp(ikz) as a factor, matrix along x,
+        [..., W', W + margins], and the factor beyond Fresnel, [..., P, Q] in FFT order, or None.
     """
     wavelength, distance = torch.broadcast_tensors(wavelength, distance)
     if tilt is None:
         tilt = torch.tensor(planes.tilt, dtype=torch.float64, device=distance.device)
     cosine2 = 1 - tilt.square().sum()
     nyquist = 0.5 / planes.grid.pitch[0], 0.5 / planes.grid.pitch[1]
-    # Linear phase, as a shift in metres, that is moved from the factor beyond Fresnel into the taps.
+    # Shifts in metres: the linear phases that are moved from the factor beyond Fresnel into the taps.
     shifts = [torch.zeros_like(distance)] * 2
     if padded is not None and any(planes.tilt):
         shifts = [levelling_shift(nyquist, wavelength, distance, tilt, axis) for axis in (0, 1)]
@@ -77,7 +77,7 @@ def resampling_factors(
 
 
 def resample(field: Tensor, factors: Factors) -> Tensor:
-    """Apply the result of :func:`resampling_factors` to a field [..., H, W]; returns [..., H', W']."""
+    """Apply the ``factors`` of :func:`resampling_factors` to a field [..., H, W]; returns [..., H', W']."""
     columns, rows, remainder = factors
     if remainder is not None:
         top, left = _margins(columns, rows, field.shape)
@@ -106,8 +106,8 @@ class ResampledKernel(FieldOperator):
         offset: Position (y, x) in metres of the axis of the result relative to the axis of the field.
         tilt: Sines (y, x) of the direction of a carrier wave that is divided out, as in ``propagate``.
         paraxial: Leave out the factor beyond Fresnel.
-        padded: Samples of the transforms that apply this factor. The default adds to each side of the window an eighth
-            of its size and the distance by which the factor moves light.
+        padded: Number of samples (y, x) of the FFTs that apply this factor. The default adds to each side of the window
+            an eighth of its size and the distance by which the factor moves light.
 
     Raises ValueError for a number outside its range, a distance of 0, or a pitch below 0.9 wavelengths.
     """

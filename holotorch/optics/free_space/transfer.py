@@ -34,7 +34,7 @@ def transfer_function(
 
     Args:
         planes: Samples of source and result, of equal pitch.
-        padded: Grid of the transforms. The first samples of the result are those of ``planes.out``.
+        padded: Grid of the FFTs. After the inverse FFT, the first samples are those of ``planes.out``.
         wavelength: In metres, float64, shape [...].
         distance: In metres, float64, shape [...] that broadcasts; 0 gives the identity.
         sampled: Per axis (y, x): True to sample the paraxial factor in frequency, False to transform its exact taps,
@@ -59,7 +59,7 @@ def transfer_function(
         for frequency, pitch, position in zip((fy, fx), padded.pitch, positions, strict=True):
             cycles = cycles + frequency * pitch * position[..., None, None]
         return turns_phasor(cycles).to(dtype) * carrier_factor[..., None, None]
-    shifts_beyond = []  # shifts in samples that are moved from the factor beyond Fresnel into the taps
+    shifts_beyond = []  # per axis, in samples, moved from the factor beyond Fresnel into the taps
     if tilted:
         nyquist = 0.5 / padded.pitch[0], 0.5 / padded.pitch[1]
         for axis in (0, 1):
@@ -99,7 +99,7 @@ def transfer_function(
 def wide_transfer_function(
     planes: PlanePair, padded: Grid, wavelength: Tensor, distance: Tensor, *, dtype: torch.dtype
 ) -> Tensor:
-    """Band-limited angular spectrum with its carrier, [..., H, W]: for pitches below 0.9 wavelengths."""
+    """Band-limited angular spectrum with its carrier, [..., H, W], for pitches below 0.9 wavelengths."""
     kernel = angular_spectrum_kernel(padded, wavelength, distance)
     kernel = kernel * carrier(wavelength, distance)[..., None, None]
     no_tilt = torch.zeros(2, dtype=torch.float64, device=distance.device)

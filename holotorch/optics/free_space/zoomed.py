@@ -15,7 +15,7 @@ Chirp = tuple[Tensor, Tensor, Tensor]
 
 
 def chirp(size: int, step: float, start: float, count: int, device: torch.device | None = None) -> Chirp:
-    """Factors with which :func:`zoom` evaluates a field at ``count`` points, the first at ``start``, ``step`` apart.
+    """Factors with which :func:`zoom` evaluates a field at ``count`` points, ``step`` apart, beginning at ``start``.
 
     ``step`` and ``start`` are in samples of the field, which has ``size`` of them. The identity
     k j = (k^2 + j^2 - (j - k)^2) / 2 makes the sum over frequencies k a convolution with a chirp (Rabiner, Schafer and
@@ -81,7 +81,7 @@ class ZoomedFilter(FieldOperator):
     """A filter that is diagonal in frequency and evaluated on a grid of any pitch.
 
     The padded result is a band-limited periodic field. It is summed from its spectrum at the points of ``out_grid``,
-    which is exact as long as the kernel does not wrap light around into them. It takes two to four times as long as a
+    which is exact as long as no light wraps around into them. It takes two to four times as long as a
     ``SpectralFilter``, whereas the cost of ``ResampledKernel`` grows with the cube of the size.
 
     Args:

@@ -15,9 +15,9 @@ def path_difference(distance: float, aperture: float, *, tilt: float = 0.0) -> f
 
     A hologram diffracts light of spatial frequency f to the sine f lambda. Over ``distance`` the phase of this light
     changes by -pi distance lambda f^2. From the centre to the edge of the pupil, the difference of the phases at two
-    wavelengths therefore changes by 2 pi (distance aperture^2 / 2) (lambda - lambda') / lambda^2. The depth of the
-    object points has no effect, since the hologram does not depend on the wavelength. The result is paraxial; at a sine
-    of 0.1 it is 1 % too small.
+    wavelengths therefore changes by 2 pi (lambda - lambda') / lambda^2 times the result, which on the axis is
+    distance aperture^2 / 2. The depth of the object points has no effect, since the hologram does not depend on the
+    wavelength. The result is paraxial; at a sine of 0.1 it is 1 % too small.
 
     Args:
         distance: From the hologram to the depth in focus, in metres; its sign does not matter.

@@ -30,7 +30,7 @@ def incoherent_sum(
         places: A tensor [K] of wavelengths, passed on as floats, or a sequence of K arguments for ``intensity_of``.
         weights: [K], such as those of ``Spectrum.samples``; a tensor may require gradients.
         recompute: If gradients are enabled, compute each intensity again in the backward pass instead of keeping its
-            intermediate results. This takes a third more time and the memory of a single intensity.
+            intermediate results. This takes a third more time, but only the memory of a single intensity.
 
     Raises:
         TypeError: ``intensity_of`` returns a complex tensor, a field instead of an intensity.

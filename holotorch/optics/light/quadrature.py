@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 _MOST = 512  # largest number of nodes
-_JITTER = 1e-10  # diagonal addend that keeps the equations for the weights solvable; adds at most 1e-5 to the error
+_JITTER = 1e-10  # added to the diagonal so that the equations for the weights are solvable; adds <= 1e-5 to the error
 _EXACT = 1e-5  # error at which the search for better nodes stops
 _STARTS = (0.85, 0.95)  # outermost nodes of evenly spaced initial nodes, as fractions of the half band
 
@@ -75,7 +75,7 @@ class SpeckleIntegral:
     iris: float = 0.0
 
     def error(self, positions: Tensor, shares: Tensor) -> Tensor:
-        """Expected rms error of a rule with nodes ``positions`` and weights ``shares``, relative to the rms, a scalar.
+        """Expected rms error of a rule with nodes ``positions`` and weights ``shares``, relative to the rms intensity.
 
         The expectation is over fully developed speckle whose intensities correlate as in :func:`correlation`, around
         the mean brightness that the iris transmits.
@@ -110,7 +110,7 @@ class SpeckleIntegral:
 
         Raises ValueError if more than 512 wavelengths would be needed.
         """
-        # The count that suffices with Gauss's rule is an upper bound. Fewer nodes than this start have large errors.
+        # A count that suffices for Gauss's rule is an upper bound. The search for it starts where errors are large.
         count = max(1, int(self.beat * float(self.nodes.abs().max()) * 0.75))
         most = min(_MOST, len(self.nodes))
         while count <= most:

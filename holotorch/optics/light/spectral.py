@@ -8,10 +8,10 @@ change of wavelength acts like a change of depth:
 
 The field on the retina is the part of U exp(i pi A x^2 / (lambda B)) that the pupil transmits, where A and B are
 elements of the ray transfer matrix (:mod:`holotorch.optics.viewing.imaging`). Divided by this parabolic phase, it is U
-as limited by the pupil, and the equation above gives the field at the neighbouring wavelength for two transforms. An
+as limited by the pupil, and the equation above gives the field at the neighbouring wavelength by two transforms. An
 error remains, because the result has the pupil of the propagated wavelength. The true pupil transmits fixed directions
 and therefore cuts off a fraction 2 |lambda' - lambda| / lambda more, or less, of the light at its edge. This error
-limits the distance between neighbours in wavelength; speckle, which changes about every nanometre, does not.
+limits the difference in wavelength between neighbours; speckle, which changes about every nanometre, does not.
 """
 
 import math

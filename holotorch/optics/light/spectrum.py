@@ -14,7 +14,7 @@ from holotorch.core.quantities import BANDWIDTH
 from holotorch.optics.light.quadrature import SpeckleIntegral, gauss_rule
 
 CUTOFF = 0.1  # fraction of the peak below which the thesis drops the power (Sec. 5.5.2.2)
-_NODES = 256  # nodes of integrals over the band; exact to rounding for phases that vary by up to 200 rad
+_NODES = 256  # number of quadrature nodes over the band; exact to rounding for phases that vary by up to 200 rad
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class _Line:
 
     @property
     def joints(self) -> list[float]:
-        """Wavelengths 4, 16, ... half widths from the centre. Integrals between them sample the peak well."""
+        """Ends of the quadrature intervals: 4, 16, ... half widths from the centre, so that the peak is resolved."""
         offset, joints = 4 * self.half_width, []
         while offset < self.centre:
             joints = [self.centre - offset, *joints, self.centre + offset]
@@ -76,7 +76,7 @@ class _Table:
 
     @property
     def joints(self) -> list[float]:
-        """Wavelengths at which the power has a kink."""
+        """Ends of the quadrature intervals: the wavelengths at which the power has a kink."""
         return list(self.wavelengths)
 
 
@@ -120,7 +120,7 @@ class Spectrum:
 
     @classmethod
     def lorentzian_as_printed(cls, centre: float, gamma: float, *, cutoff: float = CUTOFF) -> "Spectrum":
-        """Eq. 5.15 as printed. The thesis calls ``gamma`` the FWHM, but in the equation it is half of the FWHM."""
+        """Eq. 5.15 as printed. The thesis calls ``gamma`` the full width, but in the equation it is half of it."""
         return cls.lorentzian(centre, 2 * checks.quantity(BANDWIDTH, gamma, "gamma"), cutoff=cutoff)
 
     @classmethod
@@ -176,7 +176,7 @@ class Spectrum:
         return cls.lorentzian(centre, 20e-9)
 
     def band(self, cutoff: float | None = None) -> tuple[float, float]:
-        """Outermost wavelengths in metres with at least ``cutoff`` of the peak; that of the spectrum by default."""
+        """Outermost wavelengths in metres with at least ``cutoff`` of the peak, by default ``self.cutoff``."""
         level = self.cutoff if cutoff is None else cutoff
         if not 0 < checks.finite("cutoff", level) < 1:
             raise ValueError(f"cutoff must lie between 0 and 1, a part of the peak, got {level!r}")
@@ -263,7 +263,7 @@ class Spectrum:
         return nodes, weights / weights.sum()
 
     def _steps(self) -> tuple[Tensor, Tensor]:
-        """Nodes and weights of a composite Gauss-Legendre rule for the band, with one rule between any two joints."""
+        """Nodes and weights of a composite Gauss-Legendre rule for the band, with one rule between adjacent joints."""
         low, high = self.band()
         ends = np.array([low, *(joint for joint in self.profile.joints if low < joint < high), high])
         count = max(2, math.ceil(_NODES / (len(ends) - 1)))

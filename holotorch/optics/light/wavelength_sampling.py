@@ -1,4 +1,4 @@
-"""Selection of the wavelengths to propagate, from whose images those at the other wavelengths are derived."""
+"""Selection of the wavelengths to propagate; images at the other wavelengths are derived from their images."""
 
 import math
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ class SeenLight:
     Attributes:
         rim: Fraction of the edge of the pupil that is illuminated, 0 to 1; 0 if only the window or the highest
             frequency of the hologram limits the light.
-        path_difference: ``coherence.path_difference`` in metres, the maximum over points on and off the axis.
+        path_difference: As in ``coherence.path_difference``, in metres; the maximum over points on and off the axis.
         bend: Standard deviation in metres, over the rays of a point, of the part z slope^4 / 8 of their paths that the
             Fresnel model neglects.
     """
@@ -32,7 +32,7 @@ class SeenLight:
 
 
 def seen_light(grid: Grid, wavelength: float, display: Display, eye: Eye, *, reach: float | None = None) -> SeenLight:
-    """Trace rays from points of the plane in focus forward to the pupil and back to the hologram.
+    """The light that enters an eye, from rays traced from the plane in focus to the pupil and to the hologram.
 
     Args:
         grid: Sampling of the hologram.
@@ -149,7 +149,7 @@ def flawless(eye: Eye) -> bool:
 
 
 def inseparable(grid: Grid, centre: float, display: Display, eye: Eye) -> bool:
-    """Whether the errors of an eye cannot be removed from an image, as its pupil exceeds the band of ``grid``."""
+    """Whether the pupil of an eye with errors exceeds the band of ``grid``, so that they cannot be removed."""
     if flawless(eye):
         return False
     second = number(display.matrix(number(display.focus_plane(eye.accommodation)))[1])
