@@ -37,8 +37,8 @@ class Streamed(NamedTuple):
 def read_poses(path: Path) -> list[TimedPose]:
     """Read capture times in seconds and poses from a poses.csv of ``holotorch track``.
 
-    The table has no covariance of the direction, so that the returned poses have a variance of 1 along each axis of it,
-    as for an unknown unit vector.
+    The table has no covariance of the direction. The returned poses therefore state a variance of 1 for each component
+    of the direction, as for an unknown unit vector.
 
     Raises:
         ConfigError: The file is not a poses.csv, a line cannot be read or sent, or the times do not increase.

@@ -104,7 +104,7 @@ def _render(folder: Path, frames: int, world: World) -> None:
 
 
 def read_truth(folder: Path) -> dict[str, list[float]]:
-    """True tips in metres by frame number, from truth.csv in a folder; empty without such a table.
+    """True tips (x, y, z) in metres from truth.csv in a folder, by frame number as text; empty without the table.
 
     A table of this name with other columns is ignored in a folder of pictures, and is an error in a recording.
 

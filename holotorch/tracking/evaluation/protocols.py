@@ -42,7 +42,7 @@ class GridAccuracy(NamedTuple):
 
     Attributes:
         acc: Acc_f of Sec. 3.5.3: mean absolute difference between measured and designed distances to the reference
-            point. It is insensitive to a constant bias and to errors perpendicular to the direction of the reference.
+            point. It is insensitive to a constant bias and to errors perpendicular to the line to the reference point.
         absolute: Median, 95th percentile and maximum of the distance from the true tip; NaN without ground truth.
         rigid: The same statistics after the best rigid alignment of the measured points with the grid.
         answered, refused: Numbers of points with and without a pose.
@@ -140,7 +140,7 @@ def grid_accuracy(found: Tensor, grid: Tensor, reference: int, truth: Tensor | N
 
 
 def planar_accuracy(found: Tensor, grid: Tensor, right: Tensor, up: Tensor, reference: int) -> PlanarAccuracy:
-    """Distances of tips ``found`` [n, 3] from the intersections ``grid`` [n, 2] of a printed grid, Sec. 3.5.2.
+    """Mean errors of tips ``found`` [n, 3] at the intersections ``grid`` [n, 2] of a printed grid, Sec. 3.5.2.
 
     Args:
         found: Measured tips in metres, in the camera's frame; NaN where refused.
@@ -181,7 +181,7 @@ def coverage(tips: Tensor, covariance: Tensor, truth: Tensor, level: float = 0.9
         tips: [n, 3] in metres; NaN where refused.
         covariance: [n, 3, 3] covariances of the tips in m^2.
         truth: [n, 3] in metres.
-        level: Confidence level, which correct covariances reach as their share.
+        level: Confidence level; correct covariances give a share close to it.
 
     Raises:
         TypeError, ValueError: Shapes that differ, no answered frame, NaN truth or a covariance that is not positive.
@@ -231,7 +231,7 @@ def wrong_poses(tips: Tensor, truth: Tensor, limit: float = 5e-3) -> WrongPoses:
 
 
 def _others(found: Tensor, reference: int) -> tuple[Tensor, Tensor]:
-    """Masks [n] of the points with a pose, without and with the reference."""
+    """Two masks [n] of the points with a pose: the first excludes the reference, the second includes it."""
     checks.whole("reference", reference, 0)
     if reference >= len(found):
         raise ValueError(f"reference must be one of {len(found)} points, got {reference}")
