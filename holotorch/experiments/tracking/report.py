@@ -38,7 +38,7 @@ _SHOWN = 4  # number of statuses whose first frame the page shows
 class Tracked(NamedTuple):
     """One frame and its pose."""
 
-    number: int  # of the frame, from 0
+    number: int  # number of the frame, from 0
     frame: Frame
     pose: Pose  # pose or refusal; its status is BAD_FRAME if the frame could not be read
     seconds: float  # time that the tracker took; 0 for a frame that could not be read

@@ -63,7 +63,7 @@ def write_synthetic(
     try:
         _render(folder, frames, World(size=size, camera=model, catheter=tool))
     except BaseException as error:
-        shutil.rmtree(folder)  # it was empty before
+        shutil.rmtree(folder)  # the folder was empty before
         if isinstance(error, ValueError):
             raise ConfigError([f"this catheter cannot be rendered with this camera: {error}"]) from None
         raise

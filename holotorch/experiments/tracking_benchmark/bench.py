@@ -98,7 +98,7 @@ def _stability(own: list[Answer]) -> protocols.Stability | None:
 
 
 def grids(world: World, trackers: dict[str, Method], share: float = 1.0) -> tuple[list[Row], list[Answer]]:
-    """Errors of the tip on the 2-D grid of Sec. 3.5.2 and the faces of the 3-D grid of Sec. 3.5.3.
+    """Errors of the tip on a ``share`` of the points of the grids: 2-D (Sec. 3.5.2) and faces of 3-D (Sec. 3.5.3).
 
     The rows contain absolute errors, errors after a rigid fit, and Acc; see :class:`protocols.GridAccuracy`.
     """

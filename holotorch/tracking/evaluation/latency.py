@@ -90,7 +90,7 @@ def _peak(scores: Tensor, step: float, most: int, samples: int, overlap: float) 
     inner = scores[1:-1]
     rivals = (inner > scores[:-2]) & (inner > scores[2:]) & (inner > top - _RIVAL)
     lags = (torch.arange(1, 2 * most) - best) * step
-    rivals &= lags.abs() > width / 2  # nearer ones are noise on the peak itself
+    rivals &= lags.abs() > width / 2  # closer maxima are noise on the peak itself
     if bool(rivals.any()):
         rival = (int(rivals.nonzero()[0]) + 1 - most) * step
         raise ValueError(

@@ -239,7 +239,7 @@ def answer(edges: Endpoints, tip: np.ndarray, direction: np.ndarray, device: tor
 
 
 class Stopwatch:
-    """Seconds of each stage of one call, by name; ``wait`` is called before each reading of the clock."""
+    """Seconds of each stage of one call, by name; ``wait``, such as a GPU synchronisation, precedes each reading."""
 
     def __init__(self, wait: Callable[[], None] = lambda: None):
         self.times: dict[str, float] = dict.fromkeys(STAGES, 0.0)
