@@ -15,7 +15,7 @@ from holotorch.tracking.streaming.packet import now
 from holotorch.tracking.streaming.stream import PORT, PoseReceiver, PoseSender, UdpSocket
 
 _LOOPBACK = "127.0.0.1"
-_EVERY = 50  # one of this many packets is a refusal instead of a pose
+_EVERY = 50  # every 50th packet carries a refusal instead of a pose
 _FAST = 1e-3  # seconds: largest accepted median transit on the loopback
 
 
@@ -93,7 +93,7 @@ def _direct(name: str, receiver: PoseReceiver, packets: int) -> Iterator[tuple[b
 
 
 def _lossy(receiver: PoseReceiver, relay: "Relay") -> tuple[bool, str]:
-    """Whether the receiver behind the relay counted what the relay did, and kept the newest packet."""
+    """Whether the receiver counted as the relay did and kept the newest packet, and the result in words."""
     counts = receiver.statistics
     dropped, overtaken, repeated = relay.dropped, relay.overtaken, relay.repeated
     text = f"lossy way: of {relay.came} packets {dropped} lost, {overtaken} reordered, {repeated} twice"
@@ -108,8 +108,8 @@ class Relay(UdpSocket):
     """A simulated bad network: it loses 20 % of the packets, delays 10 % by up to three packets, and repeats 2 %.
 
     Attributes:
-        came, dropped, overtaken, repeated: Numbers of received, lost, delayed and repeated packets. A packet counts as
-            overtaken if it was forwarded after a later one.
+        came, dropped, overtaken, repeated: Numbers of received, lost, overtaken and repeated packets. A packet counts
+            as overtaken if it was forwarded after a later one.
         newest: Largest number of a forwarded packet; packets are numbered in the order of arrival.
     """
 

@@ -37,8 +37,8 @@ class Streamed(NamedTuple):
 def read_poses(path: Path) -> list[TimedPose]:
     """Read capture times in seconds and poses from a poses.csv of ``holotorch track``.
 
-    The table has no covariance of the direction, so that the returned poses have a variance of 1 along each axis of it,
-    as for an unknown unit vector.
+    The table has no covariance of the direction. The returned poses therefore state a variance of 1 for each component
+    of the direction, as for an unknown unit vector.
 
     Raises:
         ConfigError: The file is not a poses.csv, a line cannot be read or sent, or the times do not increase.
@@ -84,7 +84,7 @@ def _pose(row: dict[str, str]) -> TimedPose:
 
 
 def replay(poses: Sequence[TimedPose], rate: float | None = None) -> Iterator[TimedPose]:
-    """Yield recorded poses with capture times moved to the present. ``rate`` in Hz replaces the recorded pace."""
+    """Yield recorded poses, shifted in time so that the first is due now. ``rate`` in Hz replaces the recorded pace."""
     start, first = now(), poses[0][0]
     for i, (captured, pose) in enumerate(poses):
         yield start + (captured - first if rate is None else i / rate), pose
@@ -155,7 +155,7 @@ async def _send(
     count: list[int],
     show: Show,
 ) -> None:
-    """Send all poses; ``count[0]`` is the number of those sent so far, also if the call is interrupted."""
+    """Send all poses; ``count[0]`` becomes the number of poses sent, even if the call is interrupted."""
     links, smoother = sender.links if sender else [], OneEuro() if smooth else None
     async with AsyncExitStack() as stack:
         for connection in filter(None, (sender, server)):

@@ -80,7 +80,7 @@ def calibrate_photographs(
 
 
 def parse_board(words: Sequence[str]) -> Chessboard | Charuco:
-    """Create the board that the words after ``--board`` describe. ConfigError for words that describe no board."""
+    """Create the board that the words after ``--board`` describe. Raises ConfigError if they describe no board."""
     text, sides = " ".join(" ".join(words).split()), r"(\d{1,3})x(\d{1,3})"
     chessboard = re.fullmatch(rf"chessboard {sides} (\S+)", text)
     charuco = re.fullmatch(rf"charuco {sides} (\S+) (\S+) (\S+)", text)
@@ -96,7 +96,7 @@ def parse_board(words: Sequence[str]) -> Chessboard | Charuco:
 
 
 def calibration_text(calibration: Calibration, missing: dict[str, str], board: Sequence[str] = BOARD) -> str:
-    """The result of a calibration in a few lines."""
+    """Lines of text that ``holotorch calibrate`` prints: camera, board, coverage, views and warnings."""
     matrix, distortion = calibration.camera.matrix, calibration.camera.distortion.tolist()
     values = [matrix[0, 0].item(), matrix[1, 1].item(), matrix[0, 2].item(), matrix[1, 2].item(), *distortion]
     words = [f"{name} {_rounded(x, calibration.deviations[name])}" for name, x in zip(PARAMETERS, values, strict=True)]

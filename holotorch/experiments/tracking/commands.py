@@ -1,11 +1,11 @@
-"""The commands ``track`` and ``calibrate``: their arguments and actions. Other modules are imported when they run."""
+"""Arguments and actions of ``track`` and ``calibrate``. Other modules are imported only when a command runs."""
 
 import argparse
 import re
 from pathlib import Path
 
 OK, INTERRUPTED = 0, 130
-# Options of ``track`` and ``stream`` for the files that both need.
+# File options that ``track`` and ``stream`` share, with their help texts.
 FILES = {
     "--camera": "its intrinsics: a YAML file, as calibrate writes it",
     "--catheter": "YAML file, such as configs/tracking/catheter.yaml",

@@ -17,11 +17,11 @@ def _camera_number(value: Any) -> Any:
 class TrackSettings(Settings):
     """Tracking of a catheter in a video, a folder of pictures, a recording, or the frames of a live camera.
 
-    ``source``: a path, the index of a camera, or ``synthetic``, which first renders a recording of ``frames`` frames
-    with the true poses. ``camera``, ``catheter``: YAML files; by default, those beside the recording or, for
-    ``synthetic``, a synthetic camera and the dissertation's catheter. ``record``: save every frame without loss, so
-    that it can be tracked again. ``video``: write a video with the pose drawn on every frame. ``still``: measure the
-    stability of the tip, for a catheter at rest. ``rate_hz``: frames per second of a source without time stamps.
+    ``source``: a path, the index of a camera, or ``synthetic``. A synthetic run first renders a recording of
+    ``frames`` frames with true poses. ``camera``, ``catheter``: YAML files; by default, those beside the recording,
+    or a synthetic camera and the dissertation's catheter if ``source`` is ``synthetic``. ``record``:
+    save every frame without loss for a later run. ``video``: write a video with the pose drawn on every frame.
+    ``still``: measure the tip's stability; the catheter must rest. ``rate_hz``: frames per second without time stamps.
     """
 
     experiment: Literal["track"]

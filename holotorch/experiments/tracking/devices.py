@@ -56,7 +56,7 @@ class CameraSettings(Settings):
     """A camera; see ``Camera``.
 
     ``distortion``: k1, k2, p1, p2, k3 in OpenCV's order. ``size``: rows and columns of its frames.
-    ``tone``: srgb, linear, or a list of the light of each of the 256 levels.
+    ``tone``: srgb, linear, or a list of the linear intensity (0 to 1) of each of the 256 grey levels.
     """
 
     fx: Positive
@@ -82,7 +82,7 @@ class HeadsetSettings(Settings):
     """Position of a camera on a headset: rows of the 4 x 4 matrix from camera to headset coordinates, in metres.
 
     ``residuals`` and ``leave_one_out``: errors in metres of the alignments from which the matrix was computed, see
-    ``Alignment``; null in ``leave_one_out`` for an alignment without which the others determine no matrix.
+    ``Alignment``. An entry of ``leave_one_out`` is null if the other alignments alone do not determine the matrix.
     """
 
     headset_from_camera: tuple[Row, Row, Row, Row]
@@ -100,12 +100,12 @@ def load_camera(path: Path | str, overrides: Sequence[str] = ()) -> CameraSettin
 
 
 def load_catheter(path: Path | str, overrides: Sequence[str] = ()) -> CatheterSettings:
-    """Read a catheter's file as :func:`load_camera`."""
+    """Read and check a catheter's file; see :func:`load_camera`."""
     return _load(CatheterSettings, build_catheter, path, overrides)
 
 
 def load_headset(path: Path | str, overrides: Sequence[str] = ()) -> HeadsetSettings:
-    """Read the file of a camera's position on a headset as :func:`load_camera`."""
+    """Read and check the file of a camera's position on a headset; see :func:`load_camera`."""
     return _load(HeadsetSettings, build_headset, path, overrides)
 
 
@@ -152,7 +152,7 @@ def build_headset(settings: HeadsetSettings) -> torch.Tensor:
 
 
 def save_camera(path: Path, camera: Camera | Calibration, size: tuple[int, int] | None = None) -> None:
-    """Write a camera, or a calibration with its quality. ``size`` (H, W) is the frame size of a plain camera."""
+    """Write a camera, or a calibration with its quality. ``size`` (H, W) in pixels is only used for a ``Camera``."""
     evidence = None
     if isinstance(camera, Calibration):
         values = vars(camera) | vars(camera.coverage)
@@ -189,7 +189,7 @@ def save_headset(path: Path, alignment: Alignment) -> None:
 
 
 def misfit(path: Path, error: ValueError) -> ConfigError:
-    """Error for a catheter that a tracker refused, at the line of its colours, the only possible reason."""
+    """Error for a catheter that a tracker refused because of its colours; it names the line of the colours."""
     return ConfigError([read_source(path, []).mistake(("colours",), str(error))])
 
 

@@ -31,28 +31,28 @@ COLUMNS = (
 )
 
 _STATED = "what the frames leave open; not what is unknown of the camera (its calibration) and of the catheter's edges"
-_MOVED = 3.0  # a catheter counts as resting if its tips spread by at most this many stated deviations
+_MOVED = 3.0  # largest spread of the tips of a resting catheter, as a multiple of the tracker's standard deviation
 _SHOWN = 4  # number of statuses whose first frame the page shows
 
 
 class Tracked(NamedTuple):
     """One frame and its pose."""
 
-    number: int  # of the frame, from 0
+    number: int  # number of the frame, from 0
     frame: Frame
-    pose: Pose  # or a refusal, BAD_FRAME for a frame that could not be read
+    pose: Pose  # pose or refusal; its status is BAD_FRAME if the frame could not be read
     seconds: float  # time that the tracker took; 0 for a frame that could not be read
     stages: dict[str, float]  # seconds of each stage of the tracker, if it measures them
 
     @property
     def status(self) -> Status:
-        """Status of the pose, which is not a batch."""
+        """Status of the single pose."""
         assert isinstance(self.pose.status, Status)
         return self.pose.status
 
 
 def row(item: Tracked) -> list[str]:
-    """The frame as cells of ``COLUMNS``."""
+    """Cells of the frame's line in poses.csv, in the order of ``COLUMNS``."""
     pose = item.pose
     cells = [str(item.number), repr(item.frame.seconds), item.status.name]
     cells += ["" if pose.answered else item.status.stage, " ".join(pose.reason.split())]
@@ -74,7 +74,7 @@ class Log:
     tips: list[list[float]] = field(default_factory=list)  # metres; NaN for a refusal
     deviations: list[float] = field(default_factory=list)  # standard deviations of the tips in metres
     seconds: list[float] = field(default_factory=list)  # time of the tracker for each frame that could be read
-    stages: list[dict[str, float]] = field(default_factory=list)  # seconds of its stages
+    stages: list[dict[str, float]] = field(default_factory=list)  # seconds of each stage of the tracker, by frame
     pictures: dict[str, str] = field(default_factory=dict)  # captions of the overlays by status
 
     def wants(self, item: Tracked) -> bool:
@@ -114,7 +114,7 @@ def summarise(log: Log, frames: Frames, method: str, still: bool) -> dict[str, A
         shares = (("median", 0.5), ("p95", 0.95), ("largest", 1.0))
         summary["milliseconds"] = {"first": float(taken[0])} | {name: quantile(taken, share) for name, share in shares}
     if log.stages:
-        counted = log.stages[1:] or log.stages  # without the first call if possible, which also builds tables
+        counted = log.stages[1:] or log.stages  # without the first call, which also builds tables
         names = dict.fromkeys(name for each in counted for name in each)
         means = {name: fmean(each.get(name, 0.0) for each in counted) for name in names}
         total = max(sum(means.values()), 1e-12)
@@ -199,7 +199,7 @@ def quantile(values: Tensor, share: float) -> float:
 
 
 def drawn_track(log: Log) -> Any:
-    """Figure of the tip and its stated deviation over time, or with the words "no pose" if there is none."""
+    """Figure of the tip and its stated deviation over time, with the words "no pose" if there is no pose."""
     from matplotlib.figure import Figure
 
     drawn = Figure(figsize=(9, 4.5), layout="constrained")

@@ -73,7 +73,7 @@ def _live(inputs: TrackingInputs) -> Iterator[tuple[float, Pose]]:
         printed, start = len(frames.notes), None
         for item in follow(frames, inputs.tracker):
             start = now() - item.frame.seconds if start is None else start
-            # A camera captured the frame before the tracker began.
+            # The capture time of a live frame is approximated by the time at which the tracker began.
             yield (now() - item.seconds if frames.live else start + item.frame.seconds), item.pose
         for note in frames.notes[printed:]:
             print(note, flush=True)
@@ -81,7 +81,7 @@ def _live(inputs: TrackingInputs) -> Iterator[tuple[float, Pose]]:
 
 @dataclass(frozen=True, eq=False)
 class TrackingExperiment:
-    """A configuration with its source."""
+    """Settings of a tracking run, with its opened inputs and the true tips."""
 
     settings: TrackSettings
     inputs: TrackingInputs | None  # None for a synthetic source, which the run renders first

@@ -83,7 +83,7 @@ def open_inputs(
 
 
 def _is_replay(source: str | Path) -> bool:
-    """Whether the source is a recording. ConfigError for a source that does not exist, or an incomplete recording."""
+    """Whether the source is a recording. Raises ConfigError if it does not exist or is an incomplete recording."""
     path = Path(source)
     if not (path.exists() or is_camera(source)):
         raise ConfigError([no_such_source(source)])
@@ -111,7 +111,7 @@ def _loaded(paths: dict[str, Path]) -> tuple[devices.CameraSettings, Catheter]:
 
 
 def make_tracker(method: str, camera: Camera, catheter: Catheter) -> Tracker:
-    """Create the tracker for a method. ValueError for a catheter whose colours it cannot distinguish."""
+    """Create the tracker of a method. Raises ValueError if the method cannot distinguish the catheter's colours."""
     if method == "thesis":
         return ThesisTracker(camera, catheter)
     return CatheterTracker(camera, catheter, channels=ChannelOrder.RGB)  # all sources deliver RGB

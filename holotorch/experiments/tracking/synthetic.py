@@ -63,7 +63,7 @@ def write_synthetic(
     try:
         _render(folder, frames, World(size=size, camera=model, catheter=tool))
     except BaseException as error:
-        shutil.rmtree(folder)  # it was empty before
+        shutil.rmtree(folder)  # the folder was empty before
         if isinstance(error, ValueError):
             raise ConfigError([f"this catheter cannot be rendered with this camera: {error}"]) from None
         raise
@@ -104,7 +104,7 @@ def _render(folder: Path, frames: int, world: World) -> None:
 
 
 def read_truth(folder: Path) -> dict[str, list[float]]:
-    """True tips in metres by frame number, from truth.csv in a folder; empty without such a table.
+    """True tips (x, y, z) in metres from truth.csv in a folder, by frame number as text; empty without the table.
 
     A table of this name with other columns is ignored in a folder of pictures, and is an error in a recording.
 

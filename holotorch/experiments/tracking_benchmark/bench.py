@@ -19,13 +19,13 @@ from holotorch.tracking.simulation.world import World
 
 Row = dict[str, Any]
 
-# Poses of catheters at rest, by distance in mm and tilt in degrees. The first three have a goal for S_RMS in mm (Eq.
-# 3.13, change of a resting tip from frame to frame). The others (None) have a goal for the efficiency.
+# Poses of catheters at rest: distance in mm, tilt in degrees. The first three have a goal for S_RMS (Eq. 3.13) in
+# mm. The others (None) have a goal for the efficiency: the Cramér-Rao bound divided by the measured variance.
 STILL: dict[tuple[int, int], float | None] = {(450, 20): 0.05, (520, 5): 0.12, (700, 30): 1.1}
 STILL |= dict.fromkeys([(350, 20), (520, 0), (520, 20)])
 # Point of the catheter that lies at the distance given in ``STILL``, in metres from the tip; None is the middle of the
-# bands. The goals refer to the tip. Tilt brings the bands nearer to the camera than the tip, so that the choice changes
-# S_RMS by up to a half.
+# bands. The goals refer to the tip. A tilted catheter has its bands nearer to the camera than its tip, so the choice of
+# the point changes S_RMS by up to 50 %.
 TIP, MIDDLE = "tip", "middle of the bands"
 POINTS: dict[str, float | None] = {TIP: 0.0, MIDDLE: None}
 # Changes of a world's ``Look`` for each codec, and for each light.
@@ -40,7 +40,7 @@ _LIGHTS: dict[str, dict[str, Any]] = {
 }
 _POSITIONS = 5  # positions of a catheter at rest, less than a pixel apart
 _INVISIBLE = {Status.NO_CATHETER, Status.BANDS_MISSING, Status.NO_AXIS}
-# Statuses that count as correct reasons for refusing a scene that cannot be answered, by the beginning of its name.
+# Statuses that count as correct reasons for refusing an unanswerable scene, by the beginning of the scene's name.
 _FITTING: dict[str, set[Status]] = {
     "motion across": _INVISIBLE | {Status.TOO_NARROW, Status.EDGES_UNCLEAR, Status.INCONSISTENT},
     "tilt": {Status.UNCERTAIN, Status.EDGES_UNCLEAR, Status.TOO_NARROW},
@@ -58,8 +58,8 @@ def still(world: World, trackers: dict[str, Method], count: int) -> tuple[list[R
     Each pose is measured twice: with the tip at the given distance, and with the middle of the bands at that distance.
     The middle of the bands appears at the centre of the frame in both cases.
 
-    Each pose is measured at five positions less than a pixel apart. The spread of a pose is the root mean square over
-    these positions, since the spread at one position depends on where edges fall between pixels, by 10 % or more.
+    Each pose is measured at five positions less than a pixel apart. S_RMS and the standard deviation are root mean
+    squares over these positions, since their values vary by 10 % or more with the subpixel position of the edges.
     """
     rows, all_answers = [], []
     pixel = 1 / float(world.camera.matrix[0, 0])
@@ -98,7 +98,7 @@ def _stability(own: list[Answer]) -> protocols.Stability | None:
 
 
 def grids(world: World, trackers: dict[str, Method], share: float = 1.0) -> tuple[list[Row], list[Answer]]:
-    """Errors of the tip on the 2-D grid of Sec. 3.5.2 and the faces of the 3-D grid of Sec. 3.5.3.
+    """Errors of the tip on a ``share`` of the points of the grids: 2-D (Sec. 3.5.2) and faces of 3-D (Sec. 3.5.3).
 
     The rows contain absolute errors, errors after a rigid fit, and Acc; see :class:`protocols.GridAccuracy`.
     """

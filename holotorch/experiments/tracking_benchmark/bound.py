@@ -51,7 +51,7 @@ def tip_bounds(world: World, pose: tuple[Tensor, Tensor], frames: int = 2) -> Bo
     near = _near(camera, catheter, pose, size)
     axes = _axes(*pose)
     to_marks, to_edges, per_metre = _slopes(camera, catheter, pose, axes)
-    # Steps that move the ends and the middle of the bands by one pixel make the information well conditioned.
+    # Steps that move the ends and the middle of the bands by one pixel make the information matrix well conditioned.
     unit_steps = torch.linalg.inv(to_marks)
     generator = torch.Generator().manual_seed(world.seed)
     zero, count = torch.zeros(5, dtype=torch.float64), len(catheter.edges)
@@ -113,12 +113,11 @@ def _axes(tip: Tensor, direction: Tensor) -> Tensor:
 def _slopes(
     camera: Camera, catheter: Catheter, pose: tuple[Tensor, Tensor], axes: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Derivatives of positions in the image, in pixels.
+    """Derivatives of image positions in pixels with respect to the pose and to the edges' positions on the tube.
 
-    Returns:
-        [5, 5] of the first end, middle and last end of the bands along the tube, and of both ends across it, and [N, 5]
-        of the band edges along the tube, by the tip (metres) and two rotations (radians); [N] of each edge along the
-        tube by its position on the tube in metres.
+    Returns three tensors. The first two are derivatives by the tip (metres) and two rotations (radians): [5, 5] of the
+    first end, middle and last end of the bands along the tube and of both ends across it, and [N, 5] of the band edges
+    along the tube. The third, [N], is the derivative of each edge along the tube by its position on the tube (metres).
     """
     first, _, last = _marks(camera, catheter, *pose)
     along = (last - first) / (last - first).norm()

@@ -16,7 +16,7 @@ from holotorch.tracking.simulation.world import World
 
 
 class Amount(NamedTuple):
-    """Numbers of frames that are measured."""
+    """Size of the measurement: numbers of frames, seeds, poses and repetitions, and the share of the cases."""
 
     still: int = 1000  # frames of each catheter at rest
     seeds: int = 2  # seeds of the conditions
@@ -98,7 +98,7 @@ def _methods(tables: dict[str, list[Row]], answers: dict[str, list[Answer]]) -> 
         for depth, tilt in STILL:
             still = one(tables["still"], depth_mm=depth, tilt_deg=tilt, point=TIP, method=name)
             row[f"s_rms_mm_{depth}_{tilt}"] = still["s_rms_mm"]
-        # Both kinds are counted separately, since frames of catheters at rest repeat only a few errors.
+        # Grids and rest are counted separately, since frames of catheters at rest repeat only a few errors.
         for kind in ("grids", "still"):
             row[f"coverage_{kind}"] = bench.covered([answer for answer in answers[kind] if answer.method == name])
         rows.append(row)

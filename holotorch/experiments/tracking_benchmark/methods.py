@@ -35,11 +35,11 @@ class Answer(NamedTuple):
     """
 
     method: str  # name of the method
-    name: str  # of the case
+    name: str  # name of the case
     answerable: bool  # whether the frame determines a pose
     truth: list[float] | None  # true position [3] of the tip in metres; None if the frame shows no catheter
-    status: Status  # of the pose
-    reason: str  # of the pose
+    status: Status  # status of the pose
+    reason: str  # reason of a refusal or of an unverified pose; may be empty
     tip: list[float]  # [3] in metres; NaN for a refusal
     covariance: list[list[float]]  # [3, 3] of the tip in m^2
     seconds: float  # time that the method took
@@ -106,7 +106,7 @@ def methods(world: World, names: Sequence[str] = (BASE, LITERAL, COLD, PRIOR, FE
 def before(case: Case, moved: tuple[float, float, float] = (2e-3, -1.5e-3, 3e-3), turned: float = 0.01) -> Pose:
     """Pose of the catheter 1/30 s before a case: moved by 4 mm (a speed of 120 mm/s) and rotated by 0.6 degrees.
 
-    ``moved`` is the displacement of the tip in metres, and ``turned`` is proportional to the rotation.
+    ``moved`` is the displacement of the tip in metres, and ``turned`` scales the change of direction.
     """
     if case.tip is None or case.direction is None:
         return Pose.refused(Status.NO_CATHETER, "no catheter was there")

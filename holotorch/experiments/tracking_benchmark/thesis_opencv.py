@@ -149,8 +149,8 @@ def _closed_form(rays: np.ndarray, positions: np.ndarray, starts: Sequence[int])
     """Mean tip and direction [B, 3] over the triples of edges that begin at ``starts``, from unit rays [B, N, 3].
 
     Applies the sine rule to the triangles formed by the camera and each band (corrected Eqs. 3.5 to 3.12); bands may
-    have any length. This repeats :func:`holotorch.tracking.pose.pose.closed_form` in NumPy, since it belongs to the
-    baseline of the times.
+    have any length. This repeats :func:`holotorch.tracking.pose.pose.closed_form` in NumPy, so that the timed
+    baseline does not use PyTorch.
     """
     tips, directions = [], []
     for i in starts:

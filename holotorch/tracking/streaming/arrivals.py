@@ -19,7 +19,7 @@ from holotorch.tracking.streaming.packet import PosePacket
 
 _WINDOW = 1024  # sequence numbers that are stored to distinguish late packets from repeated ones
 _KEPT = 4096  # packets whose delays are stored for the quantiles
-_RECENT = 256  # packets between updates of the fastest transit, which limit the effect of wrong stamps and clock drift
+_RECENT = 256  # packets after which the fastest transit is computed anew, so that wrong stamps and drift do not persist
 _RATE = 1000.0  # poses per second: largest rate at which the sequence may advance while no packet arrives
 _STEP = 1.0  # seconds: longest delay of one packet, by which times of sending may advance faster than arrivals
 _AGREE = 3  # packets in a row that continue each other, after which a receiver accepts them as the stream
@@ -62,10 +62,10 @@ class Statistics:
     _highest: int = -1  # largest sequence number
     _arrived: int = field(default=0, repr=False)  # bit i is set if the packet ``_highest - i`` arrived
     _counted: int = 0  # packets received since the sequence numbers last started anew
-    _missed: int = 0  # packets lost before that
+    _missed: int = 0  # packets lost before the sequence numbers last started anew
     _newest: _Mark | None = None
     _candidates: list[_Mark] = field(default_factory=list, repr=False)  # continue each other, but not the stream
-    _fastest: float = math.inf  # smallest ``raw``, see ``transit``
+    _fastest: float = math.inf  # smallest recent ``raw`` (see ``transit``) in seconds
     _previous: float | None = None  # ``raw`` of the newest packet
     # ``raw`` and time from capture to sending of the last packets.
     _delays: deque = field(default_factory=lambda: deque(maxlen=_KEPT), repr=False)

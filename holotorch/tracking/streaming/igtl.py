@@ -33,8 +33,8 @@ def messages(pose: Pose, captured: float | None = None, *, name: str = "ToolToCa
 
     Args:
         pose: A single pose, not a batch.
-        captured: Time at which the camera took the frame, in seconds since 1970; now by default. It becomes the stamp,
-            also if it lies in the future.
+        captured: Time at which the camera took the frame, in seconds since 1970; now by default. It becomes the
+            time stamp, even if it lies in the future.
         name: Name of the transform, 1 to 14 ASCII characters: OpenIGTLink allows 20, and ``Status`` is appended.
 
     Raises:

@@ -35,7 +35,7 @@ sending of the reply (the last two are 0 in a request); CRC-32 at 48.
 
 A capture time must not lie after the time of sending: a receiver does not use such a packet, since its age is unknown.
 
-Packets are neither encrypted nor signed: who can send to a receiver's port can forge poses. Use a private network.
+Packets are neither encrypted nor signed: anyone who reaches a receiver's port can forge poses. Use a private network.
 """
 
 import math
@@ -60,7 +60,7 @@ _UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
 _DIAGONAL = [n for n, (i, j) in enumerate(_UPPER) if i == j]
 _ALL = [_UPPER.index((min(i, j), max(i, j))) for i in range(6) for j in range(6)]
 _FARTHEST = 100.0  # metres: a tip at a larger distance was probably given in another unit
-_LONGEST = torch.finfo(torch.float32).max  # seconds of lag
+_LONGEST = torch.finfo(torch.float32).max  # largest lag in seconds
 _START = time.time() - time.perf_counter()
 
 

@@ -1,7 +1,7 @@
 """Poses over UDP: a sender to several receivers, and a receiver that counts lost, late and invalid packets.
 
-Latest wins: there is no queue for a slow receiver, a lost packet is not sent again, and an older pose never replaces a
-newer one. The packets are those of :mod:`holotorch.tracking.streaming.packet`. They are not signed;
+Only the newest pose matters: a slow receiver has no queue, a lost packet is not sent again, and an older pose never
+replaces a newer one. The packets are those of :mod:`holotorch.tracking.streaming.packet`. They are not signed;
 :mod:`holotorch.tracking.streaming.arrivals` describes what a receiver detects.
 """
 
@@ -201,7 +201,7 @@ class PoseReceiver(UdpSocket):
             sender's clock from it.
 
     Raises:
-        ValueError, OSError: As UdpSocket; also ValueError for times that are not above zero.
+        ValueError, OSError: As UdpSocket. ValueError also if ``oldest``, ``late`` or ``ahead`` is not above zero.
     """
 
     def __init__(
@@ -228,7 +228,7 @@ class PoseReceiver(UdpSocket):
         self._numbers, self._name = itertools.count(), secrets.randbits(63)
 
     def latest(self) -> PosePacket | None:
-        """The newest packet if it carries a pose not older than ``oldest``; after a refusal, no older pose."""
+        """The newest packet, or None if it is a refusal, is older than ``oldest``, or none has arrived."""
         packet = self.packet
         return packet if packet is not None and packet.answered and self.age() <= self.oldest else None
 
@@ -242,7 +242,7 @@ class PoseReceiver(UdpSocket):
     def age(self) -> float:
         """Seconds since the capture of the newest packet; infinite before the first.
 
-        At least the time since the packet arrived, whatever its stamps are.
+        The age is never below the time since the packet arrived, even if the packet's time stamps are wrong.
         """
         if self.packet is None:
             return math.inf

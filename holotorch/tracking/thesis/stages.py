@@ -1,6 +1,6 @@
-"""Parts of the thesis's pipeline besides image processing: thresholds, oriented Sobel kernel, fit of the axis, edges.
+"""Parts of the thesis's pipeline that both implementations share: thresholds, Sobel kernel, axis fit and endpoints.
 
-``ThesisTracker`` (kornia) and its counterpart in OpenCV share them, so that both refuse the same frames.
+``ThesisTracker`` (kornia) and its counterpart in OpenCV use them, so that both refuse the same frames.
 """
 
 import colorsys
@@ -27,7 +27,7 @@ STAGES: tuple[str, ...] = (
 
 # The thesis gives no numbers for its thresholds; with these, its method works on synthetic frames.
 HUE_TOLERANCE = 15.0  # degrees: largest difference from a band's hue
-LEAST_SATURATION, LEAST_VALUE = 0.55, 0.3  # relative to the least saturation and value of the bands' colours
+LEAST_SATURATION, LEAST_VALUE = 0.55, 0.3  # thresholds as shares of the bands' least saturation and value
 LEAST_PIXELS = 30  # least number of pixels of all bands after the erosion; a visible band has at least a fifth of it
 AXIS_ROUNDS = 6  # largest number of rounds that remove pixels far from the line and fit it again
 AXIS_DISTANCE_PX = 3.0  # pixels farther from the axis than this and than twice the rms are left out of the next fit
@@ -239,7 +239,7 @@ def answer(edges: Endpoints, tip: np.ndarray, direction: np.ndarray, device: tor
 
 
 class Stopwatch:
-    """Seconds of each stage of one call, by name; ``wait`` is called before each reading of the clock."""
+    """Seconds of each stage of one call, by name; ``wait``, such as a GPU synchronisation, precedes each reading."""
 
     def __init__(self, wait: Callable[[], None] = lambda: None):
         self.times: dict[str, float] = dict.fromkeys(STAGES, 0.0)

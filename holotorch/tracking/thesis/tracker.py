@@ -167,7 +167,7 @@ class ThesisTracker:
 
 
 def _line(points: Tensor) -> Axis:
-    """Line with the least squared distances from points [n, 2]."""
+    """Line with the least sum of squared distances from points [n, 2]."""
     line = fit_line(points[None])
     (x, y), (dx, dy) = line.origin[0].tolist(), line.direction[0].tolist()
     return Axis((x, y), (dx, dy))
