@@ -8,6 +8,7 @@ torch's scaled transform of 2048 x 2048 complex64 samples loses the scale on Int
 import math
 
 import torch
+from scipy.fft import next_fast_len
 from torch import Tensor
 from torch.nn import functional
 
@@ -53,9 +54,11 @@ def good_length(minimum: int, *, odd: bool = False) -> int:
     """
     if minimum < 1:
         raise ValueError(f"an FFT length must be at least 1, got {minimum}")
-    length, primes = (minimum | 1, 3 * 5 * 7) if odd else (minimum, 2 * 3 * 5)
-    while pow(primes, 40, length):  # the remainder is 0 only if ``length`` has no other prime factors
-        length += 1 + odd
+    if not odd:
+        return next_fast_len(minimum, real=True)
+    length = minimum | 1
+    while pow(3 * 5 * 7, 40, length):  # the remainder is 0 only if ``length`` has no other prime factors
+        length += 2
     return length
 
 

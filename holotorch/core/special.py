@@ -40,10 +40,17 @@ def fresnel_auxiliary(u: Tensor) -> tuple[Tensor, Tensor]:
     return scale * density.sum(-1) * inverse, scale * (density * t.square()).sum(-1) * inverse**3
 
 
-def chirped_fresnel_integral(u: Tensor, chirp: Tensor, end: Tensor, sign: Tensor | float = 1.0) -> Tensor:
-    """``chirp`` times int_0^u exp(-i sign pi t^2 / 2) dt, complex128; ``end`` is chirp exp(-i sign pi u^2 / 2)."""
+def chirped_fresnel_integral(u: Tensor, chirp: Tensor, end: Tensor, sign: Tensor | None = None) -> Tensor:
+    """``chirp`` times int_0^u exp(-i sign pi t^2 / 2) dt, complex128; ``end`` is chirp exp(-i sign pi u^2 / 2).
+
+    ``sign`` is 1 or -1 and broadcasts; None stands for 1.
+    """
     large = u.abs() > FRESNEL_BORDER
     f, g = fresnel_auxiliary(torch.where(large, u.abs(), 2.0))
-    outside = torch.sign(u) * ((0.5 - 0.5j * sign) * chirp + torch.complex(-g, sign * f) * end)
     integral = fresnel_integral(torch.where(large, 0.0, u))
-    return torch.where(large, outside, chirp * torch.complex(integral.real, sign * integral.imag))
+    half: Tensor | complex = 0.5 - 0.5j
+    if sign is not None:
+        f, half = sign * f, 0.5 - 0.5j * sign
+        integral = torch.complex(integral.real, sign * integral.imag)
+    outside = torch.sign(u) * (half * chirp + torch.complex(-g, f) * end)
+    return torch.where(large, outside, chirp * integral)

@@ -118,8 +118,8 @@ class ThesisOpenCV:
         """Line through the pixels [H, W] left by the erosion, except those far from the line, and their box."""
         nonzero = cv2.findNonZero(solid)
         points = np.asarray([] if nonzero is None else nonzero, dtype=np.int32).reshape(-1, 2)
-        numbers, size = bands[points[:, 1], points[:, 0]], (solid.shape[1], solid.shape[0])
-        return stages.fit_axis(points, numbers, len(self._positions) - 1, size, _line)
+        size = solid.shape[1], solid.shape[0]
+        return stages.fit_axis(points, lambda own: bands[own[:, 1], own[:, 0]], len(self._positions) - 1, size, _line)
 
     def _pose(self, edges: Endpoints) -> Pose:
         """Mean of the closed-form poses of each pair of neighbouring bands whose three endpoints were found."""

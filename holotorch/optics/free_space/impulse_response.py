@@ -60,11 +60,13 @@ def remainder_kernel(fy: Tensor, fx: Tensor, wavelength: Tensor, distance: Tenso
     :func:`tilted_turns` is the counterpart for a tilted carrier.
     """
     sine2 = (wavelength * fy).square() + (wavelength * fx).square()
-    cosine, imaginary = direction_cosine(sine2)
-    cycles = -distance / wavelength * torch.where(sine2 < 1, (sine2 / (1 + cosine)).square() / 2, 1 - sine2 / 2)
+    travels = sine2 < 1
+    cosine = torch.where(travels, torch.sqrt(torch.where(travels, 1 - sine2, 1)), 0)
+    cycles = -distance / wavelength * torch.where(travels, (sine2 / (1 + cosine)).square() / 2, 1 - sine2 / 2)
     phase = turns_phasor(cycles)
-    if not bool(imaginary.any()):
+    if not bool((sine2 > 1).any()):
         return phase
+    _, imaginary = direction_cosine(sine2)
     return phase * torch.exp(-2 * math.pi * distance.abs() / wavelength * imaginary)
 
 

@@ -125,13 +125,13 @@ def need_frames(frames: Tensor) -> None:
 
 
 def fit_axis(
-    points: Any, numbers: Any, bands: int, size: tuple[int, int], line: Callable[[Any], Axis]
+    points: Any, number: Callable[[Any], Any], bands: int, size: tuple[int, int], line: Callable[[Any], Axis]
 ) -> tuple[Axis, Box]:
     """Fit a line to the pixels that the erosion left, without outliers.
 
     Args:
         points: Pixels (x, y), an array or tensor [n, 2].
-        numbers: Number of each pixel's band, from 1, an array or tensor [n].
+        number: Function that gives the numbers [n] of the bands of pixels [n, 2], from 1.
         bands: Number of bands of the catheter.
         size: Width and height of the frame in pixels.
         line: Function that fits a line to points, with the least sum of squared distances.
@@ -145,24 +145,23 @@ def fit_axis(
     if len(points) < LEAST_PIXELS:
         reason = f"{len(points)} pixels have a band's colour after the erosion, not {LEAST_PIXELS}"
         raise Refusal(Status.NO_CATHETER, reason)
-    axis, near, kept = line(points), numbers > 0, points
+    axis, near, kept = line(points), None, points
     for _ in range(AXIS_ROUNDS):
         distances = abs(axis.across(points[:, 0], points[:, 1]))
-        closer = distances <= max(AXIS_DISTANCE_PX, 2 * _rms(distances[near]))
-        settled = bool((closer == near).all())
+        closer = distances <= max(AXIS_DISTANCE_PX, 2 * _rms(distances if near is None else distances[near]))
+        settled = bool((closer if near is None else closer == near).all())
         near, kept = closer, points[closer]
         if settled or len(kept) < LEAST_PIXELS:
             break
         axis = line(kept)
-    x, y, numbers = kept[:, 0], kept[:, 1], numbers[near]
+    x, y = kept[:, 0], kept[:, 1]
     rms = _rms(axis.across(x, y))
     if len(kept) < max(LEAST_PIXELS, AXIS_SHARE * len(points)) or not rms <= AXIS_RMS_PX:
         counted = f"{len(kept)} of {len(points)} near the axis, {rms:.1f} px rms"
         raise Refusal(Status.NO_AXIS, f"the pixels of the bands' colours are no line: {counted}")
-    of_bands = [axis.along(x, y)[numbers == number] for number in range(1, bands + 1)]
-    extents = [
-        (float(along.min()), float(along.max())) if len(along) >= LEAST_PIXELS // 5 else None for along in of_bands
-    ]
+    along, numbers = axis.along(x, y), number(kept)
+    of_bands = [along[numbers == i] for i in range(1, bands + 1)]
+    extents = [(float(own.min()), float(own.max())) if len(own) >= LEAST_PIXELS // 5 else None for own in of_bands]
     _need_order(extents)
     left, top = (max(int(values.min()) - MARGIN_PX, 0) for values in (x, y))
     right, bottom = (min(int(values.max()) + MARGIN_PX + 1, side) for values, side in zip((x, y), size, strict=True))

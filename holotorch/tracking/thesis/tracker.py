@@ -133,7 +133,12 @@ class ThesisTracker:
         """Line through the pixels [H, W] left by the erosion, except those far from the line, and their box."""
         rows, columns = torch.nonzero(solid, as_tuple=True)
         points, size = torch.stack([columns, rows], -1).to(torch.float64), (solid.shape[1], solid.shape[0])
-        return stages.fit_axis(points, bands[rows, columns], len(self._windows.hues), size, _line)
+
+        def number(own: Tensor) -> Tensor:
+            columns, rows = own.long().unbind(-1)
+            return bands[rows, columns]
+
+        return stages.fit_axis(points, number, len(self._windows.hues), size, _line)
 
     def _gradient(self, image: Tensor, axes: dict[int, tuple[Axis, Box]]) -> tuple[Tensor, list[tuple[int, int]]]:
         """Largest gradient of the three colours along each axis within its box, and the corners of the crops.
