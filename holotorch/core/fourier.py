@@ -55,7 +55,7 @@ def good_length(minimum: int, *, odd: bool = False) -> int:
     if minimum < 1:
         raise ValueError(f"an FFT length must be at least 1, got {minimum}")
     if not odd:
-        return next_fast_len(minimum, real=True)
+        return next_fast_len(minimum, real=True)  # type: ignore[return-value]  # its stub has no return
     length = minimum | 1
     while pow(3 * 5 * 7, 40, length):  # the remainder is 0 only if ``length`` has no other prime factors
         length += 2
