@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 import torch
 
 Result = TypeVar("Result")
-ROUNDS = 5
 
 
 def timed(call: Callable[[], Result]) -> tuple[Result, float]:
@@ -20,7 +19,7 @@ def timed(call: Callable[[], Result]) -> tuple[Result, float]:
     return result, time.perf_counter() - started
 
 
-def interleaved(calls: dict[str, Callable[[], Any]], rounds: int = ROUNDS) -> dict[str, float]:
+def interleaved(calls: dict[str, Callable[[], Any]], rounds: int = 5) -> dict[str, float]:
     """Median seconds of each call over ``rounds`` of one call each, after one round of warming up."""
     times: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(rounds + 1):

@@ -73,7 +73,10 @@ def load_volume(
         if len(shape) != 3:
             raise ValueError(f"shape must be three sizes (D, H, W), got {shape}")
     scan = _read(existing(file), member, shape, dtype)
-    _check_expected(file, scan.values, shape, dtype)
+    if shape is not None and shape != scan.values.shape:
+        raise ValueError(f"{file} holds {scan.values.shape} voxels (D, H, W), but shape={shape} was asked for")
+    if dtype is not None and number_type(dtype).newbyteorder("=") != scan.values.dtype.newbyteorder("="):
+        raise ValueError(f"{file} holds {scan.values.dtype.name}, but dtype={dtype!r} was asked for")
     if spacing is None:
         return _as_stated(file, scan, unit)
     steps = (spacing,) * 3 if isinstance(spacing, int | float | np.number) else tuple(spacing)
@@ -122,13 +125,6 @@ def _read(file: Path, member: str | None, shape: Sequence[int] | None, dtype: DT
     known += ", and folders of DICOM files or numbered pictures"
     hint = "Pass shape=(D, H, W) and dtype= if it is raw under another name"
     raise ValueError(f"{file} has no known extension; known are {known}. {hint}")
-
-
-def _check_expected(file: Path, values: np.ndarray, shape: Sequence[int] | None, dtype: DTypeLike | None) -> None:
-    if shape is not None and shape != values.shape:
-        raise ValueError(f"{file} holds {values.shape} voxels (D, H, W), but shape={shape} was asked for")
-    if dtype is not None and number_type(dtype).newbyteorder("=") != values.dtype.newbyteorder("="):
-        raise ValueError(f"{file} holds {values.dtype.name}, but dtype={dtype!r} was asked for")
 
 
 def _tensor(values: np.ndarray, file: Path) -> torch.Tensor:

@@ -18,8 +18,7 @@ def channel_maps(values: Tensor, names: Sequence[str], label: str, colormap: str
         axes = figure.add_subplot(1, len(names), i + 1)
         drawn = axes.imshow(panel, cmap=colormap, vmin=limits[0], vmax=limits[1], interpolation="nearest")
         axes.set_title(name, fontsize=10)
-        axes.set_xticks([])
-        axes.set_yticks([])
+        axes.set(xticks=[], yticks=[])
         figure.colorbar(drawn, ax=axes, label=label, shrink=0.85)
     return figure_png(figure)
 
@@ -37,8 +36,7 @@ def visual_field(values: Tensor, eccentricity: Tensor, field_deg: float, rings: 
         style = {"colors": "white", "linewidths": 1, "linestyles": ":"}
         lines = axes.contour(x * columns, -y * rows, eccentricity.numpy(), inside, **style)
         axes.clabel(lines, fmt=lambda ring: f"{ring:g} deg", fontsize=8)
-    axes.set_xlabel("right of the middle (deg)")
-    axes.set_ylabel("above the middle (deg)")
+    axes.set(xlabel="right of the middle (deg)", ylabel="above the middle (deg)")
     axes.set_title("Dotted: eccentricities between which the report's zones lie", fontsize=9)
     figure.colorbar(drawn, ax=axes, label=label, shrink=0.85)
     return figure_png(figure)
@@ -46,7 +44,10 @@ def visual_field(values: Tensor, eccentricity: Tensor, field_deg: float, rings: 
 
 def comparison(images: Sequence[Tensor], captions: Sequence[str]) -> bytes:
     """PNG of pictures [C, H, W] in [0, 1] side by side with captions; a score in a caption gets its own line."""
-    titles = [_title(caption) for caption in captions]
+    titles = []
+    for caption in captions:
+        description, _, score = caption.partition(", SSIM ")
+        titles.append(textwrap.fill(description, 38) + (f"\nSSIM {score}" if score else ""))
     wide, gap, top = 3.1, 0.1, 0.14 + 0.18 * max(title.count("\n") + 1 for title in titles)  # inches
     tall = wide * images[0].shape[-2] / images[0].shape[-1]
     size = (wide + gap) * len(images) + gap, tall + gap + top
@@ -59,11 +60,6 @@ def comparison(images: Sequence[Tensor], captions: Sequence[str]) -> bytes:
         axes.set_title(title, fontsize=10)
         axes.set_axis_off()
     return figure_png(figure)
-
-
-def _title(caption: str) -> str:
-    what, _, score = caption.partition(", SSIM ")
-    return textwrap.fill(what, 38) + (f"\nSSIM {score}" if score else "")
 
 
 def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[int, float]], metric: str) -> bytes:
@@ -81,8 +77,7 @@ def convergence(losses: Tensor, names: Sequence[str], checked: Sequence[tuple[in
         axes.axvline(stage - 0.5, color="0.4", linewidth=1, linestyle=":")
         words = "the error of the amplitude; from there on that of the intensity, and what a limit adds"
         axes.set_title(f"The loss up to step {stage - 1} (dotted) is {words}", fontsize=8)
-    axes.set_xlabel("step")
-    axes.set_ylabel("loss / loss at the start")
+    axes.set(xlabel="step", ylabel="loss / loss at the start")
     axes.grid(alpha=0.3)
     if checked:
         right = axes.twinx()
@@ -124,8 +119,7 @@ def curves(rows: Sequence[dict[str, Any]], title: str) -> bytes:
         step = max(1, len(positions) // 12)
         words = [f"{setting}\n{sigma:g} px" if setting else f"{sigma:g} px" for setting, sigma in positions]
         axes.set_xticks(range(0, len(positions), step), words[::step], fontsize=7, rotation=30 if step > 1 else 0)
-        axes.set_ylim(0, 1.02)
-        axes.set_ylabel("mean SSIM")
+        axes.set(ylim=(0, 1.02), ylabel="mean SSIM")
         axes.set_title(f"{title}, {kind}", fontsize=9)
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)

@@ -257,25 +257,22 @@ def _verdict(rows: list[dict], scaling: list[dict]) -> list[str]:
 
 def _draw(rows: list[dict], scaling: list[dict]) -> bytes:
     figure = Figure(figsize=(15, 7.5), layout="constrained")
-    axes = figure.add_subplot(2, 2, 1)
+    axes, *others = figure.subplots(2, 2).flat
     for k, method in enumerate(dict.fromkeys(row["method"] for row in rows)):
         selected = [row for row in rows if row["method"] == method and row["colours"] == 3 and row["error"]]
         if selected:
             points = [float(row["seconds"]) for row in selected], [float(row["error"]) for row in selected]
             axes.loglog(*points, "os^vD"[k], label=method, color=f"C{k}")
-    axes.set_xlabel(f"seconds, three colours at {SMALL} px")
-    axes.set_ylabel("relative L2 error")
-    axes.legend(fontsize=8)
-    series = ("planes", "planes"), ("pixels", "side"), ("distance", "distance_mm")
-    for position, (against, key) in enumerate(series, 2):
-        axes = figure.add_subplot(2, 2, position)
+    axes.set(xlabel=f"seconds, three colours at {SMALL} px", ylabel="relative L2 error")
+    keys = {"planes": "planes", "pixels": "side", "distance": "distance_mm"}
+    labels = ("planes", "pixels a side", "distance (mm)")
+    for axes, (against, key), label in zip(others, keys.items(), labels, strict=True):
         selected = [row for row in scaling if row["against"] == against]
         values = [float(row[key]) for row in selected]
         axes.loglog(values, [float(row["thesis_seconds"]) for row in selected], "o-", label=BASE)
         axes.loglog(values, [float(row["seconds"]) for row in selected], "^-", label="axial nodes, 3e-3")
-        axes.set_xlabel({"side": "pixels a side", "distance_mm": "distance (mm)"}.get(key, key))
-        axes.set_ylabel("seconds a colour")
-        axes.legend(fontsize=8)
+        axes.set(xlabel=label, ylabel="seconds a colour")
     for axes in figure.axes:
+        axes.legend(fontsize=8)
         axes.grid(alpha=0.3, which="both")
     return figure_png(figure)
