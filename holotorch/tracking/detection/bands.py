@@ -215,11 +215,13 @@ def _judged(
         before, after = (cut - mixed - side, cut - mixed), (cut + mixed, cut + mixed + side)
         if i > 0:
             was = sums[bands[i - 1]]
-            if mean(was, *before) <= _RIGHT or mean(was, *after) >= (_RIGHT if i < last else 1 - _RIGHT):
+            rest = was if i < last else own[bands[i - 1]]
+            if mean(was, *before) <= _RIGHT or mean(rest, *after) >= (_RIGHT if i < last else 1 - _RIGHT):
                 return False
         if i < last:
             then = sums[bands[i]]
-            if mean(then, *after) <= _RIGHT or mean(then, *before) >= (_RIGHT if i else 1 - _RIGHT):
+            rest = then if i else own[bands[0]]
+            if mean(then, *after) <= _RIGHT or mean(rest, *before) >= (_RIGHT if i else 1 - _RIGHT):
                 return False
         # Beyond an outer edge lies the bare tube: neither the band's colour nor that of any other band.
         if i == 0:

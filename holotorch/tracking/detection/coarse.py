@@ -17,6 +17,9 @@ from holotorch.tracking.pose.status import Refusal, Status
 
 _STEP = 2  # distance of coarse pixels, in pixels
 _TILE = 12  # side of a tile in coarse pixels
+_AWAY = 14  # distance from a pixel to its surroundings, in coarse pixels; over half the width of the widest tube
+_PATCH = 5  # side of the square whose median is the colour of the surroundings, in coarse pixels
+_ALIKE = 14  # largest difference of equal colours in each channel, in levels; several times the noise
 _DENSE = 0.35  # fraction of a colour in a tile and its neighbours above which the object is not thin
 _FEWEST = 6  # least number of coarse pixels of a part
 _TILES = 40  # largest number of parts of each colour that are used
@@ -38,13 +41,18 @@ class Segment:
     end: complex
 
 
-def find_segments(frame: Tensor, table: ColourTable) -> list[Segment]:
+def find_segments(frame: Tensor, table: ColourTable, *, thin: bool = False) -> list[Segment]:
     """Up to three lines with at least two bands on a frame uint8 [3, H, W], the best one first.
+
+    ``thin`` leaves out all pixels that do not differ from their surroundings on two opposite sides. Cloth and skin may
+    have the hue of a band over much of the frame, and then hide the bands' labels among their own.
 
     Raises:
         Refusal: NO_CATHETER where nothing thin has a band's colour, BANDS_MISSING where no line has two bands in a row.
     """
     labels = _labels(frame, table)
+    if thin:
+        labels = cv2.bitwise_and(labels, _thin(frame))
     tiles = _tiles(labels, len(table.colours))
     if tiles is None:
         raise Refusal(Status.NO_CATHETER, "nothing thin in the bands' colours")
@@ -66,6 +74,26 @@ def _labels(frame: Tensor, table: ColourTable) -> np.ndarray:
         # The lower 16 bits of two pixels are the first pixel. This cast is four times as fast as a strided copy.
         return cv2.LUT(packed.view("<u4").astype(np.uint16), table.table)
     return cv2.LUT(np.ascontiguousarray(packed[:, ::aside]), table.table)
+
+
+def _thin(frame: Tensor) -> np.ndarray:
+    """Mask uint8 [h, w], 0 or 255, of the coarse pixels that differ from the surroundings on two opposite sides."""
+    planes = np.ascontiguousarray(frame[:, ::_STEP, ::_STEP].cpu().numpy())
+    height, width = planes.shape[1:]
+    border = (_AWAY, _AWAY, _AWAY, _AWAY)
+    medians = [cv2.copyMakeBorder(cv2.medianBlur(p, _PATCH), *border, cv2.BORDER_REPLICATE) for p in planes]
+
+    def differs(down: int, right: int) -> np.ndarray:
+        top, left = _AWAY * (1 + down), _AWAY * (1 + right)
+        parts = [median[top : top + height, left : left + width] for median in medians]
+        red, green, blue = (cv2.absdiff(plane, part) for plane, part in zip(planes, parts, strict=True))
+        return cv2.max(cv2.max(red, green), blue)
+
+    thin = np.zeros((height, width), np.uint8)
+    # Two directions would do for a lone tube. With four, an object beside it hides it less often.
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        thin = cv2.max(thin, cv2.min(differs(down, right), differs(-down, -right)))
+    return cv2.threshold(thin, _ALIKE, 255, cv2.THRESH_BINARY)[1]
 
 
 @dataclass(frozen=True, eq=False)

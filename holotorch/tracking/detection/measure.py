@@ -27,7 +27,8 @@ class StripSearch:
     columns: int = 40  # least number of columns in half of the strip that are classified; 2 to 6 pixels apart
     columns_cold: int = 280  # the same number without a previous pose
     similar: float = 0.2  # largest difference of equal colours, as a fraction of the brightest channel
-    pale: float = 0.5  # purity of a colour over that of the background below which cloth is visible through the tube
+    same_hue: float = math.cos(math.radians(12))  # least cosine between the chromas of two colours of the same hue
+    pale: float = 1.05  # largest chroma of a clear tube over that of the background beside it
     beside: float = 14.0  # distance from the axis at which the background is read, in pixels; beside the widest tubes
     halfway: int = 6  # samples on either side of a change of labels
     halfway_ends: int = 3  # outermost samples on either side that surely show one colour
@@ -129,9 +130,13 @@ def find_bands(
     gap = np.abs(shown[..., 1:] - shown[..., :1]).max(0)
     alike = near[:, 3:] == near[:, 1:2]
     drape = alike[:, 0] & alike[:, 1] & (np.maximum(gap[:, 0], gap[:, 1]) < _SEARCH.similar * most[:, 0])
-    # A transparent tube on cloth has the hue of the cloth, but is paler than any band.
-    pure = 1 - shown.min(0) / np.maximum(most, 1.0)
-    through = alike[:, 0] & alike[:, 1] & (pure[:, 0] < _SEARCH.pale * np.minimum(pure[:, 1], pure[:, 2]))
+    # A transparent tube has the hue of what is behind it, and no more chroma.
+    light = sampler.light[levels[:, [1, 3, 4]]]
+    chroma = light - light.mean(-1, keepdims=True)
+    size = np.sqrt((chroma * chroma).sum(-1))
+    like = (chroma[:, 1:] * chroma[:, :1]).sum(-1) > _SEARCH.same_hue * size[:, 1:] * size[:, :1]
+    through = ~drape & (near[:, 1] > 0) & (alike & like & (size[:, :1] < _SEARCH.pale * size[:, 1:])).all(-1)
+    drape |= through
     stretches = find_stretches(near[:, :3], drape, through, table, float(end), onward=onward)
     if stretches is None:
         why = "no stretch of line shows the bands in their order, or it shows them both ways"

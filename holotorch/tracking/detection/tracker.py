@@ -172,8 +172,20 @@ class CatheterTracker:
             return Pose.refused(refusal.status, refusal.reason)
 
     def _search_frame(self, sampler: Sampler) -> Pose:
+        """Pose from the whole frame: by the colours alone, and if these show no bands, by thin objects alone."""
+        try:
+            return self._search_lines(sampler, thin=False)
+        except Refusal as refusal:
+            if refusal.status > Status.EDGES_UNCLEAR:  # bands were measured
+                raise
+            try:
+                return self._search_lines(sampler, thin=True)
+            except Refusal as other:
+                raise max(refusal, other, key=lambda one: one.status) from None
+
+    def _search_lines(self, sampler: Sampler, *, thin: bool) -> Pose:
         with self._timed("colour"):
-            segments = find_segments(sampler.frame, self.table)
+            segments = find_segments(sampler.frame, self.table, thin=thin)
         furthest = Status.OK, ""
         planes = self.lens.undistort(np.array([(segment.start, segment.end) for segment in segments]).ravel())
         for segment, (start, end) in zip(segments, planes.reshape(-1, 2).tolist(), strict=True):

@@ -177,3 +177,23 @@ def test_tiles_are_those_of_a_count_one_by_one(size):
         assert n == count[y, x, label]
         if values[1] > 1.01 * values[0]:
             assert abs(way.real * vector[0] + way.imag * vector[1]) == pytest.approx(1, abs=1e-6)
+
+
+def test_thin_objects_are_found_on_cloth_of_a_bands_hue():
+    """Cloth in the hues of two bands hides them among its own labels; thin objects alone show all three."""
+    cloth = np.zeros((*SIZE, 3))
+    cloth[:, :320], cloth[:, 320:] = (150, 60, 60), (60, 80, 150)
+    frame = drawn((320, 180), 0.35, ground=cloth, noise=2.5)
+    assert refused(frame) in (Status.BANDS_MISSING, Status.NO_CATHETER)
+    assert (
+        missed(find_segments(frame, TABLE, thin=True)[0], (320, 180), 0.35) < 8
+    )  # half of what the next step searches
+
+
+def test_wide_patches_are_not_thin_and_lines_are():
+    frame = torch.full((3, 200, 200), 120, dtype=torch.uint8)
+    frame[:, 20:150, 20:110] = 30  # a sheet, with borders
+    frame[:, :, 160:166] = 220
+    thin = coarse._thin(frame)
+    assert thin.shape == (100, 100) and bool(thin[20:70, 80:83].all())
+    assert not thin[26:58, :60].any()  # far from the corners of the sheet

@@ -124,9 +124,9 @@ EMPTY = [Segment(60 + 60j, 300 + 80j), Segment(700 + 480j, 900 + 500j)]
 def test_lines_without_bands_do_not_use_up_those_that_are_measured(monkeypatch):
     case, frame = scenes()["plain"]
     there = segment_of(truth(case))
-    monkeypatch.setattr(tracker_module, "find_segments", lambda frame, table: [*EMPTY, there])
+    monkeypatch.setattr(tracker_module, "find_segments", lambda *_, **__: [*EMPTY, there])
     right(TRACKER(frame[None])[0], case)
-    monkeypatch.setattr(tracker_module, "find_segments", lambda frame, table: EMPTY)
+    monkeypatch.setattr(tracker_module, "find_segments", lambda *_, **__: EMPTY)
     refused(TRACKER(frame[None])[0], Status.NO_AXIS, Status.BANDS_MISSING)
 
 
@@ -134,9 +134,9 @@ def test_the_work_for_a_frame_is_bounded(monkeypatch):
     """Of lines that show bands one is measured, and the refusal is its own."""
     frame = WORLD.case("shorter", at(), shown=SHORTER).frame()
     there, looked = segment_of(at()), []
-    monkeypatch.setattr(tracker_module, "find_segments", lambda frame, table: [there, EMPTY[0], there, there, there])
+    monkeypatch.setattr(tracker_module, "find_segments", lambda *_, **__: [there, EMPTY[0], there, there, there])
     monkeypatch.setattr(tracker_module, "halfway", lambda *given: looked.append(1) or given[-1])
     refused(TRACKER(frame[None])[0], Status.INCONSISTENT)
     assert len(looked) == 1
-    monkeypatch.setattr(tracker_module, "find_segments", lambda frame, table: [there, *EMPTY])
+    monkeypatch.setattr(tracker_module, "find_segments", lambda *_, **__: [there, *EMPTY])
     refused(TRACKER(frame[None])[0], Status.INCONSISTENT)
