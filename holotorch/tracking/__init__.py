@@ -3,6 +3,7 @@
 from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.camera.tone import tone_curve
 from holotorch.tracking.detection.channels import ChannelOrder, ambiguities
+from holotorch.tracking.detection.photometric import PhotometricFit
 from holotorch.tracking.detection.tracker import CatheterTracker
 from holotorch.tracking.pose.alignment import headset_from_camera
 from holotorch.tracking.pose.band_edges import fit_band_edges
@@ -20,6 +21,7 @@ __all__ = [
     "CatheterTracker",
     "ChannelOrder",
     "OneEuro",
+    "PhotometricFit",
     "Pose",
     "PoseReceiver",
     "PoseSender",

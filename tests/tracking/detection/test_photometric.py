@@ -1,0 +1,132 @@
+"""The photometric fit on both synthetic renderers, and its derivatives."""
+
+import math
+
+import pytest
+import torch
+
+from holotorch.tracking import Camera
+from holotorch.tracking.detection import photometric
+from holotorch.tracking.detection.photometric import FitPlan, PhotometricFit
+from holotorch.tracking.pose.catheter import THESIS
+from holotorch.tracking.simulation.render import Look
+from holotorch.tracking.simulation.world import World
+
+SMALL = World(size=(540, 960))
+SIMPLE = Look(noise_dn=0.5, ambient=1.0, highlight=0.0)
+
+
+def shot(world: World, name: str, look: Look | None = None, depth: float = 0.3, tilt: float = 20.0):
+    """Frame [1, 3, H, W], tip and direction [1, 3] of a catheter on a plain table."""
+    pose = world.pose(depth, math.radians(tilt))
+    grey = torch.full((3, *world.size), 120, dtype=torch.uint8)
+    one = World(world.size, world.camera, look=look) if look else world
+    return one.case(name, pose, lambda: grey).frame()[None], pose[0][None], pose[1][None]
+
+
+def nudged(tip: torch.Tensor, metres: float = 3e-4) -> torch.Tensor:
+    return tip + metres * torch.randn(tip.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+
+def test_it_finds_the_pose_of_a_quiet_frame_from_a_rough_one():
+    frame, tip, direction = shot(SMALL, "quiet", SIMPLE)
+    found = PhotometricFit(SMALL.camera, THESIS)(frame, nudged(tip), direction)
+    assert float((found.tip - tip).norm()) < 2e-5 < float((nudged(tip) - tip).norm())
+    assert float((found.direction - direction).norm()) < 2e-4
+    assert abs(float(found.blur) - SIMPLE.blur_px) < 0.05
+    assert bool(found.used.all()) and float((found.shift / found.shift_sd).abs().max()) < 3
+
+
+def test_light_from_one_side_and_gloss_do_not_move_the_pose():
+    look = Look(noise_dn=0.5, light=(-0.9, -0.3, -0.4), ambient=0.2, highlight=0.5)
+    frame, tip, direction = shot(SMALL, "side", look)
+    found = PhotometricFit(SMALL.camera, THESIS)(frame, nudged(tip), direction)
+    assert float((found.tip - tip).norm()) < 1e-4
+
+
+def test_its_covariance_says_how_far_it_is_off():
+    """Mean of 24 squared distances in units of the covariance: 3 for a Gaussian, with a standard error of 0.5."""
+    squares = []
+    fit = PhotometricFit(SMALL.camera, THESIS)
+    for i in range(24):
+        frame, tip, direction = shot(SMALL, f"noise {i}", Look(noise_dn=4.0), depth=0.28 + 0.003 * i)
+        found = fit(frame, nudged(tip), direction)
+        error = (found.tip - tip)[0]
+        squares.append(float(error @ torch.linalg.solve(found.covariance[0, :3, :3], error)))
+    assert 1.0 < sum(squares) / len(squares) < 5.0
+
+
+def test_a_batch_is_its_items_and_levels_may_be_shares():
+    shots = [shot(SMALL, name, depth=depth) for name, depth in (("one", 0.3), ("two", 0.34))]
+    frames, tips, directions = (torch.cat(parts) for parts in zip(*shots, strict=True))
+    fit = PhotometricFit(SMALL.camera, THESIS, plan=FitPlan(settled=1e-7, iterations=20))
+    both, shares = fit(frames, nudged(tips), directions), fit(frames.double() / 255, nudged(tips), directions)
+    for i in range(2):
+        alone = fit(frames[i : i + 1], nudged(tips)[i : i + 1], directions[i : i + 1])
+        assert torch.allclose(both.tip[i], alone.tip[0], atol=1e-9)
+    assert torch.allclose(both.tip, shares.tip, atol=1e-9)
+
+
+def test_windows_off_the_frame_are_not_used():
+    case = World().case("cut", World().pose(0.5, 0.3, 0.0, at=(0.62, 0.0)))
+    assert case.tip is not None and case.direction is not None
+    found = PhotometricFit(World().camera, THESIS)(case.frame()[None], case.tip[None], case.direction[None])
+    assert found.used[0].tolist().count(False) >= 1
+    assert bool(torch.isfinite(found.tip).all())
+
+
+def test_the_analytic_derivatives_are_those_of_the_geometry():
+    frame, tip, direction = shot(SMALL, "slopes", SIMPLE)
+    fit = PhotometricFit(SMALL.camera, THESIS)
+    windows = fit._windows(frame, fit._pixels(tip, direction), tip, direction)
+    start = photometric._frame(tip + 0.127 * direction, direction)
+    unknown = torch.tensor([[1e-4, -2e-4, 1e-3, 2e-3, -1e-3, -0.3]], dtype=torch.float64)
+    moved, rest = photometric._moved(start, unknown)
+
+    def values(change: torch.Tensor) -> torch.Tensor:
+        place = photometric._Geometry.of(moved, rest + change, windows, fit.radius)
+        return torch.stack([place.miss, place.along, place.slant, place.blur.log()], -1)[0, :, ::40]
+
+    wanted = torch.autograd.functional.jacobian(values, torch.zeros(1, 6, dtype=torch.float64))
+    given = photometric._Geometry.of(moved, rest, windows, fit.radius).derivatives[0, :, ::40]
+    assert isinstance(wanted, torch.Tensor)
+    # The blur's derivative leaves out that the distance changes along the line of sight: compare what it includes.
+    assert torch.allclose(given, wanted[..., 0, :], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("what", ["focal length", "edges", "pixels"])
+def test_the_pose_is_differentiable(what):
+    """By the implicit function theorem, against differences of whole fits."""
+    frame, tip, direction = shot(SMALL, "gradient", Look(noise_dn=1.0))
+    share, plan = frame.double() / 255, FitPlan(settled=1e-10, iterations=40)
+    way = torch.randn(share.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * 1e-3
+
+    def tip_of(amount: torch.Tensor) -> torch.Tensor:
+        camera, pixels = SMALL.camera, share
+        if what == "focal length":
+            matrix = camera.matrix * (1 + amount * torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 0]]))
+            camera = Camera(matrix, camera.distortion)
+        if what == "pixels":
+            pixels = share + amount * way
+        fit = PhotometricFit(camera, THESIS, plan=plan, learnable=True)
+        if what == "edges":
+            positions = THESIS.positions + amount * torch.tensor([0.0, 1e-3, 0, -1e-3], dtype=torch.float64)
+            return torch.func.functional_call(fit, {"positions": positions}, (pixels, tip, direction)).tip
+        return fit(pixels, tip, direction).tip
+
+    zero = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    weights = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    (given,) = torch.autograd.grad((tip_of(zero) * weights).sum(), zero)
+    step = 1e-4
+    with torch.no_grad():
+        ahead, behind = (float((tip_of(torch.tensor(s * step)) * weights).sum()) for s in (1, -1))
+    wanted = (ahead - behind) / (2 * step)
+    assert float(given) == pytest.approx(wanted, rel=2e-3, abs=1e-9)
+
+
+def test_edges_and_radius_are_parameters_on_request():
+    assert not list(PhotometricFit(SMALL.camera, THESIS).parameters())
+    assert {name for name, _ in PhotometricFit(SMALL.camera, THESIS, learnable=True).named_parameters()} == {
+        "positions",
+        "radius",
+    }
