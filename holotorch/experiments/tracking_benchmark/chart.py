@@ -11,7 +11,9 @@ from holotorch.experiments.tracking_benchmark import bench, methods
 from holotorch.experiments.tracking_benchmark.bench import STILL, TIP, Row, one
 from holotorch.experiments.tracking_benchmark.methods import BASE, COLD, FEWER, LITERAL, PRIOR, Answer
 from holotorch.experiments.tracking_benchmark.picture import draw
+from holotorch.experiments.tracking_benchmark.second_world import second_world, verdict
 from holotorch.experiments.tracking_benchmark.timing import spread, stages, timing
+from holotorch.tracking.simulation.varied import VariedWorld
 from holotorch.tracking.simulation.world import World
 
 
@@ -23,6 +25,8 @@ class Amount(NamedTuple):
     poses: int = 4  # poses of the occlusions
     negatives: int = 1000  # frames without a catheter
     rounds: int = 15  # repetitions of each measurement of time
+    varied: int = 480  # scenes of the second world with the catheter
+    lookalikes: int = 200  # scenes of the second world without it
     share: float = 1.0  # share of the grids, conditions, occlusions, and of the frames whose times are compared
 
 
@@ -60,6 +64,7 @@ def tracking(
     for kind, count in (("conditions", amount.seeds), ("occlusions", amount.poses)):
         tables[kind], answers[kind] = bench.scenes(world, three, count, kind, amount.share)
     tables["negatives"], answers["negatives"] = bench.empty(world, two, amount.negatives)
+    tables["second_world"] = second_world(VariedWorld(photographs=world.photographs), amount.varied, amount.lookalikes)
     # The frames of catheters at rest are left out of the sum: they repeat a few poses.
     answers[_ALL] = [each for kind in ("grids", "codecs", "conditions", "occlusions") for each in answers[kind]]
     tables["reliability"] = [
@@ -123,6 +128,7 @@ def _verdict(world: World, rows: list[Row], tables: dict[str, list[Row]]) -> lis
         grid = f"2D grid median {row['median_mm']} mm, p95 {row['p95_mm']} mm of {row['points']} tips"
         lines.append(f"light {row['light']}, {COLD}: S_RMS in mm {rest}; {grid}")
     lines += [line for name in (COLD, PRIOR) for line in _unanswerable(name, tables)]
+    lines += verdict(tables["second_world"])
     for row in tables["times"]:
         goal, milliseconds = {COLD: 0.5, PRIOR: 0.2}.get(row["method"], math.inf), row["milliseconds"]
         ratio = milliseconds / one(tables["times"], frame=row["frame"], method=LITERAL)["milliseconds"]

@@ -116,9 +116,9 @@ def before(case: Case, moved: tuple[float, float, float] = (2e-3, -1.5e-3, 3e-3)
     return Pose(tip, direction / direction.norm(), 1e-6 * torch.eye(6, dtype=torch.float64), zero, zero + 1, Status.OK)
 
 
-def answers(cases: Iterable[Case], trackers: dict[str, Method], label: str = "frames") -> Iterator[Answer]:
-    """Answers of all methods to all frames, with a progress bar; only one frame at a time is in memory."""
-    for case in tqdm(list(cases), desc=label, unit="frame", dynamic_ncols=True):
+def answers(cases: Iterable[Case], trackers: dict[str, Method], label: str | None = "frames") -> Iterator[Answer]:
+    """Answers of all methods to all frames, with a progress bar if it has a label; one frame at a time is in memory."""
+    for case in tqdm(list(cases), desc=label, unit="frame", dynamic_ncols=True, disable=label is None):
         frame = as_camera(case.frame())
         for name, track in trackers.items():
             yield Answer.of(name, case, *timed(partial(track, frame, case)))

@@ -22,6 +22,7 @@ from holotorch.tracking.detection.stations import StationPlan
 from holotorch.tracking.pose.pose import solve_pose
 from holotorch.tracking.pose.status import Pose, Status
 from holotorch.tracking.simulation.render import Look
+from holotorch.tracking.simulation.varied import VariedWorld
 from holotorch.tracking.simulation.world import World, aimed
 
 TILT = math.radians(20)
@@ -36,7 +37,7 @@ def small(**changes) -> World:
 
 def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(chart_tracking, "scene", lambda _: small())
-    monkeypatch.setattr(chart_tracking, "AMOUNT", Amount(2, 1, 1, 10, 1, 0.06))
+    monkeypatch.setattr(chart_tracking, "AMOUNT", Amount(2, 1, 1, 10, 1, varied=2, lookalikes=2, share=0.06))
     for module in (chart_tracking, tracking_bench, tracking_picture):
         monkeypatch.setattr(module, "STILL", {(520, 20): 0.2, (520, 5): None})
     monkeypatch.setattr(tracking_bench, "tip_bounds", lambda *_: Bounds(1e-9 * torch.eye(3), 2e-9 * torch.eye(3)))
@@ -51,6 +52,7 @@ def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
         "negatives",
         "occlusions",
         "reliability",
+        "second_world",
         "slowest",
         "stages",
         "still",
@@ -77,6 +79,14 @@ def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
         assert int(row["right"]) + int(row["wrong"]) + int(row["refused"]) == int(row["frames"])
     darker = [row for row in tables["lights"] if row["light"].endswith("of it")]
     assert len(tables["lights"]) == 5 and len(darker) == 2 and all(int(row["points"]) > 1 for row in darker)
+    second = {(row["condition"], row["method"]): row for row in tables["second_world"]}
+    assert {condition for condition, _ in second} == {
+        "all conditions",
+        "all without the catheter",
+        *(world.trial(1000 + i).condition for world in [VariedWorld()] for i in range(2)),
+        *(world.negative(1000 + i).condition for world in [VariedWorld()] for i in range(2)),
+    }
+    assert all(int(row["wrong"]) == 0 for row in second.values() if row["method"] != BASE)
     said = capsys.readouterr().out
     assert "mm (goal <= 0.2: " in said and "(dissertation, real camera: Acc 0.85)" in said
     text = (tmp_path / "verdict.txt").read_text().splitlines()
