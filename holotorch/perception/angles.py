@@ -54,7 +54,7 @@ def within(values: Tensor, low: float, high: float, tolerance: float = 0.0) -> T
 
 
 def require(valid: Tensor, rule: str, values: Tensor, cure: str = "") -> None:
-    """Raise ValueError with ``rule``, the first invalid value and ``cure`` as text, unless ``valid`` is true everywhere."""
+    """Raise ValueError unless all of ``valid`` is true. The message: ``rule``, the first invalid value, ``cure``."""
     if not valid.all():
         raise ValueError(f"{rule}, got {first(values, ~valid):g}{cure}")
 

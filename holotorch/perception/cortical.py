@@ -1,7 +1,7 @@
 """Size of content over eccentricity, from cortical magnification and from empirical laws.
 
-A law is a function of the eccentricity E in degrees, within 0 .. 180. Some laws return the size S in degrees. The others
-return 1 / M in deg/mm, and sizes are proportional to 1 / M. The cortical magnification M is the length of cortex per
+A law is a function of the eccentricity E in degrees, within 0 .. 180. Some laws return the size S in degrees; others
+return 1 / M in deg/mm, to which the size is proportional. The cortical magnification M is the length of cortex per
 degree of visual angle; M0 (``m0``, in mm/deg) is its value in the fovea.
 """
 
@@ -28,7 +28,7 @@ class _Law:
 
 @dataclass(frozen=True)
 class LinearMagnification(_Law):
-    """1 / M = (1 + E / E2) / M0, thesis Eqs. 2.1 and 2.2 with a = 1 / E2; at E = E2, 1 / M is twice its foveal value."""
+    """1 / M = (1 + E / E2) / M0, thesis Eqs. 2.1 and 2.2 with a = 1 / E2; at E2, 1 / M is twice its foveal value."""
 
     m0: float
     e2_deg: float
@@ -79,8 +79,8 @@ class TolhurstLing(_Law):
 class StrasburgerLetters(_Law):
     """S = 0.022 E + 0.25 / (log10 C + 2.07 - 0.0345 E), the size in degrees at which a letter is recognised.
 
-    ``contrast`` is the Michelson contrast C of the letter, above 10^-2.07 = 0.0085 and at most 1. The law is valid below
-    the eccentricity ``pole_deg``, at which its denominator is zero; this pole is at 60 deg for a contrast of 1.
+    ``contrast`` is the letter's Michelson contrast C, above 10^-2.07 = 0.0085 and at most 1. The law is valid below the
+    eccentricity ``pole_deg``, at which its denominator is zero; this pole is at 60 deg for a contrast of 1.
 
     Source: Strasburger et al. (2011), in thesis Sec. 2.2.1.
     """
@@ -144,8 +144,8 @@ def cortical_scale(eccentricity_deg: Any, law: Law, size_deg: float = 1.0) -> Te
 def peripheral_weight(eccentricity_deg: Any, law: Law, *, least: float = 0.0) -> Tensor:
     """Weights for the squared error of image samples, lower where the eye resolves less detail; their mean is 1.
 
-    To be equally visible at eccentricity E, a detail must be law(E) / law(0) times as wide as at the fixation point. The
-    eye therefore sees a fraction (law(0) / law(E))^2 of an error with a white spectrum, and this is the weight.
+    To be equally visible at eccentricity E, a detail must be law(E) / law(0) times as wide as at the fixation point.
+    The eye thus sees a fraction (law(0) / law(E))^2 of an error with a white 2-D spectrum; this fraction is the weight.
 
     Args:
         eccentricity_deg: Eccentricities of the samples, [..., H, W], e.g. from ``Display.eccentricity_map``.
