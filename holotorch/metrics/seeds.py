@@ -29,9 +29,9 @@ class SeedStatistics(NamedTuple):
 def seed_statistics(pictures: Tensor) -> SeedStatistics:
     """Statistics of ``pictures`` [S, ..., H, W] of one scene with S >= 2 independent seeds.
 
-    Averaging S pictures divides the variance of the speckle by S. This remaining variance is subtracted from the mean
-    square of the average, so that the expected ``contrast`` does not depend on S; see thesis Sec. 6.4.2. The contrast
-    of a black scene is 0. TypeError for pictures that are not real floating-point, ValueError for fewer than two seeds.
+    Averaging S pictures divides the variance of the speckle by S. The remaining variance is subtracted from the mean
+    square of the average, so that ``contrast`` does not depend on S except for noise (thesis Sec. 6.4.2). It is 0 for a
+    black scene. TypeError for pictures that are not real floating-point, ValueError for fewer than two seeds.
     """
     checks.real("pictures", pictures)
     if pictures.ndim < 3 or pictures.shape[0] < 2:
@@ -43,7 +43,7 @@ def seed_statistics(pictures: Tensor) -> SeedStatistics:
 
 
 def squared_blur(pictures: Tensor, references: Tensor) -> Tensor:
-    """Unbiased estimate [...] of the mean square difference between two speckle-free pictures (sharp and blurred).
+    """Unbiased estimate [...] of the mean square difference between two speckle-free pictures, as a measure of blur.
 
     The speckle that is expected to remain in the two means is subtracted from the mean square of their difference. The
     estimate can be negative. Raises TypeError and ValueError as :func:`seed_statistics`; ValueError for unequal shapes.

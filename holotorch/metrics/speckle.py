@@ -80,9 +80,9 @@ def grain_size(intensity: Tensor, *, level: float = 0.5) -> Tensor:
     """Size (y, x) of the speckle grains in samples, [..., 2] for [..., H, W]: full width of the autocorrelation.
 
     The width is measured where the autocorrelation of I - mean along an axis, normalised to 1 at lag 0, falls to
-    ``level``. The picture is zero-padded, and each lag is divided by its number of pixel pairs. Sinc interpolation
-    between whole lags resolves grains of only two samples. The width is infinite if the level is not reached within
-    a lag of half the picture. Divide the picture of a scene that is not uniform by its speckle-free mean first.
+    ``level``. The picture is zero-padded, and the autocorrelation at each lag is averaged over the pixel pairs there.
+    Sinc interpolation between whole lags resolves grains of two samples. The width is infinite if the level is not
+    reached at lags up to half the picture. First divide pictures of non-uniform scenes by their speckle-free mean.
 
     For ``level=0.5``, a square pupil of side D at distance z gives 0.8859 wavelength z / D, and a round pupil of
     diameter D gives 1.0290 wavelength z / D. ValueError unless 0 < level < 1, and for a picture without speckle.

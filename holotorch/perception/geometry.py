@@ -107,7 +107,7 @@ class Display:
 
 @dataclass(frozen=True)
 class _Screen(Display):
-    """A screen of ``size`` (height, width) along its surface. Its middle is at ``distance`` from the eye; in metres."""
+    """A screen of ``size`` (height, width) metres along its surface; its middle is ``distance`` metres from the eye."""
 
     size: tuple[float, float]
     distance: float
@@ -193,8 +193,8 @@ class FlatScreen(_Screen):
 class CurvedScreen(_Screen):
     """A screen on a vertical cylinder of ``radius`` metres, concave towards the eye; its middle is straight ahead.
 
-    ``size`` is (height, arc length) in metres. The eye may be off the axis of the cylinder, or outside the cylinder. In
-    that case, a ray intersects the cylinder twice, and the farther intersection is used.
+    ``size`` is (height, arc length) in metres. The eye may be off the axis of the cylinder. If the eye is outside the
+    cylinder, a ray intersects the cylinder twice, and the farther intersection is used.
     """
 
     radius: float
@@ -265,7 +265,7 @@ class Headset(Display):
     def pixels_per_degree(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
         """See :class:`Display`.
 
-        At eccentricity r in radians: ``resolution`` along the radius, ``resolution`` r / sin r perpendicular to it.
+        At r radians from the middle, it is ``resolution`` along the radius and ``resolution`` r / sin r across it.
         """
         y, x = self._middle(y_px, x_px)
         radius = _norm(y, x)

@@ -45,8 +45,8 @@ def scale_layout(
 
     Args:
         centres_deg: (elevation, azimuth) of each item's centre, [N, 2]; azimuths to the left are negative.
-        size_deg: (height, width) of each item, [N, 2]. The larger side becomes S(E); the patterns of the study were
-            square.
+        size_deg: (height, width) of each item, [N, 2]. The larger side becomes S(E); the patterns of the study were as
+            wide as high.
         scale: The line S(E), for example of a row of Table 2.2. The result is differentiable in its parameters.
         extrapolate: Also scale items beyond ``scale.high_deg``; otherwise these items keep their size.
 

@@ -11,7 +11,7 @@ from holotorch.perception import angles
 from holotorch.perception.table import TABLE_2_2
 from holotorch.perception.time import PerceptionTime
 
-TESTED_DEG = (5.0, 26.0)  # smallest and largest pattern that the study of thesis chapter 2 showed at 40 .. 70 deg
+TESTED_DEG = (5.0, 26.0)  # smallest and largest pattern that the study of thesis chapter 2 showed in the far periphery
 FITTED_DEG = (40.0, 70.0)  # eccentricities over which that study fitted its lines
 
 
@@ -123,7 +123,7 @@ class EqualEfficiencyScale:
         return sizes
 
     def inverse(self, size_deg: Any, *, extrapolate: bool = False) -> Tensor:
-        """The eccentricity E in degrees where S(E) = ``size_deg``. ValueError as for S(E), or if alpha is 0."""
+        """Eccentricity E in degrees where S(E) = ``size_deg``. ValueError if alpha is 0 or E is not allowed in S(E)."""
         if not torch.as_tensor(self.alpha).detach().any():
             raise ValueError("alpha is 0: the size is the same at every eccentricity, so that there is no inverse")
         sizes = angles.size(size_deg)
@@ -137,11 +137,11 @@ class EqualEfficiencyScale:
         return eccentricity.clamp(self.low_deg, self.high_deg)
 
     def inside(self, eccentricity_deg: Any) -> Tensor:
-        """Whether each eccentricity is within ``low_deg`` .. ``high_deg``, up to rounding errors; bool [...]."""
+        """Whether each eccentricity is within ``low_deg`` .. ``high_deg``, up to rounding errors; bool, same shape."""
         return self._covers(angles.eccentricity(eccentricity_deg))
 
     def tested(self, eccentricity_deg: Any) -> Tensor:
-        """Whether S(E) is within 5 .. 26 deg, the sizes tested in the study; bool [...]. E may be any eccentricity.
+        """Whether S(E) is within 5 .. 26 deg, the sizes tested in the study; bool. E may be any eccentricity.
 
         The lines of Table 2.2 range from 4.0 deg at E = 40 deg to 29.0 deg at E = 70 deg, so that some are not tested.
         """

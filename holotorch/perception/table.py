@@ -9,7 +9,7 @@ class EqualEfficiencyRow:
 
     ``size_deg`` and ``eccentricity_deg`` describe the target. ``alpha`` is in degrees of size per degree of
     eccentricity, ``beta`` in degrees. The ANOVA compares the sizes at four eccentricities, and treats those of one
-    participant as independent; ``freedom`` is its between-group degrees of freedom, ``f`` and ``p`` are its F and p.
+    participant as independent. ``freedom`` is its between-group degrees of freedom, ``f`` its F, ``p`` its p-value.
     """
 
     size_deg: float

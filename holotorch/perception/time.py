@@ -50,7 +50,7 @@ class PerceptionTime:
 
         Raises:
             TypeError: ``seen`` is not bool.
-            ValueError: A time is not above zero, the median time exceeds 30 s, or a set has fewer than two sizes.
+            ValueError: A time is not above zero, the median time exceeds 30 s, or a set has fewer than two seen sizes.
         """
         times = seconds if isinstance(seconds, Tensor) else torch.as_tensor(seconds, dtype=torch.float64)
         seen = torch.ones_like(times, dtype=torch.bool) if seen is None else seen

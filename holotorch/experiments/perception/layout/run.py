@@ -111,7 +111,7 @@ def _name(item: ItemSettings) -> str:
 
 
 def _flags(settings: LayoutSettings, layout: ScaledLayout) -> dict[str, Any]:
-    """Counts of icons by the origin of their size; indices of overlapping pairs and of icons cut by the field's edge."""
+    """Counts of icons by the origin of their size; indices of overlapping pairs and of icons cut by the edge."""
     centres, half_field = _centres(settings), torch.tensor(settings.field_deg, dtype=torch.float64) / 2
     cut = (centres.abs() + layout.size_deg / 2 > half_field + _ROUNDING_DEG).any(-1)
     return {
