@@ -45,13 +45,12 @@ def seed_statistics(pictures: Tensor) -> SeedStatistics:
 def squared_blur(pictures: Tensor, references: Tensor) -> Tensor:
     """Unbiased estimate [...] of the mean square difference between two speckle-free pictures, as a measure of blur.
 
-    The speckle that is expected to remain in the two means is subtracted from the mean square of their difference. The
-    estimate can be negative. Raises TypeError and ValueError as :func:`seed_statistics`; ValueError for unequal shapes.
+    The speckle expected to remain in the two means is subtracted from the mean square of their difference. The estimate
+    can be negative. Raises as :func:`seed_statistics`, and ValueError for unequal shapes [..., H, W].
 
     Args:
         pictures: Pictures with S >= 2 seeds, [S, ..., H, W].
-        references: Pictures with R >= 2 seeds, [R, ..., H, W]. Their seeds must differ from those of ``pictures``;
-            otherwise the speckle of the two means is correlated, and too much is subtracted.
+        references: Pictures with R >= 2 other seeds, [R, ..., H, W]; with shared seeds, too much is subtracted.
     """
     first, second = seed_statistics(pictures), seed_statistics(references)
     if pictures.shape[1:] != references.shape[1:]:
@@ -64,7 +63,8 @@ def squared_error(picture: Tensor, references: Tensor) -> Tensor:
     """Unbiased estimate [...] of the mean square error of a ``picture`` [..., H, W], due to both speckle and blur.
 
     The picture is compared with the mean of ``references`` [R, ..., H, W], which have R >= 2 other seeds. The speckle
-    expected to remain in this mean is subtracted. Raises as :func:`squared_blur`.
+    expected to remain in this mean is subtracted. ``references`` are checked as in :func:`seed_statistics`; ValueError
+    if the shape of ``picture`` differs.
     """
     reference = seed_statistics(references)
     if picture.shape != references.shape[1:]:

@@ -93,7 +93,7 @@ class PerceptionTime:
         return PerceptionTime(*(None if part is None else part[index] for part in parts))  # type: ignore[arg-type]
 
     def seconds(self, size_deg: Any) -> Tensor:
-        """T(S) in seconds for sizes that broadcast with the batch [...]. ValueError for a size that is not above 0."""
+        """T(S) in seconds for sizes that broadcast with the batch [...]. ValueError unless 0 < size <= 360."""
         return self.slope * angles.size(size_deg).to(self.slope.device).log() + self.intercept
 
     def size(self, seconds: Any) -> Tensor:
