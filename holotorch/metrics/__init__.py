@@ -1,4 +1,4 @@
-"""Image quality and speckle metrics."""
+"""Image quality and speckle metrics; float16 and bfloat16 images are converted to float32."""
 
 from holotorch.metrics.quality import SSIM_WINDOW, PerceptualSimilarity, psnr, ssim, ssim_map
 from holotorch.metrics.seeds import SeedStatistics, seed_statistics, squared_blur, squared_error

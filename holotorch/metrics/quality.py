@@ -6,34 +6,34 @@ from torch import Tensor, nn
 from holotorch.core import checks
 from holotorch.core.precision import at_least_single
 
-SSIM_WINDOW = 11  # pixels along each side of the window of ssim
+SSIM_WINDOW = 11  # side of the square window of ssim, in pixels
 
 
 def psnr(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
     """Peak signal-to-noise ratio in dB, [...] for images [..., H, W]; infinite for equal images.
 
-    The peak is ``data_range``; thesis Eq. 4.37 prints the maximum of the reference instead. Computed in float32 at
-    least. Raises TypeError and ValueError as :func:`ssim`, but has no minimum size.
+    The peak is ``data_range``, the difference between the largest and smallest possible value; thesis Eq. 4.37 uses the
+    maximum of the reference instead. TypeError and ValueError as in :func:`ssim`, except that any size is allowed.
     """
     image, reference = _checked_pair(image, reference, data_range)
     return 10 * torch.log10(data_range**2 / (image - reference).square().mean((-2, -1)))
 
 
 def ssim(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
-    """Structural similarity, mean over the image, [...] for images [..., H, W].
+    """Structural similarity (SSIM), averaged over the image: [...] for images [..., H, W].
 
-    The settings are those of Wang et al. (2004): 11 x 11 Gaussian window with sigma = 1.5 px, K = (0.01, 0.03), only
-    windows inside the image. The terms for luminance, contrast and structure are multiplied; thesis Eq. 4.39 prints a
-    sum, for which an image would score 3 against itself.
+    The settings are those of Wang et al. (2004): an 11 x 11 Gaussian window with sigma = 1.5 px, and the constants
+    K1 = 0.01 and K2 = 0.03. Only windows that lie inside the image count. SSIM is the product of a luminance term, a
+    contrast term and a structure term; thesis Eq. 4.39 prints their sum, which would be 3 for equal images.
 
     TypeError for images that are not real floating-point tensors; ValueError for unequal shapes, a side below 11 px, or
-    a range that is not positive.
+    a ``data_range`` that is not positive.
     """
     return ssim_map(image, reference, data_range=data_range).mean((-2, -1))
 
 
 def ssim_map(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
-    """Structural similarity of each window inside the image, [..., H - 10, W - 10]; :func:`ssim` is their mean."""
+    """Structural similarity in each 11 x 11 window inside the image, [..., H - 10, W - 10]; see :func:`ssim`."""
     from kornia.metrics import ssim as kornia_ssim
 
     image, reference = _checked_pair(image, reference, data_range)
@@ -41,7 +41,7 @@ def ssim_map(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
     if min(height, width) < SSIM_WINDOW:
         least = f"{SSIM_WINDOW} x {SSIM_WINDOW} px"
         raise ValueError(f"ssim needs images of at least {least}, got {height} x {width}; psnr has no such limit")
-    if not image.numel():  # an empty batch has empty scores
+    if not image.numel():  # an empty batch has an empty map
         return image[..., SSIM_WINDOW - 1 :, SSIM_WINDOW - 1 :]
     images, references = (tensor.reshape(-1, 1, height, width) for tensor in (image, reference))
     scores = kornia_ssim(images, references, SSIM_WINDOW, float(data_range), eps=0.0, padding="valid")
@@ -49,10 +49,10 @@ def ssim_map(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
 
 
 class PerceptualSimilarity(nn.Module):
-    """Similarity exp(-d) for the learned distance d (LPIPS) of two images, as in thesis Fig. 4.17; 1 for equal images.
+    """Similarity exp(-d), where d is the LPIPS distance between two images; 1 for equal images. See thesis Fig. 4.17.
 
-    Needs the extra ``lpips`` (otherwise ImportError) and AlexNet's published weights, which the first use downloads to
-    torch's cache (OSError if that fails).
+    The constructor needs the optional dependency ``lpips`` (ImportError without it). It loads AlexNet's weights, which
+    are downloaded to torch's cache if they are not there (OSError if the download fails).
 
     Source: Zhang et al. (2018).
     """
@@ -69,7 +69,7 @@ class PerceptualSimilarity(nn.Module):
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
         """Similarity [...] of images [..., C, H, W] with values in 0..1.
 
-        C is 3 (red, green, blue) or 1 (grey); ValueError for another C and for unequal shapes.
+        C is 3 (RGB) or 1 (grey, repeated for R, G and B). ValueError for another C or for unequal shapes.
         """
         _checked_pair(image, reference, 1.0)
         if image.ndim < 3 or image.shape[-3] not in (1, 3):

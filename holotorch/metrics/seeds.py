@@ -1,4 +1,4 @@
-"""Statistics over pictures of a scene with several random phases, and errors with the residual speckle subtracted."""
+"""Statistics over pictures of one scene with different random phases, and image errors corrected for speckle."""
 
 from typing import NamedTuple
 
@@ -11,13 +11,13 @@ from holotorch.metrics.speckle import root_ratio
 
 
 class SeedStatistics(NamedTuple):
-    """Statistics over pictures of independent seeds.
+    """Statistics over pictures of one scene, each with the random phase of another seed.
 
     Attributes:
         mean: Mean over the seeds, an estimate of the speckle-free picture, [..., H, W].
         variance: Unbiased variance of each pixel over the seeds, [..., H, W].
-        contrast: Speckle contrast of a single picture, [...]: rms of the speckle over rms of the speckle-free picture.
-        noise: Expected mean square of the speckle left in ``mean``, [...].
+        contrast: Speckle contrast of a single picture, [...]: rms of the speckle / rms of the speckle-free picture.
+        noise: Expected mean square, over the pixels, of the speckle that remains in ``mean``, [...].
     """
 
     mean: Tensor
@@ -27,11 +27,11 @@ class SeedStatistics(NamedTuple):
 
 
 def seed_statistics(pictures: Tensor) -> SeedStatistics:
-    """Statistics of ``pictures`` [S, ..., H, W] of S >= 2 independent seeds.
+    """Statistics of ``pictures`` [S, ..., H, W] of one scene with S >= 2 independent seeds.
 
-    The mean of S pictures keeps 1 / S of their variance, which increases its mean square. That share is subtracted, so
-    that ``contrast`` does not depend on S (thesis Sec. 6.4.2). It is 0 for a black scene. Computed in float32 at least.
-    TypeError for pictures that are not real floating-point, ValueError for fewer than two seeds.
+    Averaging S pictures divides the variance of the speckle by S. The remaining variance is subtracted from the mean
+    square of the average, so that ``contrast`` does not depend on S except for noise (thesis Sec. 6.4.2). It is 0 for a
+    black scene. TypeError for pictures that are not real floating-point, ValueError for fewer than two seeds.
     """
     checks.real("pictures", pictures)
     if pictures.ndim < 3 or pictures.shape[0] < 2:
@@ -43,15 +43,14 @@ def seed_statistics(pictures: Tensor) -> SeedStatistics:
 
 
 def squared_blur(pictures: Tensor, references: Tensor) -> Tensor:
-    """Unbiased estimate of the mean square difference of two speckle-free scenes from a few seeds of each: [...].
+    """Unbiased estimate [...] of the mean square difference between two speckle-free pictures, as a measure of blur.
 
-    The expected noise of both means is subtracted from the mean square of their difference, which can give a negative
-    number for equal scenes.
+    The speckle expected to remain in the two means is subtracted from the mean square of their difference. The estimate
+    can be negative. Raises as :func:`seed_statistics`, and ValueError for unequal shapes [..., H, W].
 
     Args:
-        pictures: [S, ..., H, W] with S >= 2, such as those under a wide spectrum.
-        references: [R, ..., H, W] with R >= 2, of other seeds than ``pictures``: with shared seeds the noise of the
-            means is correlated, and too much is subtracted.
+        pictures: Pictures with S >= 2 seeds, [S, ..., H, W].
+        references: Pictures with R >= 2 other seeds, [R, ..., H, W]; with shared seeds, too much is subtracted.
     """
     first, second = seed_statistics(pictures), seed_statistics(references)
     if pictures.shape[1:] != references.shape[1:]:
@@ -61,10 +60,11 @@ def squared_blur(pictures: Tensor, references: Tensor) -> Tensor:
 
 
 def squared_error(picture: Tensor, references: Tensor) -> Tensor:
-    """Unbiased estimate of the mean square error of one ``picture`` [..., H, W] against the speckle-free scene: [...].
+    """Unbiased estimate [...] of the mean square error of a ``picture`` [..., H, W], due to both speckle and blur.
 
-    The scene is estimated by the mean of ``references`` [R, ..., H, W] of R >= 2 other seeds, and the expected noise of
-    that mean is subtracted. Both the speckle and the blur of the picture contribute to the error.
+    The picture is compared with the mean of ``references`` [R, ..., H, W], which have R >= 2 other seeds. The speckle
+    expected to remain in this mean is subtracted. ``references`` are checked as in :func:`seed_statistics`; ValueError
+    if the shape of ``picture`` differs.
     """
     reference = seed_statistics(references)
     if picture.shape != references.shape[1:]:

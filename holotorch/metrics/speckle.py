@@ -1,4 +1,4 @@
-"""Speckle of a single picture: contrast, power spectrum, grain size, anisotropy, sharpness, all in float32 at least."""
+"""Speckle contrast, power spectrum, grain size and anisotropy, and sharpness, each measured in a single picture."""
 
 import math
 from collections.abc import Sequence
@@ -11,32 +11,32 @@ from holotorch.core import checks
 from holotorch.core.fourier import fft2
 from holotorch.core.precision import at_least_single
 
-_BAND = (0.05, 0.25)  # cycles per sample, without the coarsest and finest detail of a picture
-_LAGS = 16  # lags per sample at which a correlation is evaluated
+_BAND = (0.05, 0.25)  # default band of sharpness in cycles per sample; excludes the coarsest and finest detail
+_LAGS = 16  # lags per sample at which grain_size evaluates the autocorrelation
 
 
 class Anisotropy(NamedTuple):
-    """Length / width ``ratio`` of the grains, at least 1; ``angle`` of the length, from x towards y, (-pi/2, pi/2]."""
+    """Length / width of the grains, >= 1, and angle of their long axis from x towards y, radians in (-pi/2, pi/2]."""
 
     ratio: Tensor
     angle: Tensor
 
 
 def speckle_contrast(intensity: Tensor, *, reference: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
-    """Standard deviation over mean, [...] for intensities [..., H, W]: 1 for fully developed speckle.
+    """Speckle contrast, [...] for intensities [..., H, W]: standard deviation / mean; 1 for fully developed speckle.
 
     Args:
-        intensity: Real, not negative.
-        reference: Speckle-free picture [..., H, W] for scenes that are not uniform. The contrast is then
-            rms(intensity - reference) / rms(reference); a uniform reference of the same mean gives the same number.
-        mask: Pixels to measure, bool [..., H, W]; all by default.
+        intensity: Real intensities, at least 0.
+        reference: Speckle-free picture [..., H, W], for scenes that are not uniform; the contrast is then
+            rms(intensity - reference) / rms(reference). By default, the mean of ``intensity`` at every pixel.
+        mask: Pixels to measure, bool [..., H, W]; by default all pixels.
 
     Returns:
-        Contrast; 0 for a black region. Differentiable; the gradient is 0 where there is no speckle.
+        Contrast, differentiable; 0 for a black region. The gradient is 0 at a contrast of 0.
 
     Raises:
-        TypeError: An intensity that is not real floating-point, or a mask that is not bool.
-        ValueError: Shapes that do not match, or an empty mask.
+        TypeError: The intensity is not real floating-point, or the mask is not bool.
+        ValueError: The shapes do not match, or the mask selects no pixel of an image.
 
     Source: Goodman, Speckle Phenomena in Optics, Sec. 3.2.
     """
@@ -63,10 +63,11 @@ def speckle_contrast(intensity: Tensor, *, reference: Tensor | None = None, mask
 def power_spectrum(intensity: Tensor) -> Tensor:
     """Contribution of each frequency to the squared contrast, [..., H, W] in FFT order; 0 at frequency 0.
 
-    |DFT(I - mean)|^2 / (H W mean)^2, which adds up to ``speckle_contrast(I)**2``. The DFT treats the picture as
-    periodic, so a step between opposite borders appears as a cross. The spectrum of a black picture is 0.
+    Defined as |DFT(I - m)|^2 / (H W m)^2 for the intensity I with mean m; its sum is ``speckle_contrast(I)**2``. The
+    DFT treats the picture as periodic: a difference between opposite edges adds a cross along the frequency axes. The
+    spectrum of a black picture is 0.
 
-    Source: Goodman, Speckle Phenomena in Optics, Sec. 4.3; Parseval's theorem.
+    Source: Goodman, Speckle Phenomena in Optics, Sec. 4.3.
     """
     intensity = _picture("intensity", intensity)
     mean = intensity.mean((-2, -1), keepdim=True)
@@ -76,16 +77,15 @@ def power_spectrum(intensity: Tensor) -> Tensor:
 
 
 def grain_size(intensity: Tensor, *, level: float = 0.5) -> Tensor:
-    """Full width (y, x) of the speckle's autocorrelation at ``level``, in samples: [..., 2] for [..., H, W].
+    """Size (y, x) of the speckle grains in samples, [..., 2] for [..., H, W]: full width of the autocorrelation.
 
-    The autocorrelation of I - mean along each axis, without wrap-around, is divided by the number of pairs of pixels
-    at each lag and by its value at lag 0. Band-limited interpolation between whole lags makes grains of two samples
-    measurable. The width is infinite where the autocorrelation does not fall to ``level`` within half the picture.
-    Divide pictures of scenes that are not uniform by their speckle-free mean first.
+    The width is measured where the autocorrelation of I - mean along an axis, normalised to 1 at lag 0, falls to
+    ``level``. The picture is zero-padded, and the autocorrelation at each lag is averaged over the pixel pairs there.
+    Sinc interpolation between whole lags resolves grains of two samples. The width is infinite if the level is not
+    reached at lags up to half the picture. First divide pictures of non-uniform scenes by their speckle-free mean.
 
-    At half height a square pupil of side D at distance z gives 0.8859 wavelength z / D, a round pupil of diameter D
-    1.0290 wavelength z / D; ``level=1/e`` gives the other usual width. ValueError for a level outside 0 to 1, and for a
-    picture without speckle.
+    For ``level=0.5``, a square pupil of side D at distance z gives 0.8859 wavelength z / D, and a round pupil of
+    diameter D gives 1.0290 wavelength z / D. ValueError unless 0 < level < 1, and for a picture without speckle.
 
     Source: Goodman, Speckle Phenomena in Optics, Sec. 4.4.
     """
@@ -101,11 +101,11 @@ def grain_size(intensity: Tensor, *, level: float = 0.5) -> Tensor:
 
 
 def anisotropy(intensity: Tensor) -> Anisotropy:
-    """Elongation of the grains in any direction, from second moments of the power spectrum of a Hann-windowed picture.
+    """Elongation of the speckle grains, from the second moments of the power spectrum of the Hann-windowed picture.
 
-    ``ratio`` and ``angle`` are [...] for intensities [..., H, W]. For an elliptical pupil the ratio is that of the
-    diameters, and the grains are long in the direction of the shorter diameter. At a ratio of 1 the angle has no
-    meaning. White noise biases the ratio towards 1, since its spectrum is isotropic and extends to high frequencies.
+    ``ratio`` and ``angle`` are [...] for intensities [..., H, W]. For an elliptical pupil, the ratio is long diameter /
+    short diameter, and the grains are elongated along the short diameter. At a ratio of 1, the angle has no meaning.
+    White noise biases the ratio towards 1, because its spectrum is isotropic and extends to high frequencies.
     """
     intensity = _picture("intensity", intensity)
     windows = [torch.hann_window(n, dtype=intensity.dtype, device=intensity.device) for n in intensity.shape[-2:]]
@@ -115,7 +115,7 @@ def anisotropy(intensity: Tensor) -> Anisotropy:
     fy, fx = _frequencies(intensity)
     yy, xx, xy = ((power * part).sum((-2, -1)) for part in (fy.square(), fx.square(), fx * fy))
     half, split = (xx + yy) / 2, torch.hypot((xx - yy) / 2, xy)
-    # A grain is long at right angles to the direction in which the spectrum is widest.
+    # The long axis of the grains is perpendicular to the direction in which the spectrum is widest.
     angle = torch.atan2(2 * xy, xx - yy) / 2 + math.pi / 2
     angle = torch.where(angle > math.pi / 2, angle - math.pi, angle)
     least = (half - split).clamp_min(torch.finfo(intensity.dtype).tiny)
@@ -123,12 +123,12 @@ def anisotropy(intensity: Tensor) -> Anisotropy:
 
 
 def sharpness(intensity: Tensor, reference: Tensor, *, band: tuple[float, float] = _BAND) -> Tensor:
-    """Fraction of a sharp ``reference``'s detail that a picture keeps, [...] for [..., H, W]; 1 for all of the detail.
+    """Mean amplitude of the detail in a picture relative to a sharp ``reference``, [...] for [..., H, W]; 1 if equal.
 
-    Regression coefficient of the picture on the reference, Re sum F(I) conj(F(R)) / sum |F(R)|^2, with the DFT F and
-    sums over radial frequencies in ``band``, in cycles per sample. Speckle does not bias it, but would bias a ratio of
-    powers. Noise of the reference, such as the residual speckle of a mean over a few seeds, makes it too small.
-    ValueError for unequal shapes, a band that is not 0 <= low < high, or a reference without detail in that band.
+    Regression coefficient Re sum F(I) conj(F(R)) / sum |F(R)|^2 of the picture I on the reference R, with the DFT F.
+    The sums are over radial frequencies within ``band`` = (low, high) in cycles per sample. Speckle in the picture does
+    not bias the coefficient; noise in the reference, such as residual speckle, makes it too small. ValueError for
+    unequal (H, W), a band that is not 0 <= low < high, or a reference without detail in the band.
     """
     intensity = _picture("intensity", intensity)
     reference = _picture("reference", reference)
@@ -152,11 +152,11 @@ def _expandable(shape: Sequence[int], whole: Sequence[int]) -> bool:
 
 
 def _width(power: Tensor, level: float) -> Tensor:
-    """Full width at ``level`` of the autocorrelation of n samples with the zero-padded power spectrum [..., 2n]."""
+    """Full width in samples, at ``level``, of the autocorrelation with the zero-padded power spectrum [..., 2n]."""
     size = power.shape[-1] // 2
     lag = torch.arange(1, _LAGS * size // 2 + 1, dtype=power.dtype, device=power.device) / _LAGS
     frequency = torch.fft.fftfreq(2 * size, dtype=power.dtype, device=power.device)
-    # 1 - lag / size is the share of the samples that overlap at a lag.
+    # 1 - lag / size is proportional to the number of pixel pairs at a lag.
     correlation = power @ torch.cos(2 * math.pi * frequency[:, None] * lag) / (1 - lag / size)
     correlation = correlation / power.sum(-1, keepdim=True)
     below = correlation <= level
@@ -173,7 +173,7 @@ def _frequencies(image: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def root_ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
-    """sqrt(numerator / denominator); 0, with gradient 0, where one of them is not positive."""
+    """sqrt(numerator / denominator); 0 with gradient 0 where the numerator or the denominator is not positive."""
     defined = (numerator > 0) & (denominator > 0)
     ratio = torch.where(defined, numerator, 1.0) / torch.where(defined, denominator, 1.0)
     return torch.where(defined, torch.sqrt(ratio), 0.0)

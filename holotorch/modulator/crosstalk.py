@@ -96,12 +96,12 @@ class ThermalCrosstalk(nn.Module):
 
     @property
     def total(self) -> float:
-        """Sum of the kernel: phase per heater phase of a uniformly heated, infinite array."""
+        """Sum of the kernel: ratio of phase to heater phase in a uniformly heated, infinite array."""
         return self.kernel.sum().item()
 
     @property
     def lost_heat(self) -> float:
-        """Share of the heat of the Gaussian that the taps do not include; NaN for a measured patch."""
+        """Share of the Gaussian's heat that lies outside the taps; NaN for a measured patch."""
         if math.isnan(self.sigma_px):
             return math.nan
         radius = _needed_radius(self.sigma_px) + 4

@@ -1,6 +1,6 @@
-"""Far-periphery perception (thesis chapter 2): perception times, sizes of content over eccentricity, and displays.
+"""Perception in the far periphery (thesis chapter 2): perception time, content size over eccentricity, and displays.
 
-Angles are in degrees, as the suffix ``_deg`` of their names says; times are in seconds.
+Angles are in degrees, and their names end in ``_deg``; times are in seconds.
 """
 
 from holotorch.perception.cortical import (

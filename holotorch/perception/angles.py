@@ -34,7 +34,7 @@ def as_tensor(name: str, value: Any, unit: str = "degrees") -> Tensor:
 
 
 def eccentricity(value: Any, name: str = "eccentricity_deg") -> Tensor:
-    """Convert eccentricities to a tensor, or raise ValueError outside 0 to 180 deg."""
+    """Convert eccentricities to a tensor. ValueError for an eccentricity outside 0 to 180 deg."""
     tensor = as_tensor(name, value)
     cure = "; it is an angle from the fixation point without a sign for left or right; take the absolute value"
     require(within(tensor, 0, 180), f"{name} must be within 0 to 180 degrees", tensor, cure)
@@ -42,19 +42,19 @@ def eccentricity(value: Any, name: str = "eccentricity_deg") -> Tensor:
 
 
 def size(value: Any, name: str = "size_deg") -> Tensor:
-    """Convert sizes of patterns to a tensor, or raise ValueError unless they are above 0 and at most 360 deg."""
+    """Convert pattern sizes to a tensor. ValueError for a size that is not above 0 and at most 360 deg."""
     tensor = as_tensor(name, value)
     require((tensor > 0) & (tensor <= 360), f"{name} must be above zero and at most 360 degrees", tensor)
     return tensor
 
 
 def within(values: Tensor, low: float, high: float, tolerance: float = 0.0) -> Tensor:
-    """Whether each value lies within ``low`` .. ``high``, ends included and widened by ``tolerance``; bool."""
+    """Whether each value v satisfies low - tolerance <= v <= high + tolerance; bool."""
     return (values >= low - tolerance) & (values <= high + tolerance)
 
 
 def require(valid: Tensor, rule: str, values: Tensor, cure: str = "") -> None:
-    """Raise ValueError unless all ``values`` are ``valid``; the message has ``rule``, the first bad value, ``cure``."""
+    """Raise ValueError unless all of ``valid`` is true. The message: ``rule``, the first invalid value, ``cure``."""
     if not valid.all():
         raise ValueError(f"{rule}, got {first(values, ~valid):g}{cure}")
 

@@ -1,8 +1,8 @@
 """Size of content over eccentricity, from cortical magnification and from empirical laws.
 
-A law is a function of the eccentricity E in degrees, within 0 .. 180. It returns the size S in degrees, or 1 / M in
-deg/mm, to which sizes are proportional. M is the cortical magnification, the length of cortex per visual angle; M0
-(``m0``, in mm/deg) is its value in the fovea.
+A law is a function of the eccentricity E in degrees, within 0 .. 180. Some laws return the size S in degrees; others
+return 1 / M in deg/mm, to which the size is proportional. The cortical magnification M is the length of cortex per
+degree of visual angle; M0 (``m0``, in mm/deg) is its value in the fovea.
 """
 
 import math
@@ -19,7 +19,7 @@ from holotorch.perception import angles
 
 @dataclass(frozen=True)
 class _Law:
-    """Base class of the laws: every parameter must be above zero."""
+    """Base class of the laws. ValueError for a parameter that is not above zero."""
 
     def __post_init__(self):
         for parameter in fields(self):
@@ -28,7 +28,7 @@ class _Law:
 
 @dataclass(frozen=True)
 class LinearMagnification(_Law):
-    """1 / M = (1 + E / E2) / M0, thesis Eqs. 2.1 and 2.2 with a = 1 / E2; at E2, sizes are twice the foveal ones."""
+    """1 / M = (1 + E / E2) / M0, thesis Eqs. 2.1 and 2.2 with a = 1 / E2; at E2, 1 / M is twice its foveal value."""
 
     m0: float
     e2_deg: float
@@ -38,10 +38,10 @@ class LinearMagnification(_Law):
         return (1 + angles.eccentricity(eccentricity_deg) / self.e2_deg) / self.m0
 
 
-# The thesis prints E / E2 for Cowey and Rolls (1974), without the 1, which would give the size 0 at the fovea.
+# Cowey and Rolls (1974). The thesis prints 1 / M = (E / E2) / M0, which would give a size of 0 at the fovea.
 COWEY_ROLLS = LinearMagnification(8.55, 1.746)
-HORTON_HOYT = LinearMagnification(17.3 / 0.75, 0.75)  # printed as M = 17.3 / (E + 0.75)
-DOUGHERTY = LinearMagnification(29.2 / 3.67, 3.67)  # printed as M = 29.2 / (E + 3.67)
+HORTON_HOYT = LinearMagnification(17.3 / 0.75, 0.75)  # thesis: M = 17.3 / (E + 0.75)
+DOUGHERTY = LinearMagnification(29.2 / 3.67, 3.67)  # thesis: M = 29.2 / (E + 3.67)
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class RovamoVirsu(_Law):
         return (1 + self.a * eccentricity + self.b * eccentricity**3) / self.m0
 
 
-# The thesis gives no coefficients; these are the commonly quoted ones for each half of the visual field.
+# Commonly quoted coefficients for the halves of the visual field; the thesis gives none.
 NASAL, TEMPORAL = RovamoVirsu(0.33, 7e-5), RovamoVirsu(0.29, 1.2e-5)
 SUPERIOR, INFERIOR = RovamoVirsu(0.42, 1.2e-4), RovamoVirsu(0.42, 5.5e-5)
 
@@ -77,10 +77,10 @@ class TolhurstLing(_Law):
 
 @dataclass(frozen=True)
 class StrasburgerLetters(_Law):
-    """S = 0.022 E + 0.25 / (log10 C + 2.07 - 0.0345 E), the size at which a letter of contrast C is recognised.
+    """S = 0.022 E + 0.25 / (log10 C + 2.07 - 0.0345 E), the size in degrees at which a letter is recognised.
 
-    ``contrast`` is the Michelson contrast C, above 10^-2.07 = 0.0085 and at most 1. The denominator is zero at
-    ``pole_deg``, which is 60 deg at full contrast; beyond this pole, S would be negative.
+    ``contrast`` is the letter's Michelson contrast C, above 10^-2.07 = 0.0085 and at most 1. The law is valid below the
+    eccentricity ``pole_deg``, at which its denominator is zero; this pole is at 60 deg for a contrast of 1.
 
     Source: Strasburger et al. (2011), in thesis Sec. 2.2.1.
     """
@@ -94,11 +94,11 @@ class StrasburgerLetters(_Law):
 
     @property
     def pole_deg(self) -> float:
-        """Eccentricity of the pole in degrees."""
+        """Eccentricity in degrees at which the denominator of S is zero."""
         return (math.log10(self.contrast) + 2.07) / 0.0345
 
     def __call__(self, eccentricity_deg: Any) -> Tensor:
-        """S in degrees. ValueError at the pole and beyond."""
+        """S in degrees. ValueError for eccentricities of ``pole_deg`` or more."""
         eccentricity = angles.eccentricity(eccentricity_deg)
         pole = f"{self.pole_deg:.4g} degrees, its pole at a contrast of {self.contrast:g}"
         rule = f"eccentricity_deg must be below {pole}"
@@ -108,7 +108,7 @@ class StrasburgerLetters(_Law):
 
 @dataclass(frozen=True)
 class LinearSize(_Law):
-    """S = slope E + foveal_deg for E up to ``high_deg``, as in Grogorick et al.; the thesis gives no coefficients."""
+    """S = slope E + foveal_deg for E <= ``high_deg``, after Grogorick et al.; the thesis gives no coefficients."""
 
     slope: float
     foveal_deg: float
@@ -126,38 +126,38 @@ Law = Callable[[Any], Tensor]
 
 
 def cortical_scale(eccentricity_deg: Any, law: Law, size_deg: float = 1.0) -> Tensor:
-    """Size in degrees, at an eccentricity, of content that has the size ``size_deg`` at the fixation point.
+    """Size in degrees at each eccentricity E, for content of size ``size_deg`` at the fixation point.
 
     Args:
         eccentricity_deg: Angles from the fixation point, >= 0, any shape; numbers give float64.
-        law: A law of this module, such as ``COWEY_ROLLS``, or any function of the eccentricity that is proportional to
-            the size. The result is ``size_deg * law(E) / law(0)``.
-        size_deg: Size at the fixation point; 1 gives the ratio law(E) / law(0).
+        law: A law of this module, such as ``COWEY_ROLLS``, or another function of the eccentricity to which the size is
+            proportional. The result is ``size_deg * law(E) / law(0)``.
+        size_deg: Size at the fixation point in degrees; 1 gives the ratio law(E) / law(0).
 
     Raises:
-        ValueError: An eccentricity is below 0, above 180, or outside the validity of the law.
+        ValueError: An eccentricity is outside 0 .. 180 deg or outside the range of the law.
     """
     eccentricity, foveal = angles.eccentricity(eccentricity_deg), angles.size(size_deg)
     return foveal.to(eccentricity) * law(eccentricity) / law(torch.zeros_like(eccentricity))
 
 
 def peripheral_weight(eccentricity_deg: Any, law: Law, *, least: float = 0.0) -> Tensor:
-    """Weights of the squared error of each image sample by the eye's resolution at its eccentricity; mean 1.
+    """Weights for the squared error of image samples, lower where the eye resolves less detail; their mean is 1.
 
-    To be equally visible, a detail must be law(E) / law(0) times as wide as at the fixation point. If the energy of an
-    error is uniform over the frequencies of both axes, the visible share is (law(0) / law(E))^2, which is the weight.
+    To be equally visible at eccentricity E, a detail must be law(E) / law(0) times as wide as at the fixation point.
+    The eye thus sees a fraction (law(0) / law(E))^2 of an error with a white 2-D spectrum; this fraction is the weight.
 
     Args:
-        eccentricity_deg: Eccentricities of the samples, [..., H, W]; see ``Display.eccentricity_map``.
+        eccentricity_deg: Eccentricities of the samples, [..., H, W], e.g. from ``Display.eccentricity_map``.
         law: As in :func:`cortical_scale`.
-        least: Lower limit of the weight, relative to the weight at the fixation point, within 0 .. 1. It keeps errors
-            in the far periphery from being ignored.
+        least: Lower limit of the weight as a fraction of the weight at the fixation point, within 0 .. 1. Errors in
+            the far periphery then keep at least this weight.
 
     Returns:
-        Real [..., H, W] with mean 1 over the last two axes, dtype and device of the eccentricities.
+        Weights [..., H, W] with mean 1 over (H, W), in the dtype and on the device of the eccentricities.
 
     Raises:
-        ValueError: As :func:`cortical_scale`; eccentricities with fewer than two axes; ``least`` outside 0 .. 1.
+        ValueError: As :func:`cortical_scale`; the eccentricities have fewer than two axes; ``least`` is outside 0 .. 1.
     """
     least = checks.finite("least", least)
     if not 0 <= least <= 1:

@@ -1,4 +1,4 @@
-"""Thesis Table 2.1 as data, and a check whether a display can show the sizes of a scale."""
+"""The wide displays of thesis Table 2.1, and a check whether a display can show patterns of given sizes."""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -18,13 +18,13 @@ class WideDisplay:
 
     Attributes:
         name: Name in the table, with examples.
-        field_deg: Field of view along ``axis``.
-        height_deg: Vertical field of view; None if it is not reported.
-        axis: Axis of ``field_deg``; "full" for a display that surrounds the viewer.
-        arcmin: Size of a pixel, (finest, coarsest) in minutes of arc; None if only a pitch is known.
-        pitch: Pixel pitch in metres of a holographic display; the angular size of its pixels depends on the eyepiece.
-        colour: Whether the display shows RGB; otherwise it has one colour.
-        derived: Whether the values are calculated from other reported numbers (* in the table).
+        field_deg: Field of view along ``axis``, from edge to edge.
+        height_deg: Vertical field of view; None if not reported.
+        axis: Direction in which ``field_deg`` is measured; "full" for a display that surrounds the viewer.
+        arcmin: Angular size of the (finest, coarsest) pixels in minutes of arc; None if only ``pitch`` is known.
+        pitch: Pixel pitch of a holographic display in metres; its ``arcmin`` would depend on the eyepiece.
+        colour: Whether the display is in full colour; otherwise it is monochrome.
+        derived: Whether the table marks its values with *, as calculated from other reported numbers.
         year: Year in the table, if any.
     """
 
@@ -40,12 +40,12 @@ class WideDisplay:
 
     @property
     def half_field_deg(self) -> float:
-        """Greatest eccentricity on the horizon; an upper bound if the field of view is diagonal."""
+        """Half of ``field_deg``, the greatest eccentricity on the horizon; an upper bound if ``axis`` is diagonal."""
         return self.field_deg / 2
 
     @property
     def pixels_per_degree(self) -> float | None:
-        """Resolution of the coarsest pixels; None if only a pitch is known."""
+        """Pixels per degree where the pixels are coarsest; None if ``arcmin`` is None."""
         return None if self.arcmin is None else 60 / self.arcmin[1]
 
 
@@ -71,16 +71,16 @@ TABLE_2_1 = (
 
 @dataclass(frozen=True, eq=False)
 class DisplayCheck:
-    """Whether a display can show the sizes of a scale at N eccentricities, both left and right of the fixation point.
+    """Whether a display can show patterns of size S(E) at N eccentricities E to the left and right of fixation.
 
     Attributes:
-        size_deg: S(E), [N].
+        size_deg: S(E) in degrees, [N].
         covered: Whether the whole pattern lies within the field of view, [N] bool. If the field of view is diagonal,
             the horizontal one is smaller, so that True only means that the pattern may fit.
-        needed: Pixels per degree needed to draw the pattern with the requested samples, [N].
-        resolved: Whether the display has this resolution, [N] bool; None if its angular resolution is not known.
+        needed: Pixels per degree for ``samples`` pixels across the pattern, [N].
+        resolved: Whether the display has the ``needed`` resolution, [N] bool; None if its resolution is not known.
         reach_deg: Half the field of view of the display in degrees.
-        tested: Whether the size was tested in the study, [N] bool.
+        tested: Whether S(E) is within the sizes that the study of thesis chapter 2 tested, [N] bool.
     """
 
     size_deg: Tensor
@@ -99,18 +99,18 @@ def check_display(
     samples: int = 12,
     extrapolate: bool = False,
 ) -> DisplayCheck:
-    """Compare a display with the sizes of patterns on the horizon that ``scale`` gives.
+    """Check whether a display is wide and fine enough for patterns on the horizon whose sizes ``scale`` gives.
 
     Args:
         display: A row of ``TABLE_2_1``, or another display.
-        scale: Scale of the sizes.
-        eccentricity_deg: Eccentricities of the patterns, [N].
-        samples: Pixels across a pattern needed to recognise it. With 12, the strokes of a cross or ring are 2.4 pixels
-            wide. The resolution of the eye is not considered, because it is no stricter at these sizes.
-        extrapolate: As in the call of ``scale``.
+        scale: Size S(E) of a pattern over eccentricity.
+        eccentricity_deg: Eccentricities E of the pattern centres, [N].
+        samples: Pixels that a pattern needs across its width to be recognised. With 12, the strokes of a cross or ring
+            are 2.4 pixels wide. The eye's resolution is not checked, because it is finer than these strokes.
+        extrapolate: Allow eccentricities outside the fit of ``scale``.
 
     Raises:
-        ValueError: As in the call of ``scale``, or ``samples`` is below 1.
+        ValueError: As ``scale(eccentricity_deg)``, or ``samples`` is below 1.
     """
     checks.whole("samples", samples, 1)
     eccentricity = angles.eccentricity(eccentricity_deg)

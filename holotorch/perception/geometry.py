@@ -1,9 +1,9 @@
-"""Geometry of flat, curved and headset displays: conversion between directions in degrees, metres and pixels.
+"""Flat screens, curved screens and headsets: conversion between directions in degrees, metres and pixels.
 
-The eye is at the origin and fixates straight ahead, along z. A direction is (elevation, azimuth) in degrees: the
-elevation above the horizontal plane, positive upwards, and the azimuth within that plane, positive to the right. Pixels
-and metres on a screen are (y, x) with y downwards. The centre of the top left pixel is (0, 0) in pixels, and the middle
-of the display is (0, 0) in metres.
+The eye is at the origin and fixates straight ahead, along z. A direction is (elevation, azimuth) in degrees. Elevation
+is the angle above the horizontal plane; azimuth is measured within this plane, positive to the right. A position on a
+display is (y, x) with y downwards. In pixels, (0, 0) is the centre of the top left pixel; in metres, (0, 0) is the
+middle of the display.
 """
 
 import math
@@ -19,19 +19,19 @@ from holotorch.perception import angles
 
 
 def eccentricity_of(elevation_deg: Any, azimuth_deg: Any) -> Tensor:
-    """Angle in degrees between a direction and the fixation point, accurate at all angles."""
+    """Angle in degrees between a direction and the fixation point; see :func:`separation`."""
     return separation(elevation_deg, azimuth_deg, 0.0, 0.0)
 
 
 def separation(elevation_deg: Any, azimuth_deg: Any, other_elevation_deg: Any, other_azimuth_deg: Any) -> Tensor:
-    """Angle in degrees between two directions, which broadcast. Its gradient at 0 is 0.
+    """Angle in degrees between two directions, whose tensors broadcast. Its gradient is 0 at 0 and at 180 deg.
 
-    Uses the half-angle formula, because the arc cosine would lose half of the digits near 0.
+    The half-angle formula keeps full precision at small angles, where the arc cosine loses half of the digits.
     """
     directions = (elevation_deg, azimuth_deg, other_elevation_deg, other_azimuth_deg)
     e1, a1, e2, a2 = (angles.as_tensor("angles", value).deg2rad() for value in directions)
     half = torch.sin((e1 - e2) / 2).square() + e1.cos() * e2.cos() * torch.sin((a1 - a2) / 2).square()
-    # 0 and 1 are replaced before the square roots, one of which has an infinite gradient at each of them.
+    # sqrt(half) has an infinite gradient at 0, and sqrt(1 - half) at 1; both values are replaced first.
     inside = (half > 0) & (half < 1)
     safe = torch.where(inside, half, 0.5)
     angle = 2 * torch.atan2(safe.sqrt(), (1 - safe).sqrt())
@@ -42,7 +42,7 @@ def separation(elevation_deg: Any, azimuth_deg: Any, other_elevation_deg: Any, o
 class Display:
     """Base class of all displays. ``shape`` is (H, W) in pixels.
 
-    The methods take numbers or tensors that broadcast to [...]. Pairs are returned as two tensors [...].
+    The methods take numbers or tensors that broadcast to [...]. A pair such as (y, x) is returned as two tensors [...].
     """
 
     shape: tuple[int, int]
@@ -54,18 +54,18 @@ class Display:
             checks.whole("shape", side, 1)
 
     def angles(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
-        """(elevation, azimuth) in degrees of points on the display surface, also beyond the edge of the display."""
+        """Directions (elevation, azimuth) in degrees of points on the display surface, also beyond its edges."""
         raise NotImplementedError
 
     def pixels(self, elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
-        """(y, x) in pixels of directions, also beyond the edge; NaN for directions that do not meet the surface.
+        """Positions (y, x) in pixels at which directions meet the display surface; NaN where they do not meet it.
 
-        ValueError for elevations beyond 90 or azimuths beyond 180 deg.
+        Positions may lie beyond the edges. ValueError for an elevation beyond 90 deg or an azimuth beyond 180 deg.
         """
         raise NotImplementedError
 
     def pixels_per_degree(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
-        """Pixels per degree of eye rotation along (y, x) at points of the display, as exact derivatives."""
+        """Pixels along (y, x) per degree of visual angle at points of the display, from analytic derivatives."""
         raise NotImplementedError
 
     def eccentricity(self, y_px: Any, x_px: Any) -> Tensor:
@@ -78,12 +78,12 @@ class Display:
         return self.eccentricity(y[:, None], x[None, :]).to(dtype)
 
     def shows(self, elevation_deg: Any, azimuth_deg: Any) -> Tensor:
-        """Whether a direction meets a pixel of the display; bool."""
+        """Whether each direction meets a pixel of the display; bool [...]."""
         y, x = self.pixels(elevation_deg, azimuth_deg)
         return angles.within(y, -0.5, self.shape[0] - 0.5) & angles.within(x, -0.5, self.shape[1] - 0.5)
 
     def width_px(self, azimuth_deg: Any, size_deg: Any) -> Tensor:
-        """Width in pixels of a pattern of ``size_deg`` centred at an azimuth on the horizon."""
+        """Width in pixels of a pattern on the horizon that spans ``size_deg`` of azimuth around ``azimuth_deg``."""
         middle, half = angles.as_tensor("azimuth_deg", azimuth_deg), angles.size(size_deg) / 2
         level = torch.zeros_like(middle)
         return self.pixels(level, middle + half)[1] - self.pixels(level, middle - half)[1]
@@ -107,7 +107,7 @@ class Display:
 
 @dataclass(frozen=True)
 class _Screen(Display):
-    """A screen of ``size`` (height, width) along its surface, ``distance`` from the eye to its middle, in metres."""
+    """A screen of ``size`` (height, width) metres along its surface; its middle is ``distance`` metres from the eye."""
 
     size: tuple[float, float]
     distance: float
@@ -124,12 +124,12 @@ class _Screen(Display):
         return self.size[0] / self.shape[0], self.size[1] / self.shape[1]
 
     def metres(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
-        """(y, x) in metres from the middle, along the surface."""
+        """Convert positions (y, x) from pixels to metres along the surface, from the middle of the screen."""
         y, x = self._middle(y_px, x_px)
         return y * self.pitch[0], x * self.pitch[1]
 
     def pixels_at(self, y_m: Any, x_m: Any) -> tuple[Tensor, Tensor]:
-        """(y, x) in pixels of points in metres from the middle, along the surface."""
+        """Convert positions (y, x) from metres along the surface, from the middle of the screen, to pixels."""
         y, x = angles.as_tensor("y_m", y_m, "metres"), angles.as_tensor("x_m", x_m, "metres")
         return self._from_middle(*torch.broadcast_tensors(y / self.pitch[0], x / self.pitch[1]))
 
@@ -147,7 +147,7 @@ class _Screen(Display):
     def pixels_per_degree(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
         """See :class:`Display`.
 
-        With u = p / |p|, a step ds along the tangent t at the point p changes the direction by (t - (t.u) u) ds / |p|.
+        A step ds from the point p along the unit tangent t changes the direction by |p x t| ds / |p|^2 radians.
         """
         point, right = self._surface(*self.metres(y_px, x_px))
 
@@ -158,21 +158,21 @@ class _Screen(Display):
         return along(point.new_tensor([0.0, 1.0, 0.0]), self.pitch[0]), along(right, self.pitch[1])
 
     def _surface(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Points [..., 3] at metres (y, x) on the surface, and their unit tangents to the right, as (x, y, z)."""
+        """Points at (y, x) metres on the surface, and their unit tangents to the right; both (x, y, z) [..., 3]."""
         raise NotImplementedError
 
     def _intersection(self, up: Tensor, side: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Whether rays at (elevation, azimuth) in radians meet the surface, and where: (y, x) in metres along it."""
+        """Whether rays at (elevation, azimuth) in radians meet the surface, and the (y, x) in metres where they do."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class FlatScreen(_Screen):
-    """A monitor, or the virtual image of a headset with rectilinear projection (an ideal lens)."""
+    """A monitor, or the virtual image of a headset whose lens has no distortion (rectilinear projection)."""
 
     @classmethod
     def spanning(cls, shape: tuple[int, int], field_deg: tuple[float, float], distance: float = 1.0) -> "FlatScreen":
-        """The flat screen that covers a field of view (vertical, horizontal), each below 180 deg."""
+        """The flat screen at ``distance`` metres with a field of view (vertical, horizontal), each below 180 deg."""
         for side in checks.pair("field_deg", field_deg, "degrees"):
             if not 0 < side < 180:
                 raise ValueError(f"field_deg must be within 0 .. 180 degrees for a flat screen, got {side:g}")
@@ -191,10 +191,10 @@ class FlatScreen(_Screen):
 
 @dataclass(frozen=True)
 class CurvedScreen(_Screen):
-    """Part of an upright cylinder of ``radius`` metres, concave towards the eye; its middle is straight ahead.
+    """A screen on a vertical cylinder of ``radius`` metres, concave towards the eye; its middle is straight ahead.
 
-    ``size`` is (height, arc length). The eye may be off the axis of the cylinder. A ray from an eye outside the
-    cylinder intersects it twice; the farther point counts.
+    ``size`` is (height, arc length) in metres. The eye may be off the axis of the cylinder. If the eye is outside the
+    cylinder, a ray intersects the cylinder twice, and the farther intersection is used.
     """
 
     radius: float
@@ -212,7 +212,7 @@ class CurvedScreen(_Screen):
         return torch.stack([self.radius * angle.sin(), y, ahead], -1), right
 
     def _intersection(self, up: Tensor, side: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        offset = self.distance - self.radius  # distance from the eye to the axis of the cylinder
+        offset = self.distance - self.radius  # from the eye to the axis of the cylinder, along z
         root = self.radius**2 - offset**2 * side.sin().square()
         visible = (root > 0) & (up.abs() < math.pi / 2)
         distance = offset * side.cos() + torch.where(visible, root, 1).sqrt()  # in the horizontal plane
@@ -223,9 +223,9 @@ class CurvedScreen(_Screen):
 
 @dataclass(frozen=True)
 class Headset(Display):
-    """A headset with ``resolution`` pixels per degree along each radius from the middle (f-theta projection).
+    """A headset with f-theta projection: ``resolution`` is in pixels per degree along each radius from the middle.
 
-    FlatScreen describes headsets with rectilinear projection.
+    For rectilinear projection, use FlatScreen.
     """
 
     resolution: float
@@ -238,7 +238,7 @@ class Headset(Display):
 
     @property
     def field_deg(self) -> tuple[float, float]:
-        """See :class:`Display`; may exceed 180 deg vertically, although elevations are limited to 90 deg."""
+        """See :class:`Display`. The vertical field may exceed 180 deg; it then includes directions behind the eye."""
         return self.shape[0] / self.resolution, self.shape[1] / self.resolution
 
     def angles(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
@@ -251,21 +251,21 @@ class Headset(Display):
         return up.rad2deg(), torch.atan2(x * share, angle.cos()).rad2deg()
 
     def pixels(self, elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
-        """See :class:`Display`; NaN for the direction straight behind the eye, whose image is a circle."""
+        """See :class:`Display`. NaN for the direction straight behind the eye, which corresponds to a whole circle."""
         up, side = _directions(elevation_deg, azimuth_deg)
         x, y = up.cos() * side.sin(), -up.sin()
         sine = _norm(y, x)
         angle = torch.atan2(sine, up.cos() * side.cos()).rad2deg()
-        # 0 is replaced before the division, whose gradient would be NaN.
+        # sine = 0 is replaced by 1, because 0 / 0 would have a NaN gradient even where it is not selected.
         share = angle * self.resolution / torch.where(sine > 0, sine, 1)
         share = torch.where(sine > 0, share, self.resolution * math.degrees(1))
         share = torch.where((sine < 1e-12) & (angle > 90), math.nan, share)
         return self._from_middle(y * share, x * share)
 
     def pixels_per_degree(self, y_px: Any, x_px: Any) -> tuple[Tensor, Tensor]:
-        """See :class:`Display`: ``resolution`` along a radius, and r / sin r times as many along a circle.
+        """See :class:`Display`.
 
-        r is the eccentricity in radians.
+        At r radians from the middle, it is ``resolution`` along the radius and ``resolution`` r / sin r across it.
         """
         y, x = self._middle(y_px, x_px)
         radius = _norm(y, x)
@@ -273,13 +273,13 @@ class Headset(Display):
         around = torch.where(radius > 0, angle.sin() / torch.where(radius > 0, angle, 1), 1)
         safe = torch.where(radius > 0, radius, 1)
         cosine, sine = torch.where(radius > 0, x / safe, 1), y / safe
-        rotation_x = torch.hypot(cosine, sine * around)  # eye rotation, relative to that of a radial step
+        rotation_x = torch.hypot(cosine, sine * around)  # visual angle per pixel along x / along the radius
         rotation_y = torch.hypot(sine, cosine * around)
         return self.resolution / rotation_y, self.resolution / rotation_x
 
 
 def _directions(elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
-    """(elevation, azimuth) in radians, broadcast. ValueError for elevations beyond 90 or azimuths beyond 180 deg."""
+    """Elevation and azimuth in radians, broadcast. ValueError beyond 90 deg of elevation or 180 deg of azimuth."""
     up, side = angles.as_tensor("elevation_deg", elevation_deg), angles.as_tensor("azimuth_deg", azimuth_deg)
     angles.require(up.abs() <= 90, "elevation_deg must be within -90 .. 90 degrees", up)
     angles.require(side.abs() <= 180, "azimuth_deg must be within -180 .. 180 degrees", side)
@@ -288,6 +288,6 @@ def _directions(elevation_deg: Any, azimuth_deg: Any) -> tuple[Tensor, Tensor]:
 
 
 def _norm(y: Tensor, x: Tensor) -> Tensor:
-    """Norm of (y, x), with gradient 0 at 0."""
+    """Length of the vector (y, x), with gradient 0 at (0, 0)."""
     square = y.square() + x.square()
     return torch.where(square > 0, torch.where(square > 0, square, 1).sqrt(), 0)

@@ -1,4 +1,4 @@
-"""Size of a pattern, over eccentricity, for the perception time of a target pattern nearer to the fixation point."""
+"""Size over eccentricity of patterns that are perceived as quickly as a given target pattern."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,19 +11,19 @@ from holotorch.perception import angles
 from holotorch.perception.table import TABLE_2_2
 from holotorch.perception.time import PerceptionTime
 
-TESTED_DEG = (5.0, 26.0)  # sizes of the patterns that the study showed in the far periphery
-FITTED_DEG = (40.0, 70.0)  # eccentricities to which the study fitted lines
+TESTED_DEG = (5.0, 26.0)  # smallest and largest pattern that the study of thesis chapter 2 showed in the far periphery
+FITTED_DEG = (40.0, 70.0)  # eccentricities over which that study fitted its lines
 
 
 @dataclass(frozen=True, eq=False)
 class EqualEfficiencyScale:
-    """S(E) = alpha E + beta, the size in degrees at eccentricity E, for ``low_deg`` <= E <= ``high_deg``.
+    """Line S(E) = alpha E + beta: the size in degrees that gives equal perception time at each eccentricity E.
 
     Attributes:
-        alpha: Slope, degrees of size per degree of eccentricity; a number or a tensor of one value.
-        beta: Intercept in degrees.
-        low_deg, high_deg: Smallest and greatest eccentricity of the fit.
-        covariance: Covariance of (alpha, beta), [2, 2]; None for the lines of Table 2.2, where it is not printed.
+        alpha: Slope in degrees of size per degree of eccentricity, a number or a scalar tensor.
+        beta: Intercept in degrees, a number or a scalar tensor.
+        low_deg, high_deg: Smallest and greatest eccentricity at which the line is valid.
+        covariance: Covariance of (alpha, beta), [2, 2]; None for the lines of Table 2.2, which does not print it.
 
     Source: thesis Sec. 2.4.3.
     """
@@ -45,9 +45,9 @@ class EqualEfficiencyScale:
 
     @classmethod
     def from_table(cls, size_deg: float, eccentricity_deg: float) -> "EqualEfficiencyScale":
-        """The line of Table 2.2 whose target is a pattern of this size at this eccentricity, both in degrees.
+        """The line of Table 2.2 whose target pattern has this size at this eccentricity, both in degrees.
 
-        ValueError for a target that is not in the table; rows are not interpolated.
+        Rows are not interpolated: ValueError for a target that is not in the table.
         """
         for row in TABLE_2_2:
             if (row.size_deg, row.eccentricity_deg) == (size_deg, eccentricity_deg):
@@ -57,14 +57,14 @@ class EqualEfficiencyScale:
 
     @classmethod
     def fit(cls, eccentricity_deg: Any, size_deg: Any) -> "EqualEfficiencyScale":
-        """Fit a line by least squares to sizes of equal time [N] at eccentricities [N] within 40 .. 70 deg.
+        """Fit a line by least squares to the sizes [N] that have equal perception time at eccentricities [N].
 
-        Points at other eccentricities are ignored. The fit is differentiable in the sizes and uses float64. For two
-        points, the covariance is NaN.
+        Points outside 40 .. 70 deg are ignored. The fit is differentiable in the sizes and uses float64. The
+        covariance is NaN for a fit to two points.
 
         Raises:
-            ValueError: There are fewer than two different eccentricities within 40 .. 70 deg, or a size there is not
-                finite.
+            ValueError: There are fewer than two different eccentricities within 40 .. 70 deg, or a size at one of them
+                is not finite, not above zero or above 360 deg.
         """
         sizes = size_deg if isinstance(size_deg, Tensor) else torch.as_tensor(size_deg, dtype=torch.float64)
         eccentricity, inside = _fitted(eccentricity_deg, sizes.shape, "size")
@@ -79,9 +79,9 @@ class EqualEfficiencyScale:
 
     @classmethod
     def from_time(cls, seconds: float | Tensor, times: PerceptionTime, eccentricity_deg: Any) -> "EqualEfficiencyScale":
-        """The line of sizes whose time is ``seconds``, from laws ``times`` [N] at eccentricities [N] in degrees.
+        """Fit the line of sizes with perception time ``seconds``, given the laws ``times`` [N] at N eccentricities.
 
-        As in the thesis, only laws within 40 .. 70 deg are used. ValueError if one of them has a >= 0.
+        As in the thesis, only laws within 40 .. 70 deg are used. ValueError if one of them has a slope >= 0.
         """
         eccentricity, inside = _fitted(eccentricity_deg, times.slope.shape, "law")
         return cls.fit(eccentricity[inside], times[inside].size(seconds))
@@ -90,9 +90,9 @@ class EqualEfficiencyScale:
     def from_surface(
         cls, size_deg: float, target_deg: float, times: PerceptionTime, eccentricity_deg: Any
     ) -> "EqualEfficiencyScale":
-        """Like :meth:`from_time`, with the time of a pattern of ``size_deg`` at the eccentricity ``target_deg``.
+        """As :meth:`from_time`, with the perception time of a target of ``size_deg`` at eccentricity ``target_deg``.
 
-        ValueError if there is no law at ``target_deg``.
+        ValueError unless exactly one of the eccentricities equals ``target_deg``.
         """
         eccentricity = angles.eccentricity(eccentricity_deg).double()
         at = (eccentricity == target_deg).nonzero()
@@ -101,15 +101,15 @@ class EqualEfficiencyScale:
         return cls.from_time(times[int(at[0])].seconds(size_deg), times, eccentricity)
 
     def __call__(self, eccentricity_deg: Any, *, extrapolate: bool = False) -> Tensor:
-        """S(E) in degrees, a tensor with the dtype and device of the input; float64 for numbers.
+        """S(E) in degrees, in the shape, dtype and device of the eccentricities; float64 for numbers.
 
         Args:
             eccentricity_deg: Angles from the fixation point, >= 0, any shape.
-            extrapolate: Use the line beyond the eccentricities of the fit.
+            extrapolate: Allow eccentricities outside ``low_deg`` .. ``high_deg``.
 
         Raises:
-            ValueError: An eccentricity is outside ``low_deg`` .. ``high_deg`` without ``extrapolate``, or the
-                extrapolated line is not above zero there.
+            ValueError: An eccentricity is outside ``low_deg`` .. ``high_deg`` and ``extrapolate`` is False, or S(E) is
+                not above zero.
         """
         eccentricity = angles.eccentricity(eccentricity_deg)
         if not extrapolate:
@@ -123,7 +123,7 @@ class EqualEfficiencyScale:
         return sizes
 
     def inverse(self, size_deg: Any, *, extrapolate: bool = False) -> Tensor:
-        """The eccentricity E in degrees with S(E) = ``size_deg``; limits as in a call. ValueError if alpha is 0."""
+        """Eccentricity E in degrees where S(E) = ``size_deg``. ValueError if alpha is 0 or E is not allowed in S(E)."""
         if not torch.as_tensor(self.alpha).detach().any():
             raise ValueError("alpha is 0: the size is the same at every eccentricity, so that there is no inverse")
         sizes = angles.size(size_deg)
@@ -137,18 +137,18 @@ class EqualEfficiencyScale:
         return eccentricity.clamp(self.low_deg, self.high_deg)
 
     def inside(self, eccentricity_deg: Any) -> Tensor:
-        """Whether eccentricities lie within those of the fit, up to rounding errors; bool, of the given shape."""
+        """Whether each eccentricity is within ``low_deg`` .. ``high_deg``, up to rounding errors; bool, same shape."""
         return self._covers(angles.eccentricity(eccentricity_deg))
 
     def tested(self, eccentricity_deg: Any) -> Tensor:
-        """Whether S(E) is within the sizes tested in the study, 5 .. 26 deg; bool, at any eccentricity.
+        """Whether S(E) is within 5 .. 26 deg, the sizes tested in the study; bool. E may be any eccentricity.
 
-        The lines of Table 2.2 give sizes from 4.0 deg at E = 40 deg to 29.0 deg at E = 70 deg; all are allowed.
+        The lines of Table 2.2 range from 4.0 deg at E = 40 deg to 29.0 deg at E = 70 deg, so that some are not tested.
         """
         return angles.within(self._line(angles.eccentricity(eccentricity_deg)), *TESTED_DEG)
 
     def _covers(self, eccentricity: Tensor) -> Tensor:
-        """Whether eccentricities lie within those of the fit, up to the rounding errors of their dtype."""
+        """As :meth:`inside`, without a check of the range of the eccentricities."""
         tolerance = 1e-9 if eccentricity.dtype == torch.float64 else 1e-4  # degrees
         return angles.within(eccentricity, self.low_deg, self.high_deg, tolerance)
 
@@ -161,7 +161,7 @@ class EqualEfficiencyScale:
 
 
 def _fitted(eccentricity_deg: Any, shape: torch.Size, what: str) -> tuple[Tensor, Tensor]:
-    """Eccentricities [N] in float64, and the mask [N] of those within ``FITTED_DEG``, at least two of which differ."""
+    """Eccentricities [N] in float64, and mask of those in ``FITTED_DEG``; ValueError unless two of these differ."""
     eccentricity = angles.eccentricity(eccentricity_deg).double()
     if eccentricity.ndim != 1 or shape != eccentricity.shape:
         shapes = f"{tuple(shape)} and {tuple(eccentricity.shape)}"

@@ -1,15 +1,15 @@
-"""Thesis Table 2.2: the lines of equal perception time and their analyses of variance."""
+"""Thesis Table 2.2: lines S(E) of equal perception time, and analyses of variance of the sizes."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class EqualEfficiencyRow:
-    """One row: a target pattern, the line S(E) = alpha E + beta, and the one-way ANOVA over the eccentricities.
+    """One row: a target pattern, the line S(E) = alpha E + beta of equal perception time, and a one-way ANOVA.
 
-    Sizes, eccentricities and ``beta`` are in degrees, and ``alpha`` in degrees of size per degree of eccentricity.
-    ``freedom`` is the number of degrees of freedom between the groups, four eccentricities minus one. The statistic
-    ``f`` treats the sizes of one participant at different eccentricities as independent; ``p`` is its p-value.
+    ``size_deg`` and ``eccentricity_deg`` describe the target. ``alpha`` is in degrees of size per degree of
+    eccentricity, ``beta`` in degrees. The ANOVA compares the sizes at four eccentricities, and treats those of one
+    participant as independent. ``freedom`` is its between-group degrees of freedom, ``f`` its F, ``p`` its p-value.
     """
 
     size_deg: float

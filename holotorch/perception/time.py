@@ -1,4 +1,4 @@
-"""Perception time of a pattern as a logarithmic law of its size, one law per eccentricity."""
+"""Perception time of a pattern as a logarithmic function of its size, one such law per eccentricity."""
 
 import math
 from dataclasses import dataclass
@@ -12,18 +12,18 @@ from holotorch.perception import angles
 
 @dataclass(frozen=True, eq=False)
 class PerceptionTime:
-    """T(S) = a ln S + b in seconds for a pattern of S degrees: one law or a batch [...], such as one per eccentricity.
+    """Perception time T(S) = a ln S + b in seconds of a pattern of S degrees: one law, or a batch of laws [...].
 
-    As in the thesis, the time includes the decision and the press of a button.
+    As in the thesis, the time includes the observer's decision and the press of a button.
 
     Attributes:
         slope: a in seconds, [...]; negative if a larger pattern is perceived sooner.
-        intercept: b in seconds, [...]: the time at 1 degree.
-        covariance: Covariance of (a, b) in s^2, [..., 2, 2]; this and ``deviation`` are NaN for a fit to two points.
-        deviation: Standard deviation of the residuals in seconds, [...].
+        intercept: b in seconds, [...]; the time for a pattern of 1 degree.
+        covariance: Covariance of (a, b) in s^2, [..., 2, 2]; NaN for a fit to two points.
+        deviation: Standard deviation of the residuals in seconds, [...]; NaN for a fit to two points.
         freedom: Degrees of freedom of the residuals, the number of points minus two, [...].
 
-    Source: thesis Eq. 2.3 (in milliseconds there).
+    Source: thesis Eq. 2.3, which is in milliseconds.
     """
 
     slope: Tensor
@@ -41,15 +41,16 @@ class PerceptionTime:
 
     @classmethod
     def fit(cls, size_deg: Any, seconds: Any, *, seen: Tensor | None = None) -> "PerceptionTime":
-        """Fit laws by least squares over the last axis, in float64; differentiable with respect to the times.
+        """Fit a law to each set of N patterns by least squares, in float64; differentiable in the times.
 
         Args:
             size_deg: Sizes of the patterns, [N] or [..., N].
-            seconds: Measured times, [..., N].
-            seen: bool [..., N]; False for missed patterns, whose ``seconds`` are ignored and may be NaN.
+            seconds: Measured perception times, [..., N].
+            seen: Whether each pattern was seen, bool [..., N]. Times of unseen patterns are ignored and may be NaN.
 
         Raises:
-            ValueError: A time is not above zero, or a law has fewer than two different sizes.
+            TypeError: ``seen`` is not bool.
+            ValueError: A time is not above zero, the median time exceeds 30 s, or a set has fewer than two seen sizes.
         """
         times = seconds if isinstance(seconds, Tensor) else torch.as_tensor(seconds, dtype=torch.float64)
         seen = torch.ones_like(times, dtype=torch.bool) if seen is None else seen
@@ -75,33 +76,31 @@ class PerceptionTime:
         residual = times - slope[..., None] * x - intercept[..., None]
         variance = (weight * residual.square()).sum(-1) / freedom.clamp(min=1)
         variance = torch.where(freedom > 0, variance, math.nan)
-        slope_variance, mixed = 1 / spread, -mean_x[..., 0] / spread  # per unit variance of the residuals
+        slope_variance, mixed = 1 / spread, -mean_x[..., 0] / spread  # for residuals of variance 1
         rows = [slope_variance, mixed, mixed, 1 / count + mean_x[..., 0].square() / spread]
         covariance = variance[..., None, None] * torch.stack(rows, -1).unflatten(-1, (2, 2))
-        # The square root has an infinite gradient at 0, for data exactly on the line; 1e-300 changes no other result.
+        # If all data lie on the line, the variance is 0, where sqrt has an infinite gradient; 1e-300 prevents this.
         return cls(slope, intercept, covariance, (variance + 1e-300).sqrt(), freedom)
 
     @property
     def falls(self) -> Tensor:
-        """Whether a larger pattern is perceived sooner (a < 0), as :meth:`size` requires; bool [...]."""
+        """Whether a < 0, so that a larger pattern is perceived sooner; :meth:`size` requires this. bool [...]."""
         return self.slope < 0
 
     def __getitem__(self, index) -> "PerceptionTime":
-        """Select laws by an index, a slice or a mask over [...]."""
+        """Select laws of the batch [...] by an index, a slice or a mask."""
         parts = (self.slope, self.intercept, self.covariance, self.deviation, self.freedom)
         return PerceptionTime(*(None if part is None else part[index] for part in parts))  # type: ignore[arg-type]
 
     def seconds(self, size_deg: Any) -> Tensor:
-        """T(S) in seconds for sizes that broadcast with [...]. ValueError for sizes that are not above zero."""
+        """T(S) in seconds for sizes that broadcast with the batch [...]. ValueError unless 0 < size <= 360."""
         return self.slope * angles.size(size_deg).to(self.slope.device).log() + self.intercept
 
     def size(self, seconds: Any) -> Tensor:
-        """The size in degrees whose time is ``seconds``, which broadcast with [...].
+        """The size S in degrees with T(S) = ``seconds``, which broadcast with the batch [...].
 
-        A size above 360 deg is returned as infinity, with gradient 0.
-
-        Raises:
-            ValueError: A law has a >= 0, so that larger patterns are not perceived sooner and no size is a solution.
+        A size above 360 deg is returned as infinity, with gradient 0. ValueError for a law with a >= 0, by which a
+        larger pattern is not perceived sooner.
         """
         times = angles.as_tensor("seconds", seconds, "seconds").to(self.slope.device)
         if (bad := ~self.falls).any():

@@ -65,7 +65,7 @@ class View:
 
     Attributes:
         points: float64 [n, 3], n >= 8 corners in the frame of the board in metres, z = 0.
-        pixels: float64 [n, 2], the images (x, y) of the corners in pixels.
+        pixels: float64 [n, 2], the images (x, y) of the corners; (0, 0) is the centre of the upper left pixel.
         name: Name of the photograph.
     """
 
@@ -94,8 +94,8 @@ def find_board(image: Tensor, board: Chessboard | Charuco, name: str = "") -> Vi
 
     Args:
         image: uint8, grey [H, W] or RGB [3, H, W].
-        board: Board to detect. The first corner of a chessboard with a symmetry of 180 degrees is arbitrary, which does
-            not influence the estimated intrinsics.
+        board: Board to detect. If a chessboard looks the same after half a turn, its first corner is arbitrary; this
+            does not influence the estimated intrinsics.
         name: Name of the photograph, for messages.
 
     Raises:

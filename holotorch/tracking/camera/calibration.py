@@ -45,8 +45,8 @@ class Calibration:
     Attributes:
         camera: Estimated camera.
         size: (H, W) of the photographs in pixels; the camera is valid for frames of this size.
-        deviations: Standard deviation of each of ``PARAMETERS``: the larger one of ``formal`` and that by a jackknife
-            over the views, which includes correlated errors of the corners, as from bent boards or corner detectors.
+        deviations: Standard deviation of each of ``PARAMETERS``: the larger of ``formal`` and a jackknife over the
+            views. The jackknife includes errors that the corners of a view share, such as those of a corner detector.
             For fewer than 4 views see ``holotorch.tracking.camera.few_views``.
         formal: Standard deviations for independent errors of the corners, by linear propagation.
         rms_px: Root mean square reprojection error of all corners used, in pixels.
@@ -71,8 +71,8 @@ def calibrate(views: Sequence[View], size: tuple[int, int]) -> Calibration:
     """Estimate focal lengths, principal point and five distortion coefficients from views of a board.
 
     Views with an rms error above 3 times the median and above 0.5 px are left out, the worst one first, as long as
-    three quarters of the views and at least 4 remain. Fewer than 4 views are supplemented by a prior of ordinary
-    cameras, which is not accurate enough for measurements; its uncertainty is part of the deviations.
+    three quarters of the views and at least 4 remain. Fewer than 4 views are supplemented by a prior for
+    ordinary cameras, which is not accurate enough for measurements; its uncertainty is part of the deviations.
 
     Args:
         views: 10 or more views of a flat board with different tilts; see ``holotorch.tracking.camera.boards``. A bend

@@ -67,7 +67,7 @@ class Line:
         return Line((complex(start) + complex(end)) / 2, gap / abs(gap) if gap else complex(cmath.nan), lens.scale)
 
 
-_REMAP_LIMIT = 32767  # OpenCV's remap accepts only images and maps with fewer rows and columns
+_REMAP_LIMIT = 32767  # pixels: OpenCV's remap accepts only images and maps with fewer rows and columns than this
 
 
 class Sampler:
@@ -81,7 +81,7 @@ class Sampler:
     def __init__(self, frame: Tensor, light: np.ndarray):
         self.frame, self.light = frame, light
         self.height, self.width = frame.shape[-2:]
-        # A flat view of the memory of the frame, whatever its strides, is the fastest to index.
+        # A flat view of the frame's memory is the fastest to index, for frames of any strides.
         strides = _, self._down, self._right = frame.stride()
         extent = sum((n - 1) * step for n, step in zip(frame.shape, strides, strict=True))
         self._memory = frame.as_strided((extent + 1,), (1,))
@@ -111,7 +111,7 @@ class Sampler:
         return np.fmin(np.fmax(xy, 0.0, out=xy), self._last, out=xy)
 
     def _light(self, neighbours: np.ndarray, whole: np.ndarray) -> np.ndarray:
-        """Light [..., n] of the ``neighbours`` [...], which are offsets in memory, of whole pixels [2, n]."""
+        """Light [..., n] of pixels at offsets ``neighbours`` [...] in memory from pixels ``whole`` (x, y) [2, n]."""
         index = np.add.outer(neighbours, whole[1] * self._down + whole[0] * self._right)
         return cv2.LUT(self._levels(index).reshape(neighbours.size, -1), self.light).reshape(index.shape)
 
@@ -125,7 +125,7 @@ class Sampler:
     def nearest(self, pixels: Points) -> np.ndarray:
         """Levels, uint8 [T, U, 3], of the pixels nearest to x + i y [T, U]; black outside the frame."""
         if self._image is not None:
-            # A map of one row avoids threads, over which OpenCV distributes rows and whose start takes too long.
+            # OpenCV distributes rows over threads, whose start takes too long. A map of one row avoids them.
             wide = pixels.size if pixels.size < _REMAP_LIMIT else pixels.shape[-1]
             positions = pixels.astype(np.complex64).view(np.float32).reshape(-1, wide, 2)
             levels = cv2.remap(self._image, positions, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
@@ -136,7 +136,7 @@ class Sampler:
         return self._levels(index[..., None] + self._colours) * inside[..., None]
 
     def __call__(self, pixels: Points) -> np.ndarray:
-        """Light, float32 [3, ...], at pixels [...] by bilinear interpolation; outside the frame that at its border."""
+        """Light, float32 [3, ...], at pixels [...] by bilinear interpolation; beyond the frame that of its border."""
         xy = self._clipped(pixels)
         whole = np.minimum(xy.astype(np.intp), self._before_last)
         fraction = (xy - whole).astype(np.float32)
@@ -159,7 +159,7 @@ class Sampler:
 
 @lru_cache(maxsize=16)
 def _neighbours(colour: int, down: int, right: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Offsets in memory from a pixel's red to all colours of 1 [3], 2 x 2 [3, 4] and 4 x 4 pixels [3, 4, 4]."""
+    """Offsets in memory from a pixel's red level to the levels of 1 [3], 2 x 2 [3, 4] and 4 x 4 pixels [3, 4, 4]."""
     colours, lines = colour * np.arange(3), np.arange(-1, 3)
     four = np.add.outer(colours, [0, right, down, down + right])
     return colours, four, np.add.outer(colours, np.add.outer(lines * down, lines * right))

@@ -16,7 +16,7 @@ def tone_curve(frames: Tensor, exposures: Tensor) -> Tensor:
     Args:
         frames: uint8 [E, 3, H, W] or [E, H, W], E >= 3 exposures that together cover the range of levels. All three
             colours have the same curve.
-        exposures: [E] exposure times in any unit, with true ratios.
+        exposures: [E] exposure times in any unit; only their ratios count.
 
     Returns:
         float64 [256], increasing from 0 to 1, for ``Camera.tone``. Levels below 3 and above 252 are extrapolated.
@@ -45,7 +45,7 @@ def tone_curve(frames: Tensor, exposures: Tensor) -> Tensor:
     first, second = weights.sum(2), weights.sum(1)
     normal = (torch.diag_embed(second + first) - weights - weights.mT).sum(0)
     right = (steps[:, None] * (second - first)).sum(0)
-    # The mean squared curvature of g over the logarithm of the level, in which a power law is straight, is added.
+    # Regularisation by the curvature of g over the logarithm of the level; a power law has none.
     logarithm = level.clamp(min=0.5).log()
     curvature = torch.zeros(254, 256, dtype=torch.float64)
     rows = torch.arange(254)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from holotorch.core import checks, quantities
 
-TOOL_LENGTH = 0.127  # metres: distance of the two points of an alignment in the thesis, tip and middle of the bands
+TOOL_LENGTH = 0.127  # metres from the tip to the middle of the bands: the two points of an alignment in the thesis
 SAME_DIRECTION = math.radians(10)  # angle between tools below which they count as parallel
 
 
@@ -30,7 +30,7 @@ class Alignment:
 
 
 def tool_points(tip: Tensor, direction: Tensor, length: float = TOOL_LENGTH) -> Tensor:
-    """Points [..., 2, 3] in metres: the ``tip`` [..., 3] of a tool, and that ``length`` metres behind it.
+    """Points [..., 2, 3] in metres: the ``tip`` [..., 3] of a tool, and the point ``length`` metres behind the tip.
 
     ``direction`` [..., 3] leads from the tip to the rear and need not be normalised.
     """
@@ -54,7 +54,7 @@ def headset_from_camera(camera: Tensor, headset: Tensor) -> Alignment:
     median error of 103 mm at other poses.
 
     Args:
-        camera: [n, 2, 3] two points of the tool in each of n >= 3 alignments, in metres, as by :func:`tool_points`.
+        camera: [n, 2, 3] two points of the tool in each of n >= 3 alignments, in metres; see :func:`tool_points`.
         headset: [n, 2, 3] the same points in the headset's frame, which must be right-handed.
 
     Returns:
@@ -113,7 +113,7 @@ def headset_from_camera(camera: Tensor, headset: Tensor) -> Alignment:
 
 
 def _spread(points: Tensor) -> float:
-    """Largest angle in radians between two of the tools, given by their points [n, 2, 3]."""
+    """Largest angle in radians between the directions of a tool in two alignments, given by points [n, 2, 3]."""
     return widest_angle(torch.nn.functional.normalize((points[:, 1] - points[:, 0]).detach(), dim=-1))
 
 

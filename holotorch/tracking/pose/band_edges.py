@@ -22,8 +22,8 @@ class BandEdges:
 
     Attributes:
         positions: float64 [N] in metres from the tip.
-        covariance: [N, N] in m^2, zero for known distances; multiplied by chi_square / freedom if that exceeds 1. It
-            includes no errors that are the same in all frames, such as those by a highlight.
+        covariance: [N, N] in m^2, zero for known distances; multiplied by chi_square / freedom if above 1. It
+            includes no errors that are the same in all frames, such as the shift of an edge by a highlight.
         chi_square: Sum of the squared residuals, each divided by its variance.
         freedom: Degrees of freedom of ``chi_square``.
         pivot: [3] position of a resting tip in the camera's frame; None where the tip moved.
@@ -62,7 +62,7 @@ def fit_band_edges(
         edges_px: [F, N, 2] pixels (x, y) of the edges in F >= 5 frames, all visible.
         positions_m: [N] nominal distances from the tip in metres, increasing.
         camera: Camera that took the frames.
-        known: Nominal distances that are exact: i for that of edge i from the tip, (i, j) for that of two edges.
+        known: Nominal distances that are exact: i for edge i and the tip, (i, j) for two edges.
         resting_tip: Whether the tip was in the same place in all frames.
         along_px: Standard deviation of an edge along the tool's image, in pixels.
         across_px: Standard deviation of an edge across the tool's image, in pixels.
@@ -98,7 +98,7 @@ def fit_band_edges(
     shared = torch.cholesky_inverse(factor) * size[:, None] * size
     covariance = free @ shared[: free.shape[1], : free.shape[1]] @ free.mT * max(1.0, chi_square / max(freedom, 1))
     deviations = covariance.diagonal().clamp(min=0).sqrt()
-    if bool(failed) or not bool((deviations <= 5e-4).all()):  # a ruler is more accurate
+    if bool(failed) or not bool((deviations <= 5e-4).all()):  # half a millimetre: a ruler is more accurate
         worst = "" if bool(failed) else f" (edge {int(deviations.argmax())} to {1e3 * float(deviations.max()):.1f} mm)"
         raise ValueError(
             f"the frames leave the positions open{worst}: take more of them, nearer to the camera, tilted toward it "

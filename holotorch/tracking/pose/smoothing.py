@@ -67,7 +67,8 @@ class OneEuro:
     def __call__(self, pose: Pose, captured: float) -> Pose:
         """Smooth a pose whose frame was captured at ``captured`` seconds; a refusal is returned unchanged.
 
-        The covariance becomes (1 - alpha) C' + alpha C, which is an upper bound for any correlation of the errors.
+        The covariance C' of the previous result and C of the pose give (1 - alpha) C' + alpha C, an upper bound for any
+        correlation of their errors.
 
         Raises:
             TypeError: A batch of poses.

@@ -14,7 +14,7 @@ class Status(enum.IntEnum):
     """Result of tracking in one frame: a pose, or the reason why the first failing stage refused one."""
 
     OK = 0
-    UNVERIFIED = 1  # a pose from three edges, which nothing verifies
+    UNVERIFIED = 1  # a pose from three edges: no further edge verifies it
     BAD_FRAME = 2  # the frame is unreadable, of the wrong size, or without contrast
     NO_CATHETER = 3  # nothing thin and long has the colours of the bands
     BANDS_MISSING = 4  # fewer than two neighbouring bands are visible
@@ -104,7 +104,7 @@ class Pose:
 
     @property
     def camera_from_tool(self) -> Tensor:
-        """Rigid map [..., 4, 4] of the origin to the tip and, by the smallest rotation, of the z axis to direction."""
+        """Rigid map [..., 4, 4]: the origin to the tip and, by the smallest rotation, the z axis to the direction."""
         x, y, z = self.direction.unbind(-1)
         square = x * x + y * y
         opposite = (z < 0) & (square < 1e-30)  # no unique smallest rotation: by 180 degrees about x
@@ -118,7 +118,7 @@ class Pose:
         return torch.cat([matrix, last], -2)
 
     def point(self, along: float | Tensor) -> Tensor:
-        """Point [..., 3] ``along`` metres from the tip."""
+        """Point [..., 3] of the axis, ``along`` metres behind the tip."""
         distance = torch.as_tensor(along, dtype=self.tip.dtype, device=self.tip.device)
         return self.tip + distance[..., None] * self.direction
 

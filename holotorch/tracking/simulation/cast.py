@@ -56,7 +56,7 @@ class Tube:
         self.strength = 1 / max(facing, 0.25)  # a surface that faces the camera has a light of 1
 
     def shine(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Premultiplied light and opacity, float32 [..., 4], and visible part, uint8 [...], of rays (x, y, 1) [..., 2].
+        """Light times opacity and opacity, float32 [..., 4], and visible part, uint8 [...], of rays (x, y, 1) [..., 2].
 
         The part is 0 where a ray misses the tube or is NaN, else 1 + the index of the part in ``colours``.
         """
@@ -125,7 +125,7 @@ class Tube:
         # The image of a ring is an ellipse; two conjugate half axes a, b bound its radius by sqrt(a^2 + b^2).
         wide = 1.05 * np.linalg.norm(pixels[1::2] - pixels[0], axis=(0, -1)) + 1
         for start, end, half in zip(pixels[0, :-1] + pad, pixels[0, 1:] + pad, wide, strict=False):
-            if np.abs([*start, *end, half]).max() < 1e6:  # not NaN, as behind the camera
+            if np.abs([*start, *end, half]).max() < 1e6:  # NaN behind the camera
                 first, last = ([round(16 * float(value)) for value in point] for point in (start, end))
                 cv2.line(mask, first, last, 255, min(2 * math.ceil(half), 32767), cv2.LINE_8, 4)
         return mask
@@ -134,7 +134,7 @@ class Tube:
 class Rays:
     """Rays (x, y, 1) of the pixels where ``mask`` [H + 2 pad, W + 2 pad] of the padded frame is not 0.
 
-    Within a pixel, the distortion is taken to be linear, which is accurate to 2e-5 pixels.
+    Within a pixel, the distortion is taken to be linear; for a webcam this is accurate to 2e-5 pixels.
 
     Attributes:
         index: int32 [H + 2 pad, W + 2 pad], index of the pixel among the n pixels of the mask; -1 for other pixels.
@@ -159,7 +159,7 @@ def cast(tube: Tube, rays: Rays, window: tuple[slice, slice], fine: int) -> np.n
     """Premultiplied light and opacity, float32 [h fine, w fine, 4], of a window of the padded frame.
 
     Each pixel has fine^2 samples. A sample is one ray, or the mean of 8 rays where a neighbouring sample shows another
-    part of the tube.
+    part of the tube or none.
     """
     index = rays.index[window]
     height, width = index.shape

@@ -29,7 +29,7 @@ def sensed(
 
 
 def expose(frame: np.ndarray, noise: float, generator: torch.Generator | None) -> np.ndarray:
-    """Levels, float32 [3, H, W], with white noise of standard deviation ``noise``, rounded and clipped to uint8."""
+    """uint8 [3, H, W]: the levels ``frame``, float32, plus white noise of standard deviation ``noise`` in levels."""
     flat = frame.reshape(-1, frame.shape[-1])
     rows = np.lib.stride_tricks.sliding_window_view(_deviates(), frame.shape[-1])
     start = torch.randint(len(rows), (len(flat),), generator=generator).numpy()

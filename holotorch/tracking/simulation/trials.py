@@ -173,7 +173,7 @@ def _finger(
     start, end = world.camera.project(tip + torch.tensor(span, dtype=torch.float64)[:, None] * direction).numpy()
     width = float(np.linalg.norm(end - start))
     across = np.array([-(end - start)[1], (end - start)[0]]) / width
-    # The round end begins beyond the tube, so that the sides are straight where they cross it.
+    # The round end begins beyond the tube, so that the finger's sides are straight where they cross the tube.
     first = (start + end) / 2 - (width / 8 + 8) * across
     return scenery.finger(tuple(first.tolist()), tuple((first + 1200 * across).tolist()), width / 2, colour)
 
@@ -199,7 +199,7 @@ def _stick(catheter: Catheter, kind: str, rng: np.random.Generator) -> Catheter 
         distinct = max(shifted, key=lambda others: min(math.dist(a, b) for a in colours for b in others))
         return replace(catheter, colours=distinct)
     if kind == "unequal bands":
-        # Not an outer band, since a longer outer band looks nearly like equal bands at a slant.
+        # Not an outer band: with another length it looks nearly like equal bands at another slant.
         band = int(rng.integers(1, len(colours) - 1))
         edges[band + 1 :] += (edges[band + 1] - edges[band]) * (0.7 if rng.random() < 0.5 else -0.5)
         return replace(catheter, edges=tuple(edges.tolist()), length=max(catheter.length, float(edges[-1]) + 0.05))

@@ -100,8 +100,8 @@ class World:
     ) -> Case:
         """A case with the catheter at a pose (tip, direction), or without a catheter if ``pose`` is None.
 
-        ``background`` makes the background, by default :meth:`desk`. ``shown`` is another catheter, which is rendered
-        instead. ``changes`` replace fields of the look. Seed and name determine the noise.
+        ``background`` makes the background, by default :meth:`desk`. ``shown`` is another catheter to render instead;
+        the case then has no true pose. ``changes`` replace fields of the look. Seed and name determine the noise.
         """
 
         def frame() -> Tensor:
@@ -121,7 +121,7 @@ class World:
         at: Sequence[float] = (0.0, 0.0),
         point: float | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Tip in metres and direction, float64 [3] each, with the bands' middle on the ray through ``at`` on z = 1.
+        """Tip in metres and direction, float64 [3] each, with the bands' middle on the ray (x, y, 1), ``at`` = (x, y).
 
         ``depth`` is the coordinate z in metres of the point ``point`` metres from the tip, by default of the middle of
         the bands. For ``tilt`` and ``roll`` see :func:`aimed`. Raises ValueError for a ``depth`` not above 0, a
@@ -153,7 +153,7 @@ class World:
     def still(
         self, depth: float, tilt: float, count: int, at: Sequence[float] = (0.0, 0.0), point: float | None = None
     ) -> list[Case]:
-        """``count`` frames of a catheter at a :meth:`pose`, which differ in noise only, Sec. 3.5.1 of the thesis."""
+        """``count`` frames of a catheter at rest; they differ in noise only. Sec. 3.5.1 of the thesis."""
         pose = self.pose(depth, tilt, at=at, point=point)
         suffix = f", {1e3 * at[0]:.3f} {1e3 * at[1]:.3f}" if any(at) else ""
 
@@ -173,7 +173,7 @@ class World:
         """The sheet of Sec. 3.5.2 of the thesis: the tip at 9 x 9 points of a square of 8.16 cm that faces the camera.
 
         The cases are in rows. With the tip at the central point, the middle of the bands lies on the optical axis at
-        ``depth`` metres, which the thesis does not state.
+        ``depth`` metres. The thesis does not state this distance.
         """
         centre, direction = self.pose(depth, tilt)
         steps = [0.0816 * (i / 8 - 0.5) for i in range(9)]
@@ -183,10 +183,11 @@ class World:
         ]
 
     def grid_3d(self) -> dict[str, list[Case]]:
-        """The block of Sec. 3.5.3 of the thesis: 8 x 8 holes, 10 mm apart, in upper (A), left (B) and right face (C).
+        """The block of Sec. 3.5.3 of the thesis: 8 x 8 holes, 10 mm apart, in three faces.
 
-        The cases of each face are in rows, with one direction as if held by hand. The block is a cube of 90 mm with its
-        centre 560 mm from the camera, which the thesis does not state, and seen from an elevation of 37 degrees.
+        A is the upper, B the left, C the right face. The cases of each face are in rows, with one direction that a hand
+        would give. The block is a cube of 90 mm with its centre at z = 560 mm, seen from 37 degrees above. The thesis
+        does not state this view.
         """
         up, front, side = (torch.tensor(v, dtype=torch.float64) for v in ([0, -0.8, -0.6], [0, 0.6, -0.8], [1.0, 0, 0]))
         left, right = (front - side) / math.sqrt(2), (front + side) / math.sqrt(2)

@@ -11,19 +11,19 @@ Angle = Annotated[Number, Field(ge=-180, le=180)]
 
 
 class TargetPatternSettings(Settings):
-    """A row of thesis Table 2.2: the pattern whose perception time all icons should have."""
+    """The target pattern, a row of thesis Table 2.2. All icons are scaled to have its perception time."""
 
     size_deg: Annotated[Number, Field(gt=0, le=90)]
     eccentricity_deg: Annotated[Number, Field(ge=0, le=90)]
 
     @property
     def name(self) -> str:
-        """Size and eccentricity in words."""
+        """Size and eccentricity as text."""
         return f"{self.size_deg:g} deg at {self.eccentricity_deg:g} deg"
 
 
 class ItemSettings(Settings):
-    """An item of the layout: its icon, label and the direction of its centre; azimuths to the left are negative."""
+    """An item of the layout: icon, label, and direction of its centre (azimuth positive to the right)."""
 
     icon: Icon
     label: str = ""
@@ -32,10 +32,10 @@ class ItemSettings(Settings):
 
 
 class LayoutSettings(Settings):
-    """Icons over a wide field, scaled for equal perception time (thesis Fig. 2.8); the picture has a panel per target.
+    """Icons over a wide field, scaled for equal perception time, with one panel per target (thesis Fig. 2.8).
 
-    ``extrapolate``: scale icons beyond 70 deg of eccentricity by the lines of Table 2.2; otherwise they have the
-    target's size. ``field_deg``: field of the picture (vertical, horizontal), with equal angles per pixel.
+    ``extrapolate``: whether icons beyond 70 deg of eccentricity are scaled by the extrapolated line of Table 2.2;
+    otherwise they have the target's size. ``field_deg``: (vertical, horizontal) field of the picture in degrees.
     """
 
     experiment: Literal["perception_layout"]

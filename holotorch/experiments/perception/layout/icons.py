@@ -1,4 +1,4 @@
-"""Drawings of a fictional theme park: the background, and icons made of simple shapes in a unit square."""
+"""Drawings of a fictional theme park: a background, and icons composed of simple shapes."""
 
 import math
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from matplotlib.transforms import Affine2D, Transform
 
 
 def draw_ground(axes: Axes, field_deg: tuple[float, float]) -> None:
-    """Draw the sky, hills, paths and a pond behind the icons; ``field_deg`` is (vertical, horizontal)."""
+    """Draw the sky, hills, paths and a pond behind the icons, over ``field_deg`` (vertical, horizontal)."""
     high, wide = field_deg[0] / 2, field_deg[1] / 2
     axes.add_patch(Rectangle((-wide, -high), 2 * wide, 2 * high, color="#cfe4f2", zorder=0))
     steps = [wide * (i / 60 - 1) for i in range(121)]
@@ -27,7 +27,7 @@ def draw_ground(axes: Axes, field_deg: tuple[float, float]) -> None:
 
 
 def draw_icon(axes: Axes, name: str, centre: tuple[float, float], size: tuple[float, float], zorder: float) -> None:
-    """Draw an icon on a rounded plate; ``centre`` (x, y) and ``size`` (height, width) are in the units of the axes."""
+    """Draw an icon on a rounded plate; ``centre`` (x, y) and ``size`` (height, width) are in data units."""
     height, width = size
     left, bottom = centre[0] - width / 2, centre[1] - height / 2
     shapes, colour = _ICONS[name]
@@ -48,7 +48,7 @@ def draw_icon(axes: Axes, name: str, centre: tuple[float, float], size: tuple[fl
 
 @dataclass(frozen=True)
 class _Pen:
-    """Draws shapes, white by default, in the unit square of an icon on a plate of colour ``plate``."""
+    """Draws shapes, white by default, on an icon's plate of colour ``plate``; coordinates span 0 .. 1 over the icon."""
 
     axes: Axes
     transform: Transform
@@ -137,7 +137,7 @@ def _first_aid(pen: _Pen) -> None:
     pen.line((0.2, 0.5), (0.8, 0.5), thick=0.2)
 
 
-# The shapes of each icon and the colour of its plate.
+# For each icon: the function that draws its shapes, and the colour of its plate.
 _ICONS: dict[str, tuple[Callable[[_Pen], None], str]] = {
     "wheel": (_wheel, "#2f5d8a"),
     "coaster": (_coaster, "#a23b3b"),

@@ -1,4 +1,4 @@
-"""The kind ``perception_layout``: icons over a wide field, scaled for equal perception time."""
+"""The experiment ``perception_layout``: icons over a wide field, scaled for equal perception time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class LayoutKind(ExperimentKind[LayoutSettings, "Layouts"]):
-    """See :mod:`holotorch.experiments.kind`."""
+    """Loads the modules of the layout experiment only when needed; see :mod:`holotorch.experiments.kind`."""
 
     settings = LayoutSettings
     example = "configs/perception/layout.yaml"

@@ -1,11 +1,11 @@
-"""The part of a report page that shows a layout over a wide field."""
+"""The section of a report page for a layout over a wide field."""
 
 from holotorch.experiments.runs.page import element, figure, heading, table
 from holotorch.experiments.runs.record import RunRecord
 
 
 def layout_section(record: RunRecord) -> list[str]:
-    """HTML of a layout: the picture, its description, the sizes, and the displays that can show it."""
+    """HTML parts: the picture, its description, the table of icon sizes, and the table of displays."""
     rows = record.summary["items"]
     parts = [heading(record.title, record.summary["status"])]
     caption = "Icons of a notional theme park with their sizes. Icons framed in grey are not scaled"

@@ -31,9 +31,9 @@ from holotorch.perception import (
     scale_layout,
 )
 
-_ROUNDING_DEG = 1e-9  # rounding tolerance, so that an icon that touches the edge of the field does not count as cut
-_LIMITS = "#1a4a8a"  # colour of the lines at both ends of the fitted eccentricities
-# Frames of icons: colour, line style and legend.
+_ROUNDING_DEG = 1e-9  # tolerance for rounding errors of icons that touch the edge of the field
+_LIMITS = "#1a4a8a"  # colour of the vertical lines at 40 and 70 deg
+# Frames of the icons: colour, line style and legend text.
 _FITTED = ("#1b5e20", "-", "scaled by Table 2.2, 40 to 70 deg")
 _UNTESTED = ("#b000b0", "-", "scaled by Table 2.2, size outside the tested 5 to 26 deg")
 _KEPT = ("#555555", ":", "not scaled: outside 40 to 70 deg (size of the target)")
@@ -42,14 +42,14 @@ _EXTRAPOLATED = ("#d35400", "--", "* extrapolated beyond 70 deg")
 
 @dataclass(frozen=True)
 class Layouts:
-    """A configuration, and each of its targets with the scaled layout."""
+    """The settings, and for each target pattern the layout that is scaled to it."""
 
     settings: LayoutSettings
     scaled: list[tuple[TargetPatternSettings, ScaledLayout]]
 
 
 def build_layouts(settings: LayoutSettings) -> Layouts:
-    """Scale the icons for all targets. ConfigError for a target that Table 2.2 does not contain."""
+    """Scale the icons for each target. ConfigError for a target that Table 2.2 does not contain."""
     scaled = []
     for i, target in enumerate(settings.targets):
         try:
@@ -111,7 +111,7 @@ def _name(item: ItemSettings) -> str:
 
 
 def _flags(settings: LayoutSettings, layout: ScaledLayout) -> dict[str, Any]:
-    """Numbers of icons of each kind, pairs of icons that overlap, and icons that the edge of the picture cuts."""
+    """Counts of icons by the origin of their size; indices of overlapping pairs and of icons cut by the edge."""
     centres, half_field = _centres(settings), torch.tensor(settings.field_deg, dtype=torch.float64) / 2
     cut = (centres.abs() + layout.size_deg / 2 > half_field + _ROUNDING_DEG).any(-1)
     return {
@@ -125,7 +125,7 @@ def _flags(settings: LayoutSettings, layout: ScaledLayout) -> dict[str, Any]:
 
 
 def _note(layout: ScaledLayout, i: int, cut: bool) -> str:
-    """Warnings about an icon's size; empty if Table 2.2 gives the size, the study tested it and the icon is not cut."""
+    """Remarks on the size of icon ``i``; empty if it is scaled by Table 2.2 to a tested size and is not cut."""
     near = layout.eccentricity_deg[i] < FITTED_DEG[0]
     notes = {
         "extrapolated beyond 70 deg": layout.extrapolated[i],
@@ -155,7 +155,7 @@ def _rows(settings: LayoutSettings, title: str, layout: ScaledLayout) -> list[di
 
 
 def _displays(settings: LayoutSettings) -> Iterator[dict[str, Any]]:
-    """For each display of Table 2.1, the greatest eccentricity at which it can show each target's sizes."""
+    """One row per display of Table 2.1: the greatest eccentricity at which it shows the icon sizes of each target."""
     grid = torch.linspace(*FITTED_DEG, 301, dtype=torch.float64)
     for display in TABLE_2_1:
         row: dict[str, Any] = {"display": display.name, "half_field_deg": display.half_field_deg}
@@ -192,11 +192,11 @@ def _picture(layouts: Layouts) -> bytes:
             colour, style, _ = _frame(layout, i)
             _box(axes, centre, size, colour, style)
             label = f"{_name(item)}\n{max(size):.1f} deg" + (" *" if layout.extrapolated[i] else "")
-            position = centre[0], centre[1] - max(size[0] / 2, 3.0) - 0.4  # below the box of the target
+            position = centre[0], centre[1] - max(size[0] / 2, 3.0) - 0.4  # below the icon and the dashed box
             halo = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.7}
             axes.text(*position, label, ha="center", va="top", fontsize=7.5, color=colour, zorder=301, bbox=halo)
             if abs(layout.eccentricity_deg[i].item() - target.eccentricity_deg) < 0.05:
-                # The box has the size of the target plus 0.4 deg on each side; at 40 deg, the icon has another size.
+                # The box is 0.4 deg larger than the target on each side; an icon at 40 deg is scaled to another size.
                 _box(axes, centre, (target.size_deg + 0.8, target.size_deg + 0.8), "#d00000", "--")
         axes.plot(0, 0, "k+", markersize=11, zorder=400)
         axes.set(xlim=(-wide, wide), ylim=(-high, high), aspect="equal")
@@ -211,7 +211,7 @@ def _picture(layouts: Layouts) -> bytes:
 
 
 def _frame(layout: ScaledLayout, i: int) -> tuple[str, str, str]:
-    """Colour, line style and legend of an icon's frame."""
+    """Colour, line style and legend text of the frame of icon ``i``."""
     if layout.extrapolated[i]:
         return _EXTRAPOLATED
     if layout.kept[i]:
@@ -220,7 +220,7 @@ def _frame(layout: ScaledLayout, i: int) -> tuple[str, str, str]:
 
 
 def _legend(layouts: Layouts) -> list[Artist]:
-    """Legend entries of the frames that occur in the picture."""
+    """Legend entries of the frames in the picture, and of the lines at 40 and 70 deg."""
     used = {_frame(layout, i) for _, layout in layouts.scaled for i in range(len(layout.kept))}
     entries: list[Artist] = [
         Rectangle((0, 0), 1, 1, fill=False, edgecolor=colour, linestyle=style, label=words)
