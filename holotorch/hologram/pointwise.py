@@ -26,7 +26,7 @@ class DirectHologram(LayerHologram):
     """
 
     def pairs(self, layers: Tensor) -> int:
-        """Number of pairs of a nonzero source of ``layers`` [D, h, w] and a pixel; only within a box for sharp cones."""
+        """Number of pairs of a nonzero source in ``layers`` [D, h, w] and a pixel (for "box" and "disc", in a box)."""
         total = 0
         for plane, depth in zip(layers, self.depths, strict=True):
             sharp = self.cone in ("box", "disc")

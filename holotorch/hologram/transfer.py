@@ -41,7 +41,7 @@ class AxialDesign:
     def last(self, node: int, like: Tensor) -> Tensor:
         """First quadrant of the factor by which the sum over all nodes is multiplied, to give the hologram's spectrum.
 
-        The sum refers to the plane of ``node``. The factor is the spectrum of the spherical wave from there, times taper
+        The sum refers to the plane of ``node``. The factor is the spectrum of the spherical wave from it, times taper
         and attenuation, divided by the Fourier transform of the window. dtype and device are those of ``like``.
         """
         axial, offset = self._axial_frequency(like.device)
