@@ -56,7 +56,7 @@ def render_adaptively(sampler: DVRSampler, volume: Volume, *, step: int = 4, con
 
     The first rays are the corners of rectangular cells. In a cell all rays are computed if a colour or the opacity
     differs by more than ``contrast`` among the corners of this cell and its neighbours. Pixels in the other cells are
-    interpolated linearly, so details between the corners are missed. The picture is differentiable; the choice of rays
+    interpolated linearly, so details between the corners are missed. The picture is differentiable, the choice of rays
     is not. ValueError for a ``step`` below 1 or a ``contrast`` below 0.
     """
     step = checks.whole("step", step, 1)

@@ -85,10 +85,9 @@ def flat_steps(volume: Volume) -> Triple:
 
 
 def slopes(values: Tensor, steps: Triple) -> Tensor:
-    """Gradient of ``values`` [D, H, W] along (z, y, x) per sample, divided by ``steps``: [3, D, H, W].
+    """Gradient of ``values`` [D, H, W] along (z, y, x) per sample, divided by :func:`flat_steps`: [3, D, H, W].
 
-    Differences are central, one-sided at the faces, and zero along an axis of one sample. ``steps`` are those of
-    :func:`flat_steps`.
+    Differences are central, one-sided at the faces, and zero along an axis of one sample.
     """
     return torch.stack([_difference(values, axis, step) for axis, step in enumerate(steps)])
 

@@ -18,7 +18,7 @@ BRICK = 16  # edge length in voxels of the blocks of a volume that are skipped i
 
 @dataclass(frozen=True)
 class RaySamples:
-    """Samples of n rays on one plane."""
+    """Samples of n rays on a plane."""
 
     rays: Tensor  # flat indices of the rays into the rows and columns of the window, [n]
     samples: Tensor  # value, and with lighting three slopes, of each ray, [c, n]
@@ -59,7 +59,7 @@ class Window:
         return len(self.rows) * len(self.columns)
 
     def length(self, low: float, high: float, rows: slice) -> Tensor | float:
-        """Path length in the box between depths ``low`` and ``high`` from its centre, [rows, w] or one for all."""
+        """Path length in metres in the box between two depths in metres from its centre: [rows, w] or one number."""
         if self.entry is None or self.exit is None:
             return max(0.0, high - low)
         path = (self.exit[rows].clamp(max=high) - self.entry[rows].clamp(min=low)).clamp_(min=0)
