@@ -18,7 +18,7 @@ class Lighting:
     The shaded colour is colour * (ambient + diffuse * (n . l)) + specular * (r . v)^shininess. The normal n is the
     direction of the gradient of the values or its opposite, whichever points towards the observer. l is the direction
     to the light, r is l mirrored at n, and v is the direction to the observer along the axis. Where the value is
-    constant there is no surface, and the result is colour * (ambient + diffuse). The weight of the former is
+    constant there is no surface, and the result is colour * (ambient + diffuse). The first formula has the weight
     g^2 / (g^2 + 1), where g is the norm of the :func:`slopes`, so that the result and its derivative are finite.
 
     Attributes:

@@ -41,7 +41,7 @@ class Window:
 
     @classmethod
     def of(cls, place: Placement, rays: Rays, rows: range, columns: range, like: Tensor) -> "Window":
-        """Window of ``rows`` and ``columns``; tensors are on the device of ``like``, depths and lengths in its dtype."""
+        """Window of ``rows`` and ``columns``; tensors on the device of ``like``, depths and lengths in its dtype."""
         y, x = (axis.flatten() for axis in rays.grid.coordinates(like.device))
         down, across = y[rows.start : rows.stop], x[columns.start : columns.stop]
         if not place.turned and rays.eye is None:
