@@ -20,20 +20,20 @@ from holotorch.hologram.raster import Raster, has_light
 from holotorch.hologram.transfer import AxialDesign
 from holotorch.optics.free_space.padding import FINEST
 
-_GROUP = 16  # most planes that one matrix product spreads onto the nodes
+_GROUP = 16  # largest number of planes that one matrix product spreads onto the nodes
 
 
 class AxialHologram(LayerHologram):
     """Sum over planes of band-limited spherical waves exp(i k r) / r, with one small FFT per node instead of per plane.
 
-    Planes are spread onto evenly spaced nodes along the axis (:class:`Nodes`). Each node needs one FFT at the
-    resolution of the sources. The spectra are summed by Horner's rule: the partial sum is multiplied by the same
-    factor from each node to the next. Finally the sum is multiplied by the spectrum of the spherical wave and
-    transformed back. If the planes are evenly spaced and not more expensive than nodes, they serve as nodes.
+    Planes are spread onto evenly spaced nodes, which are planes at fixed depths (``holotorch.hologram.nodes``). Each
+    node needs one FFT at the resolution of the sources. The spectra are summed by Horner's rule: the partial sum is
+    multiplied by the same propagation factor from each node to the next. Finally the sum is multiplied by the spectrum
+    of the spherical wave and transformed back. Evenly spaced planes serve as nodes themselves if this is cheaper.
 
     Arguments as for :class:`LayerHologram`, except:
         cone: "taper", "band" or "full". "full" is allowed only if every pixel lies within the cone of every source,
-            since steeper light is left out.
+            since this method leaves out light outside the cone.
         tolerance: Largest relative L2 error of the field for random sources; complex64 reaches 1e-6 at best.
 
     Raises:
@@ -68,7 +68,7 @@ class AxialHologram(LayerHologram):
         self._designs: dict[tuple[int, int], AxialDesign] = {}
 
     def design(self, shape: tuple[int, int]) -> AxialDesign:
-        """Nodes and transform sizes for layers of ``shape`` (h, w)."""
+        """Nodes, transform sizes and predicted error for layers of ``shape`` (h, w); computed once per shape."""
         if shape not in self._designs:
             common = self.wavelength, min(self.depths), max(self.depths), self.cone
             axes = y, x = [
@@ -82,7 +82,7 @@ class AxialHologram(LayerHologram):
                     f"{least:.3g} m on for layers of {shape}; "
                     f"the nearest depth is {min(self.depths):.3g} m: use cone='taper' or ConvolutionHologram"
                 )
-            # Of the tolerance, 0.4 is granted to each axis and 0.3 to the nodes; the errors add in quadrature.
+            # The error of each axis may be 0.4 of the tolerance, that of the nodes 0.3. They add in quadrature.
             (height, error_y), (width, error_x) = (choose_length(axis, 0.4 * self.tolerance) for axis in axes)
             steepest = min(y.steepest, y.fade(height)[1]), min(x.steepest, x.fade(width)[1])
             low, high = axial_range(self.wavelength, steepest)
@@ -93,7 +93,7 @@ class AxialHologram(LayerHologram):
         return self._designs[shape]
 
     def checked_design(self, shape: tuple[int, int]) -> AxialDesign:
-        """The design for layers of ``shape`` (h, w), with a SamplingWarning if it is not adequate."""
+        """The design for layers of ``shape`` (h, w); warns if its predicted error exceeds the tolerance."""
         design = self.design(shape)
         if not design.adequate:
             warnings.warn(
@@ -105,10 +105,10 @@ class AxialHologram(LayerHologram):
         return design
 
     def accumulate(self, planes: Iterable[Tensor], phase: Tensor | None = None) -> Tensor:
-        """Field [H, W] of planes [h, w], real or complex, in the order of ``depths``, which must rise or fall.
+        """Field [H, W] of planes [h, w], real or complex, given in the order of ``depths``.
 
-        The planes are read one after another and not all kept in memory. ``phase`` in rad, [h, w], is added to all of
-        them. ValueError if there is no plane, or if the depths neither rise nor fall.
+        The planes are read one after another and not all kept in memory. ``phase`` in rad, [h, w], is added to the
+        phase of every plane. ValueError if there is no plane, or if the depths neither rise nor fall throughout.
         """
         total = None
         for j, plane in enumerate(planes):
@@ -119,7 +119,7 @@ class AxialHologram(LayerHologram):
         return total.finish()
 
     def accumulator(self, shape: tuple[int, int], phase: Tensor | None = None) -> "Accumulator":
-        """Running sum over planes of ``shape`` (h, w); ``phase`` in rad, [h, w], is added to all planes."""
+        """Running sum over planes of ``shape`` (h, w); ``phase`` in rad, [h, w], is added to the phase of each."""
         return Accumulator(self, shape, phase)
 
     def _forward(self, layers: Tensor) -> Tensor:
@@ -150,10 +150,10 @@ class AxialHologram(LayerHologram):
 
 
 class Accumulator:
-    """Running sum of an :class:`AxialHologram` over planes that are added in rising or falling depth.
+    """Running sum of an :class:`AxialHologram` over planes that are added in order of rising or falling depth.
 
-    A node is open from the first plane that contributes to it to the last. The open nodes share one block of memory,
-    node m in row m modulo the number of rows, so that a group of planes is added in place by one matrix product.
+    A node is open between the first and the last plane that contribute to it. The open nodes share one array, in which
+    node m is row m modulo the number of rows. One matrix product adds a group of planes to all open nodes in place.
     """
 
     def __init__(self, operator: AxialHologram, shape: tuple[int, int], phase: Tensor | None = None):
@@ -161,7 +161,7 @@ class Accumulator:
         self.phasor = None if phase is None else phasor(phase)
         self.nodes = self.design.nodes
         self.begins, self.weights = self.nodes.weights(operator.depths)
-        # A plane needs ``width`` rows. Additional rows let a group hold several planes even if they are far apart.
+        # A plane contributes to ``width`` nodes. Additional rows allow groups of planes that are far apart.
         spare = round(_GROUP / 2 * self.nodes.count / len(operator.depths))
         self.rows = self.nodes.width + min(spare, self.nodes.width)
         self.last_depth: float | None = None
@@ -169,7 +169,7 @@ class Accumulator:
         self.pending: list[tuple[int, Tensor]] = []
         self.open: set[int] = set()
         self.block: Tensor | None = None  # [h, rows, w] complex, or [h, 2 rows, w] while all planes are real
-        # Sum of the spectra of the nodes closed so far, [N_y, N_x], with phases relative to the node ``total_node``.
+        # Sum of the spectra of all closed nodes, [N_y, N_x], propagated to the depth of the node ``total_node``.
         self.total: Tensor | None = None
         self.total_node = 0
         self.step: Tensor | None = None
@@ -228,13 +228,13 @@ class Accumulator:
         elif planes.is_complex() and not self.block.is_complex():
             self.block = torch.complex(self.block[:, ::2], self.block[:, 1::2])
         if not self.block.is_complex():
-            # Real planes: rows hold real and imaginary parts alternately.
+            # Rows of the block hold real and imaginary parts of the nodes alternately, since the planes are real.
             spread = torch.view_as_real(spread).movedim(-1, 1).flatten(0, 1)
-        # A batch of products, one per row of the planes: for a single product torch would first reorder them in memory.
+        # One product per image row: for a single large product torch would first copy the planes into another order.
         self.block.baddbmm_(spread.to(self.block).expand(height, -1, -1), planes.to(self.block.dtype))
 
     def _close(self, nodes: set[int]) -> None:
-        """Add ``nodes``, to which no later plane contributes, to the sum and free their rows."""
+        """Add ``nodes``, to which no later plane contributes, to the total, and clear their rows of the block."""
         for index in sorted(nodes, reverse=self.rising is False):
             assert self.block is not None
             k = index % self.rows
@@ -244,7 +244,7 @@ class Accumulator:
         self.open = self.open - nodes
 
     def _add_node(self, index: int, node: Tensor) -> None:
-        """Apply Horner's rule: propagate the sum to node ``index`` and add the spectrum of the node."""
+        """One step of Horner's rule: propagate the total to node ``index`` and add the spectrum of that node."""
         if self.phasor is not None:
             node *= self.phasor
         raster = self.design.raster
@@ -252,7 +252,7 @@ class Accumulator:
         if self.total is None:
             self.total = period.repeat(raster.stride, raster.stride)
         else:
-            # Light of a deeper node has a larger phase, so the sum is retarded when it refers to a deeper node.
+            # The phase grows with depth as exp(2 pi i z w), so relative to a deeper node the total has a smaller phase.
             direction = 1 if index > self.total_node else -1
             if self.step is None:
                 self.step = self.design.step(-direction, node)
@@ -264,7 +264,7 @@ class Accumulator:
 
 
 def _stacked(planes: list[Tensor]) -> Tensor:
-    """Planes [h, w] as [h, J, w]; a view if they are adjacent in memory, like the slices of one tensor."""
+    """J planes [h, w] as one tensor [h, J, w]; a view if the planes follow one another in memory."""
     first = planes[0]
     begin, memory = first.data_ptr(), first.untyped_storage().data_ptr()
     for k, plane in enumerate(planes):

@@ -1,9 +1,9 @@
 """Spherical waves limited to the frequencies of a grid: their spectrum, and their values in space by quadrature.
 
 Weyl's expansion writes a spherical wave as an integral of plane waves over the frequencies f = (fx, fy),
-exp(ikr) / r = i int exp(2 pi i (f . x + z w)) / w df with w = sqrt(1 / wavelength^2 - fx^2 - fy^2). The cones ``taper``
-and ``band`` weight the integrand. The result has no closed form in space; it is integrated numerically, which is slow
-but exact to rounding.
+exp(ikr) / r = i int exp(2 pi i (f . x + z w)) / w df with w = sqrt(1 / wavelength^2 - fx^2 - fy^2). Here x is the
+lateral and z the axial distance. With the cones ``taper`` and ``band`` the integrand is weighted, and the integral has
+no closed form. It is computed by numerical quadrature, which is slow but exact to rounding.
 """
 
 import itertools
@@ -16,16 +16,16 @@ from torch import Tensor
 from holotorch.hologram.cone import TAPER_BEGIN, taper
 from holotorch.optics.free_space.kernels import carrier, turns_phasor
 
-_RULE = np.polynomial.legendre.leggauss(64)
-_CYCLES = 10.0  # most cycles of the integrand per panel of 64 nodes; the rule is exact to rounding up to about 15
-_MOST_NODES = 30_000  # most quadrature nodes per axis, with which the sum over both axes takes minutes
+_RULE = np.polynomial.legendre.leggauss(64)  # nodes and weights of one panel
+_CYCLES = 10.0  # cycles of the integrand allowed per panel; up to about 15 the rule is exact to rounding
+_MOST_NODES = 30_000  # largest number of quadrature nodes per axis; at this limit the double sum takes minutes
 
 
 def point_spectrum(fy: Tensor, fx: Tensor, wavelength: float, depth: float) -> Tensor:
     """Spectrum i exp(2 pi i z w) / w of a point source at z = ``depth`` metres, complex128 of the broadcast shape.
 
-    ``fy`` and ``fx`` are float64 in cycles per metre, with f^2 = fy^2 + fx^2 < 1 / wavelength^2. The phase in cycles,
-    z w, is computed as z / wavelength - z f^2 / (w + 1 / wavelength), to avoid the cancellation of w - 1 / wavelength.
+    w is the axial frequency. ``fy`` and ``fx`` are float64 in cycles per metre, with f^2 = fy^2 + fx^2 below
+    1 / wavelength^2. The phase z w in cycles is computed as z / wavelength - z f^2 / (w + 1 / wavelength) for accuracy.
     """
     square = fy.square() + fx.square()
     axial = torch.sqrt(wavelength**-2 - square)
@@ -38,14 +38,14 @@ def band_limited_wave(
 ) -> Tensor:
     """Spherical wave whose spectrum is limited to frequencies up to 1 / (2 ``pitch``), complex128 [A, B].
 
-    ``dy`` [A] and ``dx`` [B] are displacements in metres, float64. ``pitch`` (y, x) in metres is at least 0.9
-    wavelengths. The spectrum ends with the taper of ``cone.taper`` if ``soft``, else sharply. ValueError if ``depth``
-    in metres is so large that the quadrature needs too many nodes.
+    ``dy`` [A] and ``dx`` [B] are displacements from source to pixel in metres, float64. ``pitch`` (y, x) in metres is
+    at least 0.9 wavelengths. The spectrum falls to 0 as in ``cone.taper`` if ``soft``, else sharply. ValueError if
+    ``depth``, in metres, is so large that the quadrature needs too many nodes.
     """
     fy, fx = (
         _nodes(displacement, step, wavelength, depth, soft) for displacement, step in zip((dy, dx), pitch, strict=True)
     )
-    # The spectrum is even in both frequencies, so a cosine transform of one quadrant suffices.
+    # The spectrum is even in fy and in fx, so the integral is a cosine transform over one quadrant.
     columns = 2 * fx[1] * torch.cos(2 * math.pi * dx[:, None] * fx[0])
     rows = 2 * fy[1] * torch.cos(2 * math.pi * dy[:, None] * fy[0])
     total = torch.zeros(len(dy), len(dx), dtype=torch.complex128, device=dy.device)
@@ -57,10 +57,10 @@ def band_limited_wave(
 
 
 def _nodes(displacement: Tensor, pitch: float, wavelength: float, depth: float, soft: bool) -> tuple[Tensor, Tensor]:
-    """Quadrature nodes from frequency 0 to the highest one of the pitch, and weights, which include the taper."""
+    """Quadrature nodes between 0 and 1 / (2 ``pitch``), and their weights, which include the taper if ``soft``."""
     highest = 1 / (2 * pitch)
     sine = wavelength * highest
-    # Largest derivative of the phase in cycles by frequency: the displacement plus the spread of the steepest light.
+    # Largest derivative of the phase in cycles with respect to frequency: |displacement| + depth * tan(largest angle).
     slope = displacement.abs().max().item() + depth * sine / math.sqrt(max(1 - 2 * sine**2, 0.1))
     if slope * highest / _CYCLES * 64 > _MOST_NODES:
         raise ValueError(

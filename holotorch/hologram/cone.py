@@ -1,18 +1,18 @@
 """Spherical wave of a point source on a sampled hologram, and the cone of directions that the pixels can carry.
 
 The wave of a point source is exp(+i k r) / r (thesis Eqs. 5.1, 5.13). Pixels of pitch p sample frequencies up to
-1 / (2 p) along each axis, that is directions up to the angle theta with sin(theta) = wavelength / (2 p); steeper light
-aliases. The option ``cone`` of every hologram defines which part of the wave is kept:
+1 / (2 p) along each axis, which are directions up to the angle theta with sin(theta) = wavelength / (2 p). Light at
+larger angles aliases. The option ``cone`` of every hologram defines which part of the wave is kept:
 
-- ``full``: the whole wave. It aliases where the cone is narrower than the hologram (Algorithm 4 as printed).
-- ``box``: a sharp pyramid in space, |x| <= z tan(theta) and |y| <= z tan(theta), the thesis's K_z of Sec. 5.6.1.
-- ``disc``: a sharp cone in space with the same half-widths, which is elliptical where the pitches differ.
+- ``full``: the whole wave. It aliases at pixels outside the cone (Algorithm 4 as printed).
+- ``box``: a pyramid in space with sharp edges, |x| <= z tan(theta) and |y| <= z tan(theta); K_z in Sec. 5.6.1.
+- ``disc``: an elliptical cone in space with sharp edges and the same half-widths along x and y as ``box``.
 - ``band``: the spectrum is cut off sharply at 1 / (2 p) along each axis, so all light that the pixels sample is kept.
-- ``taper``: the spectrum falls to 0 over the last 30 % of the frequencies of each axis, to suppress ringing.
+- ``taper``: the spectrum falls to 0 from 70 % to 100 % of 1 / (2 p) along each axis, to suppress ringing.
 
 If every pixel lies well inside the cone of every source, ``full``, ``box``, ``disc`` and ``taper`` agree;
-:func:`is_plain` is the criterion. The ringing of ``band`` extends farther into the cone: on the axis its amplitude is
-0.6 / sqrt(K) of the wave, if the cone covers K samples of the hologram.
+:func:`is_plain` tests this. The ringing of ``band`` extends farther into the cone: on the axis of the source its
+amplitude relative to the wave is 0.6 / sqrt(K) for a cone that is K samples wide on the hologram.
 """
 
 import math
@@ -38,18 +38,18 @@ def taper(fraction: Tensor) -> Tensor:
 
 
 def taper_margin(half_width: float, error: float) -> float:
-    """Distance in samples from an edge of the taper at which its ringing falls to ``error`` times the wave.
+    """Distance in samples within which the ringing of the taper exceeds ``error`` times the wave.
 
-    The taper has two edges, at 0.7 and 1 times the highest frequency, where its second derivative jumps. In the wave
-    of a cone of ``half_width`` samples this causes ringing around the positions that light of these two frequencies
-    reaches. At n samples from such a position the relative amplitude of the ringing is about 2 sqrt(K) / n^3 with
-    K = 2 ``half_width``. In measurements the factor, here 2, is between 0.9 and 2.5.
+    The second derivative of the taper jumps at 0.7 and at 1 times the highest frequency. The tapered wave therefore
+    rings around the positions on the hologram that light of these two frequencies reaches. For a cone of ``half_width``
+    samples, the relative amplitude of the ringing at n samples from such a position is about 2 sqrt(K) / n^3 with
+    K = 2 ``half_width``. The factor 2 is fitted: measured values lie between 0.9 and 2.5.
     """
     return (2 * math.sqrt(2 * half_width) / error) ** (1 / 3)
 
 
 def is_plain(grid: Grid, wavelength: float, depth: float, displacement: tuple[int, int], error: float) -> bool:
-    """Whether the taper changes the wave by less than ``error``, relative, up to ``displacement`` (y, x) in samples."""
+    """Whether the taper changes the wave by less than the fraction ``error`` up to ``displacement`` (y, x), samples."""
     return all(
         math.isinf(half_width) or TAPER_BEGIN * half_width - samples >= taper_margin(half_width, error / 2)
         for half_width, samples in zip(cone_samples(grid, wavelength, depth), displacement, strict=True)
@@ -66,9 +66,8 @@ def spherical_wave(dy: Tensor, dx: Tensor, pitch: tuple[float, float], wavelengt
     """exp(i k r) / r within the cone, with r^2 = ``depth``^2 + ``dy``^2 + ``dx``^2, complex128 of the broadcast shape.
 
     All lengths are in metres; the displacements ``dy`` and ``dx`` are float64. ``pitch`` (y, x) defines the width of
-    the cone, which is "full", "box" or "disc"; for "taper" and "band" see ``band_limited_wave``. With z = ``depth`` and
-    s = dy^2 + dx^2, k r is computed as k z + k s / (r + z), to avoid the cancellation of r - z, and whole cycles of k z
-    are removed in float64.
+    the cone. ``cone`` is "full", "box" or "disc"; see ``band_limited_wave`` for the others. For accuracy, k r is
+    computed as k z + k (dy^2 + dx^2) / (r + z) with z = ``depth``, and whole cycles are removed from k z.
     """
     square = dy.square() + dx.square()
     distance = torch.sqrt(depth**2 + square)
@@ -77,17 +76,17 @@ def spherical_wave(dy: Tensor, dx: Tensor, pitch: tuple[float, float], wavelengt
     if cone == "full":
         return wave
     spread = lateral_spread(Grid(1, pitch), wavelength, depth)
-    # The relative margin of 1e-12 keeps pixels on the border inside the cone in spite of rounding.
+    # With the relative margin of 1e-12, pixels exactly on the edge of the cone are inside in spite of rounding.
     y, x = (displacement.abs() / (limit * (1 + 1e-12)) for displacement, limit in zip((dy, dx), spread, strict=True))
     inside = (y.square() + x.square() <= 1) if cone == "disc" else (y <= 1) & (x <= 1)
     return torch.where(inside, wave, 0)
 
 
 def check_scene(grid: Grid, wavelength: float, depths, stride: int) -> tuple[float, tuple[float, ...], int]:
-    """Return wavelength (m), depths (m) and stride (pixels) of a hologram's sources.
+    """Check and return wavelength (m), depths (m) and stride (pixels) of the sources of a hologram.
 
-    TypeError if one is not a number. ValueError for several wavelengths, no depth, a depth that is not above zero or
-    exceeds 100 m, or a stride below 1.
+    TypeError for a value that is not a number. ValueError for several wavelengths, no depths, a depth of at most 0 or
+    above 100 m, or a stride below 1.
     """
     first, *others = checks.wavelengths(wavelength)
     if others:

@@ -15,29 +15,29 @@ from holotorch.hologram.raster import Raster, has_light, span, strided_length
 from holotorch.optics.free_space.plane_pair import plane_pair
 from holotorch.optics.free_space.transfer import transfer_function
 
-# Amplitude of wrapped light that is accepted, relative to the spherical wave. The closed form of the unlimited wave
-# replaces the tapered wave if the relative difference of the two is smaller than this.
+# Accepted amplitude of light that wraps around, relative to the spherical wave. The closed form of the full wave
+# replaces the tapered wave if the two differ by less than this fraction.
 TAPER_ERROR = 2e-7
 
 
 class ConvolutionHologram(LayerHologram):
-    """The sum of ``DirectHologram`` by FFT: thesis Eqs. 5.8 to 5.14 and Algorithm 5, exact to rounding.
+    """The sum of ``DirectHologram`` by FFT: thesis Eqs. 5.8 to 5.14 and Algorithm 5, exact to rounding but for "band".
 
-    Phases are computed in float64 before they are cast to the dtype of the layers. Each plane needs an FFT of its
-    sources on a raster of ``stride`` pixels, and half an FFT for its kernel, of which a quadrant suffices since it is
-    even. Planes are summed in frequency and transformed back together. If sources cover V samples, pixels H and the
-    cone of light K, no light wraps around at the padded length max(V, H, (V + H + K) / 2); Sec. 5.6.1 uses H + K.
+    Phases are computed in float64 before they are cast to the dtype of the layers. Each plane needs one FFT of its
+    sources, with one sample per source, and half an FFT for its kernel, which is even in y and x. The spectra of the
+    planes are summed and transformed back together. If along an axis the sources extend over V samples, the pixels over
+    H and the cone over K, no light wraps around at the padded length max(V, H, (V + H + K) / 2); Sec. 5.6.1 uses H + K.
 
-    Arguments and exceptions as for :class:`LayerHologram`. ``cone="taper"`` is applied in frequency, on arrays so long
-    that at most 2e-7 of a wave wraps around. ``cone="band"`` uses the kernel of ``CroppedKernel``, whose relative error
-    is about 2 s^2 / sqrt(N / 2), where s is the sine of the steepest light and N the padded length in samples.
+    Arguments and exceptions as for :class:`LayerHologram`. For ``cone="taper"`` the arrays are so long that at most
+    2e-7 of a wave wraps around. ``cone="band"`` uses the kernel of ``CroppedKernel``, whose relative error is about
+    2 s^2 / sqrt(N / 2), where s is wavelength / (2 pitch) and N the padded length in samples.
     """
 
     def padded(self, shape: tuple[int, int]) -> tuple[int, int]:
         """Size of the transforms in samples for layers of ``shape`` (h, w)."""
         displacement, least = span(self.grid, shape, self.stride)
         extents = [self._extent(depth, displacement) for depth in self.depths]
-        # No wave wraps onto a pixel if the length exceeds the largest displacement plus the largest kernel's extent.
+        # No light wraps onto a pixel if the length exceeds the largest displacement plus the half-width of the kernel.
         y, x = (
             strided_length(max(length, samples + max(extent) + 1), self.stride)
             for length, samples, extent in zip(least, displacement, zip(*extents, strict=True), strict=True)
@@ -45,7 +45,7 @@ class ConvolutionHologram(LayerHologram):
         return y, x
 
     def _extent(self, depth: float, displacement: tuple[int, int]) -> tuple[int, int]:
-        """Half-width (y, x) in samples of the kernel of a depth, needed for displacements up to ``displacement``."""
+        """Half-width (y, x) in samples of the kernel at ``depth``, for displacements up to ``displacement`` samples."""
         if self._in_frequency(depth, displacement):
             sines = [self.wavelength / (2 * pitch) for pitch in self.grid.pitch]
             path = depth / math.sqrt(1 - sines[0] ** 2 - sines[1] ** 2)  # path of the steepest light in metres
@@ -59,7 +59,7 @@ class ConvolutionHologram(LayerHologram):
         return y, x
 
     def kernel_samples(self, depth: float, shape: tuple[int, int], size: tuple[int, int]) -> tuple[int, int]:
-        """Size (y, x) in samples of the computed quadrant of a kernel, for layers of ``shape`` padded to ``size``."""
+        """Size (y, x) in samples of the computed quadrant of the kernel, for layers of ``shape`` padded to ``size``."""
         displacement, _ = span(self.grid, shape, self.stride)
         if self._in_frequency(depth, displacement):
             return size[0] // 2 + 1, size[1] // 2 + 1
@@ -68,7 +68,7 @@ class ConvolutionHologram(LayerHologram):
         return y, x
 
     def _in_frequency(self, depth: float, displacement: tuple[int, int]) -> bool:
-        """Whether the kernel of a depth is computed in frequency, since the taper changes it."""
+        """Whether the kernel at ``depth`` is tapered in frequency, rather than computed in space in closed form."""
         return self.cone == "taper" and not is_plain(self.grid, self.wavelength, depth, displacement, TAPER_ERROR)
 
     def _kernel(self, depth: float, raster: Raster, layers: Tensor) -> Tensor:
@@ -90,9 +90,9 @@ class ConvolutionHologram(LayerHologram):
         return even_fft2(wave.to(layers.dtype), raster.size)
 
     def _band_kernel(self, depth: float, raster: Raster, displacement: tuple[int, int]) -> Tensor:
-        """The quadrant for ``cone="band"``: the band-limited transfer function times i / (w A).
+        """First quadrant of the spectrum for ``cone="band"``: the band-limited transfer function times i / (w A).
 
-        w is the axial frequency and A the area of a pixel.
+        w is the axial frequency in cycles per metre and A the area of a pixel in square metres.
         """
         window = Grid((displacement[0] + 1, displacement[1] + 1), self.grid.pitch)
         planes = plane_pair(window, None, (0.0, 0.0), (0.0, 0.0), [self.wavelength])
@@ -105,7 +105,7 @@ class ConvolutionHologram(LayerHologram):
         return 1j * kernel[:rows, :columns] / (axial * math.prod(self.grid.pitch))
 
     def accumulator(self, shape: tuple[int, int], phase: Tensor | None = None) -> "ConvolutionSum":
-        """Running sum over planes of ``shape`` (h, w); ``phase`` in rad, [h, w], is added to all planes."""
+        """Running sum over planes of ``shape`` (h, w); ``phase`` in rad, [h, w], is added to the phase of each."""
         return ConvolutionSum(self, shape, phase)
 
     def _forward(self, layers: Tensor) -> Tensor:

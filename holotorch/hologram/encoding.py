@@ -20,15 +20,15 @@ def kinoform(field: Tensor) -> Tensor:
 
 
 def double_phase(field: Tensor) -> Tensor:
-    """Double-phase encoding: two phases per pixel, arg(field) +- acos(amplitude), of which a checkerboard picks one.
+    """Double-phase encoding: arg(field) + acos(a) and arg(field) - acos(a), alternating in a checkerboard.
 
-    The two phasors average to the field [..., H, W], scaled to a largest amplitude of 1. The differences between
-    neighbouring pixels lie at the highest frequencies, which an aperture in the Fourier plane removes. In a black
-    hologram the phases of neighbours differ by pi, so that they cancel. Source: Hsueh and Sawchuk (1978), as used by
-    Maimone et al. (2017).
+    Here a is the amplitude of the field [..., H, W], scaled to a maximum of 1. The phasors of the two phases average to
+    the scaled field. Their alternation lies at the highest frequencies, which an aperture in the Fourier plane removes.
+    In a black hologram the phases of neighbours differ by pi, so that they cancel. Source: Hsueh and Sawchuk (1978), as
+    used by Maimone et al. (2017).
 
-    Gradients are finite everywhere. Two terms without a derivative have gradient zero: the phase of a dark pixel, and
-    the arccosine of the pixel with the largest amplitude, whose scaled amplitude is always 1.
+    Gradients are finite everywhere. They are set to zero where no derivative exists: for the phase of a dark pixel, and
+    for the arccosine at the largest amplitude.
     """
     field = _checked(field)
     amplitude = field.abs()
@@ -42,11 +42,11 @@ def double_phase(field: Tensor) -> Tensor:
 
 
 def error_diffused(field: Tensor) -> Tensor:
-    """Phase of a complex hologram [..., H, W] by diffusion of the error of each pixel to its four next neighbours.
+    """Phase of a complex hologram [..., H, W] by diffusion of the error of each pixel to four later neighbours.
 
-    Rows are scanned in alternating direction. The error moves to high frequencies, where it is less visible. The scan
-    is sequential and takes half a second for 512 x 512 pixels. It has no gradient. Source: Floyd and Steinberg (1976),
-    applied to fields by Tsang and Poon (2013).
+    The error is the scaled field minus its unit phasor. Rows are scanned in alternating directions. Diffusion shifts
+    the error to high frequencies, where it is less visible. The scan is sequential, takes half a second for 512 x 512
+    pixels and has no gradient. Source: Floyd and Steinberg (1976), applied to fields by Tsang and Poon (2013).
     """
     field = _checked(field)
     peak = field.abs().amax((-2, -1), keepdim=True)
@@ -54,7 +54,7 @@ def error_diffused(field: Tensor) -> Tensor:
     height, width = field.shape[-2:]
     encoded = []
     for item in flat:
-        # A margin on three sides receives the error that leaves the hologram.
+        # An additional column on either side and a row at the bottom receive the error that leaves the hologram.
         rows = [[0j, *row, 0j] for row in item.tolist()] + [[0j] * (width + 2)]
         for i in range(height):
             row, below, step = rows[i], rows[i + 1], 1 if i % 2 == 0 else -1
@@ -74,16 +74,16 @@ def error_diffused(field: Tensor) -> Tensor:
 def iterated(
     field: Tensor, propagate: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor], *, steps: int = 30
 ) -> Tensor:
-    """Phase whose propagated field has about the amplitude of the propagated hologram, by Gerchberg-Saxton iterations.
+    """Phase [..., H, W] by Gerchberg-Saxton iterations, which match the amplitude of the hologram in another plane.
 
     Args:
         field: Complex hologram [..., H, W].
-        propagate: Propagation to the plane at which amplitudes are compared.
+        propagate: Propagation of a field from the hologram to that plane.
         adjoint: Conjugate transpose of ``propagate``, used as its approximate inverse.
         steps: Number of iterations.
     """
     field = _checked(field)
-    if not field.numel():  # an empty batch, which transforms refuse
+    if not field.numel():  # an empty batch, for which FFTs raise an error
         return torch.angle(field)
     wanted = propagate(field)
     power = field.abs().square().mean((-2, -1), keepdim=True)
@@ -96,10 +96,10 @@ def iterated(
 
 
 def encoding_loss(field: Tensor, phase: Tensor, view: Callable[[Tensor], Tensor]) -> Tensor:
-    """Relative squared error [...] of the intensity |view(exp(i phase))|^2 against |view(field)|^2.
+    """Squared error of the intensity |view(exp(i phase))|^2 relative to |view(field)|^2, one per hologram: [...].
 
-    The first intensity is multiplied by the factor of least error. ``view`` maps holograms [..., H, W] to the image
-    plane, including any aperture.
+    The first intensity is multiplied by the factor that minimises the error. ``view`` propagates holograms [..., H, W]
+    to the image plane, including any aperture.
     """
     wanted, shown = intensity(view(field)), intensity(view(phasor(phase)))
     tiny = torch.finfo(shown.dtype).tiny
@@ -109,7 +109,7 @@ def encoding_loss(field: Tensor, phase: Tensor, view: Callable[[Tensor], Tensor]
 
 
 def _checked(field: Tensor) -> Tensor:
-    """``field``, checked, with subnormal values set to zero, since their derivatives overflow."""
+    """Check ``field``, and set values of subnormal amplitude to zero, since their derivatives overflow."""
     if not isinstance(field, Tensor) or not field.is_complex():
         raise TypeError(f"field must be a complex tensor (..., H, W), got {getattr(field, 'dtype', type(field))}")
     if field.ndim < 2 or 0 in field.shape[-2:]:
@@ -121,5 +121,5 @@ def _checked(field: Tensor) -> Tensor:
 def _phase(field: Tensor) -> Tensor:
     """Phase in rad, 0 where the field is 0."""
     amplitude = field.abs()
-    # The unit phasor is used, since the derivative of torch.angle squares the amplitude, which may underflow.
+    # The field is divided by its amplitude, since the derivative of torch.angle squares it, which may underflow.
     return torch.angle(field / torch.where(amplitude > 0, amplitude, 1))

@@ -16,8 +16,8 @@ from holotorch.optics.free_space.padding import FINEST
 class LayerHologram(nn.Module):
     """A linear map from layers of point sources to the complex field on a hologram, with its conjugate transpose.
 
-    A subclass implements ``_forward`` and ``_adjoint`` for one batch axis B; this class derives gradients of any order
-    and ``vmap`` from the two.
+    A subclass implements ``_forward`` and ``_adjoint`` for one batch axis B. From these two methods this class derives
+    gradients of any order and support for ``vmap``.
 
     Args:
         grid: Pixels of the hologram.
@@ -65,7 +65,7 @@ class LayerHologram(nn.Module):
         return linear(field, adjoint, forward)
 
     def _maps(self, shape: tuple[int, int]) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
-        """Operator and adjoint for layers of ``shape`` (h, w), with any number of batch axes."""
+        """Functions for the operator and its adjoint with any number of batch axes; layers have ``shape`` (h, w)."""
         return (
             lambda layers: _flattened(self._forward, layers, 3),
             lambda field: _flattened(lambda flat: self._adjoint(flat, shape), field, 2),

@@ -1,10 +1,10 @@
 """Transform lengths at which the wrap-around of an ``AxialHologram`` stays below a tolerance, estimated per axis.
 
-A transfer function that is sampled in frequency is periodic in space: light that leaves the array re-enters on the
-opposite side, as does the ringing due to the end of the spectrum. Two remedies are combined: frequencies whose light
-reaches no pixel are attenuated, and the array is padded. The remaining error is computed for each axis alone, as the
-difference between the periodic kernel and the wave that ``cone`` defines. Each displacement is weighted by its number
-of pairs of a source and a pixel.
+A transfer function that is sampled in frequency has a periodic kernel in space: light that leaves the array at one side
+enters at the opposite side. So does the ringing due to the finite bandwidth. Two remedies are combined: frequencies
+whose light reaches no pixel are attenuated, and the array is padded. The remaining error is computed for each axis
+alone, as the difference between the periodic kernel and the wave that ``cone`` defines. The difference at each
+displacement is weighted by the number of pairs of a source and a pixel with this displacement.
 """
 
 import math
@@ -20,14 +20,14 @@ from holotorch.core.fourier import good_length
 from holotorch.hologram.cone import Cone, taper
 from holotorch.hologram.raster import strided_length
 
-_LONGEST = 1 << 24  # samples; the kernel of one axis of that length takes 2 GB and several seconds
+_LONGEST = 1 << 24  # longest kernel of one axis in samples, which takes 2 GB and several seconds to compute
 
 
 @dataclass(frozen=True)
 class Axis:
     """One axis of sources and pixels."""
 
-    sources: int  # extent of the sources in samples
+    sources: int  # extent of the sources in samples at the pixel pitch
     pixels: int  # number of pixels of the hologram
     stride: int  # distance between neighbouring sources in pixels
     pitch: float  # pixel pitch in metres
@@ -38,24 +38,24 @@ class Axis:
 
     @property
     def displacement(self) -> int:
-        """Bound on the displacement between a source and a pixel, in samples."""
+        """Upper bound of the displacement between a source and a pixel, in samples."""
         return (self.sources + self.pixels) // 2
 
     @property
     def steepest(self) -> float:
-        """Tangent of the steepest direction that the pitch samples."""
+        """Tangent of the largest angle to the axis that the pitch samples."""
         sine = min(0.995, self.wavelength / (2 * self.pitch))  # below 1, so that the tangent is finite
         return sine / math.sqrt(1 - sine**2)
 
     def fade(self, length: int) -> tuple[float, float]:
-        """Tangents of the directions between which light is attenuated, from not at all to completely.
+        """Tangents of two angles to the axis: attenuation begins at the first and is complete at the second.
 
-        Light from the nearest plane that is steeper than the first tangent reaches no pixel. In FFTs of ``length``
-        samples, light from the farthest plane wraps onto a pixel only if it is steeper than the second tangent.
+        Light from any plane at more than the first angle reaches no pixel. In FFTs of ``length`` samples, light wraps
+        onto a pixel only at more than the second angle.
         """
         begin = self.displacement * self.pitch / self.nearest
         end = (length - self.displacement) * self.pitch / self.farthest
-        # The spectrum of the "full" wave is attenuated to 0 at the highest frequency, since a sharp end causes ringing.
+        # For "full" the spectrum falls to 0 at the highest frequency at the latest, since a sharp end causes ringing.
         return begin, min(end, self.steepest) if self.cone == "full" else end
 
     @property
@@ -64,14 +64,14 @@ class Axis:
         return self.steepest * self.nearest > self.displacement * self.pitch
 
     def least(self) -> int:
-        """Shortest length at which all rays that wrap onto a pixel are attenuated."""
+        """Shortest length, in samples, at which all light that wraps onto a pixel is attenuated."""
         extent = min(
             self.steepest * self.farthest / self.pitch, 1.02 * self.displacement * self.farthest / self.nearest
         )
         return strided_length(math.ceil(self.displacement + extent) + 1, self.stride)
 
     def error(self, length: int) -> float:
-        """Relative L2 error of the field of random sources: the larger error of the nearest and the farthest depth."""
+        """Relative L2 error of the field of random sources, the larger one of the nearest and the farthest depth."""
         return max(self._error(length, depth) for depth in {self.nearest, self.farthest})
 
     def _error(self, length: int, depth: float) -> float:
@@ -79,16 +79,16 @@ class Axis:
         sine = np.clip(np.fft.fftfreq(length, self.pitch) * self.wavelength, -0.999, 0.999)
         weights = faded_out(torch.from_numpy(sine / np.sqrt(1 - sine**2)), *self.fade(length)).numpy()
         kernel = np.fft.ifft(self._spectrum(length, depth) * weights)[offsets % length]
-        # On an array at least four times as long, much less of the light wraps around.
+        # The reference is computed on an array at least four times as long, on which much less light wraps around.
         exact_length = good_length(math.ceil(4 * max(length, self.displacement + self.steepest * depth / self.pitch)))
         exact = _exact_kernel(self, exact_length, depth)
-        # Number of pairs of a source and a pixel at each offset; those in the other direction are counted as well.
+        # Number of pairs of a source and a pixel at each offset and, except for offset 0, at its negative.
         pairs = np.clip(self.displacement - offsets, 0, min(self.sources, self.pixels)) + 1.0
         pairs[1:] *= 2
         return math.sqrt((pairs * np.abs(kernel - exact) ** 2).sum() / (pairs * np.abs(exact) ** 2).sum())
 
     def _spectrum(self, length: int, depth: float) -> np.ndarray:
-        """Sampled spectrum of the wave at ``depth``, without its carrier exp(i k z)."""
+        """Spectrum of the wave from ``depth`` at ``length`` frequencies, without the factor exp(i k z)."""
         sine = np.fft.fftfreq(length, self.pitch) * self.wavelength
         propagates = np.abs(sine) < 0.999
         cosine = np.sqrt(np.where(propagates, 1 - sine**2, 1))
@@ -99,12 +99,12 @@ class Axis:
         return kernel
 
 
-@lru_cache(maxsize=8)  # for distant planes ``length`` is the same for all transform lengths that are tried
+@lru_cache(maxsize=8)  # several of the lengths that ``choose_length`` tries may need the same kernel
 def _exact_kernel(axis: Axis, length: int, depth: float) -> np.ndarray:
-    """Kernel at offsets of 0, 1, ... samples without its carrier, in closed form or from an FFT of ``length``."""
+    """Kernel at offsets of 0, 1, ... samples without the factor exp(i k z), in closed form or by FFT of ``length``."""
     if axis.cone != "full":
         return np.fft.ifft(axis._spectrum(length, depth))[: axis.displacement + 1].copy()
-    # The integral of exp(2 pi i (f x + z w)) over f, with w = sqrt(1 / wavelength^2 - f^2).
+    # Closed form of the integral of exp(2 pi i (f x + z w)) over f, with w = sqrt(1 / wavelength^2 - f^2).
     x, k = np.arange(axis.displacement + 1) * axis.pitch, 2 * math.pi / axis.wavelength
     distance = np.hypot(x, depth)
     wave = 0.5j * k * depth / distance * hankel1e(1, k * distance)
@@ -118,10 +118,10 @@ def faded_out(values: Tensor, begin: float, end: float) -> Tensor:
 
 
 def choose_length(axis: Axis, tolerance: float) -> tuple[int, float]:
-    """Shortest length with a fast FFT and an error within ``tolerance``, else the most accurate one, and its error.
+    """Shortest length in samples with an error within ``tolerance``, else the most accurate length, and its error.
 
-    Lengths are tried up to three times the sum of sources and pixels, plus twelve times the width sqrt(wavelength z) of
-    the diffraction at an edge.
+    Only lengths with a fast FFT are tried, up to 3 (sources + pixels) + 12 sqrt(wavelength z) / pitch samples, where
+    z is the farthest depth. The square root is the width of the diffraction at an edge.
     """
     spread = 4 * (axis.displacement + axis.steepest * axis.farthest / axis.pitch)
     if spread > _LONGEST:

@@ -16,9 +16,9 @@ from holotorch.hologram.raster import span
 from holotorch.optics.free_space.padding import FINEST
 
 _ROUNDING = {torch.complex64: 5e-7, torch.complex128: 1e-12}  # relative rounding error of the sums
-# Computing times, as floating-point operations of an FFT that takes as long (measured).
-_WAVE = 150.0  # per sample of a spherical wave in float64
-_PASS = 12.0  # per sample of one pass over an array
+# Measured computing times, given as the number of floating-point operations of an FFT that takes equally long.
+_WAVE = 150.0  # for one sample of a spherical wave in float64
+_PASS = 12.0  # for one sample when an array is read and written once
 
 
 @dataclass(frozen=True)
@@ -28,13 +28,13 @@ class HologramPlan:
     Attributes:
         method: "convolution" or "axial nodes".
         cone: Definition of the waves, see ``holotorch.hologram.cone``.
-        near: Whether the choice of ``cone`` may change the field by more than the tolerance, since a pixel lies near
-            the edge of the cone of a source, or outside it.
+        near: Whether a pixel lies near the edge of the cone of a source, or outside it. The choice of ``cone`` may then
+            change the field by more than the tolerance.
         transforms: Number of FFTs of sources, one per plane or per node.
-        size: Size (y, x) of the whole spectrum in samples.
+        size: Size (y, x) of the padded arrays in samples.
         predicted_error: Expected relative L2 error for random sources, against the wave that ``cone`` defines.
-        memory_bytes: Peak of the extra memory in bytes.
-        flops: Computing time, as the number of floating-point operations of an FFT that takes as long.
+        memory_bytes: Peak of the memory that the computation allocates, in bytes.
+        flops: Computing time, given as the number of floating-point operations of an FFT that takes equally long.
         reason: Short text that explains the choice.
         runner_up: Short text about the method that was not chosen.
         notes: Warnings where the scene is near a limit of validity.
@@ -75,14 +75,14 @@ def plan_hologram(
         grid: Pixels of the hologram.
         wavelength: In metres.
         depths: Distances of the planes from the hologram in metres, above 0.
-        shape: Number of sources (h, w) of a plane. It need only cover the part of the scene that is not dark.
+        shape: Number of sources (h, w) of a plane. Dark margins of the scene need not be included.
         stride: Distance between neighbouring sources in pixels.
         tolerance: Largest permitted relative L2 error of the field.
-        cone: Definition of the waves; only methods that compute this wave are considered. The default is "taper", which
-            is the cheapest and rings least, or "box" at pitches below 0.9 wavelengths. If the plan's ``near`` is False,
-            all definitions but "band" give the same field within the tolerance.
+        cone: Definition of the waves; only methods that compute these are considered. The default is "taper", which is
+            cheapest and rings least, or "box" for pitches below 0.9 wavelengths. If the plan's ``near`` is False, all
+            definitions but "band" give the same field within the tolerance.
         dtype: dtype of the field, complex64 or complex128.
-        memory_limit: Largest permitted extra memory in bytes; None for no limit.
+        memory_limit: Largest permitted ``memory_bytes`` of the plan; None for no limit.
 
     Raises:
         TypeError: ``dtype`` is not a complex type.
@@ -135,24 +135,24 @@ def _axial_cone(
         return None
     if cone in ("taper", "band"):
         return cone
-    # If every pixel lies inside the sharp cone of every source, the cone cuts nothing off: the wave is that of "full".
+    # If every pixel lies inside the box or disc of every source, no light is cut off, and the wave is that of "full".
     half_widths = cone_samples(grid, wavelength, nearest)
     y, x = (samples / half for samples, half in zip(displacement, half_widths, strict=True))
     return "full" if max(y, x) < 1 and (cone != "disc" or math.hypot(y, x) < 1) else None
 
 
 def _transform(samples: float) -> float:
-    """Floating-point operations of an FFT."""
+    """Floating-point operations of an FFT of ``samples`` complex samples."""
     return 5 * samples * math.log2(max(samples, 2))
 
 
 def _convolution(operator: ConvolutionHologram, shape: tuple[int, int], dtype: torch.dtype) -> dict:
-    """Attributes of a :class:`HologramPlan` that depend on the operator."""
+    """Attributes of a :class:`HologramPlan` that depend on the method, for convolution."""
     size, count = operator.padded(shape), len(operator.depths)
     samples, sources = math.prod(size), math.prod(size) / operator.stride**2
     waves = [math.prod(operator.kernel_samples(depth, shape, size)) for depth in operator.depths]
     flops = count * (_transform(sources) + _transform(samples) / 2 + 3 * _PASS * samples) + _WAVE * sum(waves)
-    if operator.cone == "band":  # relative to the band-limited wave, for random sources; derived in ``CroppedKernel``
+    if operator.cone == "band":  # the error is derived in ``CroppedKernel``
         sine = operator.wavelength / (2 * min(operator.grid.pitch))
         error = 2 * sine**2 / math.sqrt(min(size) / 2)
     else:
@@ -170,7 +170,7 @@ def _convolution(operator: ConvolutionHologram, shape: tuple[int, int], dtype: t
 
 
 def _axial(operator: AxialHologram, shape: tuple[int, int], dtype: torch.dtype) -> dict:
-    """As :func:`_convolution`."""
+    """As :func:`_convolution`, for axial nodes."""
     design = operator.design(shape)
     samples, sources = math.prod(design.size), math.prod(design.size) / operator.stride**2
     nodes, planes = design.nodes.count, len(operator.depths)
@@ -193,7 +193,7 @@ def _axial(operator: AxialHologram, shape: tuple[int, int], dtype: torch.dtype) 
 def _notes(grid: Grid, wavelength: float, nearest: float, near: bool) -> tuple[str, ...]:
     notes = []
     across = 2 * min(cone_samples(grid, wavelength, nearest))
-    if across < 4:  # a narrower cone is not sampled well enough to act as a spherical wave
+    if across < 4:  # a narrower cone has too few samples to represent a spherical wave
         notes.append(
             f"the nearest plane's light covers {across:.2g} pixels: closer than that a point is a pixel, not a wave"
         )

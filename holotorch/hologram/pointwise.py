@@ -10,23 +10,23 @@ from holotorch.hologram.band_limited import band_limited_wave
 from holotorch.hologram.cone import Cone, cone_samples, is_plain, spherical_wave
 from holotorch.hologram.layered import LayerHologram
 
-_EXACT = 1e-8  # relative difference below which the closed form of the unlimited wave replaces the tapered one
+_EXACT = 1e-8  # relative difference below which the closed form of the full wave replaces the tapered wave
 
 
 class DirectHologram(LayerHologram):
-    """E(x) = sum_v A(v) exp(i phi(v)) exp(i k r) / r, thesis Eq. 5.1 and Algorithm 4, pair by pair in float64.
+    """E(x) = sum_v A(v) exp(i phi(v)) exp(i k r) / r, thesis Eq. 5.1 and Algorithm 4, without FFT, in float64.
 
-    Here v runs over the sources and r is the distance from source v to the pixel at x. Sources lie on a raster, so all
-    pairs with the same displacement share one value of the spherical wave. The waves from a row of sources to a row of
-    pixels form a matrix, which serves all pairs of rows at the same distance. There is no FFT, no wrap-around and no
-    approximation. Rows and columns of dark sources, and rows of pixels outside the cone, are skipped.
+    Here v runs over the sources and r is the distance from source v to the pixel at x. Sources and pixels lie on
+    regular grids, so the wave is computed once for all pairs with the same displacement. The waves from a row of
+    sources to a row of pixels form a matrix, which is the same for all pairs of rows at the same distance. There is no
+    wrap-around. Rows and columns of dark sources, and rows of pixels outside the cone, are skipped.
 
-    Arguments and exceptions as for :class:`LayerHologram`. The waves of ``cone`` "taper" and "band" are integrated over
-    frequency, exact to 1e-8.
+    Arguments and exceptions as for :class:`LayerHologram`. For ``cone`` "taper" and "band" the waves are integrals over
+    frequency, with a relative error of 1e-8.
     """
 
     def pairs(self, layers: Tensor) -> int:
-        """Number of pairs of a source of ``layers`` [D, h, w] that is not zero and a pixel inside its cone."""
+        """Number of pairs of a nonzero source in ``layers`` [D, h, w] and a pixel (for "box" and "disc", in a box)."""
         total = 0
         for plane, depth in zip(layers, self.depths, strict=True):
             sharp = self.cone in ("box", "disc")
@@ -69,25 +69,25 @@ class DirectHologram(LayerHologram):
         return out.to(field.dtype)
 
     def _positions(self, sources: int, axis: int, device: torch.device | None = None) -> Tensor:
-        """Index of the pixel at each of the ``sources`` along an axis; may lie outside the hologram."""
+        """Position of each of the ``sources`` along an axis as a pixel index, possibly outside the hologram."""
         return (torch.arange(sources, device=device) - sources // 2) * self.stride + self.grid.shape[axis] // 2
 
     def _row_matrices(
         self, depth: float, shape: Sequence[int], columns: tuple[int, int], positions: Tensor
     ) -> Iterator[tuple[list[tuple[Tensor, Tensor]], Tensor]]:
-        """For each distance of a source row and a pixel row, yield these pairs of rows, and the waves between them.
+        """For each distance between a source row and a pixel row, yield all such pairs of rows, and the waves.
 
-        The pairs are given for both directions, as a mask of source rows and the indices of their pixel rows. The waves
-        are complex128 [columns, W], from the last source column to the first. ``shape`` (h, w) is the number of sources
-        of a plane, ``columns`` the first column and the one after the last, ``positions`` the index of the pixel row at
-        each source row.
+        There is one entry for pixel rows above the source rows and one for those below: a mask of source rows, and the
+        indices of their pixel rows. The waves are complex128 [columns, W], from the last source column to the first.
+        ``shape`` (h, w) is the number of sources of a plane, ``columns`` the first column and the one after the last,
+        ``positions`` the position of each source row as a pixel index.
         """
         (height, width), stride = self.grid.shape, self.stride
         low, high = columns
         farthest = max(height - 1 - int(positions.min()), int(positions.max()))
         if self.cone in ("box", "disc"):
             farthest = int(min(farthest, cone_samples(self.grid, self.wavelength, depth)[0] + 1))
-        # Displacements of pixels from the last source. Those from each source before begin ``stride`` samples later.
+        # Displacements of pixels from the last source; those from the source before it begin ``stride`` samples later.
         index = torch.arange((high - low - 1) * stride + width, device=positions.device)
         index -= int(self._positions(shape[1], 1)[high - 1])
         wave_row = self._wave_rows(depth, farthest, int(index.abs().max()), index.device)
@@ -100,7 +100,7 @@ class DirectHologram(LayerHologram):
                 yield pairs, wave.as_strided((high - low, width), (stride, 1)).clone()
 
     def _wave_rows(self, depth: float, rows: int, columns: int, device: torch.device) -> Callable[[int], Tensor]:
-        """Function that returns, for a row distance in samples, the wave at column distances 0 to ``columns``."""
+        """Function from a row distance, in samples, to the wave at column distances 0 to ``columns``."""
         pitch = self.grid.pitch
         dy, dx = (
             torch.arange(count + 1, dtype=torch.float64, device=device) * step

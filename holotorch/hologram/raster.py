@@ -1,4 +1,4 @@
-"""Sources and pixels on one periodic array: their positions, the spectra of layers, and the field on the pixels."""
+"""Raster: one periodic array that holds sources and pixels, with transforms between layers, spectra and fields."""
 
 import math
 
@@ -12,22 +12,22 @@ from holotorch.core.grid import Grid
 class Raster:
     """A periodic array of samples at the pixel pitch, which holds both the sources of a layer and the pixels.
 
-    ``grid`` holds the pixels, ``shape`` is the number of sources (h, w) and ``size`` the number of samples (N_y, N_x),
-    multiples of ``stride``. The sources begin at sample 0 and lie ``stride`` samples apart. Their spectrum therefore
-    has the period (N_y / stride, N_x / stride), and an FFT of that size suffices.
+    ``grid`` describes the pixels, ``shape`` is the number of sources (h, w). ``size`` is the number of samples
+    (N_y, N_x), both multiples of ``stride``. The sources begin at sample 0 and lie ``stride`` samples apart. Their
+    spectrum [N_y, N_x] therefore repeats after (N_y / stride, N_x / stride), and an FFT of that size suffices.
     """
 
     def __init__(self, grid: Grid, shape: tuple[int, int], stride: int, size: tuple[int, int]):
         self.grid, self.shape, self.stride, self.size = grid, shape, stride, size
         self.period = size[0] // stride, size[1] // stride
-        # Index of the sample at the first pixel, along each axis.
+        # Sample at which the first pixel lies, along (y, x).
         self.first = [
             (count // 2 * stride - pixels // 2) % length
             for count, pixels, length in zip(shape, grid.shape, size, strict=True)
         ]
 
     def frequencies(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Frequencies (fy, fx) >= 0 of the array in cycles per metre, [N_y // 2 + 1, 1] and [1, N_x // 2 + 1]."""
+        """Nonnegative frequencies fy [N_y // 2 + 1, 1] and fx [1, N_x // 2 + 1] of the array in cycles per metre."""
         fy, fx = (
             torch.arange(length // 2 + 1, dtype=torch.float64, device=device) / (length * pitch)
             for length, pitch in zip(self.size, self.grid.pitch, strict=True)
@@ -39,16 +39,16 @@ class Raster:
         return fft2(layer, self.period)
 
     def tiles(self, spectrum: Tensor) -> Tensor:
-        """View of a whole spectrum [N_y, N_x] divided into periods, [s, N_y / s, s, N_x / s] with s = stride."""
+        """View of a spectrum [N_y, N_x] as a matrix of periods, [s, N_y / s, s, N_x / s] with s = ``stride``."""
         y, x = self.period
         return spectrum.view(self.stride, y, self.stride, x)
 
     def pixels(self, spectrum: Tensor) -> Tensor:
-        """Field on the hologram [H, W] from a whole spectrum [N_y, N_x]."""
+        """Field on the pixels of the hologram, [H, W], from its spectrum [N_y, N_x] on the array."""
         return ifft2(spectrum, self.grid.shape, (self.first[0], self.first[1]))
 
     def spectrum_of_pixels(self, field: Tensor) -> Tensor:
-        """Adjoint of :meth:`pixels`."""
+        """Adjoint of :meth:`pixels`: a spectrum [N_y, N_x] from a field [H, W]."""
         rows, columns = (
             (torch.arange(count, device=field.device) + first) % length
             for first, count, length in zip(self.first, self.grid.shape, self.size, strict=True)
@@ -58,13 +58,13 @@ class Raster:
         return fft2(padded) * (1 / math.prod(self.size))
 
     def layer(self, spectrum: Tensor) -> Tensor:
-        """Adjoint of :meth:`spectrum` with repetition of its period: a layer [h, w] from a whole spectrum."""
+        """Layer [h, w] from a spectrum [N_y, N_x]: adjoint of :meth:`spectrum` followed by repetition of the period."""
         folded = self.tiles(spectrum).sum((0, 2))
         return ifft2(folded, self.shape) * math.prod(self.period)
 
 
 def span(grid: Grid, shape: tuple[int, int], stride: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Largest displacement from a source to a pixel, and larger extent of sources or pixels, each (y, x) in samples."""
+    """Largest displacement from a source to a pixel, and the larger extent, of sources or pixels: (y, x) in samples."""
     displacement, extent = [], []
     for count, pixels in zip(shape, grid.shape, strict=True):
         before, after = count // 2 * stride, (count - 1 - count // 2) * stride
@@ -79,5 +79,5 @@ def strided_length(minimum: int, stride: int) -> int:
 
 
 def has_light(plane: Tensor) -> bool:
-    """Whether any element is not zero (NaN counts as light). Tests a few elements before all of them, for speed."""
+    """Whether any element differs from zero; NaN does. For speed, a few elements are tested before all of them."""
     return bool(plane.flatten()[::251].any() or plane.any())

@@ -15,10 +15,10 @@ from holotorch.optics.planning.propagate import propagate
 
 
 def refocused(hologram: Tensor, grid: Grid, wavelength: float, depth: float, *, tolerance: float = 1e-3) -> Tensor:
-    """Field [..., H, W] of a hologram [..., H, W] at ``depth`` metres from it, on the side of its sources.
+    """Field [..., H, W] of a hologram [..., H, W] in the plane ``depth`` metres in front of it, where its sources are.
 
-    The hologram holds spherical waves exp(+ikr) from its sources, so it is propagated by -``depth`` (Sec. 5.5.1). The
-    field is not normalised: a source of amplitude A in focus has an amplitude of about A times a constant of the grid.
+    The hologram is a sum of waves exp(+ikr) from its sources, so it is propagated by -``depth`` (Sec. 5.5.1). The field
+    is not normalised: in focus, a source of amplitude A appears with A times a factor common to all sources.
     """
     return propagate(hologram, grid, wavelength, -checks.quantity(DEPTH, depth), tolerance=tolerance)
 
@@ -26,7 +26,7 @@ def refocused(hologram: Tensor, grid: Grid, wavelength: float, depth: float, *, 
 def focal_stack(
     hologram: Tensor, grid: Grid, wavelength: float, depths: Iterable[float], *, tolerance: float = 1e-3
 ) -> Iterator[Tensor]:
-    """Yield the intensity [..., H, W] of a hologram at each depth in metres, see :func:`refocused`."""
+    """Yield the intensity [..., H, W] of the refocused hologram for each depth in metres, see :func:`refocused`."""
     for depth in depths:
         yield intensity(refocused(hologram, grid, wavelength, depth, tolerance=tolerance))
 
@@ -34,14 +34,14 @@ def focal_stack(
 def perspective(
     hologram: Tensor, grid: Grid, wavelength: float, *, direction: tuple[float, float], aperture: float
 ) -> Tensor:
-    """The part of a hologram [..., H, W] whose light reaches a distant pupil, that is within a cone of directions.
+    """The part of a hologram [..., H, W] whose light reaches a distant pupil, selected by its direction.
 
     Args:
-        hologram: Complex field.
+        hologram: Complex field [..., H, W].
         grid: Pixels of the hologram.
         wavelength: In metres.
         direction: Sines (y, x) of the direction from the hologram to the centre of the pupil.
-        aperture: Sine of the half angle of the pupil, above 0; its edge is tapered over the last 30 %.
+        aperture: Sine of the half angle of the pupil, above 0; transmission falls to 0 over its outer 30 %.
 
     Raises:
         ValueError: The pupil lies outside the directions that the grid samples.

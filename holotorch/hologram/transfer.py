@@ -21,7 +21,7 @@ class AxialDesign:
     axes: tuple[Axis, Axis]  # sources and pixels along (y, x)
     nodes: Nodes  # nodes along the optical axis
     raster: Raster  # padded array that holds the sources and the pixels
-    predicted_error: float  # expected relative L2 error for random sources, against the wave that ``cone`` defines
+    predicted_error: float  # expected relative L2 error of the field of random sources
     adequate: bool  # whether ``predicted_error`` is within the tolerance
 
     @property
@@ -30,20 +30,19 @@ class AxialDesign:
         return self.raster.size
 
     def step(self, nodes: int, like: Tensor) -> Tensor:
-        """Factor exp(2 pi i (w - centre) z), [N_y, N_x], for a distance z of ``nodes`` spacings of the nodes.
+        """Factor exp(2 pi i (w - w0) z), [N_y, N_x], for a distance z of ``nodes`` times the spacing of the nodes.
 
-        w is the axial frequency, ``centre`` that of the nodes. dtype and device are those of ``like``.
+        w is the axial frequency and w0 is ``nodes.centre``. dtype and device are those of ``like``.
         """
         _, offset = self._axial_frequency(like.device)
         whole = torch.ones(self.size, dtype=like.dtype, device=like.device)
         return multiply_even(whole, turns_phasor(offset * (self.nodes.spacing * nodes)).to(like.dtype))
 
     def last(self, node: int, like: Tensor) -> Tensor:
-        """First quadrant of the factor from the sum over all nodes to the spectrum of the hologram.
+        """First quadrant of the factor by which the sum over all nodes is multiplied, to give the hologram's spectrum.
 
-        The phases of the sum are relative to ``node``. The factor is the spectrum of the spherical wave from ``node``
-        times taper and attenuation, divided by the Fourier transform of the window. dtype and device are those of
-        ``like``.
+        The sum refers to the plane of ``node``. The factor is the spectrum of the spherical wave from it, times taper
+        and attenuation, divided by the Fourier transform of the window. dtype and device are those of ``like``.
         """
         axial, offset = self._axial_frequency(like.device)
         strength = 1 / (axial * math.prod(self.raster.grid.pitch) * self.nodes.response(offset))
@@ -52,12 +51,12 @@ class AxialDesign:
             if axis.cone == "taper":
                 strength = strength * taper(2 * axis.pitch * frequency)
             strength = strength * faded_out(frequency / axial, *axis.fade(length))
-        # A quarter cycle is the factor i of Weyl's expansion.
+        # The factor i of Weyl's expansion is a phase of a quarter cycle.
         wave = turns_phasor(offset * self.nodes.depth(node) + 0.25)
         return (wave * strength).to(like.dtype)
 
     def _axial_frequency(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Axial frequency w of the first quadrant in cycles per metre, and w minus the nodes' ``centre``."""
+        """Axial frequency w in cycles per metre, in the first quadrant, and w minus ``nodes.centre``."""
         fy, fx = self.raster.frequencies(device)
         wavelength = self.axes[0].wavelength
         square = wavelength**-2 - fy.square() - fx.square()

@@ -1,4 +1,4 @@
-"""Volumes, direct volume rendering to light sources, and analytic test volumes."""
+"""Volumes, their direct volume rendering into light sources or pictures, and analytic test volumes."""
 
 from holotorch.scene.adaptive import AdaptivePicture, AdaptiveReport, adaptive_report, render_adaptively
 from holotorch.scene.compositing import corrected_opacity, front_to_back, safe_sqrt

@@ -1,7 +1,7 @@
-"""Adaptive ray sampling: first a coarse lattice of rays, then all rays where neighbours differ (Section 6.4.3).
+"""Adaptive ray sampling: first a coarse lattice of rays, then all rays where these differ (thesis Section 6.4.3).
 
-``DVRSampler`` skips empty space and ends opaque rays in any case. Fewer rays therefore save time only where a ray is
-expensive: in dense matter, with lighting, or in a rotated volume.
+``DVRSampler`` always skips empty space and ends opaque rays. Fewer rays therefore save time only where a ray is
+expensive to compute: in dense matter, with lighting, or in a rotated volume.
 """
 
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ from holotorch.scene.volume import Volume
 
 @dataclass(frozen=True)
 class AdaptivePicture:
-    """A picture rendered with a subset of the rays.
+    """A picture rendered with a subset of the rays; each pixel corresponds to one ray.
 
     Attributes:
-        image: Red, green, blue, [3, h, w].
+        image: Radiance in red, green and blue, [3, h, w].
         opacity: Opacity in [0, 1], [h, w].
-        followed: Whether a ray was followed, bool [h, w]; the other pixels are interpolated between their neighbours.
+        followed: Whether the ray of a pixel was computed, bool [h, w]; the other pixels are interpolated.
     """
 
     image: Tensor
@@ -32,18 +32,18 @@ class AdaptivePicture:
 
     @property
     def share(self) -> float:
-        """Fraction of the rays that were followed."""
+        """Fraction of the rays that were computed."""
         return self.followed.double().mean().item()
 
 
 @dataclass(frozen=True)
 class AdaptiveReport:
-    """Savings and error of an adaptively rendered picture.
+    """Savings and error of an adaptively rendered picture, against the picture from all rays.
 
     Attributes:
-        share: Fraction of the rays that were followed.
-        error: Relative L2 error of the image against the image of all rays; 0 if the latter is black.
-        largest: Largest absolute difference of a colour of a pixel.
+        share: Fraction of the rays that were computed.
+        error: Relative L2 error of the colours; 0 if the picture from all rays is black.
+        largest: Largest absolute error of one colour of one pixel.
     """
 
     share: float
@@ -52,14 +52,12 @@ class AdaptiveReport:
 
 
 def render_adaptively(sampler: DVRSampler, volume: Volume, *, step: int = 4, contrast: float = 0.05) -> AdaptivePicture:
-    """Picture from every ``step``-th ray along each axis, and from all rays in cells of high contrast between them.
+    """Render ``volume`` with every ``step``-th ray along each axis, and with all rays in cells of high contrast.
 
-    A cell is refined if a colour or the opacity differs by more than ``contrast`` among the corners of the cell and of
-    the adjacent cells. Pixels in the other cells are interpolated linearly, so details between these corners are
-    missed. The picture is differentiable; the choice of rays is not.
-
-    Raises:
-        ValueError: A step below 1 or a contrast below 0.
+    The first rays are the corners of rectangular cells. In a cell all rays are computed if a colour or the opacity
+    differs by more than ``contrast`` among the corners of this cell and its neighbours. Pixels in the other cells are
+    interpolated linearly, so details between the corners are missed. The picture is differentiable, the choice of rays
+    is not. ValueError for a ``step`` below 1 or a ``contrast`` below 0.
     """
     step = checks.whole("step", step, 1)
     checks.nonnegative("contrast", contrast)
@@ -90,22 +88,22 @@ def adaptive_report(sampler: DVRSampler, volume: Volume, *, step: int = 4, contr
 
 
 def _lattice(size: int, step: int, device: torch.device) -> Tensor:
-    """Indices of every ``step``-th ray and the last, so that every ray lies within a cell."""
+    """Indices of every ``step``-th ray along an axis of ``size`` rays, and of the last ray."""
     rays = torch.arange(0, size, step, device=device)
     return rays if rays[-1] == size - 1 else torch.cat([rays, rays.new_tensor([size - 1])])
 
 
 def _refined(corners: Tensor, contrast: float) -> Tensor:
-    """Mask of the cells to refine, [n - 1, m - 1], from corners [c, n, m]; an axis of one corner has one cell."""
+    """Mask [n - 1, m - 1] of the cells to refine, from corners [c, n, m]; an axis with one corner has one cell."""
     _, n, m = corners.shape
     padded = functional.pad(corners[None], (0, int(m == 1), 0, int(n == 1)), mode="replicate")
-    # Extremes over the corners of a cell, then over the adjacent cells, since an edge may run just inside them.
+    # Extremes over the corners of each cell, then over the adjacent cells, since an edge may lie just inside one.
     highest, lowest = (functional.max_pool2d(functional.max_pool2d(sign * padded, 2, 1), 3, 1, 1) for sign in (1, -1))
     return ((highest + lowest)[0] > contrast).any(0)
 
 
 def _cells(lattice: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Cell of every ray of an axis [size], and position of the ray within its cell, from 0 to 1."""
+    """Index of the cell of each ray along an axis, and position of the ray in it from 0 to 1, both [size]."""
     rays = torch.arange(size, device=lattice.device)
     cell = (torch.searchsorted(lattice, rays, right=True) - 1).clamp(max=max(0, len(lattice) - 2))
     if len(lattice) == 1:

@@ -17,17 +17,17 @@ class SourceLayers:
     """Light sources on planes parallel to the hologram.
 
     Attributes:
-        grid: Samples (rays) of every plane, centred on the axis; pitch in metres.
+        grid: Positions of the sources, the same on every plane, centred on the axis; pitch in metres.
         depths: Distances of the planes from the hologram in metres, > 0; the first plane is nearest to the observer.
         channels: Number of colours C.
-        amplitudes: Function that returns an iterator over the planes, [C, h, w] each: the square root of the radiance,
-            real, or complex if it includes a phase. Every call yields the same planes.
+        amplitudes: Function that returns an iterator over the amplitudes on the planes, [C, h, w] each. An amplitude is
+            the square root of the radiance, or complex if it includes a phase. Every call yields the same planes.
         phase: Phase in radians, [h, w], common to all planes and colours (for instance one random phase per ray), or
             None for a phase of 0.
 
     Raises:
-        TypeError: ``amplitudes`` cannot be called, or the phase is not real.
-        ValueError: No plane, a depth that is not finite and positive, no channel, or a phase of another shape.
+        TypeError: ``amplitudes`` is not a function, or the phase is not real.
+        ValueError: No plane, a depth that is not finite and positive, no channel, or a phase that is not [h, w].
     """
 
     grid: Grid
@@ -55,7 +55,7 @@ class SourceLayers:
         """The planes one after another, complex [C, h, w]: amplitude times exp(i phase).
 
         Raises:
-            ValueError: A plane of another shape, or not as many planes as depths.
+            ValueError: A plane that is not [C, h, w], or a number of planes that differs from that of the depths.
         """
         phase_factor = None if self.phase is None else phasor(self.phase)
         shape, expected, count = (self.channels, *self.grid.shape), len(self.depths), 0

@@ -1,4 +1,4 @@
-"""Phong shading of a volume by the gradient of its values."""
+"""Phong shading of a volume, with the gradient of its values as surface normal."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,11 +15,11 @@ from holotorch.scene.volume import Triple, Volume
 class Lighting:
     """A distant white light and the reflectance of the volume in the Phong model (1975).
 
-    The shaded colour is colour * (ambient + diffuse * (n . l)) + specular * (r . v)^shininess. Here n is the direction
-    of the gradient, oriented towards the observer, so that both sides of a surface are lit; l is the direction to the
-    light, r is l mirrored at n, and v is the direction to the observer along the axis. Where the value is constant
-    there is no surface, and the result is colour * (ambient + diffuse). With the length g of the gradient, in units of
-    :func:`flat_steps`, shading fades in as g^2 / (g^2 + 1), so that the result and its gradient are always finite.
+    The shaded colour is colour * (ambient + diffuse * (n . l)) + specular * (r . v)^shininess. The normal n is the
+    direction of the gradient of the values or its opposite, whichever points towards the observer. l is the direction
+    to the light, r is l mirrored at n, and v is the direction to the observer along the axis. Where the value is
+    constant there is no surface, and the result is colour * (ambient + diffuse). The first formula has the weight
+    g^2 / (g^2 + 1), where g is the norm of the :func:`slopes`, so that the result and its derivative are finite.
 
     Attributes:
         towards: Direction to the light, (z, y, x) in the scene, of any length; z points away from the hologram.
@@ -52,8 +52,8 @@ class Lighting:
     def shade(self, colour: Tensor, slopes: Tensor, rotation: Tensor, observer: float) -> Tensor:
         """Shaded colour [3, n] of n points from their ``colour`` without lighting, [3, n].
 
-        ``slopes`` [3, n] are those of :func:`slopes` along the axes (z, y, x) of the volume, ``rotation`` [3, 3] leads
-        from these axes to those of the scene. ``observer`` is -1 if the observer is on the side of lower z, else 1.
+        ``slopes`` [3, n] are those of :func:`slopes` along the axes (z, y, x) of the volume. ``rotation`` [3, 3] maps
+        vectors in these axes to the scene. ``observer`` is -1 if the observer is on the side of lower z, else 1.
         """
         light = rotation.new_tensor(self.towards)
         light = (light / light.norm()) @ rotation
@@ -73,10 +73,10 @@ class Lighting:
 
 
 def flat_steps(volume: Volume) -> Triple:
-    """Difference between neighbouring samples along (z, y, x) that counts as a slope of 1.
+    """Unit of :func:`slopes`: difference of values between neighbouring samples along (z, y, x) at a slope of 1.
 
-    It is a thousandth of the range of values along the axis of the smallest spacing, and proportional to the spacing
-    along the other axes. For a constant volume, whose slopes vanish, it is 1 instead of a thousandth of the range.
+    Along the axis of the smallest spacing it is a thousandth of the range of values of ``volume``. Along the other axes
+    it is larger in proportion to the spacing. For a volume of constant value, 1 replaces the thousandth of the range.
     """
     least, most = volume.value_range()
     flat = 1e-3 * (most - least) or 1.0
@@ -85,15 +85,15 @@ def flat_steps(volume: Volume) -> Triple:
 
 
 def slopes(values: Tensor, steps: Triple) -> Tensor:
-    """Central differences of ``values`` [D, H, W] along (z, y, x), divided by ``steps``: [3, D, H, W].
+    """Gradient of ``values`` [D, H, W] along (z, y, x) per sample, divided by :func:`flat_steps`: [3, D, H, W].
 
-    They are one-sided at the faces, and zero along an axis of one sample. ``steps`` are those of :func:`flat_steps`.
+    Differences are central, one-sided at the faces, and zero along an axis of one sample.
     """
     return torch.stack([_difference(values, axis, step) for axis, step in enumerate(steps)])
 
 
 def slice_slopes(slices: Sequence[Tensor], k: int, steps: Triple, dtype: torch.dtype) -> Tensor:
-    """Slice ``k`` of :func:`slopes`, [3, H, W], from the slices [H, W] of the values, computed in ``dtype``."""
+    """Slice ``k`` of the result of :func:`slopes`, [3, H, W], from all slices [H, W] of the values, in ``dtype``."""
     before, after = max(k - 1, 0), min(k + 1, len(slices) - 1)
     along = (slices[after].to(dtype) - slices[before].to(dtype)) * (1 / (max(1, after - before) * steps[0]))
     here = slices[k].to(dtype)

@@ -1,4 +1,4 @@
-"""Ray marching: front-to-back compositing of one volume along all rays, plane by plane."""
+"""Ray marching: front-to-back compositing of a volume along all rays, one slab of the volume per plane of sources."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -18,11 +18,11 @@ from holotorch.scene.volume import Volume
 
 @dataclass(frozen=True)
 class Step:
-    """Contribution of a plane to n rays."""
+    """Contribution of a plane to n rays; the radiance is weight times colour."""
 
-    plane: int  # number of the plane
-    rays: Tensor  # flat indices of the rays into the window, [n]
-    weight: Tensor  # T alpha, [n]
+    plane: int  # index of the plane, from front to back
+    rays: Tensor  # flat indices of the rays into the rows and columns of the window, [n]
+    weight: Tensor  # transmittance up to the slab times opacity of the slab, [n]
     colour: Tensor  # red, green, blue, [3, n]
 
 
@@ -30,15 +30,15 @@ class Step:
 class March:
     """Front-to-back compositing of a volume along rays, slab by slab.
 
-    Only the rays of ``window`` are followed, which may meet visible voxels. ``visible`` is the range of depths in
-    metres that contains visible voxels, rounded outwards to whole bricks, or None without visible voxels. ValueError if
-    a voxel is NaN or infinite.
+    A voxel is visible if its opacity is above 0. The attribute ``window`` holds the rays that may meet visible voxels;
+    only these are computed. ``visible`` is the range of depths in metres of the bricks that contain visible voxels, or
+    None if there are none. ValueError if a voxel is NaN or infinite.
     """
 
     volume: Volume  # scalar field
     place: Placement  # position, size and rotation of the volume
-    transfer: TransferFunction  # colours and opacities
-    lighting: Lighting | None  # shading, or None
+    transfer: TransferFunction  # colour and opacity of a value
+    lighting: Lighting | None  # shading; None for emission without shading
     rays: Rays  # geometry of the rays
     depths: Sequence[float]  # depths of the planes in metres, front to back
     spans: Sequence[tuple[float, float]]  # smallest and largest depth in metres of the slab of each plane
@@ -51,7 +51,7 @@ class March:
         if volume.values.is_floating_point():
             self.dtype = torch.promote_types(self.dtype, volume.values.dtype)
         low, high = volume.bricks(BRICK)
-        # No voxel is skipped if voxels are optimised, since transparent ones have a gradient as well.
+        # If voxels are optimised none is skipped, since transparent voxels have a gradient as well.
         self.learned = volume.values.requires_grad
         self.occupied = torch.ones_like(low, dtype=torch.bool) if self.learned else transfer.visible(low, high)
         box = occupied_box(self.occupied, volume.shape)
@@ -62,7 +62,7 @@ class March:
     def steps(self, wanted: Tensor | None = None) -> Iterator[Step]:
         """Yield the contributions of the planes, front to back; planes without a contribution are left out.
 
-        ``wanted``, bool [h, w], masks the rays that are followed; None means all.
+        ``wanted``, bool [h, w], selects the rays to compute; None means all.
         """
         if not self.window.size:
             return
@@ -92,7 +92,7 @@ class March:
 
     def amplitudes(self) -> Iterator[Tensor]:
         """Yield the square root of the radiance, [3, h, w], for every plane."""
-        # A single expanded zero, which takes no memory.
+        # One zero, expanded to the shape of a plane without allocating it.
         dark = torch.zeros((), dtype=self.dtype, device=self.device).expand(3, *self.rays.grid.shape)
         done = 0
         for step in self.steps():
@@ -106,11 +106,11 @@ class March:
         yield from [dark] * (len(self.depths) - done)
 
     def zeros(self, channels: int) -> Tensor:
-        """Zeros [channels, rays of the window]."""
+        """Zeros of shape [channels, rays of the window]."""
         return torch.zeros(channels, self.window.size, dtype=self.dtype, device=self.device)
 
     def whole(self, values: Tensor) -> Tensor:
-        """Values [c, rays of the window] on the grid, [c, h, w], which is zero outside the window."""
+        """Values of the rays of the window, [c, n], on the whole grid, [c, h, w], with zeros outside the window."""
         (height, width), rows, columns = self.rays.grid.shape, self.window.rows, self.window.columns
         if not self.window.size:
             return values.new_zeros(len(values), height, width)
@@ -118,14 +118,14 @@ class March:
         return functional.pad(framed, (columns.start, width - columns.stop, rows.start, height - rows.stop))
 
     def _reader(self) -> SliceReader | PointReader:
-        """Reader of the values and, with lighting, their slopes as further channels."""
+        """Reader whose first channel is the value; with lighting, three more channels are the slopes."""
         support = (-math.inf, math.inf) if self.learned else self.transfer.support()
         common = (self.place, self.rays, self.window, self.occupied, support)
         steps = flat_steps(self.volume) if self.lighting is not None else None
         if self.place.turned:
             values = self.volume.values.to(self.dtype)[None]
             return PointReader(*common, values if steps is None else torch.cat([values, slopes(values[0], steps)]))
-        # The backward pass of unbind makes one gradient for all slices; indexing would make a whole volume per slice.
+        # Backward, unbind allocates one gradient for all slices; indexing would allocate a whole volume per slice.
         slices = self.volume.values.unbind(0)
 
         def channels(k: int) -> Tensor:
@@ -135,15 +135,15 @@ class March:
         return SliceReader(*common, channels)
 
     def _resampled(self, window: Tensor, scale: float) -> Tensor:
-        """Radiance [3, rays of the window], interpolated linearly to the grid, [3, h, w].
+        """Radiance of the rays of the window, [3, n], interpolated linearly at the points of the grid, [3, h, w].
 
-        At the depth of the plane the rays are ``scale`` times as far from the axis as the points of the grid.
+        At the depth of the plane, the rays are ``scale`` times as far from the axis as the points of the grid.
         """
         rows, columns = self.window.rows, self.window.columns
         framed = functional.pad(window.unflatten(1, (len(rows), len(columns))), (1, 1, 1, 1))
         for axis, part, count in zip((-2, -1), (rows, columns), self.rays.grid.shape, strict=True):
             index = (torch.arange(count, dtype=torch.float64, device=window.device) - count // 2) / scale + count // 2
-            # Index into the padded window, whose border is dark.
+            # Index into the window, which is padded with a dark border of one sample.
             index = (index - (part.start - 1)).clamp(0, len(part) + 1)
             first = index.floor().clamp_(max=len(part))
             framed = interpolate(framed, first.to(torch.int64), index - first, axis)

@@ -1,9 +1,9 @@
 """Analytic test volumes for renderers and holograms.
 
-All fill the cube [-1, 1]^3 with coordinates (z, y, x) and are sampled at voxel centres. Every ``shape`` (D, H, W) shows
-the same object, with unequal spacings where D, H and W differ. ``width`` is the edge length of the cube in metres;
-without ``width`` the volume is "relative", with edges of 2. Values lie in [0, 1]. ``dtype`` is a floating-point type or
-torch.uint8, which holds the values times 255, rounded.
+All volumes fill the cube [-1, 1]^3 with coordinates (z, y, x) and are sampled at voxel centres. The number of voxels
+``shape`` (D, H, W) does not change the object: where D, H and W differ, the spacings differ. ``width`` is the edge
+length of the cube in metres; without it the unit of the volume is "relative" and the edge is 2. Values lie in [0, 1].
+``dtype`` is a floating-point type, or torch.uint8 for 255 times the values, rounded.
 """
 
 import itertools
@@ -18,11 +18,11 @@ from holotorch.core.quantities import WIDTH
 from holotorch.scene.volume import Volume
 
 Shape = int | tuple[int, int, int]
-# Bonds of C60 in the gas phase in angstrom (Hedberg et al. 1991).
+# Bond lengths of C60 in the gas phase in angstrom (Hedberg et al. 1991).
 _DOUBLE_BOND = 1.401  # between two hexagons
 _SINGLE_BOND = 1.458  # around a pentagon
-_ATOM_SIGMA = 0.35  # width of the Gaussian at an atom in angstrom
-_MOLECULE_BOX = 9.6  # edge of the cube around the molecule in angstrom
+_ATOM_SIGMA = 0.35  # standard deviation of the Gaussian at an atom in angstrom
+_MOLECULE_BOX = 9.6  # edge length of the cube around the molecule in angstrom
 
 
 def marschner_lobb(
@@ -33,10 +33,10 @@ def marschner_lobb(
     width: float | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Volume:
-    """Test signal of Marschner and Lobb (1994), which is hard to interpolate since it is sampled near its Nyquist rate.
+    """Test signal of Marschner and Lobb (1994); at 40^3 voxels it is sampled near its Nyquist rate.
 
-    It is (1 - sin(pi z / 2) + a (1 + cos(2 pi f cos(pi r / 2)))) / (2 (1 + a)), with r^2 = x^2 + y^2, f =
-    ``frequency`` and a = ``modulation``. The defaults are those of the paper.
+    Its value is (1 - sin(pi z / 2) + a (1 + cos(2 pi f cos(pi r / 2)))) / (2 (1 + a)), with r^2 = x^2 + y^2,
+    f = ``frequency`` and a = ``modulation``. The defaults are those of the paper.
     """
     frequency, modulation = checks.positive("frequency", frequency), checks.positive("modulation", modulation)
 
@@ -50,7 +50,7 @@ def marschner_lobb(
 def gaussian_ball(
     shape: Shape = 64, *, sigma: float = 0.25, width: float | None = None, dtype: torch.dtype = torch.float32
 ) -> Volume:
-    """exp(-r^2 / (2 sigma^2)); its integral along a line is sqrt(2 pi) sigma times the largest value on the line."""
+    """exp(-r^2 / (2 sigma^2)); the integral along a line is sqrt(2 pi) sigma times the largest value on the line."""
     sigma = checks.positive("sigma", sigma)
     return _sampled(lambda z, y, x: torch.exp((z**2 + y**2 + x**2) / (-2 * sigma**2)), shape, width, dtype)
 
@@ -60,7 +60,7 @@ def homogeneous_slab(
 ) -> Volume:
     """1 where abs(z) < ``thickness`` / 2, else 0; a voxel on a face of the slab holds the fraction that lies inside.
 
-    The sum over z times the spacing is therefore ``thickness`` at any resolution. ``thickness`` is at most 2.
+    The integral over z is therefore ``thickness`` at any resolution. ``thickness`` is at most 2, the edge of the cube.
     """
     thickness = checks.positive("thickness", thickness)
     if thickness > 2:
@@ -77,16 +77,16 @@ def homogeneous_slab(
 def exponential_medium(
     shape: Shape = 64, *, length: float = 1.0, width: float | None = None, dtype: torch.dtype = torch.float32
 ) -> Volume:
-    """exp(-(z + 1) / ``length``), which is 1 at z = -1 and has the integral length (1 - exp(-2 / length)) over z."""
+    """exp(-(z + 1) / ``length``): 1 at z = -1, with the integral ``length`` * (1 - exp(-2 / ``length``)) over z."""
     length = checks.positive("length", length)
     return _sampled(lambda z, y, x: torch.exp(-(z + 1) / length), shape, width, dtype)
 
 
 def shells(shape: Shape = 128, *, width: float | None = None, dtype: torch.dtype = torch.float32) -> Volume:
-    """Three nested shells of peak values h = 1/3, 2/3 and 1 from outside in, at radii R = 0.9, 0.6 and 0.3.
+    """Three nested shells with radii R = 0.9, 0.6 and 0.3, and peak values h = 1/3, 2/3 and 1.
 
-    The values are the sum of h exp(-(r - R)^2 / (2 w^2)) with w = 0.04. For z < 0 the outer two shells are multiplied
-    by 1 - exp(-(x^2 + y^2) / (2 g^2)) with g = 0.2: a hole through which the inner shell is visible.
+    The value is the sum over the shells of h exp(-(r - R)^2 / (2 w^2)) with w = 0.04. For z < 0 the outer two shells
+    are multiplied by 1 - exp(-(x^2 + y^2) / (2 g^2)) with g = 0.2, so that the inner shell is visible through a hole.
     """
 
     def density(z: Tensor, y: Tensor, x: Tensor) -> Tensor:
@@ -103,7 +103,7 @@ def shells(shape: Shape = 128, *, width: float | None = None, dtype: torch.dtype
 def c60(shape: Shape = 128, *, width: float | None = None, dtype: torch.dtype = torch.float32) -> Volume:
     """Buckminsterfullerene: a Gaussian of sigma 0.35 angstrom at each of the 60 atoms, in a cube of 9.6 angstrom.
 
-    The density is divided by its value at an atom. ``width`` is the edge of the enlarged cube.
+    The density is divided by its value at an atom. ``width`` is the edge of the enlarged cube in metres.
     """
     atoms = c60_atoms() * (2 / _MOLECULE_BOX)
     scale = -1 / (2 * (_ATOM_SIGMA * 2 / _MOLECULE_BOX) ** 2)
@@ -122,8 +122,8 @@ def c60(shape: Shape = 128, *, width: float | None = None, dtype: torch.dtype = 
 def c60_atoms() -> Tensor:
     """Positions (z, y, x) of the nuclei of C60 relative to its centre in angstrom, float64 [60, 3].
 
-    The shape is a truncated icosahedron: two nuclei lie on every edge of an icosahedron, each at the length of a
-    pentagon bond from an end. The distance between the two is the bond between two hexagons.
+    They form a truncated icosahedron: two nuclei lie on every edge of an icosahedron, each at the distance of a single
+    bond from one end. The bond between the two is a double bond.
     """
     golden = (1 + math.sqrt(5)) / 2
     points = [(0.0, a, b * golden) for a, b in itertools.product((-1.0, 1.0), repeat=2)]

@@ -1,8 +1,8 @@
-"""Initial phases of light sources.
+"""Phases of light sources in the scene.
 
-A constant phase gives an image without speckle in focus, but sends the light in one direction only. A random phase per
-ray, as in the thesis, spreads the light over the whole eye box and causes speckle. A smooth random phase is a
-compromise.
+A constant phase gives an image in focus without speckle, but sends the light in one direction only. A random phase per
+ray, as in the thesis, spreads the light over the whole eye box and causes speckle. A smooth random phase lies between
+the two.
 """
 
 import math
@@ -16,22 +16,22 @@ from holotorch.core.fourier import filter_real
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import WIDTH
 
-_WINDOWS = 64  # number of positions along each axis of the windows of ``PointPhases``
+_WINDOWS = 64  # number of positions of a window of ``PointPhases`` along each axis
 
 
 def random_phase(grid: Grid, *, generator: torch.Generator | None = None) -> Tensor:
-    """Uniform in [0, 2 pi), independent for every ray: float32 [h, w] on the generator's device (Section 5.3.1)."""
+    """Independent phases, uniform in [0, 2 pi): float32 [h, w] on the generator's device (thesis Section 5.3.1)."""
     return 2 * math.pi * torch.rand(grid.shape, generator=generator, device=generator.device if generator else None)
 
 
 def smooth_phase(
     grid: Grid, length: float, *, spread: float = math.pi, generator: torch.Generator | None = None
 ) -> Tensor:
-    """Low-pass filtered Gaussian noise: float32 [h, w] in radians, periodic, on the generator's device.
+    """Phases from low-pass filtered Gaussian noise, periodic: float32 [h, w] in radians on the generator's device.
 
     Args:
         grid: Grid of the rays.
-        length: Correlation length in metres; the correlation is exp(-r^2 / (2 length^2)).
+        length: Correlation length in metres; the correlation at distance r is exp(-r^2 / (2 length^2)).
         spread: Expected standard deviation of the phase in radians. The sine of the direction of the light then has a
             standard deviation of wavelength times ``spread`` / (2 pi ``length``).
         generator: Random generator of the noise.
@@ -40,7 +40,7 @@ def smooth_phase(
     noise = torch.randn(grid.shape, generator=generator, device=generator.device if generator else None)
     fy, fx = grid.frequencies(noise.device)
     square = fy.square() + fx[:, : grid.shape[1] // 2 + 1].square()
-    # The kernel is the root of the spectrum of the correlation, scaled to a standard deviation of ``spread``.
+    # The transfer function is the square root of the power spectrum, scaled to a standard deviation of ``spread``.
     variance = torch.exp(-2 * (math.pi * length) ** 2 * (fy.square() + fx.square())).mean().item()
     kernel = torch.exp(-((math.pi * length) ** 2) * square) * (spread / math.sqrt(variance))
     return filter_real(noise, kernel.to(noise.dtype))
@@ -48,32 +48,32 @@ def smooth_phase(
 
 @dataclass(frozen=True, eq=False)
 class PointPhases:
-    """Random phases for every point of every plane: each plane uses another window of one larger map.
+    """Random phases for every point of every plane: each plane uses a different window of one larger map.
 
-    Points of one ray and of neighbouring planes have independent phases, so that the planes do not interfere
+    The points of a ray therefore have independent phases on different planes, and planes do not interfere
     systematically. Drawing new phases for every plane would take longer than rendering the plane.
 
     Attributes:
-        phase: Phases in [0, 2 pi), [h + 63, w + 63].
-        order: Random order of the 64 x 64 windows, as whole numbers [4096]; it repeats after 4096 planes.
+        phase: The larger map of phases in [0, 2 pi), [h + 63, w + 63].
+        order: Random order of the 64 x 64 windows, as int64 [4096]; it repeats after 4096 planes.
     """
 
     phase: Tensor
     order: Tensor
 
     def window(self, values: Tensor, plane: int) -> Tensor:
-        """The window [h, w] of a plane in ``values``, which have the shape of ``phase``; a view."""
+        """Window [h, w] for the plane of index ``plane``: a view of ``values``, which have the shape of ``phase``."""
         y, x = divmod(int(self.order[plane % len(self.order)]), _WINDOWS)
         height, width = (size - _WINDOWS + 1 for size in self.phase.shape)
         return values[y : y + height, x : x + width]
 
     def __call__(self, plane: int) -> Tensor:
-        """Phases of a plane, [h, w]; a view."""
+        """Phases [h, w] of the plane of index ``plane``; a view of ``phase``."""
         return self.window(self.phase, plane)
 
 
 def point_phases(grid: Grid, *, generator: torch.Generator | None = None) -> PointPhases:
-    """Uniform in [0, 2 pi), float32, for every point of every plane; see :class:`PointPhases`."""
+    """Float32 phases, uniform in [0, 2 pi), for every point of every plane; see :class:`PointPhases`."""
     height, width = (size + _WINDOWS - 1 for size in grid.shape)
     order = torch.randperm(_WINDOWS**2, generator=generator, device=generator.device if generator else None)
     return PointPhases(random_phase(Grid((height, width), grid.pitch), generator=generator), order)

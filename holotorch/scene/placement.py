@@ -13,15 +13,15 @@ from holotorch.core.grid import Grid
 from holotorch.core.quantities import DEPTH, DISTANCE
 from holotorch.scene.volume import IDENTITY, Triple, Volume
 
-_ON_FACE = 1e-9  # relative margin within which a ray beside a face of the box counts as inside, because of rounding
+_ON_FACE = 1e-9  # relative margin outside a face of the box within which a ray counts as inside, because of rounding
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Straight rays, one through each sample of ``grid`` at depth ``reference``.
+    """Straight rays, one through each sample of ``grid`` at the reference depth ``reference``.
 
-    If ``eye`` is None, the rays are parallel to the axis, else they pass through the point of the axis at depth
-    ``eye``. Depths are in metres from the hologram.
+    The rays are parallel to the axis if ``eye`` is None; otherwise they meet at the point of the axis at depth ``eye``.
+    Depths are in metres from the hologram.
     """
 
     grid: Grid
@@ -29,7 +29,7 @@ class Rays:
     eye: float | None
 
     def scale(self, depth: float) -> float:
-        """Ratio of the distances of a ray from the axis at ``depth`` and at the reference depth."""
+        """Distance of a ray from the axis at ``depth``, divided by its distance at the reference depth."""
         return 1.0 if self.eye is None else (depth - self.eye) / (self.reference - self.eye)
 
     @property
@@ -49,12 +49,12 @@ class Placement:
     shape: tuple[int, int, int]  # number of samples (z, y, x)
     spacing: Triple  # distance between samples along (z, y, x) in metres
     distance: float  # depth of the centre in metres
-    # Rows of a matrix over (z, y, x): offset in the scene = rotation @ offset along the volume's axes.
+    # Rows of a matrix over (z, y, x) with (offset in the scene) = rotation @ (offset along the volume's axes).
     rotation: tuple[Triple, Triple, Triple]
 
     @property
     def turned(self) -> bool:
-        """Whether the volume is rotated, so that its slices are not parallel to the hologram."""
+        """Whether the volume is rotated relative to the scene."""
         return self.rotation != IDENTITY
 
     @property
@@ -66,17 +66,17 @@ class Placement:
     def depth_range(
         self, low: Sequence[float] | None = None, high: Sequence[float] | None = None
     ) -> tuple[float, float]:
-        """Smallest and largest depth of the box, or of its part between two index coordinates, in metres."""
+        """Smallest and largest depth in metres, of the box or its part from index coordinates ``low`` to ``high``."""
         if low is None or high is None:
             low, high = (-0.5, -0.5, -0.5), tuple(n - 0.5 for n in self.shape)
         depths = [corner[0] for corner in self._corners(low, high)]
         return min(depths), max(depths)
 
     def offsets(self, rays: Rays, depth: float, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """Offsets of rays at ``depth`` along the axes of the volume, as a part [h, 3] per row and [w, 3] per column.
+        """Offsets (z, y, x) of rays at ``depth`` along the axes of the volume, as two terms [h, 3] and [w, 3].
 
-        The offset of a ray is the sum of both. ``rows`` [h] and ``columns`` [w] are the positions of the rays in metres
-        at the reference depth.
+        The offset of a ray is the term of its row plus that of its column. ``rows`` [h] and ``columns`` [w] are the
+        positions of the rays in metres at the reference depth.
         """
         axial, vertical, horizontal = (rows.new_tensor(row) for row in self.rotation)
         scale = rays.scale(depth)
@@ -88,7 +88,7 @@ class Placement:
     def crossing(self, rays: Rays, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
         """Depths at which the rays at ``rows`` [h] and ``columns`` [w] enter and leave the box, float64 [h, w] each.
 
-        They are in metres from the centre. Where a ray misses the box, the entry is not below the exit.
+        Depths are in metres from the centre. For a ray that misses the box, the first is not below the second.
         """
         axial, vertical, horizontal = self.rotation
         near, far = rows.new_full((), -math.inf), rows.new_full((), math.inf)
@@ -97,14 +97,14 @@ class Placement:
             middle, slope = rays.scale(self.distance) * lateral, axial[axis] + rays.spread * lateral
             parallel = slope == 0
             one, other = ((end - middle) / torch.where(parallel, 1.0, slope) for end in (-half, half))
-            # A ray parallel to two faces lies between them at all depths, or at none.
+            # A ray that is parallel to two faces lies between them at all depths or at none.
             always = torch.where(middle.abs() <= half * (1 + _ON_FACE), math.inf, -math.inf)
             near = torch.maximum(near, torch.where(parallel, -always, torch.minimum(one, other)))
             far = torch.minimum(far, torch.where(parallel, always, torch.maximum(one, other)))
         return near, far
 
     def footprint(self, rays: Rays, low: Sequence[float], high: Sequence[float]) -> tuple[range, range]:
-        """Rows and columns of the rays that may meet the part of the box between two index coordinates."""
+        """Rows and columns of the rays that may meet the part of the box from index coordinates ``low`` to ``high``."""
         projected: list[list[float]] = [[], []]
         for depth, *lateral in self._corners(low, high):
             scale = rays.scale(depth)
@@ -122,7 +122,7 @@ class Placement:
         return rows, columns
 
     def _corners(self, low: Sequence[float], high: Sequence[float]) -> list[Triple]:
-        """Corners (depth, y, x) in metres of the part of the box between two index coordinates."""
+        """Corners (depth, y, x) in metres of the part of the box from index coordinates ``low`` to ``high``."""
         ends = [
             [(index - (n - 1) / 2) * step for index in pair]
             for *pair, n, step in zip(low, high, self.shape, self.spacing, strict=True)
@@ -135,10 +135,10 @@ class Placement:
 
 
 def upright(volume: Volume, rotation: tuple[Triple, Triple, Triple]) -> tuple[Volume, tuple[Triple, Triple, Triple]]:
-    """Apply a rotation by right angles to the array of ``volume``, and return the result and the identity.
+    """Replace a rotation by right angles by a permutation of the voxels; return the new volume and the identity.
 
-    Slices parallel to the hologram are read several times faster than single points. Other rotations are returned with
-    the unchanged volume.
+    This saves time, since slices parallel to the hologram are read several times faster than single points. For any
+    other ``rotation``, volume and rotation are returned unchanged.
     """
     axes = [[j for j, cosine in enumerate(row) if abs(cosine) == 1] for row in rotation]
     if any(len(candidates) != 1 for candidates in axes):
@@ -150,7 +150,7 @@ def upright(volume: Volume, rotation: tuple[Triple, Triple, Triple]) -> tuple[Vo
     values = volume.values.permute(order)
     values = (values.flip(reverse) if reverse else values).contiguous()
     z, y, x = (volume.spacing[j] for j in order)
-    # A scene uses neither origin nor orientation.
+    # Origin and orientation in the file have no effect on a scene.
     return Volume(values, (z, y, x), volume.unit), IDENTITY
 
 
@@ -159,8 +159,8 @@ def slabs(
 ) -> list[tuple[float, float]]:
     """Smallest and largest depth in metres of the slab around each plane.
 
-    Slabs meet half-way between planes, unless ``boundaries`` [D + 1] are given. The first and the last slab extend
-    equally far on both sides of their plane; that of a single plane is ``whole``, the depth range of the volume.
+    Neighbouring slabs meet half-way between their planes, unless ``boundaries`` [D + 1] in metres are given. The first
+    and the last slab are symmetric about their planes. A single plane has the slab ``whole``, the range of the volume.
     """
     if boundaries is None and len(depths) == 1:
         return [whole]
@@ -173,7 +173,7 @@ def slabs(
 def check_planes(
     depths: Sequence[float], boundaries: Sequence[float] | None
 ) -> tuple[tuple[float, ...], tuple[float, ...] | None]:
-    """``depths`` and ``boundaries`` as tuples; ValueError unless both rise or fall, with each plane in its slab."""
+    """``depths`` and ``boundaries`` as tuples; ValueError unless they are monotonic and each plane lies in its slab."""
     planes = tuple(checks.quantity(DEPTH, depth, "depth of a plane") for depth in depths)
     if not planes:
         raise ValueError("depths must hold at least one distance from the hologram in metres, got none")
@@ -195,7 +195,7 @@ def check_planes(
 
 
 def check_rotation(rotation: Tensor | None) -> tuple[Triple, Triple, Triple]:
-    """Rows of a rotation matrix, with right angles made exact; ValueError unless it is orthonormal to 1e-6."""
+    """Rows of a rotation matrix, with entries near 0 and +-1 made exact; ValueError unless orthonormal to 1e-6."""
     if rotation is None:
         return IDENTITY
     if not isinstance(rotation, Tensor) or tuple(rotation.shape) != (3, 3):

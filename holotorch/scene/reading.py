@@ -1,8 +1,8 @@
-"""Samples of a volume at the intersections of rays and planes, for rays that meet a visible value there.
+"""Samples of a volume at the intersections of rays with a plane parallel to the hologram.
 
-A value is visible if its opacity is above 0. Both readers interpolate trilinearly. The outermost half voxels have the
-value of the outermost sample. ``SliceReader`` interpolates between two slices that are parallel to the hologram;
-``PointReader`` interpolates each point of a rotated volume.
+Only visible values are returned, which are those with an opacity above 0. Both readers interpolate trilinearly. Between
+the outermost sample and the face, half a voxel farther out, the value is constant. ``SliceReader`` interpolates between
+two slices that are parallel to the hologram; ``PointReader`` interpolates at each point of a rotated volume.
 """
 
 from collections.abc import Callable
@@ -13,15 +13,15 @@ from torch import Tensor
 
 from holotorch.scene.placement import Placement, Rays
 
-BRICK = 16  # voxels along an edge of the bricks, which are skipped if they are transparent
+BRICK = 16  # edge length in voxels of the blocks of a volume that are skipped if they are transparent
 
 
 @dataclass(frozen=True)
 class RaySamples:
-    """Samples on one plane."""
+    """Samples of n rays on a plane."""
 
-    rays: Tensor  # flat indices of n rays into the window, [n]
-    samples: Tensor  # c channels of each ray, [c, n]
+    rays: Tensor  # flat indices of the rays into the rows and columns of the window, [n]
+    samples: Tensor  # value, and with lighting three slopes, of each ray, [c, n]
     length: Tensor | float  # length of the path of each ray through the slab in metres, [n], or one number for all rays
 
 
@@ -33,15 +33,15 @@ class Window:
     columns: range  # columns of the grid of rays
     down: Tensor  # positions of the rows in metres at the reference depth, float64 [h]
     across: Tensor  # positions of the columns in metres at the reference depth, float64 [w]
-    # Depth at which each ray enters the box, in metres from its centre, [h, w]; None if all rays are parallel to the
-    # axis and pass through the front and the back face.
+    # Depth at which each ray enters the box, in metres from the centre of the box, [h, w]; None if all rays are
+    # parallel to the axis and the volume is not rotated.
     entry: Tensor | None
-    exit: Tensor | None  # depth at which each ray leaves the box, in metres from its centre, [h, w], or None
+    exit: Tensor | None  # depth at which each ray leaves the box, like ``entry``
     oblique: Tensor | None  # length of the path of each ray per metre of depth, [h, w], or None for 1
 
     @classmethod
     def of(cls, place: Placement, rays: Rays, rows: range, columns: range, like: Tensor) -> "Window":
-        """Window of ``rows`` and ``columns``, with the dtype and device of ``like``."""
+        """Window of ``rows`` and ``columns``; tensors on the device of ``like``, depths and lengths in its dtype."""
         y, x = (axis.flatten() for axis in rays.grid.coordinates(like.device))
         down, across = y[rows.start : rows.stop], x[columns.start : columns.stop]
         if not place.turned and rays.eye is None:
@@ -59,7 +59,7 @@ class Window:
         return len(self.rows) * len(self.columns)
 
     def length(self, low: float, high: float, rows: slice) -> Tensor | float:
-        """Path length in the box between two depths from its centre, in metres: [rows, w], or one number for all."""
+        """Path length in metres in the box between two depths in metres from its centre: [rows, w] or one number."""
         if self.entry is None or self.exit is None:
             return max(0.0, high - low)
         path = (self.exit[rows].clamp(max=high) - self.entry[rows].clamp(min=low)).clamp_(min=0)
@@ -81,7 +81,7 @@ class SliceReader:
     def read(self, low: float, high: float, alive: Tensor) -> RaySamples | None:
         """Samples half-way between the depths ``low`` and ``high``, in metres from the centre of the volume.
 
-        ``alive``, bool [rays of the window], masks the rays that are read. None if no ray meets a visible value.
+        ``alive``, bool [rays of the window], selects the rays to read. None if no ray meets a visible value.
         """
         place, width = self.place, len(self.window.columns)
         depth = (low + high) / 2
@@ -119,7 +119,7 @@ class SliceReader:
 
 @dataclass(frozen=True, eq=False)
 class PointReader:
-    """Reads a rotated volume point by point; attributes as of :class:`SliceReader`, but channels [c, D, H, W]."""
+    """Reads a rotated volume point by point; attributes as in :class:`SliceReader`, but channels are [c, D, H, W]."""
 
     place: Placement
     rays: Rays
@@ -129,14 +129,14 @@ class PointReader:
     channels: Tensor
 
     def read(self, low: float, high: float, alive: Tensor) -> RaySamples | None:
-        """Samples as of :meth:`SliceReader.read`."""
+        """Samples as in :meth:`SliceReader.read`."""
         place, window = self.place, self.window
         length = window.length(low, high, slice(None))
         assert isinstance(length, Tensor)  # one length for all rays occurs only without rotation
         length = length.flatten()
         rays = (alive & (length > 0)).nonzero().flatten()
         down, across = place.offsets(self.rays, place.distance + (low + high) / 2, window.down, window.across)
-        # Offsets from the centre in samples.
+        # Offsets from the centre of the volume, in samples.
         spacing = down.new_tensor(place.spacing)
         down, across = ((offset / spacing).to(self.channels.dtype) for offset in (down, across))
         row = torch.div(rays, len(window.columns), rounding_mode="floor")
@@ -166,7 +166,7 @@ class PointReader:
 
 
 def occupied_box(occupied: Tensor, shape: tuple[int, int, int]) -> tuple[list[float], list[float]] | None:
-    """Smallest and largest index coordinates (z, y, x) of the occupied bricks in a volume; None without any."""
+    """Smallest and largest index coordinates (z, y, x) of the occupied bricks of a volume; None if there are none."""
     bricks = occupied.nonzero()
     if not len(bricks):
         return None
@@ -177,7 +177,7 @@ def occupied_box(occupied: Tensor, shape: tuple[int, int, int]) -> tuple[list[fl
 
 
 def _taps(offsets: Tensor, count: int, spacing: float) -> tuple[Tensor, Tensor]:
-    """Index of the sample before each of n offsets in metres from the centre, and weight of the sample after it."""
+    """Index of the sample before each of n offsets, in metres from the centre, and weight of the following sample."""
     index = (offsets / spacing + (count - 1) / 2).clamp(0, count - 1)
     first = index.floor().clamp_(max=max(0, count - 2)).to(torch.int64)
     return first, index - first
@@ -186,7 +186,7 @@ def _taps(offsets: Tensor, count: int, spacing: float) -> tuple[Tensor, Tensor]:
 def interpolate(values: Tensor, first: Tensor, weight: Tensor, axis: int) -> Tensor:
     """Linear interpolation along ``axis`` (-2 or -1) to n positions, between the samples ``first`` and ``first`` + 1.
 
-    ``weight`` [n] is the weight of the second of the two.
+    ``first`` is [n], and ``weight`` [n] is the weight of the sample ``first`` + 1.
     """
     one = values.index_select(axis, first)
     if values.shape[axis] == 1:
@@ -197,7 +197,7 @@ def interpolate(values: Tensor, first: Tensor, weight: Tensor, axis: int) -> Ten
 
 
 def _between_rows(lines: Tensor, first: Tensor, weight: Tensor, rays: Tensor) -> Tensor:
-    """As :func:`interpolate` along axis -2 of ``lines`` [c, H, w], only for m rays given by flat indices: [c, m]."""
+    """As :func:`interpolate` along axis -2 of ``lines`` [c, H, w], but only at m ``rays``, which are flat indices."""
     width = lines.shape[2]
     row = torch.div(rays, width, rounding_mode="floor")
     index = rays + (first.index_select(0, row) - row) * width
@@ -207,6 +207,6 @@ def _between_rows(lines: Tensor, first: Tensor, weight: Tensor, rays: Tensor) ->
 
 
 def _visible(values: Tensor, support: tuple[float, float]) -> Tensor:
-    """Mask of the values within ``support``, beyond which the opacity is zero."""
+    """Mask of the values inside the interval ``support``, outside which the opacity is zero."""
     low, high = support
     return (values.detach() > low) & (values.detach() < high)

@@ -22,40 +22,40 @@ PhaseMaps = Tensor | PointPhases
 
 
 class DVRSampler(nn.Module):
-    """Light sources of a volume: each ray is composited front to back, and each step becomes a source on a plane.
+    """Light sources from a volume: each ray is composited front to back, and each step becomes a source on a plane.
 
-    A ray contributes C_j = T_j alpha_j c_j on plane j (Eq. 5.6): transmittance, opacity and colour. The source lies on
-    the plane, and its amplitude is the square root of C_j. Each plane stands for a slab of the volume. Colour and
-    opacity are those of the transfer function half-way through the slab; the opacity is corrected for the path length
-    within slab and volume. A homogeneous medium is therefore exact for any planes; elsewhere the error falls with the
-    square of the slab thickness.
+    Each plane represents a slab of the volume. On plane j a ray gives a source of radiance C_j = T_j alpha_j c_j
+    (Eq. 5.6), with the transmittance T_j up to the slab, and opacity alpha_j and colour c_j of the slab. Its amplitude
+    is the square root of C_j. Colour and opacity are those of the value half-way through the slab; the opacity is
+    corrected for the path length within slab and volume. For a homogeneous medium the total opacity is therefore exact
+    for any choice of planes; otherwise the error is proportional to the square of the slab thickness.
 
-    Slabs meet half-way between planes. The outermost slabs extend equally far on both sides of their plane; a single
-    plane stands for the whole volume. Outside its faces the volume is transparent.
+    Slabs meet half-way between planes. The outermost slabs are symmetric about their plane; a single plane represents
+    the whole volume. Space outside the volume is transparent.
 
     Rays are parallel to the axis, or start at a point on it (``eye``). In the second case they pass through the points
-    of the grid on the first plane and diverge from there. On the other planes their sources lie between the points of
-    the grid, so the radiance is interpolated linearly onto the grid along each axis, and light beyond the grid is cut
-    off. ``phase`` belongs to the points of the grid, not to the rays.
+    of the grid on the first plane and diverge. On the other planes they do not meet the points of the grid, so their
+    radiance is interpolated linearly onto the grid, and light beyond the grid is cut off. ``phase`` applies to the
+    points of the grid, not to the rays.
 
-    Transparent parts of the volume are skipped, and a ray ends when its transmittance falls below ``early``, which is
-    also the largest error of an image that this causes.
+    Transparent parts of the volume are skipped. A ray ends when its transmittance falls below ``early``, which is also
+    the largest error that this causes in a picture.
 
     Args:
-        transfer: Colour and opacity of the values of the volume.
-        rays: Grid of the rays, centred on the axis, the same on all planes.
+        transfer: Colour and opacity as functions of the value of the volume.
+        rays: Grid of rays and sources, centred on the axis, the same on all planes.
         depths: Distances of the planes from the hologram in metres, rising or falling; the first is nearest to the
             observer.
-        width: Length of the longest side of the volume in metres; it replaces the volume's own size.
+        width: Length of the longest side of the volume in the scene, in metres; the size in the file is not used.
         distance: Distance of the centre of the volume from the hologram in metres; by default half-way between the
             first and the last plane.
         rotation: Rotation matrix about the centre of the volume, [3, 3] over (z, y, x): offset in the scene = rotation
             @ offset in the volume. By default slice 0 of the volume is nearest to the hologram.
-        eye: Depth of the observer in metres, in front of all slabs, negative beyond the hologram; None for an observer
-            at infinity.
+        eye: Depth of the observer in metres, in front of all slabs; negative if the hologram is between observer and
+            volume. None for an observer at infinity.
         lighting: Shading by the gradient of the volume; None for emission without shading.
-        phase: Function from the grid to the phases in radians, [h, w] for all planes or ``PointPhases``, see
-            ``holotorch.scene.phases``; None for a phase of 0.
+        phase: Function from the grid to phases in radians: [h, w] for use on all planes, or ``PointPhases``; see
+            ``holotorch.scene.phases``. None for a phase of 0.
         early: Transmittance below which a ray ends, in [0, 1).
         boundaries: Boundaries of the slabs in metres, [D + 1], if they are not half-way between the planes.
 
@@ -116,7 +116,7 @@ class DVRSampler(nn.Module):
     def render(self, volume: Volume, rays: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Picture of ``volume``: red, green and blue [3, h, w], and opacity [h, w], summed along each ray.
 
-        ``rays``, bool [h, w], masks the rays that are followed, by default all; the other pixels stay black.
+        ``rays``, bool [h, w], selects the rays to compute, by default all; the other pixels stay black.
         """
         march = self._march(volume)
         image, opacity = march.zeros(3), march.zeros(1)
@@ -126,7 +126,7 @@ class DVRSampler(nn.Module):
         return march.whole(image), march.whole(opacity)[0]
 
     def depth_map(self, volume: Volume) -> Tensor:
-        """Mean depth of each ray in metres, [h, w], weighted by the contributions to opacity; 0 without opacity."""
+        """Mean plane depth along each ray in metres, [h, w], weighted by T_j alpha_j; 0 where all is transparent."""
         march = self._march(volume)
         sums = march.zeros(2)
         for step in march.steps(None):

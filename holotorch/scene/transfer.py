@@ -15,20 +15,21 @@ class TransferFunction(nn.Module):
     """Piecewise-linear colour and opacity over the values of a volume; constant beyond the first and last position.
 
     ``colours`` and ``opacities`` are parameters without gradient; ``transfer.requires_grad_()`` makes them learnable.
-    Samplers then also evaluate transparent regions, which they skip otherwise. Parameters outside [0, 1] act as 0 or 1
-    and have gradient 0; call :meth:`clip_` after each optimiser step, so that no parameter stays outside.
+    Samplers then also evaluate transparent regions, which they otherwise skip. Parameters outside [0, 1] are clipped
+    when used and have gradient 0; call :meth:`clip_` after each optimiser step, so that none remains outside.
 
     Args:
         positions: Values of the volume, rising, shape [K], K >= 2.
-        colours: Red, green, blue in [0, 1] at the positions, shape [K, 3]: radiance of an opaque point.
+        colours: Red, green, blue in [0, 1] at the positions, shape [K, 3]: radiance of an opaque medium.
         opacities: Opacity in [0, 1] at the positions, shape [K]: fraction of the light that is absorbed along
             ``unit_distance``.
         unit_distance: Distance as a fraction of the longest side of the volume, so that the picture does not depend on
-            the size at which the volume is placed. 1 / 256 is a voxel of a cube of 256 voxels.
+            the size of the volume in the scene. 1 / 256 is the edge of a voxel in a cube of 256^3 voxels.
 
     Raises:
-        TypeError: Not numbers.
-        ValueError: Shapes that do not match, positions that do not rise, numbers outside [0, 1] or not finite.
+        TypeError: An argument does not consist of real numbers.
+        ValueError: Shapes that do not match, positions that do not rise, colours or opacities outside [0, 1], or a
+            number that is not finite.
     """
 
     positions: Tensor
@@ -65,10 +66,10 @@ class TransferFunction(nn.Module):
         self.opacities = nn.Parameter(opacity, requires_grad=False)
 
     def forward(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Colour [3, ...] and opacity [...] per unit distance for ``values`` [...].
+        """Colour [3, ...], and opacity [...] per unit distance, for ``values`` [...].
 
-        The dtype is the more precise one of values and colours. The result is differentiable in the values as well; at
-        a position the derivative is that of the interval above it.
+        The dtype is the more precise one of values and colours. The result is also differentiable in the values; at one
+        of ``positions`` the derivative is that of the interval above it.
         """
         dtype = self.colours.dtype
         if values.is_floating_point():
@@ -83,9 +84,9 @@ class TransferFunction(nn.Module):
         return result[:3], result[3]
 
     def visible(self, low: Tensor, high: Tensor) -> Tensor:
-        """Whether a value between ``low`` and ``high`` [...] has an opacity above 0, bool [...].
+        """Whether any value from ``low`` [...] to ``high`` [...] has an opacity above 0, bool [...].
 
-        True everywhere while the opacities are learnable, since values of opacity 0 then have a gradient.
+        True everywhere if the opacities are learnable, since values of opacity 0 then have a gradient.
         """
         if self.opacities.requires_grad:
             return torch.ones_like(low, dtype=torch.bool)
@@ -98,7 +99,7 @@ class TransferFunction(nn.Module):
         return between | (self.forward(low)[1] > 0) | (self.forward(high)[1] > 0)
 
     def support(self) -> tuple[float, float]:
-        """Smallest interval of values outside of which the opacity is 0; all values while opacities are learnable."""
+        """Smallest interval of values outside which the opacity is 0; all values if the opacities are learnable."""
         if self.opacities.requires_grad:
             return -math.inf, math.inf
         visible = (self.opacities.detach() > 0).nonzero().flatten().tolist()
@@ -115,7 +116,7 @@ class TransferFunction(nn.Module):
 
 
 def _table(name: str, values: Numbers | Sequence[Sequence[float]]) -> Tensor:
-    """New tensor of finite numbers, float32 or float64."""
+    """Copy of ``values`` as a tensor of finite numbers, float64 if ``values`` are, else float32."""
     try:
         table = torch.as_tensor(values)
     except (TypeError, ValueError) as error:

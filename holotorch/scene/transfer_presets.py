@@ -1,4 +1,4 @@
-"""Transfer functions for common materials, and import of those that ParaView or 3D Slicer saved as JSON."""
+"""Transfer functions for common materials, and import of transfer functions that ParaView or 3D Slicer save as JSON."""
 
 import json
 import sys
@@ -10,7 +10,7 @@ from holotorch.core import checks
 from holotorch.scene.transfer import TransferFunction
 
 UNIT_DISTANCE = 0.01  # default unit distance of the opacities, as a fraction of the longest side of the volume
-_STEP = 1e-6  # width of the slope that replaces a jump, as a fraction of the range of positions
+_STEP = 1e-6  # width of the ramp that replaces a jump of colour or opacity, as a fraction of the range of positions
 
 # Rows of the tables: position from 0 (the value ``low``) to 1 (the value ``high``), red, green, blue, opacity.
 _BONE = [
@@ -65,17 +65,17 @@ def industrial(low: float, high: float, *, unit_distance: float = UNIT_DISTANCE)
 
 
 def transfer_from_json(text: str, *, unit_distance: float = UNIT_DISTANCE) -> TransferFunction:
-    """Transfer function saved by ParaView or 3D Slicer.
+    """Transfer function from the JSON text of ParaView or 3D Slicer.
 
-    Of a ParaView file the first map of the list is read: ``RGBPoints`` [x, r, g, b, ...] and ``Points`` [x, opacity,
-    midpoint, sharpness, ...]. Of a 3D Slicer file (volume property, schema 1) the only component is read:
-    ``rgbTransferFunction`` and ``scalarOpacity``. The result has the positions of both curves. A jump becomes a steep
-    slope over a millionth of the range of positions. Lighting is ignored.
+    From a ParaView file, ``RGBPoints`` [x, r, g, b, ...] and ``Points`` [x, opacity, midpoint, sharpness, ...] of the
+    first colour map are read. From a 3D Slicer file (volume property, schema 1), ``rgbTransferFunction`` and
+    ``scalarOpacity`` of its only component are read. The positions are those of the colours and of the opacities. A
+    jump becomes a linear ramp over a millionth of the range of positions. Lighting is ignored.
 
     Args:
         text: Content of the file.
         unit_distance: Unit distance of the opacities, as a fraction of the longest side of the volume. It is not read
-            from the file: ParaView does not save it, and Slicer's is in millimetres of a volume of unknown size.
+            from the file: ParaView does not save it, and Slicer saves it in millimetres, without the volume's size.
 
     Raises:
         ValueError: Another format, or a feature that a piecewise-linear function of one scalar cannot represent; the
@@ -83,7 +83,7 @@ def transfer_from_json(text: str, *, unit_distance: float = UNIT_DISTANCE) -> Tr
     """
     try:
         content = json.loads(text)
-    except (ValueError, RecursionError) as error:  # the latter for deeply nested brackets
+    except (ValueError, RecursionError) as error:  # deeply nested brackets raise RecursionError
         raise ValueError(f"a transfer function must be JSON text, got {text[:40]!r}: {error}") from None
     first = content[0] if isinstance(content, list) and content else content
     if isinstance(first, dict) and "RGBPoints" in first:
@@ -102,7 +102,7 @@ def transfer_from_json(text: str, *, unit_distance: float = UNIT_DISTANCE) -> Tr
 
 
 Curve = tuple[np.ndarray, np.ndarray]  # rising positions [K] and their values [K, n]
-Point = tuple[str, float, list[float], float, float]  # name in errors, position, n values, midpoint, sharpness
+Point = tuple[str, float, list[float], float, float]  # name in error messages, position, n values, midpoint, sharpness
 
 
 def _paraview(content: dict[str, Any]) -> tuple[Curve, Curve]:
@@ -130,7 +130,7 @@ def _slicer(content: dict[str, Any]) -> tuple[Curve, Curve]:
 
 
 def _points(where: str, component: dict[str, Any], key: str) -> list[Point]:
-    """Points of a function of Slicer, whose values have the name ``key``."""
+    """Points of the Slicer function at ``where``; ``key`` is the name of their values, "color" or "y"."""
     function = component.get(where.rsplit(".", 1)[1])
     if not isinstance(function, dict):
         raise ValueError(f"{where} must be an object with 'points', got {_kind(function)}")
@@ -149,10 +149,10 @@ def _points(where: str, component: dict[str, Any], key: str) -> list[Point]:
 
 
 def _curve(where: str, points: list[Point]) -> Curve:
-    """Rising positions and their values, with an additional point where a midpoint is not half-way."""
+    """Rising positions and their values, with an additional point between two points whose midpoint is not 0.5."""
     positions, values = list[float](), list[list[float]]()
     for k, (name, x, value, middle, sharp) in enumerate(points):
-        # The transfer function stores float32, in which positions must still be distinct.
+        # The transfer function stores positions as float32, and they must still differ.
         x = float(np.float32(x))
         if k and x < float(np.float32(points[k - 1][1])):
             raise ValueError(f"{name} must not lie below the one before, got {points[k - 1][1]:g} before {x:g}")
@@ -181,7 +181,7 @@ def _curve(where: str, points: list[Point]) -> Curve:
 
 
 def _fours(name: str, content: dict[str, Any]) -> list[tuple[str, list[float]]]:
-    """Groups of four numbers in a list of ParaView, with a name for each in errors."""
+    """Groups of four numbers from the ParaView list ``name``, each with its name in error messages."""
     numbers = _list(name, content.get(name))
     if len(numbers) % 4:
         raise ValueError(f"{name} must hold four numbers per point, got {len(numbers)} in all")
@@ -203,7 +203,7 @@ def _objects(name: str, value: Any) -> list[dict[str, Any]]:
 
 
 def _number(name: str, value: Any) -> float:
-    # The comparison rejects infinity, integers too large for a float, and NaN, for which it is False.
+    # ``abs(value) <= max`` is False for infinity, for integers too large for a float, and for NaN.
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
         raise ValueError(f"{name} must be a number, got {value!r}")
     return float(value)

@@ -11,7 +11,7 @@ from holotorch.core.quantities import VOXEL
 
 Triple = tuple[float, float, float]
 IDENTITY: tuple[Triple, Triple, Triple] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-_SLAB = 1 << 22  # number of samples processed at once, which bounds temporary memory to tens of megabytes
+_SLAB = 1 << 22  # number of samples processed at once; temporary memory is then tens of megabytes
 
 
 @dataclass(eq=False)
@@ -19,16 +19,17 @@ class Volume:
     """Samples of a scalar field (voxels) on a regular grid in a box, with axes in the order (z, y, x).
 
     Attributes:
-        values: Real [D, H, W], of any type: the uint8 values of a file stay uint8. May be a memory-mapped file.
+        values: Real tensor [D, H, W]. It keeps the type in the file, for instance uint8, and may be memory-mapped.
         spacing: Distance between samples along (z, y, x), in ``unit``.
-        unit: "m", or "relative" for a volume that has proportions but no size until it is placed in a scene.
+        unit: "m", or "relative" if only the proportions of the volume are known.
         origin: Position (z, y, x) of sample [0, 0, 0] in the coordinates of the file, in ``unit``.
-        orientation: Unit vectors (z, y, x) along the axes z, y and x in the coordinates of the file.
+        orientation: Three unit vectors, along the axes z, y and x of ``values``, each with components (z, y, x) in the
+            coordinates of the file.
 
     Raises:
         TypeError: ``values`` is not a real tensor, or a spacing is not a number.
-        ValueError: Not three axes, no voxel, a spacing that is not finite and positive, another unit, or axes that are
-            not at right angles.
+        ValueError: ``values`` without three axes or without voxels, a spacing that is not finite and positive, an
+            unknown unit, or axes that are not at right angles.
     """
 
     values: Tensor
@@ -75,7 +76,7 @@ class Volume:
         return depth * z, height * y, width * x
 
     def value_range(self) -> tuple[float, float]:
-        """Smallest and largest value; ValueError as from :meth:`check_finite` if a value is NaN or infinite."""
+        """Smallest and largest value; ValueError if a value is NaN or infinite."""
         ends = torch.stack([torch.stack(slab.aminmax()).to(torch.float64) for _, slab in self._slabs()])
         least, most = ends[:, 0].min().item(), ends[:, 1].max().item()
         if not (abs(least) < float("inf") and abs(most) < float("inf")):
@@ -83,7 +84,7 @@ class Volume:
         return least, most
 
     def check_finite(self) -> None:
-        """Raise ValueError if a voxel is NaN or infinite, with the position of the first and the number of all."""
+        """Raise ValueError if voxels are NaN or infinite, stating the position of the first one and their number."""
         if not self.values.is_floating_point():
             return
         first, count = "", 0
@@ -91,7 +92,7 @@ class Volume:
             bad = ~torch.isfinite(slab)
             bad_voxels = int(bad.sum())
             if bad_voxels and not count:
-                # argmax finds the first bad voxel without the memory that nonzero takes for all of them.
+                # argmax finds the first bad voxel; nonzero would allocate memory for the indices of all.
                 index = bad.flatten().to(torch.uint8).argmax()
                 z, y, x = (int(i) for i in torch.unravel_index(index, slab.shape))
                 first = f"voxel (z, y, x) = ({start + z}, {y}, {x}) is {slab[z, y, x].item()}"
@@ -105,12 +106,12 @@ class Volume:
     def bricks(self, size: int = 16) -> Tensor:
         """Smallest and largest value of every brick, [2, ceil(D / size), ceil(H / size), ceil(W / size)].
 
-        Along each axis brick b holds the samples from b ``size`` to (b + 1) ``size``, both included. A value that is
-        interpolated linearly within these limits therefore lies between the smallest and the largest of the brick. The
-        dtype is that of the values, or int64 for unsigned integers above 8 bits.
+        A brick is a block of samples. Along each axis brick b holds the samples from b * size to (b + 1) * size, both
+        included. Linear interpolation in the brick therefore gives no value outside these two. The dtype is that of
+        the values, or int64 for unsigned integers of 16 and 32 bits.
 
         Raises:
-            ValueError: A voxel is NaN or infinite, as from :meth:`check_finite`.
+            ValueError: A voxel is NaN or infinite.
         """
         size = checks.whole("brick size", size, 1)
         ends = torch.stack([self._reduced(size, torch.amin), self._reduced(size, torch.amax)])
@@ -134,7 +135,7 @@ class Volume:
 
 
 def _comparable(values: Tensor) -> Tensor:
-    """``values`` in a type that torch can compare."""
+    """``values``, converted to int64 if torch cannot compare their type."""
     return values.to(torch.int64) if values.dtype in (torch.uint16, torch.uint32) else values
 
 
@@ -150,7 +151,7 @@ def _right_angled(rows: Sequence[Sequence[float]]) -> tuple[Triple, Triple, Trip
         raise TypeError(f"volume orientation must be three rows (z, y, x) of direction cosines, got {rows!r}")
     z, y, x = (_triple("row of the volume's orientation", row) for row in rows)
     axes = torch.tensor([z, y, x], dtype=torch.float64)
-    # Files give direction cosines with three digits or more.
+    # The tolerance of 1e-3 allows for direction cosines that a file states with only three digits.
     if (axes @ axes.T - torch.eye(3, dtype=torch.float64)).abs().max() > 1e-3:
         raise ValueError(
             f"volume axes must be unit vectors at right angles, got {(z, y, x)}; resample a sheared volume (a tilted "

@@ -1,4 +1,4 @@
-"""General array files, which state no spacing: NumPy, HDF5 and Zarr. Their axes are taken as (z, y, x)."""
+"""Readers of NumPy, HDF5 and Zarr arrays. No spacing is read, and the axes are taken as (z, y, x)."""
 
 import math
 from pathlib import Path
@@ -13,7 +13,7 @@ def read_npy(path: Path) -> Scan:
     """Read a NumPy array; a large one is memory-mapped."""
     with readable(path, ".npy array"):
         stored = np.load(path, mmap_mode="r", allow_pickle=False)
-    # A file in Fortran order holds the transpose.
+    # In a file in Fortran order the bytes are those of the transposed array in C order.
     values = stored if stored.flags.c_contiguous else stored.T
     values = uncompressed_from(path, values.shape, values.dtype, stored.offset)
     return Scan(three_axes(values if stored.flags.c_contiguous else values.T, path))
@@ -26,7 +26,7 @@ def read_npz(path: Path, member: str | None = None) -> Scan:
     with archive:
         name = chosen(archive.files, member, path)
         with readable(path, ".npz archive"):
-            # The stated size is checked before numpy allocates memory for it.
+            # The size that the header states is checked before numpy allocates memory for it.
             entry = next(item for item in archive.zip.infolist() if item.filename in (name, f"{name}.npy"))
             with archive.zip.open(entry) as stream:
                 version = np.lib.format.read_magic(stream)
@@ -57,7 +57,7 @@ def read_hdf5(path: Path, member: str | None = None) -> Scan:
 
 
 def read_zarr(path: Path, member: str | None = None) -> Scan:
-    """Read the array ``member`` of a Zarr folder, by default the folder itself or its only array with three axes."""
+    """Read the array ``member`` of a Zarr group, by default its only array with three axes, or read a Zarr array."""
     zarr = extra("zarr", "reading Zarr")
     with readable(path, "Zarr folder"):
         node = zarr.open(str(path), mode="r")

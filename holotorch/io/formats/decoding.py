@@ -1,4 +1,4 @@
-"""Decoding of pictures by OpenCV, after a check of the memory that the size in their header requires."""
+"""Decoding of pictures by OpenCV, after a check of the memory that the picture size in the header requires."""
 
 import io
 import math
@@ -13,7 +13,7 @@ from holotorch.io.formats.limits import affordable
 
 PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
-_MOST_SCANS = 100  # of a progressive JPEG; decoding a scan of a few bytes can take as long as a whole picture
+_MOST_SCANS = 100  # largest number of scans of a progressive JPEG; even a scan of a few bytes may take long to decode
 
 
 def decode(path: Path, flags: int, *, data: bytes | None = None, memory: int = 8) -> np.ndarray:
@@ -23,11 +23,11 @@ def decode(path: Path, flags: int, *, data: bytes | None = None, memory: int = 8
         path: Path of the file.
         flags: Flags of ``cv2.imdecode``.
         data: Content of the file, if it has been read already.
-        memory: Bytes per pixel needed for decoding and for the further processing by the caller; by default those of
+        memory: Bytes per pixel that decoding and further processing by the caller need; the default suffices for
             four channels of 16 bits.
 
     Raises:
-        ValueError: The file is no picture, is damaged, or exceeds the memory limit of
+        ValueError: The file is not a picture, is damaged, or needs more memory than the limit in
             :mod:`holotorch.io.formats.limits`.
     """
     import cv2
@@ -65,7 +65,7 @@ def picture_size(path: Path, data: bytes) -> tuple[int, int]:
             return height, width
         if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
             return _webp_size(data)
-        # The reader classes are used instead of Image.open, whose size limit does not depend on the file's size.
+        # Image.open would also apply Pillow's own limit of the picture size, so the reader classes are called directly.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             picture = readers[data[:2]](io.BytesIO(data))
@@ -77,7 +77,7 @@ def picture_size(path: Path, data: bytes) -> tuple[int, int]:
 def check_exr(path: Path, *, memory: int) -> None:
     """Raise ValueError for an EXR file that is damaged or needs more memory than the limit.
 
-    ``memory`` is the number of bytes per pixel that the caller needs besides 4 bytes for each channel of the file.
+    ``memory`` is the number of bytes per pixel that the caller needs in addition to 4 bytes per channel of the file.
     """
     import OpenEXR
 
@@ -88,28 +88,28 @@ def check_exr(path: Path, *, memory: int) -> None:
             low, high = part.header["dataWindow"]
             pixels = math.prod(int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
             needed += pixels * (memory + 4 * len(part.header["channels"]))
-    except Exception as error:  # the library raises bare RuntimeError and others
+    except Exception as error:  # OpenEXR raises errors of many types, such as RuntimeError
         raise ValueError(f"{path} is not a readable EXR file: {error}") from None
     affordable(path, needed, path.stat().st_size)
 
 
 def _scans(data: bytes) -> int:
-    """Number of scans of a JPEG, without the scans of a thumbnail in its metadata."""
+    """Number of scans of a JPEG, not counting those of a thumbnail in its metadata."""
     marker = re.compile(rb"\xff+([^\x00\xff])")
-    without_segment = {0x01, *range(0xD0, 0xD9)}  # such as restarts and the start of the image
+    without_segment = {0x01, *range(0xD0, 0xD9)}  # markers that no data follow, such as restart markers
     count, position = 0, 2
     while (match := marker.search(data, position)) and (kind := match[1][0]) != 0xD9:
         count += kind == 0xDA
         position = match.end()
-        if kind not in without_segment:  # a segment begins with its length, which includes these two bytes
+        if kind not in without_segment:  # a segment begins with its length in bytes, two of which state the length
             position += max(2, int.from_bytes(data[position : position + 2], "big"))
     return count
 
 
 def _png_end(data: bytes) -> int:
-    """Length of a PNG in bytes up to the end of its last chunk; raises if a chunk is longer than the data.
+    """Length of a PNG in bytes up to the end of its last chunk, IEND; raises if a chunk is longer than the data.
 
-    Decoders allocate the stated size of a chunk before they read it, even for data after the last chunk.
+    Data after IEND must be removed, since decoders read them as chunks and allocate the size that a chunk states.
     """
     position, kind = len(PNG), b""
     while kind != b"IEND":

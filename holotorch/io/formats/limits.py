@@ -1,4 +1,4 @@
-"""Memory limits for reading files: data are decompressed only up to the size that a file states, which is limited."""
+"""Memory limits for reading files: the size that a header states is limited, and no more is decompressed."""
 
 import bz2
 import os
@@ -9,25 +9,25 @@ from typing import Any
 
 from holotorch.core.memory import available_memory
 
-MEMORY_LIMIT = 1 << 30  # bytes of memory that any file may take
-# A file may take this many times its size. Photographs and scans expand less than 300-fold, zeros up to 1000-fold.
+MEMORY_LIMIT = 1 << 30  # bytes of memory that reading a file may take, whatever the size of the file
+# Reading a larger file may take this many times its size. Photographs and scans expand by less than 300, zeros by 1000.
 RATIO = 500
-VARIABLE = "HOLOTORCH_MEMORY_LIMIT"  # name of an environment variable, which holds a number of bytes
+VARIABLE = "HOLOTORCH_MEMORY_LIMIT"  # environment variable with a number of bytes that replaces MEMORY_LIMIT
 _CHUNK = 1 << 20  # bytes decompressed at once
 
 
 def affordable(source: Path | str, needed: int, stored: int) -> None:
-    """Raise ValueError if the file ``source`` of ``stored`` bytes needs implausibly many bytes of memory to be read.
+    """Raise ValueError if reading the file ``source`` needs more memory than the limit.
 
-    The limit is :data:`MEMORY_LIMIT` or :data:`RATIO` times ``stored``, whichever is more. The environment variable
-    :data:`VARIABLE` replaces ``MEMORY_LIMIT``.
+    ``needed`` is the memory and ``stored`` the size of the file, in bytes. The limit is :data:`MEMORY_LIMIT`, or the
+    number in the environment variable :data:`VARIABLE`, or :data:`RATIO` times ``stored`` if this is more.
     """
     try:
         limit = float(os.environ.get(VARIABLE, MEMORY_LIMIT))
     except ValueError:
         raise ValueError(f"{VARIABLE} must be a number of bytes, got {os.environ[VARIABLE]!r}") from None
     if needed > max(limit, RATIO * stored):
-        size = min(needed, 10**300) / 1e9  # a header may state more than a float holds
+        size = min(needed, 10**300) / 1e9  # a header may state a number too large for a float
         raise ValueError(
             f"{source} has {stored} bytes and asks for {size:.3g} GB of memory, more than the limit of "
             f"{limit / 1e9:.3g} GB; if it is what it should be, set the environment variable {VARIABLE}={needed}"
@@ -35,15 +35,15 @@ def affordable(source: Path | str, needed: int, stored: int) -> None:
 
 
 def readable_at_once(size: int) -> bool:
-    """Whether data of ``size`` bytes are read instead of mapped: up to MEMORY_LIMIT or half of the free memory."""
+    """Whether ``size`` bytes are read, not memory-mapped: up to the larger of MEMORY_LIMIT and half the free memory."""
     return size <= max(MEMORY_LIMIT, (available_memory() or 0) // 2)
 
 
 def unzipped(path: Path, size: int, offset: int = 0, *, kind: str = "gzip") -> bytearray:
-    """Decompress a file from byte ``offset`` on, to at most ``size`` bytes as stated by a header.
+    """Decompress a file from byte ``offset`` on; ``size`` is the largest number of bytes that the result may have.
 
     ``kind`` is "gzip", which also accepts zlib streams, or "bzip2". The content of concatenated members is joined.
-    ValueError if the data are damaged or cut short, have more than ``size`` bytes, or exceed the memory limit.
+    ValueError if the data are damaged or truncated, have more than ``size`` bytes, or exceed the memory limit.
     """
     affordable(path, size, path.stat().st_size)
     content = bytearray()
@@ -81,7 +81,7 @@ def _decompressed(path: Path, offset: int, kind: str) -> Iterator[bytes]:
                     piece = engine.decompress(rest, _CHUNK)
                     done += len(piece)
                     yield piece
-                    # Of input that is not consumed yet, zlib returns the rest and bz2 keeps it.
+                    # zlib returns the input that it has not consumed; bz2 keeps it and needs no further input.
                     rest = engine.unused_data if engine.eof else getattr(engine, "unconsumed_tail", b"")
                     if not rest and not engine.eof and getattr(engine, "needs_input", True):
                         rest = stream.read(_CHUNK)

@@ -1,4 +1,4 @@
-"""Medical formats: NIfTI files and folders of DICOM slices, with lengths in millimetres."""
+"""Readers of medical formats: NIfTI files and folders of DICOM slices."""
 
 import math
 from collections.abc import Sequence
@@ -10,13 +10,13 @@ import numpy as np
 from holotorch.io.formats.limits import affordable, readable_at_once
 from holotorch.io.formats.scan import Scan, extra, metres, placed, readable, three_axes
 
-_UNEVEN = 0.05  # tolerated deviation of a slice distance, relative to the median; files round positions to 0.01 mm
+_UNEVEN = 0.05  # tolerated relative deviation of a slice distance from the median; files round positions to 0.01 mm
 
 
 def read_nifti(path: Path) -> Scan:
-    """Read a NIfTI file, .nii or .nii.gz, in its own dtype, or as float32 if it states a scale for the values.
+    """Read a NIfTI file, .nii or .nii.gz, in the dtype of the file, or as float32 if it states a scale for the values.
 
-    A large .nii is memory-mapped. A file without a unit is taken to be in millimetres, as in other readers.
+    A large .nii is memory-mapped. Lengths are in millimetres if the file states no unit, as in other NIfTI readers.
     """
     nibabel = extra("nibabel", "reading NIfTI")
     with readable(path, "NIfTI file"):
@@ -27,7 +27,7 @@ def read_nifti(path: Path) -> Scan:
         matrix = np.asarray(image.affine, dtype=np.float64)
         unit = image.header.get_xyzt_units()[0].replace("unknown", "mm")
     if values.dtype != image.get_data_dtype() and values.dtype.kind == "f":
-        # nibabel scales in float64; float32 is precise enough for scaled integers.
+        # nibabel returns scaled values as float64; float32 is precise enough for scaled integers.
         values = values.astype(np.float32)
     values = three_axes(values.T, path)
     return placed(values, matrix[:3, :3].T, matrix[:3, 3], "m", metres(unit, path))
@@ -40,7 +40,7 @@ def is_dicom(path: Path) -> bool:
 
 
 class _Slice:
-    """Header ``data`` of one DICOM slice, with lengths in millimetres and vectors (x, y, z)."""
+    """Header of one DICOM slice; lengths are in millimetres and vectors are (x, y, z)."""
 
     def __init__(self, path: Path, data: Any):
         def numbers(tag: str, *shape: int) -> np.ndarray | None:
@@ -55,7 +55,7 @@ class _Slice:
         # Whether the file has one frame and one number per pixel.
         self.single = int(data.get("SamplesPerPixel", 1)) == 1 and int(data.get("NumberOfFrames", 1)) == 1
         self.size = int(data.Rows), int(data.Columns)
-        self.position = position  # of the first pixel
+        self.position = position  # position of the first pixel
         self.cosines = cosines  # unit vectors from column to column and from row to row, [2, 3]
         self.spacing = numbers("PixelSpacing", 2)  # distances from row to row and from column to column
         thickness = data.get("SpacingBetweenSlices") or data.get("SliceThickness")
@@ -63,15 +63,15 @@ class _Slice:
         self.scale = float(data.get("RescaleSlope", 1)), float(data.get("RescaleIntercept", 0))
         self.signed = bool(data.get("PixelRepresentation", 0))
         allocated = int(data.BitsAllocated)
-        self.bits = allocated, int(data.get("BitsStored", allocated))  # allocated and stored per pixel
+        self.bits = allocated, int(data.get("BitsStored", allocated))  # bits per pixel
         self.normal = np.cross(cosines[0], cosines[1])
-        self.height = float(self.normal @ position)  # position along the normal
+        self.height = float(self.normal @ position)  # position of the slice along the normal
 
 
 def read_dicom(folder: Path) -> Scan:
-    """Read one DICOM series of single slices, sorted by position and rescaled as stated in the headers.
+    """Read a folder with one DICOM series of one slice per file, sorted by position and rescaled as the headers state.
 
-    The voxels are integers if slope and intercept are whole numbers and equal in all slices, else float32.
+    Voxels are integers if the slope and intercept of the rescaling are integers and equal in all slices, else float32.
     """
     pydicom = extra("pydicom", "reading DICOM")
     slices: list[_Slice] = []
@@ -101,7 +101,7 @@ def read_dicom(folder: Path) -> Scan:
 
 
 def _one_series(slices: Sequence[_Slice], folder: Path) -> None:
-    """Raise ValueError unless all slices belong to one series and agree in their geometry and type."""
+    """Raise ValueError unless all slices belong to one series and have the same geometry and pixel type."""
     series = sorted({header.series for header in slices})
     if len(series) > 1:
         raise ValueError(f"{folder} holds {len(series)} series, expected one; move each to its own folder: {series}")
@@ -137,7 +137,7 @@ def _step(slices: Sequence[_Slice], folder: Path) -> np.ndarray | None:
 
 
 def _rescaled_type(slices: Sequence[_Slice]) -> np.dtype:
-    """Smallest type of the rescaled voxels that holds all values of the stored bits."""
+    """Smallest type that holds every rescaled value that the stored bits can represent."""
     (slope, intercept), *others = {header.scale for header in slices}
     allocated, bits = slices[0].bits
     if others or not (slope.is_integer() and intercept.is_integer()):
@@ -146,5 +146,5 @@ def _rescaled_type(slices: Sequence[_Slice]) -> np.dtype:
         return np.dtype(f"{'i' if slices[0].signed else 'u'}{allocated // 8}")
     limits = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if slices[0].signed else (0, 2**bits - 1)
     ends = [int(slope) * limit + int(intercept) for limit in limits]
-    # A signed type that holds a maximum also holds -maximum - 1. For a negative number min_scalar_type is signed.
+    # min_scalar_type gives a signed type for a negative number, and a type that holds -m - 1 also holds m.
     return np.min_scalar_type(min(-1, *ends, -max(ends) - 1))

@@ -1,4 +1,4 @@
-"""Formats with raw or compressed voxels and a simple header or none: raw, MetaImage and NRRD."""
+"""Readers of formats with a short text header or none before the voxels: raw, MetaImage and NRRD."""
 
 import re
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from holotorch.io.formats import scan
 from holotorch.io.formats.limits import unzipped
 from holotorch.io.formats.scan import Scan
 
-_HEADER = 1 << 20  # largest accepted header of unknown length within compressed data, in bytes
+_HEADER = 1 << 20  # largest number of bytes skipped before the voxels in compressed data if byte skip is -1
 _META_TYPES = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4",
     "MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4", "MET_DOUBLE": "f8",
@@ -32,10 +32,10 @@ _NRRD_TYPES = {
 
 
 def read_raw(path: Path, shape: Sequence[int] | None, dtype: DTypeLike | None) -> Scan:
-    """Read voxels [D, H, W] without a header; a ``shape`` or ``dtype`` of None is taken from the file name.
+    """Read voxels [D, H, W] without a header; ``shape`` is (D, H, W).
 
-    The name must then contain the sizes (x, y, z) and the type, as in the Open SciVis Datasets, for example
-    bonsai_256x256x256_uint8.raw. A file whose name ends in .gz is decompressed.
+    If ``shape`` or ``dtype`` is None, the file name must state the sizes (x, y, z) and the type, as in the Open SciVis
+    Datasets, for example bonsai_256x256x256_uint8.raw. A file whose name ends in .gz is decompressed.
     """
     stated = re.search(r"_(\d+)x(\d+)x(\d+)_(u?int\d+|float\d+)\.", path.name)
     if stated:
@@ -54,7 +54,7 @@ def read_raw(path: Path, shape: Sequence[int] | None, dtype: DTypeLike | None) -
 
 
 def read_metaimage(path: Path) -> Scan:
-    """Read MetaImage (.mhd with a data file, or .mha), in millimetres unless DistanceUnits states another unit."""
+    """Read MetaImage (.mhd with a data file, or .mha); lengths are in DistanceUnits, by default millimetres."""
     fields, end = _metaimage_header(path)
     if fields.get("NDims", "3") != "3" or fields.get("ElementNumberOfChannels", "1") != "1":
         raise ValueError(
@@ -86,7 +86,7 @@ def read_metaimage(path: Path) -> Scan:
 
 
 def read_nrrd(path: Path) -> Scan:
-    """Read NRRD (.nrrd, or .nhdr with a data file), encoded as raw, gzip, bzip2 or text; "relative" without units."""
+    """Read NRRD (.nrrd, or .nhdr with a data file); the unit of the scan is "relative" if the file states none."""
     import nrrd
 
     with open(path, "rb") as stream:
@@ -150,7 +150,7 @@ def _nrrd_placed(values: np.ndarray, header: dict[str, Any], path: Path) -> Scan
     units = [unit for unit in header.get("space units" if in_space else "units", []) if unit.strip()]
     if len(units) not in (0, 3):
         raise ValueError(f"{path} gives units for {len(units)} of three axes; pass spacing= instead")
-    # Each axis has a unit or, with space directions, each vector component. Both apply to the columns of ``axes``.
+    # Units of space directions hold for vector components, the columns of ``axes``. Without them ``axes`` is diagonal.
     scale = np.array([scan.metres(unit, path) for unit in units] if units else [1.0, 1, 1])
     origin = np.asarray(header.get("space origin", [0.0, 0, 0]), dtype=np.float64)
     origin = np.where(np.isfinite(origin), origin, 0) * scale
@@ -158,10 +158,10 @@ def _nrrd_placed(values: np.ndarray, header: dict[str, Any], path: Path) -> Scan
 
 
 def _metaimage_header(path: Path) -> tuple[dict[str, str], int]:
-    """Fields of a header, and its length in bytes."""
+    """Fields of a MetaImage header by name, and its length in bytes."""
     fields: dict[str, str] = {}
     with open(path, "rb") as stream:
-        # ElementDataFile is always the last field of the header, which the voxels may follow.
+        # ElementDataFile is always the last field of the header; voxels may follow it.
         while "ElementDataFile" not in fields and (line := stream.readline(1 << 16)):
             name, equals, value = line.decode("latin-1").partition("=")
             if equals:
@@ -184,7 +184,7 @@ def _whole(
 def _numbers(
     fields: dict[str, str], names: Sequence[str], count: int, path: Path, default: str | None = None
 ) -> list[float]:
-    """The ``count`` numbers of the first field of ``names`` that exists, or of ``default``."""
+    """The ``count`` numbers in the first of the fields ``names`` that exists, or in the text ``default``."""
     text = next((fields[name] for name in names if name in fields), default)
     try:
         numbers = [float(word) for word in (text or "").split()]

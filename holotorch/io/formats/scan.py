@@ -1,4 +1,4 @@
-"""Scan: voxels and geometry as stated by a file, and the checks that all formats share."""
+"""Scan: voxels and geometry as a file states them, and functions that the readers of all formats share."""
 
 import importlib
 import math
@@ -16,7 +16,7 @@ from numpy.typing import DTypeLike
 from holotorch.io.formats.limits import affordable, readable_at_once
 from holotorch.scene.volume import IDENTITY, Triple
 
-_MAP_NORESERVE = 0x4000  # flag of mmap on Linux; Python has no name for it before 3.13
+_MAP_NORESERVE = 0x4000  # flag MAP_NORESERVE of mmap on Linux, which Python names from version 3.13 on
 _METRES = {
     "m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 1e-2, "mm": 1e-3, "millimeter": 1e-3, "um": 1e-6, "µm": 1e-6,
     "micron": 1e-6, "nm": 1e-9, "angstrom": 1e-10,
@@ -25,18 +25,18 @@ _METRES = {
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Voxels and the geometry that their file states."""
+    """Voxels and geometry as a file states them."""
 
-    values: np.ndarray  # [D, H, W] in the dtype of the file, possibly memory-mapped
+    values: np.ndarray  # voxels [D, H, W], usually in the dtype of the file, possibly memory-mapped
     spacing: Triple | None = None  # distance between voxels along (z, y, x) in ``unit``, None if the file states none
     unit: str = "relative"  # "m" or "relative"
     origin: Triple = (0.0, 0.0, 0.0)  # position (z, y, x) of voxel [0, 0, 0] in ``unit``
-    # Unit vectors of the axes z, y, x as rows with components (z, y, x).
+    # Three unit vectors, along the axes z, y and x of ``values``, each with components (z, y, x).
     orientation: tuple[Triple, Triple, Triple] = IDENTITY
 
 
 def metres(unit: str, path: Path) -> float:
-    """Length in metres of a ``unit`` that is named in the file at ``path``; ValueError if it is unknown."""
+    """Length in metres of the ``unit`` that the file ``path`` names, for instance "mm"; ValueError if it is unknown."""
     name = unit.strip().lower()
     length = _METRES.get(name) or _METRES.get(name.removesuffix("s"))
     if length is None:
@@ -45,11 +45,11 @@ def metres(unit: str, path: Path) -> float:
 
 
 def placed(values: np.ndarray, axes: Any, origin: Any, unit: str, scale: float = 1.0) -> Scan:
-    """Scan of ``values`` [D, H, W] from geometry in the order (x, y, z), which ``scale`` converts to ``unit``.
+    """Scan of ``values`` [D, H, W] with a geometry that is given in the order (x, y, z).
 
-    The rows of ``axes`` [3, 3] are the steps from one voxel to the next along x, y and z, with components (x, y, z).
-    ``origin`` is the position (x, y, z) of the first voxel. The scan has no geometry if the length of a step is 0, or
-    not finite.
+    The rows of ``axes`` [3, 3] are the vectors from one voxel to the next along x, y and z. ``origin`` is the position
+    of the first voxel. Lengths are multiplied by ``scale`` to convert them to ``unit``. If a vector has the length 0 or
+    is not finite, the scan has no geometry.
     """
     steps = np.asarray(axes, dtype=np.float64)[::-1, ::-1]
     lengths = np.linalg.norm(steps, axis=1)
@@ -67,9 +67,9 @@ def triple(values: Sequence[float] | np.ndarray) -> Triple:
 
 
 def existing(path: Path, where: str = "", *, file: bool = False) -> Path:
-    """Return ``path``; ValueError if it is missing, cannot be read, is an empty file or, with ``file``, no file.
+    """Return ``path``; ValueError if it is missing or an empty file, or cannot be read.
 
-    ``where`` describes the path in errors.
+    If ``file`` is True, a folder is an error as well. ``where`` describes the path in error messages.
     """
     where = where or str(path)
     try:
@@ -86,10 +86,10 @@ def existing(path: Path, where: str = "", *, file: bool = False) -> Path:
 
 
 def named(header: Path, name: str) -> Path:
-    """Path of the data file that a header names, in the header's folder or below it.
+    """Path of the data file that the file ``header`` names, in the folder of the header or below it.
 
-    ValueError if it is missing, empty or no file, or lies elsewhere, since a header from someone else must not choose
-    which of the user's files are read.
+    ValueError if the data file is missing, empty, not a file, or elsewhere: a header from an untrusted source must not
+    give access to other files.
     """
     if name.split()[:1] == ["LIST"] or "%" in name:
         raise ValueError(f"{header} lists one file per slice; load the folder of the slices instead")
@@ -103,7 +103,7 @@ def named(header: Path, name: str) -> Path:
 
 
 def number_type(dtype: DTypeLike) -> np.dtype:
-    """``dtype`` as a numpy dtype; ValueError if it is no type of real numbers."""
+    """``dtype`` as a numpy dtype; ValueError if it is not a type of real numbers."""
     try:
         kind = np.dtype(dtype)
         if kind.kind not in "buif":
@@ -116,7 +116,7 @@ def number_type(dtype: DTypeLike) -> np.dtype:
 
 
 def expect_bytes(path: Path, found: int, shape: Sequence[int], dtype: np.dtype) -> int:
-    """Number of bytes of ``shape`` voxels; ValueError if ``found`` differs from it, or if a size is below 1."""
+    """Number of bytes of voxels of ``shape``; ValueError if ``found`` is another number, or a size is below 1."""
     sizes = " x ".join(map(str, shape))
     if any(size < 1 for size in shape):
         raise ValueError(f"{path} states {sizes} voxels (D x H x W); every size must be above 0")
@@ -130,9 +130,9 @@ def expect_bytes(path: Path, found: int, shape: Sequence[int], dtype: np.dtype) 
 
 
 def uncompressed(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int | None = 0) -> np.ndarray:
-    """Voxels that take a file from ``offset`` bytes to its end, read as by :func:`uncompressed_from`.
+    """Voxels that begin ``offset`` bytes into a file and end with it, read as by :func:`uncompressed_from`.
 
-    ``offset`` is None if it is unknown.
+    If ``offset`` is None, the voxels are the last bytes of the file.
     """
     size = path.stat().st_size
     offset = max(0, size - math.prod(shape) * dtype.itemsize) if offset is None else offset
@@ -141,11 +141,11 @@ def uncompressed(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int 
 
 
 def uncompressed_from(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int) -> np.ndarray:
-    """Voxels of a file from ``offset`` bytes on, writable.
+    """Writable voxels that begin ``offset`` bytes into a file.
 
-    The file is read at once, or memory-mapped if the voxels take over 1 GiB and over half of the free memory. Mapped
-    voxels are read on access, and the system terminates the program if the file has been truncated since. Only volumes
-    that may exceed the memory are therefore mapped. Changes to mapped voxels are not written to the file.
+    They are read at once, or memory-mapped if they take over 1 GiB and over half of the free memory. Mapped voxels are
+    read on access. If the file has been truncated meanwhile, the system then terminates the program, so smaller volumes
+    are not mapped. Changes to mapped voxels are not written to the file.
     """
     size = math.prod(shape) * dtype.itemsize
     if readable_at_once(size):
@@ -154,14 +154,14 @@ def uncompressed_from(path: Path, shape: Sequence[int], dtype: np.dtype, offset:
         return values.reshape(tuple(shape))
     if sys.platform != "linux":
         return np.memmap(path, dtype, "c", offset, tuple(shape))
-    # numpy.memmap reserves memory for a copy of the whole file, which fails for volumes larger than memory.
+    # numpy.memmap would reserve memory for a copy of the whole file, which fails if the file exceeds the memory.
     with open(path, "rb") as stream:
         access = {"flags": mmap.MAP_PRIVATE | _MAP_NORESERVE, "prot": mmap.PROT_READ | mmap.PROT_WRITE}
         return np.ndarray(tuple(shape), dtype, mmap.mmap(stream.fileno(), 0, **access), offset)
 
 
 def stated_bytes(path: Path, shape: Sequence[int], dtype: np.dtype) -> int:
-    """Number of bytes of ``shape`` voxels; ValueError if a size is below 1 or the memory limit is exceeded."""
+    """Number of bytes of voxels of ``shape``; ValueError if a size is below 1 or they exceed the memory limit."""
     size = expect_bytes(path, math.prod(shape) * dtype.itemsize, shape, dtype)
     affordable(path, size, path.stat().st_size)
     return size
@@ -170,13 +170,13 @@ def stated_bytes(path: Path, shape: Sequence[int], dtype: np.dtype) -> int:
 def unpacked(path: Path, data: bytes | bytearray, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
     """Decompressed ``data`` as an array of ``shape``."""
     expect_bytes(path, len(data), shape, dtype)
-    # torch needs a writable buffer, which a bytearray is.
+    # A bytearray is writable, which torch.from_numpy requires.
     return np.frombuffer(data if isinstance(data, bytearray) else bytearray(data), dtype).reshape(tuple(shape))
 
 
 def from_text(path: Path, text: str | bytes, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
     """Voxels [D, H, W] from numbers separated by white space, in native byte order."""
-    # numpy's conversion from strings would store every word with the width of the longest.
+    # A numpy array of strings would take the length of the longest word for every word.
     number = float if dtype.kind == "f" else int
     with readable(path, "text of numbers"):
         values = np.array([number(word) for word in text.split()], dtype.newbyteorder("="))
@@ -185,7 +185,7 @@ def from_text(path: Path, text: str | bytes, shape: Sequence[int], dtype: np.dty
 
 
 def three_axes(values: np.ndarray, path: Path) -> np.ndarray:
-    """``values`` as [D, H, W] without leading axes of length 1; ValueError for colours, vectors and series."""
+    """``values`` without leading axes of length 1 before [D, H, W]; ValueError for colours, vectors and series."""
     if values.dtype.names or values.dtype.kind not in "buif":
         raise ValueError(f"{path} holds {values.dtype} elements, not one real number per voxel; convert it to scalars")
     while values.ndim > 3 and values.shape[0] == 1:
@@ -201,12 +201,12 @@ def three_axes(values: np.ndarray, path: Path) -> np.ndarray:
 
 @contextmanager
 def readable(path: Path, kind: str) -> Iterator[None]:
-    """Context manager that converts any error of a decoder to a ValueError with the name of the file."""
+    """Context manager that converts any error but MemoryError to a ValueError with the name of the file."""
     try:
         yield
     except MemoryError:
         raise
-    except Exception as error:  # libraries raise many kinds, such as RuntimeError and KeyError
+    except Exception as error:  # decoders raise errors of many types, such as RuntimeError and KeyError
         raise ValueError(f"{path} is no readable {kind}, or is truncated: {error}") from None
 
 
@@ -221,13 +221,13 @@ def extra(module: str, what: str) -> Any:
 
 
 def split_member(path: str | Path) -> tuple[Path, str | None]:
-    """Split ``file::name`` into the path of the file and the name of an array in it, or None without a name."""
+    """Split ``file::name`` into the path of the file and the name of an array in it, which is None if not given."""
     file, _, member = str(path).partition("::")
     return Path(file), member.strip("/") or None
 
 
 def chosen(names: Sequence[str], member: str | None, path: Path) -> str:
-    """Name of the array to read: ``member`` if given, otherwise the only one of ``names``; else ValueError."""
+    """Name of the array to read: ``member``, or the only one of ``names`` if ``member`` is None; else ValueError."""
     if member is None and len(names) == 1:
         return names[0]
     if member is None or member not in names:

@@ -1,4 +1,4 @@
-"""Volumes stored as pictures of slices: TIFF stacks, folders of numbered pictures, and tiles in one picture."""
+"""Readers of volumes stored as pictures: TIFF files with pages, folders of numbered slices, and tiles in a picture."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -10,7 +10,7 @@ from holotorch.io.formats.decoding import decode
 from holotorch.io.formats.limits import affordable
 from holotorch.io.formats.scan import Scan, readable
 
-_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES = 256, 257, 258, 277  # tags of a page
+_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES = 256, 257, 258, 277  # TIFF tags
 SLICE_SUFFIXES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg")
 
 
@@ -31,7 +31,7 @@ def read_tiff(path: Path) -> Scan:
 
 
 def read_folder(folder: Path) -> Scan:
-    """Read the pictures of a folder as slices, ordered by the last number in their names; no number may be missing."""
+    """Read the pictures of a folder as slices, in order of the last number in each name; no number may be missing."""
     paths = [path for path in folder.iterdir() if path.suffix.lower() in SLICE_SUFFIXES]
     if not paths:
         raise ValueError(f"{folder} holds no slices: neither DICOM, Zarr nor pictures ({', '.join(SLICE_SUFFIXES)})")
@@ -55,9 +55,9 @@ def read_folder(folder: Path) -> Scan:
 
 
 def read_tiles(path: Path, shape: Sequence[int] | None) -> Scan:
-    """Read slices stored as tiles of one picture, row by row from the top left; ``shape`` is (D, H, W).
+    """Read D slices of H x W pixels stored as tiles of one picture, row by row from the top left.
 
-    Tiles after the last slice must be empty.
+    ``shape`` is (D, H, W). Tiles after the last slice must be zero.
     """
     if shape is None:
         raise ValueError(f"{path} is one picture: pass shape=(D, H, W) if it is tiled with slices, or its folder")
@@ -89,7 +89,7 @@ def _grey(pixels: np.ndarray, source: str) -> np.ndarray:
 
 
 def _stacked(slices: Iterable[np.ndarray], sources: Sequence[str]) -> Scan:
-    """Scan of grey slices; ``sources`` names them in errors."""
+    """Scan of grey ``slices``; ``sources`` are their names in error messages."""
     values = np.empty(0)
     for index, (pixels, source) in enumerate(zip(slices, sources, strict=True)):
         plane = _grey(pixels, source)
@@ -105,9 +105,9 @@ def _stacked(slices: Iterable[np.ndarray], sources: Sequence[str]) -> Scan:
 
 
 def _tiff_pages(path: Path) -> int:
-    """Number of pages from the TIFF directories, since OpenCV silently omits pages that it cannot decode.
+    """Number of pages according to the page directories; OpenCV silently omits pages that it cannot decode.
 
-    ValueError for a damaged file, or pages whose pixels need more than the memory limit.
+    ValueError for a damaged file, or for pages that need more memory than the limit.
     """
     data = np.memmap(path, np.uint8, "r")
     mark, order = bytes(data[:2]), "big" if bytes(data[:2]) == b"MM" else "little"
@@ -115,7 +115,7 @@ def _tiff_pages(path: Path) -> int:
     if mark not in (b"II", b"MM") or version not in (42, 43):
         raise ValueError(f"{path} is not a TIFF file")
     wide = version == 43  # BigTIFF
-    # Bytes of an offset, of the number of entries of a directory, and of an entry.
+    # Lengths in bytes of an offset, of the number of entries in a directory, and of an entry.
     length, counter, entry = (8, 8, 20) if wide else (4, 2, 12)
 
     def number(position: int, size: int) -> int:
@@ -124,11 +124,11 @@ def _tiff_pages(path: Path) -> int:
         return int.from_bytes(bytes(data[position : position + size]), order)
 
     def first_value(directory: int, tag: int) -> int:
-        """First value of the entry ``tag`` of a directory, 1 if there is none."""
+        """First value of the entry ``tag`` of the directory at byte ``directory``; 1 without this entry."""
         begin = directory + counter
         for position in range(begin, begin + entry * number(directory, counter), entry):
             if number(position, 2) == tag:
-                size = {3: 2, 4: 4, 16: 8}.get(number(position + 2, 2), 1)  # bytes of a value, from the entry's type
+                size = {3: 2, 4: 4, 16: 8}.get(number(position + 2, 2), 1)  # bytes per value, by TIFF type
                 count, value = number(position + 4, length), position + 4 + length
                 return number(value if count * size <= length else number(value, length), size)
         return 1
@@ -145,6 +145,6 @@ def _tiff_pages(path: Path) -> int:
         bits = max(8, first_value(position, _TIFF_BITS)) * first_value(position, _TIFF_SAMPLES)
         needed += first_value(position, _TIFF_WIDTH) * first_value(position, _TIFF_HEIGHT) * bits // 8
         position = number(position + counter + entry * count, length)
-    # Memory for the decoded pages and for the volume that they are copied to.
+    # The memory is counted twice: for the decoded pages and for the volume to which they are copied.
     affordable(path, 2 * needed, data.size)
     return len(directories)

@@ -1,4 +1,4 @@
-"""VTK image data (.vti): XML with the voxels as text, base64 or raw bytes, uncompressed or compressed by zlib."""
+"""Reader of VTK image data (.vti): XML with voxels as text, base64 or raw bytes, possibly compressed by zlib."""
 
 import base64
 import re
@@ -16,16 +16,16 @@ _TYPES = {
     "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4", "Int64": "i8",
     "UInt64": "u8", "Float32": "f4", "Float64": "f8",
 }  # fmt: skip
-# Repetitions are bounded, so that the search takes linear time even if a file has many partial matches.
+# Bounded repetitions keep the time of the search linear even for files with many partial matches.
 _APPENDED = re.compile(
     rb"<AppendedData\s[^<>]{0,200}encoding\s{0,9}=\s{0,9}[\"'](\w{1,20})[\"'][^<>]{0,200}>\s{0,999}_"
 )
 
 
 def read_vti(path: Path, member: str | None = None) -> Scan:
-    """Read the scalar array ``member`` of a file with one piece, by default the active array or the only one.
+    """Read the scalar array ``member`` of a file with one piece, by default the active array or else the only array.
 
-    VTK states no units, so the volume is "relative". Large raw appended data without compression are memory-mapped.
+    The format has no units, so the volume is "relative". Large uncompressed raw data are memory-mapped.
     """
     root, start, base64_coded = _document(path)
     image = root.find("ImageData")
@@ -59,7 +59,7 @@ def read_vti(path: Path, member: str | None = None) -> Scan:
 
 
 def _document(path: Path) -> tuple[ElementTree.Element, int, bool]:
-    """Root of the XML without the appended data, the offset of these data or -1, and whether they are in base64."""
+    """Root of the XML without appended data, offset in bytes of these data or -1, and whether they are in base64."""
     data = np.memmap(path, np.uint8, "r")
     match = _APPENDED.search(data)  # type: ignore[arg-type]
     text = bytes(data[: match.start()]) + b"</VTKFile>" if match else bytes(data)
@@ -71,7 +71,7 @@ def _document(path: Path) -> tuple[ElementTree.Element, int, bool]:
 
 
 def _array(piece: ElementTree.Element, member: str | None, path: Path) -> tuple[ElementTree.Element, int]:
-    """The selected array, and by how many values per axis it is smaller than the points: 1 for cell data, else 0."""
+    """The array to read, and the number of points minus the number of values per axis: 1 for cell data, else 0."""
     for name, cells in (("PointData", 0), ("CellData", 1)):
         holder = piece.find(name)
         arrays = {item.get("Name", ""): item for item in (holder if holder is not None else ())}
@@ -91,7 +91,7 @@ def _values(
     start: int,
     base64_coded: bool,
 ) -> np.ndarray:
-    """Voxels of an array; ``start`` and ``base64_coded`` describe the appended data, see :func:`_document`."""
+    """Voxels of ``array``; ``start`` and ``base64_coded`` are the results of :func:`_document` on appended data."""
     form, compressor = array.get("format", "ascii"), root.get("compressor")
     if form == "ascii":
         return scan.from_text(path, array.text or "", shape, dtype)
@@ -121,12 +121,12 @@ def _values(
 
 
 def _length(data: bytes, count: np.dtype) -> int:
-    """Number of bytes of uncompressed data, which is stated before them as a ``count``."""
+    """Number of bytes of uncompressed data, which precedes the data as an integer of type ``count``."""
     return int.from_bytes(data[: count.itemsize], "big" if count.byteorder == ">" else "little")
 
 
 def _decoded(text: str) -> bytes:
-    # The data end at "<". Their length is encoded before them as a separate part, which may end with "=".
+    # The text ends at "<". It has two base64 parts, the length of the data and the data; each may be padded by "=".
     parts = re.findall(r"[A-Za-z0-9+/]+=*", "".join(text.partition("<")[0].split()))
     # In a truncated file the last group of four characters may be incomplete.
     return b"".join(base64.b64decode(part[: len(part) // 4 * 4]) for part in parts)
@@ -135,7 +135,8 @@ def _decoded(text: str) -> bytes:
 def _inflated(path: Path, data: bytes, count: np.dtype, size: int) -> bytearray:
     """Decompress ``data`` to at most ``size`` bytes.
 
-    A table precedes the blocks: their number, their size, the size of the last block, and the compressed sizes.
+    A header of integers of type ``count`` precedes the compressed blocks: the number of blocks, the size of a block and
+    of the last block before compression, and the size of every compressed block.
     """
     try:
         blocks = int(np.frombuffer(data, count, 1)[0])
