@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ TABLE = ColourTable(synthetic_camera(), THESIS)
 
 
 def drawn(
-    middle, angle, length=240.0, width=6.0, ground=120, order=(0, 1, 2), noise=0.0, seed=8, size=SIZE
+    middle, angle, length=240.0, width=6.0, ground: Any = 120, order=(0, 1, 2), noise=0.0, seed=8, size=SIZE
 ) -> torch.Tensor:
     """Frame of three bands in a row around ``middle``, the first of them at the beginning."""
     rng = np.random.default_rng(seed)
