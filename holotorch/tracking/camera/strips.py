@@ -47,7 +47,7 @@ class Line:
         return lens.distort(t[:, None] * step + nodes) @ lagrange
 
     def place(self, plane: Points) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates t and u of points on the plane z = 1."""
+        """Coordinates (t, u) of points on the plane z = 1, in pixels at the principal point."""
         offset = (plane - self.origin) * (self.along.conjugate() * self.scale)
         return offset.real, offset.imag
 
@@ -136,7 +136,7 @@ class Sampler:
         return self._levels(index[..., None] + self._colours) * inside[..., None]
 
     def __call__(self, pixels: Points) -> np.ndarray:
-        """Light, float32 [3, ...], at pixels [...] by bilinear interpolation; outside the frame that at its border."""
+        """Light, float32 [3, ...], at pixels [...] by bilinear interpolation; the border is repeated outside the frame."""
         xy = self._clipped(pixels)
         whole = np.minimum(xy.astype(np.intp), self._before_last)
         fraction = (xy - whole).astype(np.float32)
@@ -145,7 +145,7 @@ class Sampler:
         return (rows[:, 0] + fraction[1] * (rows[:, 1] - rows[:, 0])).reshape(3, *pixels.shape)
 
     def sharp(self, pixels: np.ndarray) -> np.ndarray:
-        """As a call, but by cubic convolution (Keys 1981), which preserves fine detail better."""
+        """Light as from ``__call__``, but by cubic convolution (Keys 1981), which preserves fine detail better."""
         xy = self._clipped(pixels)
         whole = xy.astype(np.intp)
         np.minimum(np.maximum(whole, 1, out=whole), self._before_last - 1, out=whole)
