@@ -136,7 +136,7 @@ class Sampler:
         return self._levels(index[..., None] + self._colours) * inside[..., None]
 
     def __call__(self, pixels: Points) -> np.ndarray:
-        """Light, float32 [3, ...], at pixels [...] by bilinear interpolation; beyond the frame that of its border."""
+        """Light, float32 [3, ...], at pixels [...] by bilinear interpolation; outside the frame, that of the border."""
         xy = self._clipped(pixels)
         whole = np.minimum(xy.astype(np.intp), self._before_last)
         fraction = (xy - whole).astype(np.float32)

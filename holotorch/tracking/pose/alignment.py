@@ -18,8 +18,8 @@ class Alignment:
 
     Attributes:
         headset_from_camera: float64 [4, 4]: ``p_headset = headset_from_camera @ p_camera``, in metres.
-        residuals: [n] root mean square distances in metres between the mapped and the measured two points of each
-            alignment.
+        residuals: [n] root mean square distance in metres between the two mapped and the two measured points of
+            each alignment.
         leave_one_out: [n] residual of each alignment for the map fitted to all others, which predicts the error of a
             new alignment. Infinite where the others do not determine a map.
     """
@@ -83,7 +83,7 @@ def headset_from_camera(camera: Tensor, headset: Tensor) -> Alignment:
         )
     first, second = ((part[:, 1] - part[:, 0]).detach().norm(dim=-1) for part in points)
     worst = int((first - second).abs().argmax())
-    if bool((first - second).abs()[worst] > 0.02):  # metres: more than tremor of the hand causes
+    if bool((first - second).abs()[worst] > 0.02):  # metres; tremor of the hand causes less
         raise ValueError(
             f"the two points must be equally far apart in both frames, got {first[worst]:.3f} and "
             f"{second[worst]:.3f} m in alignment {worst}; are both in metres, and the same points?"

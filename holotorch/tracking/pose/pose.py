@@ -119,7 +119,7 @@ def closed_form(edges_px: Tensor, positions_m: Tensor, camera: Camera) -> tuple[
 def _covariance(jacobian: Tensor, middle: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
     """Covariance [B, 6, 6] of tip and direction, and which [B] are singular; ``middle`` [B] is metres from the tip."""
     inverse, singular = torch.linalg.inv_ex(jacobian.mT @ jacobian)
-    pose = jacobian.new_zeros(len(jacobian), 6, 5)  # derivatives of tip and direction by the unknowns
+    pose = jacobian.new_zeros(len(jacobian), 6, 5)  # derivatives of tip and direction with respect to the unknowns
     pose[:, :3, :3] = torch.eye(3, dtype=jacobian.dtype)
     pose[:, :3, 3:] = -middle[:, None, None] * basis
     pose[:, 3:, 3:] = basis
@@ -241,7 +241,7 @@ def _refine(point: Tensor, along: Tensor, edges: tuple[Tensor, ...]) -> tuple[Te
     rounding = 1e-14 * weights.abs().sum((1, 2, 3))  # rounding error of the residuals
     least = rounding.clamp(min=1e-9).square()  # squared change of the residuals below which a step ends the iteration
     state = evaluate(point, along)
-    for _ in range(30):  # a pose takes about five
+    for _ in range(30):  # most poses converge in about five
         point, along, basis, residuals, jacobian, cost = state
         normal = jacobian.mT @ jacobian
         damped = normal + torch.diag_embed(damping[:, None] * normal.diagonal(dim1=-2, dim2=-1) + 1e-300)
@@ -263,7 +263,7 @@ def _refine(point: Tensor, along: Tensor, edges: tuple[Tensor, ...]) -> tuple[Te
 
 
 def _implicit(point: Tensor, along: Tensor, basis: Tensor, edges: tuple[Tensor, ...]) -> Tensor:
-    """A Newton step [B, 5] at the optimum: its value is zero, its gradient that of the optimum by the inputs."""
+    """A Newton step [B, 5] at the optimum: zero, with the gradient of the optimum with respect to the inputs."""
     unknown = torch.zeros(len(point), 5, dtype=point.dtype, device=point.device, requires_grad=True)
     at = point + unknown[:, :3], tilted(along, basis, unknown[:, 3:])
     cost = 0.5 * _residuals(*at, basis, edges)[0].square().sum()

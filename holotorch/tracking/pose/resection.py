@@ -54,12 +54,12 @@ def pose_on_line(
     Args:
         line: Image of the axis of the tool on the plane z = 1.
         t: [N] coordinates along the line, in pixels at the principal point; N >= 3.
-        positions: [N] distances from the tip in metres.
-        deviation: [N] standard deviations of t.
+        positions: [N] distances of the points from the tip in metres.
+        deviation: [N] standard deviations of t, in the unit of t.
         offset_sd: Standard deviation of the line's offset at the mean of t, in the unit of t.
         slope_sd: Standard deviation of the line's slope in radians, whose error is independent of that of the offset.
-        shared_sd: Standard deviation of an additional error of t that is the same for all points.
-        rough: Whether to omit the covariance, which takes half of the time; it is then zero.
+        shared_sd: Standard deviation of an additional error of t that is the same for all points, in the unit of t.
+        rough: Whether to skip the covariance, which takes half of the time, and return zeros for it.
 
     Returns:
         The pose, or None where no pose in front of the camera fits the points.

@@ -16,7 +16,7 @@ class OneEuro:
 
     With alpha = dt / (dt + tau) and tau = 1 / (2 pi cutoff), the smoothed tip x' becomes x' + alpha (x - x'), and the
     direction moves by the fraction alpha along the great circle to the new one. The cutoff of both is ``min_cutoff +
-    beta * speed``, where the speed is the larger one of those of the tip and of the point ``arm`` behind the tip.
+    beta * speed``, where the speed is that of the tip or of the point ``arm`` behind it, whichever is larger.
 
     For a steady motion, the smoothed pose is :attr:`lag` seconds late, where lag' = (1 - alpha) (lag + dt) converges to
     tau. With the defaults and 60 frames per second, white jitter at rest falls to a third, and the lag is 80 ms at rest
