@@ -82,10 +82,12 @@ def _fitted(world: World, track: Method) -> Method:
         pose = track(frame, case)
         if not pose.answered:
             return pose
-        found = fit(frame[None], pose.tip[None], pose.direction[None])
-        chi_square = (found.shift / found.shift_sd).square()[found.used].sum()
-        freedom = found.used.sum().double() - 3
-        return Pose(found.tip[0], found.direction[0], found.covariance[0], chi_square, freedom, Status.OK)
+        fitted = fit(frame[None], pose.tip[None], pose.direction[None])
+        if not bool(fitted.tip.isfinite().all()):
+            return Pose.refused(Status.INCONSISTENT, "the photometric fit diverges")
+        chi_square = (fitted.shift / fitted.shift_sd).square()[fitted.used].sum()
+        freedom = fitted.used.sum().double() - 3
+        return Pose(fitted.tip[0], fitted.direction[0], fitted.covariance[0], chi_square, freedom, Status.OK)
 
     return refine
 

@@ -1,13 +1,15 @@
 """Pose of a catheter from the pixels around its band edges: a differentiable fit of a rendered cylinder to a frame."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from holotorch.core import checks
 from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.pose.catheter import Catheter
 
@@ -50,6 +52,15 @@ class PhotometricPose:
     shift: Tensor
     shift_sd: Tensor
     used: Tensor
+
+    def scattered(self, where: Tensor) -> "PhotometricPose":
+        """These poses at the items of a batch at which ``where`` [B] is true; NaN, or False, at the others."""
+
+        def spread(value: Tensor) -> Tensor:
+            empty = torch.nan if value.is_floating_point() else False
+            return value.new_full((len(where), *value.shape[1:]), empty).index_put((where,), value)
+
+        return PhotometricPose(*(spread(getattr(self, field.name)) for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,18 +128,27 @@ class PhotometricFit(nn.Module):
                 self.register_buffer(name, value)
 
     def forward(self, frames: Tensor, tip: Tensor, direction: Tensor) -> PhotometricPose:
-        """Fit poses near those given.
+        """Fit poses near those given; NaN where fewer than three windows are on the frame, or where the fit diverges.
 
         Args:
             frames: uint8 [B, 3, H, W], or floating with levels from 0 to 1; RGB.
             tip: [B, 3] rough tips in metres, right to a few pixels.
             direction: [B, 3] rough unit vectors from the tip to the rear.
+
+        Raises:
+            TypeError, ValueError: Another shape or dtype, a value that is not finite, or a direction that is not a unit
+                vector.
         """
+        _check(frames, tip, direction)
         tip, direction = tip.detach().double(), direction.detach().double()
         middle = (self.positions[0] + self.positions[-1]).detach() / 2
         with torch.no_grad():
             pixels = self._pixels(tip, direction)
             windows = self._windows(frames, pixels, tip, direction)
+            usable = (self._freedom(windows) > 0).sum(-1) >= 3
+        if not bool(usable.all()):
+            return self(frames[usable], tip[usable], direction[usable]).scattered(usable)
+        with torch.no_grad():
             frame = _frame(tip + middle * direction, direction)
             unknown = torch.zeros(len(tip), 6, dtype=torch.float64, device=tip.device)
             unknown[:, 5] = math.log(self.plan.blur)
@@ -139,6 +159,10 @@ class PhotometricFit(nn.Module):
             unknown = self._implicit(frame, unknown, windows)
         normal, _, parts = self._equations(frame, unknown, windows)
         return self._answer(frame, unknown, windows, normal, parts)
+
+    def _freedom(self, windows: _Windows) -> Tensor:
+        """Samples of each window beyond its linear unknowns and 20 pixels more, [B, N]; above 0 for a window in use."""
+        return 3 * (windows.mask.sum(-1) - 2 * (self.plan.degree + 1) - 4) - 60
 
     def _pixels(self, tip: Tensor, direction: Tensor) -> Tensor:
         """Pixels (x, y) [B, N, P, 2] around each edge: columns or rows of pixels that follow the tube."""
@@ -185,10 +209,11 @@ class PhotometricFit(nn.Module):
             normal, right, _ = self._equations(frame, unknown, windows, blur=step >= 2)
             damping = 1e-3 if step == 0 else 1e-9
             scale = normal.diagonal(dim1=-2, dim2=-1).clamp(min=1e-30).rsqrt()
-            scaled = normal * scale[:, None] * scale[..., None] + damping * torch.eye(6, dtype=torch.float64)
-            move = scale * torch.linalg.solve(scaled, scale * right)
+            scaled = normal * scale[:, None] * scale[..., None] + damping * torch.eye(6).to(normal)
+            move = scale * torch.linalg.solve_ex(scaled, scale * right)[0]
             frame, unknown = _moved(frame, unknown + move)
-            if float((move / _SCALES.to(move)).abs().max()) < self.plan.settled and step >= 3:
+            largest = (move / _SCALES.to(move)).abs().nan_to_num(0.0)
+            if step >= 3 and bool((largest < self.plan.settled).all()):
                 break
         return frame, unknown
 
@@ -222,10 +247,10 @@ class PhotometricFit(nn.Module):
         shade = torch.from_numpy(np.polynomial.legendre.legvander(_nodes(plan.nodes)[0].numpy(), plan.degree)).to(x)
         low, high = (-radius - place.miss) / wide, (place.miss - radius) / wide
         left, right_ = torch.special.ndtr(low)[..., None], torch.special.ndtr(high)[..., None]
-        far = ((place.along - edge) / 0.01)[..., None]
+        gradient = ((place.along - edge) / _GRADIENT)[..., None]  # of each background along the tube
         second = bright * share
         basis = torch.cat(
-            [(bright - second) @ shade, second @ shade, left, right_, left * far, right_ * far], -1
+            [(bright - second) @ shade, second @ shade, left, right_, left * gradient, right_ * gradient], -1
         )  # [B, N, P, K]
         coefficients, fitted, weights, solve = self._linear(basis, windows)
         residual = windows.light - fitted  # [B, N, 3, P]
@@ -233,24 +258,23 @@ class PhotometricFit(nn.Module):
         first_c, second_c = coefficients[..., :count] @ shade.T, coefficients[..., count : 2 * count] @ shade.T
         sides = coefficients[..., 2 * count :]  # [B, N, 3, 4]
         slopes = _slopes(
-            bright, share, z, q, depth, place, wide, first_c, second_c, sides, low, high, far[..., 0]
+            bright, share, z, q, depth, place, wide, first_c, second_c, sides, low, high, gradient[..., 0]
         )  # by miss, along, slant, log blur
         turn = torch.einsum("gbncp,bnpgk->bncpk", slopes, place.derivatives)  # [B, N, 3, P, 6]
         own = torch.stack([-slopes[1], slopes[0]], -1)  # moves of this window's edge along, and of its axis across
-        all_ = torch.cat([turn, own], -1)
-        all_ = all_ - torch.einsum("bnpk,bnckl->bncpl", basis, solve(all_))
-        weighted = weights[..., None] * all_
-        blocks = torch.einsum("bncpk,bncpl->bnkl", weighted, all_)
+        changes = torch.cat([turn, own], -1)
+        changes = changes - torch.einsum("bnpk,bnckl->bncpl", basis, solve(changes))
+        weighted = weights[..., None] * changes
+        blocks = torch.einsum("bncpk,bncpl->bnkl", weighted, changes)
         sides_ = torch.einsum("bncpk,bncp->bnk", weighted, residual)
-        pixels = 3 * (windows.mask.sum(-1) - basis.shape[-1])
-        misfit = (weights * residual * residual).sum((-2, -1)) / pixels.clamp(min=1)
-        used = pixels > 60
+        freedom = self._freedom(windows)
+        misfit = (weights * residual * residual).sum((-2, -1)) / (freedom + 60).clamp(min=1)
+        used = freedom > 0
         median = torch.where(used, misfit, torch.nan).nanmedian(-1, keepdim=True).values
-        trust = used / torch.maximum(misfit, 0.5 * median).clamp(min=1e-6)
+        trust = used / torch.maximum(misfit, 0.5 * median).clamp(min=_ROUNDING)
         blocks, sides_ = blocks * trust[..., None, None], sides_ * trust[..., None]
         # Each window's edge and axis are off by a little that no noise explains: marginalised with its prior.
-        pixel = place.pixel[..., 0] if place.pixel.ndim > 2 else place.pixel
-        floor = torch.stack([pixel / place.cosine, pixel], -1) * plan.edge_floor
+        floor = torch.stack([place.pixel / place.sine, place.pixel], -1) * plan.edge_floor
         inner = blocks[..., 6:, 6:] + torch.diag_embed(floor**-2)
         cross = torch.linalg.solve(inner, blocks[..., 6:, :6])
         normal = (blocks[..., :6, :6] - blocks[..., :6, 6:] @ cross).sum(1)
@@ -265,7 +289,7 @@ class PhotometricFit(nn.Module):
             right = right * keep
         return normal, right, (blocks, sides_, misfit, used, floor)
 
-    def _linear(self, basis: Tensor, windows: _Windows):
+    def _linear(self, basis: Tensor, windows: _Windows) -> tuple[Tensor, Tensor, Tensor, Callable[[Tensor], Tensor]]:
         """Coefficients [B, N, 3, K] of the light, fitted light, weights [B, N, 3, P], and a solver for projections."""
         camera = self.camera
 
@@ -278,7 +302,7 @@ class PhotometricFit(nn.Module):
             gram = heavy.mT @ basis[:, :, None]
             ridge = 1e-7 * gram.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] + 1e-12
             gram = gram + ridge * torch.eye(basis.shape[-1], dtype=basis.dtype, device=basis.device)
-            factor = torch.linalg.cholesky(gram)
+            factor, _ = torch.linalg.cholesky_ex(gram)  # NaN instead of an error where a fit has diverged
             return lambda values: torch.cholesky_solve(heavy.mT @ values, factor)
 
         solve = solver(weights_of(windows.light.clamp(2e-2)))
@@ -299,13 +323,16 @@ class PhotometricFit(nn.Module):
         rows = (frame.side, frame.axis, frame.sight, -middle * frame.side, -middle * frame.front, zero)
         turns = (zero, zero, zero, frame.side, frame.front, zero)
         lever = torch.cat([torch.stack(rows, -1), torch.stack(turns, -1)], 1)
-        covariance = lever @ torch.linalg.inv(normal) @ lever.mT
+        covariance = lever @ torch.linalg.inv_ex(normal)[0] @ lever.mT
         information = blocks[..., 6, 6]
         shift = sides[..., 6] / information.clamp(min=1e-30)
         deviation = (1 / information.clamp(min=1e-30) + floor[..., 0] ** 2).sqrt()
         return PhotometricPose(tip, direction, covariance, rest[:, 5].exp(), misfit, shift, deviation, used)
 
 
+_GRADIENT = 0.01  # metres along the tube over which a background changes by its coefficient
+_ROUNDING = 1 / 12  # levels^2: the noise of rounding to whole levels, below which no residual is trusted
+# Typical size of each unknown: shifts in metres, turns in radians, logarithm of the blur.
 _SCALES = torch.tensor([1e-4, 1e-4, 1e-3, 1e-3, 1e-2, 0.3], dtype=torch.float64)
 
 
@@ -318,7 +345,8 @@ class _Geometry:
         along: Position along the axis, from the bands' middle, where the ray is nearest to the axis.
         slant: Change of the visible surface's position along the axis per metre of depth below the axis.
         blur, soft: Standard deviation of the blur across and along the axis, in metres.
-        pixel: [B, N, P] metres across per pixel; ``cosine``: mean sine of the angle between ray and axis [B, N].
+        pixel: [B, N] metres across the axis per pixel, mean over a window.
+        sine: [B, N] sine of the angle between rays and axis, mean over a window.
         derivatives: [B, N, P, 4, 6] of miss, along, slant and log blur by the six unknowns.
     """
 
@@ -328,7 +356,7 @@ class _Geometry:
     blur: Tensor
     soft: Tensor
     pixel: Tensor
-    cosine: Tensor
+    sine: Tensor
     derivatives: Tensor
 
     @staticmethod
@@ -373,13 +401,13 @@ class _Geometry:
             torch.cat([shifted(by_depth) / depth[..., None], depth_turn / depth[..., None], log_blur], -1),
         ]
         mean = (pixel * windows.mask).sum(-1) / windows.mask.sum(-1).clamp(min=1)
-        cosine = (sine * windows.mask).sum(-1) / windows.mask.sum(-1).clamp(min=1)
+        mean_sine = (sine * windows.mask).sum(-1) / windows.mask.sum(-1).clamp(min=1)
         mean = torch.where(mean > 0, mean, pixel.mean(-1))
-        cosine = torch.where(cosine > 0, cosine, sine.mean(-1))
-        return _Geometry(miss, along, b / sine, blur, blur / sine, mean, cosine, torch.stack(rows, -2))
+        mean_sine = torch.where(mean_sine > 0, mean_sine, sine.mean(-1))
+        return _Geometry(miss, along, b / sine, blur, blur / sine, mean, mean_sine, torch.stack(rows, -2))
 
 
-def _slopes(bright, share, z, q, depth, place, wide, first, second, sides, low, high, far) -> Tensor:
+def _slopes(bright, share, z, q, depth, place, wide, first, second, sides, low, high, gradient) -> Tensor:
     """Derivatives [4, B, N, 3, P] of the fitted light by miss, along, slant and log blur."""
     density = torch.exp(-0.5 * q * q) / math.sqrt(2 * math.pi)
     step = (second - first).mT  # [B, N, M, 3]
@@ -395,14 +423,29 @@ def _slopes(bright, share, z, q, depth, place, wide, first, second, sides, low, 
     by_miss = -tube(z) / across
     by_blur = tube(z * z - 1) - ((rise * q) @ step).mT
     falls = [torch.exp(-0.5 * side * side) / math.sqrt(2 * math.pi) for side in (low, high)]
-    left = sides[..., 0:1] + sides[..., 2:3] * far[:, :, None]
-    right = sides[..., 1:2] + sides[..., 3:4] * far[:, :, None]
+    left = sides[..., 0:1] + sides[..., 2:3] * gradient[:, :, None]
+    right = sides[..., 1:2] + sides[..., 3:4] * gradient[:, :, None]
     by_miss = by_miss + (falls[1][:, :, None] * right - falls[0][:, :, None] * left) / across
     by_blur = by_blur - (low * falls[0])[:, :, None] * left - (high * falls[1])[:, :, None] * right
     covers = (
         torch.special.ndtr(low)[:, :, None] * sides[..., 2:3] + torch.special.ndtr(high)[:, :, None] * sides[..., 3:4]
     )
-    return torch.stack([by_miss, by_along + covers / 0.01, by_slant, by_blur])
+    return torch.stack([by_miss, by_along + covers / _GRADIENT, by_slant, by_blur])
+
+
+def _check(frames: Tensor, tip: Tensor, direction: Tensor) -> None:
+    if frames.dtype != torch.uint8 and not frames.is_floating_point():
+        raise TypeError(f"frames must be uint8, or floating from 0 to 1, got {frames.dtype}")
+    if frames.ndim != 4 or frames.shape[1] != 3:
+        raise ValueError(f"frames must be [B, 3, H, W], got {list(frames.shape)}")
+    for name, value in (("frames", frames), ("tip", tip), ("direction", direction)):
+        if value.is_floating_point():
+            checks.all_finite(name, value)
+    for name, value in (("tip", tip), ("direction", direction)):
+        if value.shape != (len(frames), 3) or not value.is_floating_point():
+            raise ValueError(f"{name} must be floating, [B, 3] = [{len(frames)}, 3], got {list(value.shape)}")
+    if bool(((direction.detach().norm(dim=-1) - 1).abs() > 1e-4).any()):
+        raise ValueError("direction must be unit vectors; divide each by its length")
 
 
 def _frame(middle: Tensor, axis: Tensor) -> _Frame:

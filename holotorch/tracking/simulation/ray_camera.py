@@ -144,13 +144,13 @@ def take(shot: Shot, seed: int) -> Tensor:
 
 def _spread(light: np.ndarray, shot: Shot) -> np.ndarray:
     """The background through the lens."""
-    seen = cv2.GaussianBlur(light, (0, 0), max(shot.blur_px, 0.3))
+    blurred = cv2.GaussianBlur(light, (0, 0), max(shot.blur_px, 0.3))
     if shot.disc_px > 0.5:
         side = math.ceil(shot.disc_px)
         down, right = np.mgrid[-side : side + 1, -side : side + 1]
         disc = np.clip(shot.disc_px + 0.5 - np.hypot(down, right), 0, 1).astype(np.float32)
-        seen = cv2.filter2D(seen, -1, disc / disc.sum())
-    return seen
+        blurred = cv2.filter2D(blurred, -1, disc / disc.sum())
+    return blurred
 
 
 def _offsets(rng: np.random.Generator, count: int, samples: int, shot: Shot) -> np.ndarray:
@@ -163,10 +163,10 @@ def _offsets(rng: np.random.Generator, count: int, samples: int, shot: Shot) -> 
     dimensions = 2 + 2 * defocus + moves
     engine = torch.quasirandom.SobolEngine(dimensions, scramble=True, seed=int(rng.integers(2**31)))
     points = (engine.draw(samples, dtype=torch.float64).numpy() + rng.random((count, 1, dimensions))) % 1
-    places = np.linspace(-6 * shot.blur_px - 0.5, 6 * shot.blur_px + 0.5, 4001)
-    spread = ndtr((places + 0.5) / shot.blur_px) - ndtr((places - 0.5) / shot.blur_px)
+    offset = np.linspace(-6 * shot.blur_px - 0.5, 6 * shot.blur_px + 0.5, 4001)
+    spread = ndtr((offset + 0.5) / shot.blur_px) - ndtr((offset - 0.5) / shot.blur_px)
     share = np.cumsum(spread) - spread / 2
-    offsets = np.interp(points[..., :2] * share[-1], share, places)
+    offsets = np.interp(points[..., :2] * share[-1], share, offset)
     if defocus:
         radius, angle = shot.disc_px * np.sqrt(points[..., 2]), 2 * math.pi * points[..., 3]
         offsets += np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
@@ -175,10 +175,10 @@ def _offsets(rng: np.random.Generator, count: int, samples: int, shot: Shot) -> 
 
 
 def _near(shot: Shot, size: tuple[int, int], start: float, end: float) -> np.ndarray:
-    """Mask uint8 [H, W] of the pixels that the catheter may reach from ``start`` to ``end``, in metres from the tip."""
+    """Mask uint8 [H, W] of the pixels that the catheter may cover from ``start`` to ``end``, in metres from the tip."""
     assert shot.catheter is not None and shot.tip is not None and shot.direction is not None
-    places = np.linspace(start, end, 100)[:, None]
-    axis = shot.tip + places * shot.direction
+    positions = np.linspace(start, end, 100)[:, None]
+    axis = shot.tip + positions * shot.direction
     pixels = shot.camera.project(torch.from_numpy(axis)).numpy()
     focal = float(shot.camera.matrix[0, 0])
     mask = np.zeros(size, np.uint8)
@@ -222,8 +222,8 @@ def _trace(light: np.ndarray, shot: Shot, rng: np.random.Generator) -> None:
 
 def _chunks(mask: np.ndarray) -> list[np.ndarray]:
     """Pixels (x, y) of a mask in parts [n, 2] of limited size."""
-    found = cv2.findNonZero(mask)
-    pixels = np.zeros((0, 2), np.intp) if found is None else np.asarray(found, np.intp).reshape(-1, 2)
+    nonzero = cv2.findNonZero(mask)
+    pixels = np.asarray([] if nonzero is None else nonzero, np.intp).reshape(-1, 2)
     return [pixels[first : first + _CHUNK] for first in range(0, len(pixels), _CHUNK)]
 
 
@@ -294,11 +294,11 @@ def paint_rods(light: np.ndarray, rods: tuple[Rod, ...], soft: float, where: np.
     """Draw rods over light [H, W, 3], in place, with edges of ``soft`` pixels, only where ``where`` [H, W] is true."""
     height, width = light.shape[:2]
     for rod in rods:
-        reach = rod.radius + 4 * soft + 1
+        extent = rod.radius + 4 * soft + 1
         left, right = (
-            int(np.clip(f(rod.start[0], rod.end[0]) + s * reach, 0, width)) for f, s in ((min, -1), (max, 1))
+            int(np.clip(f(rod.start[0], rod.end[0]) + s * extent, 0, width)) for f, s in ((min, -1), (max, 1))
         )
-        top, low = (int(np.clip(f(rod.start[1], rod.end[1]) + s * reach, 0, height)) for f, s in ((min, -1), (max, 1)))
+        top, low = (int(np.clip(f(rod.start[1], rod.end[1]) + s * extent, 0, height)) for f, s in ((min, -1), (max, 1)))
         if left >= right or top >= low:
             continue
         y, x = np.mgrid[top:low, left:right].astype(np.float32)

@@ -18,7 +18,7 @@ def linear(colour: tuple[float, float, float] | np.ndarray) -> np.ndarray:
 
 
 def of_hue(hue: float, saturation: float, value: float) -> Rgb:
-    """Linear RGB of a hue (in turns), saturation and value of sRGB."""
+    """Linear RGB of a hue (1 is the whole circle), saturation and value (0 to 1) of sRGB."""
     red, green, blue = linear(colorsys.hsv_to_rgb(hue % 1, saturation, value)).tolist()
     return red, green, blue
 
@@ -114,8 +114,8 @@ def monitor(rng: np.random.Generator, size: tuple[int, int]) -> np.ndarray:
                     cv2.rectangle(picture, (column, row), (column + int(rng.integers(8, 28)), row + 5), shade, -1)
     for _ in range(int(rng.integers(2, 7))):
         columns = np.arange(0, size[1], 6)
-        wave = size[0] * rng.random() + rng.uniform(5, 80) * np.sin(columns / rng.uniform(20, 200) + rng.uniform(0, 6))
-        points = np.stack([columns, wave], -1).round().astype(np.int32)
+        curve = size[0] * rng.random() + rng.uniform(5, 80) * np.sin(columns / rng.uniform(20, 200) + rng.uniform(0, 6))
+        points = np.stack([columns, curve], -1).round().astype(np.int32)
         cv2.polylines(picture, [points], False, any_colour(rng), int(rng.integers(2, 7)), cv2.LINE_AA)
     return picture
 

@@ -7,6 +7,7 @@ with others. Nothing here depends on how a tracker works.
 import colorsys
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from holotorch.core import checks
 from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.pose.catheter import THESIS, Catheter
 from holotorch.tracking.simulation import surfaces
@@ -111,7 +113,7 @@ class VariedWorld:
 
     def trial(self, seed: int, condition: str | None = None) -> Trial:
         """The scene of a seed; its condition is the seed's turn of :data:`CONDITIONS` unless one is named."""
-        condition = condition or CONDITIONS[seed % len(CONDITIONS)]
+        condition = _named("condition", condition, CONDITIONS, checks.whole("seed", seed, 0))
         rng = np.random.default_rng([seed, *condition.encode()])
         shot = self._shot(rng, condition)
         hidden = (math.inf, math.inf)
@@ -125,7 +127,7 @@ class VariedWorld:
 
     def negative(self, seed: int, kind: str | None = None) -> Trial:
         """A scene without the catheter, or with a stick that differs in one thing; ``kind`` is of :data:`NEGATIVES`."""
-        kind = kind or NEGATIVES[seed % len(NEGATIVES)]
+        kind = _named("kind", kind, NEGATIVES, checks.whole("seed", seed, 0))
         rng = np.random.default_rng([seed, *kind.encode()])
         shot = self._shot(rng, CONDITIONS[int(rng.integers(13))])
         stick = None if kind == "no catheter" else self._stick(rng, kind)
@@ -153,8 +155,8 @@ class VariedWorld:
             direction = np.array([math.cos(tilt) * math.cos(roll), math.cos(tilt) * math.sin(roll), -math.sin(tilt)])
             pixel = torch.tensor([rng.uniform(low, high) * width, rng.uniform(low, high) * height], dtype=torch.float64)
             tip = depth * np.append(camera.undistort(pixel).numpy(), 1.0) - ends.mean() * direction
-            seen = camera.project(torch.from_numpy(tip + ends[:, None] * direction)).numpy()
-            inside = np.isfinite(seen).all() and (seen > 10).all() and (seen < np.array([width, height]) - 10).all()
+            image = camera.project(torch.from_numpy(tip + ends[:, None] * direction)).numpy()
+            inside = np.isfinite(image).all() and (image > 10).all() and (image < np.array([width, height]) - 10).all()
             if inside and tip_deviation(camera, self.catheter, tip, direction) < _VAGUE:
                 return tip, direction
         raise ValueError(f"no pose shows all bands in a frame of {width} x {height} px; take a larger frame")
@@ -300,15 +302,15 @@ class VariedWorld:
         focal, depth = float(camera.matrix[0, 0]), float(tip[2])
         across = np.array([-direction[1], direction[0], 0.0]) / np.hypot(*direction[:2])
         along = np.array([direction[0], direction[1], 0.0]) / np.hypot(*direction[:2])
-        way = rng.uniform(-8, 8) * along + rng.uniform(-3, 3) * across
-        return tuple(way * depth / focal)
+        moved = rng.uniform(-8, 8) * along + rng.uniform(-3, 3) * across
+        return tuple(moved * depth / focal)
 
     def _occluded(self, rng: np.random.Generator, shot: Shot) -> tuple[Shot, tuple[float, float]]:
         """A finger or an instrument across part of the bands, at an angle of 45 degrees or more to the catheter."""
         edges = self.catheter.edges
         centre, long = rng.uniform(edges[0], edges[-1]), rng.uniform(0.004, 0.022)
-        places = np.array([[centre - long / 2], [centre + long / 2]])
-        first, last = shot.camera.project(torch.from_numpy(shot.tip + places * shot.direction)).numpy()
+        ends = np.array([[centre - long / 2], [centre + long / 2]])
+        first, last = shot.camera.project(torch.from_numpy(shot.tip + ends * shot.direction)).numpy()
         slant = math.pi / 2 + rng.uniform(-math.pi / 4, math.pi / 4)  # angle between the object and the catheter
         turn = math.atan2(*(last - first)[::-1]) + slant
         radius = max(float(np.linalg.norm(last - first)) / 2 * math.sin(slant), 2.0)
@@ -352,6 +354,13 @@ class VariedWorld:
         change = rng.uniform(0.10, 0.35) * (1 if rng.random() < 0.5 else -1)
         edges[band + 1 :] += change * (edges[band + 1] - edges[band])
         return replace(tool, edges=tuple(edges.tolist()), length=max(tool.length, float(edges[-1]) + 0.05))
+
+
+def _named(name: str, value: str | None, known: Sequence[str], seed: int) -> str:
+    """The ``value``, or without one the turn of ``seed`` among those ``known``."""
+    if value is not None and value not in known:
+        raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+    return value or known[seed % len(known)]
 
 
 def tip_deviation(camera: Camera, catheter: Catheter, tip: np.ndarray, direction: np.ndarray) -> float:

@@ -130,3 +130,39 @@ def test_edges_and_radius_are_parameters_on_request():
         "positions",
         "radius",
     }
+
+
+def test_a_flat_frame_says_nothing_about_the_pose():
+    frame = torch.full((1, 3, *SMALL.size), 120, dtype=torch.uint8)
+    tip, direction = (part[None] for part in SMALL.pose(0.3, 0.3))
+    found = PhotometricFit(SMALL.camera, THESIS)(frame, tip, direction)
+    assert not float(found.covariance[0, :3, :3].trace().sqrt()) < 1  # metres
+
+
+def test_poses_off_the_frame_are_nan_and_do_not_disturb_others():
+    frame, tip, direction = shot(SMALL, "beside", SIMPLE)
+    aside, behind = tip + torch.tensor([5.0, 0, 0]), -tip
+    fit = PhotometricFit(SMALL.camera, THESIS)
+    alone = fit(frame, nudged(tip), direction)
+    three = fit(frame.expand(3, -1, -1, -1), torch.cat([aside, nudged(tip), behind]), direction.expand(3, -1))
+    assert torch.equal(three.tip[1], alone.tip[0])
+    assert bool(three.tip[[0, 2]].isnan().all()) and not bool(three.used[[0, 2]].any())
+    assert len(fit(frame[:0], tip[:0], direction[:0]).tip) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("frames", lambda value: value.short(), "uint8, or floating"),
+        ("frames", lambda value: value[0], r"\[B, 3, H, W\]"),
+        ("frames", lambda value: value.double() * math.nan, "finite"),
+        ("tip", lambda value: value * math.nan, "finite"),
+        ("tip", lambda value: value.repeat(2, 1), r"\[1, 3\]"),
+        ("direction", lambda value: 2 * value, "unit"),
+    ],
+)
+def test_wrong_input_is_named(name, change, message):
+    frame, tip, direction = shot(SMALL, "input", SIMPLE)
+    given = {"frames": frame, "tip": tip, "direction": direction}
+    with pytest.raises((TypeError, ValueError), match=message):
+        PhotometricFit(SMALL.camera, THESIS)(**given | {name: change(given[name])})

@@ -132,3 +132,12 @@ def test_a_rod_covers_what_it_says():
     assert cover.tolist() == [True, True, False, False]
     soft, _ = rod.paint(np.array([20.0]), np.array([14.0]), softness=0.7)
     assert float(soft[0]) == pytest.approx(0.5)
+
+
+def test_unknown_conditions_and_seeds_are_named():
+    with pytest.raises(ValueError, match="condition must be one of clean.*'fog'"):
+        WORLD.trial(2000, "fog")
+    with pytest.raises(ValueError, match="kind must be one of no catheter"):
+        WORLD.negative(2000, "fog")
+    with pytest.raises(ValueError, match="seed"):
+        WORLD.trial(-1)
