@@ -283,15 +283,24 @@ class CatheterTracker:
                     else measure_axis(stations, wide, _CHECK.exact, *rest)
                 )
                 edges = dataclasses.replace(edges, t=axis.line.place(plane)[0])
-        if float(np.abs(curve - first).max()) > _SEARCH.bulge_change or abs(edges.blur - edges.expected) > BLURRED:
+        missing = np.isnan(edges.t)
+        again = float(np.abs(curve - first).max()) > _SEARCH.bulge_change or abs(edges.blur - edges.expected) > BLURRED
+        if again or missing.any():
             with self._timed("edges"):
-                edges = measure_edges(sampler, lens, axis, edges.t, stretches.doubtful, edges.blur, curve)
+                # Colours alone may miss an edge on a background of the same hue; the others tell where it must be.
+                expected = np.where(missing, self._expected_edges(line_pose, axis.line), edges.t)
+                doubtful = tuple((missing | np.array(stretches.doubtful)).tolist())
+                edges = measure_edges(sampler, lens, axis, expected, doubtful, edges.blur, curve)
         with self._timed("pose"):
             line_pose = self._solved(axis, edges)
             pose = self._checked(line_pose, width, edges, cold=before is None)
             if before is None and shows_reversed(sampler, lens, line_pose, self.catheter):
                 raise Refusal(Status.INCONSISTENT, f"the tube goes on beyond its end on one side only: {_EXCHANGED}")
             return pose
+
+    def _expected_edges(self, line_pose: LinePose, line: Line) -> np.ndarray:
+        """Positions [N] in pixels along ``line`` at which a pose puts the centres of the rings of all edges."""
+        return np.array([line.along_at(axis_on_plane(line_pose, position)) for position in self._positions])
 
     def _rough(self, line: Line, rough_t: np.ndarray) -> LinePose | None:
         """Rough pose from edge positions ``rough_t`` [N] in pixels; None if these are too few or not plausible."""
