@@ -54,9 +54,12 @@ class EdgeLimits:
     margin: float = 8.0  # least distance of an edge to the border of the frame, in addition to two blurs
     smeared: float = 4.0  # blur above which the tube must have moved during the exposure
     unsure: float = 0.1  # deviation above which an edge is measured again in the middle rows alone
+    vague: float = 0.3  # deviation from which on an edge is not clear
     lost: float = 3.0  # deviation from which on there is no edge
     across: float = 0.25  # ratio of light's change beside and on an edge above which an object crosses the tube
     same: float = 0.6  # the same ratio above which the bands continue beside the tube
+    differs: float = 0.1  # least difference of the tube from both sides, as a fraction of the brighter light
+    mostly: float = 0.8  # least fraction of the samples along an edge's window that differ where the tube is visible
     clear: float = 4.0  # least change of the background in standard deviations for the change to be significant
 
 
@@ -77,6 +80,7 @@ class Edges:
         bulge: Largest bulge of a ring's front along the line.
         coarse: Whether chroma has fewer pixels than luma.
         hidden, outside: Indices of the edges that are hidden and of those that are too close to the frame's border.
+        absent: Indices of the edges that the light does not show, although it shows the tube on both of their sides.
     """
 
     t: np.ndarray
@@ -87,6 +91,7 @@ class Edges:
     coarse: bool
     hidden: tuple[int, ...]
     outside: tuple[int, ...]
+    absent: tuple[int, ...]
 
 
 def find_bands(
@@ -189,7 +194,7 @@ def measure_edges(
     chosen = np.isfinite(guess).nonzero()[0]
     t, deviation = np.full(len(guess), np.nan), np.full(len(guess), np.inf)
     if not len(chosen):
-        return Edges(t, deviation, blur, blur, 0.0, False, (), ())
+        return Edges(t, deviation, blur, blur, 0.0, False, (), (), ())
     near = guess[chosen]
     along, window = _positions_along(near, blur)
     widths, bulge = axis.width_at(near), curve[chosen]
@@ -224,12 +229,13 @@ def measure_edges(
             break
     near = near - bulge * front.shift(shading.steps, shading.told, row)
     beside = sampler.light.take(sampler.nearest(every[..., len(u) :].reshape(-1, 6)))
-    covered, beyond = _across(beside.reshape(*every.shape[:2], 6, 3), along - fit.place[:, None], fit)
+    beside_light = beside.reshape(*every.shape[:2], 6, 3)
+    covered, beyond = _across(beside_light, along - fit.place[:, None], fit)
     if beyond and len(near) > 2 and median(fit.blur) < blur + BLURRED:
         raise Refusal(Status.INCONSISTENT, "all bands go on beside the tube: this is thicker, seen in one part of it")
     within = _within_frame(sampler, lens, line, near, fit, window if inside.all() else 0)
-    clear = (fit.deviation < 0.6) & (np.abs(fit.place) < window / 2) & (fit.blur < 0.55 * window)
-    hidden, outside = list[int](), list[int]()
+    clear = (fit.deviation < _LIMITS.vague) & (np.abs(fit.place) < window / 2) & (fit.blur < 0.55 * window)
+    hidden, outside, absent = list[int](), list[int](), list[int]()
     for j, index in enumerate(chosen.tolist()):
         if not within[j]:
             outside.append(index)
@@ -237,8 +243,17 @@ def measure_edges(
             hidden.append(index)  # an edge between two bands is not doubtful, since both colours identify it
         elif clear[j]:
             t[index], deviation[index] = near[j], fit.deviation[j]
+        elif _shows_tube(light[j, ..., half - 1 : half + 2, :].mean(1), beside_light[j]):
+            absent.append(index)
     soft = median(fit.blur[known]) if (known := np.isfinite(fit.deviation)).any() else blur
-    return Edges(t, deviation, soft, blur, float(np.abs(bulge).max()), coarse, tuple(hidden), tuple(outside))
+    return Edges(t, deviation, soft, blur, float(np.abs(bulge).max()), coarse, *map(tuple, (hidden, outside, absent)))
+
+
+def _shows_tube(tube: np.ndarray, beside: np.ndarray) -> bool:
+    """Whether the light of the tube's middle [T, C] differs from the light [T, 6, C] on both sides of the tube."""
+    sides = beside.reshape(len(beside), 2, 3, -1).mean(2)
+    gap = np.abs(sides - tube[:, None]).max(-1) / np.maximum(sides, tube[:, None]).max(-1)
+    return float((gap.min(-1) > _LIMITS.differs).mean()) > _LIMITS.mostly
 
 
 def _positions_along(near: np.ndarray, blur: float) -> tuple[np.ndarray, int]:

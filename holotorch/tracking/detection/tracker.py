@@ -291,6 +291,9 @@ class CatheterTracker:
                 expected = np.where(missing, self._expected_edges(line_pose, axis.line), edges.t)
                 doubtful = tuple((missing | np.array(stretches.doubtful)).tolist())
                 edges = measure_edges(sampler, lens, axis, expected, doubtful, edges.blur, curve)
+            if edges.absent:
+                text = "no edge where the others put it, although the tube is visible there"
+                raise Refusal(Status.INCONSISTENT, text)
         with self._timed("pose"):
             line_pose = self._solved(axis, edges)
             pose = self._checked(line_pose, width, edges, cold=before is None)
