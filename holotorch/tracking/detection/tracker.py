@@ -22,6 +22,7 @@ from holotorch.tracking.detection.bands import Stretches
 from holotorch.tracking.detection.channels import ChannelOrder, need_frames, stated_order
 from holotorch.tracking.detection.coarse import find_segments
 from holotorch.tracking.detection.colours import ColourTable
+from holotorch.tracking.detection.completion import complete_edges
 from holotorch.tracking.detection.ends import shows_reversed
 from holotorch.tracking.detection.footprint import axis_on_plane, bulge_px, width_px
 from holotorch.tracking.detection.measure import BLURRED, Edges, find_bands, halfway, measure_edges
@@ -195,13 +196,12 @@ class CatheterTracker:
                     raise Refusal(Status.OUTSIDE_CAMERA, "it lies where the lens's distortion cannot be inverted")
                 length = abs(segment.end - segment.start)
                 half = 0.5 * length + max(40.0, 0.7 * length)
-                shown = self._shown(sampler, line, half, _SEARCH.aside, onward=False)
+                line, stretches = self._shown(sampler, line, half, _SEARCH.aside, onward=False, least=2)
+                return self._measured(sampler, line, stretches)
             except Refusal as refusal:
                 # The refusal of the latest stage is reported; the exception itself would keep the frame in memory.
                 if refusal.status > furthest[0]:
                     furthest = refusal.status, refusal.reason
-            else:  # only the first line with all bands in order is measured, which is almost always the catheter
-                return self._along(sampler, *shown, None)
         raise Refusal(*furthest)
 
     def _near(self, sampler: Sampler, line_pose: LinePose) -> tuple[Line, Stretches]:
@@ -227,21 +227,61 @@ class CatheterTracker:
         return Line.between(self.lens, start, end), abs(end - start) * self.lens.scale / 2 + 1.5 * _SEARCH.motion
 
     def _shown(
-        self, sampler: Sampler, line: Line, half: float, aside: float, *, onward: bool
+        self, sampler: Sampler, line: Line, half: float, aside: float, *, onward: bool, least: int = 3
     ) -> tuple[Line, Stretches]:
         """Line of the tube within ``half`` pixels along ``line`` and ``aside`` across, and the bands on it.
 
-        ``onward``: t is known to rise from the tip. Raises a Refusal if fewer than three band edges are visible.
+        ``onward``: t is known to rise from the tip. Raises a Refusal if fewer than ``least`` band edges are visible.
         """
         half = min(half, 1.5 * math.hypot(sampler.height, sampler.width))
         with self._timed("axis"):
             reach = min(0.15, 2 * aside / half) if onward else 0.06
             line, stretches = find_bands(sampler, self.lens, line, self.table, half, aside, reach, onward=onward)
-        if stretches.known < 3:
+        if stretches.known < least:
             few = "a band hides, is drowned by its surroundings or leaves the frame"
-            text = f"{stretches.known} edges of bands are seen, 3 are needed: {few}"
+            text = f"{stretches.known} edges of bands are seen, {least} are needed: {few}"
             raise Refusal(Status.BANDS_MISSING, text, turned=stretches.turned)
         return line, stretches
+
+    def _measured(self, sampler: Sampler, line: Line, stretches: Stretches) -> Pose:
+        """Pose from the bands on ``line``; from the two surest edges where colours put the others in wrong places."""
+        refused = None
+        if stretches.known > 2:
+            try:
+                return self._along(sampler, line, stretches, None)
+            except Refusal as refusal:
+                if refusal.status not in (Status.EDGES_UNCLEAR, Status.OUT_OF_FRAME, Status.INCONSISTENT):
+                    raise
+                refused = Refusal(refusal.status, refusal.reason)
+        completed = self._completed(sampler, line, stretches)
+        if completed is None:
+            raise refused or Refusal(Status.BANDS_MISSING, "two edges of bands are seen, and no third that fits them")
+        return self._along(sampler, *completed, None)
+
+    def _completed(self, sampler: Sampler, line: Line, stretches: Stretches) -> tuple[Line, Stretches] | None:
+        """The tube's line, and the bands with all edges, from the two edges of the surest band on ``line``."""
+        last = len(self._positions) - 1
+        pairs = [(i, i + 1) for i in range(last) if np.isfinite(stretches.edges[[i, i + 1]]).all()]
+        if not pairs:
+            return None
+        # An edge between two bands shows the colours of both; bare tube beyond an outer one may have any colour.
+        pair = max(pairs, key=lambda two: (two[0] > 0) + (two[1] < last))
+        with self._timed("axis"):
+            only = np.full(last + 1, np.nan)
+            only[list(pair)] = stretches.edges[list(pair)]
+            rough_t = halfway(sampler, self.lens, line, only)
+            one = dataclasses.replace(stretches, edges=rough_t)
+            wide = self._slight(rough_t)
+            stations = look_across(sampler, self.lens, line, one, wide[0], _SEARCH.blur, self.stations)
+            axis = measure_axis(stations, wide, THIRD, _SEARCH.blur).line
+            t, _ = axis.place(line.plane(rough_t))
+        with self._timed("edges"):
+            edges = complete_edges(sampler, self.lens, axis, t.tolist(), self._positions)
+            if edges is None:
+                return None
+            whole = tuple(np.diff(edges).tolist())
+            doubtful = tuple(bool(given) or i not in pair for i, given in enumerate(stretches.doubtful))
+            return axis, Stretches(edges, whole, whole, doubtful, stretches.flipped)
 
     def _along(self, sampler: Sampler, line: Line, stretches: Stretches, before: LinePose | None) -> Pose:
         """Pose of the catheter whose bands lie on ``line``; raises a Refusal if a measurement or a check fails."""
