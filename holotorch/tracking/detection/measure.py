@@ -40,6 +40,7 @@ class EdgeWindow:
 
     half: int = 20  # half-width of the window along the tube, of which every second pixel is read
     dense: int = 5  # distance from the edge, plus two blurs, up to which every pixel is read
+    close: int = 7  # the same for edges that cannot be measured in the whole window
     outside: int = 10  # distance beyond an outermost edge, plus two blurs, up to which samples have weight
     aside: float = 0.9  # distance outside the side of the tube from which on a row of samples has no weight
     white: int = 252  # highest 8-bit level that is surely not saturated
@@ -58,8 +59,6 @@ class EdgeLimits:
     lost: float = 3.0  # deviation from which on there is no edge
     across: float = 0.25  # ratio of light's change beside and on an edge above which an object crosses the tube
     same: float = 0.6  # the same ratio above which the bands continue beside the tube
-    differs: float = 0.1  # least difference of the tube from both sides, as a fraction of the brighter light
-    mostly: float = 0.8  # least fraction of the samples along an edge's window that differ where the tube is visible
     clear: float = 4.0  # least change of the background in standard deviations for the change to be significant
 
 
@@ -80,7 +79,6 @@ class Edges:
         bulge: Largest bulge of a ring's front along the line.
         coarse: Whether chroma has fewer pixels than luma.
         hidden, outside: Indices of the edges that are hidden and of those that are too close to the frame's border.
-        absent: Indices of the edges that the light does not show, although it shows the tube on both of their sides.
     """
 
     t: np.ndarray
@@ -91,7 +89,6 @@ class Edges:
     coarse: bool
     hidden: tuple[int, ...]
     outside: tuple[int, ...]
-    absent: tuple[int, ...]
 
 
 def find_bands(
@@ -194,7 +191,7 @@ def measure_edges(
     chosen = np.isfinite(guess).nonzero()[0]
     t, deviation = np.full(len(guess), np.nan), np.full(len(guess), np.inf)
     if not len(chosen):
-        return Edges(t, deviation, blur, blur, 0.0, False, (), (), ())
+        return Edges(t, deviation, blur, blur, 0.0, False, (), ())
     near = guess[chosen]
     along, window = _positions_along(near, blur)
     widths, bulge = axis.width_at(near), curve[chosen]
@@ -223,19 +220,23 @@ def measure_edges(
         elif bool((fit.deviation > _LIMITS.unsure).any()) and not _astray(fit, looks):
             # Light of an uneven background leaks into the outer rows, so that the middle rows alone may fit better.
             core = weight * (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)[:, None, :, None]
-            fit = shading = fit.or_better(fit_edges(light, core, blur, t=along))
+            fit = fit.or_better(fit_edges(light, core, blur, t=along))
+            if bool((fit.deviation > _LIMITS.unsure).any()):
+                # A stain or a shadow on the tube is a second edge in the window of an edge beside it.
+                close = (np.abs(along) <= _WINDOW.close + 2 * blur)[:, None, None]
+                fit = fit.or_better(fit_edges(light, weight * close, blur, t=along))
+            shading = fit
         near = near + fit.place
         if not _astray(fit, looks):
             break
     near = near - bulge * front.shift(shading.steps, shading.told, row)
     beside = sampler.light.take(sampler.nearest(every[..., len(u) :].reshape(-1, 6)))
-    beside_light = beside.reshape(*every.shape[:2], 6, 3)
-    covered, beyond = _across(beside_light, along - fit.place[:, None], fit)
+    covered, beyond = _across(beside.reshape(*every.shape[:2], 6, 3), along - fit.place[:, None], fit)
     if beyond and len(near) > 2 and median(fit.blur) < blur + BLURRED:
         raise Refusal(Status.INCONSISTENT, "all bands go on beside the tube: this is thicker, seen in one part of it")
     within = _within_frame(sampler, lens, line, near, fit, window if inside.all() else 0)
     clear = (fit.deviation < _LIMITS.vague) & (np.abs(fit.place) < window / 2) & (fit.blur < 0.55 * window)
-    hidden, outside, absent = list[int](), list[int](), list[int]()
+    hidden, outside = list[int](), list[int]()
     for j, index in enumerate(chosen.tolist()):
         if not within[j]:
             outside.append(index)
@@ -243,17 +244,8 @@ def measure_edges(
             hidden.append(index)  # an edge between two bands is not doubtful, since both colours identify it
         elif clear[j]:
             t[index], deviation[index] = near[j], fit.deviation[j]
-        elif _shows_tube(light[j, ..., half - 1 : half + 2, :].mean(1), beside_light[j]):
-            absent.append(index)
     soft = median(fit.blur[known]) if (known := np.isfinite(fit.deviation)).any() else blur
-    return Edges(t, deviation, soft, blur, float(np.abs(bulge).max()), coarse, *map(tuple, (hidden, outside, absent)))
-
-
-def _shows_tube(tube: np.ndarray, beside: np.ndarray) -> bool:
-    """Whether the light of the tube's middle [T, C] differs from the light [T, 6, C] on both sides of the tube."""
-    sides = beside.reshape(len(beside), 2, 3, -1).mean(2)
-    gap = np.abs(sides - tube[:, None]).max(-1) / np.maximum(sides, tube[:, None]).max(-1)
-    return float((gap.min(-1) > _LIMITS.differs).mean()) > _LIMITS.mostly
+    return Edges(t, deviation, soft, blur, float(np.abs(bulge).max()), coarse, tuple(hidden), tuple(outside))
 
 
 def _positions_along(near: np.ndarray, blur: float) -> tuple[np.ndarray, int]:

@@ -331,8 +331,8 @@ class CatheterTracker:
                 expected = np.where(missing, self._expected_edges(line_pose, axis.line), edges.t)
                 doubtful = tuple((missing | np.array(stretches.doubtful)).tolist())
                 edges = measure_edges(sampler, lens, axis, expected, doubtful, edges.blur, curve)
-            if edges.absent:
-                text = "no edge where the others put it, although the tube is visible there"
+            if unexplained := set(np.isnan(edges.t).nonzero()[0].tolist()) - {*edges.hidden, *edges.outside}:
+                text = f"edge {min(unexplained)} is not where the others put it, and nothing hides it"
                 raise Refusal(Status.INCONSISTENT, text)
         with self._timed("pose"):
             line_pose = self._solved(axis, edges)
