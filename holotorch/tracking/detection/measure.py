@@ -78,6 +78,7 @@ class Edges:
         expected: Blur for which the windows were chosen.
         bulge: Largest bulge of a ring's front along the line.
         coarse: Whether chroma has fewer pixels than luma.
+        texture: [N] variation of the background beside each edge, as a fraction of the step of light at the edge.
         hidden, outside: Indices of the edges that are hidden and of those that are too close to the frame's border.
     """
 
@@ -87,6 +88,7 @@ class Edges:
     expected: float
     bulge: float
     coarse: bool
+    texture: np.ndarray
     hidden: tuple[int, ...]
     outside: tuple[int, ...]
 
@@ -191,7 +193,7 @@ def measure_edges(
     chosen = np.isfinite(guess).nonzero()[0]
     t, deviation = np.full(len(guess), np.nan), np.full(len(guess), np.inf)
     if not len(chosen):
-        return Edges(t, deviation, blur, blur, 0.0, False, (), ())
+        return Edges(t, deviation, blur, blur, 0.0, False, np.zeros(len(guess)), (), ())
     near = guess[chosen]
     along, window = _positions_along(near, blur)
     widths, bulge = axis.width_at(near), curve[chosen]
@@ -231,7 +233,8 @@ def measure_edges(
             break
     near = near - bulge * front.shift(shading.steps, shading.told, row)
     beside = sampler.light.take(sampler.nearest(every[..., len(u) :].reshape(-1, 6)))
-    covered, beyond = _across(beside.reshape(*every.shape[:2], 6, 3), along - fit.place[:, None], fit)
+    texture = np.zeros(len(guess))
+    covered, beyond, texture[chosen] = _across(beside.reshape(*every.shape[:2], 6, 3), along - fit.place[:, None], fit)
     if beyond and len(near) > 2 and median(fit.blur) < blur + BLURRED:
         raise Refusal(Status.INCONSISTENT, "all bands go on beside the tube: this is thicker, seen in one part of it")
     within = _within_frame(sampler, lens, line, near, fit, window if inside.all() else 0)
@@ -245,7 +248,7 @@ def measure_edges(
         elif clear[j]:
             t[index], deviation[index] = near[j], fit.deviation[j]
     soft = median(fit.blur[known]) if (known := np.isfinite(fit.deviation)).any() else blur
-    return Edges(t, deviation, soft, blur, float(np.abs(bulge).max()), coarse, tuple(hidden), tuple(outside))
+    return Edges(t, deviation, soft, blur, float(np.abs(bulge).max()), coarse, texture, tuple(hidden), tuple(outside))
 
 
 def _positions_along(near: np.ndarray, blur: float) -> tuple[np.ndarray, int]:
@@ -321,12 +324,12 @@ def _sides(widths: np.ndarray, blur: float) -> np.ndarray:
     return _SIGNS * (_ROWS + 2 * blur + widths[:, None] / 2)
 
 
-def _across(light: np.ndarray, along: np.ndarray, fit: EdgeFit) -> tuple[np.ndarray, bool]:
+def _across(light: np.ndarray, along: np.ndarray, fit: EdgeFit) -> tuple[np.ndarray, bool, np.ndarray]:
     """Whether the background changes at the edges, from ``fit`` and the background rows ``light`` [E, T, 6, C].
 
     ``along`` [E, T] are the positions of the samples relative to the edges. Returns [E] whether the background changes
-    on both sides, so that something lies across the tube; and whether on one side the background at all edges changes
-    about as much as the tube.
+    on both sides, so that something lies across the tube; whether on one side the background at all edges changes about
+    as much as the tube; and [E] the rms variation of the background along the tube as a fraction of the tube's change.
     """
     count, samples, _, colours = light.shape
     light = light.reshape(count, samples, -1).astype(np.float64)
@@ -338,10 +341,12 @@ def _across(light: np.ndarray, along: np.ndarray, fit: EdgeFit) -> tuple[np.ndar
     middle = fit.steps.shape[1] // 2
     own = fit.steps[:, middle - 1 : middle + 2].sum(1)
     own = np.sqrt((own * own).sum(-1, keepdims=True)) / 3
+    side = light.reshape(count, samples, 2, 3, colours).sum(3) / 3
+    side -= side.sum(1, keepdims=True) / samples
+    texture = np.sqrt(np.square(side).sum((1, 2, 3)) / (2 * samples)) / np.maximum(own[:, 0], 1e-9)
     large = size > _LIMITS.across * own
     if not large.any():  # the usual case, which needs no estimate of the noise
-        return large[:, 0], False
-    side = light.reshape(count, samples, 2, 3, colours).sum(3) / 3
-    left = side - side.sum(1, keepdims=True) / samples - step[:, None] * up[:, :, None, None]
+        return large[:, 0], False, texture
+    left = side - step[:, None] * up[:, :, None, None]
     large &= size > _LIMITS.clear * np.sqrt((left * left).sum((1, 3)) / (samples * power[..., 0]))
-    return large.all(1), bool((large & (size > _LIMITS.same * own)).all(0).any())
+    return large.all(1), bool((large & (size > _LIMITS.same * own)).all(0).any()), texture

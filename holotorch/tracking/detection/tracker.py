@@ -51,11 +51,13 @@ class ErrorFloors:
 
     model: float = 0.004  # every edge: the edge profile and the sampling by pixels are approximate
     transparency: float = 0.010  # outermost edges: the background is visible through the clear tube beside them
+    texture: float = 0.5  # outermost edges: per variation of the background relative to the edge's step of light
     bulge: float = 0.004  # per pixel by which the front of a ring bulges along the line
     shared: float = 0.010  # common to all edges of a frame
     defocus: float = 0.08  # per pixel of blur in all directions, which lets light from beside the tube leak in
     smear: float = 0.03  # per pixel of blur along the tube, from the lens or from motion
     coarse_edge: float = 0.07  # edges of frames whose chroma has fewer pixels than their luma (4:2:0 codecs)
+    line: float = 0.06  # offset of the line: light from one side moves the apparent middle of the tube
     coarse_line: float = 0.17  # offset of the line in the same frames
 
 
@@ -392,13 +394,18 @@ class CatheterTracker:
             _FLOORS.defocus * min(soft, smeared),
             _FLOORS.smear * smeared,
         )
-        shines = (_FLOORS.transparency if n in (0, last) else 0.0 for n in known)
-        along = [math.hypot(*each, floor) for each in zip(edges.deviation[known].tolist(), shines, strict=True)]
+        through = [n in (0, last) for n in known]
+        along = [
+            math.hypot(deviation, floor, outer * _FLOORS.transparency, outer * _FLOORS.texture * texture)
+            for deviation, texture, outer in zip(edges.deviation[known], edges.texture[known], through, strict=True)
+        ]
         # Shading that is constant along the tube shifts and rotates the line by more than the deviations of its fit.
         # Both deviations, expressed as displacements at the edges, are therefore raised to the larger one.
         middle = sum(t) / len(t)
         spread = math.sqrt(sum((each - middle) ** 2 for each in t) / len(t))
-        offset = math.hypot(axis.offset_sd, axis.slope_sd * (middle - axis.centre), _FLOORS.coarse_line * edges.coarse)
+        offset = math.hypot(
+            axis.offset_sd, axis.slope_sd * (middle - axis.centre), _FLOORS.line, _FLOORS.coarse_line * edges.coarse
+        )
         most = max(offset, axis.slope_sd * spread)
         positions = [self._positions[n] for n in known]
         line_pose = pose_on_line(
@@ -440,9 +447,11 @@ class CatheterTracker:
         if line_pose.tip_sd > self.most_sd:
             text = f"tip uncertain to {1e3 * line_pose.tip_sd:.1f} mm, above {1e3 * self.most_sd:g} mm"
             raise Refusal(Status.UNCERTAIN, text)
+        # Edges that agree less well than their deviations say are that much less certain (the scale factor of Birge).
+        scale = max(1.0, line_pose.chi_square / max(freedom, 1))
         status = Status.OK if freedom else Status.UNVERIFIED
         reason = "" if freedom else "three edges determine a pose and leave nothing to check it with"
-        tip, direction, covariance = map(torch.from_numpy, (line_pose.tip, line_pose.direction, line_pose.covariance))
+        tip, direction, covariance = map(torch.from_numpy, (line_pose.tip, line_pose.direction, scale * line_pose.covariance))
         chi_square, degrees = torch.from_numpy(np.array([line_pose.chi_square, freedom], dtype=np.float64))
         return Pose(tip, direction, covariance, chi_square, degrees, status, reason)
 
