@@ -25,6 +25,7 @@ class Stretches:
 
     Attributes:
         edges: [N] position t of each edge; NaN for an edge that is not visible.
+        cuts: [N] position t at which each edge would divide the colours best, whether it is visible or not.
         shown: For each band, the number of pixels of its colour on the line.
         whole: For each band, its length on the line in pixels.
         doubtful: For each edge, whether its colours would also fit an object in front of the tube.
@@ -34,6 +35,7 @@ class Stretches:
     """
 
     edges: np.ndarray
+    cuts: np.ndarray
     shown: tuple[float, ...]
     whole: tuple[float, ...]
     doubtful: tuple[bool, ...]
@@ -228,7 +230,7 @@ def _judged(
             return all(mean(row, cut - longest // 2, before[1]) < _RIGHT for row in own)
         return i < last or all(mean(row, after[0], cut + longest // 2) < _RIGHT for row in own)
 
-    edges, doubtful = [], []
+    edges, places, doubtful = [], [], []
     for i, cut in enumerate(cuts):
         length = [cuts[j + 1] - cuts[j] for j in (i - 1, i) if 0 <= j < last]
         # A band on a background of the same colour has length 0 here, but its edge to the next band may be visible.
@@ -244,10 +246,12 @@ def _judged(
         )
         doubtful.append(i in (0, last) or max(near) > 0.25)
         at = cut - 0.5
-        edges.append((count - 1 - at if flipped else at) - middle if visible else np.nan)
+        places.append((count - 1 - at if flipped else at) - middle)
+        edges.append(places[-1] if visible else np.nan)
     spans = list(zip(bands, cuts, cuts[1:], strict=False))
     return Stretches(
         np.array(edges),
+        np.array(places),
         tuple(sums[band].item(high) - sums[band].item(low) for band, low, high in spans),
         tuple(float(high - low) for _, low, high in spans),
         tuple(doubtful),

@@ -147,7 +147,7 @@ def find_bands(
         raise Refusal(Status.BANDS_MISSING, why, turned=onward)
     if stretches.flipped:  # from here on t rises from the tip to the rear
         turned = Line(line.origin, -line.along, line.scale)
-        return turned, dataclasses.replace(stretches, edges=-stretches.edges, flipped=False)
+        return turned, dataclasses.replace(stretches, edges=-stretches.edges, cuts=-stretches.cuts, flipped=False)
     return line, stretches
 
 

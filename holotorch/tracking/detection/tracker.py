@@ -86,6 +86,7 @@ class SearchLimits:
     bulge_change: float = 0.1  # change of a ring's bulge above which the edges are measured again
     bulge_settled: float = 0.05  # change of a ring's bulge below which the pose is not computed again
     aside: float = 16.0  # largest distance of the tube, with its blur, from a segment of the search of a whole frame
+    full: float = 0.8  # fraction of a band's length that shows its colour if the whole band is visible
     motion: float = 30.0  # largest motion of the catheter between two frames
 
 
@@ -198,7 +199,7 @@ class CatheterTracker:
                     raise Refusal(Status.OUTSIDE_CAMERA, "it lies where the lens's distortion cannot be inverted")
                 length = abs(segment.end - segment.start)
                 half = 0.5 * length + max(40.0, 0.7 * length)
-                line, stretches = self._shown(sampler, line, half, _SEARCH.aside, onward=False, least=2)
+                line, stretches = self._shown(sampler, line, half, _SEARCH.aside, onward=False, least=1)
                 return self._measured(sampler, line, stretches)
             except Refusal as refusal:
                 # The refusal of the latest stage is reported; the exception itself would keep the frame in memory.
@@ -263,14 +264,18 @@ class CatheterTracker:
     def _completed(self, sampler: Sampler, line: Line, stretches: Stretches) -> tuple[Line, Stretches] | None:
         """The tube's line, and the bands with all edges, from the two edges of the surest band on ``line``."""
         last = len(self._positions) - 1
-        pairs = [(i, i + 1) for i in range(last) if np.isfinite(stretches.edges[[i, i + 1]]).all()]
-        if not pairs:
-            return None
+        known, whole = np.isfinite(stretches.edges), np.array(stretches.whole)
+        both, full = known[:-1] & known[1:], np.array(stretches.shown) > _SEARCH.full * whole
+        inner = np.minimum(np.arange(last), last - 1 - np.arange(last)) > 0
         # An edge between two bands shows the colours of both; bare tube beyond an outer one may have any colour.
-        pair = max(pairs, key=lambda two: (two[0] > 0) + (two[1] < last))
+        worth = np.where(both, 2 + inner, (known[:-1] | known[1:]) & full)
+        first = int(worth.argmax())
+        if not worth[first]:
+            return None
+        pair = (first, first + 1)
         with self._timed("axis"):
             only = np.full(last + 1, np.nan)
-            only[list(pair)] = stretches.edges[list(pair)]
+            only[list(pair)] = stretches.cuts[list(pair)]
             rough_t = halfway(sampler, self.lens, line, only)
             one = dataclasses.replace(stretches, edges=rough_t)
             wide = self._slight(rough_t)
@@ -279,11 +284,20 @@ class CatheterTracker:
             t, _ = axis.place(line.plane(rough_t))
         with self._timed("edges"):
             edges = complete_edges(sampler, self.lens, axis, t.tolist(), self._positions)
-            if edges is None:
+            if edges is None or not self._coloured(sampler, axis, edges):
                 return None
             whole = tuple(np.diff(edges).tolist())
             doubtful = tuple(bool(given) or i not in pair for i, given in enumerate(stretches.doubtful))
-            return axis, Stretches(edges, whole, whole, doubtful, stretches.flipped)
+            return axis, Stretches(edges, edges, whole, whole, doubtful, stretches.flipped)
+
+    def _coloured(self, sampler: Sampler, axis: Line, edges: np.ndarray) -> bool:
+        """Whether more than half of the pixels between ``edges`` [N] have the colours of their bands."""
+        t, u = np.arange(math.ceil(edges[0]), math.floor(edges[-1]) + 1.0), np.arange(-1.0, 2.0)
+        pixels = axis.pixels(self.lens, t, u)
+        band = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, len(self.table.bands) - 1)
+        own = self.table.labels(sampler.nearest(pixels)) == np.array(self.table.bands)[band, None] + 1
+        shown = [own[part].mean() for i in set(band.tolist()) if (part := sampler.inside(pixels) & (band == i)[:, None]).any()]
+        return min(shown, default=0.0) > 0.5
 
     def _along(self, sampler: Sampler, line: Line, stretches: Stretches, before: LinePose | None) -> Pose:
         """Pose of the catheter whose bands lie on ``line``; raises a Refusal if a measurement or a check fails."""
