@@ -59,6 +59,8 @@ class EdgeLimits:
     lost: float = 3.0  # deviation from which on there is no edge
     across: float = 0.25  # ratio of light's change beside and on an edge above which an object crosses the tube
     same: float = 0.6  # the same ratio above which the bands continue beside the tube
+    differs: float = 0.1  # least difference of the tube from both sides, as a fraction of the brighter light
+    mostly: float = 0.8  # least fraction of the samples along an edge's window that differ where the tube is visible
     clear: float = 4.0  # least change of the background in standard deviations for the change to be significant
 
 
@@ -80,6 +82,7 @@ class Edges:
         coarse: Whether chroma has fewer pixels than luma.
         texture: [N] variation of the background beside each edge, as a fraction of the step of light at the edge.
         hidden, outside: Indices of the edges that are hidden and of those that are too close to the frame's border.
+        absent: Indices of the edges that are not there, although the tube is visible on both of their sides.
     """
 
     t: np.ndarray
@@ -91,6 +94,7 @@ class Edges:
     texture: np.ndarray
     hidden: tuple[int, ...]
     outside: tuple[int, ...]
+    absent: tuple[int, ...]
 
 
 def find_bands(
@@ -193,7 +197,7 @@ def measure_edges(
     chosen = np.isfinite(guess).nonzero()[0]
     t, deviation = np.full(len(guess), np.nan), np.full(len(guess), np.inf)
     if not len(chosen):
-        return Edges(t, deviation, blur, blur, 0.0, False, np.zeros(len(guess)), (), ())
+        return Edges(t, deviation, blur, blur, 0.0, False, np.zeros(len(guess)), (), (), ())
     near = guess[chosen]
     along, window = _positions_along(near, blur)
     widths, bulge = axis.width_at(near), curve[chosen]
@@ -232,14 +236,15 @@ def measure_edges(
         if not _astray(fit, looks):
             break
     near = near - bulge * front.shift(shading.steps, shading.told, row)
-    beside = sampler.light.take(sampler.nearest(every[..., len(u) :].reshape(-1, 6)))
+    beside = sampler.light.take(sampler.nearest(every[..., len(u) :].reshape(-1, 6))).reshape(*every.shape[:2], 6, 3)
     texture = np.zeros(len(guess))
-    covered, beyond, texture[chosen] = _across(beside.reshape(*every.shape[:2], 6, 3), along - fit.place[:, None], fit)
+    covered, beyond, texture[chosen] = _across(beside, along - fit.place[:, None], fit)
     if beyond and len(near) > 2 and median(fit.blur) < blur + BLURRED:
-        raise Refusal(Status.INCONSISTENT, "all bands go on beside the tube: this is thicker, seen in one part of it")
+        text = "all bands go on beside the tube: this is thicker, seen in one part of it"
+        raise Refusal(Status.INCONSISTENT, text, final=True)
     within = _within_frame(sampler, lens, line, near, fit, window if inside.all() else 0)
     clear = (fit.deviation < _LIMITS.vague) & (np.abs(fit.place) < window / 2) & (fit.blur < 0.55 * window)
-    hidden, outside = list[int](), list[int]()
+    hidden, outside, absent = list[int](), list[int](), list[int]()
     for j, index in enumerate(chosen.tolist()):
         if not within[j]:
             outside.append(index)
@@ -247,8 +252,19 @@ def measure_edges(
             hidden.append(index)  # an edge between two bands is not doubtful, since both colours identify it
         elif clear[j]:
             t[index], deviation[index] = near[j], fit.deviation[j]
+        elif _shows_tube(light[j, ..., half - 1 : half + 2, :].mean(1), beside[j]):
+            absent.append(index)
     soft = median(fit.blur[known]) if (known := np.isfinite(fit.deviation)).any() else blur
-    return Edges(t, deviation, soft, blur, float(np.abs(bulge).max()), coarse, texture, tuple(hidden), tuple(outside))
+    return Edges(
+        t, deviation, soft, blur, float(np.abs(bulge).max()), coarse, texture, *map(tuple, (hidden, outside, absent))
+    )
+
+
+def _shows_tube(tube: np.ndarray, beside: np.ndarray) -> bool:
+    """Whether the light of the tube's middle [T, C] differs from the light [T, 6, C] on both sides of the tube."""
+    sides = beside.reshape(len(beside), 2, 3, -1).mean(2)
+    gap = np.abs(sides - tube[:, None]).max(-1) / np.maximum(sides, tube[:, None]).max(-1)
+    return float((gap.min(-1) > _LIMITS.differs).mean()) > _LIMITS.mostly
 
 
 def _positions_along(near: np.ndarray, blur: float) -> tuple[np.ndarray, int]:

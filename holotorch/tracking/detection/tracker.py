@@ -180,7 +180,7 @@ class CatheterTracker:
         try:
             return self._search_lines(sampler, thin=False)
         except Refusal as refusal:
-            if refusal.status > Status.EDGES_UNCLEAR:  # bands were measured
+            if refusal.final:
                 raise
             try:
                 return self._search_lines(sampler, thin=True)
@@ -202,6 +202,8 @@ class CatheterTracker:
                 line, stretches = self._shown(sampler, line, half, _SEARCH.aside, onward=False, least=1)
                 return self._measured(sampler, line, stretches)
             except Refusal as refusal:
+                if refusal.final:
+                    raise
                 # The refusal of the latest stage is reported; the exception itself would keep the frame in memory.
                 if refusal.status > furthest[0]:
                     furthest = refusal.status, refusal.reason
@@ -248,21 +250,24 @@ class CatheterTracker:
 
     def _measured(self, sampler: Sampler, line: Line, stretches: Stretches) -> Pose:
         """Pose from the bands on ``line``; from the two surest edges where colours put the others in wrong places."""
-        refused = None
+        given = ""
         if stretches.known > 2:
             try:
                 return self._along(sampler, line, stretches, None)
             except Refusal as refusal:
-                if refusal.status not in (Status.EDGES_UNCLEAR, Status.OUT_OF_FRAME, Status.INCONSISTENT):
+                if refusal.final:
                     raise
-                refused = Refusal(refusal.status, refusal.reason)
-        completed = self._completed(sampler, line, stretches)
-        if completed is None:
-            raise refused or Refusal(Status.BANDS_MISSING, "two edges of bands are seen, and no third that fits them")
-        return self._along(sampler, *completed, None)
+                status, given = refusal.status, refusal.reason
+        try:
+            return self._along(sampler, *self._completed(sampler, line, stretches), None, completed=True)
+        except Refusal as refusal:
+            if given and not refusal.final:
+                raise Refusal(status, given) from None
+            raise
 
-    def _completed(self, sampler: Sampler, line: Line, stretches: Stretches) -> tuple[Line, Stretches] | None:
+    def _completed(self, sampler: Sampler, line: Line, stretches: Stretches) -> tuple[Line, Stretches]:
         """The tube's line, and the bands with all edges, from the two edges of the surest band on ``line``."""
+        refusal = Refusal(Status.BANDS_MISSING, "too few edges of bands are seen, and no others that fit them")
         last = len(self._positions) - 1
         known, whole = np.isfinite(stretches.edges), np.array(stretches.whole)
         both, full = known[:-1] & known[1:], np.array(stretches.shown) > _SEARCH.full * whole
@@ -271,7 +276,7 @@ class CatheterTracker:
         worth = np.where(both, 2 + inner, (known[:-1] | known[1:]) & full)
         first = int(worth.argmax())
         if not worth[first]:
-            return None
+            raise refusal
         pair = (first, first + 1)
         with self._timed("axis"):
             only = np.full(last + 1, np.nan)
@@ -285,7 +290,7 @@ class CatheterTracker:
         with self._timed("edges"):
             edges = complete_edges(sampler, self.lens, axis, t.tolist(), self._positions)
             if edges is None or not self._coloured(sampler, axis, edges):
-                return None
+                raise refusal
             whole = tuple(np.diff(edges).tolist())
             doubtful = tuple(bool(given) or i not in pair for i, given in enumerate(stretches.doubtful))
             return axis, Stretches(edges, edges, whole, whole, doubtful, stretches.flipped)
@@ -296,11 +301,20 @@ class CatheterTracker:
         pixels = axis.pixels(self.lens, t, u)
         band = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, len(self.table.bands) - 1)
         own = self.table.labels(sampler.nearest(pixels)) == np.array(self.table.bands)[band, None] + 1
-        shown = [own[part].mean() for i in set(band.tolist()) if (part := sampler.inside(pixels) & (band == i)[:, None]).any()]
+        shown = [
+            own[part].mean()
+            for i in set(band.tolist())
+            if (part := sampler.inside(pixels) & (band == i)[:, None]).any()
+        ]
         return min(shown, default=0.0) > 0.5
 
-    def _along(self, sampler: Sampler, line: Line, stretches: Stretches, before: LinePose | None) -> Pose:
-        """Pose of the catheter whose bands lie on ``line``; raises a Refusal if a measurement or a check fails."""
+    def _along(
+        self, sampler: Sampler, line: Line, stretches: Stretches, before: LinePose | None, *, completed: bool = False
+    ) -> Pose:
+        """Pose of the catheter whose bands lie on ``line``; raises a Refusal if a measurement or a check fails.
+
+        ``completed``: only two edges are known by their colours, so that no other may be missing without a reason.
+        """
         lens = self.lens
         with self._timed("axis"):
             rough_t = stretches.edges if before else halfway(sampler, lens, line, stretches.edges)
@@ -347,14 +361,16 @@ class CatheterTracker:
                 expected = np.where(missing, self._expected_edges(line_pose, axis.line), edges.t)
                 doubtful = tuple((missing | np.array(stretches.doubtful)).tolist())
                 edges = measure_edges(sampler, lens, axis, expected, doubtful, edges.blur, curve)
-            if unexplained := set(np.isnan(edges.t).nonzero()[0].tolist()) - {*edges.hidden, *edges.outside}:
-                text = f"edge {min(unexplained)} is not where the others put it, and nothing hides it"
+            missing = set(np.isnan(edges.t).nonzero()[0].tolist()) - {*edges.hidden, *edges.outside}
+            if absent := missing if completed else edges.absent:
+                text = f"edge {min(absent)} is not where the others put it, and nothing hides it"
                 raise Refusal(Status.INCONSISTENT, text)
         with self._timed("pose"):
             line_pose = self._solved(axis, edges)
             pose = self._checked(line_pose, width, edges, cold=before is None)
             if before is None and shows_reversed(sampler, lens, line_pose, self.catheter):
-                raise Refusal(Status.INCONSISTENT, f"the tube goes on beyond its end on one side only: {_EXCHANGED}")
+                text = f"the tube goes on beyond its end on one side only: {_EXCHANGED}"
+                raise Refusal(Status.INCONSISTENT, text, final=True)
             return pose
 
     def _expected_edges(self, line_pose: LinePose, line: Line) -> np.ndarray:
@@ -436,7 +452,7 @@ class CatheterTracker:
         freedom = count - 3  # degrees of freedom of positions along the line; the line is fitted separately
         if line_pose.chi_square > self._chi_square_limits[freedom]:
             text = f"edges disagree with any pose: chi-square {line_pose.chi_square:.1f} of {freedom}"
-            raise Refusal(Status.INCONSISTENT, text)
+            raise Refusal(Status.INCONSISTENT, text, final=True)
         middle = float(visible.sum()) / count
         near, taper = self._wide(line_pose, axis.line)
         wide = near + taper * middle
@@ -457,15 +473,18 @@ class CatheterTracker:
             ratio = combined
         if abs(ratio - 1) > most and not moved:
             depth = float((line_pose.tip + sum(self._positions) / len(self._positions) * line_pose.direction)[2])
-            raise Refusal(Status.INCONSISTENT, f"{ratio:.2f} times as wide as it should be at {depth:.2f} m")
+            text = f"{ratio:.2f} times as wide as it should be at {depth:.2f} m"
+            raise Refusal(Status.INCONSISTENT, text, final=True)
         if line_pose.tip_sd > self.most_sd:
             text = f"tip uncertain to {1e3 * line_pose.tip_sd:.1f} mm, above {1e3 * self.most_sd:g} mm"
-            raise Refusal(Status.UNCERTAIN, text)
+            raise Refusal(Status.UNCERTAIN, text, final=True)
         # Edges that agree less well than their deviations say are that much less certain (the scale factor of Birge).
         scale = max(1.0, line_pose.chi_square / max(freedom, 1))
         status = Status.OK if freedom else Status.UNVERIFIED
         reason = "" if freedom else "three edges determine a pose and leave nothing to check it with"
-        tip, direction, covariance = map(torch.from_numpy, (line_pose.tip, line_pose.direction, scale * line_pose.covariance))
+        tip, direction, covariance = map(
+            torch.from_numpy, (line_pose.tip, line_pose.direction, scale * line_pose.covariance)
+        )
         chi_square, degrees = torch.from_numpy(np.array([line_pose.chi_square, freedom], dtype=np.float64))
         return Pose(tip, direction, covariance, chi_square, degrees, status, reason)
 

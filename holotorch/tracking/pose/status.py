@@ -47,11 +47,12 @@ class Refusal(Exception):
     Attributes:
         status, reason: Status and reason of the refused pose.
         turned: Whether the bands may appear in the reversed order.
+        final: Whether the bands were measured, so that a search elsewhere in the frame is of no use.
     """
 
-    def __init__(self, status: Status, reason: str, *, turned: bool = False):
+    def __init__(self, status: Status, reason: str, *, turned: bool = False, final: bool = False):
         super().__init__(reason)
-        self.status, self.reason, self.turned = status, reason, turned
+        self.status, self.reason, self.turned, self.final = status, reason, turned, final
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,7 +51,7 @@ def seen(name: str = "plain", **changes) -> Seen:
     line = Line.between(LENS, *ends)
     places = line.place(on_plane(TIP + POSITIONS[:, None] * DIRECTION))[0]
     whole = tuple(np.diff(places).tolist())
-    stretches = Stretches(places, whole, whole, (False,) * 4, False)
+    stretches = Stretches(places, places, whole, whole, (False,) * 4, False)
     width = 2 * THESIS.radius * LENS.scale / NEAR
     stations = look_across(Sampler(plain, LENS.light), LENS, line, stretches, width, 0.9)
     axis = measure_axis(stations, (width, 0.0), 0.01, 0.9)
@@ -188,7 +188,7 @@ def beside(steps: list[list[float]], noise: float = 0.01) -> np.ndarray:
 def test_something_lies_across_where_both_sides_change_by_a_quarter_of_the_edge(steps, across, beyond):
     """Of an edge of 0.2: above 0.05 on both sides; above 0.12 on one side of all, the bands go on there."""
     along = np.broadcast_to(np.arange(-16.0, 17), (3, 33))
-    found, on = _across(beside(steps), along, fit_of(0.2))
+    found, on, _ = _across(beside(steps), along, fit_of(0.2))
     assert found.tolist() == across and on == beyond
 
 

@@ -64,7 +64,7 @@ def stretches(*edges: float, shown: float = 1.0) -> Stretches:
     places = np.array(edges or CUTS)
     whole = tuple(float(gap) if math.isfinite(gap) else 0.0 for gap in np.diff(places))
     part = tuple(shown * length for length in whole)
-    return Stretches(places, part, whole, (False,) * len(places), False)
+    return Stretches(places, places, part, whole, (False,) * len(places), False)
 
 
 def looked(scene: Scene, width: float | None = None, line: Line = LINE, given: Stretches | None = None) -> Stations:
