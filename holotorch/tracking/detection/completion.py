@@ -1,4 +1,4 @@
-"""Positions of band edges that colours do not show, from two edges that they show and the steps of light between them."""
+"""Positions of band edges that colours do not show, from two that they do show and the steps of light beyond them."""
 
 import math
 from collections.abc import Sequence

@@ -58,7 +58,7 @@ class EdgeLimits:
     vague: float = 0.3  # deviation from which on an edge is not clear
     lost: float = 3.0  # deviation from which on there is no edge
     across: float = 0.25  # ratio of light's change beside and on an edge above which an object crosses the tube
-    same: float = 0.6  # the same ratio above which the bands continue beside the tube
+    same: float = 0.4  # the same ratio above which the bands continue beside the tube
     differs: float = 0.1  # least difference of the tube from both sides, as a fraction of the brighter light
     mostly: float = 0.8  # least fraction of the samples along an edge's window that differ where the tube is visible
     clear: float = 4.0  # least change of the background in standard deviations for the change to be significant
@@ -66,7 +66,7 @@ class EdgeLimits:
 
 _SEARCH, _WINDOW, _LIMITS = StripSearch(), EdgeWindow(), EdgeLimits()
 BLURRED = 0.6  # pixels: difference of the measured from the expected blur above which edges are measured again
-_SIGNS, _ROWS = np.repeat([-1.0, 1.0], 3), np.tile([2.0, 3.0, 4.0], 2)  # three background rows on each side of the tube
+_SIGNS, _ROWS = np.repeat([-1.0, 1.0], 3), np.tile([1.0, 2.0, 3.0], 2)  # three background rows on each side of the tube
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,21 +348,25 @@ def _across(light: np.ndarray, along: np.ndarray, fit: EdgeFit) -> tuple[np.ndar
     as much as the tube; and [E] the rms variation of the background along the tube as a fraction of the tube's change.
     """
     count, samples, _, colours = light.shape
-    light = light.reshape(count, samples, -1).astype(np.float64)
+    light = light.reshape(count, samples, 2, 3, colours).astype(np.float64)
     up = ndtr(along / fit.blur[:, None])
     up -= up.sum(1, keepdims=True) / samples
     power = np.maximum((up * up).sum(1), 1e-30)[:, None, None]
-    step = (up[:, None] @ light).reshape(count, 2, 3, colours).sum(2) / (3 * power)  # [E, 2, C]
+    rows = (up[:, None] @ light.reshape(count, samples, -1)).reshape(count, 2, 3, colours) / power[..., None]
+    step = rows.sum(2) / 3  # [E, 2, C]
     size = np.sqrt((step * step).sum(-1))
     middle = fit.steps.shape[1] // 2
     own = fit.steps[:, middle - 1 : middle + 2].sum(1)
     own = np.sqrt((own * own).sum(-1, keepdims=True)) / 3
-    side = light.reshape(count, samples, 2, 3, colours).sum(3) / 3
+    side = light.sum(3) / 3
     side -= side.sum(1, keepdims=True) / samples
     texture = np.sqrt(np.square(side).sum((1, 2, 3)) / (2 * samples)) / np.maximum(own[:, 0], 1e-9)
     large = size > _LIMITS.across * own
-    if not large.any():  # the usual case, which needs no estimate of the noise
+    each = np.sqrt((rows * rows).sum(-1)).max(-1) > _LIMITS.same * own  # bright and dark rows may have a mean of 0
+    if not (large | each).any():  # the usual case, which needs no estimate of the noise
         return large[:, 0], False, texture
     left = side - step[:, None] * up[:, :, None, None]
-    large &= size > _LIMITS.clear * np.sqrt((left * left).sum((1, 3)) / (samples * power[..., 0]))
-    return large.all(1), bool((large & (size > _LIMITS.same * own)).all(0).any()), texture
+    clear = _LIMITS.clear * np.sqrt((left * left).sum((1, 3)) / (samples * power[..., 0]))
+    large &= size > clear
+    each &= np.sqrt((rows * rows).sum(-1)).max(-1) > math.sqrt(3) * clear
+    return large.all(1), bool(each.all(0).any()), texture

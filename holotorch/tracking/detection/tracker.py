@@ -71,7 +71,7 @@ class WidthCheck:
     slant: float = 1.5  # largest ratio of the width from a rough pose to that from the bands' length: 55 degrees
     vague: float = 0.15  # largest relative deviation of a width that is used to check a pose from three edges
     path: float = 2.5  # longest motion across the tube during the exposure, in widths of the tube
-    path_blur: float = 0.2  # largest relative difference between the blur of the sides and that of such a motion
+    path_blur: float = 0.15  # largest relative difference between the blur of the sides and that of such a motion
     path_deviation: float = 0.04  # largest relative deviation of a width that can indicate such a motion
     nearly: float = 0.01  # relative deviation of the width from a rough pose
     exact: float = 0.002  # relative deviation of the width from the fitted pose
@@ -255,7 +255,7 @@ class CatheterTracker:
             try:
                 return self._along(sampler, line, stretches, None)
             except Refusal as refusal:
-                if refusal.final:
+                if refusal.final or self._rough(line, stretches.edges):
                     raise
                 status, given = refusal.status, refusal.reason
         try:
