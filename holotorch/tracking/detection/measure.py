@@ -344,8 +344,8 @@ def _across(light: np.ndarray, along: np.ndarray, fit: EdgeFit) -> tuple[np.ndar
     """Whether the background changes at the edges, from ``fit`` and the background rows ``light`` [E, T, 6, C].
 
     ``along`` [E, T] are the positions of the samples relative to the edges. Returns [E] whether the background changes
-    on both sides, so that something lies across the tube; whether on one side the background at all edges changes about
-    as much as the tube; and [E] the rms variation of the background along the tube as a fraction of the tube's change.
+    on both sides, so that something lies across the tube; whether on one side, the background at all edges changes nearly
+    as much as the tube, still a few pixels away from it; and [E] the rms variation of the background along the tube as a fraction of the tube's change.
     """
     count, samples, _, colours = light.shape
     light = light.reshape(count, samples, 2, 3, colours).astype(np.float64)
@@ -362,11 +362,13 @@ def _across(light: np.ndarray, along: np.ndarray, fit: EdgeFit) -> tuple[np.ndar
     side -= side.sum(1, keepdims=True) / samples
     texture = np.sqrt(np.square(side).sum((1, 2, 3)) / (2 * samples)) / np.maximum(own[:, 0], 1e-9)
     large = size > _LIMITS.across * own
-    each = np.sqrt((rows * rows).sum(-1)).max(-1) > _LIMITS.same * own  # bright and dark rows may have a mean of 0
+    # A tube that moved across during the exposure fades away from its path within its width, so the last row counts.
+    last = np.sqrt(np.square(rows[:, :, 2]).sum(-1))
+    each = last > _LIMITS.same * own
     if not (large | each).any():  # the usual case, which needs no estimate of the noise
         return large[:, 0], False, texture
     left = side - step[:, None] * up[:, :, None, None]
     clear = _LIMITS.clear * np.sqrt((left * left).sum((1, 3)) / (samples * power[..., 0]))
     large &= size > clear
-    each &= np.sqrt((rows * rows).sum(-1)).max(-1) > math.sqrt(3) * clear
+    each &= last > math.sqrt(3) * clear
     return large.all(1), bool(each.all(0).any()), texture
