@@ -28,9 +28,9 @@ def test_farther_is_less_sure_and_depth_least():
     near, far = (TRACKER(scenes()[name][1][None])[0] for name in ("near", "far"))
     assert near.tip_sd < far.tip_sd
     sight = far.tip / far.tip.norm()
-    across = torch.linalg.cross(far.direction, sight)
-    deep, beside = (float(axis @ far.covariance[:3, :3] @ axis / axis.square().sum()) for axis in (sight, across))
-    assert deep > 4 * beside  # across the tube's image, the line of all stations tells, not four edges
+    along = far.direction - (far.direction @ sight) * sight
+    deep, beside = (float(axis @ far.covariance[:3, :3] @ axis / axis.square().sum()) for axis in (sight, along))
+    assert deep > 2 * beside  # the edges give both, and the depth from their distances alone
 
 
 def test_a_batch_is_its_frames_and_they_stay_as_they_were():
