@@ -71,7 +71,7 @@ class WidthCheck:
     slant: float = 1.5  # largest ratio of the width from a rough pose to that from the bands' length: 55 degrees
     vague: float = 0.15  # largest relative deviation of a width that is used to check a pose from three edges
     path: float = 2.5  # longest motion across the tube during the exposure, in widths of the tube
-    path_blur: float = 0.15  # largest relative difference between the blur of the sides and that of such a motion
+    path_blur: float = 0.2  # largest relative difference between the blur of the sides and that of such a motion
     path_deviation: float = 0.04  # largest relative deviation of a width that can indicate such a motion
     nearly: float = 0.01  # relative deviation of the width from a rough pose
     exact: float = 0.002  # relative deviation of the width from the fitted pose
@@ -313,7 +313,7 @@ class CatheterTracker:
     ) -> Pose:
         """Pose of the catheter whose bands lie on ``line``; raises a Refusal if a measurement or a check fails.
 
-        ``completed``: only two edges are known by their colours, so that no other may be missing without a reason.
+        ``completed``: only two edges are known by their colours, so that no other may be missing on the frame.
         """
         lens = self.lens
         with self._timed("axis"):
@@ -361,7 +361,7 @@ class CatheterTracker:
                 expected = np.where(missing, self._expected_edges(line_pose, axis.line), edges.t)
                 doubtful = tuple((missing | np.array(stretches.doubtful)).tolist())
                 edges = measure_edges(sampler, lens, axis, expected, doubtful, edges.blur, curve)
-            missing = set(np.isnan(edges.t).nonzero()[0].tolist()) - {*edges.hidden, *edges.outside}
+            missing = set(np.isnan(edges.t).nonzero()[0].tolist()) - {*edges.outside}
             if absent := missing if completed else edges.absent:
                 text = f"edge {min(absent)} is not where the others put it, and nothing hides it"
                 raise Refusal(Status.INCONSISTENT, text)
