@@ -57,7 +57,7 @@ class ErrorFloors:
     defocus: float = 0.08  # per pixel of blur in all directions, which lets light from beside the tube leak in
     smear: float = 0.03  # per pixel of blur along the tube, from the lens or from motion
     coarse_edge: float = 0.07  # edges of frames whose chroma has fewer pixels than their luma (4:2:0 codecs)
-    line: float = 0.06  # offset of the line: light from one side moves the apparent middle of the tube
+    line: float = 0.04  # offset of the line: light from one side moves the apparent middle of the tube
     coarse_line: float = 0.17  # offset of the line in the same frames
 
 
