@@ -23,6 +23,8 @@ _ALIKE = 14  # largest difference of equal colours in each channel, in levels; s
 _DENSE = 0.35  # fraction of a colour in a tile and its neighbours above which the object is not thin
 _FEWEST = 6  # least number of coarse pixels of a part
 _TILES = 40  # largest number of parts of each colour that are used
+_CONTINUED = 480  # preference of parts that go on in another colour; as much as the most elongated part has
+_STRAIGHT = 0.95  # least cosine between the direction of parts and that from one to the next
 _CANDIDATES = 16  # largest number of lines whose labels are read
 _EVERY = 2  # distance of these labels along a line, in coarse pixels
 _LINES = 3  # largest number of lines that are returned
@@ -133,9 +135,29 @@ def _tiles(labels: np.ndarray, colours: int) -> _Tiles | None:
     root = np.sqrt((vx - vy) ** 2 / 4 + c * c)
     long, short = (vx + vy) / 2 + root, (vx + vy) / 2 - root
     worth = np.minimum(long / (short + 0.3), 20) * np.minimum(n, 2 * _TILE)
+    centre = mx + column * _TILE + 1j * (my + row * _TILE)
+    along = np.exp(0.5j * np.arctan2(2 * c, vx - vy))
+    if int(np.bincount(label).max()) > _TILES:
+        worth += _CONTINUED * _continued(label, row, column, centre, along)
     pick = np.concatenate([_most(np.where(label == colour, worth, -1.0), _TILES, 0.0) for colour in range(colours)])
-    centre = mx[pick] + column[pick] * _TILE + 1j * (my[pick] + row[pick] * _TILE)
-    return _Tiles(label[pick], n[pick].astype(np.float32), centre, np.exp(0.5j * np.arctan2(2 * c, vx - vy)[pick]))
+    return _Tiles(label[pick], n[pick].astype(np.float32), centre[pick], along[pick])
+
+
+def _continued(
+    label: np.ndarray, row: np.ndarray, column: np.ndarray, centre: np.ndarray, along: np.ndarray
+) -> np.ndarray:
+    """Whether each part [M] goes on, in its own direction, as a part of another colour, as bands do at their edges."""
+    height, width, colours = row.max() + 5, column.max() + 5, label.max() + 1
+    grid = np.full((colours, height, width), -1)
+    grid[label, row + 2, column + 2] = np.arange(len(label))
+    continued = np.zeros(len(label), dtype=bool)
+    for down, right, other in itertools.product(range(-2, 3), range(-2, 3), range(colours)):
+        near = grid[other, row + 2 + down, column + 2 + right]
+        one = np.flatnonzero((near >= 0) & (label != other))
+        gap = centre[near[one]] - centre[one]
+        straight = [np.abs((gap.conj() * along[some]).real) for some in (one, near[one])]
+        continued[one] |= np.minimum(*straight) > _STRAIGHT * np.abs(gap)
+    return continued
 
 
 def _most(worth: np.ndarray, count: int, least: float) -> np.ndarray:
