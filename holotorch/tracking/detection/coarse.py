@@ -22,7 +22,7 @@ _PATCH = 5  # side of the square whose median is the colour of the surroundings,
 _ALIKE = 14  # largest difference of equal colours in each channel, in levels; several times the noise
 _DENSE = 0.35  # fraction of a colour in a tile and its neighbours above which the object is not thin
 _FEWEST = 6  # least number of coarse pixels of a part
-_TILES = 40  # largest number of parts of each colour that are used
+_TILES = 80  # largest number of parts of each colour that are used
 _CONTINUED = 480  # preference of parts that go on in another colour; as much as the most elongated part has
 _STRAIGHT = 0.95  # least cosine between the direction of parts and that from one to the next
 _CANDIDATES = 16  # largest number of lines whose labels are read
@@ -147,12 +147,11 @@ def _continued(
     label: np.ndarray, row: np.ndarray, column: np.ndarray, centre: np.ndarray, along: np.ndarray
 ) -> np.ndarray:
     """Whether each part [M] goes on, in its own direction, as a part of another colour, as bands do at their edges."""
-    height, width, colours = row.max() + 5, column.max() + 5, label.max() + 1
-    grid = np.full((colours, height, width), -1)
-    grid[label, row + 2, column + 2] = np.arange(len(label))
+    grid = np.full((label.max() + 1, row.max() + 3, column.max() + 3), -1)
+    grid[label, row + 1, column + 1] = np.arange(len(label))
     continued = np.zeros(len(label), dtype=bool)
-    for down, right, other in itertools.product(range(-2, 3), range(-2, 3), range(colours)):
-        near = grid[other, row + 2 + down, column + 2 + right]
+    for down, right, other in itertools.product(range(3), range(3), range(len(grid))):
+        near = grid[other, row + down, column + right]
         one = np.flatnonzero((near >= 0) & (label != other))
         gap = centre[near[one]] - centre[one]
         straight = [np.abs((gap.conj() * along[some]).real) for some in (one, near[one])]
