@@ -58,7 +58,7 @@ class EdgeLimits:
     vague: float = 0.3  # deviation from which on an edge is not clear
     lost: float = 3.0  # deviation from which on there is no edge
     across: float = 0.25  # ratio of light's change beside and on an edge above which an object crosses the tube
-    same: float = 0.4  # the same ratio above which the bands continue beside the tube
+    same: float = 0.15  # the same ratio above which the bands continue beside the tube
     differs: float = 0.1  # least difference of the tube from both sides, as a fraction of the brighter light
     mostly: float = 0.8  # least fraction of the samples along an edge's window that differ where the tube is visible
     clear: float = 4.0  # least change of the background in standard deviations for the change to be significant
@@ -344,8 +344,9 @@ def _across(light: np.ndarray, along: np.ndarray, fit: EdgeFit) -> tuple[np.ndar
     """Whether the background changes at the edges, from ``fit`` and the background rows ``light`` [E, T, 6, C].
 
     ``along`` [E, T] are the positions of the samples relative to the edges. Returns [E] whether the background changes
-    on both sides, so that something lies across the tube; whether on one side, the background at all edges changes nearly
-    as much as the tube, still a few pixels away from it; and [E] the rms variation of the background along the tube as a fraction of the tube's change.
+    on both sides, so that something lies across the tube; whether on one side, and still a few pixels away, the
+    background at all edges changes like the tube; and [E] the rms variation of the background along the tube, as a
+    fraction of the tube's change.
     """
     count, samples, _, colours = light.shape
     light = light.reshape(count, samples, 2, 3, colours).astype(np.float64)

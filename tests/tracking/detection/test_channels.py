@@ -101,7 +101,8 @@ def test_a_catheter_whose_colours_tell_is_never_found_wrongly():
         frame = case.frame()
         right(tracker(frame[None])[0], case)
         for order in OTHERS:
-            refused(tracker(reordered(frame, order)[None])[0], Status.NO_CATHETER, Status.BANDS_MISSING)
+            pose = tracker(reordered(frame, order)[None])[0]
+            refused(pose, Status.NO_CATHETER, Status.BANDS_MISSING, Status.TOO_NARROW)
 
 
 def test_lengths_alone_do_not_tell():
