@@ -36,12 +36,26 @@ class ChannelOrderWarning(UserWarning):
     """The order of the channels is not stated, and frames in another order would show the catheter in another pose."""
 
 
-def need_frames(frames: Tensor) -> None:
-    """TypeError or ValueError unless ``frames`` is a tensor of uint8 [B, 3, H, W]."""
+def as_levels(frames: Tensor) -> Tensor:
+    """Frames uint8 [B, 3, H, W] as they are, and floating ones from 0 to 1, as kornia has them, as 8-bit levels.
+
+    Raises:
+        TypeError, ValueError: Another type, shape or range, or frames that require a gradient, which levels cut off.
+    """
     if not isinstance(frames, Tensor):
-        raise TypeError(f"frames must be a torch tensor, uint8 of shape [B, 3, H, W], got {type(frames).__name__}")
-    if frames.ndim != 4 or frames.shape[1] != 3 or frames.dtype != torch.uint8:
-        raise ValueError(f"frames must be uint8 of shape [B, 3, H, W], got {frames.dtype}, {list(frames.shape)}")
+        raise TypeError(f"frames must be a torch tensor of shape [B, 3, H, W], got {type(frames).__name__}")
+    if frames.ndim != 4 or frames.shape[1] != 3:
+        raise ValueError(f"frames must be of shape [B, 3, H, W], got {list(frames.shape)}")
+    if frames.dtype == torch.uint8:
+        return frames
+    if not frames.is_floating_point():
+        raise ValueError(f"frames must be uint8, or floating from 0 to 1, got {frames.dtype}")
+    if frames.requires_grad:
+        raise TypeError("frames that require a gradient cannot be tracked; refine their poses by PhotometricFit")
+    low, high = (float(value) for value in frames.aminmax()) if frames.numel() else (0.0, 0.0)
+    if not (low >= 0 and high <= 1):
+        raise ValueError(f"floating frames must be from 0 to 1, got {low:g} to {high:g}")
+    return (255 * frames).round().to(torch.uint8)
 
 
 def stated_order(channels: ChannelOrder | None, camera: Camera, catheter: Catheter) -> ChannelOrder:

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 import torch
 from scipy.special import chdtri
-from torch import Tensor
+from torch import Tensor, nn
 
 from holotorch.core import checks
 from holotorch.core.quantities import TOOL_DEVIATION
@@ -19,7 +19,7 @@ from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.camera.numpy_lens import Lens
 from holotorch.tracking.camera.strips import Line, Sampler
 from holotorch.tracking.detection.bands import Stretches
-from holotorch.tracking.detection.channels import ChannelOrder, need_frames, stated_order
+from holotorch.tracking.detection.channels import ChannelOrder, as_levels, stated_order
 from holotorch.tracking.detection.coarse import find_segments
 from holotorch.tracking.detection.colours import ColourTable
 from holotorch.tracking.detection.completion import complete_edges
@@ -95,7 +95,7 @@ _SIGNIFICANCE = 1e-3  # fraction of correct poses that the chi-square test of th
 _EXCHANGED = "a frame whose red and blue are exchanged looks so; state the order of its channels (ChannelOrder)"
 
 
-class CatheterTracker:
+class CatheterTracker(nn.Module):
     """Detects the bands of a catheter in frames and computes its pose from their edges.
 
     The tracker classifies every second pixel with a table of colours, proposes a few lines, and samples a strip of the
@@ -126,8 +126,8 @@ class CatheterTracker:
 
     Raises:
         TypeError, ValueError: ``most_sd`` is not positive, or the colours are grey, too similar, or the same from both
-            ends. In a call: the frames are not uint8 [B, 3, H, W], or their number differs from that of the previous
-            poses.
+            ends. In a call: the frames are not [B, 3, H, W], uint8 or floating from 0 to 1; they require a gradient; or
+            their number differs from that of the previous poses.
 
     Source: Chapter 3 of the thesis defines the task (coloured bands, one camera). The method differs from the thesis.
     """
@@ -141,6 +141,7 @@ class CatheterTracker:
         channels: ChannelOrder | None = None,
         stations: StationPlan = STATION_PLAN,
     ):
+        super().__init__()
         self.camera, self.catheter = camera, catheter
         self.most_sd = checks.quantity(TOOL_DEVIATION, most_sd, "most_sd")
         self.table = ColourTable(camera, catheter)
@@ -150,17 +151,21 @@ class CatheterTracker:
         self._chi_square_limits = _chi_square_limits(len(catheter.edges))
         self.times: dict[str, float] = {}
 
-    def __call__(self, frames: Tensor, previous: Sequence[Pose] | None = None) -> list[Pose]:
-        """Poses [B] of the catheter in frames uint8 [B, 3, H, W]; each frame is searched near its ``previous`` pose."""
-        need_frames(frames)
+    def forward(self, frames: Tensor, previous: Sequence[Pose] | Pose | None = None) -> list[Pose]:
+        """Poses [B] of the catheter in frames [B, 3, H, W], uint8 or floating from 0 to 1.
+
+        Each frame is searched near its ``previous`` pose, of a sequence or of a batch.
+        """
+        frames = as_levels(frames)
         self.camera.need_size(frames)
-        if isinstance(previous, Pose) or not all(isinstance(pose, Pose) for pose in previous or ()):
-            raise TypeError("previous must be a list with a Pose for each frame")
-        if previous is not None and len(previous) != len(frames):
-            raise ValueError(f"{len(frames)} frames take {len(frames)} previous poses, got {len(previous)}")
+        before = [None] * len(frames) if previous is None else list(previous)
+        if previous is not None and not all(isinstance(pose, Pose) for pose in before):
+            raise TypeError("previous must hold a Pose for each frame")
+        if len(before) != len(frames):
+            raise ValueError(f"{len(frames)} frames take {len(frames)} previous poses, got {len(before)}")
         frames = self.channels.to_rgb(frames)
         self.times = dict.fromkeys(("colour", "axis", "edges", "pose"), 0.0)
-        return [self._track(frame, previous[i] if previous else None) for i, frame in enumerate(frames)]
+        return [self._track(frame, pose) for frame, pose in zip(frames, before, strict=True)]
 
     def _track(self, frame: Tensor, before: Pose | None) -> Pose:
         height, width = frame.shape[-2:]

@@ -150,10 +150,10 @@ def test_tiny_frames_are_refused(shape):
 
 @pytest.mark.parametrize("shape", [(3, 64, 64), (1, 1, 64, 64), (1, 64, 64, 3)], ids=str)
 def test_what_is_no_frame_is_an_error(shape):
-    frames = [torch.zeros(1, 3, 64, 64, dtype=dtype) for dtype in (torch.float32, torch.int16)]
-    for wrong in (torch.zeros(shape, dtype=torch.uint8), *frames):
-        with pytest.raises(ValueError, match=r"uint8 of shape \[B, 3, H, W\], got"):
-            TRACKER(wrong)
+    with pytest.raises(ValueError, match=r"of shape \[B, 3, H, W\], got"):
+        TRACKER(torch.zeros(shape, dtype=torch.uint8))
+    with pytest.raises(ValueError, match="uint8, or floating from 0 to 1, got torch.int16"):
+        TRACKER(torch.zeros(1, 3, 64, 64, dtype=torch.int16))
 
 
 def test_as_many_poses_as_frames():

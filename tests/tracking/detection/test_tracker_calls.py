@@ -59,12 +59,33 @@ def test_a_pose_before_that_no_camera_sees_gets_a_refusal(name):
     refused(TRACKER(frame[None], [wrong])[0], Status.NO_AXIS, Status.BANDS_MISSING, Status.OUTSIDE_CAMERA)
 
 
-def test_one_pose_is_no_list_of_poses():
+def test_previous_poses_are_poses():
     _, frame = scenes()["plain"]
-    pose = TRACKER(frame[None])[0]
-    for wrong in (pose, ["x"], [None], "x"):
-        with pytest.raises(TypeError, match="previous must be a list with a Pose for each frame"):
+    for wrong in (["x"], [None], "x"):
+        with pytest.raises(TypeError, match="previous must hold a Pose for each frame"):
             TRACKER(frame[None], wrong)  # type: ignore[arg-type]
+
+
+def test_a_batch_of_previous_poses_is_its_poses():
+    frames = torch.stack([scenes()[name][1] for name in ("plain", "after")])
+    single = TRACKER(frames)
+    fields = ("tip", "direction", "covariance", "chi_square", "freedom")
+    stacked = (torch.stack([getattr(pose, name) for pose in single]) for name in fields)
+    batch = Pose(*stacked, status=tuple(pose.status for pose in single))  # type: ignore[arg-type]
+    for one, other in zip(TRACKER(frames, batch), TRACKER(frames, single), strict=True):
+        assert torch.equal(one.tip, other.tip) and one.answered
+
+
+def test_floating_frames_are_levels():
+    """As kornia has them: 0 to 1. A gradient would be cut off by the rounding, so it is refused by name."""
+    _, frame = scenes()["plain"]
+    assert isinstance(TRACKER, torch.nn.Module)
+    light = frame[None].float() / 255
+    assert torch.equal(TRACKER(light)[0].tip, TRACKER(frame[None])[0].tip)
+    with pytest.raises(TypeError, match="require a gradient .* PhotometricFit"):
+        TRACKER(light.requires_grad_())
+    with pytest.raises(ValueError, match="from 0 to 1, got 38 to 229"):
+        TRACKER(frame[None].float())
 
 
 @pytest.mark.parametrize(
@@ -72,7 +93,7 @@ def test_one_pose_is_no_list_of_poses():
 )
 def test_what_is_no_tensor_is_said_to_be_none(frames):
     name = type(frames).__name__
-    with pytest.raises(TypeError, match=rf"torch tensor, uint8 of shape \[B, 3, H, W\], got {name}"):
+    with pytest.raises(TypeError, match=rf"torch tensor of shape \[B, 3, H, W\], got {name}"):
         TRACKER(frames)
 
 

@@ -1,0 +1,64 @@
+"""Scenes of the second world that colours alone get wrong, all with seeds for tuning."""
+
+from dataclasses import replace
+
+import pytest
+
+from holotorch.tracking.detection.channels import ChannelOrder
+from holotorch.tracking.detection.tracker import CatheterTracker
+from holotorch.tracking.pose.catheter import THESIS
+from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.simulation.ray_camera import take
+from holotorch.tracking.simulation.varied import Trial, VariedWorld
+
+WORLD = VariedWorld()
+
+
+def tracked(trial: Trial) -> Pose:
+    return CatheterTracker(trial.camera, THESIS, channels=ChannelOrder.RGB)(trial.frame()[None])[0]
+
+
+@pytest.mark.parametrize(
+    ("seed", "condition"),
+    [
+        (3, "hue of band 2"),
+        (4, "hue of band 3"),
+        (14, "blood"),
+        (392, "monitor"),
+        (29, "skin on drape"),
+        (418, "coloured lights"),
+    ],
+    ids=[
+        "an inner edge on cloth in the colour of its band",
+        "an outer edge on cloth in the colour of its band",
+        "a stain beside an edge",
+        "more clutter in the colours of the bands than is searched",
+        "colours that put three edges in wrong places",
+        "colours that show one edge",
+    ],
+)
+def test_edges_that_colours_miss_are_measured_where_the_others_put_them(seed, condition):
+    trial = WORLD.trial(seed, condition)
+    pose = tracked(trial)
+    assert pose.status is Status.OK and float(pose.freedom) == 1, pose.reason
+    assert float((pose.tip - trial.tip).norm()) < 1e-3
+
+
+@pytest.mark.parametrize("seed", [39, 129, 344])
+def test_a_stick_with_one_band_of_another_length_is_refused(seed):
+    """Its outer edge is not seen by its colours; it is neither where the others put it, nor does anything hide it."""
+    pose = tracked(WORLD.negative(seed, "near miss"))
+    assert not pose.answered, pose.reason
+
+
+@pytest.mark.parametrize("seed", [68, 248, 328])
+def test_a_thicker_stick_is_refused_in_any_light(seed):
+    assert not tracked(WORLD.negative(seed, "thicker")).answered
+
+
+@pytest.mark.parametrize(("seed", "radius"), [(0, 0.4e-3), (1, 0.5e-3)])
+def test_a_thinner_stick_is_refused(seed, radius):
+    trial = WORLD.trial(seed, "clean")
+    shot = replace(trial.shot, catheter=replace(THESIS, radius=radius))
+    pose = CatheterTracker(trial.camera, THESIS, channels=ChannelOrder.RGB)(take(shot, seed)[None])[0]
+    assert not pose.answered
