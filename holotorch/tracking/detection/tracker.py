@@ -86,6 +86,7 @@ class SearchLimits:
     bulge_change: float = 0.1  # change of a ring's bulge above which the edges are measured again
     bulge_settled: float = 0.05  # change of a ring's bulge below which the pose is not computed again
     aside: float = 16.0  # largest distance of the tube, with its blur, from a segment of the search of a whole frame
+    vague: float = 5.0  # largest ratio of the deviations of two edges, if colours do not show all edges
     full: float = 0.8  # fraction of a band's length that shows its colour if the whole band is visible
     motion: float = 30.0  # largest motion of the catheter between two frames
 
@@ -366,9 +367,14 @@ class CatheterTracker(nn.Module):
                 expected = np.where(missing, self._expected_edges(line_pose, axis.line), edges.t)
                 doubtful = tuple((missing | np.array(stretches.doubtful)).tolist())
                 edges = measure_edges(sampler, lens, axis, expected, doubtful, edges.blur, curve)
-            missing = set(np.isnan(edges.t).nonzero()[0].tolist()) - {*edges.outside}
-            if absent := missing if completed else edges.absent:
-                text = f"edge {min(absent)} is not where the others put it, and nothing hides it"
+        if completed or missing.any():
+            # Of edges that colours do not show, one that is far less clear than the others is something else.
+            vague = edges.deviation > _SEARCH.vague * edges.deviation.min()
+            absent = vague & ~np.isin(np.arange(len(vague)), edges.outside)
+            if not completed:
+                absent &= np.isfinite(edges.t) | np.isin(np.arange(len(vague)), edges.absent)
+            if absent.any():
+                text = f"edge {absent.argmax()} is not where the others put it, and nothing hides it"
                 raise Refusal(Status.INCONSISTENT, text)
         with self._timed("pose"):
             line_pose = self._solved(axis, edges)
