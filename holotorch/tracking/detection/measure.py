@@ -224,14 +224,8 @@ def measure_edges(
         if coarse:
             fit, shading = fit_luma(fit, light, shown, sampler.light, along)
         elif bool((fit.deviation > _LIMITS.unsure).any()) and not _astray(fit, looks):
-            # Light of an uneven background leaks into the outer rows, so that the middle rows alone may fit better.
-            core = weight * (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)[:, None, :, None]
-            fit = fit.or_better(fit_edges(light, core, blur, t=along))
-            if bool((fit.deviation > _LIMITS.unsure).any()):
-                # A stain or a shadow on the tube is a second edge in the window of an edge beside it.
-                close = (np.abs(along) <= _WINDOW.close + 2 * blur)[:, None, None]
-                fit = fit.or_better(fit_edges(light, weight * close, blur, t=along))
-            shading = fit
+            core = (widths[:, None] / 2 - 0.5 - np.abs(u)).clip(0, 1)
+            fit = shading = _refitted(fit, light, weight, blur, along, core)
         near = near + fit.place
         if not _astray(fit, looks):
             break
@@ -258,6 +252,22 @@ def measure_edges(
     return Edges(
         t, deviation, soft, blur, float(np.abs(bulge).max()), coarse, texture, *map(tuple, (hidden, outside, absent))
     )
+
+
+def _refitted(
+    fit: EdgeFit, light: np.ndarray, weight: np.ndarray, blur: float, along: np.ndarray, core: np.ndarray
+) -> EdgeFit:
+    """For each unsure edge the best of the ``fit``, one of the middle rows, and one of the samples near the edge.
+
+    Arguments as for :func:`fit_edges`; ``core`` [E, U] are the weights of the middle rows.
+    """
+    # Light of an uneven background leaks into the outer rows.
+    fit = fit.or_better(fit_edges(light, weight * core[:, None, :, None], blur, t=along))
+    if bool((fit.deviation > _LIMITS.unsure).any()):
+        # A stain or a shadow on the tube is a second edge in the window of an edge beside it.
+        close = (np.abs(along) <= _WINDOW.close + 2 * blur)[:, None, None]
+        fit = fit.or_better(fit_edges(light, weight * close, blur, t=along))
+    return fit
 
 
 def _shows_tube(tube: np.ndarray, beside: np.ndarray) -> bool:
