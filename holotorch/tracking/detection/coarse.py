@@ -154,8 +154,8 @@ def _continued(
         near = grid[other, row + down, column + right]
         one = np.flatnonzero((near >= 0) & (label != other))
         gap = centre[near[one]] - centre[one]
-        straight = [np.abs((gap.conj() * along[some]).real) for some in (one, near[one])]
-        continued[one] |= np.minimum(*straight) > _STRAIGHT * np.abs(gap)
+        own, others = (np.abs(np.real(gap.conj() * along[some])) for some in (one, near[one]))
+        continued[one] |= np.minimum(own, others) > _STRAIGHT * np.abs(gap)
     return continued
 
 

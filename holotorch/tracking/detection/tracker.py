@@ -256,19 +256,19 @@ class CatheterTracker(nn.Module):
 
     def _measured(self, sampler: Sampler, line: Line, stretches: Stretches) -> Pose:
         """Pose from the bands on ``line``; from the two surest edges where colours put the others in wrong places."""
-        given = ""
+        earlier = None
         if stretches.known > 2:
             try:
                 return self._along(sampler, line, stretches, None)
             except Refusal as refusal:
                 if refusal.final or self._rough(line, stretches.edges):
                     raise
-                status, given = refusal.status, refusal.reason
+                earlier = refusal.status, refusal.reason
         try:
             return self._along(sampler, *self._completed(sampler, line, stretches), None, completed=True)
         except Refusal as refusal:
-            if given and not refusal.final:
-                raise Refusal(status, given) from None
+            if earlier and not refusal.final:
+                raise Refusal(*earlier) from None
             raise
 
     def _completed(self, sampler: Sampler, line: Line, stretches: Stretches) -> tuple[Line, Stretches]:
