@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
@@ -18,23 +18,32 @@ from holotorch.tracking.pose.catheter import Catheter
 class FitPlan:
     """Size of the windows, and the model of their light. Lengths in pixels unless said otherwise."""
 
-    along: int = 12  # pixels to each side of an edge, along the image axis nearer to the tube's direction
+    along: int = 10  # pixels to each side of an edge, along the image axis nearer to the tube's direction
     widest: int = 30  # most pixels to each side of the tube's axis, along the other image axis
-    beside: float = 3.5  # background beside the tube that counts: more of it helps no more and is less uniform
+    beside: float = 3.0  # background beside the tube that counts: more of it helps no more and is less uniform
     degree: int = 4  # degree of the shading across the tube: the blur hides higher ones up to a width of ten pixels
     nodes: int = 12  # nodes of the quadrature over the tube's width
     times: int = 8  # nodes of the quadrature over the time of exposure
     blur: float = 0.75  # blur to begin with, standard deviation: that of a focused camera
-    moving: float = 0.9
+    moving: float = 10.0
+    stretch: float = 1.2
+    wide: float = 0.95
     evidence: float = 150.0
     blur_spread: float = 0.5  # standard deviation of the logarithm of a blur before it is measured
     clear: float = 0.6  # share of the background in the light of a clear tube
-    chroma: float = 0.05
+    chroma: float = 0.15
+    fine: float = 0.65
+    smeared: float = 2.0
+    margin: float = 8.0
+    grain_floor: float = 1.0
+    inconsistent: float = 12.0
+    moving_floor: float = 0.01
+    blur_floor: float = 0.03
     edge_floor: float = 0.012
     outer_floor: float = 0.02
     axis_floor: float = 0.07
-    coarse_floor: float = 0.05
-    dark: float = 0.02
+    coarse_floor: float = 0.06
+    dark: float = 0.01
     step: float = 2.0  # most pixels that a step moves an edge
     reach: float = 6.0  # farthest that an edge may be from where the rough pose shows it
     iterations: int = 20  # most Gauss-Newton steps
@@ -151,6 +160,7 @@ class _Linear:
     mixes: Tensor | None
     misfit: Tensor  # [B, N]
     objective: Tensor  # [B]
+    grain: Tensor  # [B, N]
 
 
 class PhotometricFit(nn.Module):
@@ -236,17 +246,20 @@ class PhotometricFit(nn.Module):
         unknown = frame.middle.new_zeros(len(tip), 6 + 2 * len(self.positions))
         unknown[:, 5] = math.log(plan.blur)
         frame, unknown, settled = self._settled(frame, unknown, windows, False)
-        fits = [((~coarse).nonzero()[:, 0], frame.take(~coarse), unknown[~coarse], settled[~coarse], False)]
+        moving = ~coarse & (self._stretched(frame, unknown, windows) | (unknown[:, 5] > math.log(plan.wide)))
+        fits = []
+        if bool(moving.any()):
+            where = moving.nonzero()[:, 0]
+            *found, better = self._moving(frame.take(where), unknown[where], windows.take(where))
+            better = better & ~self._smeared(*found[:2], windows.take(where))
+            fits.append((where[better], *(part.take(better) for part in found[:1]), *(part[better] for part in found[1:]), False))
+            moving = moving.index_put((where,), better)
+        coarse = coarse | (~moving & self._smeared(frame, unknown, windows))
+        still = ~moving & ~coarse
+        fits.append((still.nonzero()[:, 0], frame.take(still), unknown[still], settled[still], False))
         if bool(coarse.any()):
             where = coarse.nonzero()[:, 0]
             fits.append((where, *self._settled(frame.take(where), unknown[where], windows.take(where), True), True))
-        where, frame, unknown, settled, _ = fits[0]
-        blurred = unknown[:, 5] > math.log(plan.moving)
-        if bool(blurred.any()):
-            moved = self._moving(frame.take(blurred), unknown[blurred], windows.take(where[blurred]))
-            better = blurred.index_put((blurred,), moved[-1])
-            fits[0] = (where[~better], frame.take(~better), unknown[~better], settled[~better], False)
-            fits.append((where[better], *(part.take(moved[-1]) if isinstance(part, _Items) else part[moved[-1]] for part in moved[:-1]), False))
         return [fit for fit in fits if len(fit[0])]
 
     def _moving(self, frame: _Frame, unknown: Tensor, windows: _Windows) -> tuple[_Frame, Tensor, Tensor, Tensor]:
@@ -314,30 +327,60 @@ class PhotometricFit(nn.Module):
             miss = (across * tip[:, None, None]).sum(-1) / across.norm(dim=-1)
             depth = (tip[:, None] + self.positions[:, None] * direction[:, None]).norm(dim=-1)[..., None]
             near = miss.abs() < self.radius + self.plan.beside * depth * angle
-        return _Windows(rays.mT.contiguous(), angle, light, (inside & near).double())
+        # An edge counts if all of the frame around it is there; a saturated pixel does not.
+        clear = (levels < _WHITE).all(2)
+        x, y = pixels[:, :, pixels.shape[2] // 2].unbind(-1)
+        margin = torch.minimum(torch.minimum(x, width - 1 - x), torch.minimum(y, height - 1 - y))
+        within = (margin >= self.plan.margin)[..., None]
+        return _Windows(rays.mT.contiguous(), angle, light, (inside & near & clear & within).double())
 
     def _coarse(self, frames: Tensor, pixels: Tensor) -> Tensor:
-        """[B] whether chroma has a lower resolution than luma around the first or the last edge.
+        """[B] whether red minus luma has less fine detail than luma around an edge: chroma at half resolution.
 
-        The test is that of :func:`holotorch.tracking.detection.luma.coarse_colours`.
+        With independent noise in each channel it has 1.4 times as much, and a grey texture adds to luma alone.
         """
         height, width = frames.shape[-2:]
         if min(height, width) < _PATCH:
             return torch.zeros(len(frames), dtype=torch.bool, device=frames.device)
-        middle = pixels[:, [0, -1], pixels.shape[2] // 2]
+        middle = pixels[:, :, pixels.shape[2] // 2]
         corner = (middle - _PATCH // 2).clamp(min=0).minimum(middle.new_tensor([width - _PATCH, height - _PATCH]))
         i = torch.arange(_PATCH, dtype=pixels.dtype, device=pixels.device)
         square = torch.stack(torch.broadcast_tensors(i, i[:, None]), -1).flatten(0, 1)
         levels = _levels(frames, corner[:, :, None] + square).double().unflatten(-1, (_PATCH, _PATCH))
-        luma = (levels * levels.new_tensor(_LUMA)[:, None, None]).sum(2)
+        luma = (levels * levels.new_tensor(_CODES[0])[:, None, None]).sum(2)
         both = torch.stack([luma, levels[:, :, 0] - luma])
-        step = both.diff(dim=-1)
-        bent, red = (part.abs().flatten(-2).median(-1).values for part in step.diff(dim=-1))
-        even, odd, fine = (
-            part.abs().flatten(-2).median(-1).values for part in (step[1, ..., ::2], step[1, ..., 1::2], step[0])
+        luma, red = both.diff(n=2, dim=-1).diff(n=2, dim=-2).abs().flatten(-2).median(-1).values
+        return (red < self.plan.fine * luma).any(-1)
+
+    def _smeared(self, frame: _Frame, unknown: Tensor, windows: _Windows) -> Tensor:
+        """[B] whether chroma fits worse than luma near the edges between bands: JPEG at half resolution of chroma."""
+        place, tube = self._model(frame, unknown, windows)
+        fitted = (windows.light - self._linear(tube, windows, False).residual).clamp(2e-3, 0.98)
+        levels = self.camera.levels(windows.light) - self.camera.levels(fitted)
+        square = torch.einsum("ec,bncp->bnep", levels.new_tensor(_CODES), levels).square()
+        near = tube.gradient.abs() * _GRADIENT * place.ratio < 2.5 * place.pixels
+        weight = windows.mask * (1 - tube.texture) * near
+        luma, *chroma = (square * weight[:, :, None])[:, 1:-1].sum((1, 3)).unbind(-1)
+        return sum(chroma) / 2 > self.plan.smeared * luma
+
+    def _stretched(self, frame: _Frame, unknown: Tensor, windows: _Windows) -> Tensor:
+        """[B] whether another blur along the tube than across it fits better: a motion during the exposure."""
+        plan = self.plan
+        round_, *others = (
+            self._linear(self._model(frame, unknown, windows, stretch)[1], windows, False).objective
+            for stretch in (1.0, plan.stretch, 1 / plan.stretch)
         )
-        shared = torch.minimum(even, odd) < _SHARED * torch.minimum(torch.maximum(even, odd), fine)
-        return (shared | (red < _SHARED * bent)).any(-1)
+        return torch.stack(others).amin(0) < round_ - plan.moving
+
+    def _model(
+        self, frame: _Frame, unknown: Tensor, windows: _Windows, stretch: float = 1.0
+    ) -> tuple["_Geometry", "_Tube"]:
+        """Geometry and light of the tube; ``stretch`` is the ratio of the blurs along the tube and across it."""
+        place = _Geometry.of(frame, unknown, windows)
+        if stretch != 1:
+            place = replace(place, blur=place.blur / math.sqrt(stretch), ratio=place.ratio / stretch)
+        edge = (self.positions - (self.positions[0] + self.positions[-1]) / 2)[:, None]
+        return place, _Tube.of(place, unknown, self.radius, edge, self.plan)
 
     def _settled(
         self, frame: _Frame, unknown: Tensor, windows: _Windows, coarse: bool
@@ -391,9 +434,7 @@ class PhotometricFit(nn.Module):
         logarithm of the blur and, with D = 8, the motion during the exposure along and across the tube in pixels.
         """
         plan = self.plan
-        place = _Geometry.of(frame, unknown, windows)
-        edge = (self.positions - (self.positions[0] + self.positions[-1]) / 2)[:, None]
-        tube = _Tube.of(place, unknown, self.radius, edge, plan)
+        place, tube = self._model(frame, unknown, windows)
         size = unknown.shape[1] - 2 * len(self.positions)
         fit = self._linear(tube, windows, coarse)
         changes = tube.changes(place, fit.colours, size)  # [B, N, 3, D + 2, P]
@@ -413,7 +454,7 @@ class PhotometricFit(nn.Module):
             score = score.unflatten(-1, (3, -1)).sum(-2)
         trust = used / _correlation(score, 2 * plan.along + 1)
         blocks, sides = blocks * trust[..., None, None], sides * trust[..., None]
-        floor = self._floor(place, unknown, coarse)
+        floor = self._floor(place, unknown, fit.grain, coarse)
         normal, right = _assembled(blocks, sides)
         prior, start = torch.zeros_like(unknown), torch.zeros_like(unknown)
         prior[:, 5], start[:, 5] = plan.blur_spread**-2, math.log(plan.blur)
@@ -455,6 +496,11 @@ class PhotometricFit(nn.Module):
             tone = self.camera.linear(level + 0.5) - self.camera.linear(level - 0.5)
         rounding = _ROUNDING * tone**2 / noise.mean(-1)
         own, other = variance(equal * (1 - texture)), variance(equal * texture)  # of the tube, and of what is behind
+        # Changes of light across the edge, and of the texture that shows through.
+        step = colours[..., plan.degree + 1] - colours[..., 0]
+        stripes = (equal * texture)[:, :, None], (equal * (1 - texture))[:, :, None]
+        grain, noise_square = ((one * square).sum(-1) / one.sum(-1).clamp(min=1) for one in stripes)
+        grain = ((grain - noise_square).sum(-1).clamp(min=0) / step.square().sum(-1).clamp(min=1e-9)).clamp(1e-12, 100).sqrt()
         ratio = (other / own).log().mean(-1, keepdim=True).exp()
         spread = own[..., None] * noise * (1 - texture + texture * ratio)[:, :, None]
         weight = equal[:, :, None] / spread
@@ -463,7 +509,7 @@ class PhotometricFit(nn.Module):
         colours = colours if not coarse else colours[:, :, 0].unflatten(-1, (3, -1))
         objective = 0.5 * (equal[:, :, None] * spread.log()).sum((1, 2, 3))
         misfit = (equal[:, :, None] * square).sum(-1) / equal.sum(-1, keepdim=True).clamp(min=1) / tone**2
-        return _Linear(design, data, weight, colours, factor, heavy, residual, mixes, misfit.mean(-1), objective)
+        return _Linear(design, data, weight, colours, factor, heavy, residual, mixes, misfit.mean(-1), objective, grain)
 
     def _codes(self, basis: Tensor, light: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Design [B, N, 3 P, 3 K] and data [B, N, 1, 3 P] of luma and chroma, and their derivatives [B, N, 3, 3, P].
@@ -482,15 +528,21 @@ class PhotometricFit(nn.Module):
         design = torch.einsum("bnecp,bnpk->bnepck", mixes, basis).flatten(4).flatten(2, 3)
         return design, data.flatten(2)[:, :, None], mixes
 
-    def _floor(self, place: "_Geometry", unknown: Tensor, coarse: bool) -> Tensor:
+    def _floor(self, place: "_Geometry", unknown: Tensor, grain: Tensor, coarse: bool) -> Tensor:
         """Standard deviations of the errors of each edge along and across the tube that no noise explains, [B, N, 2]."""
         plan, count = self.plan, len(self.positions)
         outer = torch.tensor([n in (0, count - 1) for n in range(count)], device=unknown.device)
-        along = torch.where(outer, plan.outer_floor, plan.edge_floor)
+        along = torch.where(outer, plan.outer_floor**2 + (plan.grain_floor * (not coarse) * grain).square(), plan.edge_floor**2)
+        across = torch.full_like(along, plan.axis_floor**2)
         if coarse:
-            along = along + plan.coarse_floor
-        across = torch.full_like(along, plan.axis_floor + coarse * plan.coarse_floor)
-        return torch.stack([place.pixel / place.sine * along, place.pixel * across], -1)
+            along, across = along + plan.coarse_floor**2, across + plan.coarse_floor**2
+        defocus = (plan.blur_floor * (unknown[:, 5:6].exp() - plan.blur).clamp(min=0)).square()
+        along, across = along + defocus, across + 9 * defocus
+        if unknown.shape[1] - 2 * count > 6:
+            motion = (plan.moving_floor * unknown[:, 6:8]).square().sum(-1, keepdim=True)
+            along, across = along + motion, across + motion
+        scale = torch.stack([place.pixel / place.sine, place.pixel], -1)
+        return scale * torch.stack([along, across], -1).sqrt()
 
     def _answer(
         self, frame: _Frame, unknown: Tensor, windows: _Windows, state: _Equations, settled: Tensor
@@ -506,6 +558,8 @@ class PhotometricFit(nn.Module):
         covariance = lever @ torch.linalg.inv_ex(state.normal)[0] @ lever.mT
         shift = unknown[:, -2 * len(self.positions) :: 2]
         deviation = (1 / state.blocks[..., -2, -2].clamp(min=1e-30) + state.floor[..., 0] ** 2).sqrt()
+        lost = (shift / deviation).square().sum(-1) > self.plan.inconsistent
+        settled = settled & ~lost
         lost = torch.where(settled, 0.0, torch.nan)[:, None]
         return PhotometricPose(
             tip + lost, direction + lost, covariance + lost[..., None], rest[:, 5].exp(), state.misfit, shift, deviation, state.used
@@ -514,10 +568,9 @@ class PhotometricFit(nn.Module):
 
 _GRADIENT = 0.01  # metres along the tube over which a background changes by its coefficient
 _ROUNDING = 1 / 12  # levels^2: the noise of rounding to whole levels
-_LUMA = (0.299, 0.587, 0.114)  # weights of red, green and blue levels in luma (ITU-R BT.601)
 _CODES = ((0.299, 0.587, 0.114), (-0.169, -0.331, 0.5), (0.5, -0.419, -0.081))  # Y, Cb, Cr of red, green, blue levels
+_WHITE = 254.0  # level from which a pixel may be saturated
 _PATCH = 24  # side in pixels of the patches in which the resolution of chroma is estimated
-_SHARED = 0.6  # ratio of changes of red minus luma to changes of luma below which chroma is coarse
 
 
 @dataclass(frozen=True, eq=False)
