@@ -1,51 +1,53 @@
 """Pose of a catheter from the pixels around its band edges: a differentiable fit of a rendered cylinder to a frame."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from holotorch.core import checks
 from holotorch.tracking.camera.camera import Camera
+from holotorch.tracking.detection.tube_light import GRADIENT, SHARED, Frame, Items, TubeGeometry, TubeLight, Windows
 from holotorch.tracking.pose.catheter import Catheter
 
 
 @dataclass(frozen=True)
 class FitPlan:
-    """Size of the windows, and the model of their light. Lengths in pixels unless said otherwise."""
+    """Size of the windows, models of light and errors, and limits of the search. Lengths in pixels unless said otherwise.
+
+    The floors are the errors that remain with little noise, measured on seeds 0 to 119 and 240 to 479 of VariedWorld.
+    """
 
     along: int = 10  # pixels to each side of an edge, along the image axis nearer to the tube's direction
     widest: int = 30  # most pixels to each side of the tube's axis, along the other image axis
     beside: float = 3.0  # background beside the tube that counts: more of it helps no more and is less uniform
-    degree: int = 4  # degree of the shading across the tube: the blur hides higher ones up to a width of ten pixels
+    margin: float = 8.0  # least distance of an edge from the border of the frame: its window must show both sides
+    degree: int = 4  # degree of the shading across the tube: higher ones leave the position across less certain
     nodes: int = 12  # nodes of the quadrature over the tube's width
-    times: int = 8  # nodes of the quadrature over the time of exposure
+    times: int = 8  # nodes of the quadrature over the time of exposure, where the tube moves
     blur: float = 0.75  # blur to begin with, standard deviation: that of a focused camera
-    moving: float = 10.0
-    stretch: float = 1.2
-    wide: float = 0.95
-    evidence: float = 150.0
     blur_spread: float = 0.5  # standard deviation of the logarithm of a blur before it is measured
     clear: float = 0.6  # share of the background in the light of a clear tube
-    chroma: float = 0.15
-    fine: float = 0.65
-    smeared: float = 2.0
-    margin: float = 8.0
-    grain_floor: float = 1.0
-    inconsistent: float = 12.0
-    moving_floor: float = 0.01
-    blur_floor: float = 0.03
-    edge_floor: float = 0.012
-    outer_floor: float = 0.02
-    axis_floor: float = 0.07
-    coarse_floor: float = 0.06
-    dark: float = 0.01
+    dark: float = 0.01  # light, 0 to 1, whose shot noise is as large as the noise of reading the sensor
+    fine: float = 0.65  # ratio of fine detail in red minus luma to that in luma below which chroma is coarse
+    smeared: float = 2.0  # ratio of the squared residuals of chroma to those of luma above which chroma is coarse
+    chroma: float = 0.15  # weight of a level of coarse chroma relative to luma: enough to tell the colours apart
+    stretch: float = 1.2  # ratio of the blurs along and across the tube that is tried to find a motion
+    stretch_gain: float = 10.0  # log-likelihood that this must gain before a fit with a motion is tried
+    wide: float = 0.95  # blur above which a fit with a motion is tried, too
+    motion_gain: float = 150.0  # log-likelihood that a motion must gain; defocus alone gains up to 110
+    edge_floor: float = 0.012  # error of an inner edge along the tube: shading and sampling
+    outer_floor: float = 0.02  # error of an outer edge along the tube: what shows through the clear tube
+    grain_floor: float = 1.0  # error of an outer edge per ratio of the texture behind it to the step at the edge
+    axis_floor: float = 0.07  # error of the axis across: shading of higher degree
+    coarse_floor: float = 0.06  # additional error of edge and axis where chroma is coarse
+    blur_floor: float = 0.03  # additional error of an edge per pixel of blur above ``blur``; 3 times that of the axis
+    motion_floor: float = 0.01  # additional error of edge and axis per pixel of motion
+    readout: float = 0.0  # metres, standard deviation of the motion while a rolling shutter reads a frame; 0: global
     step: float = 2.0  # most pixels that a step moves an edge
-    reach: float = 6.0  # farthest that an edge may be from where the rough pose shows it
+    reach: float = 6.0  # farthest that an edge may be from where the rough pose shows it: the window must show it
+    inconsistent: float = 12.0  # sum of the squares of shifts over their deviations above which the edges disagree
     iterations: int = 20  # most Gauss-Newton steps
     settled: float = 0.1  # step in standard deviations of the result below which a fit ends
 
@@ -55,12 +57,12 @@ class PhotometricPose:
     """Fitted poses of B frames, with what each of the N edges says about them.
 
     Attributes:
-        tip, direction: [B, 3], in metres; unit vectors from the tip to the rear.
+        tip, direction: [B, 3], in metres; unit vectors from the tip to the rear. NaN where the fit has not converged.
         covariance: [B, 6, 6] of tip and direction.
         blur: [B] standard deviation of the point spread, in pixels.
-        misfit: [B, N] mean squared residual of each edge's window relative to noise of one level.
-        shift: [B, N] of each edge along the tube relative to the fitted pose, in metres, if it alone were free.
-        shift_sd: [B, N] its standard deviation.
+        misfit: [B, N] mean squared residual of each edge's window in squared levels.
+        shift: [B, N] of each edge along the tube relative to the fitted pose, in metres.
+        shift_sd: [B, N] standard deviation of this shift, had the pose not been fitted to the edge.
         used: [B, N] whether the edge's window is on the frame.
     """
 
@@ -84,83 +86,65 @@ class PhotometricPose:
 
 
 @dataclass(frozen=True, eq=False)
-class _Items:
-    """Tensors of which the first axis counts the items of a batch."""
+class _Fit(Items):
+    """Fits of B frames: unknowns relative to ``frame``, whether they have converged, negative log-likelihood [B]."""
 
-    def take(self, index: Tensor):
-        return type(self)(*(getattr(self, field.name)[index] for field in fields(self)))
+    frame: Frame
+    unknown: Tensor
+    converged: Tensor
+    loss: Tensor
 
-
-@dataclass(frozen=True, eq=False)
-class _Windows(_Items):
-    """Pixels of B x N windows of P = I x J pixels, I along the tube.
-
-    Attributes:
-        rays: [B, N, 3, P] unit vectors.
-        angle: [B, N, P] radians per pixel.
-        light: [B, N, 3, P].
-        mask: [B, N, P] 1 for pixels that count, else 0.
-    """
-
-    rays: Tensor
-    angle: Tensor
-    light: Tensor
-    mask: Tensor
-
-
-@dataclass(frozen=True, eq=False)
-class _Frame(_Items):
-    """Coordinates in which a pose is corrected: middle of the bands, axis, and unit vectors [B, 3].
-
-    ``side`` is perpendicular to axis and line of sight, ``front`` to axis and side, and ``sight`` points at the middle.
-    """
-
-    middle: Tensor
-    axis: Tensor
-    side: Tensor
-    front: Tensor
-    sight: Tensor
-
-
-@dataclass(frozen=True, eq=False)
-class _Equations:
-    """Normal equations of B fits of D unknowns, and what each of N windows adds to them.
-
-    Attributes:
-        normal, right: [B, D, D] and [B, D].
-        blocks, sides: [B, N, D + 2, D + 2] and [B, N, D + 2]; the last two unknowns are the shifts of this window's edge
-            along the tube and of its axis across.
-        misfit: [B, N] mean squared residual, in levels squared.
-        used: [B, N] whether the window counts.
-        floor: [B, N, 2] standard deviations of the last two unknowns in metres.
-        objective: [B] negative logarithm of the likelihood, up to a constant.
-    """
-
-    normal: Tensor
-    right: Tensor
-    blocks: Tensor
-    sides: Tensor
-    misfit: Tensor
-    used: Tensor
-    floor: Tensor
-    objective: Tensor
+    def take(self, index: Tensor) -> "_Fit":
+        return _Fit(self.frame.take(index), self.unknown[index], self.converged[index], self.loss[index])
 
 
 @dataclass(frozen=True, eq=False)
 class _Linear:
-    """Fit of the linear unknowns of B x N windows with C independent channels of P samples and K unknowns each."""
+    """Fit of the linear unknowns of B x N windows with C independent channels of P samples and K unknowns each.
 
-    design: Tensor  # [B, N, P, K]
-    data: Tensor  # [B, N, C, P]
-    weight: Tensor  # [B, N, C, P]
-    colours: Tensor  # [B, N, 3, K]
-    factor: Tensor  # [B, N, C, K, K]
-    heavy: Tensor  # [B, N, C, P, K]
-    residual: Tensor  # [B, N, C, P]
+    Attributes:
+        design: [B, N, K, P].
+        weight, residual: [B, N, C, P].
+        heavy: [B, N, C, K, P] weighted design.
+        factor: [B, N, C, K, K] Cholesky factor of the normal matrix.
+        colours: [B, N, 3, K].
+        mixes: [B, N, 3, 3, P] derivatives of the samples of one channel by red, green and blue light, or None.
+        misfit: [B, N] mean squared residual in squared levels.
+        grain: [B, N] texture behind the tube relative to the step of light at the edge.
+        loss: [B] negative log-likelihood, up to a constant.
+    """
+
+    design: Tensor
+    weight: Tensor
+    residual: Tensor
+    heavy: Tensor
+    factor: Tensor
+    colours: Tensor
     mixes: Tensor | None
-    misfit: Tensor  # [B, N]
-    objective: Tensor  # [B]
-    grain: Tensor  # [B, N]
+    misfit: Tensor
+    grain: Tensor
+    loss: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """Normal equations of B fits of D + 2 N unknowns, of which the last are two for each of N windows.
+
+    Attributes:
+        normal, right: [B, D + 2 N, D + 2 N] and [B, D + 2 N].
+        information: [B, N] of the shift of each edge along the tube.
+        floor: [B, N, 2] prior standard deviations of each window's shifts along and across, in metres.
+        used: [B, N] whether the window counts.
+        misfit, loss: As in :class:`_Linear`.
+    """
+
+    normal: Tensor
+    right: Tensor
+    information: Tensor
+    floor: Tensor
+    used: Tensor
+    misfit: Tensor
+    loss: Tensor
 
 
 class PhotometricFit(nn.Module):
@@ -170,14 +154,15 @@ class PhotometricFit(nn.Module):
     backgrounds. Position, direction and blur are found by Gauss-Newton steps with an analytic Jacobian; all colours and
     the shading across the tube are linear and are eliminated in each step (variable projection). The cylinder is exact
     in the space of rays, so that the rings' curvature and the lens's distortion need no correction, and pixels are used
-    as they are, without interpolation.
+    as they are, without interpolation. Each window may shift a little on its own: by what no noise explains.
+
+    The noise is estimated from the residuals: of each channel, of the tube and of the background apart, and as far as
+    the residuals of neighbouring pixels agree. Where chroma has a lower resolution than luma (4:2:0 video, JPEG), luma
+    is fitted. Where another blur along the tube than across it fits better, a uniform motion during the exposure is
+    tried. A rolling shutter cannot be told from another pose: state ``readout`` in the plan.
 
     The result is differentiable with respect to the frames, the camera and the catheter, by the implicit function
     theorem at the optimum.
-
-    The model has one blur in all directions and full resolution of the colours: motion of more than about a pixel,
-    chroma at half resolution (4:2:0) and textures as fine as the tube bias the pose by more than its covariance says.
-    ``misfit`` is high where the light does not fit.
 
     Args:
         camera: Intrinsics and tone curve.
@@ -204,7 +189,10 @@ class PhotometricFit(nn.Module):
                 self.register_buffer(name, value)
 
     def forward(self, frames: Tensor, tip: Tensor, direction: Tensor) -> PhotometricPose:
-        """Fit poses near those given; NaN where fewer than three windows are on the frame, or where the fit diverges.
+        """Fit poses near those given.
+
+        Poses are NaN where fewer than three windows are on the frame, where the fit does not converge or ends far from
+        the given pose, and where the edges disagree.
 
         Args:
             frames: uint8 [B, 3, H, W], or floating with levels from 0 to 1; RGB.
@@ -223,68 +211,99 @@ class PhotometricFit(nn.Module):
             usable = (self._freedom(windows) > 0).sum(-1) >= 3
             if not bool(usable.all()):
                 return self(frames[usable], tip[usable], direction[usable]).scattered(usable)
-            coarse = self._coarse(frames, pixels)
-            fits = self._fits(windows, tip, direction, coarse)
+            start = Frame.of(tip + self._middle() * direction, direction)
+            groups = self._fits(start, windows, self._coarse(frames, pixels))
         trainable = (frames, self.camera.matrix, self.camera.distortion, self.positions, self.radius)
         implicit = torch.is_grad_enabled() and any(one.requires_grad for one in trainable)
         if implicit:
             windows = self._windows(frames, pixels, tip, direction)
-        parts = []
-        for where, frame, unknown, settled, rough in fits:
-            own = windows.take(where)
+        poses = []
+        for where, fit, coarse in groups:
+            own, unknown = windows.take(where), fit.unknown
             if implicit:
-                unknown = self._implicit(frame, unknown, own, rough)
-            state = self._equations(frame, unknown, own, rough)
-            parts.append((where, self._answer(frame, unknown, own, state, settled & self._within(frame, tip[where], direction[where]))))
-        return _merged(parts, len(tip))
+                unknown = self._implicit(fit.frame, unknown, own, coarse)
+            state = self._equations(fit.frame, unknown, own, coarse)
+            known = fit.converged & self._within(fit.frame, start.take(where))
+            poses.append(self._answer(fit.frame, unknown, state, known, frames.shape[-2]))
+        order = torch.cat([where for where, _, _ in groups] or [torch.zeros(0, dtype=torch.long)]).argsort()
+        return _joined(poses, order)
 
-    def _fits(self, windows: _Windows, tip: Tensor, direction: Tensor, coarse: Tensor):
-        """Settled fits, in groups of items that have the same unknowns: (items, frame, unknown, whether settled)."""
+    def _middle(self) -> Tensor:
+        return (self.positions[0] + self.positions[-1]) / 2
+
+    def _fits(self, start: Frame, windows: Windows, coarse: Tensor) -> list[tuple[Tensor, _Fit, bool]]:
+        """Fits in groups with the same model: items of the batch, fits, and whether their chroma is coarse."""
         plan = self.plan
-        middle = (self.positions[0] + self.positions[-1]) / 2
-        frame = _frame(tip + middle * direction, direction)
-        unknown = frame.middle.new_zeros(len(tip), 6 + 2 * len(self.positions))
+        unknown = start.middle.new_zeros(len(start.middle), SHARED + 2 * len(self.positions))
         unknown[:, 5] = math.log(plan.blur)
-        frame, unknown, settled = self._settled(frame, unknown, windows, False)
-        moving = ~coarse & (self._stretched(frame, unknown, windows) | (unknown[:, 5] > math.log(plan.wide)))
-        fits = []
-        if bool(moving.any()):
-            where = moving.nonzero()[:, 0]
-            *found, better = self._moving(frame.take(where), unknown[where], windows.take(where))
-            better = better & ~self._smeared(*found[:2], windows.take(where))
-            fits.append((where[better], *(part.take(better) for part in found[:1]), *(part[better] for part in found[1:]), False))
-            moving = moving.index_put((where,), better)
-        coarse = coarse | (~moving & self._smeared(frame, unknown, windows))
-        still = ~moving & ~coarse
-        fits.append((still.nonzero()[:, 0], frame.take(still), unknown[still], settled[still], False))
-        if bool(coarse.any()):
-            where = coarse.nonzero()[:, 0]
-            fits.append((where, *self._settled(frame.take(where), unknown[where], windows.take(where), True), True))
-        return [fit for fit in fits if len(fit[0])]
+        fit = self._settled(start, unknown, windows)
+        blurred = ~coarse & (self._stretched(fit, windows) | (fit.unknown[:, 5] > math.log(plan.wide)))
+        where = blurred.nonzero()[:, 0]
+        groups, moves = [], torch.zeros_like(coarse)
+        if len(where):
+            moving, own = self._moving(fit.take(where), windows.take(where)), windows.take(where)
+            better = (moving.loss < fit.loss[where] - plan.motion_gain) & ~self._smeared(moving, own)
+            moves = moves.index_put((where,), better)
+            groups.append((where[better], moving.take(better), False))
+        coarse = coarse | (~moves & self._smeared(fit, windows))
+        still = (~moves & ~coarse).nonzero()[:, 0]
+        groups.append((still, fit.take(still), False))
+        where = coarse.nonzero()[:, 0]
+        if len(where):
+            rough = fit.take(where)
+            groups.append((where, self._settled(rough.frame, rough.unknown, windows.take(where), coarse=True), True))
+        return [group for group in groups if len(group[0])]
 
-    def _moving(self, frame: _Frame, unknown: Tensor, windows: _Windows) -> tuple[_Frame, Tensor, Tensor, Tensor]:
-        """Fits with a motion during the exposure, and whether each is better than ``unknown``, the fit without."""
-        still = self._equations(frame, unknown, windows, False).objective
-        count = len(unknown)
+    def _moving(self, fit: _Fit, windows: Windows) -> _Fit:
+        """The best fits with a motion during the exposure, from two starts: along either diagonal of tube and width."""
+        count, unknown = len(fit.unknown), fit.unknown
+        # The variance of a uniform motion is a twelfth of its square; it has two components of the same length.
         length = (6 * (unknown[:, 5:6].exp() ** 2 - self.plan.blur**2)).clamp(min=0.5).sqrt()
         sharp = torch.full_like(length, math.log(self.plan.blur))
-        start = [torch.cat([unknown[:, :5], sharp, sign * length, length, unknown[:, 6:]], 1) for sign in (1.0, -1.0)]
+        starts = [torch.cat([unknown[:, :5], sharp, sign * length, length, unknown[:, 6:]], 1) for sign in (1.0, -1.0)]
         twice = torch.arange(count, device=unknown.device).repeat(2)
-        both, windows = frame.take(twice), windows.take(twice)
-        both, found, settled = self._settled(both, torch.cat(start), windows, False)
-        objective = self._equations(both, found, windows, False).objective.unflatten(0, (2, count)).nan_to_num(torch.inf)
-        best = objective.argmin(0) * count + twice[:count]
-        better = objective.amin(0) < still - self.plan.evidence
-        return both.take(best), found[best], settled[best], better
+        both = self._settled(fit.frame.take(twice), torch.cat(starts), windows.take(twice))
+        return both.take(both.loss.nan_to_num(torch.inf).unflatten(0, (2, count)).argmin(0) * count + twice[:count])
 
-    def _within(self, frame: _Frame, tip: Tensor, direction: Tensor) -> Tensor:
+    def _stretched(self, fit: _Fit, windows: Windows) -> Tensor:
+        """[B] whether another blur along the tube than across it fits better: a motion during the exposure."""
+        stretch = self.plan.stretch
+        others = [self._linear(self._model(fit.frame, fit.unknown, windows, one)[1], windows, False).loss
+                  for one in (stretch, 1 / stretch)]
+        return torch.stack(others).amin(0) < fit.loss - self.plan.stretch_gain
+
+    def _smeared(self, fit: _Fit, windows: Windows) -> Tensor:
+        """[B] whether chroma fits worse than luma near the edges between bands: JPEG at half resolution of chroma."""
+        place, tube = self._model(fit.frame, fit.unknown, windows)
+        fitted = (windows.light - self._linear(tube, windows, False).residual).clamp(*_LIGHT)
+        levels = self.camera.levels(windows.light) - self.camera.levels(fitted)
+        square = torch.einsum("ec,bncp->bnep", levels.new_tensor(_CODES), levels).square()
+        near = tube.beyond.abs() * place.sine < 2.5 * place.pixels
+        weight = windows.mask * (1 - tube.texture) * near
+        luma, blue, red = (square * weight[:, :, None])[:, 1:-1].sum((1, 3)).unbind(-1)
+        return (blue + red) / 2 > self.plan.smeared * luma
+
+    def _model(
+        self, frame: Frame, unknown: Tensor, windows: Windows, stretch: float = 1.0
+    ) -> tuple[TubeGeometry, TubeLight]:
+        """Geometry and light of the tube; ``stretch`` is the ratio of the blurs along the tube and across it."""
+        plan = self.plan
+        place = TubeGeometry.of(frame, unknown, windows)
+        if stretch != 1:
+            place = replace(place, blur=place.blur / math.sqrt(stretch), sine=place.sine / stretch)
+        edge = self.positions - self._middle()
+        light = TubeLight.of(
+            place, unknown, self.radius, edge, nodes=plan.nodes, times=plan.times, degree=plan.degree, clear=plan.clear
+        )
+        return place, light
+
+    def _within(self, frame: Frame, start: Frame) -> Tensor:
         """[B] whether no edge is farther than ``reach`` from where it was in the rough pose."""
-        edges = (self.positions - (self.positions[0] + self.positions[-1]) / 2)[:, None].detach()
-        before = self.camera.project(tip[:, None] + self.positions[:, None].detach() * direction[:, None])
-        after = self.camera.project(frame.middle[:, None] + edges * frame.axis[:, None])
+        edges = (self.positions - self._middle())[:, None].detach()
+        before, after = (self.camera.project(one.middle[:, None] + edges * one.axis[:, None]) for one in (start, frame))
         return ~((after - before).norm(dim=-1) > self.plan.reach).any(-1)
 
-    def _freedom(self, windows: _Windows) -> Tensor:
+    def _freedom(self, windows: Windows) -> Tensor:
         """Pixels of each window beyond twice its linear unknowns, [B, N]; above 0 for a window in use."""
         return windows.mask.sum(-1) - 2 * (2 * (self.plan.degree + 1) + 4)
 
@@ -308,7 +327,7 @@ class PhotometricFit(nn.Module):
         pixels = torch.stack(torch.broadcast_tensors(main[..., None], other[..., None] + j), -1).flatten(2, 3)
         return pixels.gather(-1, order[:, :, None].expand_as(pixels)).nan_to_num(-1.0)
 
-    def _windows(self, frames: Tensor, pixels: Tensor, tip: Tensor, direction: Tensor) -> _Windows:
+    def _windows(self, frames: Tensor, pixels: Tensor, tip: Tensor, direction: Tensor) -> Windows:
         """Rays and light of the pixels; those near the tube at the rough pose count."""
         camera = self.camera
         height, width = frames.shape[-2:]
@@ -332,7 +351,7 @@ class PhotometricFit(nn.Module):
         x, y = pixels[:, :, pixels.shape[2] // 2].unbind(-1)
         margin = torch.minimum(torch.minimum(x, width - 1 - x), torch.minimum(y, height - 1 - y))
         within = (margin >= self.plan.margin)[..., None]
-        return _Windows(rays.mT.contiguous(), angle, light, (inside & near & clear & within).double())
+        return Windows(rays.mT.contiguous(), angle, light, (inside & near & clear & within).double())
 
     def _coarse(self, frames: Tensor, pixels: Tensor) -> Tensor:
         """[B] whether red minus luma has less fine detail than luma around an edge: chroma at half resolution.
@@ -352,47 +371,14 @@ class PhotometricFit(nn.Module):
         luma, red = both.diff(n=2, dim=-1).diff(n=2, dim=-2).abs().flatten(-2).median(-1).values
         return (red < self.plan.fine * luma).any(-1)
 
-    def _smeared(self, frame: _Frame, unknown: Tensor, windows: _Windows) -> Tensor:
-        """[B] whether chroma fits worse than luma near the edges between bands: JPEG at half resolution of chroma."""
-        place, tube = self._model(frame, unknown, windows)
-        fitted = (windows.light - self._linear(tube, windows, False).residual).clamp(2e-3, 0.98)
-        levels = self.camera.levels(windows.light) - self.camera.levels(fitted)
-        square = torch.einsum("ec,bncp->bnep", levels.new_tensor(_CODES), levels).square()
-        near = tube.gradient.abs() * _GRADIENT * place.ratio < 2.5 * place.pixels
-        weight = windows.mask * (1 - tube.texture) * near
-        luma, *chroma = (square * weight[:, :, None])[:, 1:-1].sum((1, 3)).unbind(-1)
-        return sum(chroma) / 2 > self.plan.smeared * luma
-
-    def _stretched(self, frame: _Frame, unknown: Tensor, windows: _Windows) -> Tensor:
-        """[B] whether another blur along the tube than across it fits better: a motion during the exposure."""
+    def _settled(self, frame: Frame, unknown: Tensor, windows: Windows, *, coarse: bool = False) -> _Fit:
+        """Fits after Gauss-Newton steps. Position and direction are always 0 in the returned unknowns."""
         plan = self.plan
-        round_, *others = (
-            self._linear(self._model(frame, unknown, windows, stretch)[1], windows, False).objective
-            for stretch in (1.0, plan.stretch, 1 / plan.stretch)
-        )
-        return torch.stack(others).amin(0) < round_ - plan.moving
-
-    def _model(
-        self, frame: _Frame, unknown: Tensor, windows: _Windows, stretch: float = 1.0
-    ) -> tuple["_Geometry", "_Tube"]:
-        """Geometry and light of the tube; ``stretch`` is the ratio of the blurs along the tube and across it."""
-        place = _Geometry.of(frame, unknown, windows)
-        if stretch != 1:
-            place = replace(place, blur=place.blur / math.sqrt(stretch), ratio=place.ratio / stretch)
-        edge = (self.positions - (self.positions[0] + self.positions[-1]) / 2)[:, None]
-        return place, _Tube.of(place, unknown, self.radius, edge, self.plan)
-
-    def _settled(
-        self, frame: _Frame, unknown: Tensor, windows: _Windows, coarse: bool
-    ) -> tuple[_Frame, Tensor, Tensor]:
-        """Pose and other unknowns after Gauss-Newton steps, and whether the steps have become small.
-
-        Position and direction are always 0 in the returned unknown.
-        """
-        settled = torch.zeros(len(unknown), dtype=torch.bool, device=unknown.device)
-        half = float(self.positions[-1] - self.positions[0]) / 2
-        for step in range(self.plan.iterations):
-            active = (~settled).nonzero()[:, 0]
+        converged = torch.zeros(len(unknown), dtype=torch.bool, device=unknown.device)
+        loss = unknown.new_zeros(len(unknown))
+        half = self.positions[-1] - self._middle()
+        for step in range(plan.iterations):
+            active = (~converged).nonzero()[:, 0]
             here, own = frame.take(active), windows.take(active)
             state = self._equations(here, unknown[active], own, coarse, blur=step >= 1)
             damping = 1e-3 if step == 0 else 1e-9
@@ -401,46 +387,48 @@ class PhotometricFit(nn.Module):
             scaled = scaled + damping * torch.eye(scaled.shape[-1]).to(scaled)
             move = scale * torch.linalg.solve_ex(scaled, scale * state.right)[0]
             gain = (move * state.right).sum(-1)
-            # Changes that move the edges by about a pixel, for shifts to side, axis and sight and for both turns.
-            depth = here.middle.norm(dim=-1, keepdim=True)
-            pixel = depth * own.angle.mean((1, 2))[:, None]
-            unit = pixel * torch.cat([torch.ones_like(depth), torch.ones_like(depth), depth / half, torch.ones_like(depth) / half, depth / half**2], -1)
+            # Changes that move the edges by about a pixel: shifts to side, axis and sight, turns to side and front.
+            depth = here.middle.norm(dim=-1)
+            one = torch.ones_like(depth)
+            unit = torch.stack([one, one, depth / half, one / half, depth / half**2], -1)
+            unit = unit * (depth * own.angle.mean((1, 2)))[:, None]
             length = (move[:, :5] / unit).abs().amax(-1, keepdim=True)
-            move = move * (self.plan.step / length.clamp(min=1e-30)).clamp(max=1.0)
-            moved, rest = _moved(here, unknown[active] + move)
-            unknown = unknown.index_put((active,), rest)
-            frame = _Frame(*(getattr(frame, f.name).index_put((active,), getattr(moved, f.name)) for f in fields(frame)))
+            move = move * (plan.step / length.clamp(min=1e-30)).clamp(max=1.0)
+            moved, rest = here.moved(unknown[active] + move)
+            frame, unknown = frame.put(active, moved), unknown.index_put((active,), rest)
+            loss = loss.index_put((active,), state.loss)
             if step >= 1:
-                settled = settled.index_put((active,), gain < self.plan.settled**2)
-                if bool(settled.all()):
+                converged = converged.index_put((active,), gain < plan.settled**2)
+                if bool(converged.all()):
                     break
-        return frame, unknown, settled
+        return _Fit(frame, unknown, converged, loss)
 
-    def _implicit(self, frame: _Frame, unknown: Tensor, windows: _Windows, coarse: bool) -> Tensor:
+    def _implicit(self, frame: Frame, unknown: Tensor, windows: Windows, coarse: bool) -> Tensor:
         """``unknown`` at the optimum, with its derivative by the pixels, the camera and the catheter."""
         unknown = unknown.detach().requires_grad_()
         right = self._equations(frame, unknown, windows, coarse).right
         rows = [torch.autograd.grad(one.sum(), unknown, retain_graph=True)[0] for one in right.unbind(-1)]
         slope = torch.stack(rows, 1).detach()
         right = self._equations(frame, unknown.detach(), windows, coarse).right
-        return unknown.detach() - torch.linalg.solve(slope, right)
+        return unknown.detach() - torch.linalg.solve_ex(slope, right)[0]
 
     def _equations(
-        self, frame: _Frame, unknown: Tensor, windows: _Windows, coarse: bool, blur: bool = True
+        self, frame: Frame, unknown: Tensor, windows: Windows, coarse: bool, blur: bool = True
     ) -> _Equations:
-        """Equations of a Gauss-Newton step at ``unknown`` [B, D].
+        """Equations of a Gauss-Newton step at ``unknown`` [B, D + 2 N].
 
         The unknowns are shifts along side, axis and sight in metres, turns towards side and front in radians, the
-        logarithm of the blur and, with D = 8, the motion during the exposure along and across the tube in pixels.
+        logarithm of the blur and, with D = 8, the motion during the exposure along and across the tube in pixels; and
+        the shifts of each window's edge along and of its axis across, in metres.
         """
-        plan = self.plan
+        plan, count = self.plan, len(self.positions)
+        size = unknown.shape[1] - 2 * count
         place, tube = self._model(frame, unknown, windows)
-        size = unknown.shape[1] - 2 * len(self.positions)
         fit = self._linear(tube, windows, coarse)
-        changes = tube.changes(place, fit.colours, size)  # [B, N, 3, D + 2, P]
+        changes = tube.changes(place, fit.colours, still=size == SHARED)  # [B, N, 3, D + 2, P]
         if fit.mixes is not None:
             changes = torch.einsum("bnecp,bncdp->bndep", fit.mixes, changes).flatten(-2)[:, :, None]
-        projected = fit.heavy.mT @ changes.mT  # [B, N, C, K, D + 2]
+        projected = fit.heavy @ changes.mT  # [B, N, C, K, D + 2]
         solved = torch.linalg.solve_triangular(fit.factor, projected, upper=False)
         weighted = changes * fit.weight[..., None, :]
         blocks = (weighted @ changes.mT - solved.mT @ solved).sum(2)
@@ -448,7 +436,7 @@ class PhotometricFit(nn.Module):
         used = self._freedom(windows) > 0
         # Residuals of neighbouring pixels that agree in sign leave more error than the same number of independent ones.
         known = torch.linalg.solve_triangular(fit.factor.mT, solved[..., -2:], upper=True)
-        score = changes[..., -2:, :] - (fit.design[:, :, None] @ known).mT
+        score = changes[..., -2:, :] - (known.mT.flatten(2, 3) @ fit.design).unflatten(2, (-1, 2))
         score = (score * (fit.weight * fit.residual)[..., None, :]).sum(2)  # [B, N, 2, P]
         if coarse:
             score = score.unflatten(-1, (3, -1)).sum(-2)
@@ -464,91 +452,86 @@ class PhotometricFit(nn.Module):
         if not blur:
             keep = torch.ones_like(unknown[0])
             keep[5:size] = 0
-            normal = normal * keep * keep[:, None] + torch.diag(1 - keep)
-            right = right * keep
-        return _Equations(normal, right, blocks, sides, fit.misfit, used, floor, fit.objective)
+            normal, right = normal * keep * keep[:, None] + torch.diag(1 - keep), right * keep
+        return _Equations(normal, right, blocks[..., -2, -2], floor, used, fit.misfit, fit.loss)
 
-    def _linear(self, tube: "_Tube", windows: _Windows, coarse: bool) -> "_Linear":
+    def _linear(self, tube: TubeLight, windows: Windows, coarse: bool) -> _Linear:
         """Fit of the linear unknowns: first with equal weights, then with weights from the residuals."""
         plan, mask, basis = self.plan, windows.mask, tube.basis
-        repeats = 3 if coarse else 1
-        equal, texture = (value.repeat(1, 1, repeats) for value in (mask, tube.texture))
+        equal, texture = (value.repeat(1, 1, 3) if coarse else value for value in (mask, tube.texture))
         design, data, mixes = basis, windows.light, None
-        colours, _, _ = _least_squares(design, data, mask[:, :, None])  # [B, N, C, K]
+        colours = _least_squares(design, data, mask[:, :, None])[0]  # [B, N, 3, K]
         for _ in range(2 * coarse):
             design, data, mixes = self._codes(basis, windows.light, colours)
             colours = _least_squares(design, data, equal[:, :, None])[0].unflatten(-1, (3, -1))[:, :, 0]
-        fitted = colours.flatten(2)[:, :, None] @ design.mT if coarse else colours @ design.mT
-        noise = torch.ones_like(fitted) if coarse else (fitted.clamp(min=0) + plan.dark)
+        fitted = colours.flatten(2)[:, :, None] @ design if coarse else colours @ design
         square = (data - fitted).square()
-        relative = square / noise
-        freedom = mask.sum(-1) / (mask.sum(-1) - basis.shape[-1]).clamp(min=1)
-
-        def variance(weight: Tensor) -> Tensor:
-            mean = (weight[:, :, None] * relative).sum(-1) / weight.sum(-1, keepdim=True).clamp(min=1)
-            return mean * freedom[..., None] + rounding
-
-        # Light per level at the mean light of each window and channel; 1 where the samples are levels.
-        tone = torch.ones_like(noise[..., 0])
+        # Variance of the noise, up to a factor, and light per level; both 1 where the samples are levels.
+        noise, tone = torch.ones_like(fitted), torch.ones_like(fitted[..., 0])
         if not coarse:
+            noise = fitted.clamp(min=0) + plan.dark
             mean = (fitted * mask[:, :, None]).sum(-1) / mask.sum(-1, keepdim=True).clamp(min=1)
-            level = self.camera.levels(mean.clamp(2e-3, 0.98)).clamp(4, 250)
+            level = self.camera.levels(mean.clamp(*_LIGHT))
             tone = self.camera.linear(level + 0.5) - self.camera.linear(level - 0.5)
-        rounding = _ROUNDING * tone**2 / noise.mean(-1)
-        own, other = variance(equal * (1 - texture)), variance(equal * texture)  # of the tube, and of what is behind
-        # Changes of light across the edge, and of the texture that shows through.
-        step = colours[..., plan.degree + 1] - colours[..., 0]
-        stripes = (equal * texture)[:, :, None], (equal * (1 - texture))[:, :, None]
-        grain, noise_square = ((one * square).sum(-1) / one.sum(-1).clamp(min=1) for one in stripes)
-        grain = ((grain - noise_square).sum(-1).clamp(min=0) / step.square().sum(-1).clamp(min=1e-9)).clamp(1e-12, 100).sqrt()
-        ratio = (other / own).log().mean(-1, keepdim=True).exp()
-        spread = own[..., None] * noise * (1 - texture + texture * ratio)[:, :, None]
-        weight = equal[:, :, None] / spread
-        colours, factor, heavy = _least_squares(design, data, weight)
-        residual = data - colours @ design.mT
-        colours = colours if not coarse else colours[:, :, 0].unflatten(-1, (3, -1))
-        objective = 0.5 * (equal[:, :, None] * spread.log()).sum((1, 2, 3))
-        misfit = (equal[:, :, None] * square).sum(-1) / equal.sum(-1, keepdim=True).clamp(min=1) / tone**2
-        return _Linear(design, data, weight, colours, factor, heavy, residual, mixes, misfit.mean(-1), objective, grain)
+        parts = (equal * (1 - texture))[:, :, None], (equal * texture)[:, :, None]  # the tube, and what is behind it
+        amounts = [part.sum(-1).clamp(min=1) for part in parts]
+        freedom = (mask.sum(-1) / (mask.sum(-1) - basis.shape[2]).clamp(min=1))[..., None]
+        relative, rounding = square / noise, _ROUNDING * tone**2 / noise.mean(-1)
+        own, other = (
+            freedom * (part * relative).sum(-1) / amount + rounding for part, amount in zip(parts, amounts, strict=True)
+        )
+        ratio = (other / own).log().mean(-1)[..., None, None].exp()
+        variance = own[..., None] * noise * (1 - texture + texture * ratio.squeeze(-1))[:, :, None]
+        step = (colours[..., plan.degree + 1] - colours[..., 0]).square().sum(-1)
+        tube_square, grain = (
+            ((part * square).sum(-1) / amount).sum(-1) for part, amount in zip(parts, amounts, strict=True)
+        )
+        grain = ((grain - tube_square).clamp(min=0) / step.clamp(min=1e-9)).clamp(1e-12, 100.0).sqrt()
+        weight = equal[:, :, None] / variance
+        solution, factor, heavy = _least_squares(design, data, weight)
+        residual = data - solution @ design
+        colours = solution[:, :, 0].unflatten(-1, (3, -1)) if coarse else solution
+        loss = 0.5 * (equal[:, :, None] * variance.log()).sum((1, 2, 3))
+        misfit = ((equal[:, :, None] * square).sum(-1) / equal.sum(-1, keepdim=True).clamp(min=1) / tone**2).mean(-1)
+        return _Linear(design, weight, residual, heavy, factor, colours, mixes, misfit, grain, loss)
 
-    def _codes(self, basis: Tensor, light: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Design [B, N, 3 P, 3 K] and data [B, N, 1, 3 P] of luma and chroma, and their derivatives [B, N, 3, 3, P].
+    def _codes(self, basis: Tensor, light: Tensor, colours: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Design [B, N, 3 K, 3 P] and data [B, N, 1, 3 P] of luma and chroma, and their derivatives [B, N, 3, 3, P].
 
-        Luma and chroma are sums of levels, which are linearised at the light that ``coefficients`` [B, N, 3, K] give.
+        Luma and chroma are sums of levels, which are linearised at the light that ``colours`` [B, N, 3, K] give.
         """
         camera = self.camera
-        fitted = coefficients @ basis.mT
-        level = camera.levels(fitted.clamp(2e-3, 0.98))
+        fitted = colours @ basis
+        level = camera.levels(fitted.clamp(*_LIGHT))
         slope = 1 / (camera.linear(level + 0.5) - camera.linear(level - 0.5))
-        mix = basis.new_tensor(_CODES) * basis.new_tensor([1.0, self.plan.chroma, self.plan.chroma])[:, None]
+        mix = basis.new_tensor(_CODES) * basis.new_tensor([[1.0], [self.plan.chroma], [self.plan.chroma]])
         mixes = mix[:, :, None] * slope[:, :, None]  # [B, N, e, c, P]
-        data = torch.einsum("bnecp,bncp->bnep", mixes, fitted) + torch.einsum(
-            "ec,bncp->bnep", mix, camera.levels(light) - level
-        )
-        design = torch.einsum("bnecp,bnpk->bnepck", mixes, basis).flatten(4).flatten(2, 3)
+        data = (mixes * fitted[:, :, None]).sum(3) + mix @ (camera.levels(light) - level)
+        design = torch.einsum("bnecp,bnkp->bnckep", mixes, basis).flatten(4).flatten(2, 3)
         return design, data.flatten(2)[:, :, None], mixes
 
-    def _floor(self, place: "_Geometry", unknown: Tensor, grain: Tensor, coarse: bool) -> Tensor:
-        """Standard deviations of the errors of each edge along and across the tube that no noise explains, [B, N, 2]."""
+    def _floor(self, place: TubeGeometry, unknown: Tensor, grain: Tensor, coarse: bool) -> Tensor:
+        """Standard deviations in metres of what no noise explains in each edge along and across the tube, [B, N, 2]."""
         plan, count = self.plan, len(self.positions)
         outer = torch.tensor([n in (0, count - 1) for n in range(count)], device=unknown.device)
-        along = torch.where(outer, plan.outer_floor**2 + (plan.grain_floor * (not coarse) * grain).square(), plan.edge_floor**2)
+        texture = torch.zeros_like(grain) if coarse else (plan.grain_floor * grain).square()
+        along = torch.where(outer, plan.outer_floor**2 + texture, plan.edge_floor**2)
         across = torch.full_like(along, plan.axis_floor**2)
+        more = (plan.blur_floor * (unknown[:, 5:6].exp() - plan.blur).clamp(min=0)).square()
+        along, across = along + more, across + 9 * more
+        if unknown.shape[1] > SHARED + 2 * count:
+            more = (plan.motion_floor * unknown[:, 6:8]).square().sum(-1, keepdim=True)
+            along, across = along + more, across + more
         if coarse:
             along, across = along + plan.coarse_floor**2, across + plan.coarse_floor**2
-        defocus = (plan.blur_floor * (unknown[:, 5:6].exp() - plan.blur).clamp(min=0)).square()
-        along, across = along + defocus, across + 9 * defocus
-        if unknown.shape[1] - 2 * count > 6:
-            motion = (plan.moving_floor * unknown[:, 6:8]).square().sum(-1, keepdim=True)
-            along, across = along + motion, across + motion
-        scale = torch.stack([place.pixel / place.sine, place.pixel], -1)
-        return scale * torch.stack([along, across], -1).sqrt()
+        return place.scale * torch.stack([along, across], -1).sqrt()
 
     def _answer(
-        self, frame: _Frame, unknown: Tensor, windows: _Windows, state: _Equations, settled: Tensor
+        self, frame: Frame, unknown: Tensor, state: _Equations, converged: Tensor, height: int
     ) -> PhotometricPose:
-        moved, rest = _moved(frame, unknown)
-        middle = (self.positions[0] + self.positions[-1]) / 2
+        """Poses; NaN for those that have not converged or whose edges disagree."""
+        moved, rest = frame.moved(unknown)
+        middle = self._middle()
         tip, direction = moved.middle - middle * moved.axis, moved.axis
         zero = torch.zeros_like(frame.side)
         more = [zero] * (unknown.shape[1] - 5)
@@ -556,229 +539,67 @@ class PhotometricFit(nn.Module):
         turns = (zero, zero, zero, frame.side, frame.front, *more)
         lever = torch.cat([torch.stack(rows, -1), torch.stack(turns, -1)], 1)
         covariance = lever @ torch.linalg.inv_ex(state.normal)[0] @ lever.mT
+        if self.plan.readout:
+            covariance = covariance + self._rolled(moved, height)
         shift = unknown[:, -2 * len(self.positions) :: 2]
-        deviation = (1 / state.blocks[..., -2, -2].clamp(min=1e-30) + state.floor[..., 0] ** 2).sqrt()
-        lost = (shift / deviation).square().sum(-1) > self.plan.inconsistent
-        settled = settled & ~lost
-        lost = torch.where(settled, 0.0, torch.nan)[:, None]
-        return PhotometricPose(
-            tip + lost, direction + lost, covariance + lost[..., None], rest[:, 5].exp(), state.misfit, shift, deviation, state.used
-        )
+        deviation = (1 / state.information.clamp(min=1e-30) + state.floor[..., 0] ** 2).sqrt()
+        converged = converged & ((shift / deviation).square().sum(-1) < self.plan.inconsistent)
+        lost = torch.where(converged, 0.0, torch.nan)[:, None]
+        pose = (tip + lost, direction + lost, covariance + lost[..., None])
+        return PhotometricPose(*pose, rest[:, 5].exp(), state.misfit, shift, deviation, state.used)
+
+    def _rolled(self, frame: Frame, height: int) -> Tensor:
+        """Covariance [B, 6, 6] of tip and direction that a motion while a rolling shutter reads the frame adds.
+
+        Such a motion turns the tube's image, and stretches it, which looks like a shorter distance.
+        """
+        middle, half = self._middle(), self.positions[-1] - self._middle()
+        ends = frame.middle[:, None] + half * frame.axis[:, None] * frame.axis.new_tensor([[-1.0], [1.0]])
+        rows = self.camera.project(ends)[..., 1]
+        late = ((rows[:, 1] - rows[:, 0]) / (2 * half * height))[:, None, None]  # share of the readout per metre of tube
+        across = torch.eye(3).to(frame.axis) - frame.axis[:, :, None] * frame.axis[:, None]
+        lever = torch.cat([-middle * across - frame.middle[:, :, None] * frame.axis[:, None], across], 1) * late
+        return self.plan.readout**2 * lever @ lever.mT
 
 
-_GRADIENT = 0.01  # metres along the tube over which a background changes by its coefficient
+_LIGHT = (2e-3, 0.98)  # light between which a tone curve is not clipped
 _ROUNDING = 1 / 12  # levels^2: the noise of rounding to whole levels
-_CODES = ((0.299, 0.587, 0.114), (-0.169, -0.331, 0.5), (0.5, -0.419, -0.081))  # Y, Cb, Cr of red, green, blue levels
+_CODES = ((0.299, 0.587, 0.114), (-0.169, -0.331, 0.5), (0.5, -0.419, -0.081))  # Y, Cb, Cr of levels (ITU-R BT.601)
 _WHITE = 254.0  # level from which a pixel may be saturated
 _PATCH = 24  # side in pixels of the patches in which the resolution of chroma is estimated
-
-
-@dataclass(frozen=True, eq=False)
-class _Geometry:
-    """Where each ray passes the tube: [B, N, P] each.
-
-    Attributes:
-        miss: Signed distance between ray and axis.
-        along: Position along the axis, from the bands' middle, where the ray is nearest to the axis.
-        slant: Change of the visible surface's position along the axis per metre of depth below the axis.
-        pixels: Metres across the axis per pixel.
-        ratio: Sine of the angle between ray and axis.
-        blur: Standard deviation of the blur across the axis, in metres; along it, this over ``ratio``.
-        pixel, sine: [B, N] means of ``pixels`` and ``ratio`` over a window.
-        derivatives: [B, N, 4, 6, P] of miss, along, slant and log blur by the first six unknowns.
-    """
-
-    miss: Tensor
-    along: Tensor
-    slant: Tensor
-    pixels: Tensor
-    ratio: Tensor
-    blur: Tensor
-    pixel: Tensor
-    sine: Tensor
-    derivatives: Tensor
-
-    @staticmethod
-    def of(frame: _Frame, unknown: Tensor, windows: _Windows) -> "_Geometry":
-        moved, rest = _moved(frame, unknown)
-        middle, axis, side, front, sight = moved.middle, moved.axis, moved.side, moved.front, moved.sight
-        cross = torch.linalg.cross
-        vectors = (axis, middle, side, front, sight, cross(axis, middle), cross(axis, side), cross(axis, sight))
-        vectors = torch.stack([*vectors, cross(side, middle), cross(front, middle)], 1)
-        parts = (vectors[:, None] @ windows.rays).unbind(2)
-        b, ahead, by_side, by_front, by_sight, missed, miss_side, miss_sight, turn_side, turn_front = parts
-        beside, slope, own = (
-            (one * other).sum(-1)[:, None, None] for one, other in ((axis, middle), (axis, sight), (front, middle))
-        )
-        square = 1 - b * b
-        sine = square.sqrt()
-        per_sine, per_square = 1 / sine, 1 / square
-        miss = missed * per_sine
-        depth = (ahead - b * beside) * per_square
-        along = depth * b - beside
-        pixels = depth * windows.angle
-        width = rest[:, 5].exp()[:, None, None]
-        point = (width**2 + 1 / 12).sqrt()
-        zero = torch.zeros_like(b)
-        depth_side, depth_sight = by_side * per_square, (by_sight - b * slope) * per_square
-        common = (2 * b * depth - beside) * per_square
-        turned_side, turned_front = common * by_side, common * by_front - b * own * per_square
-        bend = miss * b * per_square
-        rows = (
-            (miss_side * per_sine, zero, miss_sight * per_sine, turn_side * per_sine + bend * by_side,
-             turn_front * per_sine + bend * by_front, zero),
-            (b * depth_side, zero - 1, b * depth_sight - slope, turned_side * b + depth * by_side,
-             turned_front * b + depth * by_front - own, zero),
-            (zero, zero, zero, by_side * per_square * per_sine, by_front * per_square * per_sine, zero),
-            (depth_side / depth, zero, depth_sight / depth, turned_side / depth, turned_front / depth,
-             zero + (width / point) ** 2),
-        )
-        derivatives = torch.stack([one for row in rows for one in row], 2).unflatten(2, (4, 6))
-        weight = windows.mask + 1e-9
-        mean, mean_sine = ((value * weight).sum(-1) / weight.sum(-1) for value in (pixels, sine))
-        return _Geometry(miss, along, b * per_sine, pixels, sine, point * pixels, mean, mean_sine, derivatives)
-
-
-@dataclass(frozen=True, eq=False)
-class _Tube:
-    """Light of a blurred tube with two bands, before two backgrounds, per unit of its linear coefficients.
-
-    The M nodes of the quadrature over the tube's width and the T over the time of exposure are one axis of M T nodes.
-    """
-
-    basis: Tensor  # [B, N, P, K]: shading of the first and of the second band, backgrounds, their gradients
-    texture: Tensor  # [B, N, P] share of the light that comes from the background, 0 to 1
-    bright: Tensor
-    part: Tensor
-    rise: Tensor
-    z: Tensor
-    q: Tensor
-    depth: Tensor
-    time: Tensor
-    shade: Tensor
-    falls: tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
-    gradient: Tensor
-
-    @staticmethod
-    def of(place: _Geometry, unknown: Tensor, radius: Tensor, edge: Tensor, plan: FitPlan) -> "_Tube":
-        moves = unknown.shape[1] - 2 * len(edge) > 6
-        shift = unknown[:, -2 * len(edge) :].unflatten(1, (-1, 2))
-        x, share_x = (value.to(unknown) for value in _nodes(plan.nodes))
-        t, share_t = (value.to(unknown) / 2 for value in _nodes(plan.times if moves else 1))
-        shade = torch.from_numpy(np.polynomial.legendre.legvander(_nodes(plan.nodes)[0].numpy(), plan.degree)).to(x)
-        x, time = (value.flatten() for value in torch.broadcast_tensors(x[:, None], t))
-        weight = (share_x[:, None] * share_t).flatten()
-        shade = shade.repeat_interleave(len(t), 0)
-        along = place.along - edge - shift[..., :1]
-        gradient = along / _GRADIENT
-        miss, along = (place.miss + shift[..., 1:])[..., None], along[..., None]
-        per_blur = 1 / place.blur[..., None]
-        per_soft = per_blur * place.ratio[..., None]
-        depth = radius * (1 - x * x).sqrt()
-        path, late = miss, along
-        if moves:
-            path = miss - (unknown[:, 7, None, None] * place.pixels)[..., None] * time
-            late = along - (unknown[:, 6, None, None] * place.pixels / place.ratio)[..., None] * time
-        z = (path - radius * x) * per_blur
-        bright = (radius * weight / math.sqrt(2 * math.pi)) * torch.exp(-0.5 * z * z) * per_blur
-        q = (late - place.slant[..., None] * depth) * per_soft
-        part = bright * torch.special.ndtr(q)
-        rise = bright * torch.exp(-0.5 * q * q) / math.sqrt(2 * math.pi)
-        path = miss if not moves else miss - (unknown[:, 7, None, None] * place.pixels)[..., None] * t
-        low, high = (-radius - path) * per_blur, (path - radius) * per_blur
-        left, right = ((torch.special.ndtr(side) * share_t).sum(-1) for side in (low, high))
-        falls = []
-        for side in (low, high):
-            fall = torch.exp(-0.5 * side * side) * share_t / math.sqrt(2 * math.pi)
-            falls += [fall.sum(-1), (fall * t).sum(-1), (fall * side).sum(-1)]
-        sides = torch.stack([left, right, left * gradient, right * gradient], -1)
-        basis = torch.cat([(bright - part) @ shade, part @ shade, sides], -1)
-        texture = (left + right).clamp(0, 1)
-        before, after = (bright - part).sum(-1), part.sum(-1)
-        texture = torch.cat(
-            [
-                (texture[:, :1] + plan.clear * before[:, :1]),
-                texture[:, 1:-1],
-                (texture[:, -1:] + plan.clear * after[:, -1:]),
-            ],
-            1,
-        )
-        return _Tube(basis, texture.clamp(0, 1), bright, part, rise, z, q, depth, time, shade, tuple(falls), gradient)
-
-    def changes(self, place: _Geometry, colours: Tensor, count: int) -> Tensor:
-        """Derivatives [B, N, 3, D + 2, P] of the light of ``colours`` [B, N, 3, K] by D = ``count`` and own unknowns."""
-        degrees = self.shade.shape[1]
-        first = self.shade @ colours[..., :degrees].mT  # [B, N, nodes, 3]
-        second = self.shade @ colours[..., degrees : 2 * degrees].mT
-        left, right, left_slope, right_slope = colours[..., 2 * degrees :, None].unbind(-2)
-        step = second - first
-        blur = place.blur[:, :, None]
-        soft = blur / place.ratio[:, :, None]
-        gradient = self.gradient[:, :, None]
-        left, right = left + left_slope * gradient, right + right_slope * gradient
-        timed = count > 6
-        time = self.time[:, None]
-        by_z = self.z * self.bright @ first + self.z * self.part @ step if not timed else None
-        if timed:
-            both = torch.cat([first, first * time], -1), torch.cat([step, step * time], -1)
-            by_z, by_zt = (self.z * self.bright @ both[0] + self.z * self.part @ both[1]).split(3, -1)
-            along, along_t = (self.rise @ both[1]).mT.split(3, 2)
-        else:
-            along = (self.rise @ step).mT
-        fall_low, late_low, side_low, fall_high, late_high, side_high = (value[:, :, None] for value in self.falls)
-        by_miss = (fall_high * right - fall_low * left - by_z.mT) / blur
-        covers = self.basis[..., -4:-2].mT
-        by_along = along / soft
-        by_edge = by_along
-        by_along = by_along + (covers[:, :, :1] * left_slope + covers[:, :, 1:] * right_slope) / _GRADIENT
-        by_slant = -(self.rise @ (self.depth[:, None] * step)).mT / soft
-        square = self.z * self.z - 1
-        by_blur = (square * self.bright @ first + square * self.part @ step - self.rise * self.q @ step).mT
-        by_blur = by_blur - side_low * left - side_high * right
-        slopes = torch.stack([by_miss, by_along, by_slant, by_blur], 2)  # [B, N, 4, 3, P]
-        turn = (slopes[..., None, :] * place.derivatives[:, :, :, None]).sum(2)
-        own = torch.stack([-by_along, by_miss], 3)
-        if not timed:
-            return torch.cat([turn, own], 3)
-        pixels = place.pixels[:, :, None]
-        motion_along = -pixels / place.ratio[:, :, None] * along_t / soft
-        motion_across = -pixels * (late_high * right - late_low * left - by_zt.mT) / blur
-        return torch.cat([turn, torch.stack([motion_along, motion_across], 3), own], 3)
 
 
 def _assembled(blocks: Tensor, sides: Tensor) -> tuple[Tensor, Tensor]:
     """Normal equations of all unknowns: those that all windows share, and then two of each window."""
     batch, count, size, _ = blocks.shape
     shared = size - 2
-    whole = shared + 2 * count
-    normal, right = blocks.new_zeros(batch, whole, whole), sides.new_zeros(batch, whole)
+    select = blocks.new_zeros(count, size, shared + 2 * count)
+    select[:, range(shared), range(shared)] = 1
     for n in range(count):
-        index = [*range(shared), shared + 2 * n, shared + 2 * n + 1]
-        place = torch.zeros(size, whole, dtype=blocks.dtype)
-        place[range(size), index] = 1
-        place = place.to(blocks)
-        normal = normal + place.mT @ blocks[:, n] @ place
-        right = right + sides[:, n] @ place
-    return normal, right
+        select[n, [-2, -1], [shared + 2 * n, shared + 2 * n + 1]] = 1
+    normal = (select.mT @ blocks @ select).sum(1)
+    return normal, (sides[:, :, None] @ select)[:, :, 0].sum(1)
 
 
 def _least_squares(design: Tensor, data: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Coefficients [B, N, C, K] of ``data`` [B, N, C, P], Cholesky factor, and weighted design [B, N, C, P, K].
+    """Coefficients [B, N, C, K] of ``data`` [B, N, C, P], Cholesky factor, and weighted design [B, N, C or 1, K, P].
 
-    ``weight`` is [B, N, C or 1, P].
+    ``design`` is [B, N, K, P] and ``weight`` [B, N, C or 1, P].
     """
-    heavy = design[:, :, None] * weight[..., None]
-    gram = heavy.mT @ design[:, :, None]
+    heavy = design[:, :, None] * weight[..., None, :]
+    gram = (heavy.flatten(2, 3) @ design.mT).unflatten(2, heavy.shape[2:4])
     ridge = 1e-7 * gram.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] + 1e-12
     gram = gram + ridge * torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
     factor, _ = torch.linalg.cholesky_ex(gram)  # NaN instead of an error where a fit has diverged
-    return torch.cholesky_solve(heavy.mT @ data[..., None], factor)[..., 0], factor, heavy
+    if heavy.shape[2] == 1:
+        return torch.cholesky_solve(heavy[:, :, 0] @ data.mT, factor[:, :, 0]).mT, factor, heavy
+    return torch.cholesky_solve(heavy @ data[..., None], factor)[..., 0], factor, heavy
 
 
 def _correlation(score: Tensor, rows: int) -> Tensor:
     """Variance of the sum of scores [B, N, 2, P] relative to that of independent ones, [B, N], at least 1.
 
-    Source: Newey and West (1987), with blocks of pixels instead of lags.
+    Source: Newey and West (1987), with squares of 5 x 5 pixels, which is a triangular weight of lags up to 4.
     """
     grid = score.flatten(0, 1).unflatten(-1, (rows, -1))
     sums = nn.functional.avg_pool2d(nn.functional.pad(grid, [4] * 4), 5, stride=1) * 25
@@ -795,12 +616,10 @@ def _levels(frames: Tensor, pixels: Tensor) -> Tensor:
     return levels if frames.dtype == torch.uint8 else 255 * levels.double()
 
 
-def _merged(parts: list[tuple[Tensor, PhotometricPose]], count: int) -> PhotometricPose:
-    """Poses of ``count`` items from those of groups of them."""
-    if len(parts) == 1 and len(parts[0][0]) == count:
-        return parts[0][1]
-    order = torch.cat([where for where, _ in parts]).argsort()
-    return PhotometricPose(*(torch.cat([getattr(pose, f.name) for _, pose in parts])[order] for f in fields(PhotometricPose)))
+def _joined(poses: list[PhotometricPose], order: Tensor) -> PhotometricPose:
+    """Poses of groups of items in one batch, in another ``order``."""
+    names = [field.name for field in fields(PhotometricPose)]
+    return PhotometricPose(*(torch.cat([getattr(pose, name) for pose in poses])[order] for name in names))
 
 
 def _check(frames: Tensor, tip: Tensor, direction: Tensor) -> None:
@@ -816,27 +635,3 @@ def _check(frames: Tensor, tip: Tensor, direction: Tensor) -> None:
             raise ValueError(f"{name} must be floating, [B, 3] = [{len(frames)}, 3], got {list(value.shape)}")
     if bool(((direction.detach().norm(dim=-1) - 1).abs() > 1e-4).any()):
         raise ValueError("direction must be unit vectors; divide each by its length")
-
-
-def _frame(middle: Tensor, axis: Tensor) -> _Frame:
-    axis = axis / axis.norm(dim=-1, keepdim=True)
-    sight = middle / middle.norm(dim=-1, keepdim=True)
-    side = torch.linalg.cross(axis, sight)
-    side = side / side.norm(dim=-1, keepdim=True)
-    return _Frame(middle, axis, side, torch.linalg.cross(side, axis), sight)
-
-
-def _moved(frame: _Frame, unknown: Tensor) -> tuple[_Frame, Tensor]:
-    """Frame after the shifts and turns of ``unknown`` [B, D], and what is left of it: 0 for the first five."""
-    shift = unknown[:, 0:1] * frame.side + unknown[:, 1:2] * frame.axis + unknown[:, 2:3] * frame.sight
-    turn = unknown[:, 3:4] * frame.side + unknown[:, 4:5] * frame.front
-    blur = unknown[:, 5:6].clamp(math.log(0.25), math.log(8.0))
-    rest = torch.cat([torch.zeros_like(unknown[:, :5]), blur, unknown[:, 6:]], -1)
-    return _frame(frame.middle + shift, frame.axis + turn), rest
-
-
-@lru_cache(maxsize=8)
-def _nodes(count: int) -> tuple[Tensor, Tensor]:
-    """Nodes and weights of the Gauss-Legendre rule on -1 to 1."""
-    x, weight = np.polynomial.legendre.leggauss(count)
-    return torch.from_numpy(x), torch.from_numpy(weight)
