@@ -19,12 +19,12 @@ class FitPlan:
     The floors are the errors that remain with little noise, measured on seeds 0 to 119 and 240 to 479 of VariedWorld.
     """
 
-    along: int = 10  # pixels to each side of an edge, along the image axis nearer to the tube's direction
+    along: int = 8  # pixels to each side of an edge, along the image axis nearer to the tube's direction
     widest: int = 30  # most pixels to each side of the tube's axis, along the other image axis
     beside: float = 3.0  # background beside the tube that counts: more of it helps no more and is less uniform
     margin: float = 8.0  # least distance of an edge from the border of the frame: its window must show both sides
     degree: int = 4  # degree of the shading across the tube: higher ones leave the position across less certain
-    nodes: int = 12  # nodes of the quadrature over the tube's width
+    density: float = 1.6  # nodes of the quadrature over the tube's width, per pixel of it: 1e-4 of the light at least
     times: int = 8  # nodes of the quadrature over the time of exposure, where the tube moves
     blur: float = 0.75  # blur to begin with, standard deviation: that of a focused camera
     blur_spread: float = 0.5  # standard deviation of the logarithm of a blur before it is measured
@@ -49,7 +49,7 @@ class FitPlan:
     reach: float = 6.0  # farthest that an edge may be from where the rough pose shows it: the window must show it
     inconsistent: float = 12.0  # sum of the squares of shifts over their deviations above which the edges disagree
     iterations: int = 20  # most Gauss-Newton steps
-    settled: float = 0.1  # step in standard deviations of the result below which a fit ends
+    settled: float = 0.2  # step in standard deviations of the result below which a fit ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,26 +86,12 @@ class PhotometricPose:
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit(Items):
-    """Fits of B frames: unknowns relative to ``frame``, whether they have converged, negative log-likelihood [B]."""
-
-    frame: Frame
-    unknown: Tensor
-    converged: Tensor
-    loss: Tensor
-
-    def take(self, index: Tensor) -> "_Fit":
-        return _Fit(self.frame.take(index), self.unknown[index], self.converged[index], self.loss[index])
-
-
-@dataclass(frozen=True, eq=False)
 class _Linear:
     """Fit of the linear unknowns of B x N windows with C independent channels of P samples and K unknowns each.
 
     Attributes:
         design: [B, N, K, P].
         weight, residual: [B, N, C, P].
-        heavy: [B, N, C, K, P] weighted design.
         factor: [B, N, C, K, K] Cholesky factor of the normal matrix.
         colours: [B, N, 3, K].
         mixes: [B, N, 3, 3, P] derivatives of the samples of one channel by red, green and blue light, or None.
@@ -117,7 +103,6 @@ class _Linear:
     design: Tensor
     weight: Tensor
     residual: Tensor
-    heavy: Tensor
     factor: Tensor
     colours: Tensor
     mixes: Tensor | None
@@ -127,7 +112,7 @@ class _Linear:
 
 
 @dataclass(frozen=True, eq=False)
-class _Equations:
+class _Equations(Items):
     """Normal equations of B fits of D + 2 N unknowns, of which the last are two for each of N windows.
 
     Attributes:
@@ -145,6 +130,19 @@ class _Equations:
     used: Tensor
     misfit: Tensor
     loss: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Fits of B frames: unknowns relative to ``frame``, whether they have converged, equations of the last step."""
+
+    frame: Frame
+    unknown: Tensor
+    converged: Tensor
+    state: _Equations
+
+    def take(self, index: Tensor) -> "_Fit":
+        return _Fit(self.frame.take(index), self.unknown[index], self.converged[index], self.state.take(index))
 
 
 class PhotometricFit(nn.Module):
@@ -219,10 +217,11 @@ class PhotometricFit(nn.Module):
             windows = self._windows(frames, pixels, tip, direction)
         poses = []
         for where, fit, coarse in groups:
-            own, unknown = windows.take(where), fit.unknown
+            unknown, state = fit.unknown, fit.state
             if implicit:
+                own = windows.take(where)
                 unknown = self._implicit(fit.frame, unknown, own, coarse)
-            state = self._equations(fit.frame, unknown, own, coarse)
+                state = self._equations(fit.frame, unknown, own, coarse)
             known = fit.converged & self._within(fit.frame, start.take(where))
             poses.append(self._answer(fit.frame, unknown, state, known, frames.shape[-2]))
         order = torch.cat([where for where, _, _ in groups] or [torch.zeros(0, dtype=torch.long)]).argsort()
@@ -242,7 +241,7 @@ class PhotometricFit(nn.Module):
         groups, moves = [], torch.zeros_like(coarse)
         if len(where):
             moving, own = self._moving(fit.take(where), windows.take(where)), windows.take(where)
-            better = (moving.loss < fit.loss[where] - plan.motion_gain) & ~self._smeared(moving, own)
+            better = (moving.state.loss < fit.state.loss[where] - plan.motion_gain) & ~self._smeared(moving, own)
             moves = moves.index_put((where,), better)
             groups.append((where[better], moving.take(better), False))
         coarse = coarse | (~moves & self._smeared(fit, windows))
@@ -263,14 +262,17 @@ class PhotometricFit(nn.Module):
         starts = [torch.cat([unknown[:, :5], sharp, sign * length, length, unknown[:, 6:]], 1) for sign in (1.0, -1.0)]
         twice = torch.arange(count, device=unknown.device).repeat(2)
         both = self._settled(fit.frame.take(twice), torch.cat(starts), windows.take(twice))
-        return both.take(both.loss.nan_to_num(torch.inf).unflatten(0, (2, count)).argmin(0) * count + twice[:count])
+        return both.take(both.state.loss.nan_to_num(torch.inf).unflatten(0, (2, count)).argmin(0) * count + twice[:count])
 
     def _stretched(self, fit: _Fit, windows: Windows) -> Tensor:
         """[B] whether another blur along the tube than across it fits better: a motion during the exposure."""
-        stretch = self.plan.stretch
-        others = [self._linear(self._model(fit.frame, fit.unknown, windows, one)[1], windows, False).loss
-                  for one in (stretch, 1 / stretch)]
-        return torch.stack(others).amin(0) < fit.loss - self.plan.stretch_gain
+        count, twice = len(fit.unknown), torch.arange(len(fit.unknown), device=fit.unknown.device).repeat(2)
+        stretch = fit.unknown.new_full((2 * count, 1, 1), self.plan.stretch)
+        stretch[count:] = 1 / self.plan.stretch
+        windows = windows.take(twice)
+        _, tube = self._model(fit.frame.take(twice), fit.unknown[twice], windows, stretch)
+        losses = self._linear(tube, windows, False).loss.unflatten(0, (2, count))
+        return losses.amin(0) < fit.state.loss - self.plan.stretch_gain
 
     def _smeared(self, fit: _Fit, windows: Windows) -> Tensor:
         """[B] whether chroma fits worse than luma near the edges between bands: JPEG at half resolution of chroma."""
@@ -284,16 +286,18 @@ class PhotometricFit(nn.Module):
         return (blue + red) / 2 > self.plan.smeared * luma
 
     def _model(
-        self, frame: Frame, unknown: Tensor, windows: Windows, stretch: float = 1.0
+        self, frame: Frame, unknown: Tensor, windows: Windows, stretch: Tensor | None = None
     ) -> tuple[TubeGeometry, TubeLight]:
-        """Geometry and light of the tube; ``stretch`` is the ratio of the blurs along the tube and across it."""
+        """Geometry and light of the tube; ``stretch`` [B, 1, 1] is the ratio of the blurs along the tube and across."""
         plan = self.plan
         place = TubeGeometry.of(frame, unknown, windows)
-        if stretch != 1:
-            place = replace(place, blur=place.blur / math.sqrt(stretch), sine=place.sine / stretch)
+        if stretch is not None:
+            place = replace(place, blur=place.blur / stretch.sqrt(), sine=place.sine / stretch)
         edge = self.positions - self._middle()
+        width = float((2 * self.radius / place.scale[..., 1]).detach().nan_to_num(0.0).max())
+        nodes = math.ceil(plan.density * min(max(width, 5.0), 2.0 * plan.widest))
         light = TubeLight.of(
-            place, unknown, self.radius, edge, nodes=plan.nodes, times=plan.times, degree=plan.degree, clear=plan.clear
+            place, unknown, self.radius, edge, nodes=nodes, times=plan.times, degree=plan.degree, clear=plan.clear
         )
         return place, light
 
@@ -375,7 +379,7 @@ class PhotometricFit(nn.Module):
         """Fits after Gauss-Newton steps. Position and direction are always 0 in the returned unknowns."""
         plan = self.plan
         converged = torch.zeros(len(unknown), dtype=torch.bool, device=unknown.device)
-        loss = unknown.new_zeros(len(unknown))
+        states: _Equations | None = None
         half = self.positions[-1] - self._middle()
         for step in range(plan.iterations):
             active = (~converged).nonzero()[:, 0]
@@ -396,12 +400,13 @@ class PhotometricFit(nn.Module):
             move = move * (plan.step / length.clamp(min=1e-30)).clamp(max=1.0)
             moved, rest = here.moved(unknown[active] + move)
             frame, unknown = frame.put(active, moved), unknown.index_put((active,), rest)
-            loss = loss.index_put((active,), state.loss)
+            states = state if states is None else states.put(active, state)
             if step >= 1:
                 converged = converged.index_put((active,), gain < plan.settled**2)
                 if bool(converged.all()):
                     break
-        return _Fit(frame, unknown, converged, loss)
+        assert states is not None
+        return _Fit(frame, unknown, converged, states)
 
     def _implicit(self, frame: Frame, unknown: Tensor, windows: Windows, coarse: bool) -> Tensor:
         """``unknown`` at the optimum, with its derivative by the pixels, the camera and the catheter."""
@@ -428,9 +433,9 @@ class PhotometricFit(nn.Module):
         changes = tube.changes(place, fit.colours, still=size == SHARED)  # [B, N, 3, D + 2, P]
         if fit.mixes is not None:
             changes = torch.einsum("bnecp,bncdp->bndep", fit.mixes, changes).flatten(-2)[:, :, None]
-        projected = fit.heavy @ changes.mT  # [B, N, C, K, D + 2]
-        solved = torch.linalg.solve_triangular(fit.factor, projected, upper=False)
         weighted = changes * fit.weight[..., None, :]
+        projected = (weighted.flatten(2, 3) @ fit.design.mT).unflatten(2, changes.shape[2:4]).mT  # [B, N, C, K, D + 2]
+        solved = torch.linalg.solve_triangular(fit.factor, projected, upper=False)
         blocks = (weighted @ changes.mT - solved.mT @ solved).sum(2)
         sides = (weighted @ fit.residual[..., None])[..., 0].sum(2)
         used = self._freedom(windows) > 0
@@ -488,12 +493,12 @@ class PhotometricFit(nn.Module):
         )
         grain = ((grain - tube_square).clamp(min=0) / step.clamp(min=1e-9)).clamp(1e-12, 100.0).sqrt()
         weight = equal[:, :, None] / variance
-        solution, factor, heavy = _least_squares(design, data, weight)
+        solution, factor = _least_squares(design, data, weight)
         residual = data - solution @ design
         colours = solution[:, :, 0].unflatten(-1, (3, -1)) if coarse else solution
         loss = 0.5 * (equal[:, :, None] * variance.log()).sum((1, 2, 3))
         misfit = ((equal[:, :, None] * square).sum(-1) / equal.sum(-1, keepdim=True).clamp(min=1) / tone**2).mean(-1)
-        return _Linear(design, weight, residual, heavy, factor, colours, mixes, misfit, grain, loss)
+        return _Linear(design, weight, residual, factor, colours, mixes, misfit, grain, loss)
 
     def _codes(self, basis: Tensor, light: Tensor, colours: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Design [B, N, 3 K, 3 P] and data [B, N, 1, 3 P] of luma and chroma, and their derivatives [B, N, 3, 3, P].
@@ -581,8 +586,8 @@ def _assembled(blocks: Tensor, sides: Tensor) -> tuple[Tensor, Tensor]:
     return normal, (sides[:, :, None] @ select)[:, :, 0].sum(1)
 
 
-def _least_squares(design: Tensor, data: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Coefficients [B, N, C, K] of ``data`` [B, N, C, P], Cholesky factor, and weighted design [B, N, C or 1, K, P].
+def _least_squares(design: Tensor, data: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Coefficients [B, N, C, K] of ``data`` [B, N, C, P], and Cholesky factor [B, N, C or 1, K, K].
 
     ``design`` is [B, N, K, P] and ``weight`` [B, N, C or 1, P].
     """
@@ -592,8 +597,9 @@ def _least_squares(design: Tensor, data: Tensor, weight: Tensor) -> tuple[Tensor
     gram = gram + ridge * torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
     factor, _ = torch.linalg.cholesky_ex(gram)  # NaN instead of an error where a fit has diverged
     if heavy.shape[2] == 1:
-        return torch.cholesky_solve(heavy[:, :, 0] @ data.mT, factor[:, :, 0]).mT, factor, heavy
-    return torch.cholesky_solve(heavy @ data[..., None], factor)[..., 0], factor, heavy
+        return torch.cholesky_solve(heavy[:, :, 0] @ data.mT, factor[:, :, 0]).mT, factor
+    right = ((weight * data) @ design.mT)[..., None]
+    return torch.cholesky_solve(right, factor)[..., 0], factor
 
 
 def _correlation(score: Tensor, rows: int) -> Tensor:
