@@ -8,13 +8,13 @@ from torch import Tensor, nn
 
 from holotorch.core import checks
 from holotorch.tracking.camera.camera import Camera
-from holotorch.tracking.detection.tube_light import GRADIENT, SHARED, Frame, Items, TubeGeometry, TubeLight, Windows
+from holotorch.tracking.detection.tube_light import SHARED, Frame, Items, TubeGeometry, TubeLight, Windows
 from holotorch.tracking.pose.catheter import Catheter
 
 
 @dataclass(frozen=True)
 class FitPlan:
-    """Size of the windows, models of light and errors, and limits of the search. Lengths in pixels unless said otherwise.
+    """Size of the windows, models of light and errors, limits of the search. Lengths in pixels unless said otherwise.
 
     The floors are the errors that remain with little noise, measured on seeds 0 to 119 and 240 to 479 of VariedWorld.
     """
@@ -40,11 +40,12 @@ class FitPlan:
     edge_floor: float = 0.012  # error of an inner edge along the tube: shading and sampling
     outer_floor: float = 0.02  # error of an outer edge along the tube: what shows through the clear tube
     grain_floor: float = 1.0  # error of an outer edge per ratio of the texture behind it to the step at the edge
-    axis_floor: float = 0.07  # error of the axis across: shading of higher degree
+    axis_floor: float = 0.08  # error of the axis across: shading of higher degree
     coarse_floor: float = 0.06  # additional error of edge and axis where chroma is coarse
     blur_floor: float = 0.03  # additional error of an edge per pixel of blur above ``blur``; 3 times that of the axis
     motion_floor: float = 0.01  # additional error of edge and axis per pixel of motion
-    readout: float = 0.0  # metres, standard deviation of the motion while a rolling shutter reads a frame; 0: global
+    radius_spread: float = 0.02  # standard deviation of the logarithm of the radius: blur and shading at the sides
+    readout: float = 2e-4  # metres, standard deviation of a hand's motion while a rolling shutter reads; 0: global
     step: float = 2.0  # most pixels that a step moves an edge
     reach: float = 6.0  # farthest that an edge may be from where the rough pose shows it: the window must show it
     inconsistent: float = 12.0  # sum of the squares of shifts over their deviations above which the edges disagree
@@ -259,10 +260,14 @@ class PhotometricFit(nn.Module):
         # The variance of a uniform motion is a twelfth of its square; it has two components of the same length.
         length = (6 * (unknown[:, 5:6].exp() ** 2 - self.plan.blur**2)).clamp(min=0.5).sqrt()
         sharp = torch.full_like(length, math.log(self.plan.blur))
-        starts = [torch.cat([unknown[:, :5], sharp, sign * length, length, unknown[:, 6:]], 1) for sign in (1.0, -1.0)]
+        starts = [
+            torch.cat([unknown[:, :5], sharp, unknown[:, 6:7], sign * length, length, unknown[:, 7:]], 1)
+            for sign in (1.0, -1.0)
+        ]
         twice = torch.arange(count, device=unknown.device).repeat(2)
         both = self._settled(fit.frame.take(twice), torch.cat(starts), windows.take(twice))
-        return both.take(both.state.loss.nan_to_num(torch.inf).unflatten(0, (2, count)).argmin(0) * count + twice[:count])
+        best = both.state.loss.nan_to_num(torch.inf).unflatten(0, (2, count)).argmin(0)
+        return both.take(best * count + twice[:count])
 
     def _stretched(self, fit: _Fit, windows: Windows) -> Tensor:
         """[B] whether another blur along the tube than across it fits better: a motion during the exposure."""
@@ -423,8 +428,8 @@ class PhotometricFit(nn.Module):
         """Equations of a Gauss-Newton step at ``unknown`` [B, D + 2 N].
 
         The unknowns are shifts along side, axis and sight in metres, turns towards side and front in radians, the
-        logarithm of the blur and, with D = 8, the motion during the exposure along and across the tube in pixels; and
-        the shifts of each window's edge along and of its axis across, in metres.
+        logarithms of the blur and of the radius and, with D = 9, the motion during the exposure along and across the
+        tube in pixels; and the shifts of each window's edge along and of its axis across, in metres.
         """
         plan, count = self.plan, len(self.positions)
         size = unknown.shape[1] - 2 * count
@@ -451,12 +456,13 @@ class PhotometricFit(nn.Module):
         normal, right = _assembled(blocks, sides)
         prior, start = torch.zeros_like(unknown), torch.zeros_like(unknown)
         prior[:, 5], start[:, 5] = plan.blur_spread**-2, math.log(plan.blur)
+        prior[:, 6] = plan.radius_spread**-2
         prior = torch.cat([prior[:, :size], floor.flatten(1) ** -2], 1)
         normal = normal + torch.diag_embed(prior)
         right = right - prior * (unknown - start)
         if not blur:
             keep = torch.ones_like(unknown[0])
-            keep[5:size] = 0
+            keep[5] = keep[SHARED:size] = 0
             normal, right = normal * keep * keep[:, None] + torch.diag(1 - keep), right * keep
         return _Equations(normal, right, blocks[..., -2, -2], floor, used, fit.misfit, fit.loss)
 
@@ -525,7 +531,7 @@ class PhotometricFit(nn.Module):
         more = (plan.blur_floor * (unknown[:, 5:6].exp() - plan.blur).clamp(min=0)).square()
         along, across = along + more, across + 9 * more
         if unknown.shape[1] > SHARED + 2 * count:
-            more = (plan.motion_floor * unknown[:, 6:8]).square().sum(-1, keepdim=True)
+            more = (plan.motion_floor * unknown[:, 7:9]).square().sum(-1, keepdim=True)
             along, across = along + more, across + more
         if coarse:
             along, across = along + plan.coarse_floor**2, across + plan.coarse_floor**2
@@ -561,7 +567,7 @@ class PhotometricFit(nn.Module):
         middle, half = self._middle(), self.positions[-1] - self._middle()
         ends = frame.middle[:, None] + half * frame.axis[:, None] * frame.axis.new_tensor([[-1.0], [1.0]])
         rows = self.camera.project(ends)[..., 1]
-        late = ((rows[:, 1] - rows[:, 0]) / (2 * half * height))[:, None, None]  # share of the readout per metre of tube
+        late = ((rows[:, 1] - rows[:, 0]) / (2 * half * height))[:, None, None]  # share of the readout per metre
         across = torch.eye(3).to(frame.axis) - frame.axis[:, :, None] * frame.axis[:, None]
         lever = torch.cat([-middle * across - frame.middle[:, :, None] * frame.axis[:, None], across], 1) * late
         return self.plan.readout**2 * lever @ lever.mT

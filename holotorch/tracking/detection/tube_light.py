@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 GRADIENT = 0.01  # metres along the tube over which a background changes by its coefficient
-SHARED = 6  # unknowns that all windows of a still frame share: 3 shifts, 2 turns, logarithm of the blur
+SHARED = 7  # unknowns that all windows of a still frame share: 3 shifts, 2 turns, logarithms of blur and radius
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +59,7 @@ class Frame(Items):
 
     @staticmethod
     def of(middle: Tensor, axis: Tensor) -> "Frame":
+        """Frame of the middle of the bands [B, 3] and the direction [B, 3] of the axis."""
         axis = axis / axis.norm(dim=-1, keepdim=True)
         sight = middle / middle.norm(dim=-1, keepdim=True)
         side = torch.linalg.cross(axis, sight)
@@ -157,12 +158,14 @@ class TubeLight:
     basis: Tensor
     texture: Tensor
     beyond: Tensor
+    aside: Tensor  # [B, N, 1] shift of each window's axis across
+    motion: Tensor  # [B, 1, 1, 1] motion across the tube in pixels, 0 without one
     bright: Tensor  # [B, N, M, P] weight of each node
     second: Tensor  # [B, N, M, P] its part on the second band
     rise: Tensor  # [B, N, M, P] derivative of ``second`` by the position along, times ``blur`` / ``sine``
     across: Tensor  # [B, N, M, P] distances of ray and node across the tube, in units of the blur
     ahead: Tensor  # [B, N, M, P] distances of ray and edge along the tube, in units of the blur
-    depth: Tensor  # [M, 1] heights of the nodes above the axis in metres
+    depth: Tensor  # [B, 1, M, 1] heights of the nodes above the axis in metres
     time: Tensor  # [M] times of the nodes, -0.5 to 0.5
     shade: Tensor  # [M, degrees] polynomials at the nodes
     sides: tuple[tuple[Tensor, Tensor, Tensor], ...]  # of each background: density, its moments by time and distance
@@ -189,14 +192,15 @@ class TubeLight:
         miss = place.miss + shift[..., 1:]
         per_blur = 1 / place.blur
         per_soft = per_blur * place.sine
-        depth = radius * (1 - x * x).sqrt()
-        x, depth, time, weight = (
-            value.flatten()[:, None]
-            for value in torch.broadcast_tensors(x[:, None], depth[:, None], t, weight[:, None] * weight_t)
+        x, time, weight = (
+            value.flatten()[:, None] for value in torch.broadcast_tensors(x[:, None], t, weight[:, None] * weight_t)
         )
+        radius = radius * unknown[:, 6, None, None, None].exp()
+        depth = radius * (1 - x * x).sqrt()
         path, late, paths = miss[:, :, None], beyond[:, :, None], miss[:, :, None]
         if not still:
-            along, across = unknown[:, 6, None, None] * place.pixels / place.sine, unknown[:, 7, None, None] * place.pixels
+            across = unknown[:, 8, None, None] * place.pixels
+            along = unknown[:, 7, None, None] * place.pixels / place.sine
             paths = path - across[:, :, None] * t[:, None]
             path, late = path - across[:, :, None] * time, late - along[:, :, None] * time
         far = (path - radius * x) * per_blur[:, :, None]
@@ -220,7 +224,8 @@ class TubeLight:
         through = torch.cat([first[:, :1].sum(2), seen, second[:, -1:].sum(2)], 1)  # the clear tube beyond the bands
         texture = (behind + clear * through).clamp(0, 1)
         values = (bright, second, rise, far, ahead, depth, time[:, 0], repeated)
-        return TubeLight(basis, texture, beyond, *values, tuple(sides))
+        motion = unknown[:, 6 if still else 8, None, None, None] * (not still)
+        return TubeLight(basis, texture, beyond, shift[..., 1:], motion, *values, tuple(sides))
 
     def changes(self, place: TubeGeometry, colours: Tensor, *, still: bool) -> Tensor:
         """Derivatives [B, N, 3, D + 2, P] of the light of ``colours`` [B, N, 3, K].
@@ -242,9 +247,12 @@ class TubeLight:
         covers = self.basis[:, :, -4:-2]
         slope = (left_slope * covers[:, :, :1] + right_slope * covers[:, :, 1:]) / GRADIENT
         by_along = step @ self.rise / soft + slope
-        by_slant = (step * -self.depth[:, 0]) @ self.rise / soft
+        by_slant = (step * -self.depth.mT) @ self.rise / soft
         by_blur = first @ (self.across * far - self.bright) + step @ (self.across * far_second - self.second)
-        by_blur = by_blur - step @ (self.rise * self.ahead) - low_far * left - high_far * right
+        by_blur = by_blur - low_far * left - high_far * right
+        # Light does not change if radius, miss and blur across change by the same factor.
+        by_radius = place.slant[:, :, None] * by_slant - (place.miss + self.aside)[:, :, None] * by_miss - by_blur
+        by_blur = by_blur - step @ (self.rise * self.ahead)
         parts = [
             slopes[:, :, :, None] * place.derivatives[:, :, index, None]
             for index, slopes in enumerate((by_miss, by_along))
@@ -254,12 +262,14 @@ class TubeLight:
         turn = turn + by_blur[:, :, :, None] * place.derivatives[:, :, 3, None]
         own = [-by_along[:, :, :, None], by_miss[:, :, :, None]]
         if still:
-            return torch.cat([turn, *own], 3)
+            return torch.cat([turn, by_radius[:, :, :, None], *own], 3)
         first, step = first * self.time, step * self.time
         pixels = place.pixels[:, :, None]
         along = -pixels / sine * (step @ self.rise) / soft
         across = -pixels * (high_time * right - low_time * left - first @ far - step @ far_second) / blur
-        return torch.cat([turn, along[:, :, :, None], across[:, :, :, None], *own], 3)
+        by_radius = by_radius - self.motion * across
+        rest = [one[:, :, :, None] for one in (by_radius, along, across)]
+        return torch.cat([turn, *rest, *own], 3)
 
 
 @lru_cache(maxsize=8)
