@@ -48,6 +48,7 @@ class FitPlan:
     readout: float = 2e-4  # metres, standard deviation of a hand's motion while a rolling shutter reads; 0: global
     step: float = 2.0  # most pixels that a step moves an edge
     reach: float = 6.0  # farthest that an edge may be from where the rough pose shows it: the window must show it
+    unsure: float = 0.3  # standard deviation of an edge from noise alone above which there is none: 0.5 without edges
     inconsistent: float = 12.0  # sum of the squares of shifts over their deviations above which the edges disagree
     iterations: int = 20  # most Gauss-Newton steps
     settled: float = 0.2  # step in standard deviations of the result below which a fit ends
@@ -75,6 +76,14 @@ class PhotometricPose:
     shift: Tensor
     shift_sd: Tensor
     used: Tensor
+
+    @staticmethod
+    def lost(tip: Tensor, edges: int) -> "PhotometricPose":
+        """Poses that are NaN, as many as ``tip`` [B, 3] and on its device, with ``edges`` edges each."""
+        shapes = ((3,), (3,), (6, 6), (), (edges,), (edges,), (edges,))
+        values = [tip.new_full((len(tip), *shape), torch.nan) for shape in shapes]
+        values.append(torch.zeros(len(tip), edges, dtype=torch.bool, device=tip.device))
+        return PhotometricPose(*values)
 
     def scattered(self, where: Tensor) -> "PhotometricPose":
         """These poses at the items of a batch at which ``where`` [B] is true; NaN, or False, at the others."""
@@ -120,7 +129,7 @@ class _Equations(Items):
         normal, right: [B, D + 2 N, D + 2 N] and [B, D + 2 N].
         information: [B, N] of the shift of each edge along the tube.
         floor: [B, N, 2] prior standard deviations of each window's shifts along and across, in metres.
-        used: [B, N] whether the window counts.
+        used, seen: [B, N] whether the window counts, and whether it shows an edge.
         misfit, loss: As in :class:`_Linear`.
     """
 
@@ -129,6 +138,7 @@ class _Equations(Items):
     information: Tensor
     floor: Tensor
     used: Tensor
+    seen: Tensor
     misfit: Tensor
     loss: Tensor
 
@@ -190,8 +200,8 @@ class PhotometricFit(nn.Module):
     def forward(self, frames: Tensor, tip: Tensor, direction: Tensor) -> PhotometricPose:
         """Fit poses near those given.
 
-        Poses are NaN where fewer than three windows are on the frame, where the fit does not converge or ends far from
-        the given pose, and where the edges disagree.
+        Poses are NaN where fewer than three windows are on the frame or show an edge, where the fit does not converge
+        or ends far from the given pose, and where the edges disagree.
 
         Args:
             frames: uint8 [B, 3, H, W], or floating with levels from 0 to 1; RGB.
@@ -208,6 +218,8 @@ class PhotometricFit(nn.Module):
             pixels = self._pixels(tip, direction)
             windows = self._windows(frames, pixels, tip, direction)
             usable = (self._freedom(windows) > 0).sum(-1) >= 3
+            if not bool(usable.any()):
+                return PhotometricPose.lost(tip, len(self.positions))
             if not bool(usable.all()):
                 return self(frames[usable], tip[usable], direction[usable]).scattered(usable)
             start = Frame.of(tip + self._middle() * direction, direction)
@@ -225,7 +237,7 @@ class PhotometricFit(nn.Module):
                 state = self._equations(fit.frame, unknown, own, coarse)
             known = fit.converged & self._within(fit.frame, start.take(where))
             poses.append(self._answer(fit.frame, unknown, state, known, frames.shape[-2]))
-        order = torch.cat([where for where, _, _ in groups] or [torch.zeros(0, dtype=torch.long)]).argsort()
+        order = torch.cat([where for where, _, _ in groups]).argsort()
         return _joined(poses, order)
 
     def _middle(self) -> Tensor:
@@ -464,7 +476,9 @@ class PhotometricFit(nn.Module):
             keep = torch.ones_like(unknown[0])
             keep[5] = keep[SHARED:size] = 0
             normal, right = normal * keep * keep[:, None] + torch.diag(1 - keep), right * keep
-        return _Equations(normal, right, blocks[..., -2, -2], floor, used, fit.misfit, fit.loss)
+        information = blocks[..., -2, -2]
+        seen = information.sqrt() * place.scale[..., 0] * plan.unsure > 1
+        return _Equations(normal, right, information, floor, used, seen, fit.misfit, fit.loss)
 
     def _linear(self, tube: TubeLight, windows: Windows, coarse: bool) -> _Linear:
         """Fit of the linear unknowns: first with equal weights, then with weights from the residuals."""
@@ -554,6 +568,7 @@ class PhotometricFit(nn.Module):
             covariance = covariance + self._rolled(moved, height)
         shift = unknown[:, -2 * len(self.positions) :: 2]
         deviation = (1 / state.information.clamp(min=1e-30) + state.floor[..., 0] ** 2).sqrt()
+        converged = converged & (state.seen.sum(-1) >= 3)
         converged = converged & ((shift / deviation).square().sum(-1) < self.plan.inconsistent)
         lost = torch.where(converged, 0.0, torch.nan)[:, None]
         pose = (tip + lost, direction + lost, covariance + lost[..., None])
