@@ -1,33 +1,57 @@
 """Pose of a catheter from the pixels around its band edges: a differentiable fit of a rendered cylinder to a frame."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, fields
-from functools import lru_cache
+from dataclasses import dataclass, fields, replace
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from holotorch.core import checks
 from holotorch.tracking.camera.camera import Camera
+from holotorch.tracking.detection.tube_light import SHARED, Frame, Items, TubeGeometry, TubeLight, Windows
 from holotorch.tracking.pose.catheter import Catheter
 
 
 @dataclass(frozen=True)
 class FitPlan:
-    """Size of the windows, and the model of their light. Lengths in pixels unless said otherwise."""
+    """Size of the windows, models of light and errors, limits of the search. Lengths in pixels unless said otherwise.
 
-    along: int = 12  # pixels to each side of an edge, along the image axis nearer to the tube's direction
-    across: int = 9  # pixels to each side of the tube's axis, along the other image axis
-    beside: float = 2.5  # background beside the tube that counts: more of it helps no more and is less uniform
-    degree: int = 6  # degree of the shading across the tube: the blur hides higher ones up to a width of ten pixels
-    nodes: int = 12  # nodes of the quadrature over the tube's width
+    The floors are the errors that remain with little noise, measured on seeds 0 to 119 and 240 to 479 of VariedWorld.
+    """
+
+    along: int = 8  # pixels to each side of an edge, along the image axis nearer to the tube's direction
+    widest: int = 30  # most pixels to each side of the tube's axis, along the other image axis
+    beside: float = 3.0  # background beside the tube that counts: more of it helps no more and is less uniform
+    margin: float = 8.0  # least distance of an edge from the border of the frame: its window must show both sides
+    degree: int = 4  # degree of the shading across the tube: higher ones leave the position across less certain
+    density: float = 1.6  # nodes of the quadrature over the tube's width, per pixel of it: 1e-4 of the light at least
+    times: int = 8  # nodes of the quadrature over the time of exposure, where the tube moves
     blur: float = 0.75  # blur to begin with, standard deviation: that of a focused camera
     blur_spread: float = 0.5  # standard deviation of the logarithm of a blur before it is measured
-    edge_floor: float = 0.03  # error of an edge that does not shrink with the noise: texture, shading, sampling
-    iterations: int = 12  # most Gauss-Newton steps
-    settled: float = 3e-3  # steps below this share of a parameter's scale end the fit
+    clear: float = 0.6  # share of the background in the light of a clear tube
+    dark: float = 0.01  # light, 0 to 1, whose shot noise is as large as the noise of reading the sensor
+    fine: float = 0.65  # ratio of fine detail in red minus luma to that in luma below which chroma is coarse
+    smeared: float = 2.0  # ratio of the squared residuals of chroma to those of luma above which chroma is coarse
+    chroma: float = 0.15  # weight of a level of coarse chroma relative to luma: enough to tell the colours apart
+    stretch: float = 1.2  # ratio of the blurs along and across the tube that is tried to find a motion
+    stretch_gain: float = 10.0  # log-likelihood that this must gain before a fit with a motion is tried
+    wide: float = 0.95  # blur above which a fit with a motion is tried, too
+    motion_gain: float = 150.0  # log-likelihood that a motion must gain; defocus alone gains up to 110
+    edge_floor: float = 0.012  # error of an inner edge along the tube: shading and sampling
+    outer_floor: float = 0.02  # error of an outer edge along the tube: what shows through the clear tube
+    grain_floor: float = 1.0  # error of an outer edge per ratio of the texture behind it to the step at the edge
+    axis_floor: float = 0.08  # error of the axis across: shading of higher degree
+    coarse_floor: float = 0.06  # additional error of edge and axis where chroma is coarse
+    blur_floor: float = 0.03  # additional error of an edge per pixel of blur above ``blur``; 3 times that of the axis
+    motion_floor: float = 0.01  # additional error of edge and axis per pixel of motion
+    radius_spread: float = 0.02  # standard deviation of the logarithm of the radius: blur and shading at the sides
+    readout: float = 2e-4  # metres, standard deviation of a hand's motion while a rolling shutter reads; 0: global
+    step: float = 2.0  # most pixels that a step moves an edge
+    reach: float = 6.0  # farthest that an edge may be from where the rough pose shows it: the window must show it
+    unsure: float = 0.3  # standard deviation of an edge from noise alone above which there is none: 0.5 without edges
+    inconsistent: float = 12.0  # sum of the squares of shifts over their deviations above which the edges disagree
+    iterations: int = 20  # most Gauss-Newton steps
+    settled: float = 0.2  # step in standard deviations of the result below which a fit ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +59,12 @@ class PhotometricPose:
     """Fitted poses of B frames, with what each of the N edges says about them.
 
     Attributes:
-        tip, direction: [B, 3], in metres; unit vectors from the tip to the rear.
+        tip, direction: [B, 3], in metres; unit vectors from the tip to the rear. NaN where the fit has not converged.
         covariance: [B, 6, 6] of tip and direction.
         blur: [B] standard deviation of the point spread, in pixels.
-        misfit: [B, N] mean squared residual of each edge's window relative to noise of one level.
-        shift: [B, N] of each edge along the tube relative to the fitted pose, in metres, if it alone were free.
-        shift_sd: [B, N] its standard deviation.
+        misfit: [B, N] mean squared residual of each edge's window in squared levels.
+        shift: [B, N] of each edge along the tube relative to the fitted pose, in metres.
+        shift_sd: [B, N] standard deviation of this shift, had the pose not been fitted to the edge.
         used: [B, N] whether the edge's window is on the frame.
     """
 
@@ -53,6 +77,14 @@ class PhotometricPose:
     shift_sd: Tensor
     used: Tensor
 
+    @staticmethod
+    def lost(tip: Tensor, edges: int) -> "PhotometricPose":
+        """Poses that are NaN, as many as ``tip`` [B, 3] and on its device, with ``edges`` edges each."""
+        shapes = ((3,), (3,), (6, 6), (), (edges,), (edges,), (edges,))
+        values = [tip.new_full((len(tip), *shape), torch.nan) for shape in shapes]
+        values.append(torch.zeros(len(tip), edges, dtype=torch.bool, device=tip.device))
+        return PhotometricPose(*values)
+
     def scattered(self, where: Tensor) -> "PhotometricPose":
         """These poses at the items of a batch at which ``where`` [B] is true; NaN, or False, at the others."""
 
@@ -64,27 +96,64 @@ class PhotometricPose:
 
 
 @dataclass(frozen=True, eq=False)
-class _Windows:
-    """Pixels of B x N windows of P pixels: unit rays [B, N, P, 3], radians per pixel, light [B, N, 3, P], mask."""
+class _Linear:
+    """Fit of the linear unknowns of B x N windows with C independent channels of P samples and K unknowns each.
 
-    rays: Tensor
-    angle: Tensor
-    light: Tensor
-    mask: Tensor
+    Attributes:
+        design: [B, N, K, P].
+        weight, residual: [B, N, C, P].
+        factor: [B, N, C, K, K] Cholesky factor of the normal matrix.
+        colours: [B, N, 3, K].
+        mixes: [B, N, 3, 3, P] derivatives of the samples of one channel by red, green and blue light, or None.
+        misfit: [B, N] mean squared residual in squared levels.
+        grain: [B, N] texture behind the tube relative to the step of light at the edge.
+        loss: [B] negative log-likelihood, up to a constant.
+    """
+
+    design: Tensor
+    weight: Tensor
+    residual: Tensor
+    factor: Tensor
+    colours: Tensor
+    mixes: Tensor | None
+    misfit: Tensor
+    grain: Tensor
+    loss: Tensor
 
 
 @dataclass(frozen=True, eq=False)
-class _Frame:
-    """Coordinates in which a pose is corrected: middle of the bands, axis, and unit vectors [B, 3].
+class _Equations(Items):
+    """Normal equations of B fits of D + 2 N unknowns, of which the last are two for each of N windows.
 
-    ``side`` is perpendicular to axis and line of sight, ``front`` to axis and side, and ``sight`` points at the middle.
+    Attributes:
+        normal, right: [B, D + 2 N, D + 2 N] and [B, D + 2 N].
+        information: [B, N] of the shift of each edge along the tube.
+        floor: [B, N, 2] prior standard deviations of each window's shifts along and across, in metres.
+        used, seen: [B, N] whether the window counts, and whether it shows an edge.
+        misfit, loss: As in :class:`_Linear`.
     """
 
-    middle: Tensor
-    axis: Tensor
-    side: Tensor
-    front: Tensor
-    sight: Tensor
+    normal: Tensor
+    right: Tensor
+    information: Tensor
+    floor: Tensor
+    used: Tensor
+    seen: Tensor
+    misfit: Tensor
+    loss: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Fits of B frames: unknowns relative to ``frame``, whether they have converged, equations of the last step."""
+
+    frame: Frame
+    unknown: Tensor
+    converged: Tensor
+    state: _Equations
+
+    def take(self, index: Tensor) -> "_Fit":
+        return _Fit(self.frame.take(index), self.unknown[index], self.converged[index], self.state.take(index))
 
 
 class PhotometricFit(nn.Module):
@@ -94,14 +163,15 @@ class PhotometricFit(nn.Module):
     backgrounds. Position, direction and blur are found by Gauss-Newton steps with an analytic Jacobian; all colours and
     the shading across the tube are linear and are eliminated in each step (variable projection). The cylinder is exact
     in the space of rays, so that the rings' curvature and the lens's distortion need no correction, and pixels are used
-    as they are, without interpolation.
+    as they are, without interpolation. Each window may shift a little on its own: by what no noise explains.
+
+    The noise is estimated from the residuals: of each channel, of the tube and of the background apart, and as far as
+    the residuals of neighbouring pixels agree. Where chroma has a lower resolution than luma (4:2:0 video, JPEG), luma
+    is fitted. Where another blur along the tube than across it fits better, a uniform motion during the exposure is
+    tried. A rolling shutter cannot be told from another pose: state ``readout`` in the plan.
 
     The result is differentiable with respect to the frames, the camera and the catheter, by the implicit function
     theorem at the optimum.
-
-    The model has one blur in all directions and full resolution of the colours: motion of more than about a pixel,
-    chroma at half resolution (4:2:0) and textures as fine as the tube bias the pose by more than its covariance says.
-    ``misfit`` is high where the light does not fit.
 
     Args:
         camera: Intrinsics and tone curve.
@@ -128,7 +198,10 @@ class PhotometricFit(nn.Module):
                 self.register_buffer(name, value)
 
     def forward(self, frames: Tensor, tip: Tensor, direction: Tensor) -> PhotometricPose:
-        """Fit poses near those given; NaN where fewer than three windows are on the frame, or where the fit diverges.
+        """Fit poses near those given.
+
+        Poses are NaN where fewer than three windows are on the frame or show an edge, where the fit does not converge
+        or ends far from the given pose, and where the edges disagree.
 
         Args:
             frames: uint8 [B, 3, H, W], or floating with levels from 0 to 1; RGB.
@@ -141,28 +214,119 @@ class PhotometricFit(nn.Module):
         """
         _check(frames, tip, direction)
         tip, direction = tip.detach().double(), direction.detach().double()
-        middle = (self.positions[0] + self.positions[-1]).detach() / 2
         with torch.no_grad():
             pixels = self._pixels(tip, direction)
             windows = self._windows(frames, pixels, tip, direction)
             usable = (self._freedom(windows) > 0).sum(-1) >= 3
-        if not bool(usable.all()):
-            return self(frames[usable], tip[usable], direction[usable]).scattered(usable)
-        with torch.no_grad():
-            frame = _frame(tip + middle * direction, direction)
-            unknown = torch.zeros(len(tip), 6, dtype=torch.float64, device=tip.device)
-            unknown[:, 5] = math.log(self.plan.blur)
-            frame, unknown = self._settled(frame, unknown, windows)
+            if not bool(usable.any()):
+                return PhotometricPose.lost(tip, len(self.positions))
+            if not bool(usable.all()):
+                return self(frames[usable], tip[usable], direction[usable]).scattered(usable)
+            start = Frame.of(tip + self._middle() * direction, direction)
+            groups = self._fits(start, windows, self._coarse(frames, pixels))
         trainable = (frames, self.camera.matrix, self.camera.distortion, self.positions, self.radius)
-        if torch.is_grad_enabled() and any(one.requires_grad for one in trainable):
+        implicit = torch.is_grad_enabled() and any(one.requires_grad for one in trainable)
+        if implicit:
             windows = self._windows(frames, pixels, tip, direction)
-            unknown = self._implicit(frame, unknown, windows)
-        normal, _, parts = self._equations(frame, unknown, windows)
-        return self._answer(frame, unknown, windows, normal, parts)
+        poses = []
+        for where, fit, coarse in groups:
+            unknown, state = fit.unknown, fit.state
+            if implicit:
+                own = windows.take(where)
+                unknown = self._implicit(fit.frame, unknown, own, coarse)
+                state = self._equations(fit.frame, unknown, own, coarse)
+            known = fit.converged & self._within(fit.frame, start.take(where))
+            poses.append(self._answer(fit.frame, unknown, state, known, frames.shape[-2]))
+        order = torch.cat([where for where, _, _ in groups]).argsort()
+        return _joined(poses, order)
 
-    def _freedom(self, windows: _Windows) -> Tensor:
-        """Samples of each window beyond its linear unknowns and 20 pixels more, [B, N]; above 0 for a window in use."""
-        return 3 * (windows.mask.sum(-1) - 2 * (self.plan.degree + 1) - 4) - 60
+    def _middle(self) -> Tensor:
+        return (self.positions[0] + self.positions[-1]) / 2
+
+    def _fits(self, start: Frame, windows: Windows, coarse: Tensor) -> list[tuple[Tensor, _Fit, bool]]:
+        """Fits in groups with the same model: items of the batch, fits, and whether their chroma is coarse."""
+        plan = self.plan
+        unknown = start.middle.new_zeros(len(start.middle), SHARED + 2 * len(self.positions))
+        unknown[:, 5] = math.log(plan.blur)
+        fit = self._settled(start, unknown, windows)
+        blurred = ~coarse & (self._stretched(fit, windows) | (fit.unknown[:, 5] > math.log(plan.wide)))
+        where = blurred.nonzero()[:, 0]
+        groups, moves = [], torch.zeros_like(coarse)
+        if len(where):
+            moving, own = self._moving(fit.take(where), windows.take(where)), windows.take(where)
+            better = (moving.state.loss < fit.state.loss[where] - plan.motion_gain) & ~self._smeared(moving, own)
+            moves = moves.index_put((where,), better)
+            groups.append((where[better], moving.take(better), False))
+        coarse = coarse | (~moves & self._smeared(fit, windows))
+        still = (~moves & ~coarse).nonzero()[:, 0]
+        groups.append((still, fit.take(still), False))
+        where = coarse.nonzero()[:, 0]
+        if len(where):
+            rough = fit.take(where)
+            groups.append((where, self._settled(rough.frame, rough.unknown, windows.take(where), coarse=True), True))
+        return [group for group in groups if len(group[0])]
+
+    def _moving(self, fit: _Fit, windows: Windows) -> _Fit:
+        """The best fits with a motion during the exposure, from two starts: along either diagonal of tube and width."""
+        count, unknown = len(fit.unknown), fit.unknown
+        # The variance of a uniform motion is a twelfth of its square; it has two components of the same length.
+        length = (6 * (unknown[:, 5:6].exp() ** 2 - self.plan.blur**2)).clamp(min=0.5).sqrt()
+        sharp = torch.full_like(length, math.log(self.plan.blur))
+        starts = [
+            torch.cat([unknown[:, :5], sharp, unknown[:, 6:7], sign * length, length, unknown[:, 7:]], 1)
+            for sign in (1.0, -1.0)
+        ]
+        twice = torch.arange(count, device=unknown.device).repeat(2)
+        both = self._settled(fit.frame.take(twice), torch.cat(starts), windows.take(twice))
+        best = both.state.loss.nan_to_num(torch.inf).unflatten(0, (2, count)).argmin(0)
+        return both.take(best * count + twice[:count])
+
+    def _stretched(self, fit: _Fit, windows: Windows) -> Tensor:
+        """[B] whether another blur along the tube than across it fits better: a motion during the exposure."""
+        count, twice = len(fit.unknown), torch.arange(len(fit.unknown), device=fit.unknown.device).repeat(2)
+        stretch = fit.unknown.new_full((2 * count, 1, 1), self.plan.stretch)
+        stretch[count:] = 1 / self.plan.stretch
+        windows = windows.take(twice)
+        _, tube = self._model(fit.frame.take(twice), fit.unknown[twice], windows, stretch)
+        losses = self._linear(tube, windows, False).loss.unflatten(0, (2, count))
+        return losses.amin(0) < fit.state.loss - self.plan.stretch_gain
+
+    def _smeared(self, fit: _Fit, windows: Windows) -> Tensor:
+        """[B] whether chroma fits worse than luma near the edges between bands: JPEG at half resolution of chroma."""
+        place, tube = self._model(fit.frame, fit.unknown, windows)
+        fitted = (windows.light - self._linear(tube, windows, False).residual).clamp(*_LIGHT)
+        levels = self.camera.levels(windows.light) - self.camera.levels(fitted)
+        square = torch.einsum("ec,bncp->bnep", levels.new_tensor(_CODES), levels).square()
+        near = tube.beyond.abs() * place.sine < 2.5 * place.pixels
+        weight = windows.mask * (1 - tube.texture) * near
+        luma, blue, red = (square * weight[:, :, None])[:, 1:-1].sum((1, 3)).unbind(-1)
+        return (blue + red) / 2 > self.plan.smeared * luma
+
+    def _model(
+        self, frame: Frame, unknown: Tensor, windows: Windows, stretch: Tensor | None = None
+    ) -> tuple[TubeGeometry, TubeLight]:
+        """Geometry and light of the tube; ``stretch`` [B, 1, 1] is the ratio of the blurs along the tube and across."""
+        plan = self.plan
+        place = TubeGeometry.of(frame, unknown, windows)
+        if stretch is not None:
+            place = replace(place, blur=place.blur / stretch.sqrt(), sine=place.sine / stretch)
+        edge = self.positions - self._middle()
+        width = float((2 * self.radius / place.scale[..., 1]).detach().nan_to_num(0.0).max())
+        nodes = math.ceil(plan.density * min(max(width, 5.0), 2.0 * plan.widest))
+        light = TubeLight.of(
+            place, unknown, self.radius, edge, nodes=nodes, times=plan.times, degree=plan.degree, clear=plan.clear
+        )
+        return place, light
+
+    def _within(self, frame: Frame, start: Frame) -> Tensor:
+        """[B] whether no edge is farther than ``reach`` from where it was in the rough pose."""
+        edges = (self.positions - self._middle())[:, None].detach()
+        before, after = (self.camera.project(one.middle[:, None] + edges * one.axis[:, None]) for one in (start, frame))
+        return ~((after - before).norm(dim=-1) > self.plan.reach).any(-1)
+
+    def _freedom(self, windows: Windows) -> Tensor:
+        """Pixels of each window beyond twice its linear unknowns, [B, N]; above 0 for a window in use."""
+        return windows.mask.sum(-1) - 2 * (2 * (self.plan.degree + 1) + 4)
 
     def _pixels(self, tip: Tensor, direction: Tensor) -> Tensor:
         """Pixels (x, y) [B, N, P, 2] around each edge: columns or rows of pixels that follow the tube."""
@@ -175,21 +339,23 @@ class PhotometricFit(nn.Module):
         # The image axis nearer to the tube's direction comes first.
         order = torch.stack([steep, ~steep], -1).long()
         first, slope = centre.gather(-1, order), along.gather(-1, order)
-        i, j = (torch.arange(-n, n + 1.0, dtype=tip.dtype, device=tip.device) for n in (plan.along, plan.across))
+        wide = self.radius * camera.matrix[0, 0] / edges.norm(dim=-1) + plan.beside
+        wide = (wide * along.norm(dim=-1) / slope[..., 0].abs()).nan_to_num(0.0, 0.0, 0.0)
+        across = min(math.ceil(float(wide.max())) if wide.numel() else 1, plan.widest)
+        i, j = (torch.arange(-n, n + 1.0, dtype=tip.dtype, device=tip.device) for n in (plan.along, across))
         main = first[..., :1].round() + i
         other = (first[..., 1:] + (main - first[..., :1]) * slope[..., 1:] / slope[..., :1]).round()
         pixels = torch.stack(torch.broadcast_tensors(main[..., None], other[..., None] + j), -1).flatten(2, 3)
         return pixels.gather(-1, order[:, :, None].expand_as(pixels)).nan_to_num(-1.0)
 
-    def _windows(self, frames: Tensor, pixels: Tensor, tip: Tensor, direction: Tensor) -> _Windows:
+    def _windows(self, frames: Tensor, pixels: Tensor, tip: Tensor, direction: Tensor) -> Windows:
         """Rays and light of the pixels; those near the tube at the rough pose count."""
         camera = self.camera
         height, width = frames.shape[-2:]
         x, y = pixels.unbind(-1)
         inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-        index = (y.clamp(0, height - 1) * width + x.clamp(0, width - 1)).long().flatten(1)
-        levels = frames.flatten(2).gather(2, index[:, None].expand(-1, 3, -1)).unflatten(2, pixels.shape[1:3])
-        light = camera.linear(levels if frames.dtype == torch.uint8 else 255 * levels.double()).double().movedim(1, 2)
+        levels = _levels(frames, pixels)
+        light = camera.linear(levels).double()
         plane = camera.undistort(pixels)
         rays = torch.cat([plane, torch.ones_like(plane[..., :1])], -1)
         length = rays.norm(dim=-1)
@@ -201,236 +367,286 @@ class PhotometricFit(nn.Module):
             miss = (across * tip[:, None, None]).sum(-1) / across.norm(dim=-1)
             depth = (tip[:, None] + self.positions[:, None] * direction[:, None]).norm(dim=-1)[..., None]
             near = miss.abs() < self.radius + self.plan.beside * depth * angle
-        return _Windows(rays, angle, light, (inside & near).double())
+        # An edge counts if all of the frame around it is there; a saturated pixel does not.
+        clear = (levels < _WHITE).all(2)
+        x, y = pixels[:, :, pixels.shape[2] // 2].unbind(-1)
+        margin = torch.minimum(torch.minimum(x, width - 1 - x), torch.minimum(y, height - 1 - y))
+        within = (margin >= self.plan.margin)[..., None]
+        return Windows(rays.mT.contiguous(), angle, light, (inside & near & clear & within).double())
 
-    def _settled(self, frame: _Frame, unknown: Tensor, windows: _Windows) -> tuple[_Frame, Tensor]:
-        """Pose and blur after Gauss-Newton steps. Position and direction are always 0 in the returned unknown."""
-        for step in range(self.plan.iterations):
-            normal, right, _ = self._equations(frame, unknown, windows, blur=step >= 2)
+    def _coarse(self, frames: Tensor, pixels: Tensor) -> Tensor:
+        """[B] whether red minus luma has less fine detail than luma around an edge: chroma at half resolution.
+
+        With independent noise in each channel it has 1.4 times as much, and a grey texture adds to luma alone.
+        """
+        height, width = frames.shape[-2:]
+        if min(height, width) < _PATCH:
+            return torch.zeros(len(frames), dtype=torch.bool, device=frames.device)
+        middle = pixels[:, :, pixels.shape[2] // 2]
+        corner = (middle - _PATCH // 2).clamp(min=0).minimum(middle.new_tensor([width - _PATCH, height - _PATCH]))
+        i = torch.arange(_PATCH, dtype=pixels.dtype, device=pixels.device)
+        square = torch.stack(torch.broadcast_tensors(i, i[:, None]), -1).flatten(0, 1)
+        levels = _levels(frames, corner[:, :, None] + square).double().unflatten(-1, (_PATCH, _PATCH))
+        luma = (levels * levels.new_tensor(_CODES[0])[:, None, None]).sum(2)
+        both = torch.stack([luma, levels[:, :, 0] - luma])
+        luma, red = both.diff(n=2, dim=-1).diff(n=2, dim=-2).abs().flatten(-2).median(-1).values
+        return (red < self.plan.fine * luma).any(-1)
+
+    def _settled(self, frame: Frame, unknown: Tensor, windows: Windows, *, coarse: bool = False) -> _Fit:
+        """Fits after Gauss-Newton steps. Position and direction are always 0 in the returned unknowns."""
+        plan = self.plan
+        converged = torch.zeros(len(unknown), dtype=torch.bool, device=unknown.device)
+        states: _Equations | None = None
+        half = self.positions[-1] - self._middle()
+        for step in range(plan.iterations):
+            active = (~converged).nonzero()[:, 0]
+            here, own = frame.take(active), windows.take(active)
+            state = self._equations(here, unknown[active], own, coarse, blur=step >= 1)
             damping = 1e-3 if step == 0 else 1e-9
-            scale = normal.diagonal(dim1=-2, dim2=-1).clamp(min=1e-30).rsqrt()
-            scaled = normal * scale[:, None] * scale[..., None] + damping * torch.eye(6).to(normal)
-            move = scale * torch.linalg.solve_ex(scaled, scale * right)[0]
-            frame, unknown = _moved(frame, unknown + move)
-            largest = (move / _SCALES.to(move)).abs().nan_to_num(0.0)
-            if step >= 3 and bool((largest < self.plan.settled).all()):
-                break
-        return frame, unknown
+            scale = state.normal.diagonal(dim1=-2, dim2=-1).clamp(min=1e-30).rsqrt()
+            scaled = state.normal * scale[:, None] * scale[..., None]
+            scaled = scaled + damping * torch.eye(scaled.shape[-1]).to(scaled)
+            move = scale * torch.linalg.solve_ex(scaled, scale * state.right)[0]
+            gain = (move * state.right).sum(-1)
+            # Changes that move the edges by about a pixel: shifts to side, axis and sight, turns to side and front.
+            depth = here.middle.norm(dim=-1)
+            one = torch.ones_like(depth)
+            unit = torch.stack([one, one, depth / half, one / half, depth / half**2], -1)
+            unit = unit * (depth * own.angle.mean((1, 2)))[:, None]
+            length = (move[:, :5] / unit).abs().amax(-1, keepdim=True)
+            move = move * (plan.step / length.clamp(min=1e-30)).clamp(max=1.0)
+            moved, rest = here.moved(unknown[active] + move)
+            frame, unknown = frame.put(active, moved), unknown.index_put((active,), rest)
+            states = state if states is None else states.put(active, state)
+            if step >= 1:
+                converged = converged.index_put((active,), gain < plan.settled**2)
+                if bool(converged.all()):
+                    break
+        assert states is not None
+        return _Fit(frame, unknown, converged, states)
 
-    def _implicit(self, frame: _Frame, unknown: Tensor, windows: _Windows) -> Tensor:
+    def _implicit(self, frame: Frame, unknown: Tensor, windows: Windows, coarse: bool) -> Tensor:
         """``unknown`` at the optimum, with its derivative by the pixels, the camera and the catheter."""
         unknown = unknown.detach().requires_grad_()
-        _, right, _ = self._equations(frame, unknown, windows)
-        rows = [torch.autograd.grad(right[:, i].sum(), unknown, retain_graph=True)[0] for i in range(6)]
+        right = self._equations(frame, unknown, windows, coarse).right
+        rows = [torch.autograd.grad(one.sum(), unknown, retain_graph=True)[0] for one in right.unbind(-1)]
         slope = torch.stack(rows, 1).detach()
-        _, right, _ = self._equations(frame, unknown.detach(), windows)
-        return unknown.detach() - torch.linalg.solve(slope, right)
+        right = self._equations(frame, unknown.detach(), windows, coarse).right
+        return unknown.detach() - torch.linalg.solve_ex(slope, right)[0]
 
     def _equations(
-        self, frame: _Frame, unknown: Tensor, windows: _Windows, blur: bool = True
-    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-        """Normal matrix [B, 6, 6], right side [B, 6] and parts for the answer, at ``unknown`` [B, 6].
+        self, frame: Frame, unknown: Tensor, windows: Windows, coarse: bool, blur: bool = True
+    ) -> _Equations:
+        """Equations of a Gauss-Newton step at ``unknown`` [B, D + 2 N].
 
-        The unknowns are shifts along side, axis and sight in metres, turns towards side and front in radians, and the
-        logarithm of the blur.
+        The unknowns are shifts along side, axis and sight in metres, turns towards side and front in radians, the
+        logarithms of the blur and of the radius and, with D = 9, the motion during the exposure along and across the
+        tube in pixels; and the shifts of each window's edge along and of its axis across, in metres.
         """
-        plan, radius = self.plan, self.radius
-        place = _Geometry.of(frame, unknown, windows, radius)
-        x, weight = (value.to(unknown.device) for value in _nodes(plan.nodes))
-        edge = (self.positions - (self.positions[0] + self.positions[-1]) / 2)[:, None]
-        wide = place.blur  # metres across, per unit of the Gaussian
-        z = (place.miss[..., None] - radius * x) / wide[..., None]
-        bright = (radius * weight / math.sqrt(2 * math.pi)) * torch.exp(-0.5 * z * z) / wide[..., None]  # [B, N, P, M]
-        depth = radius * (1 - x * x).sqrt()
-        q = (place.along[..., None] - place.slant[..., None] * depth - edge[..., None]) / place.soft[..., None]
-        share = torch.special.ndtr(q)
-        shade = torch.from_numpy(np.polynomial.legendre.legvander(_nodes(plan.nodes)[0].numpy(), plan.degree)).to(x)
-        low, high = (-radius - place.miss) / wide, (place.miss - radius) / wide
-        left, right_ = torch.special.ndtr(low)[..., None], torch.special.ndtr(high)[..., None]
-        gradient = ((place.along - edge) / _GRADIENT)[..., None]  # of each background along the tube
-        second = bright * share
-        basis = torch.cat(
-            [(bright - second) @ shade, second @ shade, left, right_, left * gradient, right_ * gradient], -1
-        )  # [B, N, P, K]
-        coefficients, fitted, weights, solve = self._linear(basis, windows)
-        residual = windows.light - fitted  # [B, N, 3, P]
-        count = shade.shape[1]
-        first_c, second_c = coefficients[..., :count] @ shade.T, coefficients[..., count : 2 * count] @ shade.T
-        sides = coefficients[..., 2 * count :]  # [B, N, 3, 4]
-        slopes = _slopes(
-            bright, share, z, q, depth, place, wide, first_c, second_c, sides, low, high, gradient[..., 0]
-        )  # by miss, along, slant, log blur
-        turn = torch.einsum("gbncp,bnpgk->bncpk", slopes, place.derivatives)  # [B, N, 3, P, 6]
-        own = torch.stack([-slopes[1], slopes[0]], -1)  # moves of this window's edge along, and of its axis across
-        changes = torch.cat([turn, own], -1)
-        changes = changes - torch.einsum("bnpk,bnckl->bncpl", basis, solve(changes))
-        weighted = weights[..., None] * changes
-        blocks = torch.einsum("bncpk,bncpl->bnkl", weighted, changes)
-        sides_ = torch.einsum("bncpk,bncp->bnk", weighted, residual)
-        freedom = self._freedom(windows)
-        misfit = (weights * residual * residual).sum((-2, -1)) / (freedom + 60).clamp(min=1)
-        used = freedom > 0
-        median = torch.where(used, misfit, torch.nan).nanmedian(-1, keepdim=True).values
-        trust = used / torch.maximum(misfit, 0.5 * median).clamp(min=_ROUNDING)
-        blocks, sides_ = blocks * trust[..., None, None], sides_ * trust[..., None]
-        # Each window's edge and axis are off by a little that no noise explains: marginalised with its prior.
-        floor = torch.stack([place.pixel / place.sine, place.pixel], -1) * plan.edge_floor
-        inner = blocks[..., 6:, 6:] + torch.diag_embed(floor**-2)
-        cross = torch.linalg.solve(inner, blocks[..., 6:, :6])
-        normal = (blocks[..., :6, :6] - blocks[..., :6, 6:] @ cross).sum(1)
-        right = (sides_[..., :6] - (cross.mT @ sides_[..., 6:, None])[..., 0]).sum(1)
-        prior = unknown.new_zeros(6)
-        prior[5] = plan.blur_spread**-2
-        normal = normal + torch.diag(prior)
-        right = right - prior * (unknown - unknown.new_tensor([0, 0, 0, 0, 0, math.log(plan.blur)]))
+        plan, count = self.plan, len(self.positions)
+        size = unknown.shape[1] - 2 * count
+        place, tube = self._model(frame, unknown, windows)
+        fit = self._linear(tube, windows, coarse)
+        changes = tube.changes(place, fit.colours, still=size == SHARED)  # [B, N, 3, D + 2, P]
+        if fit.mixes is not None:
+            changes = torch.einsum("bnecp,bncdp->bndep", fit.mixes, changes).flatten(-2)[:, :, None]
+        weighted = changes * fit.weight[..., None, :]
+        projected = (weighted.flatten(2, 3) @ fit.design.mT).unflatten(2, changes.shape[2:4]).mT  # [B, N, C, K, D + 2]
+        solved = torch.linalg.solve_triangular(fit.factor, projected, upper=False)
+        blocks = (weighted @ changes.mT - solved.mT @ solved).sum(2)
+        sides = (weighted @ fit.residual[..., None])[..., 0].sum(2)
+        used = self._freedom(windows) > 0
+        # Residuals of neighbouring pixels that agree in sign leave more error than the same number of independent ones.
+        known = torch.linalg.solve_triangular(fit.factor.mT, solved[..., -2:], upper=True)
+        score = changes[..., -2:, :] - (known.mT.flatten(2, 3) @ fit.design).unflatten(2, (-1, 2))
+        score = (score * (fit.weight * fit.residual)[..., None, :]).sum(2)  # [B, N, 2, P]
+        if coarse:
+            score = score.unflatten(-1, (3, -1)).sum(-2)
+        trust = used / _correlation(score, 2 * plan.along + 1)
+        blocks, sides = blocks * trust[..., None, None], sides * trust[..., None]
+        floor = self._floor(place, unknown, fit.grain, coarse)
+        normal, right = _assembled(blocks, sides)
+        prior, start = torch.zeros_like(unknown), torch.zeros_like(unknown)
+        prior[:, 5], start[:, 5] = plan.blur_spread**-2, math.log(plan.blur)
+        prior[:, 6] = plan.radius_spread**-2
+        prior = torch.cat([prior[:, :size], floor.flatten(1) ** -2], 1)
+        normal = normal + torch.diag_embed(prior)
+        right = right - prior * (unknown - start)
         if not blur:
-            keep = unknown.new_tensor([1.0, 1, 1, 1, 1, 0])
-            normal = normal * keep * keep[:, None] + torch.diag(1 - keep)
-            right = right * keep
-        return normal, right, (blocks, sides_, misfit, used, floor)
+            keep = torch.ones_like(unknown[0])
+            keep[5] = keep[SHARED:size] = 0
+            normal, right = normal * keep * keep[:, None] + torch.diag(1 - keep), right * keep
+        information = blocks[..., -2, -2]
+        seen = information.sqrt() * place.scale[..., 0] * plan.unsure > 1
+        return _Equations(normal, right, information, floor, used, seen, fit.misfit, fit.loss)
 
-    def _linear(self, basis: Tensor, windows: _Windows) -> tuple[Tensor, Tensor, Tensor, Callable[[Tensor], Tensor]]:
-        """Coefficients [B, N, 3, K] of the light, fitted light, weights [B, N, 3, P], and a solver for projections."""
+    def _linear(self, tube: TubeLight, windows: Windows, coarse: bool) -> _Linear:
+        """Fit of the linear unknowns: first with equal weights, then with weights from the residuals."""
+        plan, mask, basis = self.plan, windows.mask, tube.basis
+        equal, texture = (value.repeat(1, 1, 3) if coarse else value for value in (mask, tube.texture))
+        design, data, mixes = basis, windows.light, None
+        colours = _least_squares(design, data, mask[:, :, None])[0]  # [B, N, 3, K]
+        for _ in range(2 * coarse):
+            design, data, mixes = self._codes(basis, windows.light, colours)
+            colours = _least_squares(design, data, equal[:, :, None])[0].unflatten(-1, (3, -1))[:, :, 0]
+        fitted = colours.flatten(2)[:, :, None] @ design if coarse else colours @ design
+        square = (data - fitted).square()
+        # Variance of the noise, up to a factor, and light per level; both 1 where the samples are levels.
+        noise, tone = torch.ones_like(fitted), torch.ones_like(fitted[..., 0])
+        if not coarse:
+            noise = fitted.clamp(min=0) + plan.dark
+            mean = (fitted * mask[:, :, None]).sum(-1) / mask.sum(-1, keepdim=True).clamp(min=1)
+            level = self.camera.levels(mean.clamp(*_LIGHT))
+            tone = self.camera.linear(level + 0.5) - self.camera.linear(level - 0.5)
+        parts = (equal * (1 - texture))[:, :, None], (equal * texture)[:, :, None]  # the tube, and what is behind it
+        amounts = [part.sum(-1).clamp(min=1) for part in parts]
+        freedom = (mask.sum(-1) / (mask.sum(-1) - basis.shape[2]).clamp(min=1))[..., None]
+        relative, rounding = square / noise, _ROUNDING * tone**2 / noise.mean(-1)
+        own, other = (
+            freedom * (part * relative).sum(-1) / amount + rounding for part, amount in zip(parts, amounts, strict=True)
+        )
+        ratio = (other / own).log().mean(-1)[..., None, None].exp()
+        variance = own[..., None] * noise * (1 - texture + texture * ratio.squeeze(-1))[:, :, None]
+        step = (colours[..., plan.degree + 1] - colours[..., 0]).square().sum(-1)
+        tube_square, grain = (
+            ((part * square).sum(-1) / amount).sum(-1) for part, amount in zip(parts, amounts, strict=True)
+        )
+        grain = ((grain - tube_square).clamp(min=0) / step.clamp(min=1e-9)).clamp(1e-12, 100.0).sqrt()
+        weight = equal[:, :, None] / variance
+        solution, factor = _least_squares(design, data, weight)
+        residual = data - solution @ design
+        colours = solution[:, :, 0].unflatten(-1, (3, -1)) if coarse else solution
+        loss = 0.5 * (equal[:, :, None] * variance.log()).sum((1, 2, 3))
+        misfit = ((equal[:, :, None] * square).sum(-1) / equal.sum(-1, keepdim=True).clamp(min=1) / tone**2).mean(-1)
+        return _Linear(design, weight, residual, factor, colours, mixes, misfit, grain, loss)
+
+    def _codes(self, basis: Tensor, light: Tensor, colours: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Design [B, N, 3 K, 3 P] and data [B, N, 1, 3 P] of luma and chroma, and their derivatives [B, N, 3, 3, P].
+
+        Luma and chroma are sums of levels, which are linearised at the light that ``colours`` [B, N, 3, K] give.
+        """
         camera = self.camera
+        fitted = colours @ basis
+        level = camera.levels(fitted.clamp(*_LIGHT))
+        slope = 1 / (camera.linear(level + 0.5) - camera.linear(level - 0.5))
+        mix = basis.new_tensor(_CODES) * basis.new_tensor([[1.0], [self.plan.chroma], [self.plan.chroma]])
+        mixes = mix[:, :, None] * slope[:, :, None]  # [B, N, e, c, P]
+        data = (mixes * fitted[:, :, None]).sum(3) + mix @ (camera.levels(light) - level)
+        design = torch.einsum("bnecp,bnkp->bnckep", mixes, basis).flatten(4).flatten(2, 3)
+        return design, data.flatten(2)[:, :, None], mixes
 
-        def weights_of(light: Tensor) -> Tensor:
-            level = camera.levels(light.clamp(2e-3, 0.98)).clamp(4, 250)
-            return windows.mask[:, :, None] / (camera.linear(level + 0.5) - camera.linear(level - 0.5)) ** 2
-
-        def solver(weights: Tensor):
-            heavy = basis[:, :, None] * weights[..., None]
-            gram = heavy.mT @ basis[:, :, None]
-            ridge = 1e-7 * gram.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] + 1e-12
-            gram = gram + ridge * torch.eye(basis.shape[-1], dtype=basis.dtype, device=basis.device)
-            factor, _ = torch.linalg.cholesky_ex(gram)  # NaN instead of an error where a fit has diverged
-            return lambda values: torch.cholesky_solve(heavy.mT @ values, factor)
-
-        solve = solver(weights_of(windows.light.clamp(2e-2)))
-        fitted = (basis[:, :, None] @ solve(windows.light[..., None]))[..., 0]
-        weights = weights_of(fitted)
-        solve = solver(weights)
-        coefficients = solve(windows.light[..., None])
-        return coefficients[..., 0], (basis[:, :, None] @ coefficients)[..., 0], weights, solve
+    def _floor(self, place: TubeGeometry, unknown: Tensor, grain: Tensor, coarse: bool) -> Tensor:
+        """Standard deviations in metres of what no noise explains in each edge along and across the tube, [B, N, 2]."""
+        plan, count = self.plan, len(self.positions)
+        outer = torch.tensor([n in (0, count - 1) for n in range(count)], device=unknown.device)
+        texture = torch.zeros_like(grain) if coarse else (plan.grain_floor * grain).square()
+        along = torch.where(outer, plan.outer_floor**2 + texture, plan.edge_floor**2)
+        across = torch.full_like(along, plan.axis_floor**2)
+        more = (plan.blur_floor * (unknown[:, 5:6].exp() - plan.blur).clamp(min=0)).square()
+        along, across = along + more, across + 9 * more
+        if unknown.shape[1] > SHARED + 2 * count:
+            more = (plan.motion_floor * unknown[:, 7:9]).square().sum(-1, keepdim=True)
+            along, across = along + more, across + more
+        if coarse:
+            along, across = along + plan.coarse_floor**2, across + plan.coarse_floor**2
+        return place.scale * torch.stack([along, across], -1).sqrt()
 
     def _answer(
-        self, frame: _Frame, unknown: Tensor, windows: _Windows, normal: Tensor, parts: tuple[Tensor, ...]
+        self, frame: Frame, unknown: Tensor, state: _Equations, converged: Tensor, height: int
     ) -> PhotometricPose:
-        blocks, sides, misfit, used, floor = parts
-        moved, rest = _moved(frame, unknown)
-        middle = (self.positions[0] + self.positions[-1]) / 2
-        tip, direction = _pose(moved, middle)
+        """Poses; NaN for those that have not converged or whose edges disagree."""
+        moved, rest = frame.moved(unknown)
+        middle = self._middle()
+        tip, direction = moved.middle - middle * moved.axis, moved.axis
         zero = torch.zeros_like(frame.side)
-        rows = (frame.side, frame.axis, frame.sight, -middle * frame.side, -middle * frame.front, zero)
-        turns = (zero, zero, zero, frame.side, frame.front, zero)
+        more = [zero] * (unknown.shape[1] - 5)
+        rows = (frame.side, frame.axis, frame.sight, -middle * frame.side, -middle * frame.front, *more)
+        turns = (zero, zero, zero, frame.side, frame.front, *more)
         lever = torch.cat([torch.stack(rows, -1), torch.stack(turns, -1)], 1)
-        covariance = lever @ torch.linalg.inv_ex(normal)[0] @ lever.mT
-        information = blocks[..., 6, 6]
-        shift = sides[..., 6] / information.clamp(min=1e-30)
-        deviation = (1 / information.clamp(min=1e-30) + floor[..., 0] ** 2).sqrt()
-        return PhotometricPose(tip, direction, covariance, rest[:, 5].exp(), misfit, shift, deviation, used)
+        covariance = lever @ torch.linalg.inv_ex(state.normal)[0] @ lever.mT
+        if self.plan.readout:
+            covariance = covariance + self._rolled(moved, height)
+        shift = unknown[:, -2 * len(self.positions) :: 2]
+        deviation = (1 / state.information.clamp(min=1e-30) + state.floor[..., 0] ** 2).sqrt()
+        converged = converged & (state.seen.sum(-1) >= 3)
+        converged = converged & ((shift / deviation).square().sum(-1) < self.plan.inconsistent)
+        lost = torch.where(converged, 0.0, torch.nan)[:, None]
+        pose = (tip + lost, direction + lost, covariance + lost[..., None])
+        return PhotometricPose(*pose, rest[:, 5].exp(), state.misfit, shift, deviation, state.used)
+
+    def _rolled(self, frame: Frame, height: int) -> Tensor:
+        """Covariance [B, 6, 6] of tip and direction that a motion while a rolling shutter reads the frame adds.
+
+        Such a motion turns the tube's image, and stretches it, which looks like a shorter distance.
+        """
+        middle, half = self._middle(), self.positions[-1] - self._middle()
+        ends = frame.middle[:, None] + half * frame.axis[:, None] * frame.axis.new_tensor([[-1.0], [1.0]])
+        rows = self.camera.project(ends)[..., 1]
+        late = ((rows[:, 1] - rows[:, 0]) / (2 * half * height))[:, None, None]  # share of the readout per metre
+        across = torch.eye(3).to(frame.axis) - frame.axis[:, :, None] * frame.axis[:, None]
+        lever = torch.cat([-middle * across - frame.middle[:, :, None] * frame.axis[:, None], across], 1) * late
+        return self.plan.readout**2 * lever @ lever.mT
 
 
-_GRADIENT = 0.01  # metres along the tube over which a background changes by its coefficient
-_ROUNDING = 1 / 12  # levels^2: the noise of rounding to whole levels, below which no residual is trusted
-# Typical size of each unknown: shifts in metres, turns in radians, logarithm of the blur.
-_SCALES = torch.tensor([1e-4, 1e-4, 1e-3, 1e-3, 1e-2, 0.3], dtype=torch.float64)
+_LIGHT = (2e-3, 0.98)  # light between which a tone curve is not clipped
+_ROUNDING = 1 / 12  # levels^2: the noise of rounding to whole levels
+_CODES = ((0.299, 0.587, 0.114), (-0.169, -0.331, 0.5), (0.5, -0.419, -0.081))  # Y, Cb, Cr of levels (ITU-R BT.601)
+_WHITE = 254.0  # level from which a pixel may be saturated
+_PATCH = 24  # side in pixels of the patches in which the resolution of chroma is estimated
 
 
-@dataclass(frozen=True, eq=False)
-class _Geometry:
-    """Where each ray passes the tube: [B, N, P] each.
+def _assembled(blocks: Tensor, sides: Tensor) -> tuple[Tensor, Tensor]:
+    """Normal equations of all unknowns: those that all windows share, and then two of each window."""
+    batch, count, size, _ = blocks.shape
+    shared = size - 2
+    select = blocks.new_zeros(count, size, shared + 2 * count)
+    select[:, range(shared), range(shared)] = 1
+    for n in range(count):
+        select[n, [-2, -1], [shared + 2 * n, shared + 2 * n + 1]] = 1
+    normal = (select.mT @ blocks @ select).sum(1)
+    return normal, (sides[:, :, None] @ select)[:, :, 0].sum(1)
 
-    Attributes:
-        miss: Signed distance between ray and axis.
-        along: Position along the axis, from the bands' middle, where the ray is nearest to the axis.
-        slant: Change of the visible surface's position along the axis per metre of depth below the axis.
-        blur, soft: Standard deviation of the blur across and along the axis, in metres.
-        pixel: [B, N] metres across the axis per pixel, mean over a window.
-        sine: [B, N] sine of the angle between rays and axis, mean over a window.
-        derivatives: [B, N, P, 4, 6] of miss, along, slant and log blur by the six unknowns.
+
+def _least_squares(design: Tensor, data: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Coefficients [B, N, C, K] of ``data`` [B, N, C, P], and Cholesky factor [B, N, C or 1, K, K].
+
+    ``design`` is [B, N, K, P] and ``weight`` [B, N, C or 1, P].
     """
-
-    miss: Tensor
-    along: Tensor
-    slant: Tensor
-    blur: Tensor
-    soft: Tensor
-    pixel: Tensor
-    sine: Tensor
-    derivatives: Tensor
-
-    @staticmethod
-    def of(frame: _Frame, unknown: Tensor, windows: _Windows, radius: Tensor) -> "_Geometry":
-        moved, rest = _moved(frame, unknown)
-        ray = windows.rays
-        middle, axis = moved.middle[:, None, None], moved.axis[:, None, None]
-        b = (ray * axis).sum(-1)
-        square = 1 - b * b
-        sine = square.sqrt()
-        normal = torch.linalg.cross(ray, axis.expand_as(ray)) / sine[..., None]
-        miss = (normal * middle).sum(-1)
-        ahead, beside = (ray * middle).sum(-1), (axis * middle).sum(-1)
-        depth = (ahead - b * beside) / square
-        along = depth * b - beside
-        pixel = depth * windows.angle
-        point = (rest[:, 5].exp() ** 2 + 1 / 12).sqrt()[:, None, None]
-        blur = point * pixel
-        # Derivatives by a shift of the middle along side, axis and sight, and by turns of the axis to side and front.
-        shifts = torch.stack([moved.side, moved.axis, moved.sight], -1)[:, None, None]  # [B, 1, 1, 3, 3]
-        turns = torch.stack([moved.side, moved.front], -1)[:, None, None]
-        by_depth = (ray - b[..., None] * axis) / square[..., None]
-        along_slope = b[..., None] * by_depth - axis
-        db = (ray[..., None] * turns).sum(-2)  # [B, N, P, 2]
-        beyond = torch.linalg.cross(middle.expand_as(ray), ray)
-        miss_turn = (beyond[..., None] * turns).sum(-2) / sine[..., None] + (miss * b / square)[..., None] * db
-        own = (middle[..., None] * turns).sum(-2)
-        depth_turn = (2 * b[..., None] * db * depth[..., None] - db * beside[..., None] - b[..., None] * own) / square[
-            ..., None
-        ]
-        along_turn = depth_turn * b[..., None] + depth[..., None] * db - own
-
-        def shifted(slope: Tensor) -> Tensor:
-            return (slope[..., None] * shifts).sum(-2)
-
-        zero = torch.zeros_like(b)[..., None]
-        log_blur = (rest[:, 5].exp() ** 2)[:, None, None, None] / (point**2)[..., None] + zero
-        rows = [
-            torch.cat([shifted(normal), miss_turn, zero], -1),
-            torch.cat([shifted(along_slope), along_turn, zero], -1),
-            torch.cat([zero, zero, zero, db / (sine**3)[..., None], zero], -1),
-            torch.cat([shifted(by_depth) / depth[..., None], depth_turn / depth[..., None], log_blur], -1),
-        ]
-        mean = (pixel * windows.mask).sum(-1) / windows.mask.sum(-1).clamp(min=1)
-        mean_sine = (sine * windows.mask).sum(-1) / windows.mask.sum(-1).clamp(min=1)
-        mean = torch.where(mean > 0, mean, pixel.mean(-1))
-        mean_sine = torch.where(mean_sine > 0, mean_sine, sine.mean(-1))
-        return _Geometry(miss, along, b / sine, blur, blur / sine, mean, mean_sine, torch.stack(rows, -2))
+    heavy = design[:, :, None] * weight[..., None, :]
+    gram = (heavy.flatten(2, 3) @ design.mT).unflatten(2, heavy.shape[2:4])
+    ridge = 1e-7 * gram.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] + 1e-12
+    gram = gram + ridge * torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
+    factor, _ = torch.linalg.cholesky_ex(gram)  # NaN instead of an error where a fit has diverged
+    if heavy.shape[2] == 1:
+        return torch.cholesky_solve(heavy[:, :, 0] @ data.mT, factor[:, :, 0]).mT, factor
+    right = ((weight * data) @ design.mT)[..., None]
+    return torch.cholesky_solve(right, factor)[..., 0], factor
 
 
-def _slopes(bright, share, z, q, depth, place, wide, first, second, sides, low, high, gradient) -> Tensor:
-    """Derivatives [4, B, N, 3, P] of the fitted light by miss, along, slant and log blur."""
-    density = torch.exp(-0.5 * q * q) / math.sqrt(2 * math.pi)
-    step = (second - first).mT  # [B, N, M, 3]
-    part, rise = bright * share, bright * density
+def _correlation(score: Tensor, rows: int) -> Tensor:
+    """Variance of the sum of scores [B, N, 2, P] relative to that of independent ones, [B, N], at least 1.
 
-    def tube(factor: Tensor) -> Tensor:
-        return ((bright * factor - part * factor) @ first.mT + (part * factor) @ second.mT).mT
+    Source: Newey and West (1987), with squares of 5 x 5 pixels, which is a triangular weight of lags up to 4.
+    """
+    grid = score.flatten(0, 1).unflatten(-1, (rows, -1))
+    sums = nn.functional.avg_pool2d(nn.functional.pad(grid, [4] * 4), 5, stride=1) * 25
+    excess = sums.square().sum((-2, -1)) / (25 * grid.square().sum((-2, -1))).clamp(min=1e-30)
+    return excess.mean(-1).unflatten(0, score.shape[:2]).clamp(min=1.0)
 
-    soft = place.soft[:, :, None]
-    across = wide[:, :, None]
-    by_along = (rise @ step).mT / soft
-    by_slant = ((rise * -depth) @ step).mT / soft
-    by_miss = -tube(z) / across
-    by_blur = tube(z * z - 1) - ((rise * q) @ step).mT
-    falls = [torch.exp(-0.5 * side * side) / math.sqrt(2 * math.pi) for side in (low, high)]
-    left = sides[..., 0:1] + sides[..., 2:3] * gradient[:, :, None]
-    right = sides[..., 1:2] + sides[..., 3:4] * gradient[:, :, None]
-    by_miss = by_miss + (falls[1][:, :, None] * right - falls[0][:, :, None] * left) / across
-    by_blur = by_blur - (low * falls[0])[:, :, None] * left - (high * falls[1])[:, :, None] * right
-    covers = (
-        torch.special.ndtr(low)[:, :, None] * sides[..., 2:3] + torch.special.ndtr(high)[:, :, None] * sides[..., 3:4]
-    )
-    return torch.stack([by_miss, by_along + covers / _GRADIENT, by_slant, by_blur])
+
+def _levels(frames: Tensor, pixels: Tensor) -> Tensor:
+    """Levels [B, N, 3, P] of frames [B, 3, H, W] at pixels (x, y) [B, N, P, 2], clamped to the frame."""
+    height, width = frames.shape[-2:]
+    x, y = pixels.unbind(-1)
+    index = (y.clamp(0, height - 1) * width + x.clamp(0, width - 1)).long().flatten(1)
+    levels = frames.flatten(2).gather(2, index[:, None].expand(-1, 3, -1)).unflatten(2, pixels.shape[1:3]).movedim(1, 2)
+    return levels if frames.dtype == torch.uint8 else 255 * levels.double()
+
+
+def _joined(poses: list[PhotometricPose], order: Tensor) -> PhotometricPose:
+    """Poses of groups of items in one batch, in another ``order``."""
+    names = [field.name for field in fields(PhotometricPose)]
+    return PhotometricPose(*(torch.cat([getattr(pose, name) for pose in poses])[order] for name in names))
 
 
 def _check(frames: Tensor, tip: Tensor, direction: Tensor) -> None:
@@ -446,30 +662,3 @@ def _check(frames: Tensor, tip: Tensor, direction: Tensor) -> None:
             raise ValueError(f"{name} must be floating, [B, 3] = [{len(frames)}, 3], got {list(value.shape)}")
     if bool(((direction.detach().norm(dim=-1) - 1).abs() > 1e-4).any()):
         raise ValueError("direction must be unit vectors; divide each by its length")
-
-
-def _frame(middle: Tensor, axis: Tensor) -> _Frame:
-    axis = axis / axis.norm(dim=-1, keepdim=True)
-    sight = middle / middle.norm(dim=-1, keepdim=True)
-    side = torch.linalg.cross(axis, sight)
-    side = side / side.norm(dim=-1, keepdim=True)
-    return _Frame(middle, axis, side, torch.linalg.cross(side, axis), sight)
-
-
-def _moved(frame: _Frame, unknown: Tensor) -> tuple[_Frame, Tensor]:
-    """Frame after the shifts and turns of ``unknown`` [B, 6], and what is left of it: 0 except for the blur."""
-    shift = unknown[:, 0:1] * frame.side + unknown[:, 1:2] * frame.axis + unknown[:, 2:3] * frame.sight
-    turn = unknown[:, 3:4] * frame.side + unknown[:, 4:5] * frame.front
-    rest = torch.cat([torch.zeros_like(unknown[:, :5]), unknown[:, 5:].clamp(math.log(0.25), math.log(8.0))], -1)
-    return _frame(frame.middle + shift, frame.axis + turn), rest
-
-
-def _pose(frame: _Frame, middle: Tensor) -> tuple[Tensor, Tensor]:
-    return frame.middle - middle * frame.axis, frame.axis
-
-
-@lru_cache(maxsize=8)
-def _nodes(count: int) -> tuple[Tensor, Tensor]:
-    """Nodes and weights of the Gauss-Legendre rule on -1 to 1."""
-    x, weight = np.polynomial.legendre.leggauss(count)
-    return torch.from_numpy(x), torch.from_numpy(weight)
