@@ -15,7 +15,13 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 # Rooms of a package: each may use those after it; names on one level do not import each other.
 ROOMS = {
     "optics": [{"light"}, {"viewing"}, {"elements", "planning"}, {"free_space"}],
-    "tracking": [{"thesis", "evaluation", "streaming", "simulation"}, {"detection"}, {"pose"}, {"camera"}],
+    "tracking": [
+        {"thesis", "evaluation", "streaming", "simulation"},
+        {"detection"},
+        {"refinement"},
+        {"pose"},
+        {"camera"},
+    ],
     "experiments": [
         {"eye", "panel", "pec_study", "tracking_benchmark", "streaming"},
         {"pec", "volume", "perception", "propagation", "tracking"},

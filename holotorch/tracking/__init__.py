@@ -3,7 +3,6 @@
 from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.camera.tone import tone_curve
 from holotorch.tracking.detection.channels import ChannelOrder, ambiguities
-from holotorch.tracking.detection.photometric import PhotometricFit
 from holotorch.tracking.detection.tracker import CatheterTracker
 from holotorch.tracking.pose.alignment import headset_from_camera
 from holotorch.tracking.pose.band_edges import fit_band_edges
@@ -11,6 +10,7 @@ from holotorch.tracking.pose.catheter import THESIS, Catheter
 from holotorch.tracking.pose.pose import closed_form, solve_pose
 from holotorch.tracking.pose.smoothing import OneEuro
 from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.refinement.photometric import PhotometricFit
 from holotorch.tracking.streaming.stream import PoseReceiver, PoseSender
 from holotorch.tracking.thesis.tracker import ThesisTracker
 

@@ -17,9 +17,11 @@ from holotorch.tracking.detection.channels import ChannelOrder
 from holotorch.tracking.detection.stations import StationPlan
 from holotorch.tracking.detection.tracker import CatheterTracker
 from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.refinement.photometric import PhotometricFit
 from holotorch.tracking.simulation.world import Case, World
 
 BASE, COLD, PRIOR, FEWER = "thesis, OpenCV", "ours, cold", "ours, prior", "ours, fewer stations"
+FIT = "ours, cold, photometric fit"
 LITERAL = "thesis, OpenCV, maps anew"
 FEWER_STATIONS = StationPlan(most=6)  # cross-sections of the tube that the method FEWER uses
 WRONG = 5e-3  # metres: error of the tip above which an answer counts as wrong
@@ -92,6 +94,7 @@ def methods(world: World, names: Sequence[str] = (BASE, LITERAL, COLD, PRIOR, FE
     thesis, literal = ThesisOpenCV(camera, catheter), ThesisOpenCV(camera, catheter, literal=True)
     create = partial(CatheterTracker, camera, catheter, channels=ChannelOrder.RGB)
     ours, fewer = create(), create(stations=FEWER_STATIONS)
+    fitted = create(refinement=PhotometricFit(camera, catheter))
     expected = lru_cache(maxsize=16)(before)  # cached, so that its computation does not count as time of the tracker
     known: dict[str, Method] = {
         BASE: lambda frame, _: thesis(frame[None])[0],
@@ -99,6 +102,7 @@ def methods(world: World, names: Sequence[str] = (BASE, LITERAL, COLD, PRIOR, FE
         COLD: lambda frame, _: ours(frame[None])[0],
         PRIOR: lambda frame, case: ours(frame[None], [expected(case)])[0],
         FEWER: lambda frame, _: fewer(frame[None])[0],
+        FIT: lambda frame, _: fitted(frame[None])[0],
     }
     return {name: known[name] for name in names}
 

@@ -8,18 +8,14 @@ from functools import partial
 from itertools import chain
 
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 from holotorch.experiments.tracking_benchmark import bench, methods
 from holotorch.experiments.tracking_benchmark.bench import Row
-from holotorch.experiments.tracking_benchmark.methods import BASE, COLD, Answer, Method
-from holotorch.tracking.detection.photometric import PhotometricFit
-from holotorch.tracking.pose.status import Pose, Status
+from holotorch.experiments.tracking_benchmark.methods import BASE, COLD, FIT, Answer
 from holotorch.tracking.simulation.varied import CONDITIONS, NEGATIVES, TUNING_SEEDS, Trial, VariedWorld
-from holotorch.tracking.simulation.world import Case, World
+from holotorch.tracking.simulation.world import World
 
-FIT = "ours, cold, photometric fit"  # the fit starts from the pose of COLD
 _FEW = 48  # scenes below which further processes take longer to start than they save
 # Largest percentages of refusals over all and in the worst condition, number of wrong poses, and median errors in mm.
 _GOALS = {"refused": 8.0, "worst": 20.0, "wrong": 0.0, "median": 0.15, "clean": 0.06}
@@ -104,27 +100,8 @@ def _seen(world: VariedWorld, scene: Callable[[int], Trial], seed: int) -> list[
     """Answers of all methods to the scene of a seed."""
     trial = scene(seed)
     own = World(world.size, trial.camera, world.catheter)
-    trackers = methods.methods(own, (BASE, COLD))
-    trackers[FIT] = _fitted(own, trackers[COLD])
+    trackers = methods.methods(own, (BASE, COLD, FIT))
     return list(methods.answers([trial.case], trackers, None))
-
-
-def _fitted(world: World, track: Method) -> Method:
-    """The method whose poses are those of ``track`` after a photometric fit."""
-    fit = PhotometricFit(world.camera, world.catheter)
-
-    def refine(frame: Tensor, case: Case) -> Pose:
-        pose = track(frame, case)
-        if not pose.answered:
-            return pose
-        fitted = fit(frame[None], pose.tip[None], pose.direction[None])
-        if not bool(fitted.tip.isfinite().all()):
-            return Pose.refused(Status.INCONSISTENT, "the photometric fit diverges")
-        chi_square = (fitted.shift / fitted.shift_sd).square()[fitted.used].sum()
-        freedom = fitted.used.sum().double() - 3
-        return Pose(fitted.tip[0], fitted.direction[0], fitted.covariance[0], chi_square, freedom, Status.OK)
-
-    return refine
 
 
 def _row(condition: str, method: str, own: list[Answer]) -> Row:

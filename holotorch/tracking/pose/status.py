@@ -37,6 +37,7 @@ class Status(enum.IntEnum):
         return _STAGES[self]
 
 
+THREE_EDGES = "three edges determine a pose and leave nothing to check it with"  # reason of an UNVERIFIED pose
 # In the order of Status.
 _STAGES = ("pose", "pose", "frame", "colour", "colour", "axis", "axis", "edges", "edges", "camera", "pose", "pose")
 

@@ -8,8 +8,9 @@ from torch import Tensor, nn
 
 from holotorch.core import checks
 from holotorch.tracking.camera.camera import Camera
-from holotorch.tracking.detection.tube_light import SHARED, Frame, Items, TubeGeometry, TubeLight, Windows
 from holotorch.tracking.pose.catheter import Catheter
+from holotorch.tracking.pose.status import THREE_EDGES, Pose, Status
+from holotorch.tracking.refinement.tube_light import SHARED, Frame, Items, TubeGeometry, TubeLight, Windows
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,20 @@ class PhotometricPose:
     shift: Tensor
     shift_sd: Tensor
     used: Tensor
+
+    def poses(self) -> list[Pose]:
+        """Each as a :class:`Pose`: UNVERIFIED from three edges, and refused as INCONSISTENT where it is NaN."""
+        freedom = (self.used.sum(-1) - 3).clamp(min=0).double()
+        chi_square = torch.where(self.used, self.shift / self.shift_sd, 0.0).square().sum(-1)
+        poses = []
+        for i, converged in enumerate(self.tip.detach().isfinite().all(-1).tolist()):
+            if not converged:
+                poses.append(Pose.refused(Status.INCONSISTENT, "the pixels around the edges do not confirm the pose"))
+                continue
+            status, reason = (Status.OK, "") if freedom[i] > 0 else (Status.UNVERIFIED, THREE_EDGES)
+            tip, direction, covariance = self.tip[i], self.direction[i], self.covariance[i]
+            poses.append(Pose(tip, direction, covariance, chi_square[i], freedom[i], status, reason))
+        return poses
 
     @staticmethod
     def lost(tip: Tensor, edges: int) -> "PhotometricPose":

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from holotorch.tracking import Camera
-from holotorch.tracking.detection.photometric import FitPlan, PhotometricFit
-from holotorch.tracking.detection.tube_light import Frame, TubeGeometry
 from holotorch.tracking.pose.catheter import THESIS
+from holotorch.tracking.refinement.photometric import FitPlan, PhotometricFit
+from holotorch.tracking.refinement.tube_light import Frame, TubeGeometry
 from holotorch.tracking.simulation import surfaces
 from holotorch.tracking.simulation.ray_camera import Rod, Shot, take
 from holotorch.tracking.simulation.render import Look

@@ -1,0 +1,1 @@
+"""Refinement of poses from the pixels around the band edges."""
