@@ -13,9 +13,12 @@ from tracked import SIZE, TRACKER, WORLD, at, refused, right, scenes, truth
 
 from holotorch.tracking.camera.strips import Sampler
 from holotorch.tracking.detection import tracker as tracker_module
+from holotorch.tracking.detection.channels import ChannelOrder
 from holotorch.tracking.detection.coarse import Segment
+from holotorch.tracking.detection.tracker import CatheterTracker
 from holotorch.tracking.pose.catheter import THESIS
 from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.refinement.photometric import PhotometricFit
 
 SHORTER = replace(THESIS, edges=(0.070, 0.108, 0.127, 0.165))  # bands that no pose explains
 
@@ -161,3 +164,20 @@ def test_the_work_for_a_frame_is_bounded(monkeypatch):
     assert len(looked) == 1
     monkeypatch.setattr(tracker_module, "find_segments", lambda *_, **__: [there, *EMPTY])
     refused(TRACKER(frame[None])[0], Status.INCONSISTENT)
+
+
+def test_a_refinement_fits_all_poses_of_a_batch_at_once():
+    """Refusals stay as they are, a batch is its frames, and the fit's own shift is within what both state."""
+    tracker = CatheterTracker(
+        WORLD.camera, THESIS, channels=ChannelOrder.RGB, refinement=PhotometricFit(WORLD.camera, THESIS)
+    )
+    names = ("plain", "roll 135")
+    frames = torch.stack([*(scenes()[name][1] for name in names), WORLD.desk()])
+    poses, rough = tracker(frames), TRACKER(frames)
+    assert tracker.times["refinement"] > 0
+    for name, pose, before, frame in zip(names, poses, rough, frames, strict=False):
+        right(pose, scenes()[name][0])
+        assert pose.status is Status.OK and float(pose.freedom) == 1
+        assert 0 < float((pose.tip - before.tip).norm()) < 3 * (float(pose.tip_sd) + float(before.tip_sd))
+        torch.testing.assert_close(tracker(frame[None])[0].tip, pose.tip, rtol=0, atol=1e-9)
+    assert poses[-1].status is rough[-1].status is Status.NO_CATHETER
