@@ -142,6 +142,22 @@ def take(shot: Shot, seed: int) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(frame.transpose(2, 0, 1)))
 
 
+def insert(shot: Shot, seed: int) -> Tensor:
+    """The background as it is, uint8 [3, H, W], with the catheter rendered into it.
+
+    For a background that is a photograph: it has the lens's blur and the noise already, and only the pixels of the
+    catheter get them. Gain and codecs of the shot are not applied.
+    """
+    rng = np.random.default_rng([seed, 1])
+    light = shot.background.astype(np.float32, copy=True)
+    _trace(light, shot, rng)
+    changed = (light != shot.background).any(-1, keepdims=True)
+    noise = rng.standard_normal(light.shape, dtype=np.float32)
+    light += changed * noise * np.sqrt(np.maximum(light, 0) * shot.shot_noise + shot.read_noise**2)
+    levels = shot.camera.levels(torch.from_numpy(light)).numpy()
+    return torch.from_numpy(np.clip(levels + 0.5, 0, 255).astype(np.uint8).transpose(2, 0, 1).copy())
+
+
 def _spread(light: np.ndarray, shot: Shot) -> np.ndarray:
     """The background through the lens."""
     blurred = cv2.GaussianBlur(light, (0, 0), max(shot.blur_px, 0.3))
