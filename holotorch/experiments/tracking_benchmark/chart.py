@@ -11,6 +11,7 @@ from holotorch.experiments.tracking_benchmark import bench, methods
 from holotorch.experiments.tracking_benchmark.bench import STILL, TIP, Row, one
 from holotorch.experiments.tracking_benchmark.methods import BASE, COLD, FEWER, LITERAL, PRIOR, Answer
 from holotorch.experiments.tracking_benchmark.picture import draw
+from holotorch.experiments.tracking_benchmark.real_pixels import drawn_photograph, real_pixels, shared_photographs
 from holotorch.experiments.tracking_benchmark.second_world import second_world, verdict
 from holotorch.experiments.tracking_benchmark.timing import spread, stages, timing
 from holotorch.tracking.simulation.varied import VariedWorld
@@ -27,6 +28,7 @@ class Amount(NamedTuple):
     rounds: int = 15  # repetitions of each measurement of time
     varied: int = 2000  # scenes of the second world with the catheter
     lookalikes: int = 2000  # scenes of the second world without it
+    placed: int = 4  # poses of the catheter in each photograph of a calibration board
     share: float = 1.0  # share of the grids, conditions, occlusions, and of the frames whose times are compared
 
 
@@ -41,11 +43,14 @@ def scene(folder: Path | None = None) -> World:
 
 def tracking(
     photographs_folder: Path | None = None,
+    boards_folder: Path | None = None,
 ) -> tuple[list[Row], dict[str, list[Row]], dict[str, bytes], list[str]]:
     """Measure all trackers; this takes about an hour and a half on two cores.
 
     Args:
         photographs_folder: Folder with photographs for backgrounds; without it, those of scikit-image.
+        boards_folder: Folder with the calibration photographs of scikit-surgerybard and OpenCV, into which the catheter
+            is rendered; without it, into one drawn board.
 
     Returns:
         Rows of the methods, further tables by name, pictures by name, and lines of text that compare the results with
@@ -65,6 +70,8 @@ def tracking(
         tables[kind], answers[kind] = bench.scenes(world, three, count, kind, amount.share)
     tables["negatives"], answers["negatives"] = bench.empty(world, two, amount.negatives)
     tables["second_world"] = second_world(VariedWorld(photographs=world.photographs), amount.varied, amount.lookalikes)
+    boards = shared_photographs(boards_folder) if boards_folder else [drawn_photograph()]
+    tables["real_pixels"], sheet, found = real_pixels(boards, amount.placed)
     # The frames of catheters at rest are left out of the sum: they repeat a few poses.
     answers[_ALL] = [each for kind in ("grids", "codecs", "conditions", "occlusions") for each in answers[kind]]
     tables["reliability"] = [
@@ -74,7 +81,8 @@ def tracking(
         if (own := [answer for answer in given if answer.method == name])
     ]
     rows = _methods(tables, answers)
-    return rows, tables, {"chart": draw(rows, tables)}, _verdict(world, rows, tables)
+    pictures = {"chart": draw(rows, tables), "real_pixels": sheet}
+    return rows, tables, pictures, _verdict(world, rows, tables) + [f"synthetic {line}" for line in found]
 
 
 def _share(kind: str, name: str, own: list[Answer]) -> Row:

@@ -4,7 +4,6 @@ The background is real; the catheter is synthetic. Photographs of calibration bo
 of the squares their blur, smooth patches their noise, and white squares the colour of the light.
 """
 
-import io
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,13 +12,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from PIL import Image
+from scipy.special import gammainc, gammaincinv
 from torch import Tensor
 from tqdm import tqdm
 
 from holotorch.experiments.tracking_benchmark import methods
 from holotorch.experiments.tracking_benchmark.bench import Row
 from holotorch.experiments.tracking_benchmark.methods import BASE, COLD, FIT, Answer
+from holotorch.io.images import load_image
 from holotorch.tracking.camera.boards import Charuco, Chessboard, View, find_board
 from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.camera.numpy_lens import Lens
@@ -75,7 +75,8 @@ class Pixels:
     """What a photograph says of its camera, in linear light of 0 to 1.
 
     Attributes:
-        blur_px: Median standard deviation of the edges of the board's squares, in pixels; NaN without a board.
+        blur_px: Median standard deviation of the lens's blur at the edges of the board's squares in pixels, NaN without
+            a board.
         shot_noise, read_noise: The noise's variance is shot_noise * light + read_noise^2.
         white: Light of the board's white squares; the brightest hundredth of the photograph without a board.
     """
@@ -106,7 +107,7 @@ def _published(files: Sequence[Path]) -> Camera:
 
 
 def _opened(path: Path, camera: Camera, board: Chessboard | Charuco) -> Photograph:
-    frame = torch.from_numpy(np.array(Image.open(path).convert("RGB")).transpose(2, 0, 1).copy())
+    frame = (255 * load_image(path)).round().to(torch.uint8).expand(3, -1, -1).contiguous()
     try:
         view = find_board(frame, board, path.name)
     except ValueError:
@@ -114,7 +115,9 @@ def _opened(path: Path, camera: Camera, board: Chessboard | Charuco) -> Photogra
     return Photograph(path.name, frame, camera, view, path.read_bytes() if path.suffix == ".jpg" else None)
 
 
-def drawn_photograph(blur_px: float = 0.8, shot_noise: float = 3e-4, read_noise: float = 4e-3, seed: int = 0):
+def drawn_photograph(
+    blur_px: float = 0.8, shot_noise: float = 3e-4, read_noise: float = 4e-3, seed: int = 0
+) -> Photograph:
     """A synthetic photograph of a chessboard with known blur and noise: what there is without real photographs."""
     rng, (height, width) = np.random.default_rng(seed), (480, 640)
     matrix = torch.tensor([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]], dtype=torch.float64)
@@ -177,8 +180,8 @@ def _blur(photograph: Photograph, pairs: tuple[np.ndarray, np.ndarray]) -> float
     light = sampler(places).transpose(1, 2, 3, 0)
     fit = fit_edges(light, np.ones_like(light), 1.0)
     clear = np.isfinite(fit.deviation)
-    # Each edge by itself: the common blur of the fit is of one lens, but a tilted board may be out of focus in part.
-    spread = np.sqrt(np.maximum(np.square(fit.blur[clear]) - 1 / 6, 0.0))  # interpolation adds a sixth of a pixel^2
+    # Interpolation adds a sixth of a pixel^2, and the area of a pixel a twelfth.
+    spread = np.sqrt(np.maximum(np.square(fit.blur[clear]) - 1 / 6 - 1 / 12, 0.0))
     return float(np.median(spread)) if len(spread) else math.nan
 
 
@@ -208,9 +211,7 @@ def _noise(light: np.ndarray) -> tuple[float, float]:
 
 
 def _share_of_mean(share: float) -> float:
-    """Mean of the smallest ``share`` of estimates of a variance with the freedom of a patch, relative to all of them."""
-    from scipy.special import gammainc, gammaincinv
-
+    """Mean of the smallest ``share`` of the variances of equally noisy patches, relative to the mean of all."""
     half = (_PATCH**2 - 6) / 2
     return float(gammainc(half + 1, gammaincinv(half, share)) / share)
 
@@ -259,14 +260,16 @@ def rendered(photograph: Photograph, pixels: Pixels, seed: int) -> Case:
 
 
 def _as_saved(frame: Tensor, photograph: Photograph) -> Tensor:
-    """The frame after the JPEG compression of its photograph, with the same tables."""
+    """The frame after JPEG compression of about the quality of its photograph."""
     if photograph.encoded is None:
         return frame
-    kept, out = Image.open(io.BytesIO(photograph.encoded)), io.BytesIO()
-    image = Image.fromarray(frame.numpy().transpose(1, 2, 0))
-    tables: dict[int, list[int]] = kept.quantization  # type: ignore[attr-defined]
-    image.save(out, "JPEG", qtables=[list(tables[key]) for key in sorted(tables)], subsampling="4:2:0")
-    return torch.from_numpy(np.array(Image.open(out)).transpose(2, 0, 1).copy())
+    # The first entry of the first quantisation table behind its marker is 16 at quality 50 (Annex K of ITU-T T.81).
+    first = photograph.encoded[photograph.encoded.index(b"\xff\xdb") + 5]
+    quality = round(5000 * 16 / (100 * first) if first > 16 else 100 - 50 * first / 16)
+    image = np.ascontiguousarray(frame.numpy().transpose(1, 2, 0)[..., ::-1])
+    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    levels = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))
+    return torch.from_numpy(levels[..., ::-1].transpose(2, 0, 1).copy())
 
 
 def real_pixels(photographs: Sequence[Photograph], poses: int) -> tuple[list[Row], bytes, list[str]]:
@@ -283,7 +286,8 @@ def real_pixels(photographs: Sequence[Photograph], poses: int) -> tuple[list[Row
     rows, tiles, everything = [], [], list[Answer]()
     for photograph in tqdm(photographs, "real pixels", unit="photo", dynamic_ncols=True):
         pixels = measure(photograph)
-        world = World(tuple(photograph.frame.shape[-2:]), photograph.camera, THESIS)
+        height, width = photograph.frame.shape[-2:]
+        world = World((height, width), photograph.camera, THESIS)
         trackers = methods.methods(world, (BASE, COLD, FIT))
         cases = [rendered(photograph, pixels, seed) for seed in range(poses)]
         own = list(methods.answers(cases, trackers, None))
@@ -334,7 +338,8 @@ def _lines(own: Sequence[Answer]) -> Iterator[str]:
         median = f"median {np.median(errors):.3f} mm" if errors else "no pose"
         yield (
             f"catheter in real photographs, {method}: {sum(a.right for a in shown)} of {len(shown)} right, "
-            f"{sum(a.wrong for a in shown)} wrong by more than 5 mm, {sum(not a.answered for a in shown)} refused, {median}; "
+            f"{sum(a.wrong for a in shown)} wrong by more than 5 mm, {sum(not a.answered for a in shown)} refused, "
+            f"{median}; "
             f"{sum(a.answered for a in bare)} of {len(bare)} bare photographs answered"
         )
 

@@ -37,7 +37,7 @@ def small(**changes) -> World:
 
 def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(chart_tracking, "scene", lambda _: small())
-    monkeypatch.setattr(chart_tracking, "AMOUNT", Amount(2, 1, 1, 10, 1, varied=2, lookalikes=2, share=0.06))
+    monkeypatch.setattr(chart_tracking, "AMOUNT", Amount(2, 1, 1, 10, 1, varied=2, lookalikes=2, placed=1, share=0.06))
     for module in (chart_tracking, tracking_bench, tracking_picture):
         monkeypatch.setattr(module, "STILL", {(520, 20): 0.2, (520, 5): None})
     monkeypatch.setattr(tracking_bench, "tip_bounds", lambda *_: Bounds(1e-9 * torch.eye(3), 2e-9 * torch.eye(3)))
@@ -51,6 +51,7 @@ def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
         "lights",
         "negatives",
         "occlusions",
+        "real_pixels",
         "reliability",
         "second_world",
         "slowest",
@@ -58,7 +59,7 @@ def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
         "still",
         "times",
     ]
-    files = {f"{name}.csv" for name in ["chart", *names]} | {"chart.png", "verdict.txt"}
+    files = {f"{name}.csv" for name in ["chart", *names]} | {"chart.png", "real_pixels.png", "verdict.txt"}
     assert {path.name for path in tmp_path.iterdir()} == files
     tables = {}
     for name in ["chart", *names]:

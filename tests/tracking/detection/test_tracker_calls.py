@@ -179,5 +179,7 @@ def test_a_refinement_fits_all_poses_of_a_batch_at_once():
         right(pose, scenes()[name][0])
         assert pose.status is Status.OK and float(pose.freedom) == 1
         assert 0 < float((pose.tip - before.tip).norm()) < 3 * (float(pose.tip_sd) + float(before.tip_sd))
-        torch.testing.assert_close(tracker(frame[None])[0].tip, pose.tip, rtol=0, atol=1e-7)  # a fit ends before its last step is nil
+        torch.testing.assert_close(
+            tracker(frame[None])[0].tip, pose.tip, rtol=0, atol=1e-7
+        )  # a fit ends before its last step is nil
     assert poses[-1].status is rough[-1].status is Status.NO_CATHETER
