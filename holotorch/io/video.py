@@ -73,9 +73,9 @@ class Frames:
 def open_frames(source: str | Path, rate: float | None = None) -> Frames:
     """Open a video file, a folder of pictures (ordered by the numbers in their names), or a camera (by its number).
 
-    Frames of a video have the times that the file states. Frames of a camera have the times of its driver, or of their
-    arrival if the driver states none. Pictures are spaced by 1 / ``rate``. A frame that cannot be read has a problem
-    instead of pixels.
+    Frames of a video have the times that the file states; where it states none, a frame follows the previous one by the
+    inverse of the frame rate. Frames of a camera have the times of its driver, or of their arrival if the driver states
+    none. Pictures are spaced by 1 / ``rate``. A frame that cannot be read has a problem instead of pixels.
 
     Args:
         source: Path of a file or folder, or the number of a camera.

@@ -20,8 +20,9 @@ _CHUNK = 1 << 20  # bytes decompressed at once
 def affordable(source: Path | str, needed: int, stored: int) -> None:
     """Raise ValueError if reading the file ``source`` needs more memory than the limit.
 
-    ``needed`` is the memory and ``stored`` the size of the file, in bytes. The limit is :data:`MEMORY_LIMIT`, or the
-    number in the environment variable :data:`VARIABLE`, or :data:`RATIO` times ``stored`` if this is more.
+    ``needed`` is the memory and ``stored`` the size of the file, in bytes. The limit is the larger of two numbers:
+    :data:`RATIO` times ``stored``, and :data:`MEMORY_LIMIT` or its replacement in the environment variable
+    :data:`VARIABLE`.
     """
     try:
         limit = float(os.environ.get(VARIABLE, MEMORY_LIMIT))
