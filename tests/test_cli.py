@@ -111,8 +111,11 @@ def not_a_number(path):
         (["wavelengths=[630 nm, 0, 445 nm]"], "wavelengths.1: expected a length within 10 nm .. 300 um, got 0"),
         (["grid.shape=[16,16]", "modulator.kernel_size=17"], "expected at most 16, the smaller side of the grid"),
         (["grid.shape=[8,8]"], "expected at least 11 x 11 px for ssim, got (8, 8); use a larger grid"),
-        (["target.image=black.png"], "is black: there is no light to form; use another picture"),
-        (["target.image=tiny.png"], "is 8 x 8 px, less than the 11 x 11 px window of ssim; use a larger one"),
+        (["target.image=black.png"], "is black throughout; use another picture"),
+        (
+            ["target.image=tiny.png"],
+            "is 8 x 8 px, less than the 11 x 11 px window of the image metric SSIM; use a larger one",
+        ),
         (["target.image=nan.tiff"], "is nan (400 in all); repair the picture"),
         (["--out", "file/inside"], "cannot write to file/inside: Not a directory; choose another place with --out"),
         (["a=1", "b=2", "grid=3", "seed=x", "solver.kind=y"], "solver.kind: expected one of apg, adam, lbfgs, got 'y'"),

@@ -41,42 +41,37 @@ from holotorch.optics import (
     RayleighSommerfeld,
     ResampledKernel,
     Spectrum,
-    accommodation_range,
-    angular_spectrum_kernel,
-    carrier,
-    chromatic_defocus,
-    converging_fresnel,
-    depth_of_focus,
     diffraction_angle,
-    eye_box,
-    eyepiece_distance,
-    fresnel_distance,
-    fresnel_kernel,
-    fresnel_number,
     least_padding,
-    lens_limit,
-    lens_phase,
-    magnified_fov,
-    optimum_fwhm,
-    path_difference,
     placement,
     plan_propagation,
     plan_retina,
     planar_fov,
     propagate,
     propagate_collapsed,
-    pupil,
-    region,
     retinal_image,
-    retinal_scale,
-    section,
-    smallest_spot,
     tilted_wave,
     unaliased_distance,
+)
+from holotorch.optics.elements.converging import converging_fresnel
+from holotorch.optics.elements.lens import lens_limit, lens_phase, pupil
+from holotorch.optics.free_space.kernels import angular_spectrum_kernel, carrier, fresnel_kernel
+from holotorch.optics.light.coherence import chromatic_defocus, depth_of_focus, optimum_fwhm, path_difference
+from holotorch.optics.viewing.display_geometry import (
+    accommodation_range,
+    eye_box,
+    eyepiece_distance,
+    fresnel_distance,
+    fresnel_number,
+    magnified_fov,
+    region,
+    section,
+    smallest_spot,
     vignetting,
     visible_half_width,
     volume_size,
 )
+from holotorch.optics.viewing.imaging import retinal_scale
 from holotorch.perception.geometry import CurvedScreen, FlatScreen
 from holotorch.scene import SourceLayers, Volume
 from holotorch.scene.phantoms import shells

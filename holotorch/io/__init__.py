@@ -1,1 +1,1 @@
-"""Reading and writing of files. Import from the modules of this package; the package itself imports none of them."""
+"""Reading and writing of files: import from its modules, such as ``holotorch.io.volumes``."""

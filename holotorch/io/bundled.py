@@ -1,4 +1,4 @@
-"""Bundled pictures and configurations, in a module without torch, so that configurations are checked quickly."""
+"""Names of bundled pictures and paths of configurations; without torch, which takes seconds to import."""
 
 import difflib
 from pathlib import Path
@@ -16,9 +16,10 @@ def no_such_picture(source: str) -> str:
 
 
 def find_config(name: str | Path) -> Path | None:
-    """Path of a configuration: ``name`` itself, or a bundled one such as "configs/demo.yaml"; None if there is neither.
+    """Path of a configuration: the file ``name``, or else the bundled file of that name; None if there is neither.
 
-    Bundled configurations lie inside an installed package, or beside the package in a checkout.
+    A bundled configuration is named with or without the folder, such as "configs/demo.yaml". In an installed package
+    ``configs`` lies inside the package, and in a checkout beside it.
     """
     path, package = Path(name), Path(__file__).parents[1]
     inside = Path(*path.parts[1:]) if path.parts[:1] == ("configs",) else path

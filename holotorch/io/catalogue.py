@@ -1,4 +1,4 @@
-"""Download of the volumes of Table 5.2 of the thesis whose checksum is published."""
+"""Download of those volumes of Table 5.2 of the thesis for which a checksum is published."""
 
 import difflib
 from dataclasses import dataclass
@@ -12,16 +12,16 @@ _ORIGIN = "http://klacansky.com/open-scivis-datasets"
 
 @dataclass(frozen=True)
 class Published:
-    """A volume of the Open SciVis Datasets: raw cubic voxels of unknown size, x fastest.
+    """A volume of the Open SciVis Datasets: a raw file of cubic voxels of unknown size, in which x varies fastest.
 
-    The catalogue states no licence: do not redistribute the data.
+    The Open SciVis Datasets state no licence: do not redistribute the data.
     """
 
     url: str  # of the raw file, whose name contains the size (x, y, z) and the type
     shape: tuple[int, int, int]  # number of voxels (D, H, W)
     dtype: str
-    sha512: str  # checksum of the raw file, as the catalogue publishes it
-    acknowledgement: str  # sources that the catalogue credits
+    sha512: str  # checksum of the raw file that the Open SciVis Datasets publish
+    acknowledgement: str  # sources that the Open SciVis Datasets credit
 
 
 PUBLISHED = {
@@ -56,9 +56,10 @@ def fetch_volume(name: str, directory: str | Path | None = None) -> Volume:
     """Download a volume of the thesis, verify its checksum and load it; later calls use the downloaded file.
 
     Args:
-        name: One of :data:`PUBLISHED`. For the engine, C60 and the hand of Table 5.2 no checksum is published: download
-            them and use :func:`load_volume`. ``scene.c60`` computes a C60 molecule.
-        directory: Folder in which the file is kept; the user's cache by default.
+        name: A key of :data:`PUBLISHED`. No checksum is published for the engine, C60 and the hand of Table 5.2:
+            download them by hand and use :func:`~holotorch.io.volumes.load_volume`.
+            :func:`~holotorch.scene.phantoms.c60` computes a C60 molecule.
+        directory: Folder in which the file is kept; by default a folder in the user's cache.
 
     Returns:
         The volume, uint8, with a relative spacing of 1 along all axes.

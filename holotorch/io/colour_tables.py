@@ -1,4 +1,4 @@
-"""Colours of monochromatic light: colour-matching functions and the matrix from wavelengths to linear sRGB."""
+"""Colours of monochromatic light: colour-matching functions, matrix to linear sRGB, and white balance."""
 
 from collections.abc import Sequence
 
@@ -33,17 +33,18 @@ def srgb_matrix(
 ) -> Tensor:
     """Matrix [3, K] from intensities at ``wavelengths`` to linear sRGB, float64, with one column per wavelength.
 
-    The colours are not adapted to a white point: equal intensities of three sources give the colour of their sum, which
-    is not D65. With the weights of :func:`white_balance`, equal intensities give D65.
+    The colours are not adapted to a white point: with equal ``weights``, equal intensities of three sources give the
+    colour of their sum, which is not D65. With the weights of :func:`white_balance` they give D65, the white of sRGB.
 
     Args:
         wavelengths: K wavelengths in metres.
-        weights: Power of each wavelength, 1 by default; for example the weights of the quadrature rules of
+        weights: Power of each wavelength at an intensity of 1; 1 by default. For example the quadrature weights of a
             :class:`~holotorch.optics.light.spectrum.Spectrum`.
-        white: Intensities [K] that get a luminance of 1; all ones by default.
+        white: Intensities [K] that the matrix maps to a luminance of 1; all ones by default.
 
     Raises:
-        ValueError: Wavelengths outside the table, weights that do not match or are negative, or a white without light.
+        ValueError: Wavelengths outside 360 to 830 nm, weights or a white that are negative or not K numbers, or a white
+            whose luminance is 0.
     """
     from colour.models import RGB_COLOURSPACE_sRGB
 
@@ -59,15 +60,15 @@ def srgb_matrix(
     matrix = matching * power
     luminance = matrix[1] @ white
     if luminance <= 0:
-        raise ValueError("white has no luminance; give positive weights within the visible range")
+        raise ValueError("white has no luminance; it needs a positive intensity and weight at a visible wavelength")
     return torch.from_numpy(np.array(RGB_COLOURSPACE_sRGB.matrix_XYZ_to_RGB)) @ matrix / luminance
 
 
 def white_balance(wavelengths: Sequence[float]) -> Tensor:
-    """Powers of three sources whose sum is D65, the white of sRGB, relative to the strongest source, float64 [3].
+    """Relative powers of three sources that together have the colour D65, the white of sRGB, float64 [3].
 
-    A display with these powers shows equal values of its three channels as neutral grey. ValueError unless there are
-    three wavelengths that can mix D65.
+    The largest power is 1. A display with these powers shows equal values of its three channels as neutral grey.
+    ValueError unless there are three wavelengths, in metres, that can be mixed to D65.
     """
     from colour.models import RGB_COLOURSPACE_sRGB
 
@@ -78,5 +79,5 @@ def white_balance(wavelengths: Sequence[float]) -> Tensor:
     powers = torch.linalg.solve(matching, white) if torch.linalg.matrix_rank(matching) == 3 else -torch.ones(3)
     if (powers <= 0).any():
         listed = ", ".join(f"{value * 1e9:g}" for value in wavelengths)
-        raise ValueError(f"{listed} nm cannot mix the white D65; take one red, one green and one blue source")
+        raise ValueError(f"{listed} nm cannot be mixed to the white D65; take one red, one green and one blue source")
     return powers / powers.max()

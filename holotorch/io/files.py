@@ -1,4 +1,4 @@
-"""Atomic writing of files: everything is written under a temporary name and renamed when complete."""
+"""Reading of files, and atomic writing: a new file gets a temporary name, and is renamed when it is complete."""
 
 import errno
 import io
@@ -19,10 +19,13 @@ def replacing(path: Path, *, buffering: int = -1, needed: int | None = None) -> 
     """Context manager that opens a temporary file beside ``path`` and renames it to ``path`` if the block succeeds.
 
     Args:
-        path: The file to replace.
-        buffering: As for ``open``. 0 allows a block to handle the error of a full disk and end normally, since no
-            buffered data remain whose writing could fail again.
-        needed: Number of bytes to be written; the message about a full disk states it.
+        path: The file to create or replace.
+        buffering: As for ``open``. With 0, every write fails or succeeds at once, so that the block can catch the error
+            of a full disk and keep what was written before; buffered data would be written, and fail, after the block.
+        needed: Number of bytes to be written, which the message about a full disk states.
+
+    Raises:
+        OSError: The file cannot be written; the error names ``path``, not the temporary file.
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -38,13 +41,13 @@ def replacing(path: Path, *, buffering: int = -1, needed: int | None = None) -> 
         if needed is not None and error.errno in (errno.ENOSPC, errno.EDQUOT):
             free = shutil.disk_usage(path.parent).free
             reason += f" ({needed / 1e6:.3f} MB needed, {free / 1e6:.3f} MB free)"
-        raise OSError(error.errno, reason, str(path)) from None  # the user does not know the temporary path
+        raise OSError(error.errno, reason, str(path)) from None
     finally:
         partial.unlink(missing_ok=True)
 
 
 def append(stream: IO[bytes], data: bytes | memoryview) -> None:
-    """Append ``data`` to an unbuffered file; an OSError leaves the file with its previous length."""
+    """Append ``data`` to a file opened with ``buffering=0``; after an OSError the file has its previous length."""
     start, done = stream.tell(), 0
     try:
         while done < len(data):  # a single call may write only a part
@@ -67,19 +70,19 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` as indented JSON, atomically; ValueError for NaN and infinity, which JSON lacks."""
+    """Write ``value`` as indented JSON, atomically; ValueError for NaN and infinity, which JSON cannot represent."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def read_bytes(path: Path) -> bytes:
-    """Content of a file; OSError if it cannot be read or is a device, such as /dev/zero, which never ends."""
+    """Content of a file; OSError if it cannot be read, or is a device such as /dev/zero, whose content never ends."""
     if path.is_char_device() or path.is_block_device():
         raise OSError(errno.EINVAL, "a device, not a file", str(path))
     return path.read_bytes()
 
 
 def read_json(path: Path) -> Any:
-    """Content of a JSON file; ValueError if it is damaged or nested too deeply."""
+    """Content of a JSON file; ValueError if it is damaged or nested too deeply, OSError as from :func:`read_bytes`."""
     try:
         return json.loads(read_bytes(path).decode("utf-8"))
     except RecursionError:
@@ -87,7 +90,7 @@ def read_json(path: Path) -> Any:
 
 
 def save_array(path: Path, tensor: Tensor) -> None:
-    """Write a tensor as .npy atomically, without changing its dtype."""
+    """Write a tensor as .npy with its dtype, atomically."""
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(tensor.detach().cpu().numpy()))
     write_bytes(path, buffer.getvalue())

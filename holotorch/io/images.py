@@ -1,4 +1,4 @@
-"""Loading of bundled pictures and image files, fitting to a grid, and PNG encoding."""
+"""Pictures as tensors: loading of files and bundled photographs, resizing, channels, and PNG encoding."""
 
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from holotorch.io.bundled import BUNDLED_IMAGES, no_such_picture
 from holotorch.io.formats.decoding import check_exr, decode
 from holotorch.metrics.quality import SSIM_WINDOW
 
-_MEMORY = 56  # bytes per pixel in load_image: three float64 values, a copy of them, and the decoded pixel
+_MEMORY = 56  # bytes per pixel in load_image: three float64 values (24), a copy of them (24) and the decoded pixel (8)
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of red, green and blue, ITU-R BT.709
 
 
@@ -20,14 +20,14 @@ def load_image(source: str | Path) -> Tensor:
     """Load a bundled photograph by name, or a PNG, JPEG, TIFF or EXR file by path.
 
     Returns:
-        float64 [C, H, W] in [0, 1], C = 3 (red, green, blue) or 1. 8 and 16 bit integers are divided by 255 and 65535
-        and not linearised: like the thesis, this function takes pixel values as intensities. Other types are divided by
-        their maximum if that exceeds 1. Transparent pixels are composited over black.
+        float64 [C, H, W] in [0, 1], C = 3 (red, green, blue) or 1 (grey). 8 and 16 bit integers are divided by 255 and
+        65535. The sRGB tone curve is not removed: like the thesis, this function takes pixel values as intensities.
+        Other types are divided by their maximum if that exceeds 1. Transparent pixels are composited over black.
 
     Raises:
         ValueError: The picture does not exist, cannot be decoded, exceeds the memory limit of
-            :mod:`holotorch.io.formats.limits`, has a side of less than 11 px, contains NaN, infinity or negative
-            values, or is black throughout.
+            :mod:`holotorch.io.formats.limits`, has a side of less than 11 px (the window of
+            :func:`~holotorch.metrics.ssim`), contains NaN, infinity or negative values, or is black throughout.
     """
     path = Path(source)
     if str(source) in BUNDLED_IMAGES:
@@ -48,10 +48,10 @@ def load_image(source: str | Path) -> Tensor:
 
 
 def fit_image(image: Tensor, shape: tuple[int, int], fit: str = "crop") -> Tensor:
-    """Resize ``image`` [C, h, w] to ``shape`` (H, W); a picture of that size is returned unchanged.
+    """Resize ``image`` [C, h, w] with values in [0, 1] to ``shape`` (H, W); one of that size is returned unchanged.
 
-    :func:`frame_image` changes the aspect ratio. Bilinear resampling with antialiasing follows; it does not overshoot,
-    so it creates no negative values.
+    First :func:`frame_image` gives the picture the aspect ratio of ``shape``, as ``fit`` states. Antialiased bilinear
+    interpolation follows, which creates no negative values.
     """
     if tuple(image.shape[-2:]) == tuple(shape):
         return image
@@ -76,7 +76,7 @@ def frame_image(image: Tensor, aspect: float, fit: str = "crop") -> Tensor:
 
 
 def with_channels(image: Tensor, channels: int) -> Tensor:
-    """Convert ``image`` [C, H, W] to 1 or 3 channels: colour becomes BT.709 luminance, grey is repeated."""
+    """Convert ``image`` [1 or 3, H, W] to ``channels``: one channel is the BT.709 luminance; grey is repeated."""
     if image.shape[0] == channels:
         return image
     if channels == 1:
@@ -99,7 +99,10 @@ def encode_png(image: Tensor) -> bytes:
 
 
 def read_exr(path: Path, *, memory: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and channels [H, W] of an EXR file by name; arguments and errors as for :func:`check_exr`."""
+    """Read the header of an EXR file and its channels, a mapping from names to arrays [H, W].
+
+    Arguments and errors are those of :func:`check_exr`.
+    """
     import OpenEXR
 
     check_exr(path, memory=memory)
@@ -128,13 +131,13 @@ def _exr_pixels(path: Path) -> np.ndarray:
     if names is None:
         raise ValueError(f"{path} must have channels R, G, B or Y, got {', '.join(sorted(channels))}")
     if "RY" in channels:
-        raise ValueError(f"{path} stores colour as luminance and differences; convert it to R, G, B")
+        raise ValueError(f"{path} stores colour as luminance and colour differences; convert it to R, G, B")
     names += "A" if "A" in channels else ""
     return np.stack([channels[name] for name in names], axis=-1)
 
 
 def _unit_range(pixels: np.ndarray) -> np.ndarray:
-    """Pixels as float64, divided by the largest value of 8 and 16 bit integers, or else by a maximum above 1."""
+    """Pixels as float64, divided by 255 or 65535 if they are 8 or 16 bit integers, else by their maximum if above 1."""
     values = pixels.astype(np.float64)
     peak = np.iinfo(pixels.dtype).max if pixels.dtype in (np.uint8, np.uint16) else values.max()
     if np.isfinite(peak) and peak > 1:
@@ -146,13 +149,13 @@ def _checked(image: Tensor, source: str) -> Tensor:
     try:
         checks.all_finite(f"picture {source}", image)
     except ValueError as error:
-        raise ValueError(f"{error}; repair the picture, every pixel [C, H, W] must be a number") from None
+        raise ValueError(f"{error}; repair the picture, whose elements are [channel, row, column]") from None
     if image.min() < 0:
         raise ValueError(f"picture {source} holds negative intensities, down to {image.min().item():g}; clip it first")
     height, width = image.shape[-2:]
     if min(height, width) < SSIM_WINDOW:
-        window = f"{SSIM_WINDOW} x {SSIM_WINDOW} px window of ssim"
+        window = f"{SSIM_WINDOW} x {SSIM_WINDOW} px window of the image metric SSIM"
         raise ValueError(f"picture {source} is {height} x {width} px, less than the {window}; use a larger one")
     if image.max() == 0:
-        raise ValueError(f"picture {source} is black: there is no light to form; use another picture")
+        raise ValueError(f"picture {source} is black throughout; use another picture")
     return image.contiguous()

@@ -1,4 +1,4 @@
-"""Files for a phase panel: grey levels as PNG or BMP and phases as EXR, each with metadata."""
+"""Files for a phase panel: grey levels as PNG or BMP and phases as EXR, each with metadata such as the wavelength."""
 
 import json
 import struct
@@ -19,14 +19,17 @@ from holotorch.io.images import read_exr
 
 _KEY = "holotorch"  # key of the PNG text chunk and of the EXR attribute that contain the metadata as JSON
 _CHUNK = b"iTXt"  # type of a PNG chunk with UTF-8 text
-_CHUNK_START = _KEY.encode() + bytes(5)  # key, then flags and empty fields of a text that is not compressed
+# Content of the chunk before the text: key, zero byte, two zero flags for "not compressed", and two empty strings
+# (language, translated key), each ended by a zero byte.
+_CHUNK_START = _KEY.encode() + bytes(5)
 
 
 def write_levels(path: Path, levels: Tensor, metadata: Mapping[str, Any]) -> None:
     """Write a frame of grey levels, uint8 or uint16 [H, W], as ``.png`` or (uint8 only) ``.bmp``, atomically.
 
-    Levels are stored without scaling: levels of a 10-bit panel are 0 to 1023 in a 16-bit file. The metadata, which must
-    be JSON values, go into a text chunk of a PNG, or into ``NAME.bmp.json`` beside a BMP.
+    Levels are stored without scaling: levels of a 10-bit panel are 0 to 1023 in a 16-bit file. The values of
+    ``metadata`` must be of types that JSON has. They are stored in a text chunk of a PNG, or beside a BMP in
+    ``NAME.bmp.json``.
 
     Raises:
         TypeError: Levels of another dtype, or metadata that cannot be written as JSON.
@@ -39,7 +42,7 @@ def write_levels(path: Path, levels: Tensor, metadata: Mapping[str, Any]) -> Non
     _check_frame("levels", levels)
     suffix = path.suffix.lower()
     if suffix not in (".png", ".bmp"):
-        raise ValueError(f"{path}: levels are written as .png or .bmp, got {suffix or 'no ending'}")
+        raise ValueError(f"{path}: levels are written as .png or .bmp, got {suffix or 'no extension'}")
     if suffix == ".bmp" and levels.dtype == torch.uint16:
         raise ValueError(f"{path}: a BMP holds 8 bits and these levels have more; use .png")
     text = _json(metadata)
@@ -54,7 +57,7 @@ def write_levels(path: Path, levels: Tensor, metadata: Mapping[str, Any]) -> Non
 
 
 def read_levels(path: Path) -> tuple[Tensor, dict[str, Any]]:
-    """Read a frame of grey levels, uint8 or uint16 [H, W], and its metadata, which are empty if the file has none.
+    """Read a frame of grey levels, uint8 or uint16 [H, W], and its metadata, an empty dict if the file has none.
 
     ValueError if the file is missing, damaged, or not a grey picture of 8 or 16 bits.
     """
@@ -73,7 +76,7 @@ def read_levels(path: Path) -> tuple[Tensor, dict[str, Any]]:
 
 
 def write_phases(path: Path, phase: Tensor, metadata: Mapping[str, Any]) -> None:
-    """Write phases in rad, float32 [H, W], as the channel Y of an ``.exr``, bit-exactly and atomically.
+    """Write phases in rad, float32 [H, W], as the channel Y of an ``.exr``, without loss and atomically.
 
     Raises:
         TypeError: Phases that are not float32, or metadata that cannot be written as JSON.
@@ -86,8 +89,8 @@ def write_phases(path: Path, phase: Tensor, metadata: Mapping[str, Any]) -> None
     _check_frame("phase", phase)
     checks.all_finite("phase", phase)
     if path.suffix.lower() != ".exr":
-        raise ValueError(f"{path}: phases are written as .exr, got {path.suffix or 'no ending'}")
-    pixels = np.array(phase.detach().cpu().numpy(), order="C")  # OpenEXR ignores strides
+        raise ValueError(f"{path}: phases are written as .exr, got {path.suffix or 'no extension'}")
+    pixels = np.array(phase.detach().cpu().numpy(), order="C")  # contiguous, since OpenEXR ignores strides
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, _KEY: _json(metadata)}
     with tempfile.TemporaryDirectory() as folder:  # the library writes only to a path
         temporary = Path(folder) / "phase.exr"
@@ -107,7 +110,8 @@ def read_phases(path: Path) -> tuple[Tensor, dict[str, Any]]:
 
 
 def _with_text(png: bytes, text: str) -> bytes:
-    """The PNG with ``text`` in a text chunk after its header."""
+    """The PNG with ``text`` in a text chunk after its header, the first chunk."""
+    # A chunk consists of the length of its body, its type and a checksum, four bytes each, and the body.
     end = len(PNG) + 12 + struct.unpack_from(">I", png, len(PNG))[0]
     body = _CHUNK + _CHUNK_START + text.encode()
     return png[:end] + struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body)) + png[end:]
@@ -137,7 +141,7 @@ def _metadata(path: Path, text: str | None) -> dict[str, Any]:
     except (ValueError, TypeError, RecursionError):  # TypeError: an EXR attribute that is no text
         raise ValueError(f"{path}: its metadata are damaged: not JSON") from None
     if not isinstance(metadata, dict):
-        raise ValueError(f"{path}: its metadata are damaged: expected settings, got {metadata!r}")
+        raise ValueError(f"{path}: its metadata are damaged: expected a JSON object, got {metadata!r}")
     return metadata
 
 

@@ -1,16 +1,16 @@
-"""Lossless recording of frames, and bit-exact replay.
+"""Recording of video frames without loss, and replay with the same pixels and times.
 
 A recording is a folder::
 
-    recording.json   format, frame size, rate, source, order of channels, names of the copied files; written first
-    camera.yaml ...  exact copies of the files that the recording was made with
+    recording.json   format version, frame size, frame rate, source, channel order, names of the copied files
+    camera.yaml ...  copies of files that a replay needs, such as the calibration of the camera
     frames.rgb       the frames without any bytes between them, each with H rows of W pixels of 8-bit red, green, blue
-    times.csv        frame,seconds,crc32,problem: a line per frame, written after the pixels of the frame; the line of a
-                     frame that the source could not deliver has a problem but no checksum, and the frame has no pixels
+    times.csv        frame,seconds,crc32,problem: a line per frame, written after the pixels of the frame. A frame that
+                     the source could not deliver has no pixels; its line states the problem instead of a checksum
 
-``frames.rgb`` and ``times.csv`` are only appended to, so that frames recorded before a crash of the program can be
-replayed. If the disk is full, an incomplete frame is removed. The pixels are not compressed, since encoding a 1080p
-frame as PNG takes longer than the frame period of a camera.
+The pixels are not compressed, since encoding a 1080p frame as PNG takes longer than the frame period of a camera.
+``frames.rgb`` and ``times.csv`` are only appended to, so that after a crash the frames recorded before it can be
+replayed. If the disk is full, an incomplete frame is removed.
 ``ffplay -f rawvideo -pixel_format rgb24 -video_size WxH frames.rgb`` plays the frames.
 """
 
@@ -30,8 +30,8 @@ from holotorch.core import checks
 from holotorch.io.files import append, read_json, write_bytes, write_json
 from holotorch.io.video import Frame, Frames, check_pixels
 
-_FORMAT = 1
-_CHANNELS = "RGB"  # channel order of every recording; files of older versions do not state it
+_FORMAT = 1  # version of the file format
+_CHANNELS = "RGB"  # channel order of every recording; recordings of older versions of holotorch do not state it
 _COLUMNS = ("frame", "seconds", "crc32", "problem")
 
 
@@ -88,7 +88,10 @@ class Recorder:
         self._row(_COLUMNS)
 
     def write(self, frame: Frame) -> None:
-        """Append a frame. ValueError for another shape or dtype; OSError, without a change, if the disk is full."""
+        """Append a frame.
+
+        ValueError for another shape or dtype; OSError if the disk is full, and the recording then stays as it was.
+        """
         import cv2
 
         seconds = repr(checks.finite("time of a frame", frame.seconds, "seconds"))  # repr keeps all digits of a float
@@ -129,11 +132,11 @@ def open_recording(folder: Path) -> Frames:
     """Open a recording to replay its frames with their times.
 
     A truncated recording yields all complete frames and a remark in ``notes``. A frame whose checksum does not match
-    has a problem instead of pixels. ValueError if the folder holds no recording, or if the recording is damaged, has a
-    later format, or contains no complete frame.
+    has a problem instead of pixels. ValueError if the folder holds no recording, or if the recording is damaged, has
+    the format of a later version, or contains no complete frame.
     """
     if not is_recording(folder):
-        raise ValueError(f"{folder} holds no recording: recording.json and times.csv are not both there")
+        raise ValueError(f"{folder} holds no recording: it must contain recording.json and times.csv")
     header = _header(folder)
     shape = (header["height"], header["width"])
     size = recording_bytes(shape, 1)
@@ -147,12 +150,12 @@ def open_recording(folder: Path) -> Frames:
             break
         complete.append(row)
     if not any(crc is not None for _, crc, _ in complete):
-        raise ValueError(f"{folder} holds no whole frame; the recording was cut off before its first")
+        raise ValueError(f"{folder} holds no complete frame; the recording was cut off before its end")
     notes = []
     if len(complete) < len(rows):
-        notes.append(f"frames.rgb is cut off: {len(complete)} of {len(rows)} frames are there")
+        notes.append(f"frames.rgb is cut off: it holds {len(complete)} of {len(rows)} frames")
     elif available > used:
-        notes.append(f"the recording was cut off while a frame was written; the {len(complete)} before it are there")
+        notes.append(f"the recording was cut off while a frame was written; it holds the {len(complete)} before it")
 
     def frames() -> Iterator[Frame]:
         with open(folder / "frames.rgb", "rb") as stream:
@@ -160,7 +163,7 @@ def open_recording(folder: Path) -> Frames:
                 if crc is None:
                     yield Frame(seconds, None, problem)
                 elif zlib.crc32(data := bytearray(stream.read(size))) != crc:
-                    yield Frame(seconds, None, "its bytes have changed since it was recorded")
+                    yield Frame(seconds, None, "its pixels have changed since it was recorded")
                 else:
                     pixels = np.frombuffer(data, np.uint8).reshape(*shape, 3)
                     yield Frame(seconds, torch.from_numpy(pixels).permute(2, 0, 1).contiguous())
@@ -169,7 +172,7 @@ def open_recording(folder: Path) -> Frames:
 
 
 def free_bytes(folder: Path) -> int:
-    """Free bytes on the disk of ``folder``, which need not exist yet."""
+    """Free bytes on the disk on which ``folder`` lies or would be created."""
     folder = folder.resolve()
     return shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.exists())).free
 
@@ -185,9 +188,9 @@ def _header(folder: Path) -> dict[str, Any]:
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is damaged: {type(error).__name__} {error}") from None
     if (channels := header.get("channels", _CHANNELS)) != _CHANNELS:
-        raise ValueError(f"{path} states channels {channels!r}; frames of a recording are {_CHANNELS}: convert them")
+        raise ValueError(f"{path} states channels {channels!r}; recordings are {_CHANNELS}: convert its frames")
     if version > _FORMAT:
-        raise ValueError(f"{path} is of format {version}; this version reads up to {_FORMAT}: use a newer one")
+        raise ValueError(f"{path} has format {version}; this holotorch reads up to format {_FORMAT}: use a newer one")
     return header
 
 

@@ -1,4 +1,4 @@
-"""Frames with their times from a video file, a folder of pictures or a camera, and atomic writing of videos."""
+"""Reading of frames and their times from a video file, a folder of pictures or a camera; atomic writing of videos."""
 
 import math
 import os
@@ -18,12 +18,15 @@ from holotorch.core import checks
 from holotorch.io.formats.decoding import decode
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-_CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
+_CODECS = {".mp4": "mp4v", ".avi": "MJPG"}  # four-character code of the codec for each file extension
 _ASSUMED_RATE = 30.0  # Hz; frame rate of sources that state none
 
 
 class Frame(NamedTuple):
-    """One frame: its time in seconds, and RGB pixels, uint8 [3, H, W], or None and the reason in ``problem``."""
+    """One frame: its time in seconds, and its RGB pixels, uint8 [3, H, W].
+
+    If the frame could not be read, ``pixels`` is None and ``problem`` states why.
+    """
 
     seconds: float
     pixels: Tensor | None
@@ -32,15 +35,15 @@ class Frame(NamedTuple):
 
 @dataclass(eq=False)
 class Frames:
-    """The frames of a source, which can be iterated over once; also a context manager that closes the source.
+    """The frames of a video source, to iterate over once; also a context manager that closes the source.
 
     Attributes:
         name: Name of the source.
         shape: Size (H, W) of the frames in pixels.
-        total: Number of frames that the source states, or None if it states none, like a camera.
-        rate: Frames per second that the source states, or an assumed rate.
+        total: Number of frames that the source states, or None if it states none, as a camera.
+        rate: Frames per second: stated by the source, given by the caller, or else 30.
         frames: Iterator over the frames.
-        notes: Remarks about the source for the user, such as an assumed rate; complete after the last frame.
+        notes: Remarks for the user, such as that a rate was assumed; some are added after the last frame.
         live: Whether the source is a camera, which does not end.
         close: Function that closes the source; None if ``frames`` does so itself.
     """
@@ -70,9 +73,17 @@ class Frames:
 def open_frames(source: str | Path, rate: float | None = None) -> Frames:
     """Open a video file, a folder of pictures (ordered by the numbers in their names), or a camera (by its number).
 
-    Times come from the file or from the camera's driver. Frames without times, such as pictures, are spaced by
-    1 / ``rate`` seconds (30 per second by default), and ``notes`` says so. A frame that cannot be read has a problem
-    instead of pixels. ValueError if there is no such source, no frame can be decoded, or the rate is not positive.
+    Frames of a video have the times that the file states; where it states none, a frame follows the previous one by the
+    inverse of the frame rate. Frames of a camera have the times of its driver, or of their arrival if the driver states
+    none. Pictures are spaced by 1 / ``rate``. A frame that cannot be read has a problem instead of pixels.
+
+    Args:
+        source: Path of a file or folder, or the number of a camera.
+        rate: Frames per second of pictures, and of a video file that states no rate; 30 by default. A camera is asked
+            for this rate.
+
+    Raises:
+        ValueError: There is no such source, no frame can be decoded, or the rate is not positive.
     """
     if rate is not None:
         checks.positive("rate", rate, "frames per second")
@@ -114,14 +125,14 @@ def _video(path: Path, rate: float | None) -> Frames:
         code = int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
         codec = code.to_bytes(4, "little").decode("ascii", "replace").strip("\0 ") or "unknown"
         capture.release()
-        reason = f"no frame could be decoded (codec {codec}); it is empty or damaged, or OpenCV lacks the codec"
+        reason = f"no frame could be decoded (codec {codec}); the file is empty or damaged, or OpenCV lacks the codec"
         raise ValueError(f"{path}: {reason}: convert it, for example with ffmpeg -i IN -c:v ffv1 OUT.avi")
 
     def frames() -> Iterator[Frame]:
         pixels, seconds, count, guessed = first, 0.0, 0, 0
         while True:
             now = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
-            if count and not now > seconds:  # the stream states no time for this frame
+            if count and not now > seconds:  # the file states no time for this frame
                 now, guessed = seconds + 1 / stated, guessed + 1
             seconds, count = now, count + 1
             yield _frame(seconds, pixels)
@@ -129,7 +140,7 @@ def _video(path: Path, rate: float | None) -> Frames:
                 break
             pixels = _decoded(capture.retrieve)
         if guessed:
-            notes.append(f"{guessed} of {count} frames have no time of their own; counted at {stated:g} per second")
+            notes.append(f"{guessed} of {count} frames have no time in the file; spaced at {stated:g} per second")
         if count < announced:
             notes.append(f"{path.name} announces {announced} frames and {count} could be read")
 
@@ -180,18 +191,18 @@ def _camera(index: int, rate: float | None) -> Frames:
     import cv2
 
     capture = cv2.VideoCapture(index)
-    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # deliver the newest frame, not the oldest one in a queue
+    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # so that the driver delivers the newest frame, not the oldest in a queue
     if rate is not None:
         capture.set(cv2.CAP_PROP_FPS, rate)
     first = _decoded(capture.read) if capture.isOpened() else None
     if first is None:
         capture.release()
-        raise ValueError(f"no frame from camera {index}; is it plugged in, free, and may this user read it?")
+        raise ValueError(f"no frame from camera {index}: it is not connected, in use, or not readable by this user")
     stated = capture.get(cv2.CAP_PROP_FPS)
     stated = stated if math.isfinite(stated) and stated > 0 else _ASSUMED_RATE
     # Video4Linux provides the driver's time of each frame; other systems provide none.
     driver = capture.get(cv2.CAP_PROP_POS_MSEC) > 0
-    notes = [] if driver else ["times are those of arrival in this program, the camera's driver gives none"]
+    notes = [] if driver else ["the camera's driver states no times; each frame has the time at which it arrived"]
 
     def now() -> float:
         return capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3 if driver else time.monotonic()
@@ -202,19 +213,22 @@ def _camera(index: int, rate: float | None) -> Frames:
         yield _frame(start, first)
         while capture.grab():
             yield _frame(now(), _decoded(capture.retrieve))
-        notes.append("the camera stopped giving frames")
+        notes.append("the camera stopped delivering frames")
 
     return Frames(f"camera {index}", first.shape[:2], None, stated, frames(), notes, live=True, close=capture.release)
 
 
 def check_pixels(pixels: Tensor, shape: Sequence[int], target: str) -> None:
-    """ValueError unless ``pixels`` are uint8 [3, H, W] for the ``shape`` (H, W) of the ``target``, such as "video"."""
+    """Raise ValueError unless ``pixels`` are uint8 [3, H, W], with the ``shape`` (H, W) of the frames of ``target``.
+
+    ``target`` is a word for the error message, such as "video".
+    """
     if pixels.dtype != torch.uint8 or tuple(pixels.shape) != (3, *shape):
         raise ValueError(f"frames of this {target} are uint8 {[3, *shape]}, got {pixels.dtype} {list(pixels.shape)}")
 
 
 class VideoWriter:
-    """Writer of an ``.mp4`` (MPEG-4) or ``.avi`` (motion JPEG) video, frame by frame; see :func:`replacing_video`."""
+    """Writer of an ``.mp4`` (MPEG-4) or ``.avi`` (Motion JPEG) video; :func:`replacing_video` makes one."""
 
     def __init__(self, path: Path, shape: tuple[int, int], rate: float):
         import cv2
@@ -246,14 +260,14 @@ def replacing_video(path: Path, shape: tuple[int, int], rate: float) -> Iterator
     Args:
         path: File to write; its name ends in ``.mp4`` or ``.avi``.
         shape: Size (H, W) of the frames in pixels; the codecs drop the last row or column of an odd size.
-        rate: Frames per second, constant over the video even if frames were captured irregularly.
+        rate: Frames per second; the video has a constant rate, whatever the times at which frames were captured.
 
     Raises:
         ValueError: Another file extension, or an impossible rate or shape.
         OSError: The file cannot be written.
     """
     if path.suffix.lower() not in _CODECS:
-        raise ValueError(f"{path}: videos are written as {' or '.join(_CODECS)}, got {path.suffix or 'no ending'}")
+        raise ValueError(f"{path}: videos are written as {' or '.join(_CODECS)}, got {path.suffix or 'no extension'}")
     checks.positive("rate", rate, "frames per second")
     for side in shape:
         checks.whole("side of a frame", side, 2)
@@ -289,5 +303,5 @@ def _rgb(pixels: np.ndarray) -> Tensor:
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sort key by which frame2 comes before frame10."""
+    """Sort key that orders names by the numbers in them: frame2 comes before frame10."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]

@@ -1,4 +1,4 @@
-"""Loading of volumes of all formats by one function, which guesses no geometry that a file does not state."""
+"""One function that loads volumes of all supported formats and asks for a spacing that a file does not state."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -45,26 +45,28 @@ def load_volume(
     """Read a volume with the dtype of the file; its spacing is in metres or marked as relative.
 
     Args:
-        path: A file: raw (.raw, .raw.gz), MetaImage (.mhd, .mha), NRRD (.nrrd, .nhdr), TIFF stack, picture tiled with
-            slices (.png), NumPy (.npy, .npz), VTK (.vti), NIfTI (.nii, .nii.gz), HDF5 (.h5::dataset); or a folder:
-            numbered pictures, a DICOM series, Zarr (.zarr::array).
+        path: A file: raw (.raw, .raw.gz), MetaImage (.mhd, .mha), NRRD (.nrrd, .nhdr), TIFF with one page per slice
+            (.tif, .tiff), one picture with the slices as tiles (.png), NumPy (.npy, .npz), VTK (.vti), NIfTI (.nii,
+            .nii.gz) or HDF5 (.h5, .hdf5). Or a folder: numbered pictures, a DICOM series or Zarr. In a .npz, .vti, HDF5
+            or Zarr with several arrays, path::name selects one.
         spacing: Distance between voxels along (z, y, x), or one number for cubic voxels. Required if the file states no
             spacing; otherwise it replaces the spacing of the file.
         shape: Number of voxels (D, H, W). Required for a tiled picture and for raw files whose names do not contain it;
-            compared with the content of all other files.
-        dtype: Type of raw voxels, such as "uint8", or ">i2" for big-endian; compared with the content of other files.
-        unit: Unit of ``spacing``: "m" (default), or "relative" for a volume that has proportions but no size.
+            for other files it must equal the shape that they state.
+        dtype: Type of raw voxels, such as "uint8", or ">i2" for big-endian. Required for raw files whose names do not
+            contain it; for other files it must equal the dtype that they state.
+        unit: Unit of ``spacing``: "m" (default), or "relative" for a volume whose size in metres is unknown.
 
     Returns:
         Voxels [D, H, W]. If they take over 1 GiB and over half of the free memory, and the file holds them in native
         byte order without compression, they are memory-mapped: the file is read on access and never written. Do not
-        truncate such a file while it is in use: the system would end the program. Floating-point values are not checked
-        for NaN, which would read the whole file; :meth:`Volume.check_finite` checks them.
+        truncate such a file while it is in use: the operating system would end the program. NaN is not detected here,
+        since this would read the whole file; :meth:`Volume.check_finite` detects it.
 
     Raises:
-        ValueError: No such file, an unknown format, geometry that is unknown or not stated, a file whose size differs
-            from its header, more than one number per voxel, or compressed voxels beyond the memory limit of
-            :mod:`holotorch.io.formats.limits`.
+        ValueError: No such file, an unknown format, a spacing that neither the file nor the caller states or whose unit
+            is unknown, a file that is shorter or longer than its header states, more than one number per voxel, or
+            compressed voxels beyond the memory limit of :mod:`holotorch.io.formats.limits`.
         ImportError: The library for the format is not installed; the message states the command that installs it.
     """
     file, member = split_member(path)
@@ -81,7 +83,7 @@ def load_volume(
         return _as_stated(file, scan, unit)
     steps = (spacing,) * 3 if isinstance(spacing, int | float | np.number) else tuple(spacing)
     if unit is None and any(checks.positive("spacing", step, "metres") > VOXEL.high for step in steps):
-        hint = "1 mm is 1e-3. For a volume without a size add unit='relative'"
+        hint = "1 mm is 1e-3. If the size of the volume is unknown, add unit='relative'"
         raise ValueError(f"spacing between voxels must be in metres, got {spacing!r}; {hint}")
     unit = unit or "m"
     # The origin is meaningful only in the unit of the spacing.
@@ -91,9 +93,9 @@ def load_volume(
 
 def _as_stated(file: Path, scan: Scan, unit: str | None) -> Volume:
     if unit is not None:
-        raise ValueError(f"unit={unit!r} is that of spacing=, which was not given")
+        raise ValueError(f"unit={unit!r} is the unit of spacing=, which was not given")
     if scan.spacing is None or not all(np.isfinite(scan.spacing)) or min(scan.spacing) <= 0:
-        hint = "such as (1e-3, 5e-4, 5e-4), or spacing=1, unit='relative' for cubes without a size"
+        hint = "such as (1e-3, 5e-4, 5e-4), or spacing=1, unit='relative' for cubic voxels of unknown size"
         raise ValueError(f"{file} does not state the spacing of its voxels: pass spacing=(z, y, x) in metres, {hint}")
     return Volume(_tensor(scan.values, file), triple(scan.spacing), scan.unit, scan.origin, scan.orientation)
 
@@ -123,7 +125,7 @@ def _read(file: Path, member: str | None, shape: Sequence[int] | None, dtype: DT
         return raw_volumes.read_raw(file, shape, dtype)
     known = ", ".join((".raw", ".raw.gz", ".png", *_READERS, *_MEMBER_READERS))
     known += ", and folders of DICOM files or numbered pictures"
-    hint = "Pass shape=(D, H, W) and dtype= if it is raw under another name"
+    hint = "For raw voxels under another extension, pass shape=(D, H, W) and dtype="
     raise ValueError(f"{file} has no known extension; known are {known}. {hint}")
 
 
@@ -134,7 +136,7 @@ def _tensor(values: np.ndarray, file: Path) -> torch.Tensor:
         values = values.view(np.uint8)
     elif values.dtype.kind == "u" and values.dtype.itemsize == 8:
         if values.size and int(values.max()) > np.iinfo(np.int64).max:
-            raise ValueError(f"{file} holds unsigned 64-bit values above 2^63; divide or convert them first")
+            raise ValueError(f"{file} holds unsigned 64-bit values above 2^63 - 1; divide or convert them first")
         values = values.astype(np.int64)
     if not values.dtype.isnative:  # torch supports only the native byte order
         values = values.astype(values.dtype.newbyteorder("="))

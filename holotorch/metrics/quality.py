@@ -13,7 +13,7 @@ def psnr(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
     """Peak signal-to-noise ratio in dB, [...] for images [..., H, W]; infinite for equal images.
 
     The peak is ``data_range``, the difference between the largest and smallest possible value; thesis Eq. 4.37 uses the
-    maximum of the reference instead. TypeError and ValueError as in :func:`ssim`, except that any size is allowed.
+    maximum of the reference instead. Errors are those of :func:`ssim`, but images of any size are allowed.
     """
     image, reference = _checked_pair(image, reference, data_range)
     return 10 * torch.log10(data_range**2 / (image - reference).square().mean((-2, -1)))
@@ -49,7 +49,7 @@ def ssim_map(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
 
 
 class PerceptualSimilarity(nn.Module):
-    """Similarity exp(-d), where d is the LPIPS distance between two images; 1 for equal images. See thesis Fig. 4.17.
+    """Similarity exp(-d) with the LPIPS distance d between two images, as in thesis Fig. 4.17; 1 for equal images.
 
     The constructor needs the optional dependency ``lpips`` (ImportError without it). It loads AlexNet's weights, which
     are downloaded to torch's cache if they are not there (OSError if the download fails).
@@ -67,13 +67,13 @@ class PerceptualSimilarity(nn.Module):
         self.distance = LPIPS(net="alex", verbose=False).requires_grad_(False)
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """Similarity [...] of images [..., C, H, W] with values in 0..1.
+        """Similarity [...] of images [..., C, H, W] with values in [0, 1].
 
         C is 3 (RGB) or 1 (grey, repeated for R, G and B). ValueError for another C or for unequal shapes.
         """
         _checked_pair(image, reference, 1.0)
         if image.ndim < 3 or image.shape[-3] not in (1, 3):
-            raise ValueError(f"images must be grey or red, green, blue, [..., 1 or 3, H, W], got {tuple(image.shape)}")
+            raise ValueError(f"images must be [..., C, H, W] with C = 1 (grey) or 3 (RGB), got {tuple(image.shape)}")
         batches = (x.expand(*x.shape[:-3], 3, -1, -1).reshape(-1, 3, *x.shape[-2:]) for x in (image, reference))
         distances = self.distance(*(2 * batch.float() - 1 for batch in batches))
         return torch.exp(-distances).reshape(image.shape[:-3]).to(image.dtype)

@@ -11,7 +11,7 @@ from holotorch.core import checks
 from holotorch.core.fourier import fft2
 from holotorch.core.precision import at_least_single
 
-_BAND = (0.05, 0.25)  # default band of sharpness in cycles per sample; excludes the coarsest and finest detail
+_BAND = (0.05, 0.25)  # default band of sharpness, in cycles per sample; excludes the coarsest and finest detail
 _LAGS = 16  # lags per sample at which grain_size evaluates the autocorrelation
 
 
@@ -29,7 +29,7 @@ def speckle_contrast(intensity: Tensor, *, reference: Tensor | None = None, mask
         intensity: Real intensities, at least 0.
         reference: Speckle-free picture [..., H, W], for scenes that are not uniform; the contrast is then
             rms(intensity - reference) / rms(reference). By default, the mean of ``intensity`` at every pixel.
-        mask: Pixels to measure, bool [..., H, W]; by default all pixels.
+        mask: True at the pixels to measure, bool [..., H, W]; by default all pixels.
 
     Returns:
         Contrast, differentiable; 0 for a black region. The gradient is 0 at a contrast of 0.
@@ -80,12 +80,14 @@ def grain_size(intensity: Tensor, *, level: float = 0.5) -> Tensor:
     """Size (y, x) of the speckle grains in samples, [..., 2] for [..., H, W]: full width of the autocorrelation.
 
     The width is measured where the autocorrelation of I - mean along an axis, normalised to 1 at lag 0, falls to
-    ``level``. The picture is zero-padded, and the autocorrelation at each lag is averaged over the pixel pairs there.
-    Sinc interpolation between whole lags resolves grains of two samples. The width is infinite if the level is not
-    reached at lags up to half the picture. First divide pictures of non-uniform scenes by their speckle-free mean.
+    ``level``. The picture is zero-padded, and the autocorrelation at each lag is averaged over the pairs of pixels with
+    that lag. Sinc interpolation between whole lags resolves grains of two samples. The width is infinite if the
+    autocorrelation stays above ``level`` up to a lag of half the picture. Divide the picture of a non-uniform scene by
+    its speckle-free mean first.
 
-    For ``level=0.5``, a square pupil of side D at distance z gives 0.8859 wavelength z / D, and a round pupil of
-    diameter D gives 1.0290 wavelength z / D. ValueError unless 0 < level < 1, and for a picture without speckle.
+    For ``level=0.5`` and a pupil at distance z, the width in metres is 0.8859 wavelength z / D for a square pupil of
+    side D, and 1.0290 wavelength z / D for a round pupil of diameter D. ValueError unless 0 < level < 1, and for a
+    uniform picture, which has no grains.
 
     Source: Goodman, Speckle Phenomena in Optics, Sec. 4.4.
     """

@@ -19,11 +19,11 @@ from holotorch.perception.cortical import (
     cortical_scale,
     peripheral_weight,
 )
-from holotorch.perception.display import TABLE_2_1, DisplayCheck, WideDisplay, check_display
+from holotorch.perception.display import TABLE_2_1, WideDisplay, check_display
 from holotorch.perception.geometry import CurvedScreen, FlatScreen, Headset, eccentricity_of, separation
 from holotorch.perception.layout import ScaledLayout, overlaps, scale_layout
 from holotorch.perception.scale import FITTED_DEG, TESTED_DEG, EqualEfficiencyScale
-from holotorch.perception.table import TABLE_2_2, EqualEfficiencyRow
+from holotorch.perception.table import TABLE_2_2
 from holotorch.perception.time import PerceptionTime
 
 __all__ = [
@@ -39,8 +39,6 @@ __all__ = [
     "TEMPORAL",
     "TESTED_DEG",
     "CurvedScreen",
-    "DisplayCheck",
-    "EqualEfficiencyRow",
     "EqualEfficiencyScale",
     "FlatScreen",
     "Headset",

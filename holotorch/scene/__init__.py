@@ -1,7 +1,6 @@
 """Volumes, their direct volume rendering into light sources or pictures, and analytic test volumes."""
 
-from holotorch.scene.adaptive import AdaptivePicture, AdaptiveReport, adaptive_report, render_adaptively
-from holotorch.scene.compositing import corrected_opacity, front_to_back, safe_sqrt
+from holotorch.scene.adaptive import adaptive_report, render_adaptively
 from holotorch.scene.layers import SourceLayers
 from holotorch.scene.lighting import Lighting
 from holotorch.scene.phantoms import (
@@ -20,8 +19,6 @@ from holotorch.scene.transfer_presets import bone, industrial, soft_tissue, tran
 from holotorch.scene.volume import Volume
 
 __all__ = [
-    "AdaptivePicture",
-    "AdaptiveReport",
     "DVRSampler",
     "Lighting",
     "PointPhases",
@@ -32,9 +29,7 @@ __all__ = [
     "bone",
     "c60",
     "c60_atoms",
-    "corrected_opacity",
     "exponential_medium",
-    "front_to_back",
     "gaussian_ball",
     "homogeneous_slab",
     "industrial",
@@ -42,7 +37,6 @@ __all__ = [
     "point_phases",
     "random_phase",
     "render_adaptively",
-    "safe_sqrt",
     "shells",
     "smooth_phase",
     "soft_tissue",

@@ -1,4 +1,4 @@
-"""Where the hidden tip of a catheter is, from one camera that sees its coloured bands."""
+"""Pose of a catheter whose tip is hidden, from the frames of one camera that observes its coloured bands."""
 
 from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.camera.tone import tone_curve

@@ -10,7 +10,9 @@ import torch
 from holotorch.core import checks, quantities
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import Quantity, shown
-from holotorch.optics import carrier, converging_fresnel, propagate
+from holotorch.optics import propagate
+from holotorch.optics.elements.converging import converging_fresnel
+from holotorch.optics.free_space.kernels import carrier
 
 TABLE = {name: value for name, value in vars(quantities).items() if isinstance(value, Quantity)}
 NAN, INFINITE = math.nan, math.inf

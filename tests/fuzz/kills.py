@@ -203,7 +203,7 @@ class Kills:
             with open_recording(kept) as frames:
                 levels = [int(frame.pixels[0, 0, 0]) for frame in frames if frame.pixels is not None]
         except ValueError as error:
-            if "no whole frame" in str(error):
+            if "no complete frame" in str(error):
                 return
             raise Failed(f"the frames that were kept cannot be replayed: {error}") from None
         if levels != _LEVELS[: len(levels)]:

@@ -61,7 +61,7 @@ def test_refusals():
         srgb_matrix(COLOURS, [1.0, -1.0, 1.0])
     with pytest.raises(ValueError, match="white has no luminance"):
         srgb_matrix(COLOURS, [0.0, 0.0, 0.0])
-    with pytest.raises(ValueError, match="cannot mix the white D65"):
+    with pytest.raises(ValueError, match="cannot be mixed to the white D65"):
         white_balance([636e-9, 620e-9, 600e-9])
     with pytest.raises(ValueError, match="needs three wavelengths"):
         white_balance([636e-9, 520e-9])

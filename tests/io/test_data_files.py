@@ -41,11 +41,13 @@ def test_a_header_names_files_of_its_own_folder_only(tmp_path, kind):
         "link.raw",
         "below/secret.raw",
     ):
-        with pytest.raises(ValueError, match="lies outside the header's folder; move it .* beside the header, or load"):
+        with pytest.raises(
+            ValueError, match="lies outside the header's folder; move the file itself .* beside the header, or load"
+        ):
             load_volume(header(folder, kind, name))
     for name in ("data/a.raw", "same.raw", "./data/../data/a.raw", str(folder / "data" / "a.raw")):
         assert np.array_equal(load_volume(header(folder, kind, name)).values.numpy(), VOXELS)
-    with pytest.raises(ValueError, match="which .* names, is no file"):
+    with pytest.raises(ValueError, match="which .* names, is not a file"):
         load_volume(header(folder, kind, "data"))
 
 

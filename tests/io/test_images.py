@@ -64,7 +64,7 @@ def test_exr_transparency_and_stored_differences(tmp_path):
     with pytest.raises(ValueError, match="is black"):
         load_image(tmp_path / "clear.exr")
     write_exr(tmp_path / "yc.exr", Y=values, RY=values, BY=values)
-    with pytest.raises(ValueError, match="luminance and differences; convert it to R, G, B"):
+    with pytest.raises(ValueError, match="luminance and colour differences; convert it to R, G, B"):
         load_image(tmp_path / "yc.exr")
 
 
@@ -97,7 +97,7 @@ def test_refuses_broken_pixels(tmp_path, value, message):
 
 def test_refuses_black_tiny_missing_and_garbled_pictures(tmp_path):
     cv2.imwrite(str(tmp_path / "black.png"), np.zeros((20, 20), dtype=np.uint8))
-    with pytest.raises(ValueError, match="is black: there is no light to form; use another picture"):
+    with pytest.raises(ValueError, match="is black throughout; use another picture"):
         load_image(tmp_path / "black.png")
     cv2.imwrite(str(tmp_path / "tiny.png"), np.ones((8, 8), dtype=np.uint8))
     with pytest.raises(ValueError, match="is 8 x 8 px, less than the 11 x 11 px window"):

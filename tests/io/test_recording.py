@@ -116,7 +116,7 @@ def test_a_line_that_does_not_fit_takes_its_frame_with_it(tmp_path, monkeypatch)
 
 @pytest.mark.parametrize(
     ("pixels_cut", "line_cut", "left", "note"),
-    [(0, 0, 4, ""), (0, 7, 3, "cut off while a frame was written"), (100, 0, 3, "3 of 4 frames are there")]
+    [(0, 0, 4, ""), (0, 7, 3, "cut off while a frame was written"), (100, 0, 3, "holds 3 of 4 frames")]
     + [(100, 7, 3, "cut off while a frame was written"), (recording_bytes(SHAPE, 1), 7, 3, "")],
 )
 def test_every_cut_leaves_the_frames_before_it(tmp_path, pixels_cut, line_cut, left, note):
@@ -149,7 +149,7 @@ def test_what_cannot_be_recorded_or_replayed_says_why(tmp_path):
             recorder.write(Frame(0.0, torch.zeros(3, 12, 16, dtype=torch.uint8)))
         with pytest.raises(ValueError, match="time of a frame must be finite"):
             recorder.write(Frame(float("nan"), noise(1)[0]))
-    for folder, message in (("b", "no whole frame"), ("c", "holds no recording")):
+    for folder, message in (("b", "no complete frame"), ("c", "holds no recording")):
         with pytest.raises(ValueError, match=message):
             open_recording(tmp_path / folder)
     lines = (tmp_path / "a" / "times.csv").read_text().splitlines()
@@ -161,7 +161,7 @@ def test_what_cannot_be_recorded_or_replayed_says_why(tmp_path):
     for change, message in (
         ({"format": 2}, "use a newer one"),
         ({"height": 0}, "height must be at least 1"),
-        ({"channels": "BGR"}, "states channels 'BGR'; frames of a recording are RGB"),
+        ({"channels": "BGR"}, "states channels 'BGR'; recordings are RGB"),
     ):
         (tmp_path / "a" / "recording.json").write_text(json.dumps(facts | change))
         with pytest.raises(ValueError, match=message):

@@ -170,7 +170,7 @@ def test_a_camera_gives_the_drivers_times_or_says_that_it_has_none(monkeypatch):
     assert found[1].pixels is None and same(found[2], picture(3))
     device = StandIn([bgr(1), bgr(2)], [0.0, 0.0])
     frames = open_frames("0")
-    assert "times are those of arrival" in frames.notes[0]
+    assert "the time at which it arrived" in frames.notes[0]
     first, second = frames
     assert second.seconds >= first.seconds > 0
     device = StandIn([], [])

@@ -67,7 +67,7 @@ def test_nifti_refusals(tmp_path, nibabel):
             load_volume(tmp_path / name)
 
     nibabel.save(nibabel.Nifti1Image(voxels("i2", (6, 5, 4, 3)), AFFINE), tmp_path / "series.nii")
-    load("series.nii", r"got shape \(3, 4, 5, 6\): colours, vectors or a series")
+    load("series.nii", r"got shape \(3, 4, 5, 6\): colours, vectors or a time series")
     colour = np.dtype([("R", "u1"), ("G", "u1"), ("B", "u1")])
     nibabel.save(nibabel.Nifti1Image(np.zeros((6, 5, 4), colour), AFFINE), tmp_path / "rgb.nii")
     load("rgb.nii", "not one real number per voxel; convert it to scalars")
@@ -77,9 +77,9 @@ def test_nifti_refusals(tmp_path, nibabel):
         nibabel.save(nibabel.Nifti1Image(voxels("i2", (9, 30, 40)), AFFINE), tmp_path / name)
         content = (tmp_path / name).read_bytes()
         (tmp_path / name).write_bytes(content[: len(content) // 2])
-        load(name, "no readable NIfTI file, or is truncated")
+        load(name, "not a readable NIfTI file, or is truncated")
     (tmp_path / "text.nii.gz").write_bytes(gzip.compress(b"no volume"))
-    load("text.nii.gz", "no readable NIfTI file")
+    load("text.nii.gz", "not a readable NIfTI file")
 
 
 @pytest.fixture
@@ -158,18 +158,18 @@ def test_dicom_single_slice(tmp_path, pydicom):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"ImagePositionPatient": lambda i: [10, 20, 30 + 2 * i + 2 * (i > 2)]}, "IM002 and IM001 are 4 mm apart and "
-         "most 2 mm: a slice is missing"),
-        ({"ImagePositionPatient": lambda i: [10, 20, 30 + 2 * min(i, 2)]}, "0 mm apart .* a slice is there twice"),
+        ({"ImagePositionPatient": lambda i: [10, 20, 30 + 2 * i + 2 * (i > 2)]}, "IM002 and IM001 are 4 mm apart, and "
+         "the median distance is 2 mm: a slice is missing"),
+        ({"ImagePositionPatient": lambda i: [10, 20, 30 + 2 * min(i, 2)]}, "0 mm apart.* a slice exists twice"),
         ({"ImagePositionPatient": [10, 20, 30]}, "0 mm apart"),
-        ({"ImagePositionPatient": None}, "IM.* lacks position or orientation, so that the place of the slice"),
+        ({"ImagePositionPatient": None}, "IM.* lacks ImagePositionPatient or ImageOrientationPatient"),
         ({"ImagePositionPatient": lambda i: [10 + i, 20, 30 + 2 * i]}, "resample a sheared volume .a tilted gantry"),
         ({"PixelSpacing": None}, "does not state the spacing"),
         ({"PixelSpacing": lambda i: [0.75, 0.5 + (i == 1)]}, "slices must agree in spacing, but IM003 has"),
         ({"SeriesInstanceUID": lambda i: f"1.2.{i // 2}"}, "holds 2 series, expected one; .*1.2.0.*1.2.1"),
-        ({"SamplesPerPixel": 3}, "one grey slice each, but IM.* has colour"),
+        ({"SamplesPerPixel": 3}, "one grey slice in each file, but IM.* has colour"),
         ({"NumberOfFrames": 2}, "or several frames"),
-        ({"PixelData": lambda i: bytes(20)}, "IM.* is no readable DICOM image .if it is compressed"),
+        ({"PixelData": lambda i: bytes(20)}, "IM.* is not a readable DICOM image .if it is compressed"),
     ],
 )  # fmt: skip
 def test_dicom_refusals(tmp_path, pydicom, changes, message):
@@ -201,7 +201,7 @@ def test_hdf5(tmp_path):
             load_volume(f"{tmp_path}/{name}", **CUBES)
     content = (tmp_path / "a.h5").read_bytes()
     (tmp_path / "a.h5").write_bytes(content[: len(content) // 2])
-    with pytest.raises(ValueError, match="no readable HDF5 file, or is truncated"):
+    with pytest.raises(ValueError, match="not a readable HDF5 file, or is truncated"):
         load_volume(tmp_path / "a.h5", **CUBES)
 
 
@@ -223,7 +223,7 @@ def test_zarr(tmp_path, version):
     with pytest.raises(ValueError, match="is a single array; load it without ::density"):
         load_volume(f"{tmp_path}/a.zarr/scan/density::density", **CUBES)
     (tmp_path / "empty.zarr").mkdir()
-    with pytest.raises(ValueError, match="no readable Zarr folder"):
+    with pytest.raises(ValueError, match="not a readable Zarr folder"):
         load_volume(tmp_path / "empty.zarr", **CUBES)
 
 

@@ -94,8 +94,8 @@ def test_unstated_spacing_is_asked_for(tmp_path, spacings):
             r"expected 120 bytes = 4 x 5 x 6 \(D x H x W\) of uint8, found 119; check shape and dtype, or .*trunc",
         ),
         ({}, 121, "found 121"),
-        ({"type": "short"}, 240, "must say 'endian: little' or 'endian: big' for type short, got None"),
-        ({"type": "block"}, 120, "type 'block', which is no real number"),
+        ({"type": "short"}, 240, "must state endian: little or endian: big for type short, got None"),
+        ({"type": "block"}, 120, "type 'block', which is not a type of real numbers"),
         (
             {"sizes": "3 6 5 4", "dimension": "4", "kinds": "RGB-color domain domain domain"},
             360,
@@ -124,7 +124,7 @@ def test_truncated_gzip_and_foreign_content(tmp_path):
         load_volume(path)
     for content in (b"this is no volume", b"NRRD0004\nnonsense\n\n", b"NRRD0009\n"):
         path.write_bytes(content)
-        with pytest.raises(ValueError, match="a.nrrd is no readable NRRD header"):
+        with pytest.raises(ValueError, match="a.nrrd is not a readable NRRD header"):
             load_volume(path)
 
 

@@ -177,16 +177,19 @@ def test_numpy_refusals(tmp_path):
     check(load_volume(f"{tmp_path}/two.npz::b", **CUBES), voxels("f4"))
     for name, shape in (("colour", (4, 5, 6, 3)), ("flat", (5, 6))):
         np.save(tmp_path / f"{name}.npy", voxels("u1", shape))
-    load("colour.npy", r"one scalar on three axes \(z, y, x\), got shape \(4, 5, 6, 3\): colours, vectors or a series")
-    load("flat.npy", "one slice or fewer")
+    load(
+        "colour.npy",
+        r"one scalar on three axes \(z, y, x\), got shape \(4, 5, 6, 3\): colours, vectors or a time series",
+    )
+    load("flat.npy", "fewer than three axes")
     np.save(tmp_path / "complex.npy", voxels("c8"))
     load("complex.npy", "complex64 elements, not one real number")
     np.save(tmp_path / "large.npy", np.full(SHAPE, 2**63, "u8"))
-    load("large.npy", "above 2.63; divide or convert")
+    load("large.npy", "above 2.63 - 1; divide or convert")
     np.save(tmp_path / "objects.npy", np.full(SHAPE, None), allow_pickle=True)
-    load("objects.npy", "no readable .npy array")
+    load("objects.npy", "not a readable .npy array")
     np.save(tmp_path / "none.npy", np.zeros((0, 2, 2)))
-    load("none.npy", "no readable .npy|every size must be above 0")
+    load("none.npy", "not a readable .npy|every size must be above 0")
     for name in ("two.npz", "flat.npy"):
         content = (tmp_path / name).read_bytes()
         (tmp_path / name).write_bytes(content[: len(content) - 20])
@@ -234,13 +237,16 @@ def test_what_is_not_said_is_asked_for(tmp_path):
         **whole,
     )
     load("a.raw", "must be 'm' or 'relative', got 'mm'", spacing=1, unit="mm", **whole)
-    load("a.raw", "unit='m' is that of spacing=, which was not given", unit="m", **whole)
+    load("a.raw", "unit='m' is the unit of spacing=, which was not given", unit="m", **whole)
     load("a.raw", "dtype must name a type of number.*got 'uint9'", shape=SHAPE, dtype="uint9", **CUBES)
     load("a.raw", r"shape must be three sizes \(D, H, W\)", shape=(4, 30), dtype="uint8", **CUBES)
     load("a.raw", "size of the volume must be at least 1", shape=(4, 0, 30), dtype="uint8", **CUBES)
     load("empty_6x5x4_uint8.raw", r"is empty \(0 bytes\)", **CUBES)
     load("gone.raw", "gone.raw does not exist", **CUBES)
-    load("a.xyz", "no known extension; known are .raw, .raw.gz, .png, .mhd.*folders of DICOM.*raw under another name")
+    load(
+        "a.xyz",
+        "no known extension; known are .raw, .raw.gz, .png, .mhd.*folders of DICOM.*raw voxels under another extension",
+    )
     load("a.raw::b", "only .npz, .vti, .h5.* hold named arrays, got .*a.raw::b")
     load("a.mhd", r"holds \(4, 5, 6\) voxels \(D, H, W\), but shape=\(6, 5, 4\) was asked for", shape=(6, 5, 4))
     load("a.mhd", "holds uint8, but dtype='int16' was asked for", dtype="int16")
@@ -259,9 +265,9 @@ def test_spacing_given_replaces_what_the_file_states(tmp_path):
 @pytest.mark.parametrize("size", ["inf inf inf", "nan 5 4", "6 5 0", "-6 -5 4", "6.5 5 4", "1e400 5 4"])
 def test_sizes_that_are_no_counts_are_refused_by_name(tmp_path, size):
     voxels("u1").tofile(tmp_path / "a.raw")
-    with pytest.raises(ValueError, match="a.mhd must give whole numbers from 1 on as DimSize, got"):
+    with pytest.raises(ValueError, match="a.mhd must give whole numbers of at least 1 as DimSize, got"):
         load_volume(metaimage(tmp_path, voxels("u1"), DimSize=size))
-    with pytest.raises(ValueError, match="whole numbers from -1 on as HeaderSize"):
+    with pytest.raises(ValueError, match="whole numbers of at least -1 as HeaderSize"):
         load_volume(metaimage(tmp_path, voxels("u1"), HeaderSize="inf"))
 
 

@@ -86,7 +86,7 @@ def test_perceptual_similarity_shows_the_network_what_it_was_trained_on(monkeypa
     wanted = torch.exp(-2 * (image - reference).abs().mean((-3, -2, -1)))
     assert torch.allclose(scores, wanted, rtol=1e-5)  # the network works in float32
     assert torch.equal(similarity(image, image), torch.ones(2, 5, dtype=torch.float64))
-    with pytest.raises(ValueError, match="grey or red, green, blue"):
+    with pytest.raises(ValueError, match=r"C = 1 \(grey\) or 3 \(RGB\)"):
         similarity(torch.rand(2, 16, 16), torch.rand(2, 16, 16))
 
 

@@ -177,9 +177,9 @@ def test_refusals():
         grain_size(picture, level=1.0)
     with pytest.raises(ValueError, match="two seeds or more"):
         seed_statistics(picture[None])
-    with pytest.raises(ValueError, match="match except in seeds"):
+    with pytest.raises(ValueError, match="match except in the number of seeds"):
         squared_blur(torch.rand(2, 8, 9), torch.rand(2, 9, 8))
-    with pytest.raises(ValueError, match=r"picture must be \(8, 9\)"):
+    with pytest.raises(ValueError, match=r"picture must be \(8, 9\) like the references"):
         squared_error(torch.rand(9, 8), torch.rand(2, 8, 9))
     with pytest.raises(ValueError, match="no detail"):
         sharpness(picture, torch.ones(8, 9))

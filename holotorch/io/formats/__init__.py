@@ -1,1 +1,1 @@
-"""Readers of volume and picture formats, and limits of the memory that reading a file may take."""
+"""Readers of volume formats, decoding of pictures, and limits of the memory that reading a file may take."""

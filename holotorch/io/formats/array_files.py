@@ -1,4 +1,4 @@
-"""Readers of NumPy, HDF5 and Zarr arrays. No spacing is read, and the axes are taken as (z, y, x)."""
+"""Readers of NumPy, HDF5 and Zarr arrays with the axes (z, y, x). No spacing is read from them."""
 
 import math
 from pathlib import Path
@@ -13,10 +13,11 @@ def read_npy(path: Path) -> Scan:
     """Read a NumPy array; a large one is memory-mapped."""
     with readable(path, ".npy array"):
         stored = np.load(path, mmap_mode="r", allow_pickle=False)
-    # In a file in Fortran order the bytes are those of the transposed array in C order.
-    values = stored if stored.flags.c_contiguous else stored.T
-    values = uncompressed_from(path, values.shape, values.dtype, stored.offset)
-    return Scan(three_axes(values if stored.flags.c_contiguous else values.T, path))
+    if stored.flags.c_contiguous:
+        values = uncompressed_from(path, stored.shape, stored.dtype, stored.offset)
+    else:  # Fortran order: the bytes are those of the transposed array in C order
+        values = uncompressed_from(path, stored.T.shape, stored.dtype, stored.offset).T
+    return Scan(three_axes(values, path))
 
 
 def read_npz(path: Path, member: str | None = None) -> Scan:
@@ -26,7 +27,7 @@ def read_npz(path: Path, member: str | None = None) -> Scan:
     with archive:
         name = chosen(archive.files, member, path)
         with readable(path, ".npz archive"):
-            # The size that the header states is checked before numpy allocates memory for it.
+            # The size that the header of the array states is checked before numpy allocates memory for it.
             entry = next(item for item in archive.zip.infolist() if item.filename in (name, f"{name}.npy"))
             with archive.zip.open(entry) as stream:
                 version = np.lib.format.read_magic(stream)
@@ -34,7 +35,7 @@ def read_npz(path: Path, member: str | None = None) -> Scan:
                 shape, _, dtype = read(stream)
                 stated, present = math.prod(shape) * dtype.itemsize, entry.file_size - stream.tell()
             if stated != present:
-                raise ValueError(f"its array {name} states {stated} bytes and holds {present}")
+                raise ValueError(f"the header of its array {name} states {stated} bytes, and {present} follow")
             affordable(path, stated, path.stat().st_size)
             values = archive[name]
     return Scan(three_axes(values, path))
@@ -57,7 +58,7 @@ def read_hdf5(path: Path, member: str | None = None) -> Scan:
 
 
 def read_zarr(path: Path, member: str | None = None) -> Scan:
-    """Read the array ``member`` of a Zarr group, by default its only array with three axes, or read a Zarr array."""
+    """Read a Zarr array, or the array ``member`` of a Zarr group, by default its only array with three axes."""
     zarr = extra("zarr", "reading Zarr")
     with readable(path, "Zarr folder"):
         node = zarr.open(str(path), mode="r")

@@ -1,4 +1,4 @@
-"""Decoding of pictures by OpenCV, after a check of the memory that the picture size in the header requires."""
+"""Decoding of pictures by OpenCV, after a check that the size in the header fits the memory limit."""
 
 import io
 import math
@@ -13,7 +13,9 @@ from holotorch.io.formats.limits import affordable
 
 PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
-_MOST_SCANS = 100  # largest number of scans of a progressive JPEG; even a scan of a few bytes may take long to decode
+# Largest number of scans of a progressive JPEG. Decoding a scan takes as long as a whole picture, even if the scan has
+# only a few bytes.
+_MOST_SCANS = 100
 
 
 def decode(path: Path, flags: int, *, data: bytes | None = None, memory: int = 8) -> np.ndarray:
@@ -23,8 +25,8 @@ def decode(path: Path, flags: int, *, data: bytes | None = None, memory: int = 8
         path: Path of the file.
         flags: Flags of ``cv2.imdecode``.
         data: Content of the file, if it has been read already.
-        memory: Bytes per pixel that decoding and further processing by the caller need; the default suffices for
-            four channels of 16 bits.
+        memory: Bytes per pixel that decoding and further processing by the caller need; by default those of four
+            channels of 16 bits.
 
     Raises:
         ValueError: The file is not a picture, is damaged, or needs more memory than the limit in
@@ -38,13 +40,13 @@ def decode(path: Path, flags: int, *, data: bytes | None = None, memory: int = 8
         data = data[: _png_end(data)]
     if data.startswith(_JPEG) and (scans := _scans(data)) > _MOST_SCANS:
         raise ValueError(
-            f"{path} is a JPEG of {scans} scans, each of which takes the time of a whole picture; ordinary ones have "
-            f"about ten and {_MOST_SCANS} are read: save it again"
+            f"{path} is a JPEG of {scans} scans, each of which takes as long to decode as a whole picture; usual files "
+            f"have about ten, and {_MOST_SCANS} are accepted: save it again"
         )
     affordable(path, height * width * memory, len(data))
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:  # OpenCV raises this for some kinds of damage, and returns None for others
+    except cv2.error:  # for some kinds of damage; for others imdecode returns None
         pixels = None
     if pixels is None:
         raise ValueError(_unreadable(path))
@@ -65,7 +67,7 @@ def picture_size(path: Path, data: bytes) -> tuple[int, int]:
             return height, width
         if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
             return _webp_size(data)
-        # Image.open would also apply Pillow's own limit of the picture size, so the reader classes are called directly.
+        # Image.open also applies Pillow's own limit of the picture size, so the reader classes are called directly.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             picture = readers[data[:2]](io.BytesIO(data))
@@ -94,22 +96,22 @@ def check_exr(path: Path, *, memory: int) -> None:
 
 
 def _scans(data: bytes) -> int:
-    """Number of scans of a JPEG, not counting those of a thumbnail in its metadata."""
+    """Number of scans of a JPEG, without those of a thumbnail in its metadata."""
     marker = re.compile(rb"\xff+([^\x00\xff])")
-    without_segment = {0x01, *range(0xD0, 0xD9)}  # markers that no data follow, such as restart markers
+    without_segment = {0x01, *range(0xD0, 0xD9)}  # markers without data, such as restart markers
     count, position = 0, 2
     while (match := marker.search(data, position)) and (kind := match[1][0]) != 0xD9:
         count += kind == 0xDA
         position = match.end()
-        if kind not in without_segment:  # a segment begins with its length in bytes, two of which state the length
+        if kind not in without_segment:  # a segment begins with its length, which includes the two bytes that state it
             position += max(2, int.from_bytes(data[position : position + 2], "big"))
     return count
 
 
 def _png_end(data: bytes) -> int:
-    """Length of a PNG in bytes up to the end of its last chunk, IEND; raises if a chunk is longer than the data.
+    """Length in bytes of a PNG up to the end of its last chunk, IEND; struct.error or ValueError if it is truncated.
 
-    Data after IEND must be removed, since decoders read them as chunks and allocate the size that a chunk states.
+    Data after IEND must be removed: decoders read them as further chunks, and allocate the size that a chunk states.
     """
     position, kind = len(PNG), b""
     while kind != b"IEND":
@@ -121,10 +123,11 @@ def _png_end(data: bytes) -> int:
 
 
 def _webp_size(data: bytes) -> tuple[int, int]:
+    """Size (H, W) from the header. Pillow's reader would allocate the picture when it opens the file."""
     kind = data[12:16]
-    if kind == b"VP8X":
+    if kind == b"VP8X":  # extended format
         return 1 + int.from_bytes(data[27:30], "little"), 1 + int.from_bytes(data[24:27], "little")
-    if kind == b"VP8L":
+    if kind == b"VP8L":  # lossless
         bits = struct.unpack_from("<I", data, 21)[0]
         return 1 + (bits >> 14 & 0x3FFF), 1 + (bits & 0x3FFF)
     width, height = struct.unpack_from("<HH", data, 26)

@@ -10,13 +10,15 @@ import numpy as np
 from holotorch.io.formats.limits import affordable, readable_at_once
 from holotorch.io.formats.scan import Scan, extra, metres, placed, readable, three_axes
 
-_UNEVEN = 0.05  # tolerated relative deviation of a slice distance from the median; files round positions to 0.01 mm
+# Tolerated deviation of the distance between two slices from the median distance, as a fraction of the median. Files
+# round positions, for instance to 0.01 mm.
+_UNEVEN = 0.05
 
 
 def read_nifti(path: Path) -> Scan:
-    """Read a NIfTI file, .nii or .nii.gz, in the dtype of the file, or as float32 if it states a scale for the values.
+    """Read a NIfTI file, .nii or .nii.gz, in the dtype of the file, or as float32 if the values have to be rescaled.
 
-    A large .nii is memory-mapped. Lengths are in millimetres if the file states no unit, as in other NIfTI readers.
+    A large .nii is memory-mapped. If the file states no unit of length, it is millimetres, as in other NIfTI readers.
     """
     nibabel = extra("nibabel", "reading NIfTI")
     with readable(path, "NIfTI file"):
@@ -49,36 +51,37 @@ class _Slice:
 
         position, cosines = numbers("ImagePositionPatient", 3), numbers("ImageOrientationPatient", 2, 3)
         if position is None or cosines is None:
-            raise ValueError("it lacks position or orientation, so that the place of the slice is unknown")
+            raise ValueError("it lacks ImagePositionPatient or ImageOrientationPatient")
         self.path = path
         self.series = str(data.get("SeriesInstanceUID", ""))
         # Whether the file has one frame and one number per pixel.
         self.single = int(data.get("SamplesPerPixel", 1)) == 1 and int(data.get("NumberOfFrames", 1)) == 1
         self.size = int(data.Rows), int(data.Columns)
-        self.position = position  # position of the first pixel
+        self.position = position  # of the first pixel
         self.cosines = cosines  # unit vectors from column to column and from row to row, [2, 3]
-        self.spacing = numbers("PixelSpacing", 2)  # distances from row to row and from column to column
+        self.spacing = numbers("PixelSpacing", 2)  # distances between rows and between columns
         thickness = data.get("SpacingBetweenSlices") or data.get("SliceThickness")
         self.thickness = None if thickness is None else float(thickness)
         self.scale = float(data.get("RescaleSlope", 1)), float(data.get("RescaleIntercept", 0))
         self.signed = bool(data.get("PixelRepresentation", 0))
         allocated = int(data.BitsAllocated)
-        self.bits = allocated, int(data.get("BitsStored", allocated))  # bits per pixel
+        self.bits = allocated, int(data.get("BitsStored", allocated))  # per pixel: in the file, and in use
         self.normal = np.cross(cosines[0], cosines[1])
-        self.height = float(self.normal @ position)  # position of the slice along the normal
+        self.height = float(self.normal @ position)  # position along the normal of the slice
 
 
 def read_dicom(folder: Path) -> Scan:
-    """Read a folder with one DICOM series of one slice per file, sorted by position and rescaled as the headers state.
+    """Read the DICOM series in a folder, with one slice per file, in order of position along the normal of the slices.
 
-    Voxels are integers if the slope and intercept of the rescaling are integers and equal in all slices, else float32.
+    Values are rescaled by the slope and intercept that the files state. They are integers if slope and intercept are
+    integers and equal in all slices, else float32.
     """
     pydicom = extra("pydicom", "reading DICOM")
     slices: list[_Slice] = []
     for path in sorted(path for path in folder.iterdir() if path.is_file() and is_dicom(path)):
         with readable(path, "DICOM file"):
             data = pydicom.dcmread(path, stop_before_pixels=True)
-            if "Rows" in data:  # DICOM files without an image are skipped
+            if "Rows" in data:  # other DICOM files hold no image
                 slices.append(_Slice(path, data))
     if not slices:
         raise ValueError(f"{folder} holds no DICOM images")
@@ -104,14 +107,12 @@ def _one_series(slices: Sequence[_Slice], folder: Path) -> None:
     """Raise ValueError unless all slices belong to one series and have the same geometry and pixel type."""
     series = sorted({header.series for header in slices})
     if len(series) > 1:
-        raise ValueError(f"{folder} holds {len(series)} series, expected one; move each to its own folder: {series}")
+        raise ValueError(f"{folder} holds {len(series)} series, expected one; put each in a folder: {series}")
     first = slices[0]
     for header in slices:
         name = header.path.name
         if not header.single:
-            raise ValueError(
-                f"{folder}: expected files of one grey slice each, but {name} has colour or several frames"
-            )
+            raise ValueError(f"{folder}: expected one grey slice in each file, but {name} has colour or several frames")
         for what in ("size", "cosines", "spacing", "signed", "bits"):
             value, other = getattr(header, what), getattr(first, what)
             if (value is None) != (other is None) or (value is not None and not np.allclose(value, other, atol=1e-4)):
@@ -128,10 +129,10 @@ def _step(slices: Sequence[_Slice], folder: Path) -> np.ndarray | None:
     worst = int(np.argmax(np.abs(gaps - usual)))
     if abs(gaps[worst] - usual) > _UNEVEN * usual or usual <= 0:
         between = f"{slices[worst].path.name} and {slices[worst + 1].path.name}"
-        reason = "a slice is missing" if gaps[worst] > usual else "a slice is there twice, or positions are uneven"
+        reason = "a slice is missing" if gaps[worst] > usual else "a slice exists twice, or positions are uneven"
         raise ValueError(
-            f"{folder}: slices must be evenly spaced, but {between} are {gaps[worst]:g} mm apart and most {usual:g} "
-            f"mm: {reason}"
+            f"{folder}: slices must be evenly spaced, but {between} are {gaps[worst]:g} mm apart, and the median "
+            f"distance is {usual:g} mm: {reason}"
         )
     return (last.position - first.position) / (len(slices) - 1)
 
@@ -146,5 +147,5 @@ def _rescaled_type(slices: Sequence[_Slice]) -> np.dtype:
         return np.dtype(f"{'i' if slices[0].signed else 'u'}{allocated // 8}")
     limits = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if slices[0].signed else (0, 2**bits - 1)
     ends = [int(slope) * limit + int(intercept) for limit in limits]
-    # min_scalar_type gives a signed type for a negative number, and a type that holds -m - 1 also holds m.
+    # min_scalar_type returns a signed type for a negative number; one that holds -m - 1 also holds m.
     return np.min_scalar_type(min(-1, *ends, -max(ends) - 1))

@@ -1,4 +1,4 @@
-"""Readers of formats with a short text header or none before the voxels: raw, MetaImage and NRRD."""
+"""Readers of raw voxels, with a text header (MetaImage and NRRD) or without one."""
 
 import re
 from collections.abc import Sequence
@@ -12,7 +12,8 @@ from holotorch.io.formats import scan
 from holotorch.io.formats.limits import unzipped
 from holotorch.io.formats.scan import Scan
 
-_HEADER = 1 << 20  # largest number of bytes skipped before the voxels in compressed data if byte skip is -1
+# With "byte skip: -1", NRRD voxels are the last bytes of the data. Largest number of decompressed bytes before them.
+_HEADER = 1 << 20
 _META_TYPES = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4",
     "MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4", "MET_DOUBLE": "f8",
@@ -34,8 +35,8 @@ _NRRD_TYPES = {
 def read_raw(path: Path, shape: Sequence[int] | None, dtype: DTypeLike | None) -> Scan:
     """Read voxels [D, H, W] without a header; ``shape`` is (D, H, W).
 
-    If ``shape`` or ``dtype`` is None, the file name must state the sizes (x, y, z) and the type, as in the Open SciVis
-    Datasets, for example bonsai_256x256x256_uint8.raw. A file whose name ends in .gz is decompressed.
+    If ``shape`` or ``dtype`` is None, the file name must state the number of voxels along (x, y, z) and the type, as in
+    the Open SciVis Datasets, for example bonsai_256x256x256_uint8.raw. A file whose name ends in .gz is decompressed.
     """
     stated = re.search(r"_(\d+)x(\d+)x(\d+)_(u?int\d+|float\d+)\.", path.name)
     if stated:
@@ -86,7 +87,7 @@ def read_metaimage(path: Path) -> Scan:
 
 
 def read_nrrd(path: Path) -> Scan:
-    """Read NRRD (.nrrd, or .nhdr with a data file); the unit of the scan is "relative" if the file states none."""
+    """Read NRRD (.nrrd, or .nhdr with a data file); if the file states no unit of length, the unit is "relative"."""
     import nrrd
 
     with open(path, "rb") as stream:
@@ -123,7 +124,7 @@ def _nrrd_values(path: Path, header: dict[str, Any], shape: list[int], end: int)
     if encoding in ("gzip", "gz", "bzip2", "bz2"):
         size, kind = scan.stated_bytes(data, shape, dtype), "gzip" if encoding[0] == "g" else "bzip2"
         content = unzipped(data, size + (_HEADER if skip == -1 else skip), offset, kind=kind)
-        del content[: -size if skip == -1 else skip]
+        del content[: -size if skip == -1 else skip]  # the bytes before the voxels
         return scan.unpacked(data, content, shape, dtype)
     if encoding in ("ascii", "text", "txt"):
         return scan.from_text(data, data.read_bytes()[offset:], shape, dtype)
@@ -133,10 +134,10 @@ def _nrrd_values(path: Path, header: dict[str, Any], shape: list[int], end: int)
 def _nrrd_type(path: Path, header: dict[str, Any]) -> np.dtype:
     kind = next((kind for kind, names in _NRRD_TYPES.items() if header["type"].lower() in names), None)
     if kind is None:
-        raise ValueError(f"{path} has type {header['type']!r}, which is no real number")
+        raise ValueError(f"{path} has type {header['type']!r}, which is not a type of real numbers")
     endian = header.get("endian", "little" if kind[1] == "1" or header["encoding"].lower() == "ascii" else None)
     if endian not in ("little", "big"):
-        raise ValueError(f"{path} must say 'endian: little' or 'endian: big' for type {header['type']}, got {endian!r}")
+        raise ValueError(f"{path} must state endian: little or endian: big for type {header['type']}, got {endian!r}")
     return np.dtype((">" if endian == "big" else "<") + kind)
 
 
@@ -150,7 +151,8 @@ def _nrrd_placed(values: np.ndarray, header: dict[str, Any], path: Path) -> Scan
     units = [unit for unit in header.get("space units" if in_space else "units", []) if unit.strip()]
     if len(units) not in (0, 3):
         raise ValueError(f"{path} gives units for {len(units)} of three axes; pass spacing= instead")
-    # Units of space directions hold for vector components, the columns of ``axes``. Without them ``axes`` is diagonal.
+    # "space units" belong to the components of the vectors, the columns of ``axes``. "units" belong to the axes; then
+    # ``axes`` is a diagonal matrix, to which the same scaling applies.
     scale = np.array([scan.metres(unit, path) for unit in units] if units else [1.0, 1, 1])
     origin = np.asarray(header.get("space origin", [0.0, 0, 0]), dtype=np.float64)
     origin = np.where(np.isfinite(origin), origin, 0) * scale
@@ -167,17 +169,17 @@ def _metaimage_header(path: Path) -> tuple[dict[str, str], int]:
             if equals:
                 fields[name.strip()] = value.strip()
         if "ElementDataFile" not in fields:
-            raise ValueError(f"{path} is no MetaImage header: it has no field ElementDataFile")
+            raise ValueError(f"{path} is not a MetaImage header: it has no field ElementDataFile")
         return fields, stream.tell()
 
 
 def _whole(
     fields: dict[str, str], name: str, count: int, path: Path, *, least: int, default: str | None = None
 ) -> list[int]:
-    """As :func:`_numbers`, for whole numbers of at least ``least``."""
+    """The ``count`` whole numbers, each at least ``least``, in the field ``name`` or in the text ``default``."""
     numbers = _numbers(fields, (name,), count, path, default)
     if not all(number.is_integer() and number >= least for number in numbers):
-        raise ValueError(f"{path} must give whole numbers from {least} on as {name}, got {fields[name]!r}")
+        raise ValueError(f"{path} must give whole numbers of at least {least} as {name}, got {fields[name]!r}")
     return [int(number) for number in numbers]
 
 

@@ -1,4 +1,4 @@
-"""Scan: voxels and geometry as a file states them, and functions that the readers of all formats share."""
+"""Scan, the voxels and geometry that a file states, and functions that the readers of all formats share."""
 
 import importlib
 import math
@@ -16,7 +16,7 @@ from numpy.typing import DTypeLike
 from holotorch.io.formats.limits import affordable, readable_at_once
 from holotorch.scene.volume import IDENTITY, Triple
 
-_MAP_NORESERVE = 0x4000  # flag MAP_NORESERVE of mmap on Linux, which Python names from version 3.13 on
+_MAP_NORESERVE = 0x4000  # mmap.MAP_NORESERVE on Linux; Python defines the name only from version 3.13 on
 _METRES = {
     "m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 1e-2, "mm": 1e-3, "millimeter": 1e-3, "um": 1e-6, "µm": 1e-6,
     "micron": 1e-6, "nm": 1e-9, "angstrom": 1e-10,
@@ -28,7 +28,7 @@ class Scan:
     """Voxels and geometry as a file states them."""
 
     values: np.ndarray  # voxels [D, H, W], usually in the dtype of the file, possibly memory-mapped
-    spacing: Triple | None = None  # distance between voxels along (z, y, x) in ``unit``, None if the file states none
+    spacing: Triple | None = None  # distance between voxels along (z, y, x) in ``unit``; None if the file states none
     unit: str = "relative"  # "m" or "relative"
     origin: Triple = (0.0, 0.0, 0.0)  # position (z, y, x) of voxel [0, 0, 0] in ``unit``
     # Three unit vectors, along the axes z, y and x of ``values``, each with components (z, y, x).
@@ -40,16 +40,16 @@ def metres(unit: str, path: Path) -> float:
     name = unit.strip().lower()
     length = _METRES.get(name) or _METRES.get(name.removesuffix("s"))
     if length is None:
-        raise ValueError(f"{path} gives its spacing in {unit!r}; known are {', '.join(_METRES)}; pass spacing= instead")
+        raise ValueError(f"{path} has spacing in {unit!r}; known are {', '.join(_METRES)}; pass spacing= instead")
     return length
 
 
 def placed(values: np.ndarray, axes: Any, origin: Any, unit: str, scale: float = 1.0) -> Scan:
-    """Scan of ``values`` [D, H, W] with a geometry that is given in the order (x, y, z).
+    """Scan of ``values`` [D, H, W] with a geometry whose axes and components are in the order (x, y, z).
 
-    The rows of ``axes`` [3, 3] are the vectors from one voxel to the next along x, y and z. ``origin`` is the position
-    of the first voxel. Lengths are multiplied by ``scale`` to convert them to ``unit``. If a vector has the length 0 or
-    is not finite, the scan has no geometry.
+    Row i of ``axes`` [3, 3] is the vector from one voxel to the next along axis i. ``origin`` is the position of the
+    first voxel. ``scale`` is the factor that converts lengths to ``unit``. If a vector has the length 0 or is not
+    finite, the scan has no geometry.
     """
     steps = np.asarray(axes, dtype=np.float64)[::-1, ::-1]
     lengths = np.linalg.norm(steps, axis=1)
@@ -61,7 +61,7 @@ def placed(values: np.ndarray, axes: Any, origin: Any, unit: str, scale: float =
 
 
 def triple(values: Sequence[float] | np.ndarray) -> Triple:
-    """Three numbers as floats."""
+    """The three ``values`` as a tuple of floats."""
     z, y, x = (float(value) for value in values)
     return z, y, x
 
@@ -76,28 +76,28 @@ def existing(path: Path, where: str = "", *, file: bool = False) -> Path:
         path.stat()
     except FileNotFoundError:
         raise ValueError(f"{where} does not exist") from None
-    except OSError as error:  # an invalid file name, or no permission to read the folder
+    except OSError as error:  # such as an invalid file name, or no permission to read the folder
         raise ValueError(f"{where} cannot be read: {error.strerror}") from None
     if file and not path.is_file():
-        raise ValueError(f"{where} is no file")
+        raise ValueError(f"{where} is not a file")
     if path.is_file() and not path.stat().st_size:
         raise ValueError(f"{where} is empty (0 bytes)")
     return path
 
 
 def named(header: Path, name: str) -> Path:
-    """Path of the data file that the file ``header`` names, in the folder of the header or below it.
+    """Path of the data file with the ``name`` that the file ``header`` states; relative to the folder of the header.
 
-    ValueError if the data file is missing, empty, not a file, or elsewhere: a header from an untrusted source must not
-    give access to other files.
+    ValueError if the data file is missing, empty, not a file, or outside of this folder: a header from an untrusted
+    source must not give access to other files.
     """
     if name.split()[:1] == ["LIST"] or "%" in name:
         raise ValueError(f"{header} lists one file per slice; load the folder of the slices instead")
     path = header.parent / name
     if not path.resolve().is_relative_to(header.parent.resolve()):
         raise ValueError(
-            f"{header} names the data file {name!r}, which lies outside the header's folder; move it (no link) beside "
-            "the header, or load it without its header, with shape=, dtype= and spacing="
+            f"{header} names the data file {name!r}, which lies outside the header's folder; move the file itself "
+            "(not a link) beside the header, or load it without its header, with shape=, dtype= and spacing="
         )
     return existing(path, f"the data file {path}, which {header} names,", file=True)
 
@@ -107,7 +107,7 @@ def number_type(dtype: DTypeLike) -> np.dtype:
     try:
         kind = np.dtype(dtype)
         if kind.kind not in "buif":
-            raise TypeError("not a real number")
+            raise TypeError("not a type of real numbers")
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"dtype must name a type of number, such as 'uint8' or '>i2', got {dtype!r}: {error}"
@@ -116,7 +116,7 @@ def number_type(dtype: DTypeLike) -> np.dtype:
 
 
 def expect_bytes(path: Path, found: int, shape: Sequence[int], dtype: np.dtype) -> int:
-    """Number of bytes of voxels of ``shape``; ValueError if ``found`` is another number, or a size is below 1."""
+    """Return the number of bytes of ``shape`` (D, H, W) voxels; ValueError if it is not ``found`` or is 0."""
     sizes = " x ".join(map(str, shape))
     if any(size < 1 for size in shape):
         raise ValueError(f"{path} states {sizes} voxels (D x H x W); every size must be above 0")
@@ -130,9 +130,9 @@ def expect_bytes(path: Path, found: int, shape: Sequence[int], dtype: np.dtype) 
 
 
 def uncompressed(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int | None = 0) -> np.ndarray:
-    """Voxels that begin ``offset`` bytes into a file and end with it, read as by :func:`uncompressed_from`.
+    """Voxels from byte ``offset`` to the end of a file, or at the end of a file if ``offset`` is None.
 
-    If ``offset`` is None, the voxels are the last bytes of the file.
+    They are read or memory-mapped by :func:`uncompressed_from`. ValueError if the number of bytes does not match.
     """
     size = path.stat().st_size
     offset = max(0, size - math.prod(shape) * dtype.itemsize) if offset is None else offset
@@ -141,11 +141,10 @@ def uncompressed(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int 
 
 
 def uncompressed_from(path: Path, shape: Sequence[int], dtype: np.dtype, offset: int) -> np.ndarray:
-    """Writable voxels that begin ``offset`` bytes into a file.
+    """Writable voxels from byte ``offset`` of a file on; changing them does not change the file.
 
-    They are read at once, or memory-mapped if they take over 1 GiB and over half of the free memory. Mapped voxels are
-    read on access. If the file has been truncated meanwhile, the system then terminates the program, so smaller volumes
-    are not mapped. Changes to mapped voxels are not written to the file.
+    They are read at once, or memory-mapped if they take over 1 GiB and over half of the free memory. Smaller volumes
+    are not mapped, because access to mapped voxels ends the program if the file has been truncated in the meantime.
     """
     size = math.prod(shape) * dtype.itemsize
     if readable_at_once(size):
@@ -154,14 +153,14 @@ def uncompressed_from(path: Path, shape: Sequence[int], dtype: np.dtype, offset:
         return values.reshape(tuple(shape))
     if sys.platform != "linux":
         return np.memmap(path, dtype, "c", offset, tuple(shape))
-    # numpy.memmap would reserve memory for a copy of the whole file, which fails if the file exceeds the memory.
+    # numpy.memmap would reserve memory for a writable copy of the file, which fails if the file exceeds the memory.
     with open(path, "rb") as stream:
         access = {"flags": mmap.MAP_PRIVATE | _MAP_NORESERVE, "prot": mmap.PROT_READ | mmap.PROT_WRITE}
         return np.ndarray(tuple(shape), dtype, mmap.mmap(stream.fileno(), 0, **access), offset)
 
 
 def stated_bytes(path: Path, shape: Sequence[int], dtype: np.dtype) -> int:
-    """Number of bytes of voxels of ``shape``; ValueError if a size is below 1 or they exceed the memory limit."""
+    """Number of bytes of ``shape`` (D, H, W) voxels; ValueError if it is 0 or exceeds the memory limit."""
     size = expect_bytes(path, math.prod(shape) * dtype.itemsize, shape, dtype)
     affordable(path, size, path.stat().st_size)
     return size
@@ -176,7 +175,7 @@ def unpacked(path: Path, data: bytes | bytearray, shape: Sequence[int], dtype: n
 
 def from_text(path: Path, text: str | bytes, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
     """Voxels [D, H, W] from numbers separated by white space, in native byte order."""
-    # A numpy array of strings would take the length of the longest word for every word.
+    # Words are converted one by one: an array of strings would take the length of the longest word for every word.
     number = float if dtype.kind == "f" else int
     with readable(path, "text of numbers"):
         values = np.array([number(word) for word in text.split()], dtype.newbyteorder("="))
@@ -185,13 +184,13 @@ def from_text(path: Path, text: str | bytes, shape: Sequence[int], dtype: np.dty
 
 
 def three_axes(values: np.ndarray, path: Path) -> np.ndarray:
-    """``values`` without leading axes of length 1 before [D, H, W]; ValueError for colours, vectors and series."""
+    """``values`` [..., D, H, W] without leading axes of length 1; ValueError for colours, vectors and time series."""
     if values.dtype.names or values.dtype.kind not in "buif":
         raise ValueError(f"{path} holds {values.dtype} elements, not one real number per voxel; convert it to scalars")
     while values.ndim > 3 and values.shape[0] == 1:
         values = values[0]
     if values.ndim != 3:
-        what = "one slice or fewer" if values.ndim < 3 else "colours, vectors or a series"
+        what = "fewer than three axes" if values.ndim < 3 else "colours, vectors or a time series"
         raise ValueError(
             f"{path} must hold one scalar on three axes (z, y, x), got shape {values.shape}: {what}; select or convert "
             "it to a single [D, H, W] array first"
@@ -201,17 +200,17 @@ def three_axes(values: np.ndarray, path: Path) -> np.ndarray:
 
 @contextmanager
 def readable(path: Path, kind: str) -> Iterator[None]:
-    """Context manager that converts any error but MemoryError to a ValueError with the name of the file."""
+    """Context manager that converts every error but MemoryError to a ValueError with the name of the file."""
     try:
         yield
     except MemoryError:
         raise
     except Exception as error:  # decoders raise errors of many types, such as RuntimeError and KeyError
-        raise ValueError(f"{path} is no readable {kind}, or is truncated: {error}") from None
+        raise ValueError(f"{path} is not a readable {kind}, or is truncated: {error}") from None
 
 
 def extra(module: str, what: str) -> Any:
-    """Import an optional ``module``, or raise ImportError with the command that installs it."""
+    """Import the optional ``module`` that ``what`` needs, or raise ImportError with the command that installs it."""
     try:
         return importlib.import_module(module)
     except ImportError:

@@ -1,4 +1,4 @@
-"""Readers of volumes stored as pictures: TIFF files with pages, folders of numbered slices, and tiles in a picture."""
+"""Readers of volumes stored as pictures: pages of a TIFF file, numbered slices in a folder, and tiles of a picture."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -10,8 +10,9 @@ from holotorch.io.formats.decoding import decode
 from holotorch.io.formats.limits import affordable
 from holotorch.io.formats.scan import Scan, readable
 
-_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES = 256, 257, 258, 277  # TIFF tags
-SLICE_SUFFIXES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg")
+# TIFF tags: width and height in pixels, bits per sample, samples (channels) per pixel.
+_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES = 256, 257, 258, 277
+_SUFFIXES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg")
 
 
 def read_tiff(path: Path) -> Scan:
@@ -32,14 +33,14 @@ def read_tiff(path: Path) -> Scan:
 
 def read_folder(folder: Path) -> Scan:
     """Read the pictures of a folder as slices, in order of the last number in each name; no number may be missing."""
-    paths = [path for path in folder.iterdir() if path.suffix.lower() in SLICE_SUFFIXES]
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES]
     if not paths:
-        raise ValueError(f"{folder} holds no slices: neither DICOM, Zarr nor pictures ({', '.join(SLICE_SUFFIXES)})")
+        raise ValueError(f"{folder} holds no slices: neither DICOM, Zarr nor pictures ({', '.join(_SUFFIXES)})")
     numbered: dict[int, Path] = {}
     for path in paths:
         numbers = re.findall(r"\d+", path.stem)
         if not numbers:
-            raise ValueError(f"{path} has no number in its name, so that its place is unknown; remove or rename it")
+            raise ValueError(f"{path} has no number in its name to state its position; remove or rename it")
         if (number := int(numbers[-1])) in numbered:
             raise ValueError(f"{folder} holds slice {number} twice: {numbered[number].name} and {path.name}")
         numbered[number] = path
@@ -48,7 +49,7 @@ def read_folder(folder: Path) -> Scan:
     if missing:
         first = next(number for number in numbers if number not in numbered)
         raise ValueError(
-            f"{folder}: slices {numbers[0]} to {numbers[-1]}, but {missing} missing, the first being {first}"
+            f"{folder}: of the slices {numbers[0]} to {numbers[-1]}, {missing} are missing, the first is {first}"
         )
     ordered = [numbered[number] for number in numbers]
     return _stacked((_picture(path) for path in ordered), [str(path) for path in ordered])
@@ -57,10 +58,10 @@ def read_folder(folder: Path) -> Scan:
 def read_tiles(path: Path, shape: Sequence[int] | None) -> Scan:
     """Read D slices of H x W pixels stored as tiles of one picture, row by row from the top left.
 
-    ``shape`` is (D, H, W). Tiles after the last slice must be zero.
+    ``shape`` is (D, H, W). Tiles after the last slice must be black.
     """
     if shape is None:
-        raise ValueError(f"{path} is one picture: pass shape=(D, H, W) if it is tiled with slices, or its folder")
+        raise ValueError(f"{path} is one picture: pass shape=(D, H, W) if its tiles are slices, or load the folder")
     picture = _picture(path)
     depth, height, width = shape
     rows, columns = picture.shape[0] // max(height, 1), picture.shape[1] // max(width, 1)
@@ -72,7 +73,7 @@ def read_tiles(path: Path, shape: Sequence[int] | None) -> Scan:
     tiles = picture.reshape(rows, height, columns, width).swapaxes(1, 2).reshape(-1, height, width)
     if tiles[depth:].any():
         used = int(np.flatnonzero(tiles.any((1, 2)))[-1]) + 1
-        raise ValueError(f"{path} has {used} tiles of {height} x {width} px with content, got shape {tuple(shape)}")
+        raise ValueError(f"{path} holds {used} slices of {height} x {width} px, got shape={tuple(shape)}")
     return Scan(tiles[:depth])
 
 
@@ -97,15 +98,15 @@ def _stacked(slices: Iterable[np.ndarray], sources: Sequence[str]) -> Scan:
             values = np.empty((len(sources), *plane.shape), plane.dtype)
         if plane.shape != values.shape[1:] or plane.dtype != values.dtype:
             raise ValueError(
-                f"slices must be alike, but {source} is {plane.shape} of {plane.dtype} and the first is "
-                f"{values.shape[1:]} of {values.dtype}"
+                f"slices must be equal in shape and type, but {source} is {plane.shape} of {plane.dtype} and "
+                f"the first is {values.shape[1:]} of {values.dtype}"
             )
         values[index] = plane
     return Scan(values)
 
 
 def _tiff_pages(path: Path) -> int:
-    """Number of pages according to the page directories; OpenCV silently omits pages that it cannot decode.
+    """Number of pages of a TIFF file. OpenCV omits pages that it cannot decode, so the page directories are counted.
 
     ValueError for a damaged file, or for pages that need more memory than the limit.
     """
@@ -136,15 +137,15 @@ def _tiff_pages(path: Path) -> int:
     position, directories, entries, needed = number(8 if wide else 4, length), set[int](), 0, 0
     while position:
         if position in directories:
-            raise ValueError(f"{path} is damaged: its pages point at each other in a circle")
+            raise ValueError(f"{path} is damaged: its page directories form a loop")
         directories.add(position)
         count = number(position, counter)
         entries += count
         if entries * entry > data.size:
-            raise ValueError(f"{path} is damaged: the directories of its pages overlap")
+            raise ValueError(f"{path} is damaged: its page directories overlap")
         bits = max(8, first_value(position, _TIFF_BITS)) * first_value(position, _TIFF_SAMPLES)
         needed += first_value(position, _TIFF_WIDTH) * first_value(position, _TIFF_HEIGHT) * bits // 8
         position = number(position + counter + entry * count, length)
-    # The memory is counted twice: for the decoded pages and for the volume to which they are copied.
+    # Twice: for the decoded pages, and for the volume to which they are copied.
     affordable(path, 2 * needed, data.size)
     return len(directories)

@@ -1,4 +1,4 @@
-"""Reader of VTK image data (.vti): XML with voxels as text, base64 or raw bytes, possibly compressed by zlib."""
+"""Reader of VTK image data (.vti): XML with voxels as text, base64 or raw bytes, uncompressed or compressed by zlib."""
 
 import base64
 import re
@@ -23,19 +23,20 @@ _APPENDED = re.compile(
 
 
 def read_vti(path: Path, member: str | None = None) -> Scan:
-    """Read the scalar array ``member`` of a file with one piece, by default the active array or else the only array.
+    """Read the scalar array ``member`` of a .vti file whose image is one Piece.
 
-    The format has no units, so the volume is "relative". Large uncompressed raw data are memory-mapped.
+    The default is the array that the file marks as its active scalars, or else the only array. The format has no unit
+    of length, so the unit is "relative". Large uncompressed raw data are memory-mapped.
     """
     root, start, base64_coded = _document(path)
     image = root.find("ImageData")
     pieces = root.findall("ImageData/Piece")
     if image is None or len(pieces) != 1:
-        raise ValueError(f"{path} must hold ImageData in one piece, got {root.get('type')} in {len(pieces)}")
+        raise ValueError(f"{path} must hold one ImageData in one Piece, got {root.get('type')} in {len(pieces)} pieces")
     array, cells = _array(pieces[0], member, path)
     bounds = [int(word) for word in pieces[0].get("Extent", image.get("WholeExtent", "")).split()]
     if len(bounds) != 6:
-        raise ValueError(f"{path} must give its Extent as six numbers, got {bounds}")
+        raise ValueError(f"{path} must state its Extent as six whole numbers, got {bounds}")
     points = [last - first + 1 for first, last in zip(bounds[::2], bounds[1::2], strict=True)]
     shape = [max(1, size - cells) for size in points[::-1]]
     kind = array.get("type", "")
@@ -59,19 +60,19 @@ def read_vti(path: Path, member: str | None = None) -> Scan:
 
 
 def _document(path: Path) -> tuple[ElementTree.Element, int, bool]:
-    """Root of the XML without appended data, offset in bytes of these data or -1, and whether they are in base64."""
+    """Root of the XML, byte offset of the appended data or -1 if there are none, and whether they are in base64."""
     data = np.memmap(path, np.uint8, "r")
     match = _APPENDED.search(data)  # type: ignore[arg-type]
     text = bytes(data[: match.start()]) + b"</VTKFile>" if match else bytes(data)
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise ValueError(f"{path} is no readable VTK XML file, or is truncated: {error}") from None
+        raise ValueError(f"{path} is not a readable VTK XML file, or is truncated: {error}") from None
     return root, match.end() if match else -1, bool(match) and match[1] == b"base64"
 
 
 def _array(piece: ElementTree.Element, member: str | None, path: Path) -> tuple[ElementTree.Element, int]:
-    """The array to read, and the number of points minus the number of values per axis: 1 for cell data, else 0."""
+    """The array to read, and how many fewer values than points an axis has: 1 for cell data, 0 for point data."""
     for name, cells in (("PointData", 0), ("CellData", 1)):
         holder = piece.find(name)
         arrays = {item.get("Name", ""): item for item in (holder if holder is not None else ())}
@@ -91,7 +92,7 @@ def _values(
     start: int,
     base64_coded: bool,
 ) -> np.ndarray:
-    """Voxels of ``array``; ``start`` and ``base64_coded`` are the results of :func:`_document` on appended data."""
+    """Voxels of ``array``; :func:`_document` returns ``start``, an offset in bytes, and ``base64_coded``."""
     form, compressor = array.get("format", "ascii"), root.get("compressor")
     if form == "ascii":
         return scan.from_text(path, array.text or "", shape, dtype)
@@ -126,17 +127,17 @@ def _length(data: bytes, count: np.dtype) -> int:
 
 
 def _decoded(text: str) -> bytes:
-    # The text ends at "<". It has two base64 parts, the length of the data and the data; each may be padded by "=".
+    """Decode ``text`` up to "<". It consists of two base64 texts, the length of the data and the data."""
     parts = re.findall(r"[A-Za-z0-9+/]+=*", "".join(text.partition("<")[0].split()))
-    # In a truncated file the last group of four characters may be incomplete.
+    # Base64 consists of groups of four characters, of which a truncated file may lack some of the last.
     return b"".join(base64.b64decode(part[: len(part) // 4 * 4]) for part in parts)
 
 
 def _inflated(path: Path, data: bytes, count: np.dtype, size: int) -> bytearray:
     """Decompress ``data`` to at most ``size`` bytes.
 
-    A header of integers of type ``count`` precedes the compressed blocks: the number of blocks, the size of a block and
-    of the last block before compression, and the size of every compressed block.
+    Before the compressed blocks there is a header of integers of type ``count``: the number of blocks, the uncompressed
+    sizes of a block and of the last block, and the compressed size of each block.
     """
     try:
         blocks = int(np.frombuffer(data, count, 1)[0])

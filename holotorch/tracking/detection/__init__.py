@@ -1,1 +1,1 @@
-"""From a frame to a pose."""
+"""Detection of the bands of a catheter in frames, and its tracking over a sequence."""

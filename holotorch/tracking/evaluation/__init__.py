@@ -1,1 +1,1 @@
-"""How good a tracker is."""
+"""Accuracy, stability and latency of a tracker."""

@@ -1,1 +1,1 @@
-"""The tool and its pose."""
+"""The catheter, and solvers that estimate its pose from band edges in a frame."""

@@ -1,1 +1,1 @@
-"""Synthetic frames with exact truth."""
+"""Synthetic frames of catheters whose poses are known exactly."""

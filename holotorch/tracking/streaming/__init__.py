@@ -1,1 +1,1 @@
-"""Poses over the network."""
+"""Transmission of poses over the network."""

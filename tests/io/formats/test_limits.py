@@ -110,12 +110,12 @@ def bombs(tmp_path_factory) -> dict[str, tuple[str, str]]:
             "asks for 64 GB of memory, more than the limit of 1.07",
         ),
         "lines.nrrd": (nrrd("raw", b"1", more="line skip: 999999999999\n"), "expected 336 bytes"),
-        "words.nrrd": (nrrd("ascii", words), "no readable text"),
+        "words.nrrd": (nrrd("ascii", words), "not a readable text"),
         "a_8x7x6_uint8.raw.gz": (zipped, "holds more than the expected 336 bytes"),
         "large_4000x4000x4000_uint8.raw.gz": (zipped, "asks for 64 GB of memory"),
         "a.mha": (metaimage("8 7 6", "LOCAL", "CompressedData = True\n") + zipped, "holds more than the expected 336"),
         "a.vti": (vti(blocks), "block holds more than the expected 336 bytes"),
-        "marks.vti": (b"<AppendedData " * 60_000, "no readable VTK XML"),
+        "marks.vti": (b"<AppendedData " * 60_000, "not a readable VTK XML"),
         "stack.tif": (tiff(3000, 2000), "asks for 24 GB of memory"),
         "false.png": (png(16, 16, bytes(784), more=chunk(b"tEXt", b"a", 0xFFFFFFF0)), "is not a readable picture"),
         "levels_end.png": (png(16, 16, bytes(784))[:-12] + chunk(b"IEND", b"", 0xFFFFFFF0), "not a readable picture"),
@@ -127,7 +127,7 @@ def bombs(tmp_path_factory) -> dict[str, tuple[str, str]]:
         "wide.png": (png(32_000, 32_000, b""), "asks for 57.3 GB of memory"),
         "wide.bmp": (bmp(30_000, 30_000), "asks for 50.4 GB of memory"),
         "broken.bmp": (bmp(3, 1 << 21), "is not a readable picture"),
-        "scans.jpg": (jpeg_scans(4000, 1 << 20), "scans, each of which takes the time of a whole picture"),
+        "scans.jpg": (jpeg_scans(4000, 1 << 20), "scans, each of which takes as long to decode as a whole picture"),
         "cut.bmp": (bmp(300, 300), "is not a readable picture"),
         "levels.png": (png(32_000, 32_000, b""), "asks for 16.4 GB of memory"),
         "levels.bmp": (bmp(300, 300), "is not a readable picture"),
@@ -137,7 +137,7 @@ def bombs(tmp_path_factory) -> dict[str, tuple[str, str]]:
         (folder / name).write_bytes(data)
     npz(folder / "a.npz", (1 << 20, 1 << 20, 1 << 10))
     calls = {name: (str(folder / name), message) for name, (_, message) in files.items()}
-    return calls | {"a.npz": (str(folder / "a.npz"), "states 1125899906842624 bytes and holds 1000")}
+    return calls | {"a.npz": (str(folder / "a.npz"), "states 1125899906842624 bytes, and 1000 follow")}
 
 
 PROGRAM = """

@@ -58,13 +58,16 @@ def test_tiff_refusals(tmp_path):
     with tifffile.TiffWriter(tmp_path / "uneven.tif") as writer:
         for size in (7, 8):
             writer.write(voxels("u1", (size, 9)), photometric="minisblack")
-    load("uneven.tif", r"slices must be alike, but page 1 of .* is \(8, 9\) of uint8 and the first is \(7, 9\)")
+    load(
+        "uneven.tif",
+        r"slices must be equal in shape and type, but page 1 of .* is \(8, 9\) of uint8 and the first is \(7, 9\)",
+    )
     (tmp_path / "text.tif").write_text("II, but no picture")
     load("text.tif", "is not a TIFF file")
     # The only page's directory says that it follows itself.
     ring = b"II*\0\x08\0\0\0\x00\x00\x08\0\0\0"
     (tmp_path / "ring.tif").write_bytes(ring)
-    load("ring.tif", "in a circle")
+    load("ring.tif", "form a loop")
 
 
 @pytest.mark.parametrize(("suffix", "dtype"), [("png", "u1"), ("png", "u2"), ("tif", "f4"), ("bmp", "u1")])
@@ -87,10 +90,10 @@ def test_folder_refusals(tmp_path):
     load("holds no slices: neither DICOM, Zarr nor pictures")
     for number in (1, 2, 4, 6):
         cv2.imwrite(str(tmp_path / f"s{number}.png"), voxels()[0])
-    load("slices 1 to 6, but 2 missing, the first being 3")
+    load("of the slices 1 to 6, 2 are missing, the first is 3")
     for number in (3, 5):
         cv2.imwrite(str(tmp_path / f"s{number}.png"), voxels()[0, 1:] if number == 5 else voxels()[0])
-    load(r"alike, but .*s5.png is \(6, 9\) of uint16 and the first is \(7, 9\)")
+    load(r"equal in shape and type, but .*s5.png is \(6, 9\) of uint16 and the first is \(7, 9\)")
     cv2.imwrite(str(tmp_path / "s5.png"), voxels("u1", (7, 9, 3)))
     load("s5.png has 3 colour channels")
     (tmp_path / "s5.png").write_bytes(b"\x89PNG")
@@ -120,11 +123,11 @@ def test_tiled_picture(tmp_path, rows, columns, dtype):
 @pytest.mark.parametrize(
     ("shape", "message"),
     [
-        (None, r"is one picture: pass shape=\(D, H, W\) if it is tiled"),
+        (None, r"is one picture: pass shape=\(D, H, W\) if its tiles are slices"),
         ((7, 7, 9), "is 14 x 27 px and cannot be cut into 7 tiles of 7 x 9 px"),
         ((5, 6, 9), "cannot be cut into 5 tiles of 6 x 9"),
         ((5, 70, 9), "cannot be cut"),
-        ((4, 7, 9), r"has 5 tiles of 7 x 9 px with content, got shape \(4, 7, 9\)"),
+        ((4, 7, 9), r"holds 5 slices of 7 x 9 px, got shape=\(4, 7, 9\)"),
     ],
 )
 def test_tiled_picture_refusals(tmp_path, shape, message):

@@ -109,7 +109,7 @@ def test_one_of_several_arrays(tmp_path):
     [
         ("ascii", {"Extent": "0 6 0 4 0 3"}, r"expected 140 bytes = 4 x 5 x 7 .* found 120"),
         ("appended raw", {"Extent": "0 6 0 4 0 3"}, r"expected 140 bytes = 4 x 5 x 7 .* found 120"),
-        ("binary", {"Extent": "0 6 0 4"}, "must give its Extent as six numbers"),
+        ("binary", {"Extent": "0 6 0 4"}, "must state its Extent as six whole numbers"),
         ("ascii", {"type": "Bit"}, "array of type 'Bit'; known are Int8"),
         ("ascii", {"NumberOfComponents": "3"}, "'density' has 3 components per voxel, expected a scalar"),
         (
@@ -133,5 +133,5 @@ def test_truncated(tmp_path, form, compress):
     # The tags behind the voxels take 28 bytes or more.
     for end in range(0, len(content) - 28, 7):
         path.write_bytes(content[:end])
-        with pytest.raises(ValueError, match="truncated|no readable VTK XML|is empty"):
+        with pytest.raises(ValueError, match="truncated|not a readable VTK XML|is empty"):
             load_volume(path)

@@ -9,8 +9,9 @@ from oracles import converging as oracle
 
 from holotorch import Grid
 from holotorch.core.fourier import centred_fft2
-from holotorch.optics import CroppedKernel, Fresnel, carrier
+from holotorch.optics import CroppedKernel, Fresnel
 from holotorch.optics.elements.converging import ConvergingFresnel, converging_fresnel
+from holotorch.optics.free_space.kernels import carrier
 
 # These grids are small, their lenses strong and their result compared with paraxial light.
 pytestmark = pytest.mark.filterwarnings("ignore::holotorch.core.checks.SamplingWarning")

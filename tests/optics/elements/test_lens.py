@@ -5,7 +5,8 @@ import torch
 
 from holotorch import Grid
 from holotorch.core.checks import SamplingWarning
-from holotorch.optics import Aperture, Fresnel, Lens, lens_limit, lens_phase, pupil
+from holotorch.optics import Aperture, Fresnel, Lens
+from holotorch.optics.elements.lens import lens_limit, lens_phase, pupil
 
 GRID = Grid((12, 17), (5e-6, 4e-6))
 RED, GREEN, BLUE = 636e-9, 520e-9, 455e-9

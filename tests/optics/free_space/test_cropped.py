@@ -6,8 +6,9 @@ import torch
 from oracles import dense
 
 from holotorch import Grid
-from holotorch.optics import CroppedKernel, carrier
+from holotorch.optics import CroppedKernel
 from holotorch.optics.free_space.impulse_response import fresnel_taps, remainder_kernel
+from holotorch.optics.free_space.kernels import carrier
 
 SHAPE = (20, 24)
 

@@ -6,8 +6,7 @@ import torch
 
 from holotorch import Grid
 from holotorch.core.fourier import filter_spectrum
-from holotorch.optics import angular_spectrum_kernel, carrier, fresnel_kernel
-from holotorch.optics.free_space.kernels import window_taper
+from holotorch.optics.free_space.kernels import angular_spectrum_kernel, carrier, fresnel_kernel, window_taper
 
 GRID = Grid((5, 6), (5e-6, 4e-6))
 FINE = Grid((5, 6), (0.2e-6, 0.24e-6))

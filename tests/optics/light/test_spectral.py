@@ -6,20 +6,10 @@ import pytest
 import torch
 
 from holotorch import Grid
-from holotorch.optics import (
-    Display,
-    Eye,
-    Spectrum,
-    least_followed,
-    neighbour_error,
-    neighbours,
-    propagate_collapsed,
-    propagate_elements,
-    seen_light,
-    spectral_image,
-)
+from holotorch.optics import Display, Eye, Spectrum, propagate_collapsed, propagate_elements, spectral_image
 from holotorch.optics.light.quadrature import gauss_rule
-from holotorch.optics.light.wavelength_sampling import select_wavelengths
+from holotorch.optics.light.spectral import neighbours
+from holotorch.optics.light.wavelength_sampling import least_followed, neighbour_error, seen_light, select_wavelengths
 
 PITCH, GREEN, FAR = 3.74e-6, 520e-9, 30e-3
 GRID = Grid((128, 120), PITCH)

@@ -6,7 +6,8 @@ import torch
 
 from holotorch import Grid
 from holotorch.core.checks import SamplingWarning
-from holotorch.optics import Display, Eye, EyeLens, chromatic_refraction, propagate_collapsed, zernike
+from holotorch.optics import Display, Eye, EyeLens, propagate_collapsed
+from holotorch.optics.viewing.eye import chromatic_refraction, zernike
 
 GRID = Grid((48, 40), (8e-6, 9e-6))
 RED = 636e-9

@@ -9,19 +9,9 @@ from oracles import eye as oracle
 
 from holotorch import Grid
 from holotorch.core.checks import SamplingWarning
-from holotorch.optics import (
-    Display,
-    Eye,
-    Retina,
-    least_oversampling,
-    plan_retina,
-    propagate_collapsed,
-    propagate_elements,
-    retinal_image,
-    retinal_scale,
-)
-from holotorch.optics.viewing.elementwise import ElementSampling
-from holotorch.optics.viewing.imaging import CollapseSampling, collapse_sampling
+from holotorch.optics import Display, Eye, Retina, plan_retina, propagate_collapsed, propagate_elements, retinal_image
+from holotorch.optics.viewing.elementwise import ElementSampling, least_oversampling
+from holotorch.optics.viewing.imaging import CollapseSampling, collapse_sampling, retinal_scale
 from holotorch.optics.viewing.retina import collapse_error
 
 RED, PITCH, SIZE, FAR = 636e-9, 3.74e-6, 2048, 30e-3

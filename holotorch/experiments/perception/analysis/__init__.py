@@ -1,1 +1,1 @@
-"""From the answers of a study to equal-efficiency scales."""
+"""Analysis of the answers of a study: equal-efficiency scales and their uncertainty."""
