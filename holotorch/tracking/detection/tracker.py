@@ -80,7 +80,7 @@ class WidthCheck:
 
 @dataclasses.dataclass(frozen=True)
 class SearchLimits:
-    """Limits of the search for the tube and of repeated measurements, in pixels."""
+    """Limits of the search for the tube and of repeated measurements, in pixels unless stated otherwise."""
 
     widest: float = 120.0  # largest width of the tube
     blur: float = 0.9  # initial standard deviation of the blur in fits: that of a focused camera
