@@ -11,9 +11,10 @@ from holotorch.experiments.tracking_benchmark import bench, methods
 from holotorch.experiments.tracking_benchmark.bench import STILL, TIP, Row, one
 from holotorch.experiments.tracking_benchmark.methods import BASE, COLD, FEWER, LITERAL, PRIOR, Answer
 from holotorch.experiments.tracking_benchmark.picture import draw
-from holotorch.experiments.tracking_benchmark.real_pixels import drawn_photograph, real_pixels, shared_photographs
+from holotorch.experiments.tracking_benchmark.real_pixels import real_pixels, shared_photographs
 from holotorch.experiments.tracking_benchmark.second_world import second_world, verdict
 from holotorch.experiments.tracking_benchmark.timing import spread, stages, timing
+from holotorch.tracking.simulation.photographs import drawn_photograph
 from holotorch.tracking.simulation.varied import VariedWorld
 from holotorch.tracking.simulation.world import World
 
@@ -26,8 +27,8 @@ class Amount(NamedTuple):
     poses: int = 4  # poses of the occlusions
     negatives: int = 1000  # frames without a catheter
     rounds: int = 15  # repetitions of each measurement of time
-    varied: int = 2000  # scenes of the second world with the catheter
-    lookalikes: int = 2000  # scenes of the second world without it
+    varied: int = 1104  # scenes of the second world with the catheter
+    lookalikes: int = 1160  # scenes of the second world without it
     placed: int = 4  # poses of the catheter in each photograph of a calibration board
     share: float = 1.0  # share of the grids, conditions, occlusions, and of the frames whose times are compared
 

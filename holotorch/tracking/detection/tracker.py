@@ -127,8 +127,8 @@ class CatheterTracker(nn.Module):
             under codecs, with a rolling shutter. A pose that it does not confirm is refused as INCONSISTENT.
 
     Attributes:
-        times: Seconds that each stage ("colour", "axis", "edges", "pose", "refinement") of the last call took, summed
-            over frames.
+        times: Seconds that each stage ("colour", "axis", "edges", "pose", and "refinement" where there is one) of the
+            last call took, summed over frames.
 
     Raises:
         TypeError, ValueError: ``most_sd`` is not positive, or the colours are grey, too similar, or the same from both
@@ -171,7 +171,7 @@ class CatheterTracker(nn.Module):
         if len(before) != len(frames):
             raise ValueError(f"{len(frames)} frames take {len(frames)} previous poses, got {len(before)}")
         frames = self.channels.to_rgb(frames)
-        self.times = dict.fromkeys(("colour", "axis", "edges", "pose", "refinement"), 0.0)
+        self.times = dict.fromkeys(("colour", "axis", "edges", "pose"), 0.0)
         poses = [self._track(frame, pose) for frame, pose in zip(frames, before, strict=True)]
         return poses if self.refinement is None else self._refined(self.refinement, frames, poses)
 
@@ -180,6 +180,7 @@ class CatheterTracker(nn.Module):
         chosen = [i for i, pose in enumerate(poses) if pose.answered]
         if not chosen:
             return poses
+        self.times["refinement"] = 0.0
         with self._timed("refinement"):
             tip, direction = (torch.stack([getattr(poses[i], name) for i in chosen]) for name in ("tip", "direction"))
             fitted = refinement(frames[chosen], tip.to(frames.device), direction.to(frames.device)).poses()
