@@ -10,6 +10,7 @@ import statistics
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -17,10 +18,12 @@ import torch
 from torch.nn import functional
 
 from holotorch import Grid
+from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import intensity
+from holotorch.core.fourier import convolve
 from holotorch.hologram import AxialHologram, ConvolutionHologram, plan_hologram
 from holotorch.modulator import ThermalCrosstalk
-from holotorch.optics import AngularSpectrum, Propagator, propagate
+from holotorch.optics import AngularSpectrum, Display, Eye, Propagator, Retina, propagate
 
 ROUNDS = 15
 WARM_UP = 2  # rounds before those that count
@@ -30,7 +33,7 @@ Contenders = dict[str, Callable[[], object]]
 def crosstalk() -> Iterator[tuple[str, Contenders]]:
     """Heat spreading, forward and backward, three colours: conv2d is the baseline."""
     for size in (128, 256, 512):
-        module = ThermalCrosstalk(0.66, 7)
+        module, learned = ThermalCrosstalk(0.66, 7), ThermalCrosstalk(0.66, 7, learnable=True)
         kernel = module.kernel.float()[None, None]
         phase = torch.rand(3, 1, size, size, requires_grad=True)
 
@@ -42,6 +45,18 @@ def crosstalk() -> Iterator[tuple[str, Contenders]]:
             {
                 "conv2d": lambda p=phase, k=kernel, b=backward: b(functional.conv2d(p, k, padding=3)),
                 "ThermalCrosstalk": lambda p=phase, m=module, b=backward: b(m(p)),
+                "ThermalCrosstalk, sigma learned": lambda p=phase, m=learned, b=backward: b(m(p)),
+            },
+        )
+    phase = torch.rand(3, 256, 256)
+    for taps in (15, 31, 61):
+        wide = ThermalCrosstalk(2.0, taps)
+        kernel = wide.kernel.float()
+        yield (
+            f"256 px, Gaussian of {taps} taps",
+            {
+                "FFT": lambda k=kernel: convolve(phase, k),
+                "ThermalCrosstalk": lambda m=wide: m(phase),
             },
         )
 
@@ -71,10 +86,53 @@ def propagation() -> Iterator[tuple[str, Contenders]]:
                 "AngularSpectrum": lambda m=unpadded, f=field: m(f[None]),
                 "planned, 100 mm": lambda m=module, f=field: m(f[None]),
                 "planned, forward and backward": both,
-                "planned, first call": lambda f=field, g=grid, z=distance: propagate(f, g, 530e-9, z),
+                "propagate, plan and kernel remembered": lambda f=field, g=grid, z=distance: propagate(f, g, 530e-9, z),
                 "planned, 5 mm, 1e-2": lambda m=near, f=field: m(f[None]),
             },
         )
+
+
+def learning() -> Iterator[tuple[str, Contenders]]:
+    """Forward and backward in a training loop; a fixed Propagator is the baseline."""
+    warnings.simplefilter("ignore", SamplingWarning)
+    distance = 0.05
+    for size in (64, 256, 512):
+        grid = Grid(size, 8e-6)
+        field = torch.randn(1, size, size, dtype=torch.complex64, requires_grad=True)
+        fixed, learned = (Propagator(grid, 530e-9, distance, learnable=each) for each in (False, True))
+        z = torch.tensor(distance, dtype=torch.float64, requires_grad=True)
+        moved = lambda f, g=grid, z=z: propagate(f, g, 530e-9, z)  # noqa: E731
+        planned = lambda f, g=grid, p=fixed.plan: propagate(f, g, 530e-9, distance, plan=p)  # noqa: E731
+        plain = lambda f, g=grid: propagate(f, g, 530e-9, distance)  # noqa: E731
+        yield (
+            f"{size} px, one call",
+            {
+                "Propagator": lambda m=fixed, f=field: m(f),
+                "propagate with plan=": lambda m=planned, f=field: m(f),
+                "propagate, remembered": lambda m=plain, f=field: m(f),
+            },
+        )
+        yield (
+            f"{size} px, one step",
+            {
+                "Propagator": lambda m=fixed, f=field: intensity(m(f)).sum().backward(),
+                "Propagator, distance learned": lambda m=learned, f=field: intensity(m(f)).sum().backward(),
+                "propagate, distance learned": lambda m=moved, f=field: intensity(m(f)).sum().backward(),
+            },
+        )
+    grid, wavelengths = Grid(256, 8e-6), (640e-9, 520e-9, 450e-9)
+    field = torch.randn(3, 256, 256, dtype=torch.complex64, requires_grad=True)
+    propagator = Propagator(grid, wavelengths, 0.05)
+    flat = Retina(grid, wavelengths, Display.planar(0.25), Eye(accommodation=0.25))
+    magnified = Retina(grid, wavelengths, Display(0.05, 0.05, 0.05), Eye(accommodation=1.0))
+    yield (
+        "256 px, three colours, one step",
+        {
+            "Propagator": lambda: intensity(propagator(field)).sum().backward(),
+            "Retina, planar display": lambda: flat(field).sum().backward(),
+            "Retina, eyepiece": lambda: magnified(field).sum().backward(),
+        },
+    )
 
 
 def distances() -> Iterator[tuple[str, Contenders]]:
@@ -140,6 +198,7 @@ def holograms() -> Iterator[tuple[str, Contenders]]:
 SUBJECTS = {
     "crosstalk": crosstalk,
     "propagation": propagation,
+    "learning": learning,
     "distances": distances,
     "peer": peer,
     "holograms": holograms,

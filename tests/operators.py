@@ -13,7 +13,7 @@ from torch import Tensor
 
 from holotorch import Grid
 from holotorch.hologram import AxialHologram, ConvolutionHologram, DirectHologram
-from holotorch.modulator import ThermalCrosstalk
+from holotorch.modulator import HeatCycle, ThermalCrosstalk
 from holotorch.optics import (
     AngularSpectrum,
     Aperture,
@@ -24,8 +24,10 @@ from holotorch.optics import (
     Lens,
     OpticalPath,
     Propagator,
+    PupilViews,
     RayleighSommerfeld,
     ResampledKernel,
+    View,
     ZoomedFilter,
 )
 from holotorch.optics.elements.converging import ConvergingFresnel
@@ -84,6 +86,38 @@ class Case:
     def _noise(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         real = torch.randn(shape, dtype=dtype)
         return real if self.real else torch.complex(real, torch.randn(shape, dtype=dtype))
+
+
+_VIEWS = (
+    View(70e-6, 0.03),
+    View(-40e-6, 0.02, (0.011, -0.017)),
+    View(55e-6, 0.04, covered=(0.3, 1.0)),
+    View(60e-6),
+)
+
+
+def _view_matrix(c: int, view: View) -> np.ndarray:
+    padded = PupilViews(GRID, WAVELENGTHS, _VIEWS).padded.shape
+    transfer = dense.angular_spectrum_transfer(padded, GRID.pitch, WAVELENGTHS[c], -view.focus, False)
+    transfer = transfer * np.exp(2j * np.pi * view.focus / WAVELENGTHS[c])
+    pupil = dense.pupil(padded, GRID.pitch, WAVELENGTHS[c], view.radius, view.centre, view.covered)
+    return dense.spectral_filter(GRID.shape, transfer * pupil)
+
+
+def _heat_left(frames: int, rate: float, moments: tuple[float, ...]) -> np.ndarray:
+    """Phases at all moments of the thousandth cycle for frames of unit steady phase, one after another."""
+    matrix = np.zeros((frames * len(moments), frames))
+    for lit in range(frames):
+        temperature = 0.0
+        for cycle in range(1000):
+            for frame in range(frames):
+                steady = float(frame == lit)
+                for m, moment in enumerate(moments):
+                    if cycle == 999:
+                        value = steady + (temperature - steady) * math.exp(-rate * moment)
+                        matrix[frame * len(moments) + m, lit] = value
+                temperature = steady + (temperature - steady) * math.exp(-rate)
+    return matrix
 
 
 def _angular(name: str, grid: Grid, distance: float, pad: float, band_limit=True, unitary=False) -> Case:
@@ -162,6 +196,12 @@ UNEVEN = (0.21e-3, 0.26e-3, 0.29e-3)  # depths in metres; the cones of light are
 EVEN = (0.21e-3, 0.25e-3, 0.29e-3)
 
 
+WITHOUT_LIGHT = {
+    DirectHologram: "rows without light are skipped, which depends on the values of the layers",
+    AxialHologram: "the weights of the nodes are NumPy arrays",
+}
+
+
 def _hologram(kind: type, cone: str, error: float, stride: int = 1, depths=UNEVEN, **options) -> Case:
     grid, wavelength = GRID, WAVELENGTHS[0]
     layer = (-(-GRID.shape[0] // stride), -(-GRID.shape[1] // stride))
@@ -174,7 +214,7 @@ def _hologram(kind: type, cone: str, error: float, stride: int = 1, depths=UNEVE
         channels=(),
         tolerance=error,
         refusal=None,
-        broken={"compile": "planes without light are skipped, which depends on the values of the layers"},
+        broken={} if kind is ConvolutionHologram else {"compile": WITHOUT_LIGHT[kind]},
     )
 
 
@@ -212,6 +252,22 @@ CASES = [
         lambda: DepthStack([Fresnel(GRID, WAVELENGTHS, z, pad=1.5) for z in _STACKED]),
         lambda c: np.concatenate([_fresnel_matrix(c, z, 1.5) for z in _STACKED]),
         out_shape=(len(_STACKED), *GRID.shape),
+    ),
+    Case(
+        "pupil views",
+        lambda: PupilViews(GRID, WAVELENGTHS, _VIEWS),
+        lambda c: np.concatenate([_view_matrix(c, view) for view in _VIEWS]),
+        out_shape=(len(_VIEWS), *GRID.shape),
+    ),
+    Case(
+        "heat cycle",
+        lambda: HeatCycle(ThermalCrosstalk.from_patch(PATCH), 1.0, 0.7, moments=(0.4, 1.0)),
+        lambda c: np.kron(_heat_left(3, 1 / 0.7, (0.4, 1.0)), dense.convolution(GRID.shape, PATCH.numpy())),
+        shape=(3, 1, *GRID.shape),
+        out_shape=(6, 1, *GRID.shape),
+        channels=(),
+        real=True,
+        refusal=None,
     ),
     Case(
         "resampled kernel",

@@ -23,8 +23,10 @@ ROOMS = {
         {"camera"},
     ],
     "experiments": [
-        {"eye", "panel", "pec_study", "tracking_benchmark", "streaming"},
-        {"pec", "volume", "perception", "propagation", "tracking"},
+        {"panel", "pec_study", "tracking_benchmark", "streaming"},
+        {"joint"},
+        {"eye"},
+        {"camera", "network", "pec", "volume", "perception", "propagation", "tracking"},
         {"runs"},
         {"config"},
     ],

@@ -17,7 +17,7 @@ LEVELS = [
     {"cli"},
     {"experiments"},
     {"io"},
-    {"hologram", "correction"},
+    {"hologram", "correction", "plot"},
     {"scene", "modulator", "optics", "tracking", "perception", "metrics"},
     {"core"},
     {"__init__"},
@@ -25,7 +25,7 @@ LEVELS = [
 ONLY_IN = {
     "kornia": {"tracking", "metrics"},
     "yaml": {"experiments"},
-    "matplotlib": {"experiments"},
+    "matplotlib": {"experiments", "plot"},
     "pydantic": {"experiments"},
     "aiohttp": {"experiments"},
     "cv2": {"io", "tracking"},
@@ -136,6 +136,16 @@ def test_readme_example_runs_and_is_short():
     before, after = re.findall(r"tensor\(\[([^]]+)\]", done.stdout)
     losses = [[float(word) for word in text.split(",")] for text in (before, after)]
     assert all(small < 0.1 * large for small, large in zip(*losses, strict=True))
+
+
+def test_further_readme_examples_run(tmp_path):
+    """Drawing a propagated field, and a gradient from retina to heater."""
+    draw, train = blocks("python", ROOT / "README.md")[1:]
+    subprocess.run([sys.executable, "-c", draw], check=True, cwd=tmp_path)
+    assert (tmp_path / "beam.png").stat().st_size > 10_000
+    done = subprocess.run([sys.executable, "-c", train], check=True, capture_output=True, text=True)
+    assert float(done.stdout.split()[-1]) < 0.02, done.stdout
+    assert len(train.splitlines()) <= 30
 
 
 def test_readme_example_of_tracking_runs():

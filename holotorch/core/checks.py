@@ -25,6 +25,10 @@ class PrecisionWarning(UserWarning):
     """The dtype of a wavelength or distance is too coarse for the phase k z; the message names a sufficient dtype."""
 
 
+class CostWarning(UserWarning):
+    """A result is many times as expensive as one with a somewhat larger error; the message says what accepts that."""
+
+
 def positive(name: str, value: float, unit: str = "") -> float:
     """Return ``value`` as float, or raise ValueError unless it is finite and above zero."""
     number = finite(name, value, unit)
@@ -49,7 +53,7 @@ def finite(name: str, value: float, unit: str = "") -> float:
     return number
 
 
-def quantity(kind: Quantity, value: float, name: str = "") -> float:
+def quantity(kind: Quantity, value: float | Tensor, name: str = "") -> float:
     """Return a physical quantity as float, or raise unless it is plausible.
 
     Args:
@@ -143,7 +147,7 @@ def offset(values: Sequence[float]) -> tuple[float, float]:
     return quantity(OFFSET, y), quantity(OFFSET, x)
 
 
-def wavelengths(values: float | Sequence[float]) -> tuple[float, ...]:
+def wavelengths(values: float | Sequence[float] | Tensor) -> tuple[float, ...]:
     """Return wavelengths in metres as a tuple, one per channel, or raise; a single number stands for one channel."""
     single = isinstance(values, str | numbers.Real) or (isinstance(values, Tensor) and values.ndim == 0)
     items: list[Any] = [values] if single else list(values)  # type: ignore[arg-type]
@@ -202,7 +206,7 @@ def affordable(needed: float, what: str, cure: str, device: torch.device | str =
 
 def _number(name: str, value: Any, unit: str) -> float:
     if isinstance(value, Tensor) and value.requires_grad:
-        raise TypeError(f"{name} is fixed in a module and cannot carry a gradient; use the kernel function instead")
+        raise TypeError(f"{name} is fixed here and cannot carry a gradient, which would be lost; give its detach()")
     try:
         if isinstance(value, bool | str):
             raise TypeError

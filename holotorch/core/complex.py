@@ -5,9 +5,12 @@ import math
 import torch
 from torch import Tensor
 
+from holotorch.core.precision import at_least_single
+
 
 def phasor(phase: Tensor) -> Tensor:
-    """Unit-amplitude field exp(i phase), complex of the same shape; complex64 for float32, complex128 for float64."""
+    """Unit-amplitude field exp(i phase), complex of the same shape; complex128 for float64, complex64 otherwise."""
+    phase = at_least_single(phase)
     return torch.complex(torch.cos(phase), torch.sin(phase))
 
 

@@ -4,12 +4,13 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.grid import Grid
+from holotorch.core.learning import PreciseModule
 
-Wavelengths = float | Sequence[float]  # in metres: one number, or one per channel
+Wavelengths = float | Sequence[float] | Tensor  # in metres: one number, or one per channel
 
 
 class LinearOperator(Protocol):
@@ -24,12 +25,11 @@ class LinearOperator(Protocol):
         ...
 
 
-class FieldOperator(nn.Module):
+class FieldOperator(PreciseModule):
     """Base class of operators from fields [..., C, H, W] on ``grid`` to fields [..., C, H', W'] on ``out_grid``.
 
-    Fields are complex64 or complex128 and keep their dtype. Kernels are float64 buffers; ``.to`` moves
-    them to another device, but neither ``.to`` nor ``.float()`` changes their dtype. Each call converts them to the
-    precision of its field. Subclasses implement ``_forward`` and ``_adjoint``, which receive a checked field.
+    Fields are complex64 or complex128 and keep their dtype. Kernels are computed in float64, and converted to the
+    precision of the field. Subclasses implement ``_forward`` and ``_adjoint``, which receive a checked field.
 
     Args:
         grid: Sampling of the field.
@@ -65,15 +65,6 @@ class FieldOperator(nn.Module):
     def _adjoint(self, field: Tensor) -> Tensor:
         raise NotImplementedError
 
-    def register_complex(self, name: str, values: Tensor | None) -> None:
-        """Register a complex tensor as a buffer of real pairs, since ``Module.to(dtype)`` drops imaginary parts."""
-        pairs = None if values is None else torch.view_as_real(values).contiguous()
-        self.register_buffer(name, pairs, persistent=False)
-
-    def complex_buffer(self, name: str, field: Tensor) -> Tensor:
-        """The complex tensor registered as ``name``, in the precision of ``field``."""
-        return torch.view_as_complex(self.get_buffer(name).to(field.real.dtype))
-
     def check_field(self, field: Tensor, grid: Grid) -> None:
         """Raise TypeError unless ``field`` is complex, and ValueError unless it ends in [C, H, W] of ``grid``."""
         channels = (len(self.wavelengths),) if hasattr(self, "wavelengths") else ()
@@ -84,19 +75,19 @@ class FieldOperator(nn.Module):
         names = ["grid"] + ["out_grid"] * (self.out_grid != self.grid) + ["wavelengths"] * hasattr(self, "wavelengths")
         return ", ".join(f"{name}={getattr(self, name)}" for name in names)
 
-    def _apply(self, fn, recurse=True):
-        return super()._apply(lambda tensor: tensor.to(fn(tensor).device), recurse)
-
 
 def linear(x: Tensor, apply: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor]) -> Tensor:
     """Return ``apply(x)``. Its derivatives of any order use ``adjoint`` and save no tensor for the backward pass.
 
     Both functions are linear and accept leading batch axes.
     """
-    return _Linear.apply(x, apply, adjoint)  # type: ignore[return-value]
+    function = _Linear if torch.compiler.is_compiling() else _Differentiable
+    return function.apply(x, apply, adjoint)  # type: ignore[return-value]
 
 
 class _Linear(torch.autograd.Function):
+    """A linear map without forward-mode derivative, which torch.compile does not accept where gradients are needed."""
+
     @staticmethod
     def forward(x: Tensor, apply: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor]) -> Tensor:
         return apply(x)
@@ -109,8 +100,14 @@ class _Linear(torch.autograd.Function):
     def vmap(info, in_dims, *args):
         # Both maps accept leading batch axes, so the mapped axis becomes a batch axis.
         x, *maps = args
-        return _Linear.apply(x.movedim(in_dims[0], 0), *maps), 0
+        return linear(x.movedim(in_dims[0], 0), *maps), 0
 
     @staticmethod
     def backward(ctx, *grad_outputs):
-        return _Linear.apply(*grad_outputs, *ctx.maps), None, None
+        return linear(*grad_outputs, *ctx.maps), None, None
+
+
+class _Differentiable(_Linear):
+    @staticmethod
+    def jvp(ctx, *tangents):
+        return linear(tangents[0], *reversed(ctx.maps))

@@ -19,6 +19,8 @@ class Plan:
         reason: One sentence that says why this method was chosen.
         runner_up: One sentence that says which method came next and why it was not chosen.
         adequate: Whether ``predicted_error`` is within the tolerance; False only if no method is adequate.
+        sampled: Per axis (y, x), whether the transfer function is sampled in frequency.
+        paraxial: Whether the method neglects the factor beyond Fresnel.
     """
 
     method: str
@@ -32,3 +34,5 @@ class Plan:
     reason: str
     runner_up: str
     adequate: bool = True
+    sampled: tuple[bool, bool] = (True, True)
+    paraxial: bool = False

@@ -1,4 +1,6 @@
-"""Conversion of half-precision numbers before they are summed."""
+"""Protection of numbers against half precision, whose rounding would change a phase."""
+
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from torch import Tensor
@@ -10,3 +12,9 @@ def at_least_single(values: Tensor) -> Tensor:
     float16 cannot represent values below 6e-8 or above 65504, nor every integer above 2048 (bfloat16: above 256).
     """
     return values.float() if values.dtype in (torch.float16, torch.bfloat16) else values
+
+
+def without_autocast(values: Tensor) -> AbstractContextManager[object]:
+    """Context in which products of matrices, which autocast would round, keep the dtype of ``values``."""
+    device = values.device.type
+    return torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext()

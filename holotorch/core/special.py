@@ -1,6 +1,7 @@
 """Fresnel integrals in float64, differentiable and on any device, which torch does not provide."""
 
 import math
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -18,8 +19,11 @@ def fresnel_integral(u: Tensor) -> Tensor:
     """int_0^u exp(-i pi t^2 / 2) dt = C(u) - i S(u) for abs(u) <= 1.3 by a power series, complex128."""
     factor = math.pi / 2 * u.square()
     # Terms (-i factor)^n / (n! (2 n + 1)): even n contribute to C, odd n to S.
-    powers = torch.cat([torch.ones_like(factor)[..., None], factor[..., None].expand(*factor.shape, _TERMS - 1)], -1)
-    sums = powers.cumprod(-1) @ torch.tensor(_SERIES, dtype=torch.float64, device=u.device)
+    # The second derivative of a cumulative product is NaN at 0, and that of the zeroth and first power as well.
+    exponents, coefficients = _series(u.device)
+    base = factor[..., None]
+    powers = torch.cat([torch.ones_like(base), base, base**exponents], -1)
+    sums = powers @ coefficients
     return torch.complex(u * sums[..., 0], -u * sums[..., 1])
 
 
@@ -31,13 +35,28 @@ def fresnel_auxiliary(u: Tensor) -> tuple[Tensor, Tensor]:
     integrand exp(-pi t^2 / 2) / (1 + (t/u)^4). Its poles are 0.7 u away from the real axis, so that the trapezoidal
     rule converges geometrically.
     """
-    t = torch.arange(_NODES, dtype=torch.float64, device=u.device) * _STEP
-    weight = torch.exp(-math.pi / 2 * t.square()) * _STEP
-    weight[0] /= 2
+    t, weights = _quadrature(u.device)
     inverse = 1 / u
-    density = weight / (1 + (t * inverse[..., None]).square().square())
-    scale = math.sqrt(2) / math.pi
-    return scale * density.sum(-1) * inverse, scale * (density * t.square()).sum(-1) * inverse**3
+    sums = (1 / (1 + (t * inverse[..., None]).square().square())) @ weights
+    return sums[..., 0] * inverse, sums[..., 1] * inverse**3
+
+
+@lru_cache(maxsize=8)  # making the constants takes longer than using them
+def _series(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Exponents from 2 on, [TERMS - 2], and coefficients of all terms [TERMS, 2] of C and S."""
+    with torch.inference_mode(False):
+        exponents = torch.arange(2, _TERMS, dtype=torch.float64, device=device)
+        return exponents, torch.tensor(_SERIES, dtype=torch.float64, device=device)
+
+
+@lru_cache(maxsize=8)
+def _quadrature(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Nodes [NODES] and weights [NODES, 2] of the integrals for f and g."""
+    with torch.inference_mode(False):
+        t = torch.arange(_NODES, dtype=torch.float64, device=device) * _STEP
+        weight = torch.exp(-math.pi / 2 * t.square()) * (_STEP * math.sqrt(2) / math.pi)
+        weight[0] /= 2
+        return t, torch.stack([weight, weight * t.square()], -1)
 
 
 def chirped_fresnel_integral(u: Tensor, chirp: Tensor, end: Tensor, sign: Tensor | None = None) -> Tensor:

@@ -1,6 +1,7 @@
 """Proximity effect correction: heater phases that form the wanted image although heat spreads between pixels."""
 
 from holotorch.core.deprecation import renamed
+from holotorch.correction.calibration import Calibration, calibrate, scan
 from holotorch.correction.deconvolution import deconvolve, deconvolve_admm, inverse
 from holotorch.correction.gerchberg_saxton import gerchberg_saxton, iterative_pec
 from holotorch.correction.lbfgs import LBFGS, spread_preconditioner
@@ -13,10 +14,12 @@ __all__ = [
     "APG",
     "LBFGS",
     "Box",
+    "Calibration",
     "PECProblem",
     "ProjectedAdam",
     "Solution",
     "Stage",
+    "calibrate",
     "deconvolve",
     "deconvolve_admm",
     "gerchberg_saxton",
@@ -27,6 +30,7 @@ __all__ = [
     "penalty_schedule",
     "proximal_pec",
     "run_stages",
+    "scan",
     "spread_preconditioner",
 ]
 

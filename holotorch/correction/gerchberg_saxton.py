@@ -7,6 +7,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.complex import intensity, phasor, wrapped
+from holotorch.core.learning import fixed
 from holotorch.core.operator import LinearOperator
 from holotorch.correction.deconvolution import Crosstalk, deconvolve
 from holotorch.correction.problem import check_target
@@ -48,6 +49,8 @@ def gerchberg_saxton(
         ``converged`` is always False, as there is no stop rule.
     """
     check_target(target, mask)
+    for name, value in (("start", start), ("target", target), ("mask", mask)):
+        fixed(name, value, f"the iterations have no derivative; give {name}.detach()")
     checks.all_finite("start", start)
     checks.whole("max_steps", max_steps, 1)
     checks.field("start", start, tuple(target.shape), complex_valued=False)

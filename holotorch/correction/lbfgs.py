@@ -58,24 +58,24 @@ class LBFGS(Solver):
         guess = self._preconditioned(steepest)
         rows = memory.direction(*(run.rows(part).reshape(flat) for part in (steepest, guess)))
         direction = free * run.from_rows(rows)
+        # A memory may no longer describe the loss, for example because other elements are held.
         ascending = ~(run.total(direction * gradient) < 0)
-        if ascending.any():
-            # Forget a memory that no longer describes the loss, for example because other elements are held.
-            memory.forget(ascending.reshape(-1))
-            direction = torch.where(run.each(ascending), -free * guess, direction)
+        direction = torch.where(run.each(ascending), -free * guess, direction)
+        empty = ascending | memory.empty.reshape(run.loss.shape)
         largest = run.rows(direction.abs()).amax(-1)
         first_length = self.first / largest.clamp(min=torch.finfo(largest.dtype).tiny)
-        length = torch.where(memory.empty.reshape(run.loss.shape), first_length, 1.0)
+        length = torch.where(empty, first_length, 1.0)
         x, loss, after, failed = self._search(run, direction, gradient, length)
         # A step that fails with a memory may succeed without it; an item whose step fails without a memory has stalled.
-        stalled = failed & memory.empty.reshape(run.loss.shape)
-        if failed.any():
-            memory.forget(failed.reshape(-1))
+        stalled = failed & empty
+        misled = ascending | failed
+        if misled.any():
+            memory.forget(misled.reshape(-1))
         change = after - gradient
         pair = x - run.x, change, self._preconditioned(change)
         memory.add(*(run.rows(part).reshape(flat) for part in pair))
         run.advance(x, loss, stalled)
-        gradient = after if run.active.all() else torch.where(run.each(run.active), after, gradient)
+        gradient = torch.where(run.each(run.active), after, gradient)
         return {"gradient": gradient, **memory.state()}
 
     def _preconditioned(self, x: Tensor) -> Tensor:

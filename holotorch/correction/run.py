@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.core.learning import fixed
 
 Objective = Callable[[Tensor], Tensor]
 Projection = Callable[[Tensor], Tensor]
@@ -81,6 +82,7 @@ class Run:
         self, solver: "Solver", objective: Objective, start: Tensor, project: Projection, resume: State | None
     ):
         checks.real("start", start)
+        fixed("start", start, "a solution has no derivative with respect to its start; give start.detach()")
         checks.all_finite("start", start)
         self.solver, self.objective, self.project = solver, objective, project
         self.x, self.evaluations = project(start.detach()), 0
@@ -152,7 +154,7 @@ class Run:
         last = self.loss
         self.stalled = self.stalled | (self.active & stalled)
         self.active = self.active & ~stalled
-        self.x = x if self.active.all() else torch.where(self.each(self.active), x, self.x)
+        self.x = torch.where(self.each(self.active), x, self.x)  # always, since asking first makes a GPU wait
         loss = torch.where(self.active, loss, last)
         self.step += 1
         self.losses[self.step] = loss

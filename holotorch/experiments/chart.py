@@ -7,10 +7,14 @@ from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.runs.tables import write_table
 from holotorch.io.files import write_bytes, write_text
 
-# The module whose function ``subject`` draws the chart, and the name of its second table. The function for tracking
-# returns several further tables by name instead.
+# The module whose function ``subject`` draws the chart, and the name of its second table. Functions that return several
+# further tables return them by name instead.
 CHARTS = {
+    "camera": ("holotorch.experiments.camera.chart", "corrected"),
+    "chain": ("holotorch.experiments.joint.chain", ""),
     "eye": ("holotorch.experiments.eye.chart", "tradeoff"),
+    "joint": ("holotorch.experiments.joint.chart", ""),
+    "network": ("holotorch.experiments.network.chart", "training"),
     "pec": ("holotorch.experiments.pec_study.chart", "comparison"),
     "propagation": ("holotorch.experiments.propagation.chart", "prediction"),
     "tracking": ("holotorch.experiments.tracking_benchmark.chart", "grids"),

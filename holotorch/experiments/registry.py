@@ -15,6 +15,7 @@ KINDS = {
     "pec_study": "holotorch.experiments.pec_study",
     "volume": "holotorch.experiments.volume",
     "eye": "holotorch.experiments.eye",
+    "joint": "holotorch.experiments.joint",
     "track": "holotorch.experiments.tracking",
     "perception_layout": "holotorch.experiments.perception.layout",
     "perception_analysis": "holotorch.experiments.perception.analysis",

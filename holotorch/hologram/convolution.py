@@ -8,6 +8,7 @@ from torch import Tensor
 from holotorch.core.complex import phasor
 from holotorch.core.fourier import even_fft2, multiply_even
 from holotorch.core.grid import Grid
+from holotorch.core.learning import fixed
 from holotorch.hologram.band_limited import point_spectrum
 from holotorch.hologram.cone import Cone, cone_samples, is_plain, spherical_wave, taper, taper_margin
 from holotorch.hologram.layered import LayerHologram
@@ -136,6 +137,7 @@ class ConvolutionSum:
     """Running sum of a :class:`ConvolutionHologram` over planes that are added in any order."""
 
     def __init__(self, operator: ConvolutionHologram, shape: tuple[int, int], phase: Tensor | None):
+        fixed("phase", phase, "call the hologram with layers [..., D, h, w], which is differentiable")
         self.operator, self.raster, self.phase = operator, operator.raster(shape), phase
         self.total: Tensor | None = None
 
@@ -143,6 +145,7 @@ class ConvolutionSum:
         """Add the plane at ``depths[j]``, real or complex [h, w]; a plane of zeros is skipped."""
         if not has_light(plane):
             return
+        fixed("plane", plane, "call the hologram with layers [..., D, h, w], which is differentiable")
         plane = plane.detach().to(torch.promote_types(plane.dtype, torch.complex64))
         if self.phase is not None:
             plane = plane * phasor(self.phase).to(plane.dtype)

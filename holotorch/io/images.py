@@ -1,5 +1,7 @@
 """Pictures as tensors: loading of files and bundled photographs, resizing, channels, and PNG encoding."""
 
+import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +98,17 @@ def encode_png(image: Tensor) -> bytes:
     if not ok:
         raise ValueError(f"could not encode a picture of shape {tuple(image.shape)} as PNG")
     return data.tobytes()
+
+
+def encode_animation(images: Sequence[Tensor], seconds: float) -> bytes:
+    """Animated PNG of ``images`` [C, H, W], C = 1 or 3, shown for ``seconds`` each; values as in :func:`encode_png`."""
+    from PIL import Image
+
+    frames = [Image.open(io.BytesIO(encode_png(image.expand(3, -1, -1)))) for image in images]
+    buffer = io.BytesIO()
+    options = {"append_images": frames[1:], "duration": 1e3 * seconds, "loop": 0}
+    frames[0].save(buffer, format="PNG", save_all=True, **options)
+    return buffer.getvalue()
 
 
 def read_exr(path: Path, *, memory: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

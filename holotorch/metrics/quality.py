@@ -10,13 +10,15 @@ SSIM_WINDOW = 11  # side of the square window of ssim, in pixels
 
 
 def psnr(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:
-    """Peak signal-to-noise ratio in dB, [...] for images [..., H, W]; infinite for equal images.
+    """Peak signal-to-noise ratio in dB, [...] for images [..., H, W]; infinite for equal images, with a gradient of 0.
 
     The peak is ``data_range``, the difference between the largest and smallest possible value; thesis Eq. 4.37 uses the
     maximum of the reference instead. Errors are those of :func:`ssim`, but images of any size are allowed.
     """
     image, reference = _checked_pair(image, reference, data_range)
-    return 10 * torch.log10(data_range**2 / (image - reference).square().mean((-2, -1)))
+    error = (image - reference).square().mean((-2, -1))
+    ratio = 10 * torch.log10(data_range**2 / torch.where(error == 0, 1.0, error))
+    return torch.where(error == 0, torch.inf, ratio)
 
 
 def ssim(image: Tensor, reference: Tensor, *, data_range: float) -> Tensor:

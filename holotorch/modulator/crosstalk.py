@@ -1,5 +1,6 @@
 """ThermalCrosstalk: the spreading of heat between the pixels of a phased array."""
 
+import itertools
 import math
 
 import torch
@@ -7,50 +8,72 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from holotorch.core import checks
+from holotorch.core.fourier import convolve
+from holotorch.core.learning import PreciseModule, without_graph
+from holotorch.core.precision import at_least_single
 from holotorch.core.quantities import SIGMA_PX
 
 _SMALLEST_TAP = 1e-12  # smaller taps are set to 0: products with them may be denormal numbers, which are slow
+_ROOM = 1.5  # ratio of the largest sigma that the taps of a learnable kernel have room for to the given one
+_TAPS_OF_FFT = 40  # taps per pixel, over both axes, above which FFTs are faster on a CPU (scripts/bench.py crosstalk)
 
 
-class ThermalCrosstalk(nn.Module):
+class ThermalCrosstalk(PreciseModule):
     """Convolution of heater phases (or temperatures) [..., H, W] with the heat kernel exp(-d^2 / sigma^2).
 
     The kernel at a distance of d pixels is the temperature rise there, relative to the rise of a pixel that is heated
     alone. Sigma is sqrt 2 times the standard deviation of the Gaussian. The centre tap is 1 and the kernel is not
     normalised, since the heat from all neighbours adds to that of the pixel. The array is padded with zeros. The
-    operator is linear and real; dtype and device follow the input.
+    operator is linear and real; dtype and device follow the input, but half precision, which cannot hold a phase, is
+    computed and returned in float32.
 
     Args:
-        sigma_px: Sigma in pixels, 0 to 100; 0 means no crosstalk. The thesis's chip has 0.66.
-        size: Odd number of taps per axis. By default, the kernel has all taps of at least 1e-6. The thesis always uses
-            7, which loses 2.3 % of the heat at sigma 2.0 (see :attr:`lost_heat`).
+        sigma_px: Sigma in pixels, 0 to 100; 0 means no crosstalk. The thesis's chip has 0.66. An ``nn.Parameter`` is
+            learned.
+        size: Odd number of taps per axis. By default, the kernel has all taps of at least 1e-6, if sigma is learned
+            those of 1.5 times the given sigma. The thesis always uses 7, which loses 2.3 % of the heat at sigma 2.0
+            (see :attr:`lost_heat`).
+        learnable: Make sigma a Parameter. It is in ``state_dict`` in any case, as ``sigma``.
 
     Raises:
-        ValueError: ``sigma_px`` outside its range, ``size`` even or below 1; in a call: an array smaller than the given
-            ``size``.
+        ValueError: ``sigma_px`` outside its range, or 0 if it is to be learned, or with a gradient but no Parameter;
+            ``size`` even or below 1; in a call: an array smaller than the given ``size``.
 
     Source: thesis Eqs. 4.2-4.4.
     """
 
-    def __init__(self, sigma_px: float, size: int | None = None):
+    sigma: Tensor | None
+    patch: Tensor | None
+    taps: Tensor
+
+    def __init__(self, sigma_px: float | Tensor, size: int | None = None, *, learnable: bool = False):
         super().__init__()
-        sigma = checks.quantity(SIGMA_PX, sigma_px)
+        without_graph("sigma_px", sigma_px)
+        sigma = checks.quantity(SIGMA_PX, sigma_px.detach() if isinstance(sigma_px, Tensor) else sigma_px)
         if size is not None and checks.whole("crosstalk size", size, 1) % 2 == 0:
             raise ValueError(f"crosstalk size must be an odd number of taps of at least 1, got {size!r}")
-        radius = _needed_radius(sigma) if size is None else size // 2
-        column = torch.tensor([[_tap(offset, sigma)] for offset in range(-radius, radius + 1)], dtype=torch.float64)
-        self._set_factors(column, column.T)
-        self.sigma_px, self.size_is_given = sigma, size is not None
+        self.size_is_given = size is not None
+        given = sigma_px if isinstance(sigma_px, nn.Parameter) else sigma
+        self.learned = self.record("sigma", given, learnable=learnable)
+        if self.learned and sigma == 0:
+            raise ValueError(
+                "a learned sigma must be above 0, where the kernel depends on it, got 0; start at 0.3, say"
+            )
+        self.radius = _needed_radius(sigma * (_ROOM if self.learned else 1)) if size is None else size // 2
+        self.patch = None
+        self._keep_taps()
 
     @classmethod
-    def from_patch(cls, patch: Tensor) -> "ThermalCrosstalk":
+    def from_patch(cls, patch: Tensor, *, learnable: bool = False) -> "ThermalCrosstalk":
         """Build from a measured response: the temperature rises [h, w] around one heated pixel in the centre.
 
         h and w are odd. The rises have any unit, since they are divided by that of the centre; they need not be
-        symmetric. Raises ValueError for even sizes, NaN, negative rises or a centre that is not the warmest.
+        symmetric. An ``nn.Parameter`` is learned, and with ``learnable`` the rises become one; they are in
+        ``state_dict`` as ``patch``. Raises ValueError for even sizes, NaN, negative rises, a centre that is not the
+        warmest, or a patch with a gradient that is no Parameter.
         """
         checks.real("patch", patch)
-        checks.all_finite("patch", patch)
+        checks.all_finite("patch", patch.detach())
         if patch.ndim != 2 or patch.shape[0] % 2 == 0 or patch.shape[1] % 2 == 0:
             raise ValueError(f"patch must have two odd sizes (h, w) around the heated pixel, got {tuple(patch.shape)}")
         centre = patch[patch.shape[0] // 2, patch.shape[1] // 2]
@@ -60,8 +83,10 @@ class ThermalCrosstalk(nn.Module):
                 f"minimum {patch.min().item():g}, maximum {patch.max().item():g}"
             )
         self = cls(0.0)
-        self._set_factors(patch.detach().to("cpu", torch.float64) / centre.item())
-        self.sigma_px, self.size_is_given = math.nan, True
+        del self.sigma, self.patch
+        self.sigma, self.size_is_given = None, True
+        self.learned = self.record("patch", patch, learnable=learnable)
+        self._keep_taps()
         return self
 
     @classmethod
@@ -91,8 +116,13 @@ class ThermalCrosstalk(nn.Module):
 
     @property
     def kernel(self) -> Tensor:
-        """The two-dimensional kernel, float64 [h, w], with a centre tap of 1."""
-        return math.prod(torch.tensor(factor, dtype=torch.float64) for factor in self._factors)  # type: ignore[return-value]
+        """The two-dimensional kernel, float64 [h, w], with centre tap 1, with the gradients of what is learned."""
+        return math.prod(self._factors())  # type: ignore[return-value]
+
+    @property
+    def sigma_px(self) -> float:
+        """The present sigma in pixels; NaN for a measured patch."""
+        return math.nan if self.sigma is None else self.sigma.item()
 
     @property
     def total(self) -> float:
@@ -102,85 +132,155 @@ class ThermalCrosstalk(nn.Module):
     @property
     def lost_heat(self) -> float:
         """Share of the Gaussian's heat that lies outside the taps; NaN for a measured patch."""
-        if math.isnan(self.sigma_px):
+        sigma = self.sigma_px
+        if math.isnan(sigma):
             return math.nan
-        radius = _needed_radius(self.sigma_px) + 4
-        whole = sum(_tap(offset, self.sigma_px) for offset in range(-radius, radius + 1)) ** 2
-        return max(0.0, 1 - self.total / whole)
+        offsets = torch.arange(_needed_radius(sigma) + 5, dtype=torch.float64)
+        column = _gaussian(offsets, torch.tensor(sigma, dtype=torch.float64))
+        return max(0.0, 1 - self.total / (2 * column.sum().item() - 1) ** 2)
 
     def forward(self, phase: Tensor) -> Tensor:
         """Spread ``phase``, real [..., H, W]; the result has the same shape and unit."""
-        return self._apply_factors(phase, self._factors)
+        return self._spread(phase, self._factors())
 
     def adjoint(self, phase: Tensor) -> Tensor:
         """Apply the transpose, which is the correlation with the kernel."""
-        return self._apply_factors(phase, tuple(map(_flipped, reversed(self._factors))))
+        return self._spread(phase, [factor.flip(0, 1) for factor in reversed(self._factors())])
 
     def extra_repr(self) -> str:
         """Main parameters, for ``print(module)``."""
-        return f"sigma_px={self.sigma_px:g}, taps={tuple(self.kernel.shape)}"
+        sigma = "measured" if self.sigma is None else "meta" if self.sigma.is_meta else f"{self.sigma_px:g}"
+        return f"sigma_px={sigma}, taps={self._shape()}{', learned' * self.learned}"
 
-    def _set_factors(self, *factors: Tensor) -> None:
-        # Taps are Python floats, not tensors, so that they have full precision for every dtype and device.
-        self._factors = tuple(tuple(map(tuple, factor.tolist())) for factor in factors)
+    def _shape(self) -> tuple[int, int]:
+        taps = 2 * self.radius + 1
+        return (taps, taps) if self.patch is None else (self.patch.shape[0], self.patch.shape[1])
 
-    def _apply_factors(self, phase: Tensor, factors: tuple) -> Tensor:
+    def _computed_taps(self) -> Tensor:
+        """Taps of the column [n] of a Gaussian, or the measured kernel [h, w], float64."""
+        if self.patch is not None:
+            return self.patch / self.patch[self.patch.shape[0] // 2, self.patch.shape[1] // 2]
+        assert self.sigma is not None
+        offsets = torch.arange(-self.radius, self.radius + 1, dtype=torch.float64, device=self.sigma.device)
+        return _gaussian(offsets, self.sigma)
+
+    def _keep_taps(self) -> None:
+        """Keep the taps of a kernel that is not learned; those of a learned one are computed in every call."""
+        self.keep("taps", None if self.learned else self._computed_taps())
+
+    def _factors(self) -> list[Tensor]:
+        """Kernels whose convolutions make up the whole: column and row of a Gaussian, or the measured kernel."""
+        taps = self._computed_taps() if self.learned else self.taps
+        return [taps] if taps.ndim == 2 else [taps[:, None], taps[None]]
+
+    def _spread(self, phase: Tensor, factors: list[Tensor]) -> Tensor:
         checks.real("phase", phase)
         if phase.ndim < 2:
             raise ValueError(f"phase must end in (H, W), got {tuple(phase.shape)}")
-        size = max(len(factor) for factor in factors), max(len(factor[0]) for factor in factors)
+        size = self._shape()
         if self.size_is_given and (size[0] > phase.shape[-2] or size[1] > phase.shape[-1]):
             raise ValueError(
                 f"crosstalk kernel of {size[0]} x {size[1]} px is larger than the array of {phase.shape[-2]} x "
                 f"{phase.shape[-1]} px; give a smaller size or a larger grid"
             )
+        phase = at_least_single(phase)
+        if sum(factor.numel() for factor in factors) > _TAPS_OF_FFT:
+            return convolve(phase, math.prod(factors).to(phase))  # type: ignore[union-attr]
+        add = _shifted_sum if torch.compiler.is_compiling() else _ShiftAndAdd.apply
         for factor in factors:
-            phase = _ShiftAndAdd.apply(phase, factor)
+            phase = add(phase, factor.to(phase.device))
         return phase
+
+    def _load_from_state_dict(self, *args, **kwargs):
+        super()._load_from_state_dict(*args, **kwargs)
+        self._keep_taps()
+
+
+def _shifted_sum(image: Tensor, taps: Tensor) -> Tensor:
+    """Convolution of ``image`` [..., H, W] with ``taps`` [h, w] as a sum of shifted copies, one per tap."""
+    rows, columns = taps.shape
+    height, width = image.shape[-2:]
+    padded = _padded(image, taps.shape)
+    if torch.compiler.is_compiling() or image.device.type != "cpu":
+        values = [row.unbind() for row in taps.to(image).unbind()]
+    else:  # numbers are faster than tensors, and reading them waits for nothing on a CPU
+        values = taps.tolist()
+    result = torch.zeros_like(image)
+    for i, j in itertools.product(range(rows), range(columns)):
+        tap, y, x = values[i][j], rows - 1 - i, columns - 1 - j
+        if isinstance(tap, Tensor):
+            result = result.addcmul(padded[..., y : y + height, x : x + width], tap)
+        elif tap:
+            result.add_(padded[..., y : y + height, x : x + width], alpha=tap)
+    return result
+
+
+def _padded(image: Tensor, size: torch.Size) -> Tensor:
+    rows, columns = size
+    return functional.pad(image, (columns // 2, columns // 2, rows // 2, rows // 2))
 
 
 class _ShiftAndAdd(torch.autograd.Function):
-    """Convolution as a sum of shifted copies of the image, one per tap.
+    """:func:`_shifted_sum` with derivatives that keep only the image.
 
     On a CPU, the backward pass of conv2d with one channel takes about ten times as long (``scripts/bench.py
-    crosstalk``). There is no forward-mode derivative, since torch.compile does not accept a function with one.
+    crosstalk``). torch.compile, which accepts no function with a forward-mode derivative, uses the plain sum.
     """
 
-    generate_vmap_rule = True
+    @staticmethod
+    def forward(image: Tensor, taps: Tensor) -> Tensor:
+        return _shifted_sum(image, taps)
 
     @staticmethod
-    def forward(image: Tensor, taps: tuple[tuple[float, ...], ...]) -> Tensor:
-        height, width = image.shape[-2:]
-        rows, columns = len(taps), len(taps[0])
-        padded = functional.pad(image, (columns // 2, columns // 2, rows // 2, rows // 2))
-        result = torch.zeros_like(image)
-        for i, row in enumerate(taps):
-            for j, tap in enumerate(row):
-                if tap:
-                    y, x = rows - 1 - i, columns - 1 - j
-                    result.add_(padded[..., y : y + height, x : x + width], alpha=tap)
-        return result
+    def vmap(info, in_dims, *args):
+        image, taps = args
+        images = image.expand(info.batch_size, *image.shape) if in_dims[0] is None else image.movedim(in_dims[0], 0)
+        if in_dims[1] is None:
+            return _ShiftAndAdd.apply(images, taps), 0
+        pairs = zip(images, taps.movedim(in_dims[1], 0), strict=True)
+        return torch.stack([_ShiftAndAdd.apply(*pair) for pair in pairs]), 0  # type: ignore[list-item]
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        ctx.taps = inputs[1]
+        image, taps = inputs
+        ctx.save_for_backward(image if taps.requires_grad else None, taps)
+        ctx.save_for_forward(image, taps)
 
     @staticmethod
     def backward(ctx, *gradients: Tensor):
-        return _ShiftAndAdd.apply(gradients[0], _flipped(ctx.taps)), None
+        image, taps = ctx.saved_tensors
+        (gradient,) = gradients
+        of_image = _ShiftAndAdd.apply(gradient, taps.flip(0, 1)) if ctx.needs_input_grad[0] else None
+        of_taps = _correlated(gradient, image, taps.shape) if ctx.needs_input_grad[1] else None
+        return of_image, of_taps
+
+    @staticmethod
+    def jvp(ctx, *tangents: Tensor):
+        image, taps = ctx.saved_tensors
+        of_image, of_taps = tangents
+        parts = [
+            _ShiftAndAdd.apply(x, k) for x, k in ((of_image, taps), (image, of_taps)) if x is not None and k is not None
+        ]
+        return sum(parts[1:], parts[0])
 
 
-def _flipped(taps: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
-    """Kernel of the transposed convolution: both axes reversed."""
-    return tuple(row[::-1] for row in taps[::-1])
+def _correlated(gradient: Tensor, image: Tensor, size: torch.Size) -> Tensor:
+    """Derivative with respect to the taps, of ``size`` (h, w), for a ``gradient`` with respect to the convolution."""
+    rows, columns = size
+    height, width = image.shape[-2:]
+    padded = _padded(image, size)
+    sums = [
+        (padded[..., y : y + height, x : x + width] * gradient).sum()
+        for y, x in itertools.product(reversed(range(rows)), reversed(range(columns)))
+    ]
+    return torch.stack(sums).reshape(size).double()
 
 
-def _tap(offset: int, sigma: float) -> float:
-    """One-dimensional kernel at a whole number of pixels from its centre."""
-    if offset == 0 or sigma == 0:
-        return float(offset == 0)
-    tap = math.exp(-((offset / sigma) ** 2))
-    return tap if tap >= _SMALLEST_TAP else 0.0
+def _gaussian(offsets: Tensor, sigma: Tensor) -> Tensor:
+    """One-dimensional kernel at whole numbers of pixels from its centre; differentiable in a sigma above 0."""
+    exponent = -(offsets / torch.where(sigma > 0, sigma, 1)).square()
+    lit = (offsets == 0) | ((exponent >= math.log(_SMALLEST_TAP)) & (sigma > 0))
+    return torch.where(lit, torch.exp(exponent), 0.0)
 
 
 def _needed_radius(sigma: float) -> int:

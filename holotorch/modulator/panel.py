@@ -10,6 +10,8 @@ from torch import Tensor, nn
 from holotorch.core import checks
 from holotorch.core.complex import phasor
 from holotorch.core.grid import Grid
+from holotorch.core.learning import PreciseModule, without_graph
+from holotorch.core.precision import at_least_single
 from holotorch.core.quantities import WAVELENGTH
 from holotorch.modulator.crosstalk import ThermalCrosstalk
 from holotorch.modulator.dispersion import Birefringence, phase_scale
@@ -35,7 +37,7 @@ def nearest_levels(phase: Tensor, lut: Tensor) -> Tensor:
         lut: Phases of the levels, float64 [L] in rad, over any range. If they cover less than 2 pi, a phase outside
             their range gives the nearer end. Of several levels with the same phase modulo 2 pi, any may be returned.
     """
-    circle, order = torch.sort(torch.remainder(lut, math.tau))
+    circle, order = torch.sort(torch.remainder(lut.detach(), math.tau))
     circle = torch.cat([circle[-1:] - math.tau, circle, circle[:1] + math.tau])
     order = torch.cat([order[-1:], order, order[:1]])
     borders = ((circle[1:] + circle[:-1]) / 2).to(phase.device)
@@ -46,8 +48,10 @@ def nearest_levels(phase: Tensor, lut: Tensor) -> Tensor:
 def snapped(phase: Tensor, lut: Tensor) -> Tensor:
     """Phase from ``lut`` [L] of the level by :func:`nearest_levels`, in the shape and dtype of ``phase``.
 
-    The gradient is that of the identity (straight-through estimator).
+    The gradient with respect to ``phase`` is that of the identity (straight-through estimator); with respect to
+    ``lut`` it is that of the levels shown. Phases in half precision, which cannot hold one, give float32.
     """
+    phase = at_least_single(phase)
     shown = lut.to(phase.device)[nearest_levels(phase, lut)].to(phase.dtype)
     return shown + (phase - phase.detach())  # the second term is exactly zero and carries the gradient
 
@@ -63,7 +67,7 @@ def quantisation_rms(lut: Tensor) -> float:
     return math.sqrt((gaps**3).sum().item() / (12 * math.tau))
 
 
-class PhaseModulator(nn.Module):
+class PhaseModulator(PreciseModule):
     """Emitted field of one panel, complex [..., C, H, W], for a wanted phase, real [..., C, H, W] in rad.
 
     The phase is rounded to that of the nearest grey level (:func:`snapped`), smoothed by the fringing fields between
@@ -81,16 +85,18 @@ class PhaseModulator(nn.Module):
         bits: Bits of a grey level, 1 to 16.
         full_turn: Level at which the phase is 2 pi, see :func:`even_lut`.
         lut: Phase in rad of every level, real [2^bits] or [C, 2^bits], strictly rising or falling; excludes
-            ``full_turn``.
+            ``full_turn``. An ``nn.Parameter`` is learned: the emitted field then depends on the phases of the levels
+            shown, while the choice of levels has no derivative. It is in ``state_dict`` in any case.
         fill_factor: Share of the area that is modulated, above 0 and at most 1.
         gap: Amplitude reflected by the gaps, 0 (dark) to 1, with phase 0.
         flip_rows: Whether the panel shows the last row of a frame at its top; affects only :meth:`levels` and
             :meth:`phase`. For an even size, the flip moves the optical axis, at pixel n // 2, by one pixel.
         flip_columns: The same for columns.
-        crosstalk: Fringing kernel: the standard deviation in pixels of a Gaussian, or a measured kernel [h, w], see
-            :meth:`ThermalCrosstalk.from_patch`.
+        crosstalk: Fringing kernel: the standard deviation in pixels of a Gaussian, a measured kernel [h, w], see
+            :meth:`ThermalCrosstalk.from_patch`, or a ``ThermalCrosstalk``, which may learn.
         birefringence: Birefringence of the crystal, see :func:`holotorch.modulator.dispersion.phase_scale`. With None
             the phase is the same for every wavelength, as in the thesis's simulation.
+        learnable: Make the table a Parameter, ``lut``.
 
     Raises:
         TypeError: A wrong kind of number or tensor.
@@ -111,30 +117,35 @@ class PhaseModulator(nn.Module):
         gap: float = 0.0,
         flip_rows: bool = False,
         flip_columns: bool = False,
-        crosstalk: float | Tensor = 0.0,
+        crosstalk: float | Tensor | ThermalCrosstalk = 0.0,
         birefringence: Birefringence | None = None,
+        learnable: bool = False,
     ):
         super().__init__()
         self.grid, self.wavelengths, self.bits = grid, checks.wavelengths(wavelengths), checked_bits(bits)
         if lut is not None and full_turn is not None:
             raise ValueError("give lut or full_turn, not both: the table says how far the levels reach")
+        without_graph("lut", lut)
         table = even_lut(bits, full_turn) if lut is None else checked_lut(lut, self.bits)
         if table.ndim == 2 and len(table) != len(self.wavelengths):
             raise ValueError(f"lut must have one row for each of {len(self.wavelengths)} wavelengths, got {len(table)}")
-        self.register_buffer("lut", table.expand(len(self.wavelengths), -1).contiguous(), persistent=False)
+        rows = table.expand(len(self.wavelengths), -1).contiguous()
+        self.record("lut", lut if isinstance(lut, nn.Parameter) else rows, learnable=learnable)
         self.fill_factor, self.gap = _fraction("fill_factor", fill_factor), _fraction("gap", gap, allow_zero=True)
         self.flips = tuple(axis for axis, flipped in ((-2, flip_rows), (-1, flip_columns)) if flipped)
         self.crosstalk, self.birefringence = None, birefringence
-        if isinstance(crosstalk, Tensor) and crosstalk.ndim > 0:
+        if isinstance(crosstalk, ThermalCrosstalk):
+            self.crosstalk = crosstalk
+        elif isinstance(crosstalk, Tensor) and crosstalk.ndim > 0:
             self.crosstalk = ThermalCrosstalk.from_patch(crosstalk)
-        elif width := checks.finite("crosstalk", float(crosstalk), "pixels"):
+        elif width := checks.finite("crosstalk", crosstalk, "pixels"):  # type: ignore[arg-type]
             # A Gaussian of standard deviation s, exp(-d^2 / (2 s^2)), is exp(-d^2 / sigma^2) with sigma = sqrt(2) s.
             self.crosstalk = ThermalCrosstalk(math.sqrt(2) * width)
 
     @property
     def expected_rms(self) -> tuple[float, ...]:
         """Expected rms error in rad of the quantised phase, one per channel, see :func:`quantisation_rms`."""
-        return tuple(quantisation_rms(row) for row in self.lut)
+        return tuple(quantisation_rms(row) for row in self._rows().detach())
 
     def forward(self, phase: Tensor, light: float | Sequence[float] | Tensor | None = None) -> Tensor:
         """Emitted field [..., C, H, W] for a wanted phase [..., C, H, W].
@@ -147,7 +158,7 @@ class PhaseModulator(nn.Module):
     def shown(self, phase: Tensor) -> Tensor:
         """Phase [..., C, H, W] of the levels nearest to a wanted phase, see :func:`snapped`."""
         self._check(phase)
-        rows = [snapped(phase[..., c, :, :], row) for c, row in enumerate(self.lut)]
+        rows = [snapped(phase[..., c, :, :], row) for c, row in enumerate(self._rows())]
         return torch.stack(rows, -3)
 
     def emitted(self, shown: Tensor, light: float | Sequence[float] | Tensor | None = None) -> Tensor:
@@ -170,7 +181,7 @@ class PhaseModulator(nn.Module):
         """Frames of the nearest levels, uint8 (uint16 above 8 bits) [..., C, H, W], with the flips of the panel."""
         self._check(phase)
         checks.all_finite("phase", phase.detach())
-        rows = [nearest_levels(phase[..., c, :, :], row) for c, row in enumerate(self.lut)]
+        rows = [nearest_levels(phase[..., c, :, :], row) for c, row in enumerate(self._rows())]
         return torch.stack(rows, -3).flip(self.flips).to(torch.uint8 if self.bits <= 8 else torch.uint16)
 
     def phase(self, levels: Tensor) -> Tensor:
@@ -186,12 +197,12 @@ class PhaseModulator(nn.Module):
                 f"levels must lie between 0 and {2**self.bits - 1} for {self.bits} bits, got {int(index.min())} to "
                 f"{int(index.max())}"
             )
-        lut = self.lut.to(index.device)
+        lut = self._rows().to(index.device)
         return torch.stack([row[index[..., c, :, :]] for c, row in enumerate(lut)], -3).flip(self.flips)
 
     def lut_hash(self, channel: int = 0) -> str:
         """First 16 hexadecimal digits of the SHA-256 of a channel's table, float64 little-endian."""
-        data = self.lut[channel].cpu().contiguous().numpy().astype("<f8").tobytes()
+        data = self._rows()[channel].detach().cpu().contiguous().numpy().astype("<f8").tobytes()
         return hashlib.sha256(data).hexdigest()[:16]
 
     def extra_repr(self) -> str:
@@ -201,14 +212,15 @@ class PhaseModulator(nn.Module):
     def _check(self, phase: Tensor) -> None:
         checks.field("phase", phase, (len(self.wavelengths), *self.grid.shape), complex_valued=False)
 
-    def _apply(self, fn, recurse=True):
-        # The tables stay float64 when the module is cast, since float16 has fewer digits than a panel of 16 bits.
-        return super()._apply(lambda tensor: tensor.to(fn(tensor).device), recurse)
+    def _rows(self) -> Tensor:
+        """The table with one row for each channel, [C, 2^bits]."""
+        return self.lut.expand(len(self.wavelengths), -1)
 
 
 def checked_lut(lut: Tensor, bits: int) -> Tensor:
     """``lut`` of [2^bits] or [C, 2^bits] phases as float64; ValueError for another size, NaN or no monotone table."""
     checks.real("lut", lut)
+    lut = lut.detach()
     checks.all_finite("lut", lut)
     if lut.ndim not in (1, 2) or lut.shape[-1] != 2 ** checked_bits(bits):
         raise ValueError(f"lut must hold {2**bits} phases for {bits} bits, one per level, got {tuple(lut.shape)}")
@@ -222,7 +234,7 @@ def checked_lut(lut: Tensor, bits: int) -> Tensor:
                 f"{row[at].item():g} rad against the rest ({len(wrong)} such steps); smooth the measurement, as "
                 "patterns.fit_lut does"
             )
-    return lut.detach().double()
+    return lut.double()
 
 
 def level_of(phase: Tensor, lut: Tensor) -> Tensor:

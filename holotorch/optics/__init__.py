@@ -18,6 +18,7 @@ from holotorch.optics.free_space.resampled import ResampledKernel
 from holotorch.optics.free_space.zoomed import ZoomedFilter
 from holotorch.optics.light.incoherent import disc_source, incoherent_sum, tilted_wave
 from holotorch.optics.light.spectral import spectral_image
+from holotorch.optics.light.spectral_retina import SpectralRetina
 from holotorch.optics.light.spectrum import Spectrum
 from holotorch.optics.picture import equal_power, gamut_map, linear_srgb, tone_map
 from holotorch.optics.planning.plan import plan_propagation
@@ -27,7 +28,9 @@ from holotorch.optics.viewing.display_geometry import placement, planar_fov
 from holotorch.optics.viewing.elementwise import propagate_elements
 from holotorch.optics.viewing.eye import Eye, EyeLens
 from holotorch.optics.viewing.imaging import propagate_collapsed
+from holotorch.optics.viewing.pupil_views import PupilViews, View
 from holotorch.optics.viewing.retina import Retina, plan_retina, retinal_image
+from holotorch.optics.viewing.retina_views import RetinaViews
 
 __all__ = [
     "AngularSpectrum",
@@ -44,11 +47,15 @@ __all__ = [
     "OpticalPath",
     "PixelShape",
     "Propagator",
+    "PupilViews",
     "RayleighSommerfeld",
     "ResampledKernel",
     "Retina",
+    "RetinaViews",
     "SpectralFilter",
+    "SpectralRetina",
     "Spectrum",
+    "View",
     "ZoomedFilter",
     "diffraction_angle",
     "disc_source",

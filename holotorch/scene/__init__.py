@@ -1,8 +1,8 @@
 """Volumes, their direct volume rendering into light sources or pictures, and analytic test volumes."""
 
-from holotorch.scene.adaptive import adaptive_report, render_adaptively
-from holotorch.scene.layers import SourceLayers
-from holotorch.scene.lighting import Lighting
+from holotorch.scene.adaptive import adaptive_report, render_adaptively, sample_adaptively
+from holotorch.scene.layers import SlabLayers, SourceLayers
+from holotorch.scene.lighting import Lighting, Scattering
 from holotorch.scene.phantoms import (
     c60,
     c60_atoms,
@@ -22,6 +22,8 @@ __all__ = [
     "DVRSampler",
     "Lighting",
     "PointPhases",
+    "Scattering",
+    "SlabLayers",
     "SourceLayers",
     "TransferFunction",
     "Volume",
@@ -37,6 +39,7 @@ __all__ = [
     "point_phases",
     "random_phase",
     "render_adaptively",
+    "sample_adaptively",
     "shells",
     "smooth_phase",
     "soft_tissue",

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from holotorch.core import checks
+from holotorch.scene.layers import SourceLayers
 from holotorch.scene.reading import interpolate
 from holotorch.scene.sampler import DVRSampler
 from holotorch.scene.volume import Volume
@@ -59,22 +60,28 @@ def render_adaptively(sampler: DVRSampler, volume: Volume, *, step: int = 4, con
     interpolated linearly, so details between the corners are missed. The picture is differentiable, the choice of rays
     is not. ValueError for a ``step`` below 1 or a ``contrast`` below 0.
     """
-    step = checks.whole("step", step, 1)
-    checks.nonnegative("contrast", contrast)
-    shape = sampler.grid.shape
-    device = volume.values.device
-    rows, columns = (_lattice(size, step, device) for size in shape)
-    coarse = torch.zeros(shape, dtype=torch.bool, device=device)
-    coarse[rows[:, None], columns] = True
-    first = torch.cat([part.reshape(-1, *shape) for part in sampler.render(volume, coarse)])
-    corners = first[:, rows[:, None], columns]
-    refined = _refined(corners.detach(), contrast)
-    down, across = (_cells(lattice, size) for lattice, size in zip((rows, columns), shape, strict=True))
-    fine = refined[down[0]][:, across[0]] & ~coarse
-    second = torch.cat([part.reshape(-1, *shape) for part in sampler.render(volume, fine)])
-    filled = interpolate(interpolate(corners, *across, -1), *down, -2)
-    picture = torch.where(coarse, first, torch.where(fine, second, filled))
-    return AdaptivePicture(picture[:3], picture[3], coarse | fine)
+    lattice = _Lattice(sampler.grid.shape, step, contrast, volume.values.device)
+    first = torch.cat([part.reshape(-1, *sampler.grid.shape) for part in sampler.render(volume, lattice.coarse)])
+    fine = lattice.fine(first)
+    second = torch.cat([part.reshape(-1, *sampler.grid.shape) for part in sampler.render(volume, fine)])
+    picture = torch.where(fine, second, lattice.filled(first))
+    return AdaptivePicture(picture[:3], picture[3], lattice.coarse | fine)
+
+
+def sample_adaptively(
+    sampler: DVRSampler, volume: Volume, *, step: int = 4, contrast: float = 0.05
+) -> tuple[SourceLayers, Tensor]:
+    """Light sources of ``volume`` for a hologram, from the rays of :func:`render_adaptively`, which are bool [h, w].
+
+    On every plane, the radiance between the rays is interpolated linearly, so the light of all planes together is
+    that of the adaptive picture. ValueError also for a sampler with an ``eye``.
+    """
+    lattice = _Lattice(sampler.grid.shape, step, contrast, volume.values.device)
+    with torch.no_grad():
+        first = torch.cat([part.reshape(-1, *sampler.grid.shape) for part in sampler.render(volume, lattice.coarse)])
+        fine = lattice.fine(first)
+    followed = lattice.coarse | fine
+    return sampler(volume, followed, lambda radiance: torch.where(fine, radiance, lattice.filled(radiance))), followed
 
 
 @torch.no_grad()
@@ -85,6 +92,32 @@ def adaptive_report(sampler: DVRSampler, volume: Volume, *, step: int = 4, contr
     difference, norm = adaptive.image - whole, whole.norm().item()
     error = difference.norm().item() / norm if norm else 0.0
     return AdaptiveReport(adaptive.share, error, difference.abs().max().item())
+
+
+class _Lattice:
+    """The coarse rays, the cells between them, and interpolation from the ones to the others."""
+
+    def __init__(self, shape: tuple[int, int], step: int, contrast: float, device: torch.device):
+        step = checks.whole("step", step, 1)
+        self.contrast = checks.nonnegative("contrast", contrast)
+        self.rows, self.columns = (_lattice(size, step, device) for size in shape)
+        self.coarse = torch.zeros(shape, dtype=torch.bool, device=device)
+        self.coarse[self.rows[:, None], self.columns] = True
+        self.down, self.across = (
+            _cells(lattice, size) for lattice, size in zip((self.rows, self.columns), shape, strict=True)
+        )
+
+    def fine(self, picture: Tensor) -> Tensor:
+        """Rays to follow as well, bool [h, w], from the values [c, h, w] at the coarse ones."""
+        refined = _refined(self._corners(picture).detach(), self.contrast)
+        return refined[self.down[0]][:, self.across[0]] & ~self.coarse
+
+    def filled(self, values: Tensor) -> Tensor:
+        """Values [c, h, w] at the coarse rays, interpolated linearly between them."""
+        return interpolate(interpolate(self._corners(values), *self.across, -1), *self.down, -2)
+
+    def _corners(self, values: Tensor) -> Tensor:
+        return values[:, self.rows[:, None], self.columns]
 
 
 def _lattice(size: int, step: int, device: torch.device) -> Tensor:

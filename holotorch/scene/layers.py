@@ -1,5 +1,6 @@
-"""SourceLayers: point sources of light on planes, the interface between a scene and a hologram."""
+"""SourceLayers, point sources of light on planes, the interface between scene and hologram; SlabLayers before them."""
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -8,8 +9,9 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.complex import phasor
-from holotorch.core.grid import Grid
+from holotorch.core.grid import Grid, Pair
 from holotorch.core.quantities import DEPTH
+from holotorch.scene.lighting import shifted
 
 
 @dataclass(eq=False)
@@ -74,3 +76,58 @@ class SourceLayers:
     def stack(self) -> Tensor:
         """All planes at once, complex [D, C, h, w]."""
         return torch.stack(list(self.planes()))
+
+
+@dataclass(eq=False)
+class SlabLayers:
+    """Slabs of a volume before compositing, each on its plane: what they hide from each other depends on the direction.
+
+    Slabs are as thin as their planes here. Seen obliquely, a slab in front moves as a whole against one behind it, and
+    uncovers what it hides along the axis. The opacity of a slab, and its shading, are those along the axis.
+
+    Attributes:
+        grid: Positions of the sources, the same on every plane, centred on the axis; pitch in metres.
+        depths: Distances of the planes from the hologram in metres, > 0, rising or falling; the first plane is nearest
+            to the observer.
+        emission: Radiance of each slab without the others, opacity times colour, [D, C, h, w].
+        opacity: Fraction of the light from behind that each slab absorbs, 0 to 1, [D, h, w].
+
+    Raises ValueError for depths that are not above 0 and monotonic, or tensors of other shapes.
+    """
+
+    grid: Grid
+    depths: tuple[float, ...]
+    emission: Tensor
+    opacity: Tensor
+
+    def __post_init__(self) -> None:
+        self.depths = tuple(checks.quantity(DEPTH, depth, "depth of a slab") for depth in self.depths)
+        if list(self.depths) not in (sorted(set(self.depths)), sorted(set(self.depths), reverse=True)):
+            raise ValueError(f"depths must rise or fall throughout, front to back, got {self.depths}")
+        expected = len(self.depths), *self.grid.shape
+        given = tuple(self.emission.shape), tuple(self.opacity.shape)
+        if self.emission.ndim != 4 or (given[0][0], *given[0][2:]) != expected or given[1] != expected:
+            raise ValueError(f"emission and opacity must be [D, C, h, w] and [D, h, w] = {expected}, got {given}")
+
+    def towards(self, direction: Pair) -> Tensor:
+        """Radiance of the planes towards ``direction``, the sines (y, x) of light that arrives at the hologram.
+
+        C_j = emission_j prod_i (1 - opacity_i), over the slabs i in front of j where the ray from the source crosses
+        them, interpolated linearly; [D, C, h, w]. The direction (0, 0) gives the light of ``DVRSampler``.
+
+        Raises ValueError for sines of no direction.
+        """
+        sines = checks.pair("direction", direction, "sines")
+        if math.hypot(*sines) >= 1:
+            raise ValueError(f"direction must be the sines (y, x) of an angle, within the unit circle, got {direction}")
+        cosine = math.sqrt(1 - sines[0] ** 2 - sines[1] ** 2)
+        light = []
+        for j, emission in enumerate(self.emission):
+            transmittance = torch.ones_like(self.opacity[0])
+            for i in range(j):
+                # Towards the hologram, at smaller depths, light moves along the direction.
+                y, x = ((self.depths[j] - self.depths[i]) * sine / cosine for sine in sines)
+                moved = shifted(self.opacity[i], (y / self.grid.pitch[0], x / self.grid.pitch[1]))
+                transmittance = transmittance * (1 - moved)
+            light.append(emission * transmittance)
+        return torch.stack(light)

@@ -1,7 +1,7 @@
 """Ray marching: front-to-back compositing of a volume along all rays, one slab of the volume per plane of sources."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from holotorch.scene.compositing import absorb, corrected_opacity, safe_sqrt
-from holotorch.scene.lighting import Lighting, flat_steps, slice_slopes, slopes
+from holotorch.scene.lighting import Lighting, Scattering, flat_steps, slice_slopes, slopes
 from holotorch.scene.placement import Placement, Rays
 from holotorch.scene.reading import BRICK, PointReader, SliceReader, Window, interpolate, occupied_box
 from holotorch.scene.transfer import TransferFunction
@@ -38,7 +38,7 @@ class March:
     volume: Volume  # scalar field
     place: Placement  # position, size and rotation of the volume
     transfer: TransferFunction  # colour and opacity of a value
-    lighting: Lighting | None  # shading; None for emission without shading
+    lighting: Lighting | Scattering | None  # shading; None for emission without shading
     rays: Rays  # geometry of the rays
     depths: Sequence[float]  # depths of the planes in metres, front to back
     spans: Sequence[tuple[float, float]]  # smallest and largest depth in metres of the slab of each plane
@@ -90,16 +90,23 @@ class March:
             transmittance.index_copy_(0, sampled.rays, after)
             yield Step(plane, sampled.rays, weight, colour)
 
-    def amplitudes(self) -> Iterator[Tensor]:
-        """Yield the square root of the radiance, [3, h, w], for every plane."""
+    def amplitudes(
+        self, wanted: Tensor | None = None, fill: Callable[[Tensor], Tensor] | None = None
+    ) -> Iterator[Tensor]:
+        """Yield the square root of the radiance, [3, h, w], for every plane.
+
+        ``wanted`` as in :meth:`steps`; ``fill`` completes the radiance of a plane, for rays parallel to the axis.
+        """
         # One zero, expanded to the shape of a plane without allocating it.
         dark = torch.zeros((), dtype=self.dtype, device=self.device).expand(3, *self.rays.grid.shape)
         done = 0
-        for step in self.steps():
+        for step in self.steps(wanted):
             yield from [dark] * (step.plane - done)
             done = step.plane + 1
             scale, radiance = self.rays.scale(self.depths[step.plane]), step.weight * step.colour
-            if scale == 1:
+            if fill is not None:
+                yield safe_sqrt(fill(self.whole(self.zeros(3).index_copy_(1, step.rays, radiance))))
+            elif scale == 1:
                 yield self.whole(self.zeros(3).index_copy_(1, step.rays, safe_sqrt(radiance)))
             else:
                 yield safe_sqrt(self._resampled(self.zeros(3).index_copy_(1, step.rays, radiance), scale))
@@ -118,19 +125,25 @@ class March:
         return functional.pad(framed, (columns.start, width - columns.stop, rows.start, height - rows.stop))
 
     def _reader(self) -> SliceReader | PointReader:
-        """Reader whose first channel is the value; with lighting, three more channels are the slopes."""
+        """Reader whose first channel is the value; lighting adds three slopes, scattering its illumination."""
         support = (-math.inf, math.inf) if self.learned else self.transfer.support()
         common = (self.place, self.rays, self.window, self.occupied, support)
-        steps = flat_steps(self.volume) if self.lighting is not None else None
+        values, light = self.volume.values, None
+        steps = flat_steps(self.volume) if isinstance(self.lighting, Lighting) else None
+        if isinstance(self.lighting, Scattering):
+            light = self.lighting.illumination(self.volume, self.place, self.transfer, self.observer).to(self.dtype)
         if self.place.turned:
-            values = self.volume.values.to(self.dtype)[None]
-            return PointReader(*common, values if steps is None else torch.cat([values, slopes(values[0], steps)]))
+            extra = [] if steps is None else [slopes(values.to(self.dtype), steps)]
+            extra += [] if light is None else [light[None]]
+            return PointReader(*common, torch.cat([values.to(self.dtype)[None], *extra]))
         # Backward, unbind allocates one gradient for all slices; indexing would allocate a whole volume per slice.
-        slices = self.volume.values.unbind(0)
+        slices, lit = values.unbind(0), None if light is None else light.unbind(0)
 
         def channels(k: int) -> Tensor:
-            values = slices[k].to(self.dtype)[None]
-            return values if steps is None else torch.cat([values, slice_slopes(slices, k, steps, self.dtype)])
+            here = [slices[k].to(self.dtype)[None]]
+            if steps is not None:
+                here.append(slice_slopes(slices, k, steps, self.dtype))
+            return torch.cat(here if lit is None else [*here, lit[k][None]])
 
         return SliceReader(*common, channels)
 

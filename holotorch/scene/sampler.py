@@ -2,6 +2,8 @@
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -10,8 +12,8 @@ from holotorch.core import checks
 from holotorch.core.complex import phasor
 from holotorch.core.grid import Grid
 from holotorch.core.quantities import DEPTH, WIDTH
-from holotorch.scene.layers import SourceLayers
-from holotorch.scene.lighting import Lighting
+from holotorch.scene.layers import SlabLayers, SourceLayers
+from holotorch.scene.lighting import Lighting, Scattering
 from holotorch.scene.march import March
 from holotorch.scene.phases import PointPhases
 from holotorch.scene.placement import Placement, Rays, check_planes, check_rotation, slabs, upright
@@ -53,7 +55,7 @@ class DVRSampler(nn.Module):
             @ offset in the volume. By default slice 0 of the volume is nearest to the hologram.
         eye: Depth of the observer in metres, in front of all slabs; negative if the hologram is between observer and
             volume. None for an observer at infinity.
-        lighting: Shading by the gradient of the volume; None for emission without shading.
+        lighting: Shading by the gradient of the volume, or light that it scatters; None for emission without shading.
         phase: Function from the grid to phases in radians: [h, w] for use on all planes, or ``PointPhases``; see
             ``holotorch.scene.phases``. None for a phase of 0.
         early: Transmittance below which a ray ends, in [0, 1).
@@ -77,7 +79,7 @@ class DVRSampler(nn.Module):
         distance: float | None = None,
         rotation: Tensor | None = None,
         eye: float | None = None,
-        lighting: Lighting | None = None,
+        lighting: Lighting | Scattering | None = None,
         phase: Callable[[Grid], PhaseMaps] | None = None,
         early: float = 1e-3,
         boundaries: Sequence[float] | None = None,
@@ -94,21 +96,29 @@ class DVRSampler(nn.Module):
             raise ValueError(f"early must be a transmittance in [0, 1), 0 to follow all rays, got {early}")
         self.early = float(early)
 
-    def forward(self, volume: Volume) -> SourceLayers:
+    def forward(
+        self, volume: Volume, rays: Tensor | None = None, fill: Callable[[Tensor], Tensor] | None = None
+    ) -> SourceLayers:
         """Light sources of ``volume``; the planes are composited one by one as the result is iterated.
 
+        ``rays``, bool [h, w], selects the rays to compute, by default all. The others have no sources unless ``fill``
+        adds them: a function from the radiance of a plane [3, h, w], 0 where no ray was computed, to that of all rays.
+
         Raises:
-            ValueError: A voxel is NaN or infinite, or the eye is not in front of the slabs.
+            ValueError: A voxel is NaN or infinite, the eye is not in front of the slabs, or ``fill`` and ``eye`` are
+                both given.
         """
+        if fill is not None and self.eye is not None:
+            raise ValueError("fill needs rays through the points of the grid on every plane, eye=None")
         march = self._march(volume)
         phase = self.phase(self.grid) if self.phase is not None else None
         if not isinstance(phase, PointPhases):
             common = phase if phase is None else phase.to(march.device, march.dtype)
-            return SourceLayers(self.grid, self.depths, 3, march.amplitudes, common)
+            return SourceLayers(self.grid, self.depths, 3, partial(march.amplitudes, rays, fill), common)
         factors = phasor(phase.phase.to(march.device, march.dtype))
 
         def amplitudes() -> Iterator[Tensor]:
-            for plane, amplitude in enumerate(march.amplitudes()):
+            for plane, amplitude in enumerate(march.amplitudes(rays, fill)):
                 yield _with_phase(amplitude, phase.window(factors, plane))
 
         return SourceLayers(self.grid, self.depths, 3, amplitudes)
@@ -124,6 +134,25 @@ class DVRSampler(nn.Module):
             image.index_add_(1, step.rays, step.weight * step.colour)
             opacity.index_add_(1, step.rays, step.weight[None])
         return march.whole(image), march.whole(opacity)[0]
+
+    def slab_layers(self, volume: Volume) -> SlabLayers:
+        """Colours and opacities of the slabs on their own, for light towards any direction; without phases.
+
+        ValueError for an ``eye``, since the light of a slab is known along parallel rays only.
+        """
+        if self.eye is not None:
+            raise ValueError(f"slab_layers needs rays parallel to the axis, eye=None, got an eye at {self.eye:g} m")
+        march = self._march(volume)
+        emission, opacity = [], []
+        for depth, span in zip(march.depths, march.spans, strict=True):
+            alone = replace(march, depths=[depth], spans=[span])
+            sums = alone.zeros(4)
+            for step in alone.steps():
+                sums.index_add_(1, step.rays, torch.cat([step.weight * step.colour, step.weight[None]]))
+            whole = alone.whole(sums)
+            emission.append(whole[:3])
+            opacity.append(whole[3])
+        return SlabLayers(self.grid, self.depths, torch.stack(emission), torch.stack(opacity))
 
     def depth_map(self, volume: Volume) -> Tensor:
         """Mean plane depth along each ray in metres, [h, w], weighted by T_j alpha_j; 0 where all is transparent."""

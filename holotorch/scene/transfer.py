@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from holotorch.core import checks
+from holotorch.core.learning import fixed
 
 Numbers = Tensor | Sequence[float]
 
@@ -123,6 +124,7 @@ def _table(name: str, values: Numbers | Sequence[Sequence[float]]) -> Tensor:
         raise TypeError(f"{name} must be numbers, got {values!r}: {error}") from None
     if table.is_complex() or table.dtype == torch.bool:
         raise TypeError(f"{name} must be real numbers, got {table.dtype}")
+    fixed(name, values, "transfer.requires_grad_() makes colours and opacities learnable")
     table = table if table.dtype == torch.float64 else table.to(torch.float32)
     checks.all_finite(name, table)
     return table.detach().clone()

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import torch
 from oracles import dense, pec
+from torch import nn
 
 from holotorch import Grid, correction
 from holotorch.correction import APG, LBFGS, PECProblem, ProjectedAdam, proximal_pec
-from holotorch.modulator import ThermalCrosstalk
+from holotorch.modulator import HeatCycle, ThermalCrosstalk
 from holotorch.optics import Fraunhofer
 
 GRID, WAVELENGTHS = Grid((6, 7), 9e-6), (630e-9, 530e-9)
@@ -98,3 +99,49 @@ def test_old_names_still_work_and_warn(old, new):
         assert getattr(correction, old) is getattr(correction, new)
     with pytest.raises(AttributeError, match="has no attribute 'belows'"):
         _ = correction.belows
+
+
+def test_the_laser_weights_the_frames_and_can_be_learned():
+    problem, phase = setting(3)
+    powers = torch.rand(3, 2, dtype=torch.float64) + 0.5
+    images = torch.stack([problem.intensity(each[None]) for each in phase])
+    weighted = PECProblem(problem.crosstalk, problem.propagator, problem.target, frames=True, laser=powers)
+    wanted = (powers[..., None, None] * images).mean(0)
+    torch.testing.assert_close(weighted.intensity(phase), wanted, rtol=1e-12, atol=0)
+    laser = nn.Parameter(torch.ones(3, 2))
+    learned = PECProblem(problem.crosstalk, problem.propagator, wanted, frames=True, laser=laser)
+    optimiser = torch.optim.Adam([laser], lr=0.05)
+    for _ in range(400):
+        optimiser.zero_grad()
+        learned(phase).sum().backward()
+        optimiser.step()
+    torch.testing.assert_close(laser.detach().double(), powers, rtol=0, atol=2e-2)
+
+
+def test_a_laser_shines_at_every_moment_of_its_frame():
+    problem, phase = setting(3)
+    powers = torch.rand(3, 2, dtype=torch.float64)
+    cycle = HeatCycle(
+        ThermalCrosstalk(0.8, 5), 1.0, 1e-3, moments=(0.5, 1.0)
+    )  # nothing is left, so both moments are equal
+    one, two = (
+        PECProblem(heat, problem.propagator, problem.target, frames=True, laser=powers).intensity(phase)
+        for heat in (problem.crosstalk, cycle)
+    )
+    torch.testing.assert_close(one, two, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("laser", [torch.ones(3), -torch.ones(3, 2), torch.ones(3, 2, requires_grad=True)])
+def test_wrong_powers_are_refused(laser):
+    problem, _ = setting(3)
+    with pytest.raises(ValueError, match="laser"):
+        PECProblem(problem.crosstalk, problem.propagator, problem.target, frames=True, laser=laser)
+
+
+def test_powers_of_other_frames_are_refused():
+    problem, phase = setting(3)
+    two = PECProblem(problem.crosstalk, problem.propagator, problem.target, frames=True, laser=torch.ones(2, 2))
+    with pytest.raises(ValueError, match="frames of laser, 2, got 3"):
+        two(phase)
+    with pytest.raises(ValueError, match="with frames=False"):
+        PECProblem(problem.crosstalk, problem.propagator, problem.target, laser=torch.ones(2, 2))

@@ -20,7 +20,7 @@ from holotorch.correction import (
     spread_preconditioner,
 )
 from holotorch.modulator import ThermalCrosstalk
-from holotorch.optics import DepthStack, Fraunhofer, Fresnel
+from holotorch.optics import DepthStack, Fraunhofer, Fresnel, PupilViews, View
 
 GRID, WAVES = Grid((6, 7), (5e-6, 4e-6)), (630e-9, 530e-9)
 DISTANCES = (0.1e-3, 0.25e-3)
@@ -149,8 +149,8 @@ def test_a_target_of_several_depths_needs_an_image_of_them():
     stack = DepthStack([Fresnel(GRID, WAVES, z, pad=1) for z in DISTANCES])
     with pytest.raises(ValueError, match=r"give an image that ends in \(C, \*image\) = \(2, 3, 6, 7\)"):
         PECProblem(CROSSTALK, stack, torch.ones(2, 3, 6, 7))(torch.rand(2, 6, 7))
-    with pytest.raises(ValueError, match=r"end in \(C, H, W\) = \(2, 6, 5\)"):
-        PECProblem(CROSSTALK, stack, torch.ones(2, 6, 5))(torch.rand(2, 6, 7))
+    with pytest.raises(ValueError, match=r"target must have axes \(..., C, D, H, W\), got \(2, 6, 5\)"):
+        PECProblem(CROSSTALK, stack, torch.ones(2, 6, 5))
 
 
 @pytest.mark.parametrize("sigma", [0.33, 0.66, 1.0, 2.0, 5.0])
@@ -206,3 +206,73 @@ def test_solvers_keep_to_a_box_of_tensors(solver):
     box = Box(lower, upper)
     solution = solver(lambda x: (x - wanted).square().sum((-2, -1)), torch.zeros_like(wanted), box)
     torch.testing.assert_close(solution.x, box(wanted), rtol=0, atol=1e-6)
+
+
+def test_targets_in_a_batch_and_in_the_call():
+    propagator = Fraunhofer(GRID, WAVES)
+    targets = torch.rand(3, 2, *GRID.shape, dtype=torch.float64) + 0.1
+    phases = torch.rand(3, 2, *GRID.shape, dtype=torch.float64)
+    alone = torch.stack(
+        [PECProblem(CROSSTALK, propagator, t)(p) for t, p in zip(targets, phases, strict=True)]
+    )  # [3, 2]
+    torch.testing.assert_close(PECProblem(CROSSTALK, propagator, targets)(phases), alone)
+    late = PECProblem(CROSSTALK, propagator)
+    torch.testing.assert_close(late(phases, targets), alone)
+    # One target for all phases, and one phase for all targets.
+    torch.testing.assert_close(late(phases, targets[0])[0], alone[0])
+    torch.testing.assert_close(late(phases[0], targets)[0], alone[0])
+    frames = torch.rand(3, 4, 2, *GRID.shape, dtype=torch.float64)
+    shared = PECProblem(CROSSTALK, propagator, targets, frames=True)(frames)
+    single = PECProblem(CROSSTALK, propagator, targets[1], frames=True)(frames[1])
+    assert shared.shape == (3, 2)
+    torch.testing.assert_close(shared[1], single)
+    targets.requires_grad_()
+    assert torch.autograd.gradcheck(lambda t: late(phases, t), (targets,), fast_mode=True)
+
+
+def test_a_target_that_is_missing_or_does_not_fit_the_batch():
+    problem = PECProblem(CROSSTALK, Fraunhofer(GRID, WAVES))
+    phases = torch.rand(3, 2, *GRID.shape)
+    with pytest.raises(ValueError, match="target must be given, to PECProblem or in the call, got none"):
+        problem(phases)
+    with pytest.raises(ValueError, match=r"leading axes that broadcast, got \(3,\) and \(2,\)"):
+        problem(phases, torch.ones(2, 2, *GRID.shape))
+    with pytest.raises(ValueError, match=r"target must have axes \(..., C, \*image\), .* got \(6, 7\)"):
+        problem(phases, torch.ones(*GRID.shape))
+    with pytest.raises(ValueError, match=r"channel 1 of item \(2,\) is black"):
+        targets = torch.ones(3, 2, *GRID.shape)
+        targets[2, 1] = 0
+        PECProblem(CROSSTALK, Fraunhofer(GRID, WAVES), targets)
+    with pytest.raises(ValueError, match="target requires a gradient, .* give it in the call"):
+        PECProblem(CROSSTALK, Fraunhofer(GRID, WAVES), torch.ones(2, *GRID.shape, requires_grad=True))
+
+
+def test_smoothness_adds_the_squared_steps_between_neighbours():
+    crosstalk, propagator = ThermalCrosstalk(0.7, 5), Fraunhofer(Grid((5, 6), 9e-6), 530e-9)
+    target = torch.rand(1, 5, 6, dtype=torch.float64)
+    phase = torch.rand(2, 1, 5, 6, dtype=torch.float64)
+    plain, smooth = (PECProblem(crosstalk, propagator, target, smoothness_weight=weight)(phase) for weight in (0, 0.3))
+    steps = [
+        sum((x[i, j] - x[i - 1, j]) ** 2 for i in range(1, 5) for j in range(6))
+        + sum((x[i, j] - x[i, j - 1]) ** 2 for i in range(5) for j in range(1, 6))
+        for x in phase[:, 0]
+    ]
+    wanted = torch.tensor([float(step) for step in steps], dtype=torch.float64)
+    torch.testing.assert_close(smooth - plain, 0.3 * wanted[:, None], rtol=1e-10, atol=0)
+
+
+def test_a_real_result_of_the_propagator_is_an_intensity():
+    crosstalk, propagator = ThermalCrosstalk(0.7, 5), Fraunhofer(Grid((5, 6), 9e-6), 530e-9)
+    target, phase = torch.rand(1, 5, 6, dtype=torch.float64), torch.rand(1, 5, 6, dtype=torch.float64)
+    seen = PECProblem(crosstalk, lambda field: propagator(field).abs().square(), target)
+    torch.testing.assert_close(seen(phase), PECProblem(crosstalk, propagator, target)(phase))
+
+
+def test_light_that_misses_the_images_is_a_part_of_the_loss():
+    crosstalk, grid = ThermalCrosstalk(0.7, 5), Grid((5, 6), 9e-6)
+    views = PupilViews(grid, 530e-9, [View(1e-3, 0.02), View(2e-3, 0.01)])
+    target, phase = torch.rand(1, 2, 5, 6, dtype=torch.float64), torch.rand(3, 1, 5, 6, dtype=torch.float64)
+    plain, bright = (PECProblem(crosstalk, views, target, light_weight=weight) for weight in (0.0, 0.4))
+    missing = 1 - plain.intensity(phase).sum((-2, -1)).mean(-1) / 30
+    torch.testing.assert_close(bright(phase) - plain(phase), 0.4 * target.sum() * missing, rtol=1e-10, atol=0)
+    assert 0 < missing.min() < missing.max() < 1

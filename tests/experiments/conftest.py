@@ -14,7 +14,7 @@ def tiny():
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("comparison", "channel_maps", "convergence", "visual_field"):
+        for name in ("comparison", "channel_maps", "convergence", "picture_table", "visual_field"):
             patch.setattr(figures, name, lambda *_, **__: b"")
         yield
     torch.set_num_threads(threads)

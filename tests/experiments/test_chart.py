@@ -27,7 +27,10 @@ def test_a_small_chart_is_complete(tmp_path, monkeypatch, capsys):
 
 def test_unknown_subject(tmp_path, capsys):
     assert main(["chart", "propagatoin", "--out", str(tmp_path)]) == 2
-    assert "no chart of 'propagatoin'; known: eye, pec, propagation, tracking, volume" in capsys.readouterr().err
+    assert (
+        "no chart of 'propagatoin'; known: camera, chain, eye, joint, network, pec, propagation, tracking, volume"
+        in capsys.readouterr().err
+    )
 
 
 def test_contenders_take_turns():

@@ -12,6 +12,7 @@ from tiny_runs import command, results
 from holotorch.cli import main
 from holotorch.experiments.eye import experiment as eye
 from holotorch.experiments.eye import run as eye_run
+from holotorch.experiments.joint import run as joint_run
 from holotorch.experiments.pec.progress import Log
 from holotorch.experiments.pec_study import bench as pec_bench
 from holotorch.experiments.perception.analysis import run as perception_analysis_run
@@ -34,6 +35,10 @@ KINDS = {
     "eye": (
         ("eye.chromatic=true", "eye.chromatic was false and is true"),
         (eye.Observer, "image", 9, 1),
+    ),
+    "joint": (
+        ("eye.pupil=0.4", "eye.pupil was 0.5 and is 0.4"),
+        (joint_run.Log, "__call__", 3, 4),
     ),
     "study": (
         ("max_steps=5", "max_steps was 4 and is 5"),

@@ -44,6 +44,11 @@ KINDS: dict[str, list[tuple[str, dict[str, Any]]]] = {
         ("eye/focus.yaml", {"scene": {"config": "scene.yaml"}}),
         ("eye/tooth.yaml", {"scene": {"config": "scene.yaml"}, "display": {"kind": "planar", "distance": "30 mm"}}),
     ],
+    "joint": [
+        ("joint/teapot.yaml", {"volume": {"phantom": "shells", "samples": 16}}),
+        ("joint/bonsai.yaml", {"volume": {"phantom": "shells", "samples": 16}}),
+        ("joint/tooth.yaml", {"volume": {"phantom": "shells", "samples": 16}}),
+    ],
     "layout": [("perception/layout.yaml", {})],
     "analysis": [("perception/analysis.yaml", {})],
 }

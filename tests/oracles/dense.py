@@ -58,6 +58,17 @@ def angular_spectrum_transfer(shape, pitch, wavelength, distance, band_limit):
     return transfer
 
 
+def pupil(shape, pitch, wavelength, radius, centre, covered):
+    """1 for the frequencies whose sines lie within a disc about ``centre`` and not in its covered half, else 0."""
+    fy, fx = (frequencies(n, p) for n, p in zip(shape, pitch, strict=True))
+    values = np.zeros(shape)
+    for i, v in enumerate(fy):
+        for j, u in enumerate(fx):
+            y, x = wavelength * v - centre[0], wavelength * u - centre[1]
+            values[i, j] = np.hypot(y, x) <= radius and y * covered[0] + x * covered[1] <= 0
+    return values
+
+
 def fresnel_transfer(shape, pitch, wavelength, distance):
     """exp(ikz) exp(-i pi lambda z f^2)."""
     fy, fx = (frequencies(n, p) for n, p in zip(shape, pitch, strict=True))

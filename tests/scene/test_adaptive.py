@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from holotorch import Grid
-from holotorch.scene.adaptive import adaptive_report, render_adaptively
+from holotorch.scene.adaptive import adaptive_report, render_adaptively, sample_adaptively
+from holotorch.scene.phases import point_phases, random_phase
 from holotorch.scene.sampler import DVRSampler
 from holotorch.scene.transfer import TransferFunction
 from holotorch.scene.volume import Volume
@@ -84,3 +85,41 @@ def test_mistakes_are_named():
         render_adaptively(sampler(), ball(), step=0)
     with pytest.raises(ValueError, match="contrast must be at least zero"):
         render_adaptively(sampler(), ball(), contrast=-1.0)
+
+
+def test_sources_between_the_rays_have_the_light_of_the_adaptive_picture():
+    made = sampler()
+    layers, followed = sample_adaptively(made, ball(), contrast=0.4)
+    found = render_adaptively(made, ball(), contrast=0.4)
+    assert torch.equal(followed, found.followed) and 0.06 < followed.double().mean() < 0.6
+    light = torch.stack(list(layers.amplitudes())).square()
+    torch.testing.assert_close(light.sum(0), found.image, rtol=1e-10, atol=1e-12)
+    exact = torch.stack(list(made(ball()).amplitudes())).square()
+    torch.testing.assert_close(light[..., followed], exact[..., followed], rtol=1e-12, atol=1e-15)
+    assert 0.001 < (light - exact).norm() / exact.norm() < 0.2
+
+
+@pytest.mark.parametrize("phase", [random_phase, point_phases])
+def test_adaptive_sources_have_the_phases_of_the_sampler(phase):
+    parts = [[0.0, 0.3, 1.0], [[0.1, 0.2, 0.9], [0.5, 0.9, 0.1], [1.0, 0.3, 0.2]], [0.0, 0.0, 0.5]]
+    table = TransferFunction(*(torch.tensor(part).double() for part in parts), unit_distance=0.05)
+    made = DVRSampler(
+        table,
+        Grid((20, 21), 5e-5),
+        DEPTHS,
+        width=1e-3,
+        phase=lambda grid: phase(grid, generator=torch.Generator().manual_seed(3)),
+    )
+    whole, adaptive = made(ball()).stack(), sample_adaptively(made, ball(), contrast=0.02)[0].stack()
+    both = (whole.abs() > 1e-6) & (adaptive.abs() > 1e-6)
+    torch.testing.assert_close(adaptive[both].angle(), whole[both].angle(), rtol=0, atol=1e-6)
+
+
+def test_rays_that_are_left_out_have_no_sources_and_an_eye_is_refused():
+    made, rays = sampler((20, 21)), torch.zeros(20, 21, dtype=torch.bool)
+    rays[8:13] = True
+    light = made(ball(), rays).stack()
+    assert float(light[:, :, ~rays].abs().max()) == 0 < float(light.abs().max())
+    made.eye = 0.001
+    with pytest.raises(ValueError, match="eye=None"):
+        sample_adaptively(made, ball())

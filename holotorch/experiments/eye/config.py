@@ -53,12 +53,26 @@ class PlanarSettings(Settings):
     distance: Annotated[Positive, plausible(SPACING)] = 250e-3
 
 
+class SphericalSettings(Settings):
+    """A lens at the hologram, and the eye at its focal point (thesis Fig. 5.4): illumination by a spherical wave.
+
+    The lens moves the scene: a depth z, as under a plane wave, appears at f^2 / (f + z) in front of the eye.
+    """
+
+    kind: Literal["spherical"]
+    focal_length: Annotated[Positive, plausible(FOCAL_LENGTH)] = 150e-3
+
+
 class EyeSettings(Settings):
-    """The eye: radius of the pupil, distance from pupil to retina, and whether it has human chromatic aberration."""
+    """The eye: radius of the pupil, distance from pupil to retina, and whether it has human chromatic aberration.
+
+    ``position``: displacement (y, x) of the eye from the axis, for the perspective from there.
+    """
 
     pupil_radius: Annotated[Length, plausible(PUPIL_RADIUS)] = 1.5e-3
     axial_length: Annotated[Length, plausible(EYE_LENGTH)] = 24e-3
     chromatic: bool = False
+    position: Annotated[tuple[Length, Length], BeforeValidator(several)] = (0.0, 0.0)
 
 
 class LightSettings(Settings):
@@ -66,7 +80,8 @@ class LightSettings(Settings):
 
     ``tolerance``: allowed error from summing over a few wavelengths instead of the whole spectrum, relative to the rms
     intensity of a picture. ``extent``: sine of the half angle that each source, a disc, subtends at the hologram;
-    0 for a point source.
+    0 for a point source. ``dispersion``: the panel's phases depend on the wavelength, as those of a liquid crystal do.
+    With it, or with an eye beside the axis, every wavelength is propagated.
     """
 
     sources: Annotated[tuple[Source, ...], BeforeValidator(several), Field(min_length=1)] = (
@@ -77,6 +92,7 @@ class LightSettings(Settings):
     )
     tolerance: Annotated[Number, Field(gt=0, lt=1)] = 0.02
     extent: Annotated[Number, Field(ge=0, lt=0.1)] = 0.0
+    dispersion: bool = False
 
 
 class SweepSettings(Settings):
@@ -104,7 +120,7 @@ class ObserverSettings(Settings):
     experiment: Literal["eye"]
     seed: Annotated[int, BeforeValidator(number), Field(ge=0, lt=2**62)] = 0
     scene: SceneSettings
-    display: Annotated[MagnifyingSettings | PlanarSettings, Field(discriminator="kind")]
+    display: Annotated[MagnifyingSettings | PlanarSettings | SphericalSettings, Field(discriminator="kind")]
     eye: EyeSettings = EyeSettings()
     light: LightSettings = LightSettings()
     focus: Annotated[tuple[Annotated[Positive, plausible(DEPTH)], ...], BeforeValidator(several)] | None = None

@@ -9,12 +9,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from holotorch.core.grid import Pair
 from holotorch.experiments.config.errors import ConfigError
-from holotorch.experiments.eye.config import ObserverSettings, PlanarSettings
+from holotorch.experiments.eye.config import ObserverSettings, PlanarSettings, SphericalSettings
 from holotorch.experiments.volume.evaluation import pooled
 from holotorch.experiments.volume.experiment import VolumeExperiment, build
 from holotorch.metrics import sharpness, speckle_contrast, ssim
+from holotorch.modulator import phase_scale
 from holotorch.optics.light.coherence import optimum_fwhm, path_difference, predicted_contrast
+from holotorch.optics.light.displaced import displaced_eye, displacement
 from holotorch.optics.light.incoherent import disc_source, tilted_wave
 from holotorch.optics.light.spectral import spectral_image
 from holotorch.optics.light.spectrum import Spectrum
@@ -44,7 +47,7 @@ class Observer:
 
     The hologram is computed for light that diverges from a scene behind it (exp(+ikr)/r). The display shows the
     complex conjugate of the hologram, whose light converges to a scene between hologram and observer. All wavelengths
-    of a source are modulated with the same amplitude and phase, as in the thesis, without the dispersion of a panel.
+    of a source are modulated with the same amplitude and phase, as in the thesis, unless ``light.dispersion`` is set.
 
     Attributes:
         settings: The configuration.
@@ -66,6 +69,8 @@ class Observer:
         settings = self.settings.display
         if isinstance(settings, PlanarSettings):
             return Display.planar(settings.distance)
+        if isinstance(settings, SphericalSettings):
+            return Display.spherical(settings.focal_length)
         lengths = settings.focal_length, settings.eye_distance
         lens = settings.lens_distance or eyepiece_distance(self.scene.distance, settings.focus_distance, *lengths)
         return Display(lens, *lengths)
@@ -75,6 +80,8 @@ class Observer:
         settings, to_lens = self.settings.display, float(self.display.lens_distance) - depth
         if isinstance(settings, PlanarSettings):
             return to_lens
+        if isinstance(settings, SphericalSettings):
+            return settings.focal_length**2 / (settings.focal_length + depth)
         return image_distance(to_lens, settings.focal_length) + settings.eye_distance
 
     def eye(self, depth: float) -> Eye:
@@ -114,7 +121,11 @@ class Observer:
                 raise ConfigError([f"display: {words} {depth * 1e3:.4g} mm from the hologram; {hint}"])
             spectrum = PRESETS[source](wavelength)
             samples = spectrum.samples(tolerance=tolerance, path_difference=light.path_difference, iris=False)
-            count = least_followed(*samples, tolerance, self.scene.grid, self.display, eye, reach=half_width)
+            count = (
+                len(samples[0])
+                if self.separate
+                else least_followed(*samples, tolerance, self.scene.grid, self.display, eye, reach=half_width)
+            )
             self._samples[key] = *samples, count
         return self._samples[key]
 
@@ -136,6 +147,11 @@ class Observer:
             raise ConfigError([f"light.extent: {extent:g} needs {4 * rings**2} directions; {most}"])
         tilts, weights = disc_source(extent, rings)
         return tilts, weights.tolist()
+
+    @property
+    def separate(self) -> bool:
+        """Whether the wavelengths of a source have fields of their own, so that each must be propagated."""
+        return self.settings.light.dispersion or any(self.settings.eye.position)
 
     def retina(self, depth: float) -> RetinaPlan:
         """Choose the method of propagation to the retina of an eye that is focused at a depth.
@@ -173,11 +189,28 @@ class Observer:
             lengths, weights, count = samples
             total = torch.zeros(grid.shape, dtype=light.real.dtype, device=light.device)
             for tilt, share in zip(*points, strict=True):
+                if self.separate:
+                    for length, weight in zip(map(float, lengths), map(float, weights), strict=True):
+                        total += share * weight * self._at_wavelength(light, wavelength, length, tilt, depth)
+                    continue
                 tilted = light * tilted_wave(grid, wavelength, tilt).to(light) if any(tilt) else light
                 setup = tilted, grid, lengths, weights, self.display, eye
                 total += share * spectral_image(*setup, count=count, elements=elements)
             pictures.append(pooled(total, self.scene.stride))
         return torch.stack(pictures).cpu()
+
+    def _at_wavelength(self, light: Tensor, design: float, wavelength: float, tilt: Pair, depth: float) -> Tensor:
+        """Picture [H, W] at one wavelength, with the phases of the panel there and the perspective of the eye."""
+        grid, eye, elements = self.scene.grid, self.eye(depth), self.retina(depth).method == "elements"
+        if self.settings.light.dispersion:
+            phase = (light.angle() % (2 * math.pi)) * phase_scale(wavelength, design).item()
+            light = torch.polar(light.abs(), phase)
+        if any(tilt):
+            light = light * tilted_wave(grid, wavelength, tilt).to(light)
+        light, wide = displaced_eye(light, grid, wavelength, self.display, depth, self.settings.eye.position)
+        picture = spectral_image(light, wide, [wavelength], [1.0], self.display, eye, count=1, elements=elements)
+        (height, width), (y, x) = grid.shape, ((n - m) // 2 for n, m in zip(wide.shape, grid.shape, strict=True))
+        return picture[y : y + height, x : x + width]
 
     def row(self, source: str, depth: float, pictures: Tensor, reference: Tensor) -> dict[str, Any]:
         """Measurements of a source with the eye focused at a depth (metres): for each quantity, a value per colour.
@@ -221,4 +254,10 @@ def observer(settings: ObserverSettings, scene_settings) -> Observer:
             result.eye(depth)
         except ValueError as error:
             raise ConfigError([f"display: {error}; the eye cannot focus at a depth of {depth * 1e3:.4g} mm"]) from error
+        for wavelength in scene_settings.wavelengths if any(settings.eye.position) else ():
+            shortest = min(PRESETS[source](wavelength).band()[0] for source in settings.light.sources)
+            try:
+                displacement(scene.grid, shortest, result.display, depth, settings.eye.position)
+            except ValueError as error:
+                raise ConfigError([f"eye.position: {error}"]) from error
     return result

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from holotorch.experiments.eye.config import MagnifyingSettings
+from holotorch.experiments.eye.config import MagnifyingSettings, PlanarSettings, SphericalSettings
 from holotorch.experiments.eye.experiment import PRESETS, Observer
 from holotorch.experiments.runs.figures import figure_png
 from holotorch.optics.viewing import display_geometry as viewing
@@ -55,6 +55,13 @@ def geometry(eye: Observer) -> dict[str, Any]:
             "magnified_fov_deg": math.degrees(field),
             "scene_fov_deg": math.degrees(viewing.scene_fov(scene.width, to_lens, *lengths)),
             "filling_scene_mm": 1e3 * viewing.volume_size(field, display.focus_distance, *lengths),
+        }
+    if isinstance(display, SphericalSettings):
+        field = viewing.magnified_fov(width, display.focal_length)
+        values |= {
+            "magnified_fov_deg": math.degrees(field),
+            "scene_fov_deg": 2 * math.degrees(math.atan(scene.width / 2 / display.focal_length)),
+            "filling_scene_mm": 1e3 * width,
         }
     return values
 
@@ -127,21 +134,24 @@ def _draw_display(axes: Any, eye: Observer) -> None:
     axes.text(0, half * 1.05, "hologram", va="bottom", **text)
     _draw_scene(axes, eye)
     first, second, _, _ = (float(value) for value in eye.display.matrix(scene.distance))
-    focal = display.focal_length if isinstance(display, MagnifyingSettings) else math.inf
+    focal = math.inf if isinstance(display, PlanarSettings) else display.focal_length
     for height in (-scene.width / 2, 0.0, scene.width / 2):
         for side in (-1, 1):
             # The ray transfer matrix to the pupil gives the slope of the ray that ends at the edge of the pupil.
             slope = (side * pupil / 1e3 - first * height) / second
             at_lens = height + slope * (lens / 1e3 - scene.distance)
             behind_lens = slope - at_lens / focal
-            positions = [scene.distance * 1e3, lens, end]
-            heights = [height, at_lens, at_lens + behind_lens * back / 1e3]
+            positions, heights = [lens, end], [at_lens, at_lens + behind_lens * back / 1e3]
+            if lens > scene.distance * 1e3:  # otherwise the lens is at the hologram
+                positions, heights = [scene.distance * 1e3, *positions], [height, *heights]
             axes.plot(positions, [1e3 * value for value in heights], color="tab:orange", linewidth=0.8)
     if math.isfinite(focal):
         half_width = max(half, pupil) * 1.6
         arrow = {"arrowstyle": "<->", "color": "tab:blue"}
         axes.annotate("", (lens, half_width), (lens, -half_width), arrowprops=arrow)
-        axes.text(lens, -half_width * 1.05, f"eyepiece, f {1e3 * focal:.3g} mm", va="top", **text)
+        axes.text(
+            lens, -half_width * 1.05, f"{'eyepiece' if lens else 'lens'}, f {1e3 * focal:.3g} mm", va="top", **text
+        )
     for sign in (-1, 1):
         axes.plot([end, end], [sign * pupil, sign * max(2.5 * pupil, half)], "k", linewidth=2)
     axes.plot([end + retina] * 2, [-retina / 6, retina / 6], color="0.4", linewidth=3)

@@ -89,8 +89,12 @@ def plan_text(eye: Observer, values: dict[str, Any]) -> str:
         for name, count in values["wavelengths"].items()
     )
     directions = f"; from {plain(values['directions'])} directions" if settings.light.extent else ""
+    others = "" if eye.separate else "; the others are derived from them"
+    if any(settings.eye.position):
+        y, x = (1e3 * each for each in settings.eye.position)
+        lines.append(f"Eye        beside the axis, at y {y:.3g} mm, x {x:.3g} mm; light is that of an eye on the axis")
     lines += [
-        f"Light      {light}; the others are derived from them{directions}",
+        f"Light      {light}{others}{directions}",
         f"Phases     {settings.seeds} realisation(s) of the random phases, compared with the mean of "
         f"{8 * settings.seeds} others",
         f"Cost       about {values['predicted_seconds']:.2g} s on two idle cores for {values['images']} images, "

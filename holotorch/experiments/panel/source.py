@@ -13,6 +13,9 @@ from holotorch.core import checks
 from holotorch.core.complex import intensity
 from holotorch.core.grid import Grid
 from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.joint.config import JointSettings
+from holotorch.experiments.joint.experiment import build as build_joint
+from holotorch.experiments.joint.methods import Shown
 from holotorch.experiments.pec.config import PECSettings
 from holotorch.experiments.pec.experiment import PECExperiment, build
 from holotorch.experiments.registry import load_config
@@ -51,19 +54,22 @@ class PanelPhases:
 
 
 def load_panel_phases(folder: Path, encoding: str | None = None) -> PanelPhases:
-    """Phases of a run of kind ``pec`` or ``volume``, from its folder; ConfigError for any other folder."""
+    """Phases of a run of kind ``pec``, ``joint`` or ``volume``, from its folder; ConfigError for any other folder."""
     if not (folder / "config.yaml").is_file():
         raise ConfigError([f"{folder} holds no run: config.yaml is not there"])
     if encoding is not None and encoding not in ENCODINGS:
         raise ConfigError([f"expected one of {', '.join(ENCODINGS)} as the encoding, got {encoding!r}"])
     settings = load_config(folder / "config.yaml")
-    if not isinstance(settings, PECSettings | VolumeSettings):
-        raise ConfigError([f"{folder} holds a {settings.experiment}; only runs of kind pec and volume have a hologram"])
-    if isinstance(settings, PECSettings) and encoding is not None:
+    if not isinstance(settings, PECSettings | VolumeSettings | JointSettings):
+        kinds = "only runs of kind pec, volume and joint have a hologram"
+        raise ConfigError([f"{folder} holds a {settings.experiment}; {kinds}"])
+    if not isinstance(settings, VolumeSettings) and encoding is not None:
         raise ConfigError([f"{folder} holds phases already, which need no encoding; leave out --encoding"])
     try:
         if isinstance(settings, PECSettings):
             return _from_pec(folder, settings)
+        if isinstance(settings, JointSettings):
+            return _from_joint(folder, settings)
         return _from_volume(folder, settings, encoding or "double_phase")
     except ConfigError:
         raise
@@ -84,6 +90,20 @@ def _from_pec(folder: Path, settings: PECSettings) -> PanelPhases:
         return experiment.picture_in(torch.stack(formed).mean(0)).cpu()
 
     return PanelPhases(phase, experiment.wavelengths, experiment.grid, "phase", picture)
+
+
+def _from_joint(folder: Path, settings: JointSettings) -> PanelPhases:
+    experiment = build_joint(settings)
+    shape = (settings.frames, len(settings.wavelengths), *settings.display.shape)
+    heaters = _array(folder / "arrays" / "phase.npy", shape, "(F, C, H, W)", "float32")
+    checks.all_finite("phase", heaters)
+    middle = len(experiment.foci) // 2
+
+    def picture(fields: Tensor) -> Tensor:
+        return Shown(fields.to(experiment.device)).images(experiment.stack.operator)[:, middle].cpu()
+
+    phase = experiment.heat(heaters.double().to(experiment.device)).float().cpu()
+    return PanelPhases(phase, settings.wavelengths, experiment.grid, "phase", picture)
 
 
 def _from_volume(folder: Path, settings: VolumeSettings, encoding: str) -> PanelPhases:

@@ -23,6 +23,20 @@ def channel_maps(values: Tensor, names: Sequence[str], label: str, colormap: str
     return figure_png(figure)
 
 
+def fitted_pictures(pictures: dict[str, Tensor]) -> bytes:
+    """PNG of grey pictures [..., H, W] side by side by name, each scaled to fit the first one best."""
+    figure = Figure(figsize=(2.7 * len(pictures), 3.0), layout="constrained")
+    (target, *_), names = pictures.values(), list(pictures)
+    panels = figure.subplots(1, len(pictures))
+    for axes, name, picture in zip(panels, names, pictures.values(), strict=True):
+        gain = (picture * target).sum() / picture.square().sum()
+        shown = (gain * picture).detach().reshape(picture.shape[-2:])
+        axes.imshow(shown.numpy(), cmap="gray", vmin=0, vmax=target.max().item())
+        axes.set_title(name, fontsize=9)
+        axes.set(xticks=[], yticks=[])
+    return figure_png(figure)
+
+
 def visual_field(values: Tensor, eccentricity: Tensor, field_deg: float, rings: Sequence[float], label: str) -> bytes:
     """PNG of a map [H, W], ``field_deg`` degrees wide, with lines at the eccentricities ``rings``, in degrees."""
     height, width = values.shape
@@ -59,6 +73,24 @@ def comparison(images: Sequence[Tensor], captions: Sequence[str]) -> bytes:
         axes.imshow(pixels, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
         axes.set_title(title, fontsize=10)
         axes.set_axis_off()
+    return figure_png(figure)
+
+
+def picture_table(rows: dict[str, Tensor], titles: Sequence[str]) -> bytes:
+    """PNG of pictures [C, V, H, W]: a row for each entry of ``rows``, a column for each V."""
+    count = len(titles)
+    figure = Figure(figsize=(1.9 * count, 2.05 * len(rows)), dpi=100, layout="constrained")
+    for i, (label, pictures) in enumerate(rows.items()):
+        for v in range(count):
+            axes = figure.add_subplot(len(rows), count, i * count + v + 1)
+            pixels = pictures[:, v].permute(1, 2, 0).squeeze(-1).numpy()
+            axes.imshow(pixels, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+            axes.set_xticks([])
+            axes.set_yticks([])
+            if v == 0:
+                axes.set_ylabel("\n".join(label.split(", ")), fontsize=7)
+            if i == 0:
+                axes.set_title(titles[v], fontsize=8)
     return figure_png(figure)
 
 

@@ -76,12 +76,28 @@ class TransferSettings(Settings):
     unit_distance: Annotated[Number, Field(gt=0, le=1)] = 1 / 256
 
 
+class ScatteringSettings(Settings):
+    """Light that the volume scatters once, see ``holotorch.scene.Scattering``; the light comes from ``towards``.
+
+    ``half_angle_deg``: between the middle of the light and its edge. ``samples``: number of random directions.
+    """
+
+    towards: tuple[Number, Number, Number] = (-1.0, -0.5, -0.5)
+    half_angle_deg: Annotated[Number, Field(ge=0, le=180)] = 20.0
+    ambient: Annotated[Number, Field(ge=0, le=100)] = 0.2
+    strength: Annotated[Number, Field(ge=0, le=100)] = 0.8
+    anisotropy: Annotated[Number, Field(gt=-1, lt=1)] = 0.0
+    samples: Annotated[Count, Field(le=4096)] = 16
+
+
 class ViewSettings(Settings):
     """Orientation and size of the volume.
 
     The volume is rotated by ``azimuth_deg`` about the vertical axis (y), then by ``elevation_deg`` about the horizontal
     axis (x). ``width`` is the length of its longest side in metres, by default the longest side of the hologram.
-    ``front`` says which end of the volume faces the observer. ``lighting`` shades points by the gradient of the volume.
+    ``front`` says which end of the volume faces the observer. ``lighting`` shades points by the gradient of the volume;
+    ``scattering`` in its place gives the volume shadows.
+    ``adaptive``: follow all rays only where colours or opacity of every fourth ray differ by more than this.
     """
 
     azimuth_deg: Number = 0.0
@@ -89,6 +105,8 @@ class ViewSettings(Settings):
     width: Depth | None = None
     front: Literal["far", "near"] = "far"
     lighting: bool = False
+    scattering: ScatteringSettings | None = None
+    adaptive: Annotated[Number, Field(ge=0, le=1)] | None = None
 
 
 class HologramSettings(GridSettings):
@@ -160,6 +178,10 @@ def contradictions(settings: VolumeSettings) -> list[tuple[tuple[str | int, ...]
     if rays is not None and (side[0] % rays or side[1] % rays or side[0] // rays != side[1] // rays):
         message = f"expected a number that divides the hologram's sides {side}, got {rays}"
         problems.append((("hologram", "rays"), message))
+    if settings.view.lighting and settings.view.scattering:
+        problems.append((("view", "lighting"), "expected false with scattering, which takes its place"))
+    if settings.view.scattering and not any(settings.view.scattering.towards):
+        problems.append((("view", "scattering"), "expected towards to point to the light, got [0, 0, 0]"))
     width = settings.view.width or max(side[0] * hologram.pitch[0], side[1] * hologram.pitch[1])
     if isinstance(hologram.depths, int) and hologram.distance <= width / 2:
         hint = f"a volume {width:.3g} m wide needs more than {width / 2:.3g} m"

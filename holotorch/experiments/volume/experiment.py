@@ -19,7 +19,9 @@ from holotorch.io.catalogue import PUBLISHED, fetch_volume
 from holotorch.io.files import read_bytes
 from holotorch.io.volumes import load_volume
 from holotorch.scene import phantoms, transfer_presets
-from holotorch.scene.lighting import Lighting
+from holotorch.scene.adaptive import sample_adaptively
+from holotorch.scene.layers import SourceLayers
+from holotorch.scene.lighting import Lighting, Scattering
 from holotorch.scene.phases import PointPhases, point_phases, random_phase, smooth_phase
 from holotorch.scene.sampler import DVRSampler
 from holotorch.scene.transfer import TransferFunction
@@ -122,8 +124,21 @@ class VolumeExperiment:
             width=self.width,
             distance=self.distance,
             rotation=self.rotation,
-            lighting=Lighting() if self.settings.view.lighting else None,
+            lighting=self._lighting(),
             phase=phases[self.settings.phase],
+        )
+
+    def _lighting(self) -> Lighting | Scattering | None:
+        if (light := self.settings.view.scattering) is not None:
+            strengths = {name: getattr(light, name) for name in ("ambient", "strength", "anisotropy", "samples")}
+            return Scattering(light.towards, math.radians(light.half_angle_deg), seed=self.settings.seed, **strengths)
+        return Lighting() if self.settings.view.lighting else None
+
+    def layers(self, seed: int = 0) -> SourceLayers:
+        """The light sources of the planes with the random phases of a realisation."""
+        sampler, contrast = self.sampler(seed), self.settings.view.adaptive
+        return (
+            sampler(self.volume) if contrast is None else sample_adaptively(sampler, self.volume, contrast=contrast)[0]
         )
 
     def hologram(
@@ -134,7 +149,7 @@ class VolumeExperiment:
         Each plane is rendered once and added to all colours. ``seed`` is the number of the realisation of the phases;
         ``advance`` is called after every plane; ``part`` selects planes and colours, all by default.
         """
-        layers = self.sampler(seed)(self.volume)
+        layers = self.layers(seed)
         sums = []
         for plan in self.plans:
             assert isinstance(plan.operator, AxialHologram | ConvolutionHologram)

@@ -104,6 +104,11 @@ class ConvergingFresnel(FieldOperator):
     Source: Goodman, Sec. 4.2; Sziklas and Siegman (1975) for the scaling.
     """
 
+    columns: Tensor
+    rows: Tensor
+    column_curvature: Tensor
+    row_curvature: Tensor
+
     def __init__(
         self,
         grid: Grid,
@@ -127,8 +132,8 @@ class ConvergingFresnel(FieldOperator):
         if self.scaled:
             columns, rows = (self._spectrum(axis, wavelength) for axis in (0, 1))
             factor = carrier(wavelength, z)[:, None] / self.magnification
-            self.register_complex("column_curvature", self._curvature(0, wavelength) * factor)
-            self.register_complex("row_curvature", self._curvature(1, wavelength))
+            self.keep("column_curvature", self._curvature(0, wavelength) * factor)
+            self.keep("row_curvature", self._curvature(1, wavelength))
         else:
             weights = sum(n * m for n, m in zip(grid.shape, self.out_grid.shape, strict=True)) * len(wavelength)
             checks.affordable(
@@ -138,8 +143,8 @@ class ConvergingFresnel(FieldOperator):
                 "use a smaller grid or out_grid",
             )
             columns, rows = lens_matrices(grid, wavelength, z, f, self.out_grid, self.offset)
-        self.register_complex("columns", columns)
-        self.register_complex("rows", rows)
+        self.keep("columns", columns)
+        self.keep("rows", rows)
         self.beyond_fresnel = self._neglected_phase()
         if self.beyond_fresnel > _TRUSTED:
             warnings.warn(
@@ -152,14 +157,14 @@ class ConvergingFresnel(FieldOperator):
             )
 
     def _forward(self, field: Tensor) -> Tensor:
-        columns, rows = (self.complex_buffer(name, field) for name in ("columns", "rows"))
+        columns, rows = self.columns.to(field.dtype), self.rows.to(field.dtype)
         if not self.scaled:
             return columns @ field @ rows.transpose(-1, -2)
         picture = filter_spectrum(field, columns[..., :, None] * rows[..., None, :])
         return self._oriented(picture) * self._curvatures(field)
 
     def _adjoint(self, field: Tensor) -> Tensor:
-        columns, rows = (self.complex_buffer(name, field) for name in ("columns", "rows"))
+        columns, rows = self.columns.to(field.dtype), self.rows.to(field.dtype)
         if not self.scaled:
             return columns.transpose(-1, -2).conj() @ field @ rows.conj()
         picture = self._oriented(field * self._curvatures(field).conj())
@@ -176,7 +181,7 @@ class ConvergingFresnel(FieldOperator):
         return picture.flip((-2, -1)) if self.magnification < 0 else picture
 
     def _curvatures(self, field: Tensor) -> Tensor:
-        columns, rows = (self.complex_buffer(name, field) for name in ("column_curvature", "row_curvature"))
+        columns, rows = self.column_curvature.to(field.dtype), self.row_curvature.to(field.dtype)
         return columns[..., :, None] * rows[..., None, :]
 
     def _choose_grid(self, out_grid: Grid | None) -> tuple[Grid, bool]:

@@ -5,11 +5,12 @@ import warnings
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.grid import Grid
+from holotorch.core.learning import without_graph
 from holotorch.core.operator import FieldOperator, Wavelengths
 from holotorch.core.quantities import APERTURE_RADIUS, FOCAL_LENGTH, PITCH, SOFTNESS, WAVELENGTH
 from holotorch.optics.free_space.kernels import turns_phasor
@@ -87,18 +88,30 @@ class Transmission(FieldOperator):
 
     Args:
         grid, wavelengths: As for :class:`FieldOperator`.
-        values: complex128, shape [C, H, W], or [1, H, W] for all channels.
+        values: complex128, shape [C, H, W], or [1, H, W] for all channels; None for an element that learns a quantity
+            and therefore computes its values in every call.
+
+    A subclass that learns implements :meth:`computed`.
     """
 
-    def __init__(self, grid: Grid, wavelengths: Wavelengths, values: Tensor):
+    values: Tensor | None
+
+    def __init__(self, grid: Grid, wavelengths: Wavelengths, values: Tensor | None):
         super().__init__(grid, wavelengths)
-        self.register_complex("values", values)
+        self.keep("values", values)
+
+    def computed(self) -> Tensor:
+        """Values for the present parameters, as ``values``."""
+        raise NotImplementedError
+
+    def _values_for(self, field: Tensor) -> Tensor:
+        return (self.computed() if self.values is None else self.values).to(field.dtype)
 
     def _forward(self, field: Tensor) -> Tensor:
-        return field * self.complex_buffer("values", field)
+        return field * self._values_for(field)
 
     def _adjoint(self, field: Tensor) -> Tensor:
-        return field * self.complex_buffer("values", field).conj()
+        return field * self._values_for(field).conj()
 
 
 class Lens(Transmission):
@@ -108,12 +121,14 @@ class Lens(Transmission):
         grid, wavelengths: As for :class:`FieldOperator`.
         focal_length: In metres, not 0, positive for a converging lens. One number for all channels (a refractive or
             achromatic lens) or one per channel (a holographic optical element, whose focal length is proportional to
-            1 / wavelength).
+            1 / wavelength). May be an ``nn.Parameter``, of shape [] or [C].
         radius: Radius of the clear aperture in metres; None for a lens that covers the whole window.
         paraxial: As in :func:`lens_phase`.
+        learnable: Make the focal length a Parameter.
 
     Raises:
-        ValueError: A length outside its range, such as 0 or one in millimetres.
+        ValueError: A length outside its range, such as 0 or one in millimetres, or one with a gradient that is no
+            Parameter.
         MemoryError: The grid has more samples than memory is available for.
 
     Warns:
@@ -124,30 +139,44 @@ class Lens(Transmission):
     Source: Goodman, Sec. 5.1; thesis Algorithm 6.
     """
 
+    focal_length: tuple[float, ...] | Tensor
+
     def __init__(
         self,
         grid: Grid,
         wavelengths: Wavelengths,
-        focal_length: float | Sequence[float],
+        focal_length: float | Sequence[float] | Tensor,
         *,
         radius: float | None = None,
         paraxial: bool = True,
+        learnable: bool = False,
     ):
         wavelengths = checks.wavelengths(wavelengths)
-        given = list(focal_length) if isinstance(focal_length, Sequence) else [focal_length] * len(wavelengths)
+        without_graph("focal_length", focal_length)
+        numbers = focal_length.detach().tolist() if isinstance(focal_length, Tensor) else focal_length
+        given = list(numbers) if isinstance(numbers, Sequence) else [numbers] * len(wavelengths)
         if len(given) != len(wavelengths):
             wanted = f"one number or one per wavelength ({len(wavelengths)})"
             raise ValueError(f"focal_length must be {wanted}, got {len(given)}")
         lengths = [checks.quantity(FOCAL_LENGTH, each) for each in given]
         edge = None if radius is None else checks.quantity(APERTURE_RADIUS, radius, "radius")
         affordable("a lens", grid, len(wavelengths))
-        wavelength, length = (torch.tensor(each, dtype=torch.float64) for each in (wavelengths, lengths))
-        values = turns_phasor(_phase_cycles(grid, wavelength, length, paraxial))
-        if edge is not None:
-            values = values * pupil(grid, edge)
-        super().__init__(grid, wavelengths, values)
-        self.focal_length, self.radius, self.paraxial = tuple(lengths), edge, paraxial
+        super().__init__(grid, wavelengths, None)
+        self.radius, self.paraxial = edge, paraxial
+        value = torch.tensor(numbers, dtype=torch.float64) if learnable else tuple(lengths)
+        self.hold(
+            "focal_length", focal_length if isinstance(focal_length, nn.Parameter) else value, learnable=learnable
+        )
+        if not isinstance(self.focal_length, nn.Parameter):
+            self.values = self.computed()
         warn_if_coarse(grid, wavelengths, lengths, edge, paraxial=paraxial)
+
+    def computed(self) -> Tensor:
+        """Transmission for the present focal length, complex128 [C, H, W]."""
+        length = torch.as_tensor(self.focal_length, dtype=torch.float64)
+        wavelength = torch.tensor(self.wavelengths, dtype=torch.float64, device=length.device)
+        values = turns_phasor(_phase_cycles(self.grid, wavelength, length, self.paraxial))
+        return values if self.radius is None else values * pupil(self.grid, self.radius).to(length.device)
 
     def extra_repr(self) -> str:
         """Sampling, wavelengths and lens, for ``print(module)``."""
@@ -160,23 +189,52 @@ class Aperture(Transmission):
     Args:
         grid, wavelengths: As for :class:`FieldOperator`.
         shape: Radius in metres of a circle around the axis, or the amplitude transmission, real [H, W] within 0 .. 1.
+            May be an ``nn.Parameter``; values of a learned transmission outside 0 .. 1 are clipped when used.
+        softness: Width in metres of the edge of a circle, as in :func:`pupil`; a learned radius needs one.
+        learnable: Make the radius or the transmission a Parameter, ``shape``.
 
     Raises:
-        ValueError: A radius outside its range, or a transmission of another shape or with values outside 0 .. 1.
+        ValueError: A radius outside its range, a learned one with a hard edge, a transmission of another shape or with
+            values outside 0 .. 1, or a shape with a gradient that is no Parameter.
         MemoryError: The grid has more samples than memory is available for.
     """
 
-    def __init__(self, grid: Grid, wavelengths: Wavelengths, shape: float | Tensor):
-        if isinstance(shape, Tensor) and shape.ndim:
-            mask = shape.to(torch.float64) if shape.dtype == torch.bool else shape
-            checks.field("aperture", mask, grid.shape, complex_valued=False)
-            if mask.ndim != 2 or not bool(((mask >= 0) & (mask <= 1)).all()):
-                raise ValueError(f"aperture must be [H, W] with values in 0 .. 1, got {tuple(mask.shape)}")
+    shape: float | Tensor
+
+    def __init__(
+        self,
+        grid: Grid,
+        wavelengths: Wavelengths,
+        shape: float | Tensor,
+        *,
+        softness: float = 0.0,
+        learnable: bool = False,
+    ):
+        without_graph("shape", shape)
+        values = shape.detach() if isinstance(shape, Tensor) else shape
+        if isinstance(values, Tensor) and values.ndim:
+            values = values.to(torch.float64) if values.dtype == torch.bool else values
+            checks.field("aperture", values, grid.shape, complex_valued=False)
+            if values.ndim != 2 or not bool(((values >= 0) & (values <= 1)).all()):
+                raise ValueError(f"aperture must be [H, W] with values in 0 .. 1, got {tuple(values.shape)}")
         else:
-            radius = checks.quantity(APERTURE_RADIUS, float(shape))
+            values = checks.quantity(APERTURE_RADIUS, float(values))
             affordable("an aperture", grid, 1)
-            mask = pupil(grid, radius)
-        super().__init__(grid, wavelengths, torch.complex(mask.double(), torch.zeros_like(mask.double()))[None])
+        super().__init__(grid, wavelengths, None)
+        self.softness = checks.quantity(SOFTNESS, softness)
+        learned = self.hold("shape", shape if isinstance(shape, nn.Parameter) else values, learnable=learnable)
+        opening = self.computed()  # a hard edge refuses a learned radius here
+        if not learned:
+            self.values = opening
+
+    def computed(self) -> Tensor:
+        """Transmission for the present shape, complex128 [1, H, W]."""
+        shape = self.shape
+        if isinstance(shape, Tensor) and shape.ndim:
+            mask = shape.double().clamp(0, 1)
+        else:
+            mask = pupil(self.grid, shape, softness=self.softness)
+        return torch.complex(mask, torch.zeros_like(mask))[None]
 
 
 def affordable(what: str, grid: Grid, channels: int) -> None:
@@ -191,8 +249,9 @@ def affordable(what: str, grid: Grid, channels: int) -> None:
 
 def _phase_cycles(grid: Grid, wavelength: Tensor | float, focal_length: Tensor | float, paraxial: bool) -> Tensor:
     """:func:`lens_phase` in cycles."""
+    device = next((v.device for v in (focal_length, wavelength) if isinstance(v, Tensor)), None)
     wavelength_values, length = (
-        torch.as_tensor(v, dtype=torch.float64)[..., None, None] for v in (wavelength, focal_length)
+        torch.as_tensor(v, dtype=torch.float64, device=device)[..., None, None] for v in (wavelength, focal_length)
     )
     y, x = grid.coordinates(length.device)
     square = y.square() + x.square()

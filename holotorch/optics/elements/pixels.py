@@ -51,7 +51,7 @@ class PixelShape(FieldOperator):
         super().__init__(grid, None, Grid((finer * height, finer * width), (y / finer, x / finer)))
         self.fill, self.orders = _fill_pair(fill), (finer - 1) // 2
         for name, size, part in zip(("columns", "rows"), grid.shape, self.fill, strict=True):
-            self.register_complex(name, _axis_kernel(size, part, finer))
+            self.keep(name, _axis_kernel(size, part, finer))
 
     def _forward(self, field: Tensor) -> Tensor:
         height, width = self.out_grid.shape
@@ -62,12 +62,12 @@ class PixelShape(FieldOperator):
             field.device,
         )
         for name in ("columns", "rows"):  # two transpositions restore the order of the axes
-            field = _spread(field.transpose(-1, -2), self.complex_buffer(name, field))
+            field = _spread(field.transpose(-1, -2), getattr(self, name).to(field.dtype))
         return field
 
     def _adjoint(self, field: Tensor) -> Tensor:
         for name in ("rows", "columns"):
-            field = _gather(field, self.complex_buffer(name, field)).transpose(-1, -2)
+            field = _gather(field, getattr(self, name).to(field.dtype)).transpose(-1, -2)
         return field
 
     def extra_repr(self) -> str:

@@ -1,19 +1,21 @@
 """CroppedKernel: propagation at any distance that neither wraps light around nor removes frequencies."""
 
+from functools import partial
+
 import torch
+from torch import Tensor, nn
 
 from holotorch.core import checks
 from holotorch.core.fourier import good_length
 from holotorch.core.grid import Grid, Pair
 from holotorch.core.operator import Wavelengths
-from holotorch.core.quantities import DISTANCE
 from holotorch.optics.free_space.padding import FINEST, crop_length
 from holotorch.optics.free_space.plane_pair import PlanePair
-from holotorch.optics.free_space.propagators import SpectralFilter
+from holotorch.optics.free_space.propagators import DistanceFilter, checked_distance, checked_wavelengths
 from holotorch.optics.free_space.transfer import transfer_function
 
 
-class CroppedKernel(SpectralFilter):
+class CroppedKernel(DistanceFilter):
     """Exact scalar propagation of band-limited samples over ``distance``; includes the carrier exp(ikz).
 
     The paraxial kernel in space is known exactly on every sample (:func:`fresnel_taps` per axis). Cropped to the
@@ -28,10 +30,12 @@ class CroppedKernel(SpectralFilter):
 
     Args:
         grid, wavelengths: As for :class:`FieldOperator`.
-        distance: In metres, negative for backward propagation.
+        distance: In metres, negative for backward propagation. Wavelengths [C] and distance may be ``nn.Parameter``;
+            the transfer function is then computed in every call, and has room for twice the given distance.
         paraxial: Leave out the factor beyond Fresnel.
         offset: Position (y, x) in metres of the axis of the result relative to the axis of the field, which need not be
             a whole number of samples.
+        learnable: Make the distance a Parameter.
 
     Raises:
         ValueError: A number outside its range, or a pitch below 0.9 wavelengths, where the factor beyond Fresnel can no
@@ -39,22 +43,36 @@ class CroppedKernel(SpectralFilter):
     """
 
     def __init__(
-        self, grid: Grid, wavelengths: Wavelengths, distance: float, *, paraxial: bool = False, offset: Pair = (0, 0)
+        self,
+        grid: Grid,
+        wavelengths: Wavelengths,
+        distance: float | Tensor,
+        *,
+        paraxial: bool = False,
+        offset: Pair = (0, 0),
+        learnable: bool = False,
     ):
-        z = torch.tensor(checks.quantity(DISTANCE, distance), dtype=torch.float64)
-        wavelength = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
-        longest = wavelength.max().item()
+        z, longest = checked_distance(distance), max(checked_wavelengths(wavelengths))
         planes = PlanePair(grid, grid, checks.offset(offset))
         if min(grid.pitch) < FINEST * longest and not paraxial:
             raise ValueError(
                 f"CroppedKernel needs a pitch of at least {FINEST} wavelengths, got {min(grid.pitch):g} m at "
                 f"{longest:g} m; use AngularSpectrum"
             )
+        room = 2 if learnable or isinstance(distance, nn.Parameter) else 1
         lengths = [
-            2 * size - 1 if paraxial else crop_length(size, size, pitch, longest, abs(z.item()), shift / pitch)
+            2 * size - 1 if paraxial else crop_length(size, size, pitch, longest, room * abs(z), shift / pitch)
             for size, pitch, shift in zip(grid.shape, grid.pitch, planes.offset, strict=True)
         ]
         padded = Grid((good_length(lengths[0]), good_length(lengths[1])), grid.pitch)
-        kernel = transfer_function(planes, padded, wavelength, z, sampled=(False, False), paraxial=paraxial)
-        super().__init__(grid, wavelengths, kernel)
-        self.distance, self.offset = z.item(), planes.offset
+        value = distance if isinstance(distance, Tensor) else z
+        transfer = partial(_transfer_function, planes, padded, paraxial)
+        super().__init__(grid, wavelengths, value, padded.shape, transfer, learnable=learnable)
+        self.offset = planes.offset
+
+
+def _transfer_function(
+    planes: PlanePair, padded: Grid, paraxial: bool, wavelength: Tensor, distance: Tensor, dtype: torch.dtype
+) -> Tensor:
+    options = {"sampled": (False, False), "paraxial": paraxial, "dtype": dtype}
+    return transfer_function(planes, padded, wavelength, distance, **options)

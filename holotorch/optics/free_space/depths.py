@@ -22,6 +22,8 @@ class DepthStack(nn.Module):
             another grid than the field.
     """
 
+    image_axes = 3  # of a result: (D, H, W)
+
     def __init__(self, filters: Sequence[SpectralFilter]):
         super().__init__()
         if not filters:
@@ -31,7 +33,7 @@ class DepthStack(nn.Module):
         first = filters[0]
         if first.out_grid != first.grid:
             raise ValueError("DepthStack needs propagators whose result has the grid of the field")
-        if len({(each.grid, each.out_grid, each.wavelengths, each.kernel.shape) for each in filters}) > 1:
+        if len({(each.grid, each.out_grid, each.wavelengths, each.padded) for each in filters}) > 1:
             raise ValueError("DepthStack needs propagators of one grid, one set of wavelengths and one padded size")
         self.filters = nn.ModuleList(filters)
         self.grid, self.wavelengths = first.grid, first.wavelengths

@@ -102,12 +102,13 @@ def window_taper(grid: Grid, wavelength: float, distance: float, reach: Pair, *,
     """
     weights = torch.ones((), dtype=torch.float64)
     sines = [wavelength * each for each in grid.frequencies()]
+    steepest = [wavelength * (size // 2) / (size * pitch) for size, pitch in zip(grid.shape, grid.pitch, strict=True)]
     for axis, (extent, start, size) in enumerate(zip(grid.extent, reach, grid.shape, strict=True)):
         if size == 1:
             continue
         sine, other = sines[axis], sines[1 - axis].square()
         # Sines up to 0.1 on the other axis change the tangent by at most half a percent and are neglected.
-        other = other if float(other.max()) > 0.01 else 0.0
+        other = other if steepest[1 - axis] > 0.1 else 0.0
         cosine = 1.0 if paraxial else (1 - sine.square() - other).clamp_min(1e-12).sqrt()
         if extent < 2 * start * (1 - 1e-9):
             needed = f"a window of {start:.3g} m to either side needs {2 * start:.3g} m"

@@ -6,12 +6,13 @@ from collections.abc import Callable
 from functools import partial
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.fourier import centred_fft2, centred_ifft2, filter_spectrum
 from holotorch.core.grid import Grid, Pair
+from holotorch.core.learning import without_graph
 from holotorch.core.operator import FieldOperator, Wavelengths
 from holotorch.core.quantities import DISTANCE
 from holotorch.optics.free_space.geometry import least_padding
@@ -23,23 +24,31 @@ class SpectralFilter(FieldOperator):
 
     Args:
         grid, wavelengths: As for :class:`FieldOperator`.
-        kernel: Transfer function, complex128 [C, P, Q] in FFT order, with P >= H and Q >= W. The field is padded with
-            zeros to P x Q samples.
+        kernel: Transfer function, complex [C, P, Q] in FFT order, with P >= H and Q >= W. The field is padded with
+            zeros to P x Q samples. An ``nn.Parameter`` is learned.
         out_grid: Sampling of the result, which is cropped to the first samples of the padded grid; ``grid`` by default.
+        learnable: Make the transfer function a Parameter, ``kernel``.
 
-    Attributes:
-        kernel: The transfer function as real pairs, float64 [C, P, Q, 2].
-        single: ``kernel`` in float32, for complex64 fields; converting it in each call would take up to a quarter of
-            the time of the call.
+    Raises ValueError for a kernel that carries a gradient and is no Parameter.
     """
 
     kernel: Tensor
-    single: Tensor
 
-    def __init__(self, grid: Grid, wavelengths: Wavelengths, kernel: Tensor, *, out_grid: Grid | None = None):
+    def __init__(
+        self,
+        grid: Grid,
+        wavelengths: Wavelengths,
+        kernel: Tensor,
+        *,
+        out_grid: Grid | None = None,
+        learnable: bool = False,
+    ):
         super().__init__(grid, wavelengths, out_grid)
-        self.register_complex("kernel", kernel)
-        self.register_buffer("single", self.kernel.to(torch.float32), persistent=False)
+        self.padded = kernel.shape[-2], kernel.shape[-1]
+        if learnable or isinstance(kernel, nn.Parameter):
+            self.hold("kernel", kernel, learnable=True)
+        else:
+            self.keep("kernel", kernel)
 
     def _forward(self, field: Tensor) -> Tensor:
         return filter_spectrum(field, self.kernel_for(field), self.out_grid.shape)
@@ -49,40 +58,107 @@ class SpectralFilter(FieldOperator):
 
     def kernel_for(self, field: Tensor) -> Tensor:
         """The transfer function, complex [C, P, Q], in the dtype of ``field``."""
-        return torch.view_as_complex(self.single if field.dtype == torch.complex64 else self.kernel)
+        return self.kernel.to(field.dtype)
 
     def extra_repr(self) -> str:
         """Samplings, wavelengths and padded size, for ``print(module)``."""
-        return f"{super().extra_repr()}, padded={tuple(self.kernel.shape[-3:-1])}"
+        return f"{super().extra_repr()}, padded={tuple(self.padded)}"
 
 
-class _PaddedKernel(SpectralFilter):
+class DistanceFilter(SpectralFilter):
+    """A :class:`SpectralFilter` whose transfer function follows from wavelengths and a distance, which may be learned.
+
+    The function is kept in complex64, for complex64 fields, and computed anew for complex128 fields, of which the
+    last one is kept. If wavelengths or distance are learned, it is computed in every call.
+
+    Args:
+        grid, wavelengths, out_grid: As for :class:`FieldOperator`; wavelengths, [C], may be an ``nn.Parameter``.
+        distance: In metres, negative for backward propagation; may be an ``nn.Parameter``.
+        padded: Number of samples (y, x) of the transforms.
+        transfer_function: Function from wavelengths [C] and distance, float64, and a dtype to the transfer function
+            [C, *padded] with the factor exp(ikz).
+        learnable: Make the distance a Parameter.
+
+    Attributes:
+        distance: In metres, a float, or a Parameter if it is learned.
+        wavelength: Wavelengths as float64 tensor [C], a Parameter if they are learned.
+    """
+
+    distance: float | Tensor
+    wavelength: Tensor
+    single_kernel: Tensor
+    double_kernel: Tensor | None
+
+    def __init__(
+        self,
+        grid: Grid,
+        wavelengths: Wavelengths,
+        distance: float | Tensor,
+        padded: tuple[int, int],
+        transfer_function: Callable[[Tensor, Tensor, torch.dtype], Tensor],
+        *,
+        out_grid: Grid | None = None,
+        learnable: bool = False,
+    ):
+        FieldOperator.__init__(self, grid, checked_wavelengths(wavelengths), out_grid)
+        self.padded, self._transfer_function = padded, transfer_function
+        learned = self.hold("distance", distance, learnable=learnable)
+        if isinstance(wavelengths, nn.Parameter):
+            learned = self.hold("wavelength", wavelengths)
+        else:
+            self.keep("wavelength", torch.tensor(self.wavelengths, dtype=torch.float64))
+        kernel = None if learned else self.transfer_function()
+        self.keep("single_kernel", kernel if kernel is None else kernel.to(torch.complex64))
+        self.keep("double_kernel", None)
+        self.learned = learned
+
+    def transfer_function(self, dtype: torch.dtype = torch.complex128) -> Tensor:
+        """The transfer function for the present wavelengths and distance, complex [C, P, Q], with their gradients."""
+        distance = torch.as_tensor(self.distance, dtype=torch.float64, device=self.wavelength.device)
+        return self._transfer_function(self.wavelength.reshape(-1), distance, dtype)
+
+    def kernel_for(self, field: Tensor) -> Tensor:
+        """The transfer function, complex [C, P, Q], in the dtype of ``field``."""
+        if self.learned:
+            return self.transfer_function(field.dtype)
+        if field.dtype == torch.complex64:
+            return self.single_kernel
+        if torch.compiler.is_compiling():
+            return self.transfer_function()
+        if self.double_kernel is None:
+            with torch.inference_mode(False):  # a later call may need gradients
+                self.double_kernel = self.transfer_function()
+        return self.double_kernel
+
+
+class _PaddedKernel(DistanceFilter):
     """Transfer function sampled on a padded grid; computing it takes ``bytes_each`` bytes per sample (measured)."""
 
     def __init__(
         self,
         grid: Grid,
         wavelengths: Wavelengths,
-        distance: float,
+        distance: float | Tensor,
         pad: float | Pair,
-        transfer_function: Callable[[Grid, Tensor, float], Tensor],
+        kernel: Callable[[Grid, Tensor, Tensor], Tensor],
         bytes_each: int,
         *,
         paraxial: bool,
         wraps: bool,
+        learnable: bool,
     ):
-        distance, padded = checks.quantity(DISTANCE, distance), grid.padded(pad)
-        wavelength = torch.tensor(checks.wavelengths(wavelengths), dtype=torch.float64)
+        z, padded = checked_distance(distance), grid.padded(pad)
+        channels = len(checked_wavelengths(wavelengths))
         checks.affordable(
-            bytes_each * len(wavelength) * math.prod(padded.shape),
+            bytes_each * channels * math.prod(padded.shape),
             f"the kernel of {type(self).__name__} on {padded.shape[0]} x {padded.shape[1]} samples in "
-            f"{len(wavelength)} channel(s)",
+            f"{channels} channel(s)",
             "use a smaller grid or less padding",
         )
-        kernel = transfer_function(padded, wavelength, distance) * carrier(wavelength, distance)[:, None, None]
-        super().__init__(grid, wavelengths, kernel)
-        self.distance = distance
-        needed = least_padding(grid, max(self.wavelengths), distance, paraxial=paraxial)
+        transfer_function = partial(_with_carrier, kernel, padded)
+        value = distance if isinstance(distance, Tensor) else z
+        super().__init__(grid, wavelengths, value, padded.shape, transfer_function, learnable=learnable)
+        needed = least_padding(grid, max(self.wavelengths), z, paraxial=paraxial)
         actual = [big / small for big, small in zip(padded.shape, grid.shape, strict=True)]
         if all(have >= want for have, want in zip(actual, needed, strict=True)):
             return
@@ -92,7 +168,7 @@ class _PaddedKernel(SpectralFilter):
         else:
             advice = "no padding keeps all of it, since the pitch is at most half a wavelength"
         warnings.warn(
-            f"{type(self).__name__} over {distance:g} m: light of the grid's full band at {max(self.wavelengths):g} m "
+            f"{type(self).__name__} over {z:g} m: light of the grid's full band at {max(self.wavelengths):g} m "
             f"wavelength spreads beyond the padded window (pad {actual[0]:.3g} x {actual[1]:.3g}) and "
             f"{'re-enters on the other side' if wraps else 'is cut off'}; {advice}",
             SamplingWarning,
@@ -100,15 +176,38 @@ class _PaddedKernel(SpectralFilter):
         )
 
 
+def _with_carrier(
+    kernel: Callable[[Grid, Tensor, Tensor], Tensor],
+    padded: Grid,
+    wavelength: Tensor,
+    distance: Tensor,
+    dtype: torch.dtype,
+) -> Tensor:
+    return (kernel(padded, wavelength, distance) * carrier(wavelength, distance)[:, None, None]).to(dtype)
+
+
+def checked_wavelengths(wavelengths: Wavelengths) -> tuple[float, ...]:
+    """``wavelengths`` in metres as floats, also those of an ``nn.Parameter``, or an exception if one is implausible."""
+    return checks.wavelengths(wavelengths.detach() if isinstance(wavelengths, nn.Parameter) else wavelengths)
+
+
+def checked_distance(distance: float | Tensor) -> float:
+    """``distance`` in metres as a float; an exception if it is implausible, or has a gradient but is no Parameter."""
+    without_graph("distance", distance)
+    return checks.quantity(DISTANCE, distance.detach() if isinstance(distance, Tensor) else distance)
+
+
 class AngularSpectrum(_PaddedKernel):
     """Exact scalar propagation over ``distance`` by the angular spectrum; includes the carrier exp(ikz).
 
     Args:
         grid, wavelengths: As for :class:`FieldOperator`.
-        distance: In metres, negative for backward propagation.
+        distance: In metres, negative for backward propagation. Wavelengths [C] and distance may be ``nn.Parameter``;
+            the transfer function is then computed in every call.
         pad: Zero padding as a factor >= 1, one number or one per axis (y, x). 1 is the periodic model: light that
             leaves on one side enters on the other.
         band_limit: Drop frequencies that the padded grid undersamples, as :func:`angular_spectrum_kernel` explains.
+        learnable: Make the distance a Parameter.
 
     Raises:
         ValueError: A number outside its range, or ``pad`` below 1.
@@ -122,10 +221,19 @@ class AngularSpectrum(_PaddedKernel):
     """
 
     def __init__(
-        self, grid: Grid, wavelengths: Wavelengths, distance: float, *, pad: float | Pair = 2, band_limit: bool = True
+        self,
+        grid: Grid,
+        wavelengths: Wavelengths,
+        distance: float | Tensor,
+        *,
+        pad: float | Pair = 2,
+        band_limit: bool = True,
+        learnable: bool = False,
     ):
         kernel = partial(angular_spectrum_kernel, band_limit=band_limit)
-        super().__init__(grid, wavelengths, distance, pad, kernel, 90, paraxial=False, wraps=not band_limit)
+        super().__init__(
+            grid, wavelengths, distance, pad, kernel, 90, paraxial=False, wraps=not band_limit, learnable=learnable
+        )
 
 
 class Fresnel(_PaddedKernel):
@@ -135,8 +243,18 @@ class Fresnel(_PaddedKernel):
     k z (wavelength f)^4 / 8, where f is the highest frequency of the field. ``pad=1`` is the thesis's model (Sec. 4.5).
     """
 
-    def __init__(self, grid: Grid, wavelengths: Wavelengths, distance: float, *, pad: float | Pair = 2):
-        super().__init__(grid, wavelengths, distance, pad, fresnel_kernel, 40, paraxial=True, wraps=True)
+    def __init__(
+        self,
+        grid: Grid,
+        wavelengths: Wavelengths,
+        distance: float | Tensor,
+        *,
+        pad: float | Pair = 2,
+        learnable: bool = False,
+    ):
+        super().__init__(
+            grid, wavelengths, distance, pad, fresnel_kernel, 40, paraxial=True, wraps=True, learnable=learnable
+        )
 
 
 class Fraunhofer(FieldOperator):

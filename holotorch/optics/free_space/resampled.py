@@ -112,6 +112,8 @@ class ResampledKernel(FieldOperator):
     Raises ValueError for a number outside its range, a distance of 0, or a pitch below 0.9 wavelengths.
     """
 
+    columns: Tensor
+    rows: Tensor
     beyond: Tensor | None
 
     def __init__(
@@ -139,7 +141,7 @@ class ResampledKernel(FieldOperator):
         padded = None if paraxial else padded or resampled_padding(planes, longest, abs(self.distance))
         factors = resampling_factors(planes, wavelength, z, padded=padded)
         for name, values in zip(("columns", "rows", "beyond"), factors, strict=True):
-            self.register_complex(name, values)
+            self.keep(name, values)
 
     def _forward(self, field: Tensor) -> Tensor:
         return resample(field, self._factors_for(field))
@@ -154,5 +156,5 @@ class ResampledKernel(FieldOperator):
         return back[..., top : top + height, left : left + width]
 
     def _factors_for(self, field: Tensor) -> Factors:
-        columns, rows = (self.complex_buffer(name, field) for name in ("columns", "rows"))
-        return columns, rows, None if self.beyond is None else self.complex_buffer("beyond", field)
+        beyond = None if self.beyond is None else self.beyond.to(field.dtype)
+        return self.columns.to(field.dtype), self.rows.to(field.dtype), beyond

@@ -3,6 +3,8 @@
 The factor beyond Fresnel is the exact transfer function divided by the paraxial one.
 """
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -16,6 +18,7 @@ from holotorch.optics.free_space.impulse_response import (
     tilted_turns,
 )
 from holotorch.optics.free_space.kernels import angular_spectrum_kernel, carrier, turns_phasor
+from holotorch.optics.free_space.learned_distance import has_closed_form, learned_transfer_function
 from holotorch.optics.free_space.plane_pair import PlanePair, shifts
 
 
@@ -46,6 +49,23 @@ def transfer_function(
     Returns:
         Shape [..., H, W], frequencies in FFT order.
     """
+    if tilt is None and has_closed_form(planes, wavelength, distance):
+        options = {"sampled": sampled, "paraxial": paraxial, "dtype": dtype}
+        by_autograd = partial(_transfer_function, planes, padded, **options)
+        return learned_transfer_function(padded, wavelength, distance, differentiable=by_autograd, **options)
+    return _transfer_function(planes, padded, wavelength, distance, sampled, paraxial, dtype, tilt)
+
+
+def _transfer_function(
+    planes: PlanePair,
+    padded: Grid,
+    wavelength: Tensor,
+    distance: Tensor,
+    sampled: tuple[bool, bool],
+    paraxial: bool,
+    dtype: torch.dtype,
+    tilt: Tensor | None = None,
+) -> Tensor:
     wavelength, distance = torch.broadcast_tensors(wavelength, distance)
     tilted = any(planes.tilt)
     if tilt is None:
@@ -123,4 +143,6 @@ def _axis_factor(
     positions = index + position[..., None]
     at_zero = (distance == 0)[..., None]
     taps = fresnel_taps(positions, pitch, wavelength, torch.where(distance == 0, pitch, distance))
-    return torch.fft.fft(torch.where(at_zero, torch.sinc(positions).to(taps.dtype), taps))
+    # Masked, since the second derivative of torch.sinc is NaN at 0.
+    identity = torch.sinc(torch.where(at_zero, positions, 0.5))
+    return torch.fft.fft(torch.where(at_zero, identity.to(taps.dtype), taps))

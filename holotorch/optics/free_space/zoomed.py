@@ -95,7 +95,7 @@ class ZoomedFilter(FieldOperator):
         padded = Grid((kernel.shape[-2], kernel.shape[-1]), grid.pitch)
         columns, rows = chirps(grid, padded, out_grid, offset)
         for i, part in enumerate((kernel, *columns, *rows)):
-            self.register_complex(f"part{i}", part)
+            self.keep(f"part{i}", part)
 
     def _forward(self, field: Tensor) -> Tensor:
         kernel, columns, rows = self._parts_for(field)
@@ -109,5 +109,5 @@ class ZoomedFilter(FieldOperator):
         return ifft2(spectrum, self.grid.shape) * math.prod(kernel.shape[-2:])
 
     def _parts_for(self, field: Tensor) -> tuple[Tensor, Chirp, Chirp]:
-        parts = [self.complex_buffer(f"part{i}", field) for i in range(7)]
+        parts = [getattr(self, f"part{i}").to(field.dtype) for i in range(7)]
         return parts[0], (parts[1], parts[2], parts[3]), (parts[4], parts[5], parts[6])

@@ -30,8 +30,8 @@ Axes = tuple[AxisContent, AxisContent]  # (y, x) at one distance
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """One method of propagation; its error is computed at the first access.
+class Method:
+    """One method of propagation.
 
     Attributes:
         method: Name of the method.
@@ -39,6 +39,19 @@ class Candidate:
             is sampled in space and cropped to the displacements between source and window.
         padded: Samples (y, x) of the transforms.
         paraxial: Whether the factor beyond Fresnel is neglected.
+    """
+
+    method: str
+    sampled: tuple[bool, bool]
+    padded: tuple[int, int]
+    paraxial: bool
+
+
+@dataclass(frozen=True)
+class Candidate(Method):
+    """A method with its cost and its error, which is computed at the first access.
+
+    Attributes:
         scenes: Light of both axes at each distance that bounds the error, at the longest wavelength.
         predict: Computes the expected relative L2 error of one of the ``scenes``.
         flops: Floating-point operations of one call.
@@ -46,10 +59,6 @@ class Candidate:
         cost: ``flops``, with the operations of dense products divided by their relative speed.
     """
 
-    method: str
-    sampled: tuple[bool, bool]
-    padded: tuple[int, int]
-    paraxial: bool
     scenes: list[Axes]
     predict: Callable[[Axes], float]
     flops: float
@@ -65,6 +74,11 @@ class Candidate:
     def error(self) -> float:
         """Expected relative L2 error, the largest one of the scenes."""
         return max(map(self.predict, self.scenes))
+
+    @property
+    def plain(self) -> Method:
+        """The method alone."""
+        return Method(self.method, self.sampled, self.padded, self.paraxial)
 
     def captured(self) -> float:
         """Product over both axes of :attr:`AxisContent.captured`, the smallest one of the scenes."""

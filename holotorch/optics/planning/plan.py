@@ -80,7 +80,19 @@ def plan_from(
     pad = best.padded[0] / planes.grid.shape[0], best.padded[1] / planes.grid.shape[1]
     precision, window = str(dtype).removeprefix("torch."), (planes.out.shape, planes.out.pitch, planes.offset)
     costs = best.error, best.memory, best.flops
-    return Plan(best.method, pad, best.padded, precision, window, *costs, reason, runner_up, adequate)
+    return Plan(
+        best.method,
+        pad,
+        best.padded,
+        precision,
+        window,
+        *costs,
+        reason,
+        runner_up,
+        adequate,
+        best.sampled,
+        best.paraxial,
+    )
 
 
 def choose(options: list[Candidate], tolerance: float) -> tuple[Candidate, Candidate | None]:

@@ -3,27 +3,31 @@
 import math
 import warnings
 from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
 
 import torch
 from torch import Tensor, nn
 
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
-from holotorch.core.fourier import fft2, ifft2, multiplied
+from holotorch.core.fourier import fft2, filter_spectrum, ifft2, multiplied
 from holotorch.core.grid import Grid
+from holotorch.core.operator import Wavelengths
 from holotorch.core.plan import Plan
 from holotorch.core.quantities import DISTANCE, WAVELENGTH, Quantity
 from holotorch.optics.free_space.kernels import carrier
 from holotorch.optics.free_space.padding import FINEST
 from holotorch.optics.free_space.plane_pair import PlanePair, plane_pair
-from holotorch.optics.free_space.propagators import SpectralFilter
+from holotorch.optics.free_space.propagators import DistanceFilter, checked_distance, checked_wavelengths
 from holotorch.optics.free_space.resampled import ResampledKernel, resample, resampling_factors
 from holotorch.optics.free_space.transfer import transfer_function, wide_transfer_function
 from holotorch.optics.free_space.zoomed import ZoomedFilter, chirps, zoomed
-from holotorch.optics.planning.candidates import ZOOMED, Candidate, candidates
-from holotorch.optics.planning.content import field_content
+from holotorch.optics.planning.candidates import ZOOMED, Candidate, Method, candidates
+from holotorch.optics.planning.content import FieldContent, field_content
 from holotorch.optics.planning.plan import choose, plan_from
 
+STEP = 1.1  # ratio of successive distances for which propagations over a learned distance are planned
+_REMEMBERED = 1 << 24  # largest number of samples of the kernels that one call remembers; 128 MB in complex64
 _UNUSABLE = 0.1  # expected relative error above which a propagation is refused
 _DIM = 1e-5  # arriving fraction of the light below which measured content, stored per axis, cannot predict it
 _DIM_ERROR = 5.0  # error relative to the arriving light above which a warning is given, in units of the tolerance
@@ -32,9 +36,10 @@ _DIM_ERROR = 5.0  # error relative to the arriving light above which a warning i
 def propagate(
     field: Tensor,
     grid: Grid,
-    wavelength: float | Tensor,
+    wavelength: Wavelengths,
     distance: float | Tensor,
     *,
+    plan: Plan | None = None,
     tolerance: float = 1e-3,
     band: tuple[float, float] | None = None,
     spread: tuple[float, float] | None = None,
@@ -49,10 +54,14 @@ def propagate(
     Args:
         field: complex64 or complex128, shape [..., H, W].
         grid: Sampling of the field.
-        wavelength: Wavelength in metres in the medium: a number, or a tensor whose shape broadcasts against the leading
-            axes of ``field``.
+        wavelength: Wavelength in metres in the medium: a number, or several numbers or a tensor whose shape broadcasts
+            against the leading axes of ``field``.
         distance: In metres, a number or a tensor like ``wavelength``; both may carry gradients. A field whose axis has
             size 1 where ``distance`` has several values is transformed once for all of them.
+        plan: Result of :func:`plan_propagation` for these planes, which is used whatever the distance, in place of the
+            arguments that describe the content. By default the propagation is planned here; plans and, unless they
+            carry gradients, a few kernels are remembered. A distance that carries a gradient is planned as the next
+            longer power of :data:`STEP`, so that the method does not change from step to step of an optimisation.
         tolerance: Largest accepted relative L2 error, in expectation over noise that fills ``band`` and the window;
             smoother content has a smaller error.
         band: Highest frequencies (y, x) of the content, in cycles per metre; those of the grid by default.
@@ -72,42 +81,60 @@ def propagate(
 
     Raises:
         TypeError: A field that is not complex.
-        ValueError: Wrong shape, NaN or infinity, a wavelength that is not positive, or an expected error above 0.1 with
-            every method.
+        ValueError: Wrong shape, NaN or infinity, a wavelength that is not positive, an expected error above 0.1 with
+            every method, or a plan for other planes.
 
     Warns:
         SamplingWarning: No method meets the tolerance: the most accurate one is used, and the message gives its
             expected error. Or so little light arrives in the window of the result that the error is large relative to
-            this light; compiled calls and :class:`Propagator` omit this check.
+            this light; compiled calls, calls with a ``plan`` and :class:`Propagator` omit this check.
         PrecisionWarning: A wavelength or distance in float32 whose rounding changes the phase by 0.01 rad or more.
 
     A gradient in a common factor s of both pitches is that of ``propagate(field, grid, wavelength / s, distance / s)``,
     the result on grids of s times the pitch, because scaling all lengths changes nothing.
     """
-    checks.field("field", field, grid.shape)
-    norms = None if torch.compiler.is_compiling() else _norms(field)
-    if norms is not None and not bool(torch.isfinite(norms).all()):  # also if squares of finite elements overflow
-        checks.all_finite("field", torch.view_as_real(field.detach().resolve_conj()))
+    norms = _checked_norms(field, grid)
     wavelengths, distances = _float64(WAVELENGTH, wavelength, field), _float64(DISTANCE, distance, field)
-    checks.precise(wavelength, distance)
+    checks.precise(wavelengths if isinstance(wavelength, Sequence) else wavelength, distance)
     every_wavelength, every_distance = (each.detach().reshape(-1).tolist() for each in (wavelengths, distances))
     planes = plane_pair(grid, out_grid, offset, tilt, every_wavelength)
-    scene = every_wavelength, every_distance
-    example = field if measure else None
-    content = field_content(grid, *scene, band=band, spread=spread, margin=margin, field=example)
-    best = _best(candidates(planes, *scene, content, field.dtype), checks.positive("tolerance", tolerance))
-    if best.method == "identity":
-        return field * carrier(wavelengths, distances)[..., None, None].to(field.dtype)
-    sines = tilt.to(field.device, torch.float64) if isinstance(tilt, Tensor) else None
-    result = _propagate_by(best, planes, field, wavelengths, distances, sines)
-    _warn_if_dim(best, tolerance, planes, norms, result, measured=measure)
+    if plan is None:
+        chosen = _chosen(
+            planes, every_wavelength, every_distance, field, tolerance,
+            band=band, spread=spread, margin=margin, measure=measure, learned=distances.requires_grad,
+        )  # fmt: skip
+        _accept(chosen, tolerance)
+        best = chosen.plain
+    else:
+        chosen, best = None, _handed(plan, planes)
+    result = _propagate_by(best, planes, field, wavelengths, distances, tilt if isinstance(tilt, Tensor) else None)
+    if chosen is not None:
+        _warn_if_dim(chosen, tolerance, planes, norms, result, measured=measure)
     return result
 
 
 def _propagate_by(
-    candidate: Candidate, planes: PlanePair, field: Tensor, wavelengths: Tensor, distances: Tensor, tilt: Tensor | None
+    method: Method, planes: PlanePair, field: Tensor, wavelengths: Tensor, distances: Tensor, tilt: Tensor | None
 ) -> Tensor:
-    """Propagate ``field`` by one method, for each wavelength and distance in turn."""
+    """Propagate ``field`` by one method, with a remembered kernel where nothing carries a gradient."""
+    if method.method == "identity":
+        return field * carrier(wavelengths, distances)[..., None, None].to(field.dtype)
+    learned = wavelengths.requires_grad or distances.requires_grad or tilt is not None
+    if learned or not planes.same_pitch or not _rememberable(method, wavelengths, distances):
+        tilt = None if tilt is None else tilt.to(field.device, torch.float64)
+        return _propagate_anew(method, planes, field, wavelengths, distances, tilt)
+    pairs = [wavelengths.detach(), distances.detach()]
+    if wavelengths.ndim or distances.ndim:
+        pairs = torch.broadcast_tensors(*pairs)
+    numbers = [tuple(each.reshape(-1).tolist()) for each in pairs]
+    kernel = _constant_kernel(planes, method, *numbers, field.dtype, field.device)
+    return filter_spectrum(field, kernel.reshape(*pairs[0].shape, *kernel.shape[-2:]), planes.out.shape)
+
+
+def _propagate_anew(
+    candidate: Method, planes: PlanePair, field: Tensor, wavelengths: Tensor, distances: Tensor, tilt: Tensor | None
+) -> Tensor:
+    """Propagate ``field`` by one method, with a new kernel for each wavelength and distance in turn."""
 
     def filtered(spectrum: Tensor, wavelength: Tensor, distance: Tensor) -> Tensor:
         kernel = kernel_of(planes, candidate, wavelength, distance, field.dtype, tilt)
@@ -153,11 +180,13 @@ class Propagator(nn.Module):
     Args:
         grid: Sampling of the field.
         wavelengths: In metres, one per channel.
-        distance: In metres, negative to travel back.
+        distance: In metres, negative to travel back. Wavelengths [C] and distance may be ``nn.Parameter``; the method
+            and its padding stay those planned for their first values.
         tolerance, band, spread, margin, out_grid, offset, tilt: As in :func:`propagate`; numbers, not tensors.
         example: A field [..., H, W] like those to be propagated, which is measured and replaces the description of the
             content by ``band``, ``spread`` and ``margin``.
         memory_limit: Refuse a plan that needs more bytes than this per channel.
+        learnable: Make the distance a Parameter.
 
     Attributes:
         plan: The chosen method and the reason for it.
@@ -170,8 +199,8 @@ class Propagator(nn.Module):
     def __init__(
         self,
         grid: Grid,
-        wavelengths: float | Sequence[float],
-        distance: float,
+        wavelengths: Wavelengths,
+        distance: float | Tensor,
         *,
         tolerance: float = 1e-3,
         band: tuple[float, float] | None = None,
@@ -182,29 +211,44 @@ class Propagator(nn.Module):
         offset: tuple[float, float] = (0.0, 0.0),
         tilt: tuple[float, float] = (0.0, 0.0),
         memory_limit: int | None = None,
+        learnable: bool = False,
     ):
         super().__init__()
-        self.wavelengths = checks.wavelengths(wavelengths)
-        self.distance = checks.quantity(DISTANCE, distance)
+        self.wavelengths, z = checked_wavelengths(wavelengths), checked_distance(distance)
+        self._distance = z
         planes = plane_pair(grid, out_grid, offset, tilt, self.wavelengths)
         self.grid, self.out_grid, self.offset, self.tilt = grid, planes.out, planes.offset, planes.tilt
-        scene = self.wavelengths, [self.distance]
+        scene = self.wavelengths, [z]
         content = field_content(grid, *scene, band=band, spread=spread, margin=margin, field=example)
         options = candidates(planes, *scene, content)
         self.plan = plan_from(options, planes, tolerance, memory_limit)
-        best = _best(options, tolerance)
-        if not planes.same_pitch and best.method != ZOOMED:
+        best, _ = choose(options, tolerance)
+        _accept(best, tolerance)
+        if planes.same_pitch:
+            transfer = partial(_transfer_function, planes, best.plain)
+            self.operator = DistanceFilter(
+                grid, wavelengths, distance, best.padded, transfer, out_grid=planes.out, learnable=learnable
+            )
+            return
+        if learnable or isinstance(distance, nn.Parameter) or isinstance(wavelengths, nn.Parameter):
+            raise ValueError(
+                "Propagator learns distance and wavelengths only for a result of the same pitch as the field; call "
+                "propagate(..., plan=plan) with tensors that carry gradients instead"
+            )
+        if best.method != ZOOMED:
             self.operator = ResampledKernel(
-                grid, self.wavelengths, self.distance, planes.out,
+                grid, self.wavelengths, z, planes.out,
                 offset=offset, tilt=tilt, paraxial=best.paraxial, padded=best.padded,
             )  # fmt: skip
             return
-        lengths = torch.tensor(self.wavelengths, dtype=torch.float64), torch.tensor(self.distance, dtype=torch.float64)
+        lengths = torch.tensor(self.wavelengths, dtype=torch.float64), torch.tensor(z, dtype=torch.float64)
         kernel = kernel_of(planes, best, *lengths, torch.complex128)
-        if planes.same_pitch:
-            self.operator = SpectralFilter(grid, self.wavelengths, kernel, out_grid=planes.out)
-        else:
-            self.operator = ZoomedFilter(grid, self.wavelengths, kernel, planes.out, offset=planes.offset)
+        self.operator = ZoomedFilter(grid, self.wavelengths, kernel, planes.out, offset=planes.offset)
+
+    @property
+    def distance(self) -> float | Tensor:
+        """In metres; a Parameter if it is learned."""
+        return self.operator.distance if isinstance(self.operator, DistanceFilter) else self._distance
 
     def forward(self, field: Tensor) -> Tensor:
         """Propagate ``field``, complex [..., C, H, W], to [..., C, H', W'], same dtype."""
@@ -219,9 +263,82 @@ class Propagator(nn.Module):
         return f"distance={self.distance}, method={self.plan.method!r}, padded={self.plan.padded}"
 
 
-def _best(options: list[Candidate], tolerance: float) -> Candidate:
-    """The best candidate; ValueError or a warning, in the name of the caller's caller, if it exceeds the tolerance."""
-    best, _ = choose(options, tolerance)
+def _chosen(
+    planes: PlanePair,
+    wavelengths: list[float],
+    distances: list[float],
+    field: Tensor,
+    tolerance: float,
+    *,
+    measure: bool,
+    learned: bool,
+    **described: tuple[float, float] | None,
+) -> Candidate:
+    """The best candidate for the light that ``described`` (band, spread and margin) or, if measured, ``field`` is."""
+    checks.positive("tolerance", tolerance)
+    if learned and planes.straight:  # the error of such a method grows with the distance
+        distances = [next_longer(each) for each in distances]
+    example = field if measure else None
+    content = field_content(planes.grid, wavelengths, distances, field=example, **described)  # type: ignore[arg-type]
+    if measure:
+        return choose(candidates(planes, wavelengths, distances, content, field.dtype), tolerance)[0]
+    return _cached_choice(planes, tuple(wavelengths), tuple(distances), content, field.dtype, tolerance)
+
+
+@lru_cache(maxsize=64)
+def _cached_choice(
+    planes: PlanePair,
+    wavelengths: tuple[float, ...],
+    distances: tuple[float, ...],
+    content: FieldContent,
+    dtype: torch.dtype,
+    tolerance: float,
+) -> Candidate:
+    return choose(candidates(planes, wavelengths, distances, content, dtype), tolerance)[0]
+
+
+def next_longer(distance: float) -> float:
+    """The number at or beyond ``distance``, with its sign, that is a power of :data:`STEP`; 0 for 0."""
+    if distance == 0:
+        return 0.0
+    return math.copysign(STEP ** math.ceil(math.log(abs(distance), STEP) - 1e-9), distance)
+
+
+def _handed(plan: Plan, planes: PlanePair) -> Method:
+    """The method of a plan that was handed in; TypeError if it is none, ValueError if it is for other planes."""
+    if not isinstance(plan, Plan):
+        raise TypeError(f"plan must be a result of plan_propagation, got {type(plan).__name__}")
+    window = planes.out.shape, planes.out.pitch, planes.offset
+    if plan.window != window:
+        raise ValueError(f"plan must be for a result of (shape, pitch, offset) {window}, got one for {plan.window}")
+    return Method(plan.method, plan.sampled, plan.padded, plan.paraxial)
+
+
+def _rememberable(method: Method, wavelengths: Tensor, distances: Tensor) -> bool:
+    """Whether the kernels of all wavelengths and distances together are small enough to be kept and used at once."""
+    kernels = wavelengths.numel() * distances.numel()  # at most
+    return not torch.compiler.is_compiling() and kernels * math.prod(method.padded) <= _REMEMBERED
+
+
+@lru_cache(maxsize=4)
+def _constant_kernel(
+    planes: PlanePair,
+    method: Method,
+    wavelengths: tuple[float, ...],
+    distances: tuple[float, ...],
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Tensor:
+    """:func:`kernel_of` for pairs of wavelength and distance, without gradients, [N, P, Q]."""
+    with torch.inference_mode(False), torch.no_grad():
+        wavelength, distance = (
+            torch.tensor(each, dtype=torch.float64, device=device) for each in (wavelengths, distances)
+        )
+        return kernel_of(planes, method, wavelength, distance, dtype)
+
+
+def _accept(best: Candidate, tolerance: float) -> None:
+    """ValueError or a warning, in the name of the caller's caller, if the best candidate exceeds the tolerance."""
     if best.error > tolerance:
         text = (
             f"no method reaches a tolerance of {tolerance:.1e} for noise that fills the described band and window; "
@@ -230,7 +347,15 @@ def _best(options: list[Candidate], tolerance: float) -> Candidate:
         if best.error > _UNUSABLE:
             raise ValueError(text)
         warnings.warn(text, SamplingWarning, stacklevel=3)
-    return best
+
+
+def _checked_norms(field: Tensor, grid: Grid) -> Tensor | None:
+    """:func:`_norms`, None under compile; raises unless ``field`` is a finite complex field on ``grid``."""
+    checks.field("field", field, grid.shape)
+    norms = None if torch.compiler.is_compiling() else _norms(field)
+    if norms is not None and not math.isfinite(norms.sum().item()):  # also if squares of finite elements overflow
+        checks.all_finite("field", torch.view_as_real(field.detach().resolve_conj()))
+    return norms
 
 
 def _norms(field: Tensor) -> Tensor:
@@ -247,9 +372,9 @@ def _warn_if_dim(
     """
     if norms is None or 0 in result.shape or best.error > tolerance:  # _best has warned of the last case
         return
-    area_ratio = math.prod(planes.out.pitch) / math.prod(planes.grid.pitch)
-    fractions = torch.where(norms > 0, (_norms(result) / norms).square() * area_ratio, 1.0)
-    dimmest = float(torch.where(torch.isfinite(fractions), fractions, 1.0).min())
+    # No light at the source counts as light that arrives.
+    least = torch.nan_to_num(_norms(result) / norms, nan=1.0).min().item()
+    dimmest = least**2 * math.prod(planes.out.pitch) / math.prod(planes.grid.pitch)
     allowed = _DIM_ERROR * tolerance
     # Most calls end here: the expected light is at most all light, and takes longer to compute.
     if best.error <= allowed * math.sqrt(dimmest):
@@ -266,9 +391,15 @@ def _warn_if_dim(
         )
 
 
+def _transfer_function(
+    planes: PlanePair, candidate: Method, wavelength: Tensor, distance: Tensor, dtype: torch.dtype
+) -> Tensor:
+    return kernel_of(planes, candidate, wavelength, distance, dtype)
+
+
 def kernel_of(
     planes: PlanePair,
-    candidate: Candidate,
+    candidate: Method,
     wavelength: Tensor,
     distance: Tensor,
     dtype: torch.dtype,
@@ -290,10 +421,22 @@ def kernel_of(
     )
 
 
-def _float64(kind: Quantity, value: float | Tensor, field: Tensor) -> Tensor:
+def _float64(kind: Quantity, value: float | Sequence[float] | Tensor, field: Tensor) -> Tensor:
     """``value`` as float64 tensor on the device of ``field``, checked to be a plausible quantity of this kind."""
     if not isinstance(value, Tensor):
-        value = torch.tensor(checks.quantity(kind, value), dtype=torch.float64)
+        if torch.compiler.is_compiling() or not isinstance(value, float):
+            return _constant.__wrapped__(kind, value, field.device)
+        return _constant(kind, value, field.device)
     value = value.to(field.device, torch.float64)
     checks.quantities(kind, value)
     return value
+
+
+@lru_cache(maxsize=64)
+def _constant(kind: Quantity, value: float | Sequence[float], device: torch.device) -> Tensor:
+    """Checked numbers as float64 tensor, which is remembered because making it takes longer than all other checks."""
+    each = value if isinstance(value, Sequence) else [value]
+    numbers = [checks.quantity(kind, number) for number in each]
+    with torch.inference_mode(False):  # a later call may need gradients
+        tensor = torch.tensor(numbers, dtype=torch.float64, device=device)
+    return tensor if isinstance(value, Sequence) else tensor[0]

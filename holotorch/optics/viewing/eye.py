@@ -9,6 +9,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.grid import Grid
+from holotorch.core.learning import without_graph
 from holotorch.core.quantities import ACCOMMODATION, EYE_LENGTH, PUPIL_RADIUS, SOFTNESS, WAVEFRONT_ERROR
 from holotorch.optics.elements.lens import Transmission, affordable, lens_phase, opening, warn_if_coarse
 from holotorch.optics.free_space.kernels import turns_phasor
@@ -21,7 +22,8 @@ _HIGHEST = 27  # largest OSA index of a Zernike polynomial: sixth radial order
 class Eye:
     """Reduced eye: one thin lens with the pupil in its plane, in air, and a retina (thesis Sec. 5.5.2).
 
-    Lengths in metres; pupil radius, axial length and accommodation may be tensors that carry a gradient.
+    Lengths in metres; pupil radius, axial length, accommodation and the coefficients of aberrations may be tensors that
+    carry a gradient.
 
     Attributes:
         pupil_radius: Radius of the opening of the iris; 1 to 4 mm, 1.5 mm in normal light.
@@ -42,7 +44,7 @@ class Eye:
     pupil_radius: Length = 1.5e-3
     axial_length: Length = 24e-3
     accommodation: Length = math.inf
-    aberrations: Mapping[int, float] = field(default_factory=dict)
+    aberrations: Mapping[int, Length] = field(default_factory=dict)
     chromatic_reference: float | None = None
     softness: float = 0.0
 
@@ -53,7 +55,7 @@ class Eye:
         for index, coefficient in self.aberrations.items():
             if checks.whole("Zernike index", index, 0) > _HIGHEST:
                 raise ValueError(f"Zernike index must be an OSA index of 0 .. {_HIGHEST}, got {index}")
-            checks.quantity(WAVEFRONT_ERROR, coefficient, f"Zernike coefficient {index}")
+            checks.quantity(WAVEFRONT_ERROR, number(coefficient), f"Zernike coefficient {index}")
         if self.chromatic_reference is not None:
             chromatic_refraction(self.chromatic_reference)
         checks.quantity(SOFTNESS, self.softness)
@@ -89,7 +91,11 @@ class Eye:
 class EyeLens(Transmission):
     """Lens of an :class:`Eye` with pupil and aberrations, as an element of an ``OpticalPath``.
 
+    The lengths of the eye that are ``nn.Parameter`` are learned; they are registered as ``eye_accommodation``,
+    ``eye_pupil_radius``, ``eye_axial_length`` and ``eye_aberrations_4`` for the Zernike index 4.
+
     Raises:
+        ValueError: A length with a gradient that is no Parameter.
         MemoryError: The grid has more samples than memory is available for.
 
     Warns:
@@ -98,15 +104,27 @@ class EyeLens(Transmission):
 
     def __init__(self, grid: Grid, wavelengths: float | Sequence[float], eye: Eye):
         wavelengths = checks.wavelengths(wavelengths)
+        for name in ("pupil_radius", "axial_length", "accommodation"):
+            without_graph(name, getattr(eye, name))
+        for index, coefficient in eye.aberrations.items():
+            without_graph(f"Zernike coefficient {index}", coefficient)
         affordable("the lens of an eye", grid, len(wavelengths))
-        y, x = grid.coordinates()
+        super().__init__(grid, wavelengths, None)
+        if not self.adopt("eye", eye):
+            self.values = self.computed()
         length = number(eye.focal_length)
-        values = [
-            turns_phasor(lens_phase(grid, each, length) / (2 * math.pi)) * eye.pupil_function(y, x, each).detach()
-            for each in wavelengths
-        ]
-        super().__init__(grid, wavelengths, torch.stack(values))
         warn_if_coarse(grid, wavelengths, [length] * len(wavelengths), number(eye.pupil_radius))
+
+    def computed(self) -> Tensor:
+        """Transmission for the present lengths of the eye, complex128 [C, H, W]."""
+        eye: Eye = self.present("eye")
+        length = torch.as_tensor(eye.focal_length, dtype=torch.float64)
+        y, x = self.grid.coordinates(length.device)
+        values = [
+            turns_phasor(lens_phase(self.grid, each, length) / (2 * math.pi)) * eye.pupil_function(y, x, each)
+            for each in self.wavelengths
+        ]
+        return torch.stack(values)
 
 
 def chromatic_refraction(wavelength: Length) -> Length:

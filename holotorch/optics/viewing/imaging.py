@@ -35,7 +35,7 @@ from torch import Tensor
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.deprecation import renamed
-from holotorch.core.fourier import centred_fft2, centred_ifft2, good_length
+from holotorch.core.fourier import centred_fft2, centred_ifft2, fft2, good_length, ifft2, multiplied
 from holotorch.core.grid import Grid
 from holotorch.optics.free_space.kernels import (
     angular_spectrum_kernel,
@@ -44,7 +44,7 @@ from holotorch.optics.free_space.kernels import (
     turns_phasor,
     window_taper,
 )
-from holotorch.optics.free_space.zoomed import chirps, zoomed
+from holotorch.optics.free_space.zoomed import Chirp, chirps, zoomed
 from holotorch.optics.viewing.display import Display, Length, inverse, number
 from holotorch.optics.viewing.eye import Eye
 from holotorch.optics.viewing.rays import fringe_width, samples_for_all_light
@@ -71,10 +71,15 @@ class CollapseSampling:
     fine: tuple[int, int]
 
     @property
+    def plain(self) -> bool:
+        """Whether the object plane has the samples of the hologram, within the period of the transform."""
+        return self.fine == self.window and all(p >= w for p, w in zip(self.padded, self.window, strict=True))
+
+    @property
     def flops(self) -> float:
         """Floating-point operations for one image of one wavelength, 5 n log2 n for each transform."""
         padded, window, fine = (fft_flops(math.prod(shape)) for shape in (self.padded, self.window, self.fine))
-        return padded + zoom_flops(self.padded, self.fine) + fine + window
+        return padded + (padded if self.plain else zoom_flops(self.padded, self.fine)) + fine + window
 
     def memory_bytes(self, passed: float, itemsize: int = 8, batch: int = 1) -> int:
         """Largest extra memory in bytes for ``batch`` images of one wavelength, with samples of ``itemsize`` bytes.
@@ -98,6 +103,7 @@ def propagate_collapsed(
     plane: Length | None = None,
     sampling: CollapseSampling | None = None,
     paraxial: bool = False,
+    factors: "Sequence[CollapseFactors] | None" = None,
 ) -> Tensor:
     """Field on the retina, referred back to the object plane: the g(x) of this module's derivation.
 
@@ -118,6 +124,7 @@ def propagate_collapsed(
             function includes the spherical aberration that Fresnel's model neglects behind the eyepiece for points on
             the axis: the phase -k / 8 sum_i d_i u_i^4, where d_i are the distances from eyepiece to eye and from eye to
             retina, and u_i the slopes over these distances of the ray through xi.
+        factors: Results of :func:`collapse_factors` for these arguments, which are computed by default.
 
     Returns:
         Complex [..., C, H, W] on ``grid``, upright: a position times :func:`retinal_scale` (negative) is that on the
@@ -146,10 +153,8 @@ def propagate_collapsed(
         "crop the hologram, pass fewer fields at once, use a smaller pupil, or put the plane farther from the pupil",
         field.device,
     )
-    images = [
-        _image(field[..., c, :, :], grid, wavelength, display, eye, plane, sizes, paraxial)
-        for c, wavelength in enumerate(channel_wavelengths)
-    ]
+    factors = factors or collapse_factors(field, grid, channel_wavelengths, display, eye, plane, sizes, paraxial)
+    images = [_image(field[..., c, :, :], grid, sizes, each) for c, each in enumerate(factors)]
     return torch.stack(images, -3)
 
 
@@ -186,7 +191,7 @@ def collapse_sampling(
     axes = []
     for size, pitch in zip(grid.shape, grid.pitch, strict=True):
         if size == 1:
-            axes.append((1, 1, 1, 1))
+            axes.append((1.0, 1, 1, 1))
             continue
         if abs(second) <= 1e-9 * (abs(distance) + number(display.eye_distance)):
             raise ValueError("the pupil is an image of this object plane (B = 0); give another plane")
@@ -207,12 +212,61 @@ def collapse_sampling(
             padded = max(padded, math.ceil(min(all_light, tapered)))
         if factor > _FINEST:
             raise ValueError(f"the collapse would need {factor:.3g} times the hologram's sampling; give another plane")
-        axes.append((factor, good_length(padded), window, good_length(math.ceil(factor * window))))
-    return CollapseSampling(*zip(*axes, strict=True))
+        axes.append((factor, padded, window, size))
+    if all(factor == 1 for factor, *_ in axes):  # no oversampling: inverse FFTs take the place of chirp-z transforms
+        windows = [_same_parity(window, size) for _, _, window, size in axes]
+        lengths = [good_length(max(axis[1], window)) for axis, window in zip(axes, windows, strict=True)]
+        return CollapseSampling((1.0, 1.0), _pair(lengths), _pair(windows), _pair(windows))
+    sizes = [(f, good_length(padded), window, good_length(math.ceil(f * window))) for f, padded, window, _ in axes]
+    return CollapseSampling(*zip(*sizes, strict=True))
 
 
-def _image(
-    field: Tensor,
+def _same_parity(minimum: int, size: int) -> int:
+    """Good length for an FFT, at least ``minimum``, that differs from ``size`` by an even number."""
+    if size == 1:
+        return 1
+    return good_length(minimum, odd=True) if size % 2 else 2 * good_length(-(-minimum // 2))
+
+
+def _pair(values: Sequence[int]) -> tuple[int, int]:
+    return values[0], values[1]
+
+
+@dataclass(frozen=True)
+class CollapseFactors:
+    """What multiplies the light of one wavelength on its way to the retina.
+
+    Attributes:
+        kernel: Transfer function to the object plane, complex [P, Q] in FFT order.
+        zoom: Factors (y, x) of the chirp-z transform to the oversampled object plane; empty without oversampling.
+        curvature: Parabolic phase of the object plane, a column [h, 1] and a row [1, w].
+        pupil: Transmission of pupil, defocus and aberrations, complex [n, m], on the frequencies that the pupil takes.
+        bands: Number of bands (y, x) of width 1 / pitch among these frequencies.
+    """
+
+    kernel: Tensor
+    zoom: list[Chirp]
+    curvature: tuple[Tensor, Tensor]
+    pupil: Tensor
+    bands: tuple[int, int]
+
+
+def collapse_factors(
+    like: Tensor,
+    grid: Grid,
+    wavelengths: Sequence[float],
+    display: Display,
+    eye: Eye,
+    plane: Length,
+    sizes: CollapseSampling,
+    paraxial: bool,
+) -> list[CollapseFactors]:
+    """Factors of :func:`propagate_collapsed` for each wavelength, on the device and in the dtype of ``like``."""
+    return [_factors(like, grid, each, display, eye, plane, sizes, paraxial) for each in wavelengths]
+
+
+def _factors(
+    like: Tensor,
     grid: Grid,
     wavelength: float,
     display: Display,
@@ -220,12 +274,11 @@ def _image(
     plane: Length,
     sizes: CollapseSampling,
     paraxial: bool,
-) -> Tensor:
-    """One wavelength of :func:`propagate_collapsed`, [..., H, W] to [..., H, W]."""
+) -> CollapseFactors:
+    """:func:`collapse_factors` for one wavelength."""
+    device, dtype = like.device, like.dtype
     first, second, _, back = display.matrix(plane)
-    padded, window = Grid(sizes.padded, grid.pitch), Grid(sizes.window, grid.pitch)
-    fy, fx = (p * n / m for p, n, m in zip(grid.pitch, sizes.window, sizes.fine, strict=True))
-    fine = Grid(sizes.fine, (fy, fx))
+    padded, window, fine = Grid(sizes.padded, grid.pitch), Grid(sizes.window, grid.pitch), _fine(grid, sizes)
     if paraxial:
         kernel = fresnel_kernel(padded, wavelength, plane)
     else:
@@ -235,17 +288,16 @@ def _image(
     if all(p >= n + w or n == 1 for p, n, w in zip(sizes.padded, grid.shape, sizes.window, strict=True)):
         half_y, half_x = ((n + w) / 2 * p for n, w, p in zip(grid.shape, sizes.window, grid.pitch, strict=True))
         kernel = kernel * window_taper(padded, wavelength, number(plane), (half_y, half_x), paraxial=paraxial)
-    kernel = (kernel * carrier(wavelength, plane)).to(field.device, field.dtype)
-    light = zoomed(field, kernel, chirps(grid, padded, fine, (0.0, 0.0), field.device))
-    y, x = fine.coordinates(field.device)
-    rate = torch.as_tensor(first / second, dtype=torch.float64, device=field.device) / (2 * wavelength)
-    light = light * (turns_phasor(rate * y.square()) * turns_phasor(rate * x.square())).to(field.dtype)
+    kernel = (kernel * carrier(wavelength, plane)).to(device, dtype)
+    chirp_factors = [] if sizes.plain else chirps(grid, padded, fine, (0.0, 0.0), device)
+    zoom = [(a.to(dtype), b.to(dtype), c.to(dtype)) for a, b, c in chirp_factors]
+    rate = torch.as_tensor(first / second, dtype=torch.float64, device=device) / (2 * wavelength)
+    curvature = [turns_phasor(rate * each.square()).to(dtype) for each in fine.coordinates(device)]
     bands = pupil_bands(grid, wavelength, display, eye, plane)
-    spectrum = _centred(centred_fft2(light), [n * m for n, m in zip(window.shape, bands, strict=True)])
-    # The positions (eta, xi) on the pupil of the frequencies of this spectrum. The window has the same width at both
+    # The positions (eta, xi) on the pupil of the frequencies of the spectrum. The window has the same width at both
     # pitches and therefore the same frequency step.
     eta, xi = (
-        (torch.arange(n * m, dtype=torch.float64, device=field.device) - n * m // 2) / (n * p) * (wavelength * second)
+        (torch.arange(n * m, dtype=torch.float64, device=device) - n * m // 2) / (n * p) * (wavelength * second)
         for n, m, p in zip(window.shape, bands, window.pitch, strict=True)
     )
     eta, xi = eta[:, None], xi[None, :]
@@ -254,11 +306,31 @@ def _image(
     if not paraxial:
         aberration = display.eye_distance * (back / second) ** 4 + 1 / eye.axial_length**3
         cycles = cycles - aberration / (8 * wavelength) * square.square()
-    pupil = eye.pupil_function(eta, xi, wavelength) * turns_phasor(cycles)
     norm = math.sqrt(math.prod(window.shape) / math.prod(fine.shape))
-    image = spectrum * (pupil * norm).to(field.dtype)
+    pupil = (eye.pupil_function(eta, xi, wavelength) * turns_phasor(cycles) * norm).to(dtype)
+    return CollapseFactors(kernel, zoom, (curvature[0], curvature[1]), pupil, bands)
+
+
+def _fine(grid: Grid, sizes: CollapseSampling) -> Grid:
+    """The window of the object plane at the oversampled pitch."""
+    y, x = (p * n / m for p, n, m in zip(grid.pitch, sizes.window, sizes.fine, strict=True))
+    return Grid(sizes.fine, (y, x))
+
+
+def _image(field: Tensor, grid: Grid, sizes: CollapseSampling, factors: CollapseFactors) -> Tensor:
+    """One wavelength of :func:`propagate_collapsed`, [..., H, W] to [..., H, W]."""
+    if factors.zoom:
+        light = zoomed(field, factors.kernel, factors.zoom)
+    else:
+        spectrum = multiplied(fft2(field, sizes.padded), factors.kernel)
+        axes = zip(grid.shape, sizes.window, sizes.padded, strict=True)
+        light = ifft2(spectrum, sizes.window, _pair([(n // 2 - w // 2) % p for n, w, p in axes]))
+    light = light * (factors.curvature[0] * factors.curvature[1])
+    rows, columns = factors.bands
+    spectrum = _centred(centred_fft2(light), [n * m for n, m in zip(sizes.window, factors.bands, strict=True)])
+    image = spectrum * factors.pupil
     # Sampling at the hologram's pitch adds up all bands of the spectrum.
-    image = image.unflatten(-1, (bands[1], -1)).sum(-2).unflatten(-2, (bands[0], -1)).sum(-3)
+    image = image.unflatten(-1, (columns, -1)).sum(-2).unflatten(-2, (rows, -1)).sum(-3)
     return _centred(centred_ifft2(image), grid.shape)
 
 

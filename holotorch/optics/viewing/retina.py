@@ -2,17 +2,18 @@
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.checks import SamplingWarning
 from holotorch.core.complex import intensity
 from holotorch.core.grid import Grid
+from holotorch.core.learning import PreciseModule
 from holotorch.core.quantities import WIDTH
 from holotorch.optics.viewing import imaging
 from holotorch.optics.viewing.display import Display, Length, inverse, number
@@ -26,6 +27,8 @@ _EDGE_ERROR = 3.0
 _RAYS = 512  # rays across the pupil from each point of the scene that predict the error of the collapse
 _HEIGHTS = 9  # points of the scene that predict the error of the collapse
 _UNUSABLE = 0.5  # expected relative error above which a plan is refused
+TOLERANCE = 0.1  # relative error of the intensity accepted by default; most of the collapse's is a shift of spots
+_COSTLY = 10.0  # ratio of operations to those of the cheapest method above which a warning is given
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,7 @@ class RetinaPlan:
         reason: Error and cost of the chosen method, in words.
         runner_up: Error and cost of the other method, or why it is impossible, in words.
         adequate: Whether ``predicted_error`` is within the tolerance.
+        cost_ratio: ``flops`` relative to those of the cheapest usable method.
     """
 
     method: str
@@ -51,6 +55,7 @@ class RetinaPlan:
     reason: str
     runner_up: str
     adequate: bool
+    cost_ratio: float = 1.0
 
 
 def plan_retina(
@@ -59,7 +64,7 @@ def plan_retina(
     display: Display,
     eye: Eye,
     *,
-    tolerance: float = 0.02,
+    tolerance: float | None = None,
     plane: Length | None = None,
     reach: float | None = None,
     paraxial: bool = False,
@@ -74,7 +79,8 @@ def plan_retina(
         wavelengths: In metres, one per channel.
         display: Positions of hologram, eyepiece and eye.
         eye: Pupil, retina and accommodation.
-        tolerance: Largest accepted relative L2 error of the intensity.
+        tolerance: Largest accepted relative L2 error of the intensity. By default the cheapest method is taken, with an
+            error of 0.1 as the limit of what is called adequate.
         plane: Distance in metres from the hologram to the object plane; by default that of the plane in focus.
         reach: Half width in metres of the scene in the object plane; by default that of the hologram.
         paraxial: Predict errors in the Fresnel model, in which the eyepiece's edge and the sampling are the only errors
@@ -84,16 +90,16 @@ def plan_retina(
         memory_limit: Exclude a method that needs more bytes than this for one image of one wavelength.
 
     Returns:
-        The cheapest method within the tolerance, or else the most accurate one, marked as not adequate.
+        The cheapest method within the tolerance, or else the most accurate one, marked as not adequate. Without a
+        tolerance, the cheapest one whose expected error is at most 0.5.
 
     Raises:
         ValueError: Invalid arguments, no method within the memory limit, or an expected error above 0.5.
     """
-    wavelengths, tolerance = checks.wavelengths(wavelengths), checks.positive("tolerance", tolerance)
+    wavelengths = checks.wavelengths(wavelengths)
+    limit_of_error = TOLERANCE if tolerance is None else checks.positive("tolerance", tolerance)
     plane = display.object_plane(plane, eye.accommodation)
-    if reach is None:
-        reach = max(n * p for n, p in zip(grid.shape, grid.pitch, strict=True) if n > 1) / 2
-    heights = [checks.quantity(WIDTH, reach, "reach") * i / (_HEIGHTS - 1) for i in range(_HEIGHTS)]
+    heights = _heights(grid, reach)
     diameter = 2 * number(eye.pupil_radius)
     options, impossible = [], ""
     try:
@@ -106,31 +112,45 @@ def plan_retina(
         edge = _EDGE_ERROR * max(spot / (n * p) for n, p in zip(collapse.window, grid.pitch, strict=True) if n > 1)
         bands = max(math.prod(imaging.pupil_bands(grid, w, display, eye, plane)) for w in wavelengths)
         memory = collapse.memory_bytes(bands * math.prod(collapse.window), dtype.itemsize)
-        options.append(_option("collapse", collapse, math.hypot(max(errors), edge), memory, tolerance))
+        options.append(_option("collapse", collapse, math.hypot(max(errors), edge), memory, limit_of_error))
     except ValueError as error:
         impossible = f"collapse is impossible here: {error}"
     elements = least_oversampling(grid, wavelengths, display, eye, plane=plane)
     step = max(p / m for n, p, m in zip(grid.shape, grid.pitch, elements.oversampling, strict=True) if n > 1)
     edge = min(1.0, _EDGE_ERROR * step / diameter)
-    options.append(_option("elements", elements, edge, elements.memory_bytes(dtype.itemsize), tolerance))
-    limit = math.inf if memory_limit is None else memory_limit
-    fitting = [each for each in options if each.memory_bytes <= limit]
-    if not fitting:
-        raise ValueError(f"no way to the retina fits into {limit:.3g} bytes, the smallest takes "
-                         f"{min(each.memory_bytes for each in options):.3g}; crop the hologram or raise "
-                         "memory_limit")  # fmt: skip
-    best = min(fitting, key=lambda each: (not each.adequate, each.flops if each.adequate else each.predicted_error))
-    error = best.predicted_error
-    if error > _UNUSABLE:
-        raise ValueError(f"the only way that fits, {best.method}, has an expected error of {error:.2g}; raise "
-                         "memory_limit, or make the scene smaller (reach)")  # fmt: skip
+    options.append(_option("elements", elements, edge, elements.memory_bytes(dtype.itemsize), limit_of_error))
+    best, cheapest = _choice(options, tolerance, math.inf if memory_limit is None else memory_limit)
     reason = (
-        f"{best.method} at {max(best.sampling.oversampling):.2f} times the hologram's sampling: error {error:.2g} "
-        f"{'within' if best.adequate else 'beyond'} the tolerance {tolerance:g}, {best.flops:.2g} operations, "
-        f"{best.memory_bytes:.2g} bytes"
+        f"{best.method} at {max(best.sampling.oversampling):.2f} times the hologram's sampling: error "
+        f"{best.predicted_error:.2g} {'within' if best.adequate else 'beyond'} {limit_of_error:g}, "
+        f"{best.flops:.2g} operations, {best.memory_bytes:.2g} bytes"
     )
     runner_up = next((each.reason for each in options if each is not best), impossible)
-    return replace(best, reason=reason, runner_up=runner_up)
+    return replace(best, reason=reason, runner_up=runner_up, cost_ratio=best.flops / cheapest.flops)
+
+
+def _choice(options: list[RetinaPlan], tolerance: float | None, limit: float) -> tuple[RetinaPlan, RetinaPlan]:
+    """The best of the plans within ``limit`` bytes, as :func:`plan_retina` says, and the cheapest one."""
+    fitting = [each for each in options if each.memory_bytes <= limit]
+    if not fitting:
+        raise ValueError(
+            f"no way to the retina fits into {limit:.3g} bytes, the smallest takes "
+            f"{min(each.memory_bytes for each in options):.3g}; crop the hologram or raise memory_limit"
+        )
+    usable = [each for each in fitting if each.predicted_error <= _UNUSABLE]
+    if not usable:
+        best = min(fitting, key=lambda each: each.predicted_error)
+        raise ValueError(
+            f"the only way that fits, {best.method}, has an expected error of {best.predicted_error:.2g}; raise "
+            "memory_limit, or make the scene smaller (reach)"
+        )
+    cheapest = min(usable, key=lambda each: each.flops)
+    if tolerance is None:
+        return cheapest, cheapest
+    adequate = [each for each in usable if each.adequate]
+    if adequate:
+        return min(adequate, key=lambda each: each.flops), cheapest
+    return min(usable, key=lambda each: each.predicted_error), cheapest
 
 
 def _option(
@@ -194,15 +214,33 @@ def collapse_error(
     return math.sqrt(((collapsed - exact).square().sum() / total).item()) if total > 0 else 0.0
 
 
-class Retina(nn.Module):
+def scene_error(
+    grid: Grid, wavelength: float, display: Display, eye: Eye, *, reach: float | None = None, paraxial: bool = False
+) -> float:
+    """:func:`collapse_error` without shifts, for points within ``reach`` metres of the axis, or all of the hologram."""
+    plane = display.focus_plane(eye.accommodation)
+    heights = _heights(grid, reach)
+    return collapse_error(grid, wavelength, display, eye, plane, heights, paraxial=paraxial, registered=True)
+
+
+def _heights(grid: Grid, reach: float | None) -> list[float]:
+    """Heights in metres of the points of the scene that predict the error."""
+    if reach is None:
+        reach = max(n * p for n, p in zip(grid.shape, grid.pitch, strict=True) if n > 1) / 2
+    return [checks.quantity(WIDTH, reach, "reach") * i / (_HEIGHTS - 1) for i in range(_HEIGHTS)]
+
+
+class Retina(PreciseModule):
     """Planned propagation from hologram to retina: from complex fields [..., C, H, W] to the intensity on the retina.
 
-    The result has the samples of ``grid`` and is referred back to the object plane (upright). Lengths given as tensors
-    keep their gradients; the plan is made for their values at construction.
+    The result has the samples of ``grid`` and is referred back to the object plane (upright). Lengths of display and
+    eye given as tensors keep their gradients; those that are ``nn.Parameter`` are registered, as ``eye_accommodation``
+    or ``display_focal_length``. The plan is made for their values at construction.
 
     Args:
         grid, wavelengths, display, eye, plane, paraxial: As in :func:`propagate_collapsed`.
-        tolerance: Largest accepted relative L2 error of the intensity.
+        tolerance: Largest accepted relative L2 error of the intensity. By default the cheapest method, which a training
+            loop can afford; a warning says if its expected error exceeds 0.1, and what a better one costs.
         options: ``reach``, ``registered``, ``dtype`` and ``memory_limit`` of :func:`plan_retina`.
 
     Attributes:
@@ -213,8 +251,12 @@ class Retina(nn.Module):
         MemoryError: In a call, before anything is allocated: the field needs more memory than is available.
 
     Warns:
-        SamplingWarning: No method meets the tolerance; the most accurate one within the memory limit is used.
+        SamplingWarning: The method that is used does not meet the tolerance, 0.1 by default.
+        CostWarning: The method that meets the tolerance needs more than ten times the operations of the other.
     """
+
+    display: Display
+    eye: Eye
 
     def __init__(
         self,
@@ -223,32 +265,60 @@ class Retina(nn.Module):
         display: Display,
         eye: Eye,
         *,
-        tolerance: float = 0.02,
+        tolerance: float | None = None,
         plane: Length | None = None,
         paraxial: bool = False,
         **options: Any,
     ):
         super().__init__()
         self.grid, self.out_grid, self.wavelengths = grid, grid, checks.wavelengths(wavelengths)
-        self.display, self.eye, self.plane, self.paraxial = display, eye, plane, paraxial
+        self.adopt("display", display)
+        self.adopt("eye", eye)
+        self.plane, self.paraxial = plane, paraxial
+        self._factors: tuple[tuple[torch.dtype, torch.device], list[imaging.CollapseFactors]] | None = None
         self.plan = plan_retina(
             grid, self.wavelengths, display, eye, tolerance=tolerance, plane=plane, paraxial=paraxial, **options
         )
-        if not self.plan.adequate:
-            text = f"Retina: no way meets the tolerance {tolerance:g}; {self.plan.reason}"
+        plan, limit = self.plan, TOLERANCE if tolerance is None else tolerance
+        if not plan.adequate:
+            cure = f"; tolerance={limit:g} takes the other method: {plan.runner_up}" if tolerance is None else ""
+            text = f"Retina: an error of {limit:g} is not met: {plan.reason}{cure}"
             warnings.warn(text, SamplingWarning, stacklevel=2)
+        elif plan.cost_ratio > _COSTLY:
+            warnings.warn(
+                f"Retina: {plan.reason}, {plan.cost_ratio:.0f} times those of the other method: {plan.runner_up}; a "
+                "larger tolerance accepts that",
+                checks.CostWarning,
+                stacklevel=2,
+            )
 
     @property
     def scale(self) -> Length:
         """Metres on the retina per metre in the object plane, negative."""
-        return imaging.retinal_scale(self.display, self.eye, self.plane)
+        return imaging.retinal_scale(self.present("display"), self.present("eye"), self.plane)
 
     def field(self, field: Tensor) -> Tensor:
         """Complex field on the retina, [..., C, H, W], scaled as by :func:`propagate_collapsed`."""
-        collapse = self.plan.method == "collapse"
-        propagate: Callable[..., Tensor] = imaging.propagate_collapsed if collapse else propagate_elements
-        setup = self.grid, self.wavelengths, self.display, self.eye
-        return propagate(field, *setup, plane=self.plane, paraxial=self.paraxial, sampling=self.plan.sampling)
+        setup = self.grid, self.wavelengths, self.present("display"), self.present("eye")
+        options = {"plane": self.plane, "paraxial": self.paraxial, "sampling": self.plan.sampling}
+        if self.plan.method == "elements":
+            return propagate_elements(field, *setup, **options)
+        return imaging.propagate_collapsed(field, *setup, **options, factors=self._constant_factors(field))
+
+    def _constant_factors(self, like: Tensor) -> list[imaging.CollapseFactors] | None:
+        """The factors of the collapse for fields as ``like``, kept from the first call; None for learned lengths."""
+        lengths = [self.plane, *vars(self.display).values(), *vars(self.eye).values(), *self.eye.aberrations.values()]
+        if torch.compiler.is_compiling() or any(isinstance(each, Tensor) for each in lengths):
+            return None
+        checks.field("field", like, (len(self.wavelengths), *self.grid.shape))
+        key = like.dtype, like.device
+        if self._factors is None or self._factors[0] != key:
+            assert isinstance(self.plan.sampling, imaging.CollapseSampling)
+            plane = self.display.object_plane(self.plane, self.eye.accommodation)
+            setup = self.grid, self.wavelengths, self.display, self.eye, plane
+            with torch.inference_mode(False), torch.no_grad():
+                self._factors = key, imaging.collapse_factors(like, *setup, self.plan.sampling, self.paraxial)
+        return self._factors[1]
 
     def forward(self, field: Tensor) -> Tensor:
         """Intensity on the retina, real [..., C, H, W]; its sum times the pitches is the power that arrives."""

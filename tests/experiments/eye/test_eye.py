@@ -250,3 +250,47 @@ def test_a_scene_that_the_display_cannot_show_is_refused():
     other = settings("scene={config: configs/demo.yaml}")
     with pytest.raises(ConfigError, match="describes no volume but 'pec'"):
         scene_settings(other)
+
+
+def _picture(source: str, *changes: str) -> torch.Tensor:
+    given = load_config(CONFIG, [*TINY, "tolerance=0.1", *changes])
+    eye = observer(given, scene_settings(given))
+    return eye.image(eye.scene.hologram()[0], source, 2e-3)
+
+
+def test_every_wavelength_on_its_own_gives_the_same_picture():
+    """With a position so small that it is rounded to none."""
+    together, apart = _picture("led"), _picture("led", "eye.position=[1 nm, 0 m]")
+    assert (together - apart).norm() < 0.02 * together.norm()
+
+
+def test_an_eye_beside_the_axis_sees_the_same_plane_in_another_perspective():
+    axis, side = _picture("laser"), _picture("laser", "eye.position=[0 m, 60 um]")
+    assert side.isfinite().all() and 0.3 < side.sum() / axis.sum() < 3
+    assert (axis - side).norm() > 0.05 * axis.norm()
+    given = load_config(CONFIG, [*TINY, "tolerance=0.1", "eye.position=[0 m, 1 mm]"])
+    with pytest.raises(ConfigError, match="eye.position: position of the eye must be within"):
+        observer(given, scene_settings(given))  # before anything is computed
+
+
+def test_dispersion_matters_for_wide_sources_only():
+    change = [
+        ((one - other).norm() / one.norm()).item()
+        for one, other in (
+            (_picture(source), _picture(source, f"light={{sources: [laser], dispersion: {value}}}"))
+            for source, value in (("laser", "true"), ("led", "true"))
+        )
+    ]
+    assert 0 < 2 * change[0] < change[1] < 0.1, change
+
+
+def test_a_lens_at_the_hologram_is_a_display_that_runs():
+    picture = _picture("laser", "display={kind: spherical, focal_length: 10 mm}")
+    assert picture.isfinite().all() and picture.max() > 5 * picture.mean()
+
+
+def test_a_plan_says_that_an_eye_is_beside_the_axis():
+    given = load_config(CONFIG, [*TINY, "tolerance=0.1", "eye.position=[0 m, 60 um]"])
+    eye = observer(given, scene_settings(given))
+    text = plan_text(eye, plan_values(eye))
+    assert "beside the axis, at y 0 mm, x 0.06 mm" in text and "derived" not in text

@@ -57,9 +57,25 @@ def test_a_small_scene_far_away_is_in_region_three_and_seen_whole():
     assert "100 % of the light from the scene's edge enters the pupil" in words and "WARNING" not in words
 
 
-@pytest.mark.parametrize("display", ["magnifying", "planar"])
+def test_a_lens_at_the_hologram_shows_the_scene_under_the_angle_of_its_focal_length():
+    eye = looking("display={kind: spherical, focal_length: 150 mm}", size=512)
+    values = geometry(eye)
+    assert values["magnified_fov_deg"] == pytest.approx(math.degrees(2 * math.atan(512 * 3.74e-6 / 0.3)), rel=1e-12)
+    assert values["scene_fov_deg"] == pytest.approx(
+        values["magnified_fov_deg"] * eye.scene.width / (512 * 3.74e-6), rel=1e-4
+    )
+    for depth in (0.0295, 0.0305):  # the plane that the eye sees sharply is the one it looks at
+        assert eye.display.focus_plane(eye.accommodation(depth)) == pytest.approx(depth, rel=1e-9)
+    assert values["accommodation_mm"][0] == pytest.approx(150**2 / (150 + 30), rel=0.02)
+
+
+@pytest.mark.parametrize("display", ["magnifying", "planar", "spherical"])
 def test_the_drawing_shows_all_three_parts(display):
-    given = [] if display == "magnifying" else ["display={kind: planar, distance: 250 mm}"]
+    given = {
+        "magnifying": [],
+        "planar": ["display={kind: planar, distance: 250 mm}"],
+        "spherical": ["display={kind: spherical}"],
+    }[display]
     picture = np.asarray(Image.open(io.BytesIO(draw(looking(*given, size=512)))).convert("RGB")).astype(int)
     assert picture.shape[1] > 1500
     for left, right in ((0, 0.41), (0.41, 0.71), (0.71, 1)):

@@ -211,6 +211,8 @@ def test_an_empty_volume_is_black(tmp_path):
         ("transfer={preset: bone}", "transfer: a preset needs low < high"),
         ("transfer={}", "transfer: expected one of preset, file or points"),
         ("wavelengths=[520 nm]", "wavelengths: expected 3"),
+        ("view={lighting: true, scattering: {}}", "view.lighting: expected false with scattering"),
+        ("view.scattering={towards: [0, 0, 0]}", "view.scattering: expected towards to point to the light"),
         ("scale=3", "scale: expected a divisor of the pixels"),
         ("phase=rays", "did you mean 'ray'"),
         ("hologram.depths=[1 mm, -1 mm]", "hologram.depths"),
@@ -219,6 +221,19 @@ def test_an_empty_volume_is_black(tmp_path):
 def test_bad_settings_are_named(override, message, capsys):
     with pytest.raises(ConfigError, match=message.replace("(", r"\(")):
         settings(override)
+
+
+def test_adaptive_rays_and_scattered_light_are_settings_of_the_view():
+    plain, adaptive, lit = (
+        build(settings(*words)) for words in ([], ["view.adaptive=0.9"], ["view.scattering={half_angle_deg: 30}"])
+    )
+    whole, fewer = plain.layers().stack(), adaptive.layers().stack()
+    assert 1e-3 < (whole - fewer).norm() / whole.norm() < 0.5
+    shaded = lit.layers().stack()
+    ratio = shaded.abs().square()[whole.abs() > 0] / whole.abs().square()[whole.abs() > 0]
+    assert 0.19 < ratio.min() < 0.6 < ratio.max() <= 1.001  # between ambient light alone and all of the light
+    field, other = plain.hologram()[0], adaptive.hologram()[0]
+    assert 1e-3 < (field - other).norm() / field.norm() < 0.5
 
 
 def test_what_does_not_fit_into_memory_is_refused(capsys):

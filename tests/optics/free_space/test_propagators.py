@@ -70,9 +70,9 @@ def test_refuses_a_padding_below_one_and_a_wavelength_that_is_no_number():
         Fraunhofer(GRID, ["530 nm"])  # type: ignore[list-item]
 
 
-def test_a_distance_with_a_gradient_is_sent_to_the_kernel_function():
-    with pytest.raises(TypeError, match="distance is fixed in a module and cannot carry a gradient; use the kernel"):
-        AngularSpectrum(GRID, 530e-9, torch.tensor(1e-3, requires_grad=True))  # type: ignore[arg-type]
+def test_a_distance_with_a_gradient_that_is_no_parameter_is_refused():
+    with pytest.raises(ValueError, match="distance requires a gradient, but a module keeps no graph: give an nn.Param"):
+        AngularSpectrum(GRID, 530e-9, torch.tensor(1e-3, requires_grad=True))
 
 
 def test_far_field_of_a_tilted_wave_is_one_bright_sample():

@@ -1,15 +1,20 @@
 """Two ways to the retina against the thesis's simulation on one axis, oversampled, in plain numpy."""
 
 import math
+import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from oracles import eye as oracle
+from torch import nn
 
 from holotorch import Grid
-from holotorch.core.checks import SamplingWarning
+from holotorch.core.checks import CostWarning, SamplingWarning
+from holotorch.core.complex import intensity
 from holotorch.optics import Display, Eye, Retina, plan_retina, propagate_collapsed, propagate_elements, retinal_image
+from holotorch.optics.viewing.display import number
 from holotorch.optics.viewing.elementwise import ElementSampling, least_oversampling
 from holotorch.optics.viewing.imaging import CollapseSampling, collapse_sampling, retinal_scale
 from holotorch.optics.viewing.retina import collapse_error
@@ -127,10 +132,40 @@ def test_plan_takes_the_cheaper_way_that_is_good_enough():
     assert plan_retina(GRID, RED, rim, EYE, tolerance=0.02, paraxial=True).method == "elements"
 
 
+def test_a_retina_is_affordable_by_default_and_says_what_a_better_one_costs():
+    """Beside the axis most of the collapse's error is a shift; element by element costs hundreds of times as much."""
+    scene = Grid(256, 8e-6), 640e-9, Display(50e-3, 50e-3, 50e-3), Eye(accommodation=1.0)
+    with pytest.warns(SamplingWarning, match=r"0\.1 is not met: collapse at .*; tolerance=0\.1 takes .*: elements"):
+        default = Retina(*scene)
+    assert default.plan.method == "collapse" and not default.plan.adequate
+    with pytest.warns(CostWarning, match=r"elements at .* times those of the other method: collapse: error"):
+        better = Retina(*scene, tolerance=0.05)
+    assert better.plan.method == "elements" and better.plan.cost_ratio > 100
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Retina(*scene, reach=0.2e-3)
+
+
+def test_a_fixed_retina_keeps_its_factors_and_a_learned_one_does_not():
+    fixed = Retina(SMALL, RED, NEAR, NARROW, tolerance=0.5)
+    field = random_field(SMALL)
+    first = fixed(field)
+    kept = fixed._factors
+    assert torch.equal(fixed(field), first) and fixed._factors is kept
+    torch.testing.assert_close(first, intensity(propagate_collapsed(field, SMALL, RED, NEAR, NARROW)), rtol=0, atol=0)
+    single = fixed(field.to(torch.complex64))
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single.double(), first, rtol=0, atol=1e-5 * first.max().item())
+    accommodation = nn.Parameter(torch.tensor(float(number(NARROW.accommodation)), dtype=torch.float64))
+    learned = Retina(SMALL, RED, NEAR, replace(NARROW, accommodation=accommodation), tolerance=0.5)
+    torch.testing.assert_close(learned(field).detach(), first, rtol=1e-9, atol=1e-12 * first.max().item())
+    assert learned._factors is None and list(learned.parameters())[0] is accommodation
+
+
 def test_impossible_ways():
     with pytest.raises(ValueError, match="the pupil is an image of this object plane"):
         propagate_collapsed(random_field(SMALL), SMALL, RED, NEAR, NARROW, plane=20e-3)
-    with pytest.warns(SamplingWarning, match="no way meets the tolerance 1e-06; elements at"):
+    with pytest.warns(SamplingWarning, match="an error of 1e-06 is not met: elements at"):
         Retina(SMALL, RED, NEAR, NARROW, tolerance=1e-6)
     with pytest.raises(ValueError, match=r"field must end in \(C, H, W\) = \(1, 48, 40\)"):
         propagate_collapsed(random_field(SMALL)[0], SMALL, RED, NEAR, NARROW)

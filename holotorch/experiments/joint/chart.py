@@ -1,0 +1,227 @@
+"""Chart of the joint correction: two volumes, three seeds, every method, scarce heat, parallax and heat that is left.
+
+Volumes are taken from the catalogue, or from the folder that ``HOLOTORCH_VOLUMES`` names; without either, phantoms
+stand in for them, and the verdict says so.
+"""
+
+import os
+import statistics
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.joint.config import JointSettings
+from holotorch.experiments.joint.evaluation import evaluate
+from holotorch.experiments.joint.experiment import JointExperiment, build
+from holotorch.experiments.joint.methods import Shown, baseline, show
+from holotorch.experiments.joint.names import NAMES
+from holotorch.experiments.registry import load_config
+from holotorch.experiments.runs.figures import figure_png
+from holotorch.io.bundled import find_config
+
+VOLUMES = "HOLOTORCH_VOLUMES"  # variable that names a folder with the two volumes
+SCENES = ("teapot", "bonsai")
+FILES = {"teapot": "boston_teapot.nrrd", "bonsai": "bonsai.nrrd"}
+SEEDS = (7, 8, 9)
+SIZE = 128
+STEPS = 100
+BUDGETS = (5, 10, 20, 40, 80, 160)  # steps of the chart of speed against accuracy
+BITS = (4, 6, 8)  # of the heaters
+LIGHT = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3)  # weights of the light that misses the pupil
+WRONG = (0.01, 0.05, 0.1)  # relative errors of sigma in the model
+
+# What each case changes in the configuration, and the methods besides the joint correction.
+CASES: dict[str, tuple[list[str], tuple[str, ...]]] = {
+    "8 frames": ([], ("random", "afterwards", "unheated", "retrieved", "retrieved_pec", "slabs")),
+    "24 frames": (["frames=24"], ("random", "afterwards")),
+    "8 frames, parallax": (["eye.parallax=17"], ()),
+    "8 frames, parallax, occlusion per pupil": (["eye.parallax=17", "eye.occlusion=pupil"], ("random",)),
+    "24 frames, parallax": (["frames=24", "eye.parallax=17"], ()),
+    "8 frames, sigma 1.0": (["display.sigma_px=1.0"], ("afterwards", "unheated")),
+    "8 frames, limit 2 pi": (["display.max_phase=6.2832"], ("afterwards", "unheated")),
+}
+MEMORY = "heat={frame_us: 20, time_constant_us: 10}"  # a time constant of half a frame
+
+
+def joint() -> tuple[list[dict], dict[str, list[dict]], dict[str, bytes], list[str]]:
+    """Table rows of all cases, further tables by name, PNG figures by name, and lines of text."""
+    rows: list[dict[str, Any]] = []
+    memory: list[dict[str, Any]] = []
+    synthetic = ""
+    with tqdm(total=len(SCENES) * len(SEEDS) * (len(CASES) + 1), desc="joint", unit="case", dynamic_ncols=True) as bar:
+        for scene in SCENES:
+            for seed in SEEDS:
+                for case, (changes, methods) in CASES.items():
+                    experiment = _experiment(scene, seed, changes)
+                    synthetic = synthetic or experiment.scene.synthetic
+                    rows += [{"scene": scene, "seed": seed, "case": case} | row for row in _case(experiment, methods)]
+                    bar.update()
+                memory += [{"scene": scene, "seed": seed} | row for row in _with_memory(scene, seed)]
+                bar.update()
+    speed = list(_speed())
+    device = list(_device())
+    text = [f"Synthetic volumes: {synthetic}"] if synthetic else []
+    text += _verdict(rows, memory)
+    light = list(_light())
+    tables = {"memory": memory, "speed": speed, "device": device, "light": light}
+    return rows, tables, {"chart": _draw(rows, speed, light)}, text
+
+
+def _experiment(scene: str, seed: int, changes: list[str]) -> JointExperiment:
+    """The bundled configuration for one wavelength, without files where a folder of volumes is not given."""
+    path = find_config(f"configs/joint/{scene}.yaml")
+    assert path is not None
+    words = ["wavelengths=[520 nm]", f"seed={seed}", f"steps={STEPS}", f"display.shape=[{SIZE},{SIZE}]"]
+    words += ["eye.parallax=0", *changes]
+    settings = load_config(path, words + volume_file(scene))
+    assert isinstance(settings, JointSettings)
+    return build(settings)
+
+
+def volume_file(scene: str) -> list[str]:
+    """The setting that names the file of a scene, if a folder of volumes is given."""
+    if not (folder := os.environ.get(VOLUMES)):
+        return []
+    file = Path(folder) / FILES[scene]
+    if not file.is_file():
+        raise ConfigError([f"{VOLUMES} must name a folder with {FILES[scene]}, got {folder}"])
+    return [f"volume.path={file}"]
+
+
+def _case(experiment: JointExperiment, methods: tuple[str, ...]) -> Iterator[dict[str, Any]]:
+    """A table row for the joint correction and for each of the other methods."""
+    _ = experiment.trained, experiment.stack  # the inputs of all methods
+    begin = time.perf_counter()
+    yield _row(experiment, "joint", show(experiment, experiment.solve().x), begin)
+    for name in methods:
+        begin = time.perf_counter()
+        yield _row(experiment, name, baseline(experiment, name), begin)
+
+
+def _row(experiment: JointExperiment, method: str, shown: Shown, begin: float) -> dict[str, Any]:
+    seconds = time.perf_counter() - begin
+    numbers = evaluate(experiment, shown)[0]
+    return {"method": method, **{key: round(value, 4) for key, value in numbers.items()}, "seconds": round(seconds, 2)}
+
+
+def _with_memory(scene: str, seed: int) -> Iterator[dict[str, Any]]:
+    """Heat that is left from earlier frames: corrected frame by frame, and as a cycle."""
+    cold, warm = _experiment(scene, seed, []), _experiment(scene, seed, [MEMORY])
+    begin = time.perf_counter()
+    phase = cold.solve().x
+    yield _row(cold, "no heat is left", show(cold, phase), begin)
+    yield _row(warm, "heat is left, frames corrected independently", show(warm, phase), begin)
+    begin = time.perf_counter()
+    yield _row(warm, "heat is left, cycle corrected", show(warm, warm.solve().x), begin)
+
+
+def _speed() -> Iterator[dict[str, Any]]:
+    """Accuracy by time of the solver, for the first scene and seed."""
+    for frames in (8, 24):
+        experiment = _experiment(SCENES[0], SEEDS[0], [f"frames={frames}"])
+        _ = experiment.trained
+        for steps in BUDGETS:
+            budget = replace(experiment, settings=experiment.settings.model_copy(update={"steps": steps}))
+            begin = time.perf_counter()
+            phase = budget.solve().x
+            row = _row(experiment, "joint", show(experiment, phase), begin)
+            yield {"frames": frames, "steps": steps} | row
+        for name in ("random", "slabs"):
+            begin = time.perf_counter()
+            yield {"frames": frames, "steps": ""} | _row(experiment, name, baseline(experiment, name), begin)
+
+
+def _device() -> Iterator[dict[str, Any]]:
+    """What coarse heaters and a wrong model of the heat cost, for the first scene and seed."""
+    experiment = _experiment(SCENES[0], SEEDS[0], [])
+    phase = show(experiment, experiment.solve().x).phase
+    assert phase is not None
+    yield {"case": "as modelled"} | _row(experiment, "joint", show(experiment, phase), time.perf_counter())
+    for bits in BITS:
+        level = phase.max() / (2**bits - 1)
+        rounded = (phase / level).round() * level
+        yield {"case": f"{bits} bits"} | _row(experiment, "joint", show(experiment, rounded), time.perf_counter())
+    for wrong in WRONG:
+        sigma = experiment.settings.display.sigma_px * (1 + wrong)
+        other = _experiment(SCENES[0], SEEDS[0], [f"display.sigma_px={sigma}"])
+        yield {"case": f"sigma {wrong:.0%} larger"} | _row(other, "joint", show(other, phase), time.perf_counter())
+
+
+def _light() -> Iterator[dict[str, Any]]:
+    """What more light in the pupil costs, for the first scene and seed."""
+    for weight in LIGHT:
+        experiment = _experiment(SCENES[0], SEEDS[0], [f"light_weight={weight}"])
+        begin = time.perf_counter()
+        yield {"weight": weight} | _row(experiment, "joint", show(experiment, experiment.solve().x), begin)
+
+
+def _verdict(rows: list[dict[str, Any]], memory: list[dict[str, Any]]) -> list[str]:
+    lines = [f"One colour (520 nm), {SIZE} px, {STEPS} steps; mean (worst) of {len(SEEDS)} seeds; PSNR of intensity:"]
+    for scene in SCENES:
+        for case, (_, methods) in CASES.items():
+            for method in ("joint", *methods):
+                chosen = [row for row in rows if (row["scene"], row["case"], row["method"]) == (scene, case, method)]
+                words = [f"stack {_spread(chosen, 'stack_psnr')} dB, SSIM {_spread(chosen, 'stack_ssim', 4)}"]
+                words.append(f"contrast {statistics.mean(row['stack_contrast'] for row in chosen):.3f}")
+                if "held_psnr" in chosen[0]:
+                    words.append(f"held-back foci {_spread(chosen, 'held_psnr')} dB")
+                words.append(f"half pupils {_spread(chosen, 'half_psnr')} dB, SSIM {_spread(chosen, 'half_ssim', 3)}")
+                words.append(f"light {statistics.mean(row['light_in_pupil'] for row in chosen):.1%}")
+                words.append(f"{statistics.median(row['seconds'] for row in chosen):.1f} s (median)")
+                lines.append(f"{scene}, {case}, {NAMES[method]}: {'; '.join(words)}")
+        for method in dict.fromkeys(row["method"] for row in memory):
+            chosen = [row for row in memory if (row["scene"], row["method"]) == (scene, method)]
+            lines.append(f"{scene}, {method} (time constant of half a frame): stack {_spread(chosen, 'stack_psnr')} dB")
+    return lines
+
+
+def _spread(rows: list[dict[str, Any]], key: str, digits: int = 1) -> str:
+    values = [row[key] for row in rows]
+    return f"{statistics.mean(values):.{digits}f} ({min(values):.{digits}f})"
+
+
+def _draw(rows: list[dict[str, Any]], speed: list[dict[str, Any]], light: list[dict[str, Any]]) -> bytes:
+    """Accuracy against time, and what parallax and light in the pupil cost."""
+    figure = Figure(figsize=(14, 4.2), layout="constrained")
+    left, right, last = figure.subplots(1, 3)
+    for frames, colour in ((8, "#2867b2"), (24, "#c0392b")):
+        curve = [row for row in speed if row["frames"] == frames and row["method"] == "joint"]
+        left.semilogx(
+            [row["seconds"] for row in curve],
+            [row["stack_psnr"] for row in curve],
+            "o-",
+            color=colour,
+            label=f"joint correction, {frames} frames, {curve[0]['steps']} to {curve[-1]['steps']} steps",
+        )
+        for row in speed:
+            if row["frames"] == frames and row["method"] != "joint":
+                marker = {"random": "s", "slabs": "^"}[row["method"]]
+                label = f"{NAMES[row['method']]}, {frames} frames"
+                left.semilogx(max(row["seconds"], 1e-2), row["stack_psnr"], marker, color=colour, label=label)
+    left.set(xlabel="seconds on two cores", ylabel="PSNR of the focal stack (dB)", title=f"{SCENES[0]}, {SIZE} px")
+    for scene, marker in zip(SCENES, "os", strict=False):
+        for case in (case for case in CASES if "sigma" not in case and "limit" not in case):
+            chosen = [r for r in rows if (r["scene"], r["case"], r["method"]) == (scene, case, "joint")]
+            x, y = (statistics.mean(row[key] for row in chosen) for key in ("stack_psnr", "half_psnr"))
+            right.plot(x, y, marker, color="#c0392b" if "24" in case else "#2867b2", fillstyle=_fill(case))
+            right.annotate(f"{scene}, {case}", (x, y), fontsize=6, xytext=(4, 4), textcoords="offset points")
+    right.set(xlabel="PSNR of the focal stack (dB)", ylabel="PSNR through half pupils (dB)", title="Parallax costs")
+    last.plot([row["light_in_pupil"] for row in light], [row["stack_psnr"] for row in light], "o-", color="#2867b2")
+    for row in light:
+        place = {"xytext": (4, 4), "textcoords": "offset points", "fontsize": 6}
+        last.annotate(f"weight {row['weight']:g}", (row["light_in_pupil"], row["stack_psnr"]), **place)
+    last.set(xlabel="fraction of the light in pupil and window", title=f"Light costs; {SCENES[0]}, 8 frames")
+    for axes in (left, right, last):
+        axes.grid(alpha=0.3)
+    left.legend(fontsize=6)
+    return figure_png(figure)
+
+
+def _fill(case: str) -> str:
+    return "full" if "parallax" in case else "none"

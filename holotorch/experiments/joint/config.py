@@ -1,0 +1,134 @@
+"""Settings of a volume that is shown by frames of a phased array and corrected for what an eye sees of it."""
+
+import math
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field
+
+from holotorch.core.quantities import SIGMA_PX
+from holotorch.experiments.config.settings import (
+    Count,
+    GridSettings,
+    Number,
+    Settings,
+    Wavelength,
+    number,
+    plausible,
+    several,
+)
+from holotorch.experiments.config.source import Key
+from holotorch.experiments.volume.config import Depth, TransferSettings, ViewSettings, VolumeSource
+
+Baseline = Literal["random", "afterwards", "unheated", "retrieved", "retrieved_pec", "slabs"]
+
+
+class DisplaySettings(GridSettings):
+    """The phased array, and where the volume appears behind it.
+
+    ``distance``: of the volume's middle. ``depth``: the volume is stretched along the axis to this extent, since one as
+    deep as it is wide would be sharp at every focus; not stretched by default. ``planes``: number of planes that hold
+    its light. ``sigma_px``: width of the heat kernel, see ``ThermalCrosstalk``. ``max_phase``: upper limit in rad on
+    the phase of every pixel after the heat has spread (4 pi is 700 degC at 630 nm).
+    """
+
+    distance: Depth
+    depth: Depth | None = None
+    planes: Annotated[Count, Field(le=64)] = 5
+    sigma_px: Annotated[Number, plausible(SIGMA_PX)] = 0.66
+    max_phase: Annotated[Number, Field(ge=0.1, le=1000)] = 4 * math.pi
+
+
+class EyeSettings(Settings):
+    """The eye, which looks from far away and may focus on every depth.
+
+    ``pupil``: radius of the pupil in the directions that the array emits at the shortest wavelength, 1 for all of them;
+    pixels resolve the image up to 0.5. ``parallax``: number of smaller pupils, at random positions within the pupil and
+    with random foci, that are corrected too, so that the image also holds for parts of the pupil.
+    ``occlusion``: what the planes hide from each other is that along the axis for all pupils, or that of the directions
+    within each pupil.
+    """
+
+    pupil: Annotated[Number, Field(gt=0, le=1)] = 0.5
+    parallax: Annotated[int, BeforeValidator(number), Field(ge=0, le=1000)] = 0
+    occlusion: Literal["axis", "pupil"] = "axis"
+
+
+class HeatSettings(Settings):
+    """Heat that is left from earlier frames: duration of a frame and time constant of a pixel, in microseconds."""
+
+    frame_us: Annotated[Number, Field(gt=0, le=1e9)]
+    time_constant_us: Annotated[Number, Field(gt=0, le=1e9)]
+
+
+class JointReport(Settings):
+    """Methods that the result is compared with.
+
+    ``random``: an ideal display of complex fields with random phases, averaged over the frames. ``afterwards``: the
+    phases of such fields, corrected for the heat frame by frame. ``unheated``: optimised for the same views without
+    heat, then corrected for it. ``retrieved``: Gerchberg-Saxton phase retrieval over all views, heat ignored;
+    ``retrieved_pec``: the same with a deconvolution in each pass (thesis Algorithm 1). ``slabs``: each frame shows one
+    plane of the volume, as in thesis Fig. 4.18.
+    """
+
+    baselines: Annotated[tuple[Baseline, ...], BeforeValidator(several)] = ("random", "afterwards", "slabs")
+
+
+class JointSettings(Settings):
+    """A volume shown by ``frames`` heater patterns in turn, optimised together for what an eye sees at every focus.
+
+    One wavelength shows the mean of the volume's colours, three show red, green and blue. ``steps``: of L-BFGS.
+    ``light_weight``: weight of the light that misses the pupil or the window, against the error of the images.
+    ``heat``: heat that is left from earlier frames is part of the model; by default each frame starts cold.
+    """
+
+    experiment: Literal["joint"]
+    seed: Annotated[int, BeforeValidator(number), Field(ge=0, lt=2**63)] = 0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    volume: VolumeSource
+    transfer: TransferSettings
+    view: ViewSettings = ViewSettings()
+    display: DisplaySettings
+    wavelengths: Annotated[tuple[Wavelength, ...], BeforeValidator(several)]
+    frames: Annotated[Count, Field(le=256)] = 8
+    eye: EyeSettings = EyeSettings()
+    light_weight: Annotated[Number, Field(ge=0, le=100)] = 0.0
+    heat: HeatSettings | None = None
+    steps: Annotated[Count, Field(le=100000)] = 60
+    report: JointReport = JointReport()
+
+
+def volume_settings(settings: JointSettings) -> dict[str, Any]:
+    """The same scene as settings of kind ``volume``."""
+    display = settings.display
+    hologram = {"shape": display.shape, "pitch": display.pitch, "distance": display.distance, "depths": display.planes}
+    # The renderer knows three colours; one wavelength shows their mean.
+    wavelengths = settings.wavelengths if len(settings.wavelengths) == 3 else settings.wavelengths[:1] * 3
+    same = {name: getattr(settings, name) for name in ("seed", "device", "volume", "transfer", "view")}
+    return {"experiment": "volume", "hologram": hologram, "wavelengths": wavelengths, **same}
+
+
+def contradictions(settings: JointSettings) -> list[tuple[Key, str]]:
+    """Settings that contradict each other: their keys, and what to change."""
+    from holotorch.experiments.volume import config as volume
+
+    problems: list[tuple[Key, str]] = []
+    if (count := len(settings.wavelengths)) not in (1, 3):
+        return [(("wavelengths",), f"expected 1 (grey) or 3 (red, green, blue), got {count}")]
+    display = settings.display
+    renamed: dict[Key, Key] = {("hologram", "distance"): ("display", "distance")}
+    scene = volume.VolumeSettings.model_validate(volume_settings(settings))
+    problems += [(renamed.get(key, key), words) for key, words in volume.contradictions(scene) if key != ("scale",)]
+    if min(display.shape) < 11:
+        problems.append((("display", "shape"), f"expected at least 11 x 11 px for ssim, got {display.shape}"))
+    if display.depth is not None and display.depth >= 2 * display.distance:
+        message = (
+            f"expected less than twice the distance, {2 * display.distance:g} m, so that all lies behind the array"
+        )
+        problems.append((("display", "depth"), f"{message}, got {display.depth:g} m"))
+    if min(display.pitch) < 0.9 * max(settings.wavelengths):
+        least = f"at least 0.9 of the longest wavelength, {0.9 * max(settings.wavelengths):.3g} m"
+        problems.append((("display", "pitch"), f"expected {least}, got {min(display.pitch):g} m"))
+    if "slabs" in settings.report.baselines and settings.frames < display.planes:
+        hint = f"slabs shows one plane a frame and needs at least {display.planes} frames, got {settings.frames}"
+        problems.append((("report", "baselines"), f"{hint}; leave it out"))
+    return problems

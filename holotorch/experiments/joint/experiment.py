@@ -1,0 +1,255 @@
+"""The joint experiment: the light of a volume, the display, the views of an eye, and what they are to show."""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from holotorch.core.complex import phasor
+from holotorch.core.grid import Grid
+from holotorch.correction import LBFGS, PECProblem, Solution, deconvolve, limit_peak_phase, spread_preconditioner
+from holotorch.correction.run import Callback, State
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.joint.config import JointSettings, volume_settings
+from holotorch.experiments.volume.config import VolumeSettings
+from holotorch.experiments.volume.experiment import VolumeExperiment
+from holotorch.experiments.volume.experiment import build as build_volume
+from holotorch.hologram import incoherent_views
+from holotorch.modulator import HeatCycle, ThermalCrosstalk
+from holotorch.optics import PupilViews, View, disc_source, propagate
+from holotorch.scene.layers import SlabLayers, SourceLayers
+
+_PENALTY_FROM = 0.985  # fraction of the limit above which phases are penalised, so that little is left to scale down
+_TOLERANCE = 3e-3  # relative L2 error of the fields that the start is made of
+_RINGS = 2  # of directions within a pupil, for what planes hide from each other
+_VIEWS_SEED = 1 << 40  # added to the seed for the random pupils, so that they are independent of the start
+
+
+@dataclass(frozen=True)
+class Views:
+    """Views with the images that an eye is to see in them.
+
+    Attributes:
+        operator: The fields of the views from the field of the display.
+        images: Wanted intensities [C, V, H, W], relative to the mean of each colour over the trained foci.
+    """
+
+    operator: PupilViews
+    images: Tensor
+
+
+@dataclass(frozen=True)
+class JointExperiment:
+    """The scene, display and eye that a configuration describes."""
+
+    settings: JointSettings
+    scene: VolumeExperiment
+
+    @property
+    def grid(self) -> Grid:
+        """Pixels of the array."""
+        return self.scene.grid
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the computation."""
+        return self.scene.device
+
+    @cached_property
+    def depths(self) -> tuple[float, ...]:
+        """Depths of the planes in metres, stretched along the axis, in the order in which rays meet them."""
+        middle = self.settings.display.distance
+        return tuple(middle + self.stretched * (depth - middle) for depth in self.scene.depths)
+
+    @property
+    def stretched(self) -> float:
+        """Factor by which the volume is stretched along the axis."""
+        depth, planes = self.settings.display.depth, self.scene.depths
+        if depth is None or len(planes) == 1:
+            return 1.0
+        return depth / (abs(planes[-1] - planes[0]) * len(planes) / (len(planes) - 1))
+
+    @cached_property
+    def slabs(self) -> SlabLayers:
+        """Colours and opacities of the planes, at their stretched depths."""
+        with torch.no_grad():
+            layers = self.scene.sampler().slab_layers(self.scene.volume)
+        grey = len(self.settings.wavelengths) == 1
+        emission = layers.emission.mean(1, keepdim=True) if grey else layers.emission
+        return replace(layers, depths=self.depths, emission=emission)
+
+    @cached_property
+    def light(self) -> Tensor:
+        """Light of the planes along the axis, |amplitude|^2, [D, C, h, w]."""
+        return self.slabs.towards((0.0, 0.0))
+
+    def _light_into(self, pupil: View) -> Tensor:
+        """Light of the planes that gets into a pupil past the planes in front, mean over its directions."""
+        if self.settings.eye.occlusion == "axis":
+            return self.light
+        points, weights = disc_source(pupil.radius, _RINGS)
+        (y, x), (down, right) = pupil.centre, pupil.covered
+        open_ = [dy * down + dx * right <= 0 for dy, dx in points]
+        shares = weights[open_] / weights[open_].sum()
+        total = torch.zeros_like(self.light)
+        for (dy, dx), share in zip(
+            (point for point, each in zip(points, open_, strict=True) if each), shares, strict=True
+        ):
+            total += share.item() * self.slabs.towards((y + dy, x + dx))
+        return total
+
+    @property
+    def radius(self) -> float:
+        """Sine of the half-angle of the pupil."""
+        return self.settings.eye.pupil * min(self.settings.wavelengths) / (2 * max(self.grid.pitch))
+
+    @cached_property
+    def foci(self) -> list[float]:
+        """Focal distances that are corrected: the depths of the planes, nearest first."""
+        return sorted(self.depths)
+
+    @cached_property
+    def stack(self) -> Views:
+        """The whole pupil at every corrected focus."""
+        return self.at_foci(self.foci)
+
+    @cached_property
+    def held_back(self) -> Views | None:
+        """The whole pupil at foci half-way between the corrected ones, which no method is given; None for one plane."""
+        between = [(one + other) / 2 for one, other in zip(self.foci, self.foci[1:], strict=False)]
+        return self.at_foci(between) if between else None
+
+    @cached_property
+    def halves(self) -> Views:
+        """The left and the right half of the pupil at every corrected focus, which no method is given."""
+        sides = ((0.0, 1.0), (0.0, -1.0))
+        return self._views([View(focus, self.radius, covered=side) for focus in self.foci for side in sides])
+
+    @cached_property
+    def trained(self) -> Views:
+        """The views that are corrected: the stack, and smaller pupils for the parallax."""
+        generator = torch.Generator().manual_seed(self.settings.seed + _VIEWS_SEED)
+        views = [View(focus, self.radius) for focus in self.foci]
+        for _ in range(self.settings.eye.parallax):
+            size, distance, angle, focus = torch.rand(4, generator=generator, dtype=torch.float64).tolist()
+            radius = self.radius * (0.3 + 0.4 * size)
+            r, a = (self.radius - radius) * math.sqrt(distance), 2 * math.pi * angle
+            depth = self.foci[0] + focus * (self.foci[-1] - self.foci[0])
+            views.append(View(depth, radius, (r * math.sin(a), r * math.cos(a))))
+        return self._views(views) if self.settings.eye.parallax else self.stack
+
+    def at_foci(self, foci: list[float]) -> Views:
+        """The whole pupil at focal distances in metres."""
+        return self._views([View(focus, self.radius) for focus in foci])
+
+    def plane(self, index: int) -> Views:
+        """The light of one plane alone, in focus."""
+        return self._views([View(self.depths[index], self.radius)], slice(index, index + 1))
+
+    def _views(self, views: list[View], planes: slice = slice(None)) -> Views:
+        operator = PupilViews(self.grid, self.settings.wavelengths, views, longest=max(self.foci))
+        return Views(operator.to(self.device), self._images(views, planes).to(self.device) / self._mean)
+
+    def _images(self, views: list[View], planes: slice = slice(None)) -> Tensor:
+        """Incoherent images [C, V, H, W]; views that share a pupil receive the same light."""
+        pupils = [replace(view, focus=0.0) for view in views]
+        images: list[Tensor] = [torch.empty(0)] * len(views)
+        for pupil in dict.fromkeys(pupils):
+            chosen = [v for v, each in enumerate(pupils) if each == pupil]
+            light = self._light_into(pupil)[planes]
+            layers = SourceLayers(
+                self.grid, self.depths[planes], light.shape[1], lambda light=light: iter(light.sqrt())
+            )
+            observed = incoherent_views(layers, self.settings.wavelengths, [views[v] for v in chosen])
+            for v, image in zip(chosen, observed.unbind(1), strict=True):
+                images[v] = image
+        return torch.stack(images, 1)
+
+    @property
+    def colours(self) -> Tensor:
+        """Mean light of each colour in the volume, [C, 1, 1, 1], which white light gives the pictures."""
+        return self.light.sum(0).mean((-2, -1))[:, None, None, None].to(self.device)
+
+    @cached_property
+    def _mean(self) -> Tensor:
+        """Mean image of each colour over the corrected foci, [C, 1, 1, 1]. ConfigError for a black colour."""
+        views = [View(focus, self.radius) for focus in self.foci]
+        mean = self._images(views).mean((1, 2, 3), keepdim=True)
+        if not bool((mean > 0).all()):
+            dark = [f"{w * 1e9:.0f} nm" for w, each in zip(self.settings.wavelengths, mean, strict=True) if each <= 0]
+            raise ConfigError([f"transfer: the volume has no light at {', '.join(dark)}; change colours or opacity"])
+        return mean.to(self.device)
+
+    @cached_property
+    def crosstalk(self) -> ThermalCrosstalk:
+        """The spreading of the heat in the steady state."""
+        return ThermalCrosstalk(self.settings.display.sigma_px).to(self.device)
+
+    @cached_property
+    def heat(self) -> ThermalCrosstalk | HeatCycle:
+        """From heater phases to the phases that the frames show, with heat that is left from earlier frames."""
+        heat = self.settings.heat
+        if heat is None:
+            return self.crosstalk
+        return HeatCycle(self.crosstalk, heat.frame_us * 1e-6, heat.time_constant_us * 1e-6).to(self.device)
+
+    def problem(self, heat: ThermalCrosstalk | HeatCycle, views: Views, limit: float | None) -> PECProblem:
+        """The loss of F frames: squared differences of the amplitudes in all views, with one scale for each colour."""
+        return PECProblem(
+            heat,
+            views.operator,
+            views.images,
+            frames=True,
+            amplitude=True,
+            scale_free=True,
+            # Views through small pupils are darker, and count as if they were as bright as the others.
+            mask=self._weights(views),
+            limit=None if limit is None else _PENALTY_FROM * limit,
+            light_weight=self.settings.light_weight,
+        )
+
+    def _weights(self, views: Views) -> Tensor:
+        radii = torch.tensor([view.radius for view in views.operator.views])
+        return (self.radius / radii).sqrt()[:, None, None].to(self.device)
+
+    def random_fields(self, planes: slice = slice(None)) -> Tensor:
+        """Fields [F, C, H, W] at the array of all sources of the chosen planes, with random phases in each frame."""
+        settings = self.settings
+        generator = torch.Generator().manual_seed(settings.seed)
+        shape = settings.frames, len(settings.wavelengths), *self.grid.shape
+        wavelengths = torch.tensor(settings.wavelengths, dtype=torch.float64)
+        total = torch.zeros(shape, dtype=torch.complex64)
+        for depth, light in zip(self.depths[planes], self.light[planes], strict=True):
+            phases = 2 * math.pi * torch.rand(shape, generator=generator)
+            sources = light.cpu().sqrt() * phasor(phases)
+            total += propagate(sources, self.grid, wavelengths, depth, tolerance=_TOLERANCE)
+        return total.to(self.device)
+
+    def kinoform(self, fields: Tensor, crosstalk: ThermalCrosstalk) -> Tensor:
+        """Heater phases >= 0 for the phases of ``fields``, deconvolved; pi is added, so that few need cooling."""
+        return deconvolve(crosstalk, fields.angle() % (2 * math.pi) + math.pi)
+
+    def solver(self, crosstalk: ThermalCrosstalk) -> LBFGS:
+        """L-BFGS with the preconditioner of the heat kernel."""
+        return LBFGS(max_steps=self.settings.steps, precondition=spread_preconditioner(crosstalk.kernel), tolerance=0.0)
+
+    def solve(self, progress: Callback | None = None, resume: State | None = None) -> Solution:
+        """Heater phases [F, C, H, W] that form all views at once, from the kinoforms of random fields."""
+        problem = self.problem(self.heat, self.trained, self.settings.display.max_phase)
+        start = self.kinoform(self.random_fields(), self.crosstalk)
+        return self.solver(self.crosstalk)(problem, start, callback=progress, resume=resume)
+
+    def within_limit(self, phase: Tensor) -> Tensor:
+        """Heater phases scaled down where a phase after spreading exceeds the limit."""
+        return limit_peak_phase(self.settings.display.max_phase, phase, self.heat)
+
+    def emitted(self, phase: Tensor) -> Tensor:
+        """Fields [F, C, H, W] that heater phases of F frames emit."""
+        return phasor(self.heat(phase.to(self.device)))
+
+
+def build(settings: JointSettings) -> JointExperiment:
+    """Load the inputs. ConfigError for a volume or transfer function that cannot be read or used."""
+    return JointExperiment(settings, build_volume(VolumeSettings.model_validate(volume_settings(settings))))

@@ -1,0 +1,90 @@
+"""Other ways to show a volume, which the joint correction is compared with: what F frames emit, and laser powers."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from holotorch.core.complex import intensity
+from holotorch.correction import deconvolve, gerchberg_saxton, iterative_pec
+from holotorch.correction.problem import best_scale
+from holotorch.experiments.joint.experiment import JointExperiment
+from holotorch.modulator import ThermalCrosstalk
+from holotorch.optics.viewing.pupil_views import PupilViews
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a method shows: fields of the frames, their laser powers, and the heater phases, if there are any."""
+
+    fields: Tensor  # complex [F, C, H, W]
+    phase: Tensor | None = None  # rad, [F, C, H, W]
+    laser: Tensor | None = None  # relative power [F, C], 1 by default
+
+    def images(self, views: PupilViews) -> Tensor:
+        """Mean intensities of the frames in each view, [C, V, H, W]."""
+        total = torch.zeros((), device=self.fields.device)
+        for f, field in enumerate(self.fields):  # one by one, to save memory
+            seen = intensity(views(field))
+            total = total + (seen if self.laser is None else seen * self.laser[f, :, None, None, None])
+        return total / len(self.fields)
+
+
+def show(experiment: JointExperiment, phase: Tensor, laser: Tensor | None = None) -> Shown:
+    """What heater phases show, after they are scaled below the limit."""
+    with torch.no_grad():
+        phase = experiment.within_limit(phase)
+        return Shown(experiment.emitted(phase), phase, laser)
+
+
+def baseline(experiment: JointExperiment, name: str) -> Shown:
+    """One of the methods of ``names.NAMES``, other than the joint correction."""
+    if name == "random":
+        return Shown(experiment.random_fields())
+    if name == "afterwards":
+        return show(experiment, experiment.kinoform(experiment.random_fields(), experiment.crosstalk))
+    if name == "unheated":
+        return show(experiment, _unheated(experiment))
+    return _slabs(experiment) if name == "slabs" else show(experiment, _retrieved(experiment, name == "retrieved_pec"))
+
+
+def _unheated(experiment: JointExperiment) -> Tensor:
+    cold = ThermalCrosstalk(0.0).to(experiment.device)
+    problem = experiment.problem(cold, experiment.trained, None)
+    phase = experiment.solver(cold)(problem, experiment.kinoform(experiment.random_fields(), cold)).x
+    return deconvolve(experiment.crosstalk, phase % (2 * torch.pi) + torch.pi)
+
+
+def _retrieved(experiment: JointExperiment, corrected: bool) -> Tensor:
+    """Gerchberg-Saxton over all trained views, each frame from its own random phases; with Algorithm 1 or without."""
+    views, steps = experiment.trained, experiment.settings.steps
+    generator = torch.Generator().manual_seed(experiment.settings.seed)
+    shape = experiment.settings.frames, *views.images.shape
+    start = (2 * torch.pi * torch.rand(shape, generator=generator)).to(experiment.device)
+    if corrected:
+        crosstalk = experiment.crosstalk
+        return iterative_pec(views.operator, crosstalk, views.images, start, max_steps=steps).x
+    return gerchberg_saxton(views.operator, views.images, start, max_steps=steps).x
+
+
+def _slabs(experiment: JointExperiment) -> Shown:
+    """Each frame shows the light of one plane where it is in focus; a plane has the power of its light."""
+    frames, planes = experiment.settings.frames, len(experiment.depths)
+    phase = torch.zeros(frames, len(experiment.settings.wavelengths), *experiment.grid.shape, device=experiment.device)
+    laser = torch.zeros(phase.shape[:2], device=experiment.device)
+    fields = experiment.random_fields
+    for j in range(planes):
+        own, views = list(range(j, frames, planes)), experiment.plane(j)
+        lit = views.images.flatten(1).amax(-1) > 0
+        if not bool(lit.any()):
+            continue
+        start = experiment.kinoform(fields(slice(j, j + 1))[own], experiment.crosstalk)
+        # A colour without light in this plane keeps the start, and its laser off.
+        wanted = torch.where(lit[:, None, None, None], views.images, 1.0)
+        limit = experiment.settings.display.max_phase
+        problem = experiment.problem(experiment.crosstalk, replace(views, images=wanted), limit)
+        x = experiment.solver(experiment.crosstalk)(problem, start).x
+        formed = problem.intensity(x).detach()
+        phase[own] = x
+        laser[own] = best_scale(formed, views.images, -3) * lit * (frames / len(own))
+    return show(experiment, phase, laser)

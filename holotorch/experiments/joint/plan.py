@@ -1,0 +1,95 @@
+"""The plan of a joint run: cost and physics, before anything is optimised."""
+
+import math
+from typing import Any
+
+from holotorch.experiments.joint.config import JointSettings
+from holotorch.experiments.joint.experiment import JointExperiment
+from holotorch.optics.light.coherence import depth_of_focus
+from holotorch.optics.viewing.pupil_views import View, view_padding
+
+# Measured on two CPU cores.
+_SAMPLE_SECONDS = 2.2e-9  # seconds / (n log2 n) of a step for one view of one frame and colour, padded to n samples
+_SAMPLE_BYTES = 40  # bytes per sample of the same, kept for the gradient
+_BASE_BYTES = 700e6  # memory of the libraries
+_SPACING = 0.75  # of planes, in depths of focus, above which foci between them are worse (10 dB at 0.94)
+_RUNS = {
+    "random": 0.0,
+    "afterwards": 0.0,
+    "unheated": 1.0,
+    "retrieved": 0.6,
+    "retrieved_pec": 1.0,
+    "slabs": 0.4,
+}  # cost relative to that of the solver
+
+
+def plan_values(experiment: JointExperiment) -> dict[str, Any]:
+    """Cost and physics as plain JSON values."""
+    settings, grid = experiment.settings, experiment.grid
+    foci, pupil = experiment.foci, View(max(experiment.foci), experiment.radius)
+    padded = view_padding(grid, settings.wavelengths, [pupil], max(foci))
+    views = len(foci) + settings.eye.parallax
+    transforms = settings.frames * len(settings.wavelengths) * views
+    samples = math.prod(padded.shape)
+    seconds = settings.steps * transforms * _SAMPLE_SECONDS * samples * math.log2(samples)
+    seconds *= 1 + sum(_RUNS[name] for name in settings.report.baselines)
+    peak = _BASE_BYTES + _SAMPLE_BYTES * transforms * samples + experiment.scene.volume.values.nbytes
+    return {
+        "volume": {"shape": list(experiment.scene.volume.shape), "synthetic": experiment.scene.synthetic},
+        "foci_mm": [focus * 1e3 for focus in foci],
+        "stretched": experiment.stretched,
+        "pupil_deg": 2 * math.degrees(math.asin(experiment.radius)),
+        "depth_of_focus_mm": depth_of_focus(min(settings.wavelengths), experiment.radius) * 1e3,
+        "views": views,
+        "samples": list(padded.shape),
+        "predicted_seconds": round(seconds, 2),
+        "predicted_peak_bytes": round(peak),
+        "device": str(experiment.device),
+        "notes": _notes(experiment),
+    }
+
+
+def plan_text(experiment: JointExperiment, values: dict[str, Any]) -> str:
+    """The plan in words."""
+    settings, display = experiment.settings, experiment.settings.display
+    volume = values["volume"]
+    source = settings.volume.path or settings.volume.scene or settings.volume.phantom
+    if volume["synthetic"]:
+        source = f"{settings.volume.phantom} (synthetic: {volume['synthetic']})"
+    stretched = f", stretched {values['stretched']:.3g} times along the axis" if display.depth is not None else ""
+    heat = settings.heat
+    memory = "" if heat is None else f"; {_left(settings):.1%} of the heat is left after a frame"
+    lines = [
+        f"Volume     {source}, {' x '.join(map(str, volume['shape']))} voxels, on {len(values['foci_mm'])} planes from "
+        f"{min(values['foci_mm']):.4g} to {max(values['foci_mm']):.4g} mm{stretched}",
+        f"Display    {display.shape[0]} x {display.shape[1]} px of {display.pitch[1] * 1e6:.4g} um, {settings.frames} "
+        f"frame(s) in turn; heat spreads over {display.sigma_px:g} px, phases up to "
+        f"{display.max_phase / math.pi:.3g} pi{memory}",
+        f"Eye        pupil of {values['pupil_deg']:.3g} deg, depth of focus {values['depth_of_focus_mm']:.3g} mm; "
+        f"{values['views']} views are corrected together, {settings.eye.parallax} of them through smaller pupils",
+        f"Solver     L-BFGS, {settings.steps} steps; compared with {', '.join(settings.report.baselines) or 'nothing'}",
+        f"Cost       about {values['predicted_seconds']:.2g} s on two idle cores, without start-up and figures; "
+        f"{values['predicted_peak_bytes'] / 1e9:.2g} GB of memory at the peak",
+    ]
+    return "\n".join(lines + [f"Note       {note}" for note in values["notes"]])
+
+
+def _left(settings: JointSettings) -> float:
+    assert settings.heat is not None
+    return math.exp(-settings.heat.frame_us / settings.heat.time_constant_us)
+
+
+def _notes(experiment: JointExperiment) -> list[str]:
+    settings, foci = experiment.settings, experiment.foci
+    notes = []
+    focus = depth_of_focus(min(settings.wavelengths), experiment.radius)
+    if len(foci) > 1 and (step := (foci[-1] - foci[0]) / (len(foci) - 1)) > _SPACING * focus:
+        notes.append(
+            f"the planes are {step * 1e3:.3g} mm apart, more than {_SPACING:g} of the depth of focus of "
+            f"{focus * 1e3:.3g} mm: images between them may be worse; use more planes or a smaller pupil"
+        )
+    if settings.eye.pupil > 0.5:
+        notes.append("the pupil is wider than half the band of the pixels, which do not resolve its image fully")
+    if settings.display.max_phase < math.pi:
+        notes.append("phases below pi cannot form images of high contrast; expect little light in them")
+    return notes

@@ -1,0 +1,69 @@
+"""The section of a report page for a joint run."""
+
+from typing import Any
+
+from holotorch.experiments.joint.names import NAMES, SETS
+from holotorch.experiments.runs.page import element, figure, heading, plain, table
+from holotorch.experiments.runs.record import RunRecord
+
+_PICTURES = {
+    "stack": "What an eye sees through the whole pupil, by focus",
+    "parallax": "What it sees through half of the pupil; no method was given these views",
+    "sweep": "Focus moving through the volume: wanted (left) and shown by the joint correction (right)",
+    "phase": "Heater phases",
+}
+
+
+def joint_section(record: RunRecord) -> list[str]:
+    """HTML of a run: scores of the methods, pictures, scores by view, and the plan."""
+    summary, plan = record.summary, record.plan
+    parts = [heading(record.title, summary["status"])]
+    synthetic = ""
+    if summary["synthetic"]:
+        parts.append(element("p", f"Synthetic volume: {summary['synthetic']}.", "warn"))
+        synthetic = ", synthetic volume"
+    parts += [element("p", _WORDS), _methods(summary["methods"])]
+    parts += [
+        figure(source, caption + synthetic, "wide")
+        for name, caption in _PICTURES.items()
+        if (source := record.picture(name))
+    ]
+    if rows := record.rows("views.csv"):
+        parts += [element("h2", "Joint correction, view by view"), _views(rows)]
+    rows = [[name.replace("_", " "), plain(plan[name])] for name in plan if name != "notes"]
+    parts += [element("h2", "Plan"), table(["", ""], rows, head=False)]
+    return parts + [element("p", note, "warn") for note in plan.get("notes", [])]
+
+
+_WORDS = (
+    "PSNR of the intensity over all images of a set together, mean SSIM, and contrast: the standard deviation of "
+    "shown / wanted where the wanted image is bright. One scale for each colour serves all views. Light is the "
+    "fraction of the emitted light that enters the pupil and lands in the window."
+)
+
+
+def _views(rows: list[dict[str, str]]) -> str:
+    columns = ["view", "", "focus", "pupil (sines: y, x; radius)", "wavelength", "PSNR", "SSIM", "contrast"]
+    lines = []
+    for row in rows:
+        wavelength = float(row["wavelength_m"])
+        y, x, radius = (float(row[f"pupil_{name}_per_m"]) * wavelength for name in ("y", "x", "radius"))
+        pupil = f"{y:.4f}, {x:.4f}; {radius:.4f}" + (f", {row['half']} half" if row["half"] else "")
+        place = row["view"], row["use"], f"{1e3 * float(row['focus_m']):.3f} mm", pupil
+        lines.append([*place, f"{1e9 * wavelength:.0f} nm", f"{row['psnr']} dB", row["ssim"], row["contrast"]])
+    return table(columns, lines)
+
+
+def _methods(methods: dict[str, dict[str, Any]]) -> str:
+    columns = ["method", *(f"{words}: dB / SSIM / contrast" for words in SETS.values()), "light", "peak", "seconds"]
+    rows = []
+    for name, each in methods.items():
+        scores = [
+            f"{each[f'{key}_psnr']:.1f} / {each[f'{key}_ssim']:.3f} / {each[f'{key}_contrast']:.3f}"
+            if f"{key}_psnr" in each
+            else ""
+            for key in SETS
+        ]
+        peak = f"{each['peak_phase_pi']:.2f} pi" if "peak_phase_pi" in each else ""
+        rows.append([NAMES[name], *scores, f"{each['light_in_pupil']:.1%}", peak, f"{each['seconds']:.1f}"])
+    return table(columns, rows)
