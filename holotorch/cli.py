@@ -184,13 +184,15 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("--out", type=Path, help="file to write (default: DIR/report.html; ./report.html for several)")
 
     chart = command("chart", _chart, "speed against accuracy of every method, drawn and tabled")
-    chart.add_argument("subject", help="what to chart: eye, pec, propagation, tracking, volume")
+    chart.add_argument(
+        "subject", help="what to chart: camera, chain, eye, joint, network, pec, propagation, tracking, volume"
+    )
     chart.add_argument("--out", type=Path, help="folder for the chart (default: scripts/charts/SUBJECT)")
 
     usage = "holotorch export-slm DIR --slm FILE [key=value ...] [--out OUT] [--encoding ENCODING] [--format FORMAT]"
     about = "frames for a phase panel from a run, and what those files show"
     export = command("export-slm", _export_slm, about, usage=usage)
-    export.add_argument("folder", type=Path, metavar="DIR", help="folder of a run of kind pec or volume")
+    export.add_argument("folder", type=Path, metavar="DIR", help="folder of a run of kind pec, joint or volume")
     panel = "a panel, such as configs/slm/lcos_2048.yaml, and its settings to change"
     export.add_argument("--slm", nargs="+", required=True, metavar=("FILE", "key=value"), help=panel)
     export.add_argument("--out", type=Path, help="folder for the files (default: DIR/slm)")

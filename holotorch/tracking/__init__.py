@@ -4,7 +4,7 @@ from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.camera.tone import tone_curve
 from holotorch.tracking.detection.channels import ChannelOrder, ambiguities
 from holotorch.tracking.detection.tracker import CatheterTracker
-from holotorch.tracking.pose.alignment import headset_from_camera
+from holotorch.tracking.pose.alignment import headset_from_camera, in_frame
 from holotorch.tracking.pose.band_edges import fit_band_edges
 from holotorch.tracking.pose.catheter import THESIS, Catheter
 from holotorch.tracking.pose.pose import closed_form, solve_pose
@@ -31,6 +31,7 @@ __all__ = [
     "closed_form",
     "fit_band_edges",
     "headset_from_camera",
+    "in_frame",
     "solve_pose",
     "tone_curve",
 ]

@@ -2,6 +2,7 @@
 
 import asyncio
 import importlib.util
+import json
 import math
 import random
 from collections.abc import Callable, Iterator
@@ -10,12 +11,14 @@ from typing import Any
 import torch
 
 from holotorch.experiments.streaming.stream import own_address
+from holotorch.tracking import THESIS
 from holotorch.tracking.pose.status import Pose, Status
 from holotorch.tracking.streaming.packet import now
 from holotorch.tracking.streaming.stream import PORT, PoseReceiver, PoseSender, UdpSocket
 
 _LOOPBACK = "127.0.0.1"
 _EVERY = 50  # every 50th packet carries a refusal instead of a pose
+_SOON = 5e-3  # seconds: largest accepted median delay to a page; a quarter of that of the slowest per cent
 _FAST = 1e-3  # seconds: largest accepted median transit on the loopback
 
 
@@ -48,6 +51,7 @@ async def _rows(port: int, packets: int) -> list[tuple[bool, str]]:
         relay.release()
         await asyncio.sleep(0.05)
     rows += [*_direct("receiver 1", one, packets), *_direct("receiver 2", two, packets), _lossy(behind_relay, relay)]
+    rows.append(await _page(min(300, packets // 5)))
     slicer = "not installed (optional); to add: pip install 'holotorch[slicer]'"
     if importlib.util.find_spec("pyigtl") is not None:
         slicer = "installed; holotorch stream ... --igtl 18944"
@@ -72,6 +76,39 @@ async def _send(sender: PoseSender, packets: int) -> None:
         pose = Pose(tip, direction, covariance, one, one, Status.OK)
         sender.send(refusal if i % _EVERY == _EVERY - 1 else pose, now())
         await asyncio.sleep(1e-3)
+
+
+async def _page(count: int) -> tuple[bool, str]:
+    """Whether poses at 60 per second reach a page on this computer in time, and the added latency in words."""
+    from aiohttp import ClientSession
+
+    from holotorch.experiments.streaming.page import PageServer
+
+    delays: list[float] = []
+    async with (
+        PageServer(THESIS, port=0) as server,
+        ClientSession() as session,
+        session.ws_connect(server.address + "poses") as socket,
+    ):
+
+        async def read() -> None:
+            async for message in socket:
+                if (content := json.loads(message.data))["kind"] == "pose":
+                    delays.append(now() - content["sent"])
+
+        reader = asyncio.create_task(read())
+        refusal = Pose.refused(Status.NO_CATHETER, "a refusal of the self-test")
+        for _ in range(count):
+            server.send(refusal, now())
+            await asyncio.sleep(1 / 60)
+        reader.cancel()
+    median, p99 = (float(torch.tensor(delays or [math.inf]).quantile(share)) for share in (0.5, 0.99))
+    good = len(delays) == count and median < _SOON and p99 < 4 * _SOON
+    advice = (
+        "" if good else f"; expected all, in {_SOON * 1e3:g} ms: close what keeps this computer busy, and try again"
+    )
+    text = f"{len(delays)} of {count} poses, added latency median {median * 1e3:.2f} ms, p99 {p99 * 1e3:.2f} ms{advice}"
+    return good, f"page: {text}"
 
 
 def _direct(name: str, receiver: PoseReceiver, packets: int) -> Iterator[tuple[bool, str]]:

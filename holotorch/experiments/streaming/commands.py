@@ -11,13 +11,19 @@ OK, FAILED, INTERRUPTED = 0, 1, 130
 
 def add_stream(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the command to the parser of ``holotorch``."""
-    stream = commands.add_parser("stream", help="send poses to headsets and 3D Slicer, or see what arrives")
+    stream = commands.add_parser("stream", help="send poses to headsets, 3D Slicer and browsers, or see what arrives")
     stream.add_argument("sources", nargs="*", metavar="SOURCE", help="a poses.csv, or what track takes")
-    stream.add_argument("--to", action="append", metavar="HOST[:PORT]", help="receiver; may be given again")
+    receiver = "receiver, and its own headset file if it has one; may be given again"
+    stream.add_argument("--to", action="append", metavar="HOST[:PORT][=FILE]", help=receiver)
+    stream.add_argument("--headset", type=Path, metavar="FILE", help="send poses in its frame; see calibrate headset")
     stream.add_argument("--igtl", type=_port, metavar="PORT", help="serve OpenIGTLink, such as on 18944")
     stream.add_argument("--rate", type=float, metavar="HZ", help="poses per second of a poses.csv, or of pictures")
     stream.add_argument("--smooth", action="store_true", help="One-Euro filter; packets tell its lag")
-    stream.add_argument("--view", action="store_true", help="show what arrives")
+    about = "with a source: a page that shows the poses in a browser; without: print what arrives by UDP"
+    stream.add_argument("--view", action="store_true", help=about)
+    stream.add_argument("--replay", type=Path, metavar="DIR", help="a run of track as the source, again and again")
+    stream.add_argument("--page", metavar="HOST[:PORT]", help="where the page is served (default: 127.0.0.1:8765)")
+    stream.add_argument("--tls", nargs=2, type=Path, metavar=("CERT", "KEY"), help="for a page on another computer")
     stream.add_argument("--check", action="store_true", help="send to this machine itself, also with losses, and count")
     stream.add_argument("--port", type=_port, default=18950, help="where --view and --check listen (default: 18950)")
     stream.set_defaults(action=_stream)
@@ -32,7 +38,10 @@ def _port(text: str) -> int:
 
 
 def _stream(options: argparse.Namespace) -> int:
-    if options.check or options.view:
+    options.view = options.view or options.page is not None
+    if options.replay:
+        options.sources = [*options.sources, str(options.replay / "poses.csv")]
+    if options.check or (options.view and not options.sources):
         _need_no_source(options)
     if options.check:
         from holotorch.experiments.streaming.check import check
@@ -40,16 +49,26 @@ def _stream(options: argparse.Namespace) -> int:
         return OK if check(options.port) else FAILED
     from holotorch.experiments.streaming import stream
 
-    if options.view:
+    if options.view and not options.sources:
         stream.view(options.port)
         return OK
+    page = None
+    if options.view:
+        from holotorch.experiments.streaming.opening import open_page
+
+        page = open_page(
+            options.sources[0], options.camera, options.catheter, options.headset, options.page, options.tls
+        )
     from holotorch.experiments.tracking.run import live
     from holotorch.io.video import is_camera
 
     result = stream.stream(
         options.sources,
         options.to or (),
+        headset=options.headset,
         igtl=options.igtl,
+        page=page,
+        repeat=options.replay is not None,
         rate=options.rate,
         smooth=options.smooth,
         track=lambda sources: live(sources, options.camera, options.catheter, options.rate),
@@ -66,10 +85,21 @@ def _need_no_source(options: argparse.Namespace) -> None:
     from holotorch.experiments.config.errors import ConfigError
 
     unused = ["SOURCE"] if options.sources else []
-    names = ("to", "igtl", "rate", "smooth", "camera", "catheter", *(["view"] if options.check else []))
+    names = (
+        "to",
+        "headset",
+        "page",
+        "tls",
+        "igtl",
+        "rate",
+        "smooth",
+        "camera",
+        "catheter",
+        *(["view"] if options.check else []),
+    )
     given = {name: getattr(options, name) for name in names}
     unused += [f"--{name}" for name, value in given.items() if value is not None and value is not False]
     if unused:
-        listening = "--view only listens; send from another terminal"
+        listening = "--view without a SOURCE only listens; name one, or send from another terminal"
         option = "--check sends to this computer itself" if options.check else listening
         raise ConfigError([f"{option}: it takes no {', '.join(unused)}"])

@@ -2,28 +2,58 @@
 
 import asyncio
 import csv
+import itertools
 import math
 import socket
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AsyncExitStack, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
 from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.tracking.devices import build_headset, headset_covariance, load_headset
 from holotorch.experiments.tracking.report import COLUMNS
+from holotorch.tracking.pose.alignment import in_frame
 from holotorch.tracking.pose.smoothing import OneEuro
 from holotorch.tracking.pose.status import Pose, Status
 from holotorch.tracking.streaming.igtl import TransformServer
-from holotorch.tracking.streaming.packet import PosePacket, encode, now
+from holotorch.tracking.streaming.packet import FRAME, PosePacket, encode, now
 from holotorch.tracking.streaming.stream import PORT, PoseReceiver, PoseSender
+
+if TYPE_CHECKING:
+    from holotorch.experiments.streaming.page import PageServer
 
 _NUMBERS = COLUMNS[5:19]  # tip, direction, covariance of the tip, chi-square and degrees of freedom
 _COLUMNS = ("time_s", "status", "reason", *_NUMBERS)
 
 Show = Callable[[str], None]  # prints a line
 TimedPose = tuple[float, Pose]  # capture time in seconds, and pose
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The frame in which a receiver gets its poses."""
+
+    name: str = FRAME  # of the matrix in the packets
+    transform: str = "ToolToCamera"  # of the OpenIGTLink message
+    matrix: torch.Tensor | None = None  # from the camera's frame, [4, 4]; None for the camera's frame itself
+    covariance: torch.Tensor | None = None  # of ``matrix``, [6, 6]
+
+    @classmethod
+    def of(cls, path: Path | None) -> "Frame":
+        """The frame of a headset file. ConfigError for a file that cannot be read."""
+        if path is None:
+            return cls()
+        settings = load_headset(path)
+        names = f"{settings.frame}_from_tool", f"ToolTo{settings.frame.capitalize()}"
+        return cls(*names, build_headset(settings), headset_covariance(settings))
+
+    def __call__(self, pose: Pose) -> Pose:
+        """A pose of the camera's frame in this one."""
+        return pose if self.matrix is None else in_frame(pose, self.matrix, self.covariance)
 
 
 class Streamed(NamedTuple):
@@ -94,8 +124,11 @@ def stream(
     sources: Sequence[str],
     to: Sequence[str] = (),
     *,
+    headset: Path | None = None,
     igtl: int | None = None,
+    page: "PageServer | None" = None,
     rate: float | None = None,
+    repeat: bool = False,
     smooth: bool = False,
     track: Callable[[Sequence[str]], Iterable[TimedPose]] | None = None,
     show: Show = print,
@@ -104,9 +137,13 @@ def stream(
 
     Args:
         sources: One poses.csv, or sources of ``track``: videos, folders, the index of a camera.
-        to: Receivers, each ``HOST`` or ``HOST:PORT``.
+        to: Receivers, each ``HOST`` or ``HOST:PORT``, followed by ``=FILE`` if it has a headset file of its own.
+        headset: File of a camera's position on a headset, see ``devices.HeadsetSettings``: poses are sent in its frame,
+            with its covariance added. By default they are in the frame of the camera.
         igtl: Port of an OpenIGTLink server, to which Slicer connects; None for no server.
+        page: Server of a page that shows the poses in a browser; it opens and closes with the stream.
         rate: Poses per second of a poses.csv, instead of the recorded pace.
+        repeat: Begin a poses.csv again at its end, until the user interrupts the stream.
         smooth: Smooth the poses by :class:`OneEuro`; the packets then state the lag of the filter.
         track: Function that yields capture times (by ``packet.now``) and poses of the sources, as frames arrive. A pose
             with a future time is sent at that time.
@@ -115,30 +152,42 @@ def stream(
     Raises:
         ConfigError: There is no source or no receiver, an address or file cannot be read, or pyigtl is missing.
     """
-    receivers = [address(text) for text in to]
-    if not receivers and igtl is None:
+    receivers: dict[Path | None, list[tuple[str, int]]] = {}
+    for text in to:
+        place, _, file = text.partition("=")
+        receivers.setdefault(Path(file) if file else headset, []).append(address(place))
+    frames = {file: Frame.of(file) for file in {*receivers, headset}}
+    if not receivers and igtl is None and page is None:
         raise ConfigError([f"say to whom: --to HOST:PORT, such as --to 127.0.0.1:{PORT}, or --igtl 18944 for Slicer"])
     if rate is not None and not (math.isfinite(rate) and rate > 0):
         raise ConfigError([f"rate must be above 0 Hz, got {rate}"])
     if len(sources) == 1 and sources[0].lower().endswith(".csv"):
-        poses: Iterable[TimedPose] = replay(read_poses(Path(sources[0])), rate)
+        recorded = read_poses(Path(sources[0]))
+        turns = itertools.count() if repeat else range(1)
+        poses: Iterable[TimedPose] = itertools.chain.from_iterable(replay(recorded, rate) for _ in turns)
     elif sources and track is not None:
         poses = track(sources)
     else:
         raise ConfigError([f"expected one poses.csv or videos to track, got {' '.join(sources) or 'nothing'}"])
     try:
-        server = None if igtl is None else TransformServer(igtl)
+        server = None if igtl is None else TransformServer(igtl, name=frames[headset].transform)
     except ImportError as error:
         raise ConfigError([str(error)]) from None
-    sender, count, complete = PoseSender(receivers) if receivers else None, [0], True
+    senders = [(frames[file], PoseSender(places, frame=frames[file].name)) for file, places in receivers.items()]
+    servers = [] if server is None else [(frames[headset], server)]
+    pages = [] if page is None else [(frames[headset], page)]
+    count, complete = [0], True
     try:
-        asyncio.run(_send(iter(poses), sender, server, smooth, count, show))
+        asyncio.run(_send(iter(poses), [*senders, *pages], servers, smooth, count, show))
     except KeyboardInterrupt:
         show("interrupted")
         complete = False
     except OSError as error:
         raise _config_error(error) from None
-    delivered = sender is None or server is not None or any(link.sent or not link.errors for link in sender.links)
+    links = [link for _, sender in senders for link in sender.links]
+    delivered = (
+        page is not None or not links or server is not None or any(link.sent or not link.errors for link in links)
+    )
     return Streamed(count[0], complete, delivered)
 
 
@@ -149,19 +198,24 @@ def _config_error(error: OSError) -> Exception:
 
 async def _send(
     poses: Iterator[TimedPose],
-    sender: PoseSender | None,
-    server: TransformServer | None,
+    senders: Sequence[tuple["Frame", "PoseSender | PageServer"]],
+    servers: Sequence[tuple["Frame", TransformServer]],
     smooth: bool,
     count: list[int],
     show: Show,
 ) -> None:
     """Send all poses; ``count[0]`` becomes the number of poses sent, even if the call is interrupted."""
-    links, smoother = sender.links if sender else [], OneEuro() if smooth else None
+    links = [link for _, sender in senders if isinstance(sender, PoseSender) for link in sender.links]
+    pages, smoother = [each for _, each in senders if not isinstance(each, PoseSender)], OneEuro() if smooth else None
     async with AsyncExitStack() as stack:
-        for connection in filter(None, (sender, server)):
+        for _, connection in (*senders, *servers):
             await stack.enter_async_context(connection)
-        show(f"Sending    to {', '.join(f'{link.host}:{link.port}' for link in links) or 'OpenIGTLink clients'}")
-        if server:
+        show(f"Sending    to {', '.join(f'{link.host}:{link.port}' for link in links) or 'clients that connect'}")
+        for page in pages:
+            show(f"Page       {page.address}")
+        for frame in dict.fromkeys(frame for frame, _ in (*senders, *servers) if frame.matrix is not None):
+            show(f"Frame      {frame.name}{'' if frame.covariance is not None else ', of unknown accuracy'}")
+        for _, server in servers:
             show(f"Slicer     connects to {own_address()}, port {server.port}")
         try:
             # Tracking runs in a thread, so that clock requests are answered in the meantime.
@@ -169,15 +223,16 @@ async def _send(
                 captured, pose = item
                 await asyncio.sleep(max(0.0, captured - now()))  # unlike sleep in a thread, Ctrl-C ends it at once
                 pose = smoother(pose, captured) if smoother else pose
-                if sender:
-                    sender.send(pose, captured, lag=smoother.lag if smoother else 0.0)
-                if server:
-                    server.send(pose, captured)
+                for frame, sender in senders:
+                    sender.send(frame(pose), captured, lag=smoother.lag if smoother else 0.0)
+                for frame, server in servers:
+                    server.send(frame(pose), captured)
                 count[0] += 1
         finally:
             show(f"Frames     {count[0]}")
-            if server and server.future:
-                show(f"Slicer     {server.future} sent as refusals: captured in the future")
+            for _, server in servers:
+                if server.future:
+                    show(f"Slicer     {server.future} sent as refusals: captured in the future")
             for link in links:
                 text = f", {link.errors} failed: {link.last_error}" if link.errors else ""
                 show(f"Receiver   {link.host}:{link.port}: {link.sent} sent, {link.dropped} dropped for newer{text}")

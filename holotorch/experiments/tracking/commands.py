@@ -25,13 +25,16 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     track.add_argument("--rate", type=float, metavar="HZ", help="frames per second of a source without times")
     track.set_defaults(action=_track)
 
-    calibrate = commands.add_parser("calibrate", help="a camera's intrinsics from photographs of a board")
-    calibrate.add_argument("files", nargs="+", type=Path, metavar="FILE", help="photographs, or folders of them")
+    about = "a camera's intrinsics from photographs of a board, or its place on a headset from alignments"
+    calibrate = commands.add_parser("calibrate", help=about)
+    what = "photographs, or folders of them; or: headset ALIGNMENTS.csv"
+    calibrate.add_argument("files", nargs="+", type=Path, metavar="FILE", help=what)
     board = "chessboard 9x6 25mm (default; inner corners, square) or charuco 5x7 40mm 20mm DICT_6X6_250"
     calibrate.add_argument("--board", nargs="+", metavar="WORD", help=board)
     # Without this pattern, argparse would read -25mm as an option instead of an (invalid) length.
     calibrate._negative_number_matcher = re.compile(r"-\.?\d")
-    calibrate.add_argument("--out", type=Path, default=Path("camera.yaml"), help="file (default: camera.yaml)")
+    calibrate.add_argument("--axes", help="of the headset's frame: RDF (default), RUB (WebXR), RUF (Unity), ...")
+    calibrate.add_argument("--out", type=Path, help="file (default: camera.yaml or headset.yaml)")
     calibrate.set_defaults(action=_calibrate)
 
     for name, words in FILES.items():
@@ -56,9 +59,21 @@ def _track(options: argparse.Namespace) -> int:
 
 
 def _calibrate(options: argparse.Namespace) -> int:
+    from holotorch.experiments.config.errors import ConfigError
+
+    if options.files[0] == Path("headset"):
+        if len(options.files) != 2 or options.board:
+            raise ConfigError(["calibrate headset: expected one file of alignments, and no --board"])
+        from holotorch.experiments.tracking.headset import alignment_text, calibrate_headset
+
+        out = options.out or Path("headset.yaml")
+        print(alignment_text(*calibrate_headset(options.files[1], out, options.axes or "RDF")), out, sep="\n")
+        return OK
+    if options.axes:
+        raise ConfigError(["--axes belongs to: calibrate headset ALIGNMENTS.csv"])
     from holotorch.experiments.tracking.calibrate import BOARD, calibrate_photographs, calibration_text
 
-    board = options.board or BOARD
-    calibration, missing = calibrate_photographs(options.files, options.out, board)
-    print(calibration_text(calibration, missing, board), options.out, sep="\n")
+    board, out = options.board or BOARD, options.out or Path("camera.yaml")
+    calibration, missing = calibrate_photographs(options.files, out, board)
+    print(calibration_text(calibration, missing, board), out, sep="\n")
     return OK

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import torch
 import yaml
@@ -36,6 +36,7 @@ def _tone(value: Any) -> Any:
 Positive = Annotated[Number, Field(gt=0)]
 Level = Annotated[int, BeforeValidator(number), Field(ge=0, le=255)]
 Row = tuple[Number, Number, Number, Number]
+Row6 = tuple[Number, Number, Number, Number, Number, Number]
 
 
 class EvidenceSettings(Settings):
@@ -81,11 +82,15 @@ class CatheterSettings(Settings):
 class HeadsetSettings(Settings):
     """Position of a camera on a headset: rows of the 4 x 4 matrix from camera to headset coordinates, in metres.
 
-    ``residuals`` and ``leave_one_out``: errors in metres of the alignments from which the matrix was computed, see
-    ``Alignment``. An entry of ``leave_one_out`` is null if the other alignments alone do not determine the matrix.
+    The axes of both are x right, y down, z forward. ``frame``: name of the frame, headset, or world for a camera that
+    stands in a room. ``residuals`` and ``leave_one_out``: errors in metres of the alignments from which the matrix was
+    computed, and ``covariance`` of its turn and shift, see ``Alignment``. An entry of ``leave_one_out`` is null if the
+    other alignments alone do not determine the matrix.
     """
 
     headset_from_camera: tuple[Row, Row, Row, Row]
+    frame: Literal["headset", "world"] = "headset"
+    covariance: tuple[Row6, Row6, Row6, Row6, Row6, Row6] | None = None
     residuals: tuple[Number, ...] = ()
     leave_one_out: tuple[Number | None, ...] = ()
     alignments: Count | None = None
@@ -148,7 +153,16 @@ def build_headset(settings: HeadsetSettings) -> torch.Tensor:
         raise ValueError(
             "headset_from_camera must be a rotation without mirroring, a shift in metres, and the last row 0, 0, 0, 1"
         )
+    if (covariance := headset_covariance(settings)) is not None:
+        least = torch.linalg.eigvalsh(covariance).min()
+        if not torch.equal(covariance, covariance.mT) or least < -1e-9 * covariance.trace().abs():
+            raise ValueError("covariance must be symmetric and without negative eigenvalues")
     return matrix
+
+
+def headset_covariance(settings: HeadsetSettings) -> torch.Tensor | None:
+    """Covariance float64 [6, 6] of the matrix, as in ``Alignment``; None if it is unknown."""
+    return None if settings.covariance is None else torch.tensor(settings.covariance, dtype=torch.float64)
 
 
 def save_camera(path: Path, camera: Camera | Calibration, size: tuple[int, int] | None = None) -> None:
@@ -181,6 +195,7 @@ def save_headset(path: Path, alignment: Alignment) -> None:
     left_out = [value if value != float("inf") else None for value in alignment.leave_one_out.tolist()]
     settings = {
         "headset_from_camera": alignment.headset_from_camera.detach().tolist(),
+        "covariance": ((alignment.covariance + alignment.covariance.mT) / 2).tolist(),
         "residuals": alignment.residuals.tolist(),
         "leave_one_out": left_out,
         "alignments": len(left_out),

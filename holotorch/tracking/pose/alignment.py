@@ -1,14 +1,18 @@
-"""Pose of a camera relative to a headset, from poses of one tool that both have measured."""
+"""Pose of a camera relative to a headset, from poses of one tool that both have measured; poses in its frame."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from holotorch.core import checks, quantities
+from holotorch.tracking.pose.status import Pose
 
 TOOL_LENGTH = 0.127  # metres from the tip to the middle of the bands: the two points of an alignment in the thesis
+# Distance in metres between both points at which the errors of a hand, 1 mm at the tip and 1 degree in direction, have
+# the same weight: 1 mm / 1 degree. Tips elsewhere are then more accurate than with the points of the thesis.
+HAND_LENGTH = 0.057
 SAME_DIRECTION = math.radians(10)  # angle between tools below which they count as parallel
 
 
@@ -22,11 +26,15 @@ class Alignment:
             each alignment.
         leave_one_out: [n] residual of each alignment for the map fitted to all others, which predicts the error of a
             new alignment. Infinite where the others do not determine a map.
+        covariance: float64 [6, 6] of the map in the headset's frame, (turn about its origin in radians, shift in
+            metres), without gradient. It is estimated from the residuals, for alignments that err in the place of the
+            tool and in its direction, and widened for their small number.
     """
 
     headset_from_camera: Tensor
     residuals: Tensor
     leave_one_out: Tensor
+    covariance: Tensor
 
 
 def tool_points(tip: Tensor, direction: Tensor, length: float = TOOL_LENGTH) -> Tensor:
@@ -109,7 +117,74 @@ def headset_from_camera(camera: Tensor, headset: Tensor) -> Alignment:
         others = torch.arange(len(source), device=source.device) != i
         if _spread(source[others]) >= SAME_DIRECTION:
             leave_one_out[i] = _residuals(rigid_map(source[others], target[others]), source[i], target[i])
-    return Alignment(fitted, residuals, torch.stack(leave_one_out))
+    return Alignment(fitted, residuals, torch.stack(leave_one_out), _covariance(fitted.detach(), source, target))
+
+
+def in_frame(pose: Pose, matrix: Tensor, covariance: Tensor | None = None) -> Pose:
+    """A pose, or a batch of poses, of the camera's frame in another frame, such as a headset's.
+
+    Args:
+        pose: In the frame of the camera; refusals stay refusals.
+        matrix: Rigid map [4, 4] from the camera to the other frame, in metres.
+        covariance: [6, 6] of ``matrix`` as in ``Alignment``, which is added to that of the pose. All poses share this
+            error, so a mean over many of them does not become more accurate than it.
+    """
+    matrix = matrix.to(pose.tip)
+    rotation = matrix[:3, :3]
+    tip, direction = pose.tip @ rotation.mT + matrix[:3, 3], pose.direction @ rotation.mT
+    both = torch.block_diag(rotation, rotation)
+    total = both @ pose.covariance @ both.mT
+    if covariance is not None:
+        zero = torch.zeros_like(rotation)
+        by_turn = torch.cat([-_crossing(tip), -_crossing(direction)], -2)
+        by_shift = torch.cat([torch.eye(3, dtype=tip.dtype, device=tip.device), zero], -2).expand_as(by_turn)
+        change = torch.cat([by_turn, by_shift], -1)
+        total = total + change @ covariance.to(tip) @ change.mT
+    return replace(pose, tip=tip, direction=direction, covariance=total)
+
+
+def _covariance(fitted: Tensor, source: Tensor, target: Tensor) -> Tensor:
+    """Covariance of ``Alignment``: two variances explain the residuals, of the place of the tool and of its direction.
+
+    With the residuals r = M e of the errors e, and Cov(e) = a S_a + b S_b, the expected squares of the residuals of the
+    tip, and of the difference of both points, are linear in a and b.
+    """
+    source, target = source.detach(), target.detach()
+    count, mapped = len(source), source @ fitted[:3, :3].mT + fitted[:3, 3]
+    points = mapped.reshape(-1, 3)
+    eye = torch.eye(3, dtype=points.dtype, device=points.device)
+    jacobian = torch.cat([-_crossing(points), eye.expand(len(points), 3, 3)], -1).reshape(-1, 6)
+    inverse = torch.linalg.inv(jacobian.mT @ jacobian)
+    left_over = torch.eye(len(jacobian), dtype=points.dtype, device=points.device) - jacobian @ inverse @ jacobian.mT
+    axes = torch.nn.functional.normalize(mapped[:, 1] - mapped[:, 0], dim=-1)
+    across = eye - axes[:, :, None] * axes[:, None]
+    zero = torch.zeros_like(eye)
+    place = torch.cat([torch.cat([eye, eye], 1)] * 2, 0)
+    causes = [
+        torch.block_diag(*[place] * count),
+        torch.block_diag(*(torch.cat([torch.cat([zero, zero], 1), torch.cat([zero, each], 1)], 0) for each in across)),
+    ]
+    tip = torch.block_diag(*[torch.block_diag(eye, zero)] * count)
+    difference = torch.block_diag(*[torch.cat([torch.cat([eye, -eye], 1), torch.cat([-eye, eye], 1)], 0)] * count)
+    residual = (target - mapped).reshape(-1)
+    spread = [left_over @ cause @ left_over for cause in causes]
+    expected = torch.stack([torch.stack([(each * cause).sum() for cause in spread]) for each in (tip, difference)])
+    observed = torch.stack([residual @ each @ residual for each in (tip, difference)])
+    variances = torch.linalg.solve(expected, observed)
+    if bool((variances < 0).any()):  # one cause explains all
+        other = int(variances.argmax())
+        variances = torch.zeros_like(variances)
+        variances[other] = observed.sum() / expected[:, other].sum()
+    both = variances[0] * causes[0] + variances[1] * causes[1]
+    freedom = 5 * count - 6
+    return inverse @ jacobian.mT @ both @ jacobian @ inverse * (freedom / (freedom - 2))
+
+
+def _crossing(vectors: Tensor) -> Tensor:
+    """Matrices [..., 3, 3] whose product with u is the cross product of ``vectors`` [..., 3] and u."""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
 
 
 def _spread(points: Tensor) -> float:

@@ -13,10 +13,11 @@ offset bytes type     meaning
 16     8     uint64   sequence: 0, 1, 2, ... within a stream; poses and refusals are numbered together
 24     8     float64  capture time of the camera frame, seconds (see :func:`now`)
 32     8     float64  time of sending, seconds of the same clock
-40     4     bytes    axes of the camera frame: ``RDF`` and a zero: x right, y down, z forward; right-handed
+40     4     bytes    axes of the frame: ``RDF`` and a zero: x right, y down, z forward; right-handed
 44     2     bytes    unit of length: ``m`` and a zero
 46     2     bytes    order of the matrix: ``RM``, row by row, for points as columns: p_camera = M p_tool
-48     32    bytes    name of the matrix, ASCII, filled with zeros: ``camera_from_tool``
+48     32    bytes    name of the matrix, ASCII, filled with zeros: ``camera_from_tool``; ``headset_from_tool`` and
+                      ``world_from_tool`` for a camera whose place in that frame is known, in axes RDF too
 80     2     uint16   status: the integer of ``holotorch.tracking.Status``; 0 OK, 1 UNVERIFIED, larger: a refusal
 82     2     uint16   degrees of freedom of chi-square; 0 if the pose was not checked
 84     4     float32  seconds by which smoothing lags behind a steady motion; 0 without smoothing

@@ -153,6 +153,7 @@ class Listener(threading.Thread):
             while len(self.packets) < self.wanted:
                 await asyncio.sleep(0.005)
             self.lines = [module._line(receiver), *statistics_text(receiver)]
+            await asyncio.sleep(0.3)  # a reply to a clock request still finds the socket open
 
 
 def heard(sources, wanted, **options):
@@ -176,6 +177,47 @@ def test_a_recording_reaches_a_receiver(tmp_path):
     assert "camera_from_tool tip 300.0, -333.3, 500.0 mm" in listener.lines[0]
     assert listener.lines[1] == "Received   4, lost 0, reordered 0, repeated 0"
     assert listener.lines[2].startswith("Of these   refused 1")
+
+
+def headset_file(path, shift, frame="headset", covariance=1e-8):
+    rows = [[0, 0, 1, shift], [0, 1, 0, -0.05], [-1, 0, 0, 0.02], [0, 0, 0, 1]]
+    lines = [f"headset_from_camera: {rows}", f"frame: {frame}"]
+    if covariance:
+        lines.append(f"covariance: {[[covariance * (i == j) for j in range(6)] for i in range(6)]}")
+    path.write_text("\n".join(lines))
+    return path
+
+
+def test_every_receiver_gets_poses_in_the_frame_of_its_own_headset(tmp_path):
+    path, listeners, lines = str(write(tmp_path / "poses.csv")), [Listener(4) for _ in range(3)], []
+    own, all_ = headset_file(tmp_path / "own.yaml", 0.1), headset_file(tmp_path / "all.yaml", 0.2, "world", 0)
+    for listener in listeners:
+        listener.start()
+        listener.ready.wait(20)
+    first, second, third = (f"127.0.0.1:{listener.port}" for listener in listeners)
+    assert stream([path], [first, f"{second}={own}", third], rate=50.0, headset=all_, show=lines.append).delivered
+    for listener in listeners:
+        listener.join(20)
+    for listener, name, shift in zip(listeners, ("world", "headset", "world"), (0.2, 0.1, 0.2), strict=True):
+        assert [packet.frame for packet in listener.packets] == [f"{name}_from_tool"] * 4
+        for (_, before), packet in zip(POSES, listener.packets, strict=True):
+            assert packet.pose.status is before.status and packet.pose.reason == before.reason
+            x, y, z = before.tip
+            torch.testing.assert_close(packet.pose.tip, torch.stack([z + shift, y - 0.05, 0.02 - x]), equal_nan=True)
+            if before.answered:
+                added = 3e-8 * (1 + float(2 / 3 * packet.pose.tip.square().sum())) if name == "headset" else 0
+                known = before.covariance[:3, :3].trace() + added
+                torch.testing.assert_close(packet.pose.covariance[:3, :3].trace(), known)
+    assert "Frame      world_from_tool, of unknown accuracy" in lines and "Frame      headset_from_tool" in lines
+
+
+def test_a_headset_file_that_is_none_is_said(tmp_path):
+    path = str(write(tmp_path / "poses.csv"))
+    with pytest.raises(ConfigError, match="nothing.yaml"):
+        stream([path], ["127.0.0.1:9"], headset=tmp_path / "nothing.yaml")
+    bad = headset_file(tmp_path / "bad.yaml", 0.1, covariance=-1e-8)
+    with pytest.raises(ConfigError, match="bad.yaml:3:1: covariance: must be symmetric"):
+        stream([path], [f"127.0.0.1:9={bad}"])
 
 
 def nobody() -> int:
@@ -215,7 +257,7 @@ def test_openigtlink_needs_its_package_or_serves(tmp_path, monkeypatch):
     assert stream([path], igtl=0, show=lines.append).frames == 4
     assert "Slicer     connects to" in lines[1]
 
-    def missing(*_):
+    def missing(*_, **__):
         raise ImportError("OpenIGTLink needs pyigtl; run: pip install 'holotorch[slicer]'")
 
     monkeypatch.setattr(module, "TransformServer", missing)

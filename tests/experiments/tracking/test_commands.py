@@ -263,8 +263,9 @@ def test_stream_looks_at_its_files_before_it_says_that_it_sends(capsys):
 
 
 def test_what_sends_nothing_of_the_users_takes_no_source(capsys):
-    error = said(capsys, "stream", "poses.csv", "--to", "127.0.0.1:1", "--view")
-    assert error.splitlines() == ["--view only listens; send from another terminal: it takes no SOURCE, --to"]
+    error = said(capsys, "stream", "--to", "127.0.0.1:1", "--view")
+    advice = "--view without a SOURCE only listens; name one, or send from another terminal"
+    assert error.splitlines() == [f"{advice}: it takes no --to"]
     error = said(capsys, "stream", "poses.csv", "--check")
     assert error.splitlines() == ["--check sends to this computer itself: it takes no SOURCE"]
     error = said(capsys, "stream", "--check", "--view", "--smooth", "--igtl", "0")

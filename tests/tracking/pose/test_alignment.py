@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from holotorch.tracking.pose.alignment import headset_from_camera, tool_points
+from holotorch.tracking.pose.alignment import HAND_LENGTH, TOOL_LENGTH, headset_from_camera, in_frame, tool_points
+from holotorch.tracking.pose.status import Pose, Status
 
 
 def rotation(generator):
@@ -21,13 +22,13 @@ def truth(seed=0):
     return matrix
 
 
-def poses(count, seed=1, spread=1.0):
+def poses(count, seed=1, spread=1.0, length=TOOL_LENGTH):
     """Tips in a working volume of 200 mm half a metre away, directions around -z + y."""
     generator = torch.Generator().manual_seed(seed)
     tips = (torch.rand(count, 3, dtype=torch.float64, generator=generator) - 0.5) * 0.2
     tips[:, 2] += 0.5
     directions = torch.randn(count, 3, dtype=torch.float64, generator=generator) * spread
-    return tool_points(tips, directions + torch.tensor([0.0, 0.6, -0.6]))
+    return tool_points(tips, directions + torch.tensor([0.0, 0.6, -0.6]), length)
 
 
 def moved(matrix, points):
@@ -127,3 +128,70 @@ def test_directions_of_no_length_are_refused():
         tool_points(torch.zeros(2, 3), torch.zeros(2, 3))
     with pytest.raises(TypeError, match="floating"):
         headset_from_camera(torch.zeros(3, 2, 3, dtype=torch.int64), poses(3))
+
+
+def _single(tip, direction, covariance=None) -> Pose:
+    covariance = torch.zeros(6, 6, dtype=torch.float64) if covariance is None else covariance
+    zero = torch.zeros((), dtype=torch.float64)
+    return Pose(tip, direction, covariance, zero, zero, Status.OK)
+
+
+def _hand(points, generator):
+    """Points of tools that a hand has aligned, with errors of 1 mm and 1 degree (root mean square)."""
+    place, turn = 1e-3 / math.sqrt(3), math.radians(1) / math.sqrt(2)  # per axis
+    axis = points[:, 1] - points[:, 0]
+    shift = place * torch.randn(len(points), 3, dtype=torch.float64, generator=generator)
+    turned = torch.linalg.cross(turn * torch.randn(len(points), 3, dtype=torch.float64, generator=generator), axis)
+    new = axis + turned
+    new = new / new.norm(dim=-1, keepdim=True) * axis.norm(dim=-1, keepdim=True)
+    return torch.stack([points[:, 0] + shift, points[:, 0] + shift + new], 1)
+
+
+@pytest.mark.parametrize("count", [4, 6, 12])
+def test_the_stated_uncertainty_of_the_tip_is_the_true_one(count):
+    """A user who errs by 1 mm and 1 degree: the 95 % ellipsoid of a tip elsewhere contains the truth in 90 to 98 %."""
+    generator, inside, errors = torch.Generator().manual_seed(5), [], []
+    for seed in range(300):
+        wanted, points = truth(seed), poses(count, seed, length=HAND_LENGTH)
+        found = headset_from_camera(points, _hand(moved(wanted, points), generator))
+        for tool in poses(4, 5000 + seed):
+            pose = in_frame(_single(tool[0], tool[1] - tool[0]), found.headset_from_camera, found.covariance)
+            error = pose.tip - moved(wanted, tool[:1])[0]
+            inside.append(float(error @ torch.linalg.solve(pose.covariance[:3, :3], error)) < 7.815)
+            errors.append(float(error.norm()))
+    assert 0.9 <= sum(inside) / len(inside) <= 0.98
+    if count == 6:
+        assert sorted(errors)[len(errors) // 2] < 0.7e-3
+
+
+def test_a_pose_in_another_frame_is_turned_with_its_covariance():
+    generator = torch.Generator().manual_seed(4)
+    matrix, half = truth(2), torch.randn(6, 6, dtype=torch.float64, generator=generator)
+    tip, direction = torch.tensor([0.1, -0.05, 0.5]).double(), torch.tensor([0.0, 0.6, -0.8]).double()
+    pose = _single(tip, direction, half @ half.mT * 1e-6)
+    moved_pose = in_frame(pose, matrix)
+    torch.testing.assert_close(moved_pose.tip, moved(matrix, tip[None])[0])
+    torch.testing.assert_close(moved_pose.direction, matrix[:3, :3] @ direction)
+    back = in_frame(moved_pose, torch.linalg.inv(matrix))
+    for name in ("tip", "direction", "covariance"):
+        torch.testing.assert_close(getattr(back, name), getattr(pose, name), rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(moved_pose.tip_sd, pose.tip_sd)
+    tensors = [torch.stack([value] * 2) for value in (tip, direction, pose.covariance, tip[0], tip[0])]
+    batch = Pose(tensors[0], tensors[1], tensors[2], tensors[3], tensors[4], (Status.OK,) * 2)
+    covariance = torch.diag(torch.tensor([1e-6, 2e-6, 3e-6, 1e-8, 2e-8, 3e-8], dtype=torch.float64))
+    both = in_frame(batch, matrix, covariance)
+    torch.testing.assert_close(both.covariance[1], in_frame(pose, matrix, covariance).covariance)
+    refused = in_frame(Pose.refused(Status.NO_CATHETER, "none"), matrix, covariance)
+    assert not refused.answered and refused.tip.isnan().all() and refused.reason == "none"
+
+
+def test_the_covariance_of_the_map_turns_and_shifts_a_pose():
+    """Against many maps drawn from it."""
+    matrix, covariance = truth(3), torch.diag(torch.tensor([4e-6, 1e-6, 9e-6, 1e-7, 4e-7, 2e-7], dtype=torch.float64))
+    pose = _single(torch.tensor([0.1, -0.05, 0.5]).double(), torch.tensor([0.0, 0.6, -0.8]).double())
+    stated = in_frame(pose, matrix, covariance)
+    drawn = torch.randn(200_000, 6, dtype=torch.float64) * covariance.diagonal().sqrt()
+    tips = stated.tip + torch.linalg.cross(drawn[:, :3], stated.tip.expand(len(drawn), 3)) + drawn[:, 3:]
+    directions = stated.direction + torch.linalg.cross(drawn[:, :3], stated.direction.expand(len(drawn), 3))
+    found = torch.cov(torch.cat([tips, directions], 1).mT)
+    torch.testing.assert_close(found, stated.covariance, rtol=0.05, atol=2e-8)

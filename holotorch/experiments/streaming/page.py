@@ -1,0 +1,238 @@
+"""A local server that shows poses in a browser: one page, and one WebSocket for each page that is open.
+
+A page asks for the clock of this computer and gets the newest pose only; one that does not keep up misses poses, and
+one that takes none for five seconds is cut off. Poses are JSON: kind, sequence, captured, sent, status, answered,
+reason, lag, and for an answer tip [3] in metres, direction [3] and covariance [9] of the tip in m^2.
+
+On the loopback interface only programs of this computer can connect; requests for other host names, and WebSockets that
+another web site opens, are refused. On any other interface a random token in the address of the page is demanded, and
+the page should be served by TLS, which headsets need for WebXR.
+"""
+
+import asyncio
+import hmac
+import ipaddress
+import itertools
+import json
+import math
+import secrets
+import ssl
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from aiohttp import WSMsgType, web
+
+from holotorch.core import checks
+from holotorch.tracking.camera.camera import Camera
+from holotorch.tracking.pose.catheter import Catheter
+from holotorch.tracking.pose.status import Pose, Status
+from holotorch.tracking.streaming.packet import now
+
+PORT = 8765
+_PAGE = Path(__file__).with_name("page.html")
+_LONGEST = 4096  # bytes of a message from a page
+_PATIENCE = 5.0  # seconds that a page may take to accept a message
+_LOCAL = ("localhost", "127.0.0.1", "::1")
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "connect-src 'self'; frame-ancestors 'none'; base-uri 'none'",
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+}
+
+
+class PageServer:
+    """Serves the page: ``async with PageServer(catheter) as server: server.send(pose, captured)``.
+
+    Args:
+        catheter: The catheter that is drawn.
+        camera: Camera whose picture the page can show, without its distortion; None for poses of another frame.
+        frame: Name of the frame of the poses.
+        port: 0 picks a free one, which the attribute ``port`` names once the server is open.
+        host: Address to listen on; by default only this computer can connect.
+        certificate: Files of a certificate and of its key, for TLS.
+
+    Attributes:
+        malformed: Number of messages of pages that were dropped.
+
+    Raises OSError if the port is in use or the certificate cannot be read; by ``async with``.
+    """
+
+    def __init__(
+        self,
+        catheter: Catheter,
+        camera: Camera | None = None,
+        *,
+        frame: str = "camera_from_tool",
+        port: int = PORT,
+        host: str = "127.0.0.1",
+        certificate: tuple[Path, Path] | None = None,
+    ):
+        self.port, self.host, self.certificate = checks.port(port), host, certificate
+        self.token = "" if _is_loopback(host) else secrets.token_urlsafe(16)
+        self.malformed = 0
+        self._setup = json.dumps(
+            {"kind": "setup", "frame": frame, "catheter": _tool(catheter), "camera": _lens(camera)}
+        )
+        self._sequence = itertools.count()
+        self._clients: set[_Client] = set()
+        self._newest = ""
+        self._runner: web.AppRunner | None = None
+
+    @property
+    def address(self) -> str:
+        """Address of the page."""
+        name = f"[{self.host}]" if ":" in self.host else self.host
+        scheme = "http" if self.certificate is None else "https"
+        return f"{scheme}://{name}:{self.port}/" + (f"?token={self.token}" if self.token else "")
+
+    @property
+    def clients(self) -> int:
+        """Number of pages that are open."""
+        return len(self._clients)
+
+    async def __aenter__(self) -> "PageServer":
+        context = None
+        if self.certificate is not None:
+            context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+            context.load_cert_chain(*self.certificate)
+        app = web.Application(middlewares=[self._guard])
+        app.add_routes([web.get("/", self._page), web.get("/poses", self._poses)])
+        self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
+        await self._runner.setup()
+        site = web.TCPSite(self._runner, self.host, self.port, ssl_context=context, reuse_address=True)
+        try:
+            await site.start()
+        except OSError as error:
+            await self._runner.cleanup()
+            raise OSError(error.errno, f"port {self.port} for the page cannot be used: {error.strerror}") from None
+        self.port = self._runner.addresses[0][1]
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        for client in list(self._clients):
+            with suppress(TimeoutError):
+                await asyncio.wait_for(client.socket.close(), 1.0)
+        if self._runner is not None:
+            await self._runner.cleanup()
+
+    def send(self, pose: Pose, captured: float, *, lag: float = 0.0) -> int:
+        """Offer a pose or refusal to all pages and return its sequence number; never waits.
+
+        TypeError for a batch of poses, ValueError for one that is answered and not finite.
+        """
+        if not isinstance(pose.status, Status):
+            raise TypeError(f"one pose at a time, got {len(pose)}; index the batch")
+        number = next(self._sequence)
+        message: dict[str, Any] = {"kind": "pose", "sequence": number, "captured": captured, "sent": now(), "lag": lag}
+        message |= {"status": pose.status.name, "answered": pose.answered, "reason": pose.reason}
+        if pose.answered:
+            covariance = pose.covariance[:3, :3].flatten().tolist()
+            message |= {"tip": pose.tip.tolist(), "direction": pose.direction.tolist(), "covariance": covariance}
+        self._newest = json.dumps(message, allow_nan=False)
+        for client in self._clients:
+            client.offer(self._newest)
+        return number
+
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: Any) -> web.StreamResponse:
+        """Refuse requests for other hosts, WebSockets of other sites, and requests without the token."""
+        name = urlsplit(f"//{request.host}").hostname or ""
+        if not self.token and name not in _LOCAL:
+            raise web.HTTPForbidden(text="this server answers to localhost only")
+        origin = request.headers.get("Origin")
+        if origin is not None and origin != f"{request.scheme}://{request.host}":
+            raise web.HTTPForbidden(text="this page is not for other sites")
+        if self.token and not hmac.compare_digest(request.query.get("token", "").encode(), self.token.encode()):
+            raise web.HTTPForbidden(text="the address lacks its token; copy it whole from the terminal")
+        return await handler(request)
+
+    async def _page(self, request: web.Request) -> web.Response:
+        return web.Response(body=_PAGE.read_bytes(), content_type="text/html", charset="utf-8", headers=_HEADERS)
+
+    async def _poses(self, request: web.Request) -> web.WebSocketResponse:
+        socket = web.WebSocketResponse(max_msg_size=_LONGEST, heartbeat=10.0, compress=False)
+        await socket.prepare(request)
+        client = _Client(socket, request)
+        await socket.send_str(self._setup)
+        if self._newest:
+            client.offer(self._newest)
+        self._clients.add(client)
+        writer = asyncio.create_task(client.write())
+        try:
+            async for message in socket:
+                reply = self._reply(message.data) if message.type is WSMsgType.TEXT else None
+                if reply is None:
+                    self.malformed += 1
+                else:
+                    client.reply(reply)
+        finally:
+            self._clients.discard(client)
+            writer.cancel()
+        return socket
+
+    def _reply(self, text: str) -> str | None:
+        """The answer to a clock request; None for anything else."""
+        try:
+            message = json.loads(text)
+            asked = float(message["asked"])
+        except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
+            return None
+        if message.get("kind") != "clock" or not math.isfinite(asked):
+            return None
+        return json.dumps({"kind": "clock", "asked": asked, "now": now()})
+
+
+class _Client:
+    """One page: the newest pose and the newest reply that it has not been sent yet."""
+
+    def __init__(self, socket: web.WebSocketResponse, request: web.Request):
+        self.socket, self.request = socket, request
+        self._pose, self._reply, self._wake = "", "", asyncio.Event()
+
+    def offer(self, pose: str) -> None:
+        self._pose = pose
+        self._wake.set()
+
+    def reply(self, text: str) -> None:
+        self._reply = text
+        self._wake.set()
+
+    async def write(self) -> None:
+        """Send until the page goes, or takes nothing for too long."""
+        while not self.socket.closed:
+            await self._wake.wait()
+            self._wake.clear()
+            texts, self._reply, self._pose = (self._reply, self._pose), "", ""
+            for text in filter(None, texts):
+                try:
+                    await asyncio.wait_for(self.socket.send_str(text), _PATIENCE)
+                except (TimeoutError, ConnectionError, RuntimeError):
+                    if isinstance(self.request.transport, asyncio.WriteTransport):
+                        self.request.transport.abort()
+                    return
+
+
+def _tool(catheter: Catheter) -> dict[str, Any]:
+    return {
+        "edges": [float(edge) for edge in catheter.edges],
+        "colours": [list(map(int, colour)) for colour in catheter.colours],
+        "radius": float(catheter.radius),
+        "length": float(catheter.length),
+    }
+
+
+def _lens(camera: Camera | None) -> dict[str, float] | None:
+    if camera is None or camera.size is None:
+        return None
+    (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
+    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": camera.size[1], "height": camera.size[0]}
+
+
+def _is_loopback(host: str) -> bool:
+    with suppress(ValueError):
+        return ipaddress.ip_address(host).is_loopback
+    return host == "localhost"
