@@ -49,7 +49,7 @@ def run(test, camera: Camera | None = CAMERA, **options):
 
 
 async def shown(server, tab, given: Pose, ahead: float = 60.0) -> None:
-    """Send a pose and wait until the tab has drawn it. It fades ``ahead`` seconds later, so a slow machine sees it whole."""
+    """Send a pose, which fades ``ahead`` seconds later than usual, and wait until the tab has drawn it."""
     await tab.call("Page.bringToFront")  # a tab in the background draws nothing
     number = server.send(given, now() + ahead)
     two_frames = "requestAnimationFrame(() => requestAnimationFrame(() => done(1)))"
