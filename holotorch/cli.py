@@ -71,7 +71,9 @@ def _resume(options: argparse.Namespace) -> int:
 def _demo(options: argparse.Namespace) -> int:
     from holotorch.experiments.demo import demo
 
-    return _finish(*demo(options.out))
+    from holotorch.experiments.streaming.screenshot import screenshot
+
+    return _finish(*demo(options.out, screenshot))
 
 
 def _finish(folder: Path, complete: bool) -> int:

@@ -1,5 +1,6 @@
 """``holotorch demo``: a small real run of each system on bundled data."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from holotorch.experiments.execute import execute
@@ -9,8 +10,12 @@ from holotorch.experiments.runs.folder import claim
 from holotorch.io.bundled import find_config
 
 
-def demo(out: Path | None) -> tuple[Path, bool]:
-    """Carry out the runs and write one page for all of them; returns the folder, and whether all runs are complete."""
+def demo(out: Path | None, screenshot: Callable[[Path, Path], str]) -> tuple[Path, bool]:
+    """Carry out the runs and write one page for all of them; returns the folder, and whether all runs are complete.
+
+    ``screenshot(run, file)`` writes a picture of the page that ``holotorch stream --view`` shows of a tracking run, or
+    returns why there is none.
+    """
     configs = {"demo": [], "demo_volume": [], "tracking/track": ["frames=10"], "perception/layout": []}
     correction, volume, tracking, layout = (
         load_config(find_config(f"configs/{name}.yaml") or name, overrides) for name, overrides in configs.items()
@@ -27,6 +32,10 @@ def demo(out: Path | None) -> tuple[Path, bool]:
     if complete:
         _, complete = execute(tracking, folder / "tracking", "tracking")
         execute(layout, folder / "layout", "layout")
+        if reason := screenshot(folder / "tracking", folder / "tracking" / "view.png"):
+            print(f"no picture of the view in a browser: {reason}")
+        else:
+            more["The catheter in a browser, as holotorch stream --view shows it"] = "tracking/view.png"
         more["Catheter tracking, in a synthetic recording"] = "tracking/report.html"
         more["Icons over a wide field, as large as they must be"] = "layout/report.html"
     write_report(parts, folder / "report.html", more)

@@ -97,6 +97,17 @@ def open_frames(source: str | Path, rate: float | None = None) -> Frames:
     raise ValueError(no_such_source(source))
 
 
+def encode_jpeg(picture: Tensor, quality: int = 80) -> bytes:
+    """Encode an RGB picture, uint8 [3, H, W], as JPEG with a quality of 1 to 100."""
+    import cv2
+
+    if picture.dtype != torch.uint8 or picture.ndim != 3 or picture.shape[0] != 3 or 0 in picture.shape:
+        raise ValueError(f"picture must be uint8 of shape [3, H, W], got {picture.dtype} {list(picture.shape)}")
+    bgr = cv2.merge(list(picture.flip(0).cpu().numpy()))
+    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, checks.whole("quality", quality, 1)])
+    return data.tobytes()
+
+
 def no_such_source(source: str | Path) -> str:
     """Error message for a source that does not exist and is not the number of a camera."""
     return f"no such video, folder or camera: {source}; a camera is given by its number, such as 0"

@@ -7,6 +7,7 @@ from pathlib import Path
 from holotorch.experiments.tracking.commands import FILES
 
 OK, FAILED, INTERRUPTED = 0, 1, 130
+_OF_PAGE = ("page", "align", "volume", "panel")  # options that need the page, and therefore imply --view
 
 
 def add_stream(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -23,6 +24,13 @@ def add_stream(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     stream.add_argument("--view", action="store_true", help=about)
     stream.add_argument("--replay", type=Path, metavar="DIR", help="a run of track as the source, again and again")
     stream.add_argument("--page", metavar="HOST[:PORT]", help="where the page is served (default: 127.0.0.1:8765)")
+    about = "let a user of the page align the camera with a headset, and write its place there (headset.yaml)"
+    stream.add_argument("--align", type=Path, metavar="FILE", help=about)
+    stream.add_argument(
+        "--volume", type=Path, metavar="FILE", help="registered volume: the page shows slices at the tip"
+    )
+    about = "a picture in the page: a video, a camera's number, overlay (the tracked frames), or pattern (a test)"
+    stream.add_argument("--panel", metavar="SOURCE", help=about)
     stream.add_argument("--tls", nargs=2, type=Path, metavar=("CERT", "KEY"), help="for a page on another computer")
     stream.add_argument("--check", action="store_true", help="send to this machine itself, also with losses, and count")
     stream.add_argument("--port", type=_port, default=18950, help="where --view and --check listen (default: 18950)")
@@ -38,7 +46,7 @@ def _port(text: str) -> int:
 
 
 def _stream(options: argparse.Namespace) -> int:
-    options.view = options.view or options.page is not None
+    options.view = options.view or any(getattr(options, name) is not None for name in _OF_PAGE)
     if options.replay:
         options.sources = [*options.sources, str(options.replay / "poses.csv")]
     if options.check or (options.view and not options.sources):
@@ -56,9 +64,8 @@ def _stream(options: argparse.Namespace) -> int:
     if options.view:
         from holotorch.experiments.streaming.opening import open_page
 
-        page = open_page(
-            options.sources[0], options.camera, options.catheter, options.headset, options.page, options.tls
-        )
+        more = {name: getattr(options, name) for name in ("tls", "align", "volume", "panel")}
+        page = open_page(options.sources[0], options.camera, options.catheter, options.headset, options.page, **more)
     from holotorch.experiments.tracking.run import live
     from holotorch.io.video import is_camera
 
@@ -71,7 +78,7 @@ def _stream(options: argparse.Namespace) -> int:
         repeat=options.replay is not None,
         rate=options.rate,
         smooth=options.smooth,
-        track=lambda sources: live(sources, options.camera, options.catheter, options.rate),
+        track=lambda sources: live(sources, options.camera, options.catheter, options.rate, page.see if page else None),
     )
     if not result.delivered:
         print("nothing could be delivered: does a receiver run there? holotorch stream --view is one", file=sys.stderr)
@@ -88,7 +95,7 @@ def _need_no_source(options: argparse.Namespace) -> None:
     names = (
         "to",
         "headset",
-        "page",
+        *_OF_PAGE,
         "tls",
         "igtl",
         "rate",

@@ -23,17 +23,27 @@ def open_page(
     headset: Path | None = None,
     place: str | None = None,
     tls: Sequence[Path] | None = None,
+    align: Path | None = None,
+    volume: Path | None = None,
+    panel: str | None = None,
 ) -> "PageServer":
     """Make the server of the page for a source; it is opened by ``async with``.
 
     The files of camera and catheter are by default those beside the source, as in a run folder or a recording, and then
     the dissertation's catheter and no camera. Poses in the frame of a headset are not shown as the camera sees them.
+    ``align``: file of a headset, to which a user of the page aligns the camera. ``volume``: file of a registered
+    volume. ``panel``: a video that the page shows, or ``pattern`` or ``overlay``, see ``pictures``.
 
     Raises:
         ConfigError: A file or address cannot be used.
     """
+    from holotorch.experiments.streaming.aligning import Aligner
     from holotorch.experiments.streaming.page import PageServer
+    from holotorch.experiments.streaming.pictures import OVERLAY, PanelSource
+    from holotorch.experiments.streaming.registered import load_registered
 
+    if align is not None and headset is not None:
+        raise ConfigError(["--align and --headset: give one; --align FILE uses FILE where it exists"])
     folder = Path(source).parent if source.lower().endswith(".csv") else Path(source)
     lens, tool = (_file(folder, name, given) for name, given in (("camera", camera), ("catheter", catheter)))
     host, port = address(place or PLACE)
@@ -42,6 +52,10 @@ def open_page(
     for path in tls or ():
         if not path.is_file():
             raise ConfigError([f"--tls: no file {path}; expected a certificate and its key"])
+    try:
+        shown = OVERLAY if panel == OVERLAY else None if panel is None else PanelSource(panel)
+    except ValueError as error:
+        raise ConfigError([f"--panel: {error}; or pattern, or overlay"]) from None
     return PageServer(
         THESIS if tool is None else build_catheter(load_catheter(tool)),
         None if lens is None or headset is not None else build_camera(load_camera(lens)),
@@ -49,6 +63,9 @@ def open_page(
         host=host,
         port=port,
         certificate=None if tls is None else (tls[0], tls[1]),
+        aligner=None if align is None else Aligner(align),
+        volume=None if volume is None else load_registered(volume),
+        panel=shown,
     )
 
 

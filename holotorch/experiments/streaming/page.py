@@ -2,7 +2,8 @@
 
 A page asks for the clock of this computer and gets the newest pose only; one that does not keep up misses poses, and
 one that takes none for five seconds is cut off. Poses are JSON: kind, sequence, captured, sent, status, answered,
-reason, lag, and for an answer tip [3] in metres, direction [3] and covariance [9] of the tip in m^2.
+reason, lag, and for an answer tip [3] in metres, direction [3] and covariance [9] of the tip in m^2. Pictures are
+binary: a byte for the ``Channel``, the time of capture as a little-endian double, and a JPEG; again the newest only.
 
 On the loopback interface only programs of this computer can connect; requests for other host names, and WebSockets that
 another web site opens, are refused. On any other interface a random token in the address of the page is demanded, and
@@ -17,26 +18,38 @@ import json
 import math
 import secrets
 import ssl
+import struct
+from collections import deque
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from urllib.parse import urlsplit
 
 from aiohttp import WSMsgType, web
+from torch import Tensor
 
 from holotorch.core import checks
+from holotorch.experiments.streaming.aligning import Aligner
+from holotorch.experiments.streaming.pictures import Channel, Encoder, PanelSource
+from holotorch.experiments.streaming.registered import RegisteredVolume
 from holotorch.tracking.camera.camera import Camera
 from holotorch.tracking.pose.catheter import Catheter
+from holotorch.tracking.pose.overlay import Undistorter, overlay
 from holotorch.tracking.pose.status import Pose, Status
-from holotorch.tracking.streaming.packet import now
+from holotorch.tracking.streaming.packet import FRAME, now
 
 PORT = 8765
-_PAGE = Path(__file__).with_name("page.html")
+_FOLDER = Path(__file__).with_name("browser")
+_TYPES = {".html": "text/html", ".js": "text/javascript"}
+# The files of the page by the path of their address; no other file is ever read.
+_FILES = {"" if file.suffix == ".html" else file.name: file for file in sorted(_FOLDER.iterdir())}
 _LONGEST = 4096  # bytes of a message from a page
+_REPLIES = 16  # answers that wait for a page
 _PATIENCE = 5.0  # seconds that a page may take to accept a message
 _LOCAL = ("localhost", "127.0.0.1", "::1")
 _HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'unsafe-inline'; "
     "connect-src 'self'; frame-ancestors 'none'; base-uri 'none'",
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -54,6 +67,9 @@ class PageServer:
         port: 0 picks a free one, which the attribute ``port`` names once the server is open.
         host: Address to listen on; by default only this computer can connect.
         certificate: Files of a certificate and of its key, for TLS.
+        aligner: Fits the place of the camera on a headset to the alignments that pages send; it names the frame then.
+        volume: A volume whose slice at the tip the pages can show.
+        panel: Video that the pages can show beside the catheter; "overlay" for the tracked frames with the pose drawn.
 
     Attributes:
         malformed: Number of messages of pages that were dropped.
@@ -70,13 +86,17 @@ class PageServer:
         port: int = PORT,
         host: str = "127.0.0.1",
         certificate: tuple[Path, Path] | None = None,
+        aligner: Aligner | None = None,
+        volume: RegisteredVolume | None = None,
+        panel: PanelSource | Literal["overlay"] | None = None,
     ):
         self.port, self.host, self.certificate = checks.port(port), host, certificate
         self.token = "" if _is_loopback(host) else secrets.token_urlsafe(16)
         self.malformed = 0
-        self._setup = json.dumps(
-            {"kind": "setup", "frame": frame, "catheter": _tool(catheter), "camera": _lens(camera)}
-        )
+        self.aligner, self._volume, self._panel = aligner, volume, panel
+        self._catheter, self._camera, self._frame = catheter, camera, frame if aligner is None else aligner.name
+        self._encoders: dict[Channel, Encoder] = {}
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._sequence = itertools.count()
         self._clients: set[_Client] = set()
         self._newest = ""
@@ -100,7 +120,8 @@ class PageServer:
             context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
             context.load_cert_chain(*self.certificate)
         app = web.Application(middlewares=[self._guard])
-        app.add_routes([web.get("/", self._page), web.get("/poses", self._poses)])
+        files = [web.get(f"/{name}", self._file) for name in _FILES]
+        app.add_routes([*files, web.get("/poses", self._poses), web.get("/volume", self._samples)])
         self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
         await self._runner.setup()
         site = web.TCPSite(self._runner, self.host, self.port, ssl_context=context, reuse_address=True)
@@ -110,9 +131,16 @@ class PageServer:
             await self._runner.cleanup()
             raise OSError(error.errno, f"port {self.port} for the page cannot be used: {error.strerror}") from None
         self.port = self._runner.addresses[0][1]
+        self._loop = asyncio.get_running_loop()
+        if isinstance(self._panel, PanelSource):
+            self._panel.start(partial(self.picture, Channel.PANEL))
         return self
 
     async def __aexit__(self, *_: object) -> None:
+        threads = [*self._encoders.values(), *([self._panel] if isinstance(self._panel, PanelSource) else [])]
+        self._loop = None  # nothing more is delivered
+        for thread in threads:
+            await asyncio.to_thread(thread.close)
         for client in list(self._clients):
             with suppress(TimeoutError):
                 await asyncio.wait_for(client.socket.close(), 1.0)
@@ -126,6 +154,10 @@ class PageServer:
         """
         if not isinstance(pose.status, Status):
             raise TypeError(f"one pose at a time, got {len(pose)}; index the batch")
+        if self.aligner is not None and self.aligner.name != self._frame:
+            self._frame = self.aligner.name
+            for client in self._clients:
+                client.reply(self._setup())
         number = next(self._sequence)
         message: dict[str, Any] = {"kind": "pose", "sequence": number, "captured": captured, "sent": now(), "lag": lag}
         message |= {"status": pose.status.name, "answered": pose.answered, "reason": pose.reason}
@@ -137,6 +169,39 @@ class PageServer:
             client.offer(self._newest)
         return number
 
+    def see(self, pixels: Tensor, pose: Pose, captured: float) -> None:
+        """Show a tracked frame, uint8 [3, H, W], and its pose in the camera's frame; from any thread, never waits."""
+        self.picture(Channel.CAMERA, pixels, captured)
+        if self._panel == "overlay" and self._camera is not None and self._clients:
+            self.picture(Channel.PANEL, overlay(pixels, pose, self._camera, self._catheter), captured)
+
+    def picture(self, channel: Channel, pixels: Tensor, captured: float) -> None:
+        """Offer a picture, uint8 [3, H, W], to all pages; from any thread, never waits."""
+        if not self._clients or self._loop is None:
+            return
+        if channel not in self._encoders:
+            prepare = Undistorter(self._camera) if channel is Channel.CAMERA and self._camera is not None else None
+            self._encoders[channel] = Encoder(partial(self._deliver, channel), prepare)
+        self._encoders[channel].put(pixels, captured)
+
+    def _deliver(self, channel: Channel, jpeg: bytes, captured: float) -> None:
+        """Hand an encoded picture to the clients, from the thread of an encoder."""
+        message = struct.pack("<Bd", channel, captured) + jpeg
+
+        def offer() -> None:
+            for client in self._clients:
+                client.offer_picture(channel, message)
+
+        with suppress(AttributeError, RuntimeError):  # the server has closed in the meantime
+            self._loop.call_soon_threadsafe(offer)  # type: ignore[union-attr]
+
+    def _setup(self) -> str:
+        message: dict[str, Any] = {"kind": "setup", "frame": self._frame, "catheter": _tool(self._catheter)}
+        message["camera"] = _lens(self._camera) if self._frame == FRAME else None
+        message |= {"align": self.aligner is not None, "panel": self._panel is not None}
+        message["volume"] = None if self._volume is None else self._volume.setup()
+        return json.dumps(message, allow_nan=False)
+
     @web.middleware
     async def _guard(self, request: web.Request, handler: Any) -> web.StreamResponse:
         """Refuse requests for other hosts, WebSockets of other sites, and requests without the token."""
@@ -146,18 +211,31 @@ class PageServer:
         origin = request.headers.get("Origin")
         if origin is not None and origin != f"{request.scheme}://{request.host}":
             raise web.HTTPForbidden(text="this page is not for other sites")
-        if self.token and not hmac.compare_digest(request.query.get("token", "").encode(), self.token.encode()):
+        public = request.path.endswith(".js")  # our own scripts, which browsers fetch without the token of the page
+        if (
+            self.token
+            and not public
+            and not hmac.compare_digest(request.query.get("token", "").encode(), self.token.encode())
+        ):
             raise web.HTTPForbidden(text="the address lacks its token; copy it whole from the terminal")
         return await handler(request)
 
-    async def _page(self, request: web.Request) -> web.Response:
-        return web.Response(body=_PAGE.read_bytes(), content_type="text/html", charset="utf-8", headers=_HEADERS)
+    async def _file(self, request: web.Request) -> web.Response:
+        file = _FILES[request.path.removeprefix("/")]
+        kind = _TYPES[file.suffix]
+        return web.Response(body=file.read_bytes(), content_type=kind, charset="utf-8", headers=_HEADERS)
+
+    async def _samples(self, request: web.Request) -> web.Response:
+        if self._volume is None:
+            raise web.HTTPNotFound(text="there is no volume")
+        data = self._volume.samples.numpy().tobytes()
+        return web.Response(body=data, content_type="application/octet-stream", headers=_HEADERS)
 
     async def _poses(self, request: web.Request) -> web.WebSocketResponse:
         socket = web.WebSocketResponse(max_msg_size=_LONGEST, heartbeat=10.0, compress=False)
         await socket.prepare(request)
         client = _Client(socket, request)
-        await socket.send_str(self._setup)
+        await socket.send_str(self._setup())
         if self._newest:
             client.offer(self._newest)
         self._clients.add(client)
@@ -175,30 +253,36 @@ class PageServer:
         return socket
 
     def _reply(self, text: str) -> str | None:
-        """The answer to a clock request; None for anything else."""
+        """The answer to a message of a page; None for one that is not understood."""
         try:
             message = json.loads(text)
-            asked = float(message["asked"])
+            if message["kind"] == "clock":
+                asked = float(message["asked"])
+                return json.dumps({"kind": "clock", "asked": asked, "now": now()}) if math.isfinite(asked) else None
+            return None if self.aligner is None else json.dumps(self.aligner.answer(message), allow_nan=False)
         except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
             return None
-        if message.get("kind") != "clock" or not math.isfinite(asked):
-            return None
-        return json.dumps({"kind": "clock", "asked": asked, "now": now()})
 
 
 class _Client:
-    """One page: the newest pose and the newest reply that it has not been sent yet."""
+    """One page: the newest pose and pictures, and the last replies, that it has not been sent yet."""
 
     def __init__(self, socket: web.WebSocketResponse, request: web.Request):
         self.socket, self.request = socket, request
-        self._pose, self._reply, self._wake = "", "", asyncio.Event()
+        self._pose, self._replies = "", deque[str](maxlen=_REPLIES)
+        self._pictures: dict[Channel, bytes] = {}
+        self._wake = asyncio.Event()
 
     def offer(self, pose: str) -> None:
         self._pose = pose
         self._wake.set()
 
+    def offer_picture(self, channel: Channel, picture: bytes) -> None:
+        self._pictures[channel] = picture
+        self._wake.set()
+
     def reply(self, text: str) -> None:
-        self._reply = text
+        self._replies.append(text)
         self._wake.set()
 
     async def write(self) -> None:
@@ -206,10 +290,17 @@ class _Client:
         while not self.socket.closed:
             await self._wake.wait()
             self._wake.clear()
-            texts, self._reply, self._pose = (self._reply, self._pose), "", ""
-            for text in filter(None, texts):
+            messages: list[str | bytes] = [*self._replies, *([self._pose] if self._pose else [])]
+            messages += self._pictures.values()
+            self._replies.clear()
+            self._pictures.clear()
+            self._pose = ""
+            for message in messages:
                 try:
-                    await asyncio.wait_for(self.socket.send_str(text), _PATIENCE)
+                    if isinstance(message, str):
+                        await asyncio.wait_for(self.socket.send_str(message), _PATIENCE)
+                    else:
+                        await asyncio.wait_for(self.socket.send_bytes(message), _PATIENCE)
                 except (TimeoutError, ConnectionError, RuntimeError):
                     if isinstance(self.request.transport, asyncio.WriteTransport):
                         self.request.transport.abort()

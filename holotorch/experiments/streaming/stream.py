@@ -24,6 +24,7 @@ from holotorch.tracking.streaming.packet import FRAME, PosePacket, encode, now
 from holotorch.tracking.streaming.stream import PORT, PoseReceiver, PoseSender
 
 if TYPE_CHECKING:
+    from holotorch.experiments.streaming.aligning import Aligner
     from holotorch.experiments.streaming.page import PageServer
 
 _NUMBERS = COLUMNS[5:19]  # tip, direction, covariance of the tip, chi-square and degrees of freedom
@@ -175,7 +176,7 @@ def stream(
         raise ConfigError([str(error)]) from None
     senders = [(frames[file], PoseSender(places, frame=frames[file].name)) for file, places in receivers.items()]
     servers = [] if server is None else [(frames[headset], server)]
-    pages = [] if page is None else [(frames[headset], page)]
+    pages = [] if page is None else [(page.aligner or frames[headset], page)]
     count, complete = [0], True
     try:
         asyncio.run(_send(iter(poses), [*senders, *pages], servers, smooth, count, show))
@@ -198,7 +199,7 @@ def _config_error(error: OSError) -> Exception:
 
 async def _send(
     poses: Iterator[TimedPose],
-    senders: Sequence[tuple["Frame", "PoseSender | PageServer"]],
+    senders: Sequence[tuple["Frame | Aligner", "PoseSender | PageServer"]],
     servers: Sequence[tuple["Frame", TransformServer]],
     smooth: bool,
     count: list[int],

@@ -146,17 +146,21 @@ def build_catheter(settings: CatheterSettings) -> Catheter:
 
 def build_headset(settings: HeadsetSettings) -> torch.Tensor:
     """The matrix headset_from_camera, float64 [4, 4]. ValueError unless it is rigid."""
-    matrix, last = torch.tensor(settings.headset_from_camera, dtype=torch.float64), torch.eye(4, dtype=torch.float64)[3]
-    rotation, shift = matrix[:3, :3], matrix[:3, 3]
-    orthogonal = torch.allclose(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-6)
-    if not orthogonal or rotation.det() < 0 or not torch.equal(matrix[3], last) or shift.abs().max() > 10:
-        raise ValueError(
-            "headset_from_camera must be a rotation without mirroring, a shift in metres, and the last row 0, 0, 0, 1"
-        )
+    matrix = rigid_matrix("headset_from_camera", settings.headset_from_camera)
     if (covariance := headset_covariance(settings)) is not None:
         least = torch.linalg.eigvalsh(covariance).min()
         if not torch.equal(covariance, covariance.mT) or least < -1e-9 * covariance.trace().abs():
             raise ValueError("covariance must be symmetric and without negative eigenvalues")
+    return matrix
+
+
+def rigid_matrix(name: str, rows: Sequence[Sequence[float]]) -> torch.Tensor:
+    """Rows of a 4 x 4 matrix as float64 [4, 4]. ValueError unless it is a rotation and a shift of at most 10 m."""
+    matrix, last = torch.tensor(rows, dtype=torch.float64), torch.eye(4, dtype=torch.float64)[3]
+    rotation, shift = matrix[:3, :3], matrix[:3, 3]
+    orthogonal = torch.allclose(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-6)
+    if not orthogonal or rotation.det() < 0 or not torch.equal(matrix[3], last) or shift.abs().max() > 10:
+        raise ValueError(f"{name} must be a rotation without mirroring, a shift in metres, and the last row 0, 0, 0, 1")
     return matrix
 
 

@@ -5,7 +5,7 @@ import io
 import math
 import shutil
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import IO, Any, TypeVar
 
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 from holotorch.experiments.config.errors import ConfigError
@@ -54,19 +55,24 @@ def follow(frames: Iterable[Frame], tracker: Tracker) -> Iterator[Tracked]:
 
 
 def live(
-    sources: Sequence[str], camera: Path | None, catheter: Path | None, rate: float | None = None
+    sources: Sequence[str],
+    camera: Path | None,
+    catheter: Path | None,
+    rate: float | None = None,
+    see: Callable[[Tensor, Pose, float], None] | None = None,
 ) -> Iterator[tuple[float, Pose]]:
     """Yield the capture time, in seconds of the clock ``packet.now``, and the pose of each frame of one source.
 
     For a file, the capture time is the time at which the frame is due at the pace of its time stamps, which may be in
-    the future. The call opens and checks the source and its files; frames are read when poses are requested.
+    the future. The call opens and checks the source and its files; frames are read when poses are requested. ``see`` is
+    called with the pixels, pose and capture time of each frame before its pose is yielded.
     """
     if len(sources) != 1:
         raise ConfigError([f"expected one source to track and stream, got {len(sources)}"])
-    return _live(open_inputs(sources[0], camera, catheter, "ours", rate))
+    return _live(open_inputs(sources[0], camera, catheter, "ours", rate), see)
 
 
-def _live(inputs: TrackingInputs) -> Iterator[tuple[float, Pose]]:
+def _live(inputs: TrackingInputs, see: Callable[[Tensor, Pose, float], None] | None) -> Iterator[tuple[float, Pose]]:
     with inputs.frames as frames:
         for note in frames.notes:
             print(note, flush=True)
@@ -74,7 +80,10 @@ def _live(inputs: TrackingInputs) -> Iterator[tuple[float, Pose]]:
         for item in follow(frames, inputs.tracker):
             start = now() - item.frame.seconds if start is None else start
             # The capture time of a live frame is approximated by the time at which the tracker began.
-            yield (now() - item.seconds if frames.live else start + item.frame.seconds), item.pose
+            captured = now() - item.seconds if frames.live else start + item.frame.seconds
+            if see is not None and item.frame.pixels is not None:
+                see(item.frame.pixels, item.pose, captured)
+            yield captured, item.pose
         for note in frames.notes[printed:]:
             print(note, flush=True)
 

@@ -192,7 +192,7 @@ class Part:
 
 def build(settings: VolumeSettings) -> VolumeExperiment:
     """Load the inputs. ConfigError for a volume or transfer function that cannot be read or used."""
-    volume, synthetic = _volume(settings.volume)
+    volume, synthetic = open_volume(settings.volume)
     try:
         volume.check_finite()
         experiment = VolumeExperiment(settings, volume, synthetic, find_device(settings.device))
@@ -206,8 +206,8 @@ def build(settings: VolumeSettings) -> VolumeExperiment:
     return experiment
 
 
-def _volume(source: VolumeSource) -> tuple[Volume, str]:
-    """The volume, and the reason why it is a phantom, which is empty for real data."""
+def open_volume(source: VolumeSource) -> tuple[Volume, str]:
+    """The volume, and why it is a phantom, which is empty for real data. ConfigError if it cannot be read."""
     spacing = source.spacing[0] if source.spacing and len(source.spacing) == 1 else source.spacing
     try:
         if source.path:

@@ -42,6 +42,27 @@ def overlay(pixels: Tensor, pose: Pose, camera: Camera, catheter: Catheter) -> T
     return torch.from_numpy(np.stack(cv2.split(canvas))).to(pixels.device)
 
 
+class Undistorter:
+    """Removes the distortion of a camera from its frames: their pixels are then those of the camera's ``matrix`` alone.
+
+    Pixels beyond the frame are black. The maps are made at the first frame of a size. Source: OpenCV's remap, bilinear.
+    """
+
+    def __init__(self, camera: Camera):
+        self._matrix = camera.matrix.detach().cpu().numpy()
+        self._distortion = camera.distortion.detach().cpu().numpy()
+        self._maps: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
+
+    def __call__(self, pixels: Tensor) -> Tensor:
+        """A frame, uint8 [3, H, W], without distortion."""
+        height, width = pixels.shape[-2:]
+        if (width, height) not in self._maps:
+            arguments = self._matrix, self._distortion, None, self._matrix, (width, height), cv2.CV_16SC2
+            self._maps[width, height] = cv2.initUndistortRectifyMap(*arguments)
+        image = cv2.remap(cv2.merge(list(pixels.cpu().numpy())), *self._maps[width, height], cv2.INTER_LINEAR)
+        return torch.from_numpy(np.stack(cv2.split(image)))
+
+
 def ellipse_px(pose: Pose, camera: Camera) -> tuple[Tensor, Tensor]:
     """Image of the tip [2] in pixels, and its covariance [2, 2] in pixels squared; NaN where there is no image."""
     tip = pose.tip.detach().cpu()

@@ -4,12 +4,20 @@ import asyncio
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
-from browser import CHROMIUM, browser
+from oracles import boards as oracle
+from scipy.ndimage import map_coordinates
 
 from holotorch.experiments.streaming import page as module
+from holotorch.experiments.streaming.aligning import Aligner
+from holotorch.experiments.streaming.chromium import CHROMIUM, browser
 from holotorch.experiments.streaming.page import PageServer
+from holotorch.experiments.streaming.pictures import PanelSource
+from holotorch.experiments.streaming.registered import register
+from holotorch.experiments.tracking.devices import build_headset, load_headset
+from holotorch.scene.volume import Volume
 from holotorch.tracking import THESIS, Camera
 from holotorch.tracking.pose.status import Pose, Status
 from holotorch.tracking.streaming.packet import now
@@ -18,6 +26,7 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium, chromium-
 
 MATRIX = torch.tensor([[800.0, 0, 310.0], [0, 780, 250.0], [0, 0, 1]], dtype=torch.float64)
 CAMERA = Camera(MATRIX, torch.zeros(5, dtype=torch.float64), "srgb", (480, 640))
+YELLOW = "data[4 * i] > data[4 * i + 2] + 30 && data[4 * i + 1] > data[4 * i + 2] + 15"
 # Middle in pixels of the picture of all pixels of the uncertainty's colour, and how many they are.
 SPOT = """(() => {
   const canvas = document.getElementById("canvas"), gl = canvas.getContext("webgl2");
@@ -25,11 +34,11 @@ SPOT = """(() => {
   gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, data);
   let [count, x, y] = [0, 0, 0];
   for (let i = 0; i < width * height; i++)
-    if (data[4 * i] > data[4 * i + 2] + 30 && data[4 * i + 1] > data[4 * i + 2] + 15) {
+    if (YELLOW) {
       count += 1; x += i % width; y += height - 1 - Math.floor(i / width);
     }
   return [x / count, y / count, count];
-})()"""
+})()""".replace("YELLOW", YELLOW)
 
 
 def pose(i: int, sd: float = 1.5e-3) -> Pose:
@@ -196,6 +205,7 @@ const eye = (x) => {
   return { right: x > 0, projectionMatrix: flat(projection), transform: { inverse: { matrix: flat(back) } } };
 };
 window.asked = [];
+window.hand = { gripSpace: { matrix: null }, targetRaySpace: { matrix: null } };  // a controller; matrices of WebXR
 window.XRWebGLLayer = class {
   constructor(session, gl) { this.framebuffer = null; this.canvas = gl.canvas; }
   getViewport(view) {
@@ -212,7 +222,9 @@ Object.defineProperty(navigator, "xr", { value: {
     session.updateRenderState = (given) => Object.assign(session.renderState, given);
     session.requestReferenceSpace = async (kind) => { asked.push(mode, kind); return { kind }; };
     session.requestAnimationFrame = (draw) => requestAnimationFrame(
-      (time) => { if (!over) draw(time, { getViewerPose: () => ({ views }) }); });
+      (time) => { if (!over) draw(time, { getViewerPose: () => ({ views }),
+        getPose: ({ matrix }) => matrix && { transform: { matrix } } }); });
+    window.press = (name) => session.dispatchEvent(Object.assign(new Event(name), { inputSource: hand }));
     session.end = () => { over = true; session.dispatchEvent(new Event("end")); };
     return session;
   },
@@ -225,12 +237,12 @@ EYES = """(() => {
   gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, data);
   const sums = [[0, 0, 0], [0, 0, 0]];
   for (let i = 0; i < width * height; i++)
-    if (data[4 * i] > data[4 * i + 2] + 30 && data[4 * i + 1] > data[4 * i + 2] + 15) {
+    if (YELLOW) {
       const x = i % width, sum = sums[Number(x >= width / 2)];
       sum[0] += 1; sum[1] += x + 0.5; sum[2] += Math.floor(i / width) + 0.5;
     }
   return sums.map(([count, x, y]) => [count, x / count, y / count]);
-})()"""
+})()""".replace("YELLOW", YELLOW)
 
 
 def in_eye(tip, x: float, width: int, height: int) -> tuple[float, float]:
@@ -267,6 +279,248 @@ def test_both_eyes_of_a_headset_see_the_tip_where_it_is(tmp_path):
             assert await tab.value("view.state.drawn && view.state.error === ''")
 
     run(test, camera=None, frame="headset_from_tool")
+
+
+FRAMES = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))"
+FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+
+
+def rigid(turn, shift) -> torch.Tensor:
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3], matrix[:3, 3] = torch.tensor(oracle.rotation(turn)), torch.tensor(shift, dtype=torch.float64)
+    return matrix
+
+
+def carried(tip, direction, new_tip, new_direction) -> torch.Tensor:
+    """A rigid motion that takes a place and a direction to others."""
+    matrix = torch.eye(4, dtype=torch.float64)
+    axis = torch.linalg.cross(direction, new_direction)
+    sine, cosine = float(axis.norm()), float(direction @ new_direction)
+    if sine > 1e-9:
+        matrix[:3, :3] = torch.tensor(oracle.rotation((axis / sine * math.atan2(sine, cosine)).tolist()))
+    matrix[:3, 3] = new_tip - matrix[:3, :3] @ tip
+    return matrix
+
+
+def test_alignment_by_a_controller_puts_the_catheter_where_it_is(tmp_path):
+    """The virtual catheter is dragged onto the seen one six times; then both eyes see it where the fit says."""
+    truth = rigid((0.2, -0.3, 0.1), (0.02, -0.05, 0.04))
+    aligner, generator = Aligner(tmp_path / "headset.yaml"), torch.Generator().manual_seed(0)
+
+    def seen(i: int) -> Pose:  # in the camera's frame
+        inverse = torch.linalg.inv(truth)
+        place = torch.tensor([0.03 * math.cos(i), 0.03 * math.sin(2 * i), 0.45 + 0.02 * i], dtype=torch.float64)
+        turn, slant = math.pi * i / 3 + 0.2, 0.4 * (-1) ** i
+        along = torch.tensor([math.cos(turn), math.sin(turn), slant], dtype=torch.float64)
+        tip, direction = inverse[:3, :3] @ place + inverse[:3, 3], inverse[:3, :3] @ along / along.norm()
+        return replace(pose(0, 2e-3), tip=tip, direction=direction)
+
+    async def drag(tab, change: torch.Tensor) -> None:
+        start = rigid((0.1, 0.2 + float(torch.rand((), generator=generator)), 0.3), (0.1, -0.2, 0.3))
+        for event, place in (("selectstart", start), ("selectend", change @ start)):
+            matrix = (FLIP @ place @ FLIP).mT.flatten().tolist()
+            await tab.value(f"hand.gripSpace.matrix = {matrix}; hand.targetRaySpace.matrix = {matrix}; {FRAMES}")
+            await tab.value(FRAMES)
+            await tab.value(f"press('{event}')")
+            await tab.value(FRAMES)
+
+    async def test(server):
+        async with browser(tmp_path) as open_tab:
+            tab = await open_tab(server.address, HEADSET)
+            await tab.until("view.state.offset !== null && !document.getElementById('headset').disabled")
+            await tab.value("document.getElementById('headset').click()")
+            await tab.until("view.state.headset === 'immersive-vr'")
+            assert await tab.value("asked") == ["immersive-vr", "viewer"]
+            await tab.value("document.getElementById('align').click()")
+            answer: dict = {}
+            for i in range(6):
+                given = seen(i)
+                await shown(server, tab, aligner(given))
+                target = truth[:3, :3] @ given.tip + truth[:3, 3], truth[:3, :3] @ given.direction
+                first = await tab.value("[view.state.twin.tip, view.state.twin.direction]")
+                tip, direction = (torch.tensor(each, dtype=torch.float64) for each in first)
+                await drag(tab, carried(tip, direction, *target))
+                after = await tab.value("[view.state.twin.tip, view.state.twin.direction]")
+                for now_, wanted in zip(after, target, strict=True):
+                    assert math.dist(now_, wanted.tolist()) < 1e-6
+                server.send(aligner(given), now())
+                await tab.value("press('squeeze')")
+                answer = await tab.until(
+                    f"view.state.alignment && view.state.alignment.count === {i + 1} && view.state.alignment"
+                )
+                assert not answer["error"], answer["error"]
+            assert answer["solved"] and answer["rms"] < 1e-6
+            await tab.value("document.getElementById('save').click()")
+            saved = await tab.until("view.state.alignment.saved")
+            assert saved == str(aligner.out)
+            matrix = build_headset(load_headset(aligner.out))
+            torch.testing.assert_close(matrix, truth, rtol=0, atol=1e-6)
+            await tab.value("document.getElementById('align').click()")
+            given = seen(2)
+            await shown(server, tab, aligner(given))
+            assert await tab.value("view.state.setup.frame") == "headset_from_tool"
+            place = truth[:3, :3] @ given.tip + truth[:3, 3]
+            width, height = await tab.value(
+                "[document.getElementById('canvas').width, document.getElementById('canvas').height]"
+            )
+            for x, (count, u, v) in zip((-0.03, 0.03), await tab.value(EYES), strict=True):
+                assert count > 15
+                assert math.dist((u, v), in_eye(place.tolist(), x, width, height)) < 1.5
+            await tab.value("document.getElementById('headset').click()")
+            await tab.until("view.state.headset === '' && view.state.error === ''")
+
+    run(test, camera=CAMERA, aligner=aligner)
+
+
+def test_a_mouse_moves_and_turns_the_virtual_catheter(tmp_path):
+    """In the camera's picture: a drag by pixels moves its image by them, and with shift it turns about its tip."""
+
+    async def test(server):
+        async with browser(tmp_path) as open_tab:
+            tab = await open_tab(server.address)
+            await tab.until("view.state.offset !== null && !document.getElementById('align').hidden")
+            await shown(server, tab, pose(0))
+            await tab.value("document.getElementById('align').click()")
+            before = await tab.value("[view.onScreen(view.state.twin.tip), view.state.twin.direction]")
+
+            async def drag(modifiers: int) -> None:
+                for kind, x, y in (("mousePressed", 300, 300), ("mouseMoved", 340, 280), ("mouseReleased", 340, 280)):
+                    await tab.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1,
+                                   modifiers=modifiers, clickCount=1)  # fmt: skip
+
+            await drag(0)
+            moved = await tab.value("[view.onScreen(view.state.twin.tip), view.state.twin.direction]")
+            ratio = 800 / 640  # pixels of the window for one of the camera
+            assert moved[0] == pytest.approx([before[0][0] + 40 / ratio, before[0][1] - 20 / ratio], abs=0.05)
+            assert moved[1] == before[1]
+            await drag(8)  # shift
+            turned = await tab.value("[view.onScreen(view.state.twin.tip), view.state.twin.direction]")
+            assert turned[0] == pytest.approx(moved[0]) and math.dist(turned[1], moved[1]) > 0.05
+            assert math.hypot(*turned[1]) == pytest.approx(1)
+
+    run(test, aligner=Aligner(tmp_path / "headset.yaml"))
+
+
+def test_a_slice_shows_the_volume_at_its_place(tmp_path):
+    """Grey levels of an oblique volume against SciPy's interpolation at the points of the slice, in three planes."""
+    shape, spacing, origin = (20, 24, 28), (4e-3, 5e-3, 6e-3), (-0.03, 0.01, 0.02)
+    z, y, x = np.meshgrid(*(np.arange(n) / n for n in shape), indexing="ij")
+    values = 500 * np.sin(2 * np.pi * x) + 400 * np.cos(3 * y + z) - 300 * z
+    axes = np.array(oracle.rotation((0.2, 0.1, -0.3)))  # rows: directions of z, y, x in coordinates (z, y, x)
+    a, b, c = ((row[0], row[1], row[2]) for row in axes.tolist())
+    volume = Volume(torch.tensor(values, dtype=torch.float32), spacing, "m", origin, (a, b, c))
+    corner = np.array(origin) + axes.T @ (np.array(spacing) * np.array(shape) / 2)  # near the middle, (z, y, x)
+    middle = torch.tensor([0.0, 0.01, 0.5], dtype=torch.float64)
+    frame_from_volume = rigid((0.1, 0.25, 0.05), (0, 0, 0))
+    frame_from_volume[:3, 3] = middle - frame_from_volume[:3, :3] @ torch.tensor(corner[::-1].copy())
+    level, window = 50.0, 1200.0
+    given = replace(pose(0, 1e-4), tip=middle, direction=torch.tensor([0.0, -0.6, 0.8], dtype=torch.float64))
+
+    def grey(point: np.ndarray) -> float:
+        inside = np.linalg.inv(frame_from_volume.numpy()) @ np.append(point, 1.0)
+        index = axes @ (inside[:3][::-1] - np.array(origin)) / np.array(spacing)
+        value = map_coordinates(values, index[:, None], order=1, mode="nearest")[0]
+        return float(np.clip((value - level + window / 2) / window, 0, 1))
+
+    async def test(server):
+        async with browser(tmp_path) as open_tab:
+            tab = await open_tab(server.address)
+            await tab.until("view.state.offset !== null && !document.getElementById('slices').hidden")
+            await asyncio.sleep(0.3)  # the samples arrive
+            for rows in ((2, 1), (2, 0), (1, 0)):  # axial, coronal, sagittal: which axes of the volume span the slice
+                await tab.value("document.getElementById('slice').click()")
+                await shown(server, tab, given)
+                across, down = (frame_from_volume[:3, :3].numpy() @ axes[row][::-1] for row in rows)
+                compared = 0
+                for angle in np.arange(0, 2 * np.pi, np.pi / 8):
+                    point = middle.numpy() + 0.03 * (np.cos(angle) * across + np.sin(angle) * down)
+                    u, v = CAMERA.project(torch.tensor(point)).tolist()
+                    shaft = [CAMERA.project(given.tip + s * given.direction).tolist() for s in np.linspace(0, 0.2, 100)]
+                    if min(math.dist((u, v), place) for place in shaft) < 8:
+                        continue  # the catheter is drawn there
+                    place = [(u + 0.5) * 800 / 640, 600 - (v + 0.5) * 800 / 640]
+                    red, green, blue = await tab.value(PIXEL % tuple(place))
+                    expected = 255 * (0.9 * grey(point) + 0.1 * np.array([0.13, 0.15, 0.18]))
+                    assert np.abs(np.array([red, green, blue]) - expected).max() < 4, (rows, angle)
+                    compared += 1
+                assert compared > 8
+
+    run(test, volume=register(volume, frame_from_volume, level, window))
+
+
+PIXEL = """(() => {
+  const gl = document.getElementById("canvas").getContext("webgl2"), data = new Uint8Array(4);
+  gl.readPixels(Math.floor(%f), Math.floor(%f), 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, data);
+  return [...data].slice(0, 3);
+})()"""
+
+
+def test_the_tracked_frame_lies_behind_the_catheter_without_its_distortion(tmp_path):
+    camera = Camera(MATRIX, torch.tensor([-0.25, 0.08, 0.001, -0.002, 0.0]).double(), "srgb", (480, 640))
+    given = replace(pose(20), tip=torch.tensor([0.14, 0.09, 0.5], dtype=torch.float64))
+    x, y = camera.project(given.tip).tolist()  # where a distorted frame shows the tip
+    columns, rows = torch.arange(640)[None], torch.arange(480)[:, None]
+    frame = ((columns - x).square() + (rows - y).square() < 64).to(torch.uint8).mul(255).expand(3, 480, 640)
+
+    async def test(server):
+        async with browser(tmp_path) as open_tab:
+            tab = await open_tab(server.address)
+            await tab.until("view.state.offset !== null")
+            server.see(frame, given, now() + 60)
+            await tab.until("view.pictures.pictures.camera")
+            await tab.value(FRAMES)
+            u, v, count = await tab.value(SPOT.replace(YELLOW, "data[4 * i] > 128"))
+            pinhole = Camera(MATRIX, torch.zeros(5, dtype=torch.float64)).project(given.tip).tolist()
+            scale = 800 / 640
+            assert count > 100 and math.dist(((u + 0.5) / scale - 0.5, (v + 0.5) / scale - 0.5), pinhole) < 0.6
+            assert math.dist((x, y), pinhole) > 5
+            await shown(server, tab, given)
+            assert await tab.value("view.tipOnScreen()") == pytest.approx(pinhole, abs=1e-3)
+
+    run(test, camera=camera)
+
+
+def test_a_panel_shows_a_video_in_time_where_the_user_puts_it(tmp_path):
+    """The test pattern, 1080p at 30 frames per second: grey steps at their places, and the time to the frame."""
+
+    async def test(server):
+        async with browser(tmp_path) as open_tab:
+            tab = await open_tab(server.address)
+            await tab.until("view.state.offset !== null && !document.getElementById('panel').hidden")
+            await shown(server, tab, pose(0))
+            await tab.value("document.getElementById('panel').click()")
+            await tab.until("view.pictures.pictures.panel && view.pictures.pictures.panel.count > 3")
+            delays = []
+            for _ in range(40):
+                delays.append(await tab.value("view.pictures.pictures.panel.latency"))
+                await asyncio.sleep(0.03)
+            assert 0 < sorted(delays)[20] < 0.25  # the guide states what was measured on an idle computer
+
+            async def steps() -> list[float]:
+                left, top, width = await tab.value("Object.values(view.pictures.onScreen)")
+                places = [
+                    (800 * (left + width * (i + 0.5) / 16), 600 - 600 * top - 0.4 * 800 * width * 9 / 16)
+                    for i in range(16)
+                ]
+                return [(await tab.value(PIXEL % place))[0] for place in places]
+
+            wanted = [15 + 15 * i for i in range(16)]
+            assert sum(abs(a - b) < 4 for a, b in zip(await steps(), wanted, strict=True)) >= 14  # but for the bar
+            left, top, _ = await tab.value("Object.values(view.pictures.onScreen)")
+            x, y = 800 * left + 60, 600 * top + 40
+            for kind, dx, dy in (("mousePressed", 0, 0), ("mouseMoved", -200, 150), ("mouseReleased", -200, 150)):
+                await tab.call(
+                    "Input.dispatchMouseEvent", type=kind, x=x + dx, y=y + dy, button="left", buttons=1, clickCount=1
+                )
+            moved = await tab.value("Object.values(view.pictures.onScreen)")
+            assert moved[:2] == pytest.approx([left - 0.25, top + 0.25], abs=1e-3)
+            await tab.call("Input.dispatchMouseEvent", type="mouseWheel", x=x - 200, y=y + 150, deltaX=0, deltaY=-200)
+            await tab.until(f"view.pictures.onScreen.width > {moved[2]}")
+            await tab.value(FRAMES)
+            assert sum(abs(a - b) < 4 for a, b in zip(await steps(), wanted, strict=True)) >= 14
+            assert await tab.value("view.state.malformed") == 0
+
+    run(test, panel=PanelSource("pattern"))
 
 
 def test_the_page_says_what_a_headset_needs(tmp_path):

@@ -5,6 +5,7 @@ import json
 import math
 import re
 import threading
+from pathlib import Path
 
 import aiohttp
 import pytest
@@ -15,6 +16,7 @@ from holotorch.cli import main
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.streaming import page as module
 from holotorch.experiments.streaming import stream as streaming
+from holotorch.experiments.streaming.aligning import Aligner
 from holotorch.experiments.streaming.opening import open_page
 from holotorch.experiments.streaming.page import PageServer
 from holotorch.experiments.streaming.stream import stream
@@ -56,8 +58,17 @@ def test_a_page_gets_the_catheter_the_newest_pose_and_the_clock():
     async def test(server, session):
         async with session.get(server.address) as answer:
             text = await answer.text()
-            assert answer.status == 200 and "webgl2" in text and not re.search(r"https?://|src=|@import", text)
+            assert answer.status == 200 and re.findall(r"src=\S+", text) == ['src="view.js"></script>']
             assert "frame-ancestors 'none'" in answer.headers["Content-Security-Policy"]
+        scripts, seen = ["view.js"], set()
+        while scripts:  # all scripts are our own, and each that is imported is served
+            name = scripts.pop()
+            async with session.get(server.address + name) as answer:
+                assert answer.status == 200 and answer.content_type == "text/javascript"
+                text += await answer.text()
+            seen.add(name)
+            scripts += set(re.findall(r'from "\./(\w+\.js)"', text)) - seen
+        assert len(seen) > 5 and not re.search(r"https?://|@import|import\(", text)
         server.send(pose(0.1), 10.0)
         server.send(pose(0.2), 10.1)
         async with session.ws_connect(server.address + "poses") as socket:
@@ -109,6 +120,10 @@ def test_other_hosts_other_sites_and_other_paths_are_refused():
 def test_other_computers_need_the_token():
     async def test(server, session):
         bare = f"http://127.0.0.1:{server.port}/"
+        async with session.get(bare + "view.js") as answer:
+            assert answer.status == 200  # browsers ask for scripts without the token; there is nothing secret in them
+        async with session.get(bare + "volume") as answer:
+            assert answer.status == 403
         assert len(server.token) > 20 and server.address.endswith(f"?token={server.token}")
         for query, status in (("", 403), ("?token=", 403), ("?token=%00é", 403), (f"?token={server.token}", 200)):
             async with session.get(bare + query) as answer:
@@ -146,18 +161,27 @@ JSON = strategies.recursive(
     strategies.none() | strategies.booleans() | strategies.integers()
     | strategies.floats() | strategies.text(),
     lambda inner: strategies.lists(inner) | strategies.dictionaries(
-        strategies.sampled_from(["kind", "asked", "x"]), inner | strategies.just("clock")
+        strategies.sampled_from(["kind", "asked", "tip", "direction"]),
+        inner | strategies.sampled_from(["clock", "aligned", "undo", "save"]),
     ),
 )  # fmt: skip
 
 
 @given(strategies.text() | JSON.map(json.dumps))
 @example('{"kind": "clock", "asked": 1' + 400 * "0" + "}")
+@example('{"kind": "aligned", "tip": [0, 0, 1e400], "direction": [0, 0, 1]}')
+@example('{"kind": "aligned", "tip": [0, 0, 1], "direction": [0, 0, 0]}')
+@example('{"kind": "aligned", "tip": "abc", "direction": [0, 0, 1]}')
+@example('{"kind": "aligned", "tip": [[0], 0, 1], "direction": [0, 0, 1]}')
+@example('{"kind": ["save"]}')
+@example('{"kind": "save"}')
 def test_no_message_of_a_page_raises(text):
-    reply = PageServer(THESIS)._reply(text)
-    if reply is not None:
-        answer = json.loads(reply)
-        assert answer["kind"] == "clock" and math.isfinite(answer["asked"]) and math.isfinite(answer["now"])
+    for aligner in (None, Aligner(Path("/nonexistent/headset.yaml"))):
+        reply = PageServer(THESIS, aligner=aligner)._reply(text)
+        if reply is not None:
+            answer = json.loads(reply)
+            assert answer["kind"] == "clock" or (aligner is not None and answer["kind"] == "alignment")
+            assert answer["kind"] != "clock" or (math.isfinite(answer["asked"]) and math.isfinite(answer["now"]))
 
 
 def test_a_page_that_reads_nothing_is_cut_off_and_delays_nobody(monkeypatch):
