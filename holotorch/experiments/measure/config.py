@@ -1,0 +1,70 @@
+"""Settings of a measurement."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field
+
+from holotorch.experiments.config.settings import Count, Length, Number, Settings, number, several
+
+SYNTHETIC = "synthetic"
+# Rows, columns and spacing in metres of the grids of Secs. 3.5.2 (8.16 cm wide) and 3.5.3 of the dissertation.
+GRIDS = {"grid2d": (9, 9, 10.2e-3), "grid3d": (8, 8, 10e-3)}
+Protocol = Literal["still", "grid2d", "grid3d", "latency"]
+
+Side = Annotated[Count, Field(ge=2, le=100)]
+Spacing = Annotated[Length, Field(ge=1e-3, le=0.5)]
+Seconds = Annotated[Number, Field(gt=0, le=60)]
+
+
+def _sources(value: Any) -> Any:
+    """One source becomes a list of one; the index of a camera, which YAML reads as a number, becomes text."""
+    numbers = (str(each) if isinstance(each, int) and not isinstance(each, bool) else each for each in several(value))
+    return tuple(numbers)
+
+
+class GridSettings(Settings):
+    """The grid that the tip visits row by row, each row from left to right.
+
+    ``rows``, ``columns``, ``spacing``: by default those of the dissertation. ``reference``: (row, column) of the point
+    to which all distances are taken, counted from 1; by default the middle. ``partial``: evaluate a grid of which
+    points are missing. ``board``: chessboard on the sheet of grid2d, as after --board of ``holotorch calibrate``.
+    """
+
+    rows: Side | None = None
+    columns: Side | None = None
+    spacing: Spacing | None = None
+    reference: tuple[Count, Count] | None = None
+    partial: bool = False
+    board: str = "chessboard 7x5 10mm"
+
+
+class RestSettings(Settings):
+    """When the tip counts as resting: for ``seconds`` and in ``frames``, within ``spread`` (rms, metres) of its mean.
+
+    The default spread allows for a hand that holds the tip: the dissertation's S_RMS of a resting catheter is 0.33 mm.
+    """
+
+    seconds: Seconds = 0.5
+    frames: Annotated[int, BeforeValidator(number), Field(ge=3, le=1000)] = 10
+    spread: Annotated[Length, Field(gt=0, le=0.05)] = 0.5e-3
+
+
+class MeasureSettings(Settings):
+    """A protocol of Sec. 3.5 of the dissertation, for the user's own camera and catheter.
+
+    ``source``: one or, for the faces of grid3d, several of: a video, a folder of pictures, a recording, the index of a
+    camera, a run folder of ``holotorch track``, its poses.csv, or ``synthetic``: simulated poses of still, grid2d and
+    grid3d. ``camera``, ``catheter``: YAML files, needed for frames without their own. ``rate_hz``: frames per second
+    of a source without time stamps. ``reference_log``: table of the reference tracker of the protocol latency, with
+    the columns time_s, x_m, y_m, z_m.
+    """
+
+    experiment: Literal["measure"]
+    protocol: Protocol
+    source: Annotated[tuple[str, ...], BeforeValidator(_sources), Field(min_length=1)]
+    camera: str | None = None
+    catheter: str | None = None
+    rate_hz: Annotated[Number, Field(gt=0)] | None = None
+    grid: GridSettings = GridSettings()
+    rest: RestSettings = RestSettings()
+    reference_log: str | None = None

@@ -1,0 +1,124 @@
+"""Evaluation of a measurement: from the poses of its sources to numbers, a table and a figure."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import torch
+
+from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.measure import figures
+from holotorch.experiments.measure.config import MeasureSettings
+from holotorch.experiments.measure.grid import Grid, accuracy, need_all, visit
+from holotorch.experiments.measure.rests import Rests
+from holotorch.experiments.measure.source import Track, read_reference
+from holotorch.tracking.evaluation.latency import latency
+
+
+@dataclass
+class Result:
+    """Numbers, notes, table and figure of a measurement.
+
+    Attributes:
+        summary: JSON values; keys name their units.
+        table: Name of the CSV table, and its rows.
+        figure: PNG, and its caption.
+        notes: Remarks for the user.
+    """
+
+    summary: dict[str, Any]
+    table: tuple[str, list[dict[str, Any]]]
+    figure: tuple[bytes, str]
+    notes: list[str] = field(default_factory=list)
+
+
+def new_rests(settings: MeasureSettings, grid: Grid) -> Rests:
+    """The detector of rests of a configuration."""
+    rest = settings.rest
+    return Rests(grid.spacing / 2, seconds=rest.seconds, frames=rest.frames, spread=rest.spread)
+
+
+def measure_still(settings: MeasureSettings, tracks: Sequence[Track]) -> Result:
+    """Stability, Eq. 3.13 and standard deviation. ConfigError if no two neighbouring frames have a pose."""
+    (track,) = tracks
+    told = track.summary(still=True)
+    if "stability" not in told:
+        raise ConfigError([f"{track.source.name}: {told['notes'][-1]}"])
+    names = ("frame", "time_s", "tip_x_m", "tip_y_m", "tip_z_m", "tip_sd_m")
+    each = zip(range(len(track.poses)), track.log.times, track.log.tips, track.log.deviations, strict=True)
+    rows: list[dict[str, Any]] = [dict(zip(names, (i, seconds, *tip, sd), strict=True)) for i, seconds, tip, sd in each]
+    caption = "Tip in the camera's frame; gaps are refusals"
+    summary = told["stability"] | {"stated_sd_mm": told["tip_sd_mm"]["median"]}
+    return Result(summary, ("tips.csv", rows), (figures.track_figure(track.log), caption), told["notes"])
+
+
+def measure_grid(settings: MeasureSettings, tracks: Sequence[Track]) -> Result:
+    """Accuracy over one or several grids. ConfigError if points are missing or the rests do not form the grid."""
+    grid = Grid.of(settings)
+    faces, rows, notes, found = [], [], [], {}
+    for number, track in enumerate(tracks):
+        rests = new_rests(settings, grid)
+        for seconds, pose in zip(track.log.times, track.poses, strict=True):
+            rests(seconds, pose)
+        name = chr(ord("A") + number) if len(tracks) > 1 else track.source.name
+        prefix = f"face {name}: " if len(tracks) > 1 else ""
+        try:
+            visited = visit(rests.found, grid)
+            if not (settings.grid.partial or track.source.live):
+                need_all(visited, grid)
+            summary, table = accuracy(visited, grid, track.board)
+        except ConfigError as error:
+            raise ConfigError([prefix + line for line in error.mistakes]) from None
+        faces.append({"face": name, "source": track.source.name} | summary)
+        rows += [{"face": name} | row for row in table]
+        notes += [prefix + note for note in visited.notes]
+        notes += [f"{prefix}no rest at {', '.join(map(str, summary['missing'][:5]))}"] if visited.missing else []
+        found[name] = visited
+    text = f"{grid.rows} x {grid.columns} points, {1e3 * grid.spacing:g} mm apart"
+    told: dict[str, Any] = {"grid": text, "reference": grid.name(grid.reference), "faces": faces}
+    told["acc_mm"] = fmean(face["acc_mm"] for face in faces)
+    caption = "Points of the grid, and the tips moved onto them as a rigid body"
+    return Result(told, ("points.csv", rows), (figures.grid_figure(found, grid), caption), notes)
+
+
+def measure_latency(settings: MeasureSettings, tracks: Sequence[Track]) -> Result:
+    """Lag behind a reference tracker. ConfigError if the curves do not overlap or do not show the same motion."""
+    (track,) = tracks
+    path = Path(settings.reference_log or "")
+    reference = read_reference(path)
+    times, tips = (torch.tensor(values, dtype=torch.float64) for values in (track.log.times, track.log.tips))
+    other_times, other = (torch.tensor(values, dtype=torch.float64) for values in reference)
+    try:
+        found = latency(times, tips, other_times, other)
+    except ValueError as error:
+        spans = f"{track.source.name} lasts from {times[0]:.3f} to {times[-1]:.3f} s"
+        raise ConfigError([f"{spans}, {path} from {other_times[0]:.3f} to {other_times[-1]:.3f} s: {error}"]) from None
+    summary: dict[str, Any] = {"lag_ms": 1e3 * found.seconds, "sd_ms": 1e3 * found.sd}
+    summary |= {"correlation": found.correlation, "overlap_s": found.overlap}
+    told = track.summary()
+    if "milliseconds" in told:
+        taken = told["milliseconds"]["median"]
+        summary |= {"tracker_ms": taken, "total_ms": summary["lag_ms"] + taken}
+    if "stages" in told:
+        summary["stages"] = told["stages"]
+    curves = {}
+    rows = []
+    for name, seconds, places in (("tracker", times, tips), ("reference", other_times, other)):
+        known = places.isfinite().all(-1)
+        distance = 1e3 * (places[known] - places[known][0]).norm(dim=-1)
+        curves[name] = (seconds[known], distance)
+        pairs = zip(seconds[known].tolist(), distance.tolist(), strict=True)
+        rows += [{"curve": name, "time_s": second, "distance_mm": value} for second, value in pairs]
+    caption = "Distance of the tip from its first place, by both trackers, as in Fig. 3.11 (a)"
+    drawn = figures.curves_figure(curves, "distance from the first place (mm)")
+    return Result(summary, ("curves.csv", rows), (drawn, caption))
+
+
+PROTOCOLS: dict[str, Callable[[MeasureSettings, Sequence[Track]], Result]] = {
+    "still": measure_still,
+    "grid2d": measure_grid,
+    "grid3d": measure_grid,
+    "latency": measure_latency,
+}
