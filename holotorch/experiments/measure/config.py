@@ -9,7 +9,7 @@ from holotorch.experiments.config.settings import Count, Length, Number, Setting
 SYNTHETIC = "synthetic"
 # Rows, columns and spacing in metres of the grids of Secs. 3.5.2 (8.16 cm wide) and 3.5.3 of the dissertation.
 GRIDS = {"grid2d": (9, 9, 10.2e-3), "grid3d": (8, 8, 10e-3)}
-Protocol = Literal["still", "grid2d", "grid3d", "latency"]
+Protocol = Literal["still", "grid2d", "grid3d", "latency", "prediction"]
 
 Side = Annotated[Count, Field(ge=2, le=100)]
 Spacing = Annotated[Length, Field(ge=1e-3, le=0.5)]
@@ -56,7 +56,7 @@ class MeasureSettings(Settings):
     camera, a run folder of ``holotorch track``, its poses.csv, or ``synthetic``: simulated poses of still, grid2d and
     grid3d. ``camera``, ``catheter``: YAML files, needed for frames without their own. ``rate_hz``: frames per second
     of a source without time stamps. ``reference_log``: table of the reference tracker of the protocol latency, with
-    the columns time_s, x_m, y_m, z_m.
+    the columns time_s, x_m, y_m, z_m. ``delay``: seconds from capture to display, of the protocol prediction.
     """
 
     experiment: Literal["measure"]
@@ -68,3 +68,4 @@ class MeasureSettings(Settings):
     grid: GridSettings = GridSettings()
     rest: RestSettings = RestSettings()
     reference_log: str | None = None
+    delay: Annotated[Number, Field(ge=0, le=1)] = 0.095

@@ -14,7 +14,9 @@ from holotorch.experiments.measure.config import MeasureSettings
 from holotorch.experiments.measure.grid import Grid, accuracy, need_all, visit
 from holotorch.experiments.measure.rests import Rests
 from holotorch.experiments.measure.source import Track, read_reference
+from holotorch.experiments.tracking.report import quantile
 from holotorch.tracking.evaluation.latency import latency
+from holotorch.tracking.evaluation.prediction import METHODS, prediction_errors
 
 
 @dataclass
@@ -116,9 +118,34 @@ def measure_latency(settings: MeasureSettings, tracks: Sequence[Track]) -> Resul
     return Result(summary, ("curves.csv", rows), (drawn, caption))
 
 
+def measure_prediction(settings: MeasureSettings, tracks: Sequence[Track]) -> Result:
+    """Errors of poses that are shown late, by method. ConfigError if no pose has later ones to compare it with."""
+    (track,) = tracks
+    try:
+        seconds, errors = prediction_errors(
+            torch.tensor(track.log.times, dtype=torch.float64), track.poses, settings.delay
+        )
+    except ValueError as error:
+        raise ConfigError([f"{track.source.name}: {error}"]) from None
+    millimetres = 1e3 * errors
+    methods = [
+        {"method": name, "rms_mm": float(each.square().mean().sqrt())}
+        | {"median_mm": quantile(each, 0.5), "p95_mm": quantile(each, 0.95)}
+        for name, each in zip(METHODS, millimetres.mT, strict=True)
+    ]
+    summary: dict[str, Any] = {"delay_ms": 1e3 * settings.delay, "compared": len(errors), "methods": methods}
+    names = ("time_s", *(f"{name.replace(' ', '_')}_mm" for name in METHODS))
+    pairs = zip(seconds.tolist(), millimetres.tolist(), strict=True)
+    rows: list[dict[str, Any]] = [dict(zip(names, (second, *each), strict=True)) for second, each in pairs]
+    curves = {name: (seconds, each) for name, each in zip(METHODS, millimetres.mT, strict=True)}
+    caption = f"Distance between the tip shown {1e3 * settings.delay:g} ms late and the tip measured at that time"
+    return Result(summary, ("errors.csv", rows), (figures.curves_figure(curves, "error (mm)"), caption))
+
+
 PROTOCOLS: dict[str, Callable[[MeasureSettings, Sequence[Track]], Result]] = {
     "still": measure_still,
     "grid2d": measure_grid,
     "grid3d": measure_grid,
     "latency": measure_latency,
+    "prediction": measure_prediction,
 }

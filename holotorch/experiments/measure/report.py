@@ -33,6 +33,11 @@ ROWS: dict[str, list[tuple[str, str]]] = {
         ("correlation", "correlation of the curves"),
         ("overlap_s", "time that both cover (s)"),
     ],
+    "prediction": [
+        ("rms_mm", "root mean square error (mm)"),
+        ("median_mm", "median (mm)"),
+        ("p95_mm", "95th percentile (mm)"),
+    ],
 }
 # Numbers of the dissertation by protocol and key.
 THESIS: dict[str, dict[str, str]] = {
@@ -40,6 +45,7 @@ THESIS: dict[str, dict[str, str]] = {
     "grid2d": {"in_plane_mm": "0.58"},
     "grid3d": {"acc_mm": "0.49, 0.93, 1.12; mean 0.85"},
     "latency": {"total_ms": "95.01"},
+    "prediction": {},
 }
 _ACC = (
     "Acc compares distances to the reference point only (Sec. 3.5.3). It is blind to an error that is the same at all "
@@ -58,6 +64,11 @@ MEANING: dict[str, str] = {
     "latency": "The lag is where the distances from the first place, by the tracker and by the reference, correlate "
     "best (Sec. 3.5.4). It holds for the time stamps of the frames, relative to the reference's own latency, and only "
     "if both have one clock. The time of the tracker comes on top, and that of a display is not in it.",
+    "prediction": "A pose is seen later than the frame was taken, and the hand has moved on. The error is the distance "
+    "between the tip that is shown and the tip that the tracker measures for that time. Constant velocity is what the "
+    "page of holotorch stream --view does; one euro is the filter of holotorch stream --smooth with its prediction. "
+    "The later tip has the tracker's own noise, which all methods have alike, and its own bias, of which this says "
+    "nothing. Which method is best depends on the motion: record one like that of your use.",
 }
 _NEEDS_BOARD = (
     "The dissertation's error in the plane (0.58 mm) is not here: it needs the directions of the sheet, from a "
@@ -72,11 +83,16 @@ def measure_section(record: RunRecord) -> list[str]:
     parts = [heading(f"{record.title}: {protocol}", summary["status"])]
     if "failure" in summary:
         parts.append(element("p", summary["failure"], "warn"))
+    about = f"Grid: {summary['grid']}." if "grid" in summary else ""
+    about = f"Shown {summary['delay_ms']:g} ms after capture." if "delay_ms" in summary else about
     text = f"{', '.join(summary['sources'])}: {summary['answered']} of {summary['frames']} frames have a pose. "
-    parts.append(element("p", text + (f"Grid: {summary['grid']}." if "grid" in summary else "")))
+    parts.append(element("p", text + about))
     faces = summary.get("faces", [summary])
     names = [str(face["face"]) for face in faces] if len(faces) > 1 else ["here"]
-    columns = [*zip(names, faces, strict=True), *([("mean", summary)] if len(faces) > 1 else [])]
+    faces, names = (
+        (methods, [each["method"] for each in methods]) if (methods := summary.get("methods")) else (faces, names)
+    )
+    columns = [*zip(names, faces, strict=True), *([("mean", summary)] if len(summary.get("faces", [])) > 1 else [])]
     cells = [
         [words, *(_number(face.get(key)) for _, face in columns), THESIS[protocol].get(key, "")]
         for key, words in ROWS[protocol]
@@ -98,6 +114,9 @@ def measure_section(record: RunRecord) -> list[str]:
 def verdict(summary: Mapping[str, Any]) -> str:
     """The main numbers in one line, with those of the dissertation."""
     protocol = summary["protocol"]
+    if "methods" in summary:
+        each = (f"{method['method']} {_number(method['rms_mm'])} mm" for method in summary["methods"])
+        return f"{protocol:10} rms of a delay of {summary['delay_ms']:g} ms: " + "; ".join(each)
     faces = summary.get("faces", [])
     values = dict(summary) | (faces[0] if len(faces) == 1 else {})
     words = []

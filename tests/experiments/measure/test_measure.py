@@ -249,3 +249,22 @@ def test_a_sheet_seen_in_the_first_frames_gives_the_errors_in_its_plane(tmp_path
     assert face["in_plane_mm"] == pytest.approx(np.linalg.norm(apart[:, :2], axis=1).mean(), abs=0.02)
     assert face["in_space_mm"] == pytest.approx(np.linalg.norm(apart, axis=1).mean(), abs=0.05)
     assert "dissertation" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_prediction_of_a_recorded_motion(tmp_path, capsys):
+    times = np.arange(400) / RATE
+    path = write(tmp_path / "poses.csv", motion(times), refused={100, 101})
+    words = ["measure", "prediction", str(path), "--delay", "100", "--out", str(tmp_path / "out")]
+    assert main(words) == 0
+    summary = told(tmp_path / "out")
+    none, constant, filtered = summary["methods"]
+    # 100 ms are three frames: the tip three lines further on, wherever both have a pose.
+    tips = motion(times)
+    pairs = [(i, i + 3) for i in range(397) if not {i, i + 3} & {100, 101}]
+    late = [1e3 * math.dist(tips[i], tips[j]) for i, j in pairs]
+    assert summary["compared"] == pytest.approx(len(late), abs=3) and summary["delay_ms"] == 100
+    assert none["rms_mm"] == pytest.approx(math.sqrt(sum(x * x for x in late) / len(late)), rel=0.01)
+    assert constant["rms_mm"] < none["rms_mm"] / 2 and filtered["rms_mm"] < none["rms_mm"]
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "constant velocity" in page and "Shown 100 ms after capture" in page
+    assert "prediction rms of a delay of 100 ms: none" in capsys.readouterr().out
