@@ -9,7 +9,8 @@ from holotorch.experiments.config.settings import Count, Length, Number, Setting
 SYNTHETIC = "synthetic"
 # Rows, columns and spacing in metres of the grids of Secs. 3.5.2 (8.16 cm wide) and 3.5.3 of the dissertation.
 GRIDS = {"grid2d": (9, 9, 10.2e-3), "grid3d": (8, 8, 10e-3)}
-Protocol = Literal["still", "grid2d", "grid3d", "latency", "prediction"]
+Protocol = Literal["still", "grid2d", "grid3d", "latency", "prediction", "edges"]
+_KNOWN = r"^\d{1,2}(-\d{1,2})?$"  # an edge, or two
 
 Side = Annotated[Count, Field(ge=2, le=100)]
 Spacing = Annotated[Length, Field(ge=1e-3, le=0.5)]
@@ -18,8 +19,14 @@ Seconds = Annotated[Number, Field(gt=0, le=60)]
 
 def _sources(value: Any) -> Any:
     """One source becomes a list of one; the index of a camera, which YAML reads as a number, becomes text."""
-    numbers = (str(each) if isinstance(each, int) and not isinstance(each, bool) else each for each in several(value))
-    return tuple(numbers)
+    return _words(several(value))
+
+
+def _words(value: Any) -> Any:
+    """A list whose whole numbers, as YAML reads 0, become text."""
+    if not isinstance(value, list | tuple):
+        return value
+    return tuple(str(each) if isinstance(each, int) and not isinstance(each, bool) else each for each in value)
 
 
 class GridSettings(Settings):
@@ -57,6 +64,8 @@ class MeasureSettings(Settings):
     grid3d. ``camera``, ``catheter``: YAML files, needed for frames without their own. ``rate_hz``: frames per second
     of a source without time stamps. ``reference_log``: table of the reference tracker of the protocol latency, with
     the columns time_s, x_m, y_m, z_m. ``delay``: seconds from capture to display, of the protocol prediction.
+    ``known``: distances along the catheter that are exact, of the protocol edges: ``0`` for edge 0 and the tip, ``1-2``
+    for edges 1 and 2. ``resting``: the tip was in one place in all frames.
     """
 
     experiment: Literal["measure"]
@@ -68,4 +77,6 @@ class MeasureSettings(Settings):
     grid: GridSettings = GridSettings()
     rest: RestSettings = RestSettings()
     reference_log: str | None = None
+    known: Annotated[tuple[Annotated[str, Field(pattern=_KNOWN)], ...], BeforeValidator(_words)] = ()
+    resting: bool = False
     delay: Annotated[Number, Field(ge=0, le=1)] = 0.095

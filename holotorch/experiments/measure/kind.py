@@ -31,6 +31,9 @@ class MeasureKind(ExperimentKind[MeasureSettings, "Measurement"]):
         if (protocol == "latency") != (settings.reference_log is not None):
             text = "the protocol latency needs the reference tracker's log; no other protocol takes one"
             mistakes.append((("reference_log",), text))
+        if (protocol == "edges") != bool(settings.known):
+            text = "the protocol edges needs distances that are exact, such as 0 1-2; no other protocol takes them"
+            mistakes.append((("known",), text))
         return mistakes
 
     def build(self, settings: MeasureSettings) -> Measurement:

@@ -10,6 +10,7 @@ import torch
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.measure import figures
+from holotorch.experiments.measure.calibration import catheter_rows, measure_catheter
 from holotorch.experiments.measure.config import MeasureSettings
 from holotorch.experiments.measure.grid import Grid, accuracy, need_all, visit
 from holotorch.experiments.measure.rests import Rests
@@ -28,12 +29,14 @@ class Result:
         table: Name of the CSV table, and its rows.
         figure: PNG, and its caption.
         notes: Remarks for the user.
+        saved: Functions that write further files, by the names of these files.
     """
 
     summary: dict[str, Any]
     table: tuple[str, list[dict[str, Any]]]
     figure: tuple[bytes, str]
     notes: list[str] = field(default_factory=list)
+    saved: dict[str, Callable[[Path], None]] = field(default_factory=dict)
 
 
 def new_rests(settings: MeasureSettings, grid: Grid) -> Rests:
@@ -142,10 +145,23 @@ def measure_prediction(settings: MeasureSettings, tracks: Sequence[Track]) -> Re
     return Result(summary, ("errors.csv", rows), (figures.curves_figure(curves, "error (mm)"), caption))
 
 
+def measure_edges(settings: MeasureSettings, tracks: Sequence[Track]) -> Result:
+    """Positions of the band edges, and a file of the corrected catheter. ConfigError if the frames leave them open."""
+    (track,) = tracks
+    measured = measure_catheter(track.edges, track.source, settings.known, settings.resting)
+    rows = catheter_rows(measured)
+    summary: dict[str, Any] = {"edges": rows, "frames_used": measured.used, "frames_left_out": measured.left_out}
+    summary |= {"rms_px": measured.rms_px, "known": list(settings.known), "resting": settings.resting}
+    caption = "Change of the distance of each edge from the tip; bars: two standard deviations"
+    drawn = figures.edges_figure([row["change_mm"] for row in rows], [row["sd_mm"] for row in rows])
+    return Result(summary, ("edges.csv", rows), (drawn, caption), saved={"catheter.yaml": measured.save})
+
+
 PROTOCOLS: dict[str, Callable[[MeasureSettings, Sequence[Track]], Result]] = {
     "still": measure_still,
     "grid2d": measure_grid,
     "grid3d": measure_grid,
     "latency": measure_latency,
     "prediction": measure_prediction,
+    "edges": measure_edges,
 }

@@ -33,6 +33,11 @@ ROWS: dict[str, list[tuple[str, str]]] = {
         ("correlation", "correlation of the curves"),
         ("overlap_s", "time that both cover (s)"),
     ],
+    "edges": [
+        ("rms_px", "root mean square residual of the edges (px)"),
+        ("frames_used", "frames in the fit"),
+        ("frames_left_out", "frames left out, whose edges disagree with the others"),
+    ],
     "prediction": [
         ("rms_mm", "root mean square error (mm)"),
         ("median_mm", "median (mm)"),
@@ -46,6 +51,7 @@ THESIS: dict[str, dict[str, str]] = {
     "grid3d": {"acc_mm": "0.49, 0.93, 1.12; mean 0.85"},
     "latency": {"total_ms": "95.01"},
     "prediction": {},
+    "edges": {},
 }
 _ACC = (
     "Acc compares distances to the reference point only (Sec. 3.5.3). It is blind to an error that is the same at all "
@@ -64,6 +70,11 @@ MEANING: dict[str, str] = {
     "latency": "The lag is where the distances from the first place, by the tracker and by the reference, correlate "
     "best (Sec. 3.5.4). It holds for the time stamps of the frames, relative to the reference's own latency, and only "
     "if both have one clock. The time of the tracker comes on top, and that of a display is not in it.",
+    "edges": "catheter.yaml in this folder has the measured positions of the edges: use it in place of the nominal "
+    "one. The deviations hold for independent errors of 0.1 px of the edges (or more, where the residuals say so) in "
+    "each frame, and for known distances that are exact. An error that is the same in all frames, as of a highlight or "
+    "of the camera's focal length, is in none of them; neither is one of the known distances, which scales or shifts "
+    "all others. Frames that the tracker refuses because their edges contradict the nominal catheter are used as well.",
     "prediction": "A pose is seen later than the frame was taken, and the hand has moved on. The error is the distance "
     "between the tip that is shown and the tip that the tracker measures for that time. Constant velocity is what the "
     "page of holotorch stream --view does; one euro is the filter of holotorch stream --smooth with its prediction. "
@@ -89,9 +100,9 @@ def measure_section(record: RunRecord) -> list[str]:
     parts.append(element("p", text + about))
     faces = summary.get("faces", [summary])
     names = [str(face["face"]) for face in faces] if len(faces) > 1 else ["here"]
-    faces, names = (
-        (methods, [each["method"] for each in methods]) if (methods := summary.get("methods")) else (faces, names)
-    )
+    if "methods" in summary:
+        faces = summary["methods"]
+        names = [method["method"] for method in faces]
     columns = [*zip(names, faces, strict=True), *([("mean", summary)] if len(summary.get("faces", [])) > 1 else [])]
     cells = [
         [words, *(_number(face.get(key)) for _, face in columns), THESIS[protocol].get(key, "")]
@@ -99,6 +110,10 @@ def measure_section(record: RunRecord) -> list[str]:
         if any(key in face for _, face in columns) or key in THESIS[protocol]
     ]
     parts.append(table(["", *(name for name, _ in columns), "dissertation"], cells))
+    if "edges" in summary:
+        names = ("nominal_mm", "measured_mm", "sd_mm", "change_mm")
+        rows = [[str(edge["edge"]), *(f"{edge[name]:.3f}" for name in names)] for edge in summary["edges"]]
+        parts.append(table(["edge", *(name.replace("_mm", " (mm)") for name in names)], rows))
     if "stages" in summary:
         rows = [[stage["stage"], f"{stage['milliseconds']:.2f}"] for stage in summary["stages"]]
         parts.append(table(["stage of the tracker", "mean time per frame (ms)"], rows))
@@ -117,6 +132,9 @@ def verdict(summary: Mapping[str, Any]) -> str:
     if "methods" in summary:
         each = (f"{method['method']} {_number(method['rms_mm'])} mm" for method in summary["methods"])
         return f"{protocol:10} rms of a delay of {summary['delay_ms']:g} ms: " + "; ".join(each)
+    if "edges" in summary:
+        each = (f"{edge['measured_mm']:.2f} +- {edge['sd_mm']:.2f} mm" for edge in summary["edges"])
+        return f"{protocol:10} " + "; ".join(each)
     faces = summary.get("faces", [])
     values = dict(summary) | (faces[0] if len(faces) == 1 else {})
     words = []

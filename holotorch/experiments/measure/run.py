@@ -120,6 +120,8 @@ def run_measurement(experiment: Measurement, folder: RunFolder) -> bool:
     summary["notes"] = list(dict.fromkeys([*announced, *result.notes]))
     files.write(write_table, folder.path / result.table[0], result.table[1])
     files.write(write_bytes, folder.path / "images" / "measure.png", result.figure[0])
+    for name, save in result.saved.items():
+        files.write(save, folder.path / name)
     complete = conclude(folder, _finite(summary), files, done=True)
     print(verdict(summary), *(note for note in result.notes if note not in announced), sep="\n", flush=True)
     return complete

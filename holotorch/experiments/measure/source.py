@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from torch import Tensor
+
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.measure.config import SYNTHETIC, MeasureSettings
 from holotorch.experiments.measure.synthetic import synthetic_poses
@@ -70,6 +72,7 @@ class Track:
         log: Times, tips, statuses and times of stages.
         poses: Pose or refusal of each frame.
         cells: Lines for a poses.csv.
+        edges: Pixels [N, 2] of the band edges in each frame, if the tracker has measured them.
         board: Rotation [3, 3] from a board on the sheet to the camera, if the first frames showed one.
     """
 
@@ -78,12 +81,15 @@ class Track:
     poses: list[Pose] = field(default_factory=list)
     cells: list[list[str]] = field(default_factory=list)
     board: Any = None
+    edges: list[Tensor | None] = field(default_factory=list)
 
     def take(self, item: Tracked) -> None:
         """Add a frame."""
         self.log.take(item, None)
         self.poses.append(item.pose)
         self.cells.append(row(item))
+        measured = getattr(self.source.inputs.tracker, "edges_px", ()) if self.source.inputs else ()
+        self.edges.append(measured[0] if len(measured) == 1 and item.frame.pixels is not None else None)
 
     def summary(self, *, still: bool = False) -> dict[str, Any]:
         """What ``holotorch track`` says of these frames: counts, times, stages and, if ``still``, the stability."""
