@@ -2,7 +2,9 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +12,13 @@ import torch
 from torch import Tensor
 
 from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.measure.config import MeasureSettings
 from holotorch.experiments.measure.source import Source
-from holotorch.experiments.tracking.devices import save_catheter
+from holotorch.experiments.tracking.devices import CameraSettings, load_camera, save_catheter, save_tone
+from holotorch.io.bundled import find_config
+from holotorch.io.video import Frames, open_frames
 from holotorch.tracking import Camera, Catheter
+from holotorch.tracking.camera.tone import tone_curve
 from holotorch.tracking.pose.band_edges import BandEdges, fit_band_edges
 from holotorch.tracking.pose.pose import solve_pose
 
@@ -102,6 +108,59 @@ def catheter_rows(measured: MeasuredCatheter) -> list[dict[str, Any]]:
         }
         for i, (old, new, sd) in enumerate(each)
     ]
+
+
+def open_photographs(settings: MeasureSettings) -> Source:
+    """The folder of photographs of the protocol tone. ConfigError if it or the camera's file cannot be used."""
+    name = settings.source[0]
+    if not Path(name).is_dir():
+        raise ConfigError([f"source: expected a folder of photographs, got {name}"])
+    _camera_settings(settings)
+    with _pictures(name) as frames:
+        count = frames.total
+    if count != len(settings.exposures):
+        got = f"{len(settings.exposures)} for the {count} photographs in {name}"
+        raise ConfigError([f"exposures: expected one for each photograph, in the order of their names, got {got}"])
+    return Source(name, path=Path(name))
+
+
+def measure_camera(source: Source, settings: MeasureSettings) -> tuple[Tensor, Callable[[Path], None]]:
+    """Tone curve float64 [256] of the photographs, and a function that writes the camera's file with it.
+
+    Raises:
+        ConfigError: A photograph cannot be read, or they and their exposures do not determine a curve.
+    """
+    photographs = []
+    with _pictures(source.name) as frames:
+        for frame in frames:
+            if frame.pixels is None:
+                raise ConfigError([f"{source.name}: {frame.problem}"])
+            # Every n-th pixel: a million of them determine 256 levels, and a mean of pixels would blur the levels.
+            step = max(1, math.ceil(math.sqrt(frame.pixels[0].numel() / 1e6)))
+            photographs.append(frame.pixels[:, ::step, ::step])
+    order = sorted(range(len(photographs)), key=settings.exposures.__getitem__)
+    means = [float(photographs[i].double().mean()) for i in order]
+    for (i, j), (dark, light) in zip(pairwise(order), pairwise(means), strict=True):
+        if light < dark:
+            text = f"photograph {j + 1} was exposed longer than photograph {i + 1} and is darker"
+            raise ConfigError([f"{source.name}: {text}; are the exposures in the order of the file names?"])
+    try:
+        tone = tone_curve(torch.stack(photographs), torch.tensor(settings.exposures, dtype=torch.float64))
+    except ValueError as error:
+        raise ConfigError([f"{source.name}: {error}"]) from None
+    return tone, partial(save_tone, settings=_camera_settings(settings), tone=tone)
+
+
+def _camera_settings(settings: MeasureSettings) -> CameraSettings:
+    path = settings.camera or ""
+    return load_camera(find_config(path) or path)
+
+
+def _pictures(name: str) -> Frames:
+    try:
+        return open_frames(name)
+    except ValueError as error:
+        raise ConfigError([str(error)]) from None
 
 
 def _agreeing(edges: Tensor, positions: Tensor, camera: Camera) -> Tensor:

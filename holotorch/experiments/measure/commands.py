@@ -12,7 +12,7 @@ def add_measure(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
     """Add the command to the parser of ``holotorch``."""
     about = "accuracy and latency of the tracker with your camera, by the dissertation's protocols"
     measure = commands.add_parser("measure", help=about)
-    measure.add_argument("protocol", metavar="PROTOCOL", help="still, grid2d, grid3d, latency, prediction, edges")
+    measure.add_argument("protocol", metavar="PROTOCOL", help="still, grid2d, grid3d, latency, prediction, edges, tone")
     what = "video, folder of pictures or of a recording, number of a camera, run of track, poses.csv, or: synthetic"
     measure.add_argument("sources", nargs="*", metavar="SOURCE", help=f"{what}; for grid3d one for each face")
     measure.add_argument("--out", type=Path, help="folder of the run (default: runs/measure-001, ...)")
@@ -28,6 +28,8 @@ def add_measure(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
     about = "of edges: distances that are exact, such as 0 (edge 0 and the tip) or 1-2 (edges 1 and 2)"
     measure.add_argument("--known", nargs="+", metavar="EDGE", help=about)
     measure.add_argument("--resting", action="store_true", help="of edges: the tip was in one place in all frames")
+    about = "of tone: exposure times of the photographs, in the order of their names, such as 1/250 1/125"
+    measure.add_argument("--exposures", nargs="+", metavar="SECONDS", help=about)
     measure.add_argument("--delay", type=float, metavar="MS", help="of prediction: capture to display (default: 95)")
     measure.add_argument("--print", type=Path, metavar="SVG", help="write the sheet of grid2d, to be printed")
     measure.set_defaults(action=_measure)
@@ -62,11 +64,13 @@ def _settings(options: argparse.Namespace) -> Any:
         ("rate_hz",): "argument --rate",
         ("delay",): "argument --delay",
         ("known",): "argument --known",
+        ("exposures",): "argument --exposures",
+        ("camera",): "argument --camera",
         ("reference_log",): "argument --reference",
         ("grid", "reference"): "argument --reference",
     }
     positions |= {("grid", name): f"argument --{name}" for name in given}
-    data |= {"known": options.known or [], "resting": options.resting}
+    data |= {"known": options.known or [], "resting": options.resting, "exposures": options.exposures or []}
     if options.delay is not None:
         data["delay"] = options.delay / 1e3
     if options.reference is not None and options.protocol == "latency":

@@ -1,5 +1,6 @@
 """Settings of a measurement."""
 
+import re
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
@@ -9,7 +10,7 @@ from holotorch.experiments.config.settings import Count, Length, Number, Setting
 SYNTHETIC = "synthetic"
 # Rows, columns and spacing in metres of the grids of Secs. 3.5.2 (8.16 cm wide) and 3.5.3 of the dissertation.
 GRIDS = {"grid2d": (9, 9, 10.2e-3), "grid3d": (8, 8, 10e-3)}
-Protocol = Literal["still", "grid2d", "grid3d", "latency", "prediction", "edges"]
+Protocol = Literal["still", "grid2d", "grid3d", "latency", "prediction", "edges", "tone"]
 _KNOWN = r"^\d{1,2}(-\d{1,2})?$"  # an edge, or two
 
 Side = Annotated[Count, Field(ge=2, le=100)]
@@ -27,6 +28,16 @@ def _words(value: Any) -> Any:
     if not isinstance(value, list | tuple):
         return value
     return tuple(str(each) if isinstance(each, int) and not isinstance(each, bool) else each for each in value)
+
+
+def _exposure(value: Any) -> Any:
+    """Seconds of an exposure time such as 1/250 or 0.004."""
+    if isinstance(value, str) and (match := re.fullmatch(r"(\d{1,6}(?:\.\d{1,9})?)(?:/(\d{1,6}))?", value.strip())):
+        return float(match[1]) / max(float(match[2] or 1), 1e-9)
+    return value
+
+
+Exposure = Annotated[Number, BeforeValidator(_exposure), Field(gt=0, le=1e4)]
 
 
 class GridSettings(Settings):
@@ -65,7 +76,8 @@ class MeasureSettings(Settings):
     of a source without time stamps. ``reference_log``: table of the reference tracker of the protocol latency, with
     the columns time_s, x_m, y_m, z_m. ``delay``: seconds from capture to display, of the protocol prediction.
     ``known``: distances along the catheter that are exact, of the protocol edges: ``0`` for edge 0 and the tip, ``1-2``
-    for edges 1 and 2. ``resting``: the tip was in one place in all frames.
+    for edges 1 and 2. ``resting``: the tip was in one place in all frames. ``exposures``: exposure time in seconds of
+    each photograph of the protocol tone, in the order of the file names; its source is a folder of photographs.
     """
 
     experiment: Literal["measure"]
@@ -79,4 +91,5 @@ class MeasureSettings(Settings):
     reference_log: str | None = None
     known: Annotated[tuple[Annotated[str, Field(pattern=_KNOWN)], ...], BeforeValidator(_words)] = ()
     resting: bool = False
+    exposures: Annotated[tuple[Exposure, ...], BeforeValidator(_words)] = ()
     delay: Annotated[Number, Field(ge=0, le=1)] = 0.095

@@ -49,6 +49,18 @@ def edges_figure(changes: Sequence[float], deviations: Sequence[float]) -> bytes
     return figure_png(figure)
 
 
+def tone_figure(curves: Mapping[str, Tensor]) -> bytes:
+    """Tone curves [256] by name."""
+    figure = Figure(figsize=(5, 4), layout="constrained")
+    axes = figure.add_subplot()
+    for name, light in curves.items():
+        axes.plot(range(256), light.tolist(), label=name)
+    axes.set(xlabel="level", ylabel="light")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    return figure_png(figure)
+
+
 def track_figure(log: Any) -> bytes:
     """The tip over time, as ``holotorch track`` draws it."""
     from holotorch.experiments.tracking.report import drawn_track

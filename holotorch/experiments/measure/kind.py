@@ -34,6 +34,11 @@ class MeasureKind(ExperimentKind[MeasureSettings, "Measurement"]):
         if (protocol == "edges") != bool(settings.known):
             text = "the protocol edges needs distances that are exact, such as 0 1-2; no other protocol takes them"
             mistakes.append((("known",), text))
+        if (protocol == "tone") != bool(settings.exposures):
+            text = "the protocol tone needs the exposure time of each photograph; no other protocol takes them"
+            mistakes.append((("exposures",), text))
+        if protocol == "tone" and settings.camera is None:
+            mistakes.append((("camera",), "the protocol tone needs the camera's file, whose tone it replaces"))
         return mistakes
 
     def build(self, settings: MeasureSettings) -> Measurement:

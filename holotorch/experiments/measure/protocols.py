@@ -10,7 +10,7 @@ import torch
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.measure import figures
-from holotorch.experiments.measure.calibration import catheter_rows, measure_catheter
+from holotorch.experiments.measure.calibration import catheter_rows, measure_camera, measure_catheter
 from holotorch.experiments.measure.config import MeasureSettings
 from holotorch.experiments.measure.grid import Grid, accuracy, need_all, visit
 from holotorch.experiments.measure.rests import Rests
@@ -157,6 +157,23 @@ def measure_edges(settings: MeasureSettings, tracks: Sequence[Track]) -> Result:
     return Result(summary, ("edges.csv", rows), (drawn, caption), saved={"catheter.yaml": measured.save})
 
 
+def measure_tone(settings: MeasureSettings, tracks: Sequence[Track]) -> Result:
+    """Tone curve of the camera, and its file with it. ConfigError if the photographs do not determine a curve."""
+    (track,) = tracks
+    tone, save = measure_camera(track.source, settings)
+    levels = torch.arange(256, dtype=torch.float64) / 255
+    srgb = torch.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
+    summary: dict[str, Any] = {"photographs": len(settings.exposures), "exposures_s": list(settings.exposures)}
+    summary["from_srgb"] = float((tone - srgb).abs().max())
+    rows: list[dict[str, Any]] = [
+        {"level": i, "light": light, "srgb": standard}
+        for i, (light, standard) in enumerate(zip(tone.tolist(), srgb.tolist(), strict=True))
+    ]
+    drawn = figures.tone_figure({"measured": tone, "sRGB": srgb})
+    caption = "Light of each 8-bit level, relative to that of level 255"
+    return Result(summary, ("tone.csv", rows), (drawn, caption), saved={"camera.yaml": save})
+
+
 PROTOCOLS: dict[str, Callable[[MeasureSettings, Sequence[Track]], Result]] = {
     "still": measure_still,
     "grid2d": measure_grid,
@@ -164,4 +181,5 @@ PROTOCOLS: dict[str, Callable[[MeasureSettings, Sequence[Track]], Result]] = {
     "latency": measure_latency,
     "prediction": measure_prediction,
     "edges": measure_edges,
+    "tone": measure_tone,
 }

@@ -38,6 +38,10 @@ ROWS: dict[str, list[tuple[str, str]]] = {
         ("frames_used", "frames in the fit"),
         ("frames_left_out", "frames left out, whose edges disagree with the others"),
     ],
+    "tone": [
+        ("photographs", "photographs"),
+        ("from_srgb", "largest difference from the sRGB curve, of the light of level 255"),
+    ],
     "prediction": [
         ("rms_mm", "root mean square error (mm)"),
         ("median_mm", "median (mm)"),
@@ -52,6 +56,7 @@ THESIS: dict[str, dict[str, str]] = {
     "latency": {"total_ms": "95.01"},
     "prediction": {},
     "edges": {},
+    "tone": {},
 }
 _ACC = (
     "Acc compares distances to the reference point only (Sec. 3.5.3). It is blind to an error that is the same at all "
@@ -75,6 +80,10 @@ MEANING: dict[str, str] = {
     "each frame, and for known distances that are exact. An error that is the same in all frames, as of a highlight or "
     "of the camera's focal length, is in none of them; neither is one of the known distances, which scales or shifts "
     "all others. Frames that the tracker refuses because their edges contradict the nominal catheter are used as well.",
+    "tone": "camera.yaml in this folder is the camera's file with the measured tone curve, by which the tracker turns "
+    "levels into light. It holds for the camera's settings in these photographs: gain, contrast and gamma fixed, and "
+    "automatic exposure and white balance off. It is the same for all three colours, and its lowest and highest three "
+    "levels are extrapolated.",
     "prediction": "A pose is seen later than the frame was taken, and the hand has moved on. The error is the distance "
     "between the tip that is shown and the tip that the tracker measures for that time. Constant velocity is what the "
     "page of holotorch stream --view does; one euro is the filter of holotorch stream --smooth with its prediction. "
@@ -97,6 +106,7 @@ def measure_section(record: RunRecord) -> list[str]:
     about = f"Grid: {summary['grid']}." if "grid" in summary else ""
     about = f"Shown {summary['delay_ms']:g} ms after capture." if "delay_ms" in summary else about
     text = f"{', '.join(summary['sources'])}: {summary['answered']} of {summary['frames']} frames have a pose. "
+    text = text if summary["frames"] else f"{', '.join(summary['sources'])}. "
     parts.append(element("p", text + about))
     faces = summary.get("faces", [summary])
     names = [str(face["face"]) for face in faces] if len(faces) > 1 else ["here"]
@@ -135,6 +145,8 @@ def verdict(summary: Mapping[str, Any]) -> str:
     if "edges" in summary:
         each = (f"{edge['measured_mm']:.2f} +- {edge['sd_mm']:.2f} mm" for edge in summary["edges"])
         return f"{protocol:10} " + "; ".join(each)
+    if "from_srgb" in summary:
+        return f"{protocol:10} differs from sRGB by {_number(summary['from_srgb'])} of the light of level 255 at most"
     faces = summary.get("faces", [])
     values = dict(summary) | (faces[0] if len(faces) == 1 else {})
     words = []

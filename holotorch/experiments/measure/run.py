@@ -10,6 +10,7 @@ from typing import Any
 from tqdm import tqdm
 
 from holotorch.experiments.config.errors import ConfigError
+from holotorch.experiments.measure.calibration import open_photographs
 from holotorch.experiments.measure.config import GRIDS, SYNTHETIC, MeasureSettings
 from holotorch.experiments.measure.grid import Grid
 from holotorch.experiments.measure.protocols import PROTOCOLS, new_rests
@@ -68,6 +69,8 @@ def build_measurement(settings: MeasureSettings) -> Measurement:
         chessboard(settings.grid.board)
     if settings.reference_log is not None:
         read_reference(Path(settings.reference_log))
+    if settings.protocol == "tone":
+        return Measurement(settings, [open_photographs(settings)])
     sources: list[Source] = []
     with ExitStack() as stack:
         for name in settings.source:
@@ -84,7 +87,9 @@ def plan_measurement(experiment: Measurement) -> RunPlan:
     grid = f": {Grid.of(settings)}" if settings.protocol in GRIDS else ""
     lines = [f"Protocol   {settings.protocol}{grid}"]
     for source in experiment.sources:
-        if source.inputs is None:
+        if settings.protocol == "tone":
+            count = f"{len(settings.exposures)} photographs"
+        elif source.inputs is None:
             count = f"{len(source.recorded)} poses"
         else:
             total = source.inputs.frames.total
@@ -97,14 +102,18 @@ def plan_measurement(experiment: Measurement) -> RunPlan:
 def run_measurement(experiment: Measurement, folder: RunFolder) -> bool:
     """Track or read the sources, evaluate them and fill the run folder. Returns whether the run is complete.
 
-    The run writes a table of its protocol, a figure, ``summary.json`` and the page, and for a source of frames also its
-    ``poses.csv`` and copies of its YAML files. Ctrl-C ends the frames of a camera, and what they show is evaluated.
+    The run writes a table of its protocol, a figure, the corrected file of edges and tone, ``summary.json`` and the
+    page, and for a source of frames also its ``poses.csv`` and copies of its YAML files. Ctrl-C ends the frames of a
+    camera, and what they show is evaluated.
 
     Raises:
         ConfigError: The poses do not show what the protocol needs. The poses that were tracked are kept.
     """
     settings, files = experiment.settings, Results()
-    tracks = [_followed(settings, source, folder, files, i) for i, source in enumerate(experiment.sources)]
+    if settings.protocol == "tone":  # photographs, which show no catheter
+        tracks = [Track(source, Log(folder.path / "images")) for source in experiment.sources]
+    else:
+        tracks = [_followed(settings, source, folder, files, i) for i, source in enumerate(experiment.sources)]
     summary: dict[str, Any] = {"experiment": "measure", "status": "", "protocol": settings.protocol}
     summary |= {"sources": [source.name for source in experiment.sources]}
     summary |= {"frames": sum(len(track.poses) for track in tracks)}

@@ -3,12 +3,20 @@
 import csv
 import math
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from simulated_hand import told, write
 
 from holotorch.cli import main
-from holotorch.experiments.tracking.devices import build_catheter, load_catheter, save_camera, save_catheter
+from holotorch.experiments.tracking.devices import (
+    build_catheter,
+    load_camera,
+    load_catheter,
+    save_camera,
+    save_catheter,
+)
 from holotorch.io.recording import Recorder
 from holotorch.io.video import Frame
 from holotorch.tracking import THESIS, Catheter
@@ -78,3 +86,58 @@ def test_poses_have_no_edges(tmp_path, capsys):
     path = write(tmp_path / "poses.csv", [(0, 0, 0.5)] * 5)
     assert main(["measure", "edges", str(path), "--known", "0", "--resting", "--out", str(tmp_path / "out")]) == 2
     assert "the edges are measured in the frames: expected a video" in capsys.readouterr().err
+
+
+FILE = ["--camera", "c.yaml"]
+EXPOSURES = ["1/1000", "1/500", "1/250", "1/125", "0.016", "0.032"]
+
+
+def photographs(folder, gamma=1.8):
+    """A scene of many shades at each exposure; the level of light L is 255 L^(1 / gamma)."""
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    scene = np.exp(rng.uniform(math.log(2e-3), math.log(20), (120, 160)))
+    for i, seconds in enumerate((1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3)):
+        light = np.clip(scene * seconds / 16e-3, 0, 1)
+        level = np.round(255 * light ** (1 / gamma)).astype(np.uint8)
+        cv2.imwrite(str(folder / f"photo{i + 8}.png"), np.repeat(level[..., None], 3, -1))  # photo8 before photo10
+    return folder
+
+
+def test_the_tone_of_a_camera_is_measured_and_the_rest_of_its_file_kept(tmp_path):
+    folder, camera = photographs(tmp_path / "in"), tmp_path / "camera.yaml"
+    camera.write_text("fx: 900\nfy: 901\ncx: 480\ncy: 270\nsize: [540, 960]\ndistortion: [0.1, 0, 0, 0, 0]\n")
+    words = ["measure", "tone", str(folder), "--camera", str(camera), "--exposures", *EXPOSURES]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 0
+    found = load_camera(tmp_path / "out" / "camera.yaml")
+    assert (found.fx, found.fy, found.size, found.distortion[0]) == (900, 901, (540, 960), 0.1)
+    true = (np.arange(256) / 255) ** 1.8
+    assert np.abs(np.array(found.tone) - true).max() < 0.01  # the light of level 255 is 1
+    summary = told(tmp_path / "out")
+    assert summary["exposures_s"] == pytest.approx([1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3])
+    assert "measured tone curve" in (tmp_path / "out" / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["in", *FILE, "--exposures", "1/250", "1/125"],
+            "expected one for each photograph, in the order of their names, got 2",
+        ),
+        (["in", "--exposures", *EXPOSURES], "argument --camera: camera: the protocol tone needs the camera's file"),
+        (
+            ["in", *FILE, "--exposures", *EXPOSURES[::-1]],
+            "photograph 5 was exposed longer than photograph 6 and is darker",
+        ),
+        (["in", *FILE], "argument --exposures: exposures: the protocol tone needs the exposure time"),
+        (["in", *FILE, "--exposures", "slow"], "argument --exposures: exposures.0: expected a number, got 'slow'"),
+        (["nowhere", *FILE, "--exposures", "1/250"], "expected a folder of photographs, got nowhere"),
+    ],
+)
+def test_mistakes_of_tone_are_said(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    photographs(tmp_path / "in")
+    (tmp_path / "c.yaml").write_text("fx: 900\nfy: 900\ncx: 480\ncy: 270\n")
+    assert main(["measure", "tone", *words]) == 2
+    assert message in capsys.readouterr().err
