@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from holotorch import __version__
+from holotorch.experiments.measure.commands import add_measure
 from holotorch.experiments.runs.signals import interruptible
 from holotorch.experiments.streaming.commands import add_stream
 from holotorch.experiments.study_commands import add_study
@@ -202,6 +203,7 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--format", default="png", help="png (default), bmp, or exr for phases instead of levels")
 
     add_tracking(commands)
+    add_measure(commands)
     add_stream(commands)
     add_study(commands)
     command("doctor", _doctor, "check the installation and print what repairs it")

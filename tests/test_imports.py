@@ -23,6 +23,7 @@ ROOMS = {
         {"camera"},
     ],
     "experiments": [
+        {"measure"},
         {"panel", "pec_study", "tracking_benchmark", "streaming"},
         {"joint"},
         {"eye"},

@@ -30,6 +30,7 @@ RUNS: dict[str, list[str]] = {
         *("eye.parallax=2", "report.baselines=[afterwards, slabs]"),
     ],
     "study": ["pec/studies/lowpass.yaml", "images=[camera]", "size=24", "max_steps=4", "sweep=[0.1,0.2]"],
+    "measure": ["tracking/measure.yaml", "grid.rows=3", "grid.columns=2"],
     "layout": ["perception/layout.yaml", ITEMS],
     "analysis": [
         *("perception/analysis.yaml", f"targets={TIMES}", "resamples=100", "repeated_measures=false", "power=null")

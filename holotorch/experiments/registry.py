@@ -17,6 +17,7 @@ KINDS = {
     "eye": "holotorch.experiments.eye",
     "joint": "holotorch.experiments.joint",
     "track": "holotorch.experiments.tracking",
+    "measure": "holotorch.experiments.measure",
     "perception_layout": "holotorch.experiments.perception.layout",
     "perception_analysis": "holotorch.experiments.perception.analysis",
 }

@@ -13,6 +13,7 @@ from holotorch.cli import main
 from holotorch.experiments.eye import experiment as eye
 from holotorch.experiments.eye import run as eye_run
 from holotorch.experiments.joint import run as joint_run
+from holotorch.experiments.measure import run as measure_run
 from holotorch.experiments.pec.progress import Log
 from holotorch.experiments.pec_study import bench as pec_bench
 from holotorch.experiments.perception.analysis import run as perception_analysis_run
@@ -43,6 +44,10 @@ KINDS = {
     "study": (
         ("max_steps=5", "max_steps was 4 and is 5"),
         (pec_bench.Bench, "scores", 6, 4),
+    ),
+    "measure": (
+        ("rest.frames=9", "rest.frames was 10 and is 9"),
+        (measure_run.Track, "take", 3, 252),
     ),
     "layout": (
         ("extrapolate=true", "extrapolate was false and is true"),
@@ -98,7 +103,7 @@ def test_a_signal_leaves_a_folder_that_two_commands_complete(kind, whole, tmp_pa
         pressed(patch, kind, signal.SIGTERM)
         assert main(command(kind, folder)) == 130
     assert f"holotorch resume {folder}" in capsys.readouterr().err and not (folder / "summary.json").exists()
-    if kind not in ("layout", "analysis"):
+    if kind not in ("measure", "layout", "analysis"):
         assert (folder / "checkpoint.pt").exists() and (folder / "interrupted.json").exists()
     (folder / ".checkpoint.pt.1.partial").write_bytes(b"of a killed process")
     shutil.copytree(folder, tmp_path / "b")

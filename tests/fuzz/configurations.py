@@ -49,6 +49,11 @@ KINDS: dict[str, list[tuple[str, dict[str, Any]]]] = {
         ("joint/bonsai.yaml", {"volume": {"phantom": "shells", "samples": 16}}),
         ("joint/tooth.yaml", {"volume": {"phantom": "shells", "samples": 16}}),
     ],
+    "measure": [
+        ("tracking/measure.yaml", {"grid": {"rows": 3, "columns": 2}}),
+        ("tracking/measure.yaml", {"protocol": "still"}),
+        ("tracking/measure.yaml", {"protocol": "grid3d", "grid": {"rows": 2, "columns": 3, "reference": [2, 1]}}),
+    ],
     "layout": [("perception/layout.yaml", {})],
     "analysis": [("perception/analysis.yaml", {})],
 }

@@ -188,6 +188,12 @@ def save_camera(path: Path, camera: Camera | Calibration, size: tuple[int, int] 
     _write(path, "A camera: pixels; distortion k1, k2, p1, p2, k3; size in rows and columns.", settings)
 
 
+def save_tone(path: Path, settings: CameraSettings, tone: torch.Tensor) -> None:
+    """Write a camera with another tone curve, float64 [256], and all else, also the quality of its calibration."""
+    changed = settings.model_copy(update={"tone": tuple(tone.tolist())})
+    _write(path, "A camera: pixels; distortion k1, k2, p1, p2, k3; size in rows and columns; measured tone.", changed)
+
+
 def save_catheter(path: Path, catheter: Catheter) -> None:
     """Write a catheter, for instance one whose edges were measured."""
     settings = CatheterSettings(**{name: getattr(catheter, name) for name in CatheterSettings.model_fields})

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from holotorch.core import checks
 from holotorch.core.quantities import BOARD_SQUARE
+from holotorch.tracking.camera.camera import Camera
 
 _DICTIONARIES = {name: getattr(cv2.aruco, name) for name in dir(cv2.aruco) if name.startswith("DICT_")}
 _FEWEST = 8  # least number of corners of a view: 4 determine a homography, the others check it
@@ -115,6 +116,21 @@ def find_board(image: Tensor, board: Chessboard | Charuco, name: str = "") -> Vi
             "margin, in the picture?"
         )
     return View(*map(torch.from_numpy, corners), name=name)
+
+
+def board_rotation(view: View, camera: Camera) -> Tensor:
+    """Rotation float64 [3, 3] from the axes of a board to those of the camera that sees it, from all corners.
+
+    Of the two poses in which a flat board looks nearly alike (Collins and Bartoli 2014), the one with the smaller
+    error is refined. ValueError if no pose in front of the camera fits.
+    """
+    points, pixels = view.points.numpy(), view.pixels.numpy()
+    matrix, distortion = camera.matrix.detach().cpu().numpy(), camera.distortion.detach().cpu().numpy()
+    count, turns, shifts, _ = cv2.solvePnPGeneric(points, pixels, matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
+    if not count or shifts[0].ravel()[2] <= 0:
+        raise ValueError("no pose of the board in front of the camera fits its corners")
+    turn, _ = cv2.solvePnPRefineLM(points, pixels, matrix, distortion, turns[0], shifts[0])
+    return torch.from_numpy(cv2.Rodrigues(turn)[0])
 
 
 def describe_board(board: Chessboard | Charuco) -> str:

@@ -129,6 +129,9 @@ class CatheterTracker(nn.Module):
     Attributes:
         times: Seconds that each stage ("colour", "axis", "edges", "pose", and "refinement" where there is one) of the
             last call took, summed over frames.
+        edges_px: For each frame of the last call the pixels (x, y) of the centres of the edges' rings, float64 [N, 2],
+            NaN for an edge that was not measured; None for a frame in which none was. They are there also where the
+            edges contradict the catheter, so that :func:`fit_band_edges` can correct it.
 
     Raises:
         TypeError, ValueError: ``most_sd`` is not positive, or the colours are grey, too similar, or the same from both
@@ -157,6 +160,7 @@ class CatheterTracker(nn.Module):
         self._positions: list[float] = catheter.positions.tolist()
         self._chi_square_limits = _chi_square_limits(len(catheter.edges))
         self.times: dict[str, float] = {}
+        self.edges_px: list[Tensor | None] = []
 
     def forward(self, frames: Tensor, previous: Sequence[Pose] | Pose | None = None) -> list[Pose]:
         """Poses [B] of the catheter in frames [B, 3, H, W], uint8 or floating from 0 to 1.
@@ -172,7 +176,11 @@ class CatheterTracker(nn.Module):
             raise ValueError(f"{len(frames)} frames take {len(frames)} previous poses, got {len(before)}")
         frames = self.channels.to_rgb(frames)
         self.times = dict.fromkeys(("colour", "axis", "edges", "pose"), 0.0)
-        poses = [self._track(frame, pose) for frame, pose in zip(frames, before, strict=True)]
+        self.edges_px = []
+        poses = []
+        for frame, pose in zip(frames, before, strict=True):
+            self.edges_px.append(None)  # the measurement replaces it
+            poses.append(self._track(frame, pose))
         return poses if self.refinement is None else self._refined(self.refinement, frames, poses)
 
     def _refined(self, refinement: PhotometricFit, frames: Tensor, poses: list[Pose]) -> list[Pose]:
@@ -402,6 +410,8 @@ class CatheterTracker(nn.Module):
                 raise Refusal(Status.INCONSISTENT, text)
         with self._timed("pose"):
             line_pose = self._solved(axis, edges)
+            pixels = lens.distort(axis.line.plane(edges.t))
+            self.edges_px[-1] = torch.from_numpy(np.stack([pixels.real, pixels.imag], -1))
             pose = self._checked(line_pose, width, edges, cold=before is None)
             if before is None and shows_reversed(sampler, lens, line_pose, self.catheter):
                 text = f"the tube goes on beyond its end on one side only: {_EXCHANGED}"

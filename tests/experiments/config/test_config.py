@@ -11,7 +11,7 @@ from holotorch.experiments.eye.config import ObserverSettings
 from holotorch.experiments.registry import load_config
 from holotorch.experiments.volume.config import VolumeSettings
 
-KINDS = "pec, pec_study, volume, eye, joint, track, perception_layout, perception_analysis"
+KINDS = "pec, pec_study, volume, eye, joint, track, measure, perception_layout, perception_analysis"
 GOOD = """\
 experiment: pec
 target: {image: coffee}
