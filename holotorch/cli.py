@@ -71,7 +71,6 @@ def _resume(options: argparse.Namespace) -> int:
 
 def _demo(options: argparse.Namespace) -> int:
     from holotorch.experiments.demo import demo
-
     from holotorch.experiments.streaming.screenshot import screenshot
 
     return _finish(*demo(options.out, screenshot))

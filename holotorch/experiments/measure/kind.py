@@ -37,6 +37,10 @@ class MeasureKind(ExperimentKind[MeasureSettings, "Measurement"]):
         if (protocol == "tone") != bool(settings.exposures):
             text = "the protocol tone needs the exposure time of each photograph; no other protocol takes them"
             mistakes.append((("exposures",), text))
+        for name, owners in (("grid", ("grid2d", "grid3d")), ("delay", ("prediction",)), ("resting", ("edges",))):
+            value, usual = getattr(settings, name), type(settings).model_fields[name].default
+            if protocol not in owners and value != usual:
+                mistakes.append(((name,), f"it belongs to the protocol {' or '.join(owners)}, got {protocol}"))
         if protocol == "tone" and settings.camera is None:
             mistakes.append((("camera",), "the protocol tone needs the camera's file, whose tone it replaces"))
         return mistakes

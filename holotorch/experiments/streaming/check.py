@@ -1,14 +1,19 @@
 """``holotorch stream --check``: a test of streaming on this computer, which also prints its address for senders."""
 
 import asyncio
+import gc
 import importlib.util
 import json
 import math
 import random
+import struct
+import tracemalloc
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Any
 
 import torch
+from aiohttp import WSMsgType
 
 from holotorch.experiments.streaming.stream import own_address
 from holotorch.tracking import THESIS
@@ -19,6 +24,8 @@ from holotorch.tracking.streaming.stream import PORT, PoseReceiver, PoseSender, 
 _LOOPBACK = "127.0.0.1"
 _EVERY = 50  # every 50th packet carries a refusal instead of a pose
 _SOON = 5e-3  # seconds: largest accepted median delay to a page; a quarter of that of the slowest per cent
+_PICTURE = 0.1  # seconds: largest accepted median delay of a picture to a page
+_GROWTH = 100_000  # bytes by which the server may grow
 _FAST = 1e-3  # seconds: largest accepted median transit on the loopback
 
 
@@ -52,6 +59,8 @@ async def _rows(port: int, packets: int) -> list[tuple[bool, str]]:
         await asyncio.sleep(0.05)
     rows += [*_direct("receiver 1", one, packets), *_direct("receiver 2", two, packets), _lossy(behind_relay, relay)]
     rows.append(await _page(min(300, packets // 5)))
+    rows.append(await _panel(min(90, packets // 10)))
+    rows.append(await _memory(packets))
     slicer = "not installed (optional); to add: pip install 'holotorch[slicer]'"
     if importlib.util.find_spec("pyigtl") is not None:
         slicer = "installed; holotorch stream ... --igtl 18944"
@@ -109,6 +118,64 @@ async def _page(count: int) -> tuple[bool, str]:
     )
     text = f"{len(delays)} of {count} poses, added latency median {median * 1e3:.2f} ms, p99 {p99 * 1e3:.2f} ms{advice}"
     return good, f"page: {text}"
+
+
+async def _panel(count: int) -> tuple[bool, str]:
+    """Whether 1080p pictures at 30 per second reach a page on this computer in time, and the added latency in words.
+
+    It holds the encoding and the transfer; what a browser takes to decode and draw is shown on its page.
+    """
+    from aiohttp import ClientSession
+
+    from holotorch.experiments.streaming.page import PageServer
+    from holotorch.experiments.streaming.pictures import PATTERN, PanelSource
+
+    delays: list[float] = []
+    async with (
+        PageServer(THESIS, port=0, panel=PanelSource(PATTERN)) as server,
+        ClientSession() as session,
+        session.ws_connect(server.address + "poses") as socket,
+    ):
+        begin = now()
+        while len(delays) < count and now() < begin + count / 30 * 4 + 2:
+            with suppress(TimeoutError):
+                message = await asyncio.wait_for(socket.receive(), 1.0)
+                if message.type is WSMsgType.BINARY:
+                    delays.append(now() - struct.unpack_from("<d", message.data, 1)[0])
+        rate = len(delays) / (now() - begin)
+    median = float(torch.tensor(delays or [math.inf]).median())
+    good = median < _PICTURE
+    advice = "" if good else f"; above {_PICTURE * 1e3:g} ms: close what keeps this computer busy, and try again"
+    return good, f"panel: 1080p at {rate:.0f} of 30 Hz, added latency median {median * 1e3:.0f} ms{advice}"
+
+
+async def _memory(count: int) -> tuple[bool, str]:
+    """Whether the memory of the server stays the same while it sends ``count`` poses as fast as a page takes them."""
+    from aiohttp import ClientSession
+
+    from holotorch.experiments.streaming.page import PageServer
+
+    refusal, received = Pose.refused(Status.NO_CATHETER, "a refusal of the self-test"), 0
+    async with (
+        PageServer(THESIS, port=0) as server,
+        ClientSession() as session,
+        session.ws_connect(server.address + "poses") as socket,
+    ):
+        await socket.receive()
+        tracemalloc.start()
+        before = 0
+        for i in range(count):
+            server.send(refusal, now())
+            await socket.receive()
+            received += 1
+            if i == count // 10:  # everything has been used once
+                gc.collect()
+                before = tracemalloc.get_traced_memory()[0]
+        gc.collect()
+        grown = tracemalloc.get_traced_memory()[0] - before
+        tracemalloc.stop()
+    good = received == count and grown < _GROWTH
+    return good, f"memory: {grown / 1e3:+.0f} kB while {count - count // 10} messages went to a page"
 
 
 def _direct(name: str, receiver: PoseReceiver, packets: int) -> Iterator[tuple[bool, str]]:

@@ -4,8 +4,9 @@ import asyncio
 import itertools
 import os
 import shutil
+import signal
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +73,9 @@ async def browser(folder: Path, size: tuple[int, int] = (800, 600)) -> AsyncIter
     root = ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
     flags = (*_FLAGS, *root, f"--window-size={size[0]},{size[1]}", f"--user-data-dir={profile}")
     nothing = asyncio.subprocess.DEVNULL
-    process = await asyncio.create_subprocess_exec(CHROMIUM, *flags, "about:blank", stdout=nothing, stderr=nothing)
+    process = await asyncio.create_subprocess_exec(
+        CHROMIUM, *flags, "about:blank", stdout=nothing, stderr=nothing, start_new_session=True
+    )
     try:
         port = await _port(profile / "DevToolsActivePort")
         async with aiohttp.ClientSession() as session:
@@ -92,7 +95,8 @@ async def browser(folder: Path, size: tuple[int, int] = (800, 600)) -> AsyncIter
 
             yield open_tab
     finally:
-        process.kill()
+        with suppress(ProcessLookupError):  # its helpers, too, which would go on writing into the profile
+            os.killpg(process.pid, signal.SIGKILL) if hasattr(os, "killpg") else process.kill()
         await process.wait()
 
 

@@ -33,6 +33,8 @@ def add_stream(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     stream.add_argument("--panel", metavar="SOURCE", help=about)
     stream.add_argument("--tls", nargs=2, type=Path, metavar=("CERT", "KEY"), help="for a page on another computer")
     stream.add_argument("--check", action="store_true", help="send to this machine itself, also with losses, and count")
+    about = "how many packets --check sends (default: 1000); with many its line memory tells more"
+    stream.add_argument("--packets", type=_count, metavar="N", help=about)
     stream.add_argument("--port", type=_port, default=18950, help="where --view and --check listen (default: 18950)")
     stream.set_defaults(action=_stream)
     for name, words in FILES.items():
@@ -45,6 +47,12 @@ def _port(text: str) -> int:
     return int(text)
 
 
+def _count(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and 100 <= int(text) <= 10_000_000):
+        raise argparse.ArgumentTypeError(f"expected a number from 100 to 10 million, got {text!r}")
+    return int(text)
+
+
 def _stream(options: argparse.Namespace) -> int:
     options.view = options.view or any(getattr(options, name) is not None for name in _OF_PAGE)
     if options.replay:
@@ -54,7 +62,11 @@ def _stream(options: argparse.Namespace) -> int:
     if options.check:
         from holotorch.experiments.streaming.check import check
 
-        return OK if check(options.port) else FAILED
+        return OK if check(options.port, packets=options.packets or 1000) else FAILED
+    if options.packets is not None:
+        from holotorch.experiments.config.errors import ConfigError
+
+        raise ConfigError(["--packets belongs to --check"])
     from holotorch.experiments.streaming import stream
 
     if options.view and not options.sources:

@@ -50,7 +50,7 @@ def _frame(run: Path, number: int) -> Tensor | None:
 async def _taken(run: Path, pose: Pose, frame: Tensor | None) -> bytes:
     page = open_page(str(run / "poses.csv"))
     page.port = 0  # any that is free
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         async with page as server, browser(Path(folder), _SIZE) as open_tab:
             tab = await open_tab(server.address)
             await tab.until("view.state.setup !== null && view.state.offset !== null")

@@ -37,6 +37,9 @@ def add_tracking(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     calibrate.add_argument("--out", type=Path, help="file (default: camera.yaml or headset.yaml)")
     calibrate.set_defaults(action=_calibrate)
 
+    track.add_argument(
+        "--headset", type=Path, metavar="FILE", help="write poses in its frame too; see calibrate headset"
+    )
     for name, words in FILES.items():
         track.add_argument(name, type=Path, help=words)
 
@@ -49,7 +52,7 @@ def _track(options: argparse.Namespace) -> int:
 
     given = {"source": options.source, "method": options.method, "record": options.record, "still": options.still}
     given |= {"video": not options.no_video, "rate_hz": options.rate}
-    given |= {name: str(path) for name in ("camera", "catheter") if (path := getattr(options, name))}
+    given |= {name: str(path) for name in ("camera", "catheter", "headset") if (path := getattr(options, name))}
     arguments: dict[Key, str] = {("method",): "argument --method", ("rate_hz",): "argument --rate"}
     settings = validated(Source(Path("track"), {"experiment": "track", **given}, arguments), TrackSettings)
     folder, complete = execute(settings, options.out, "track")

@@ -19,8 +19,9 @@ class TrackSettings(Settings):
 
     ``source``: a path, the index of a camera, or ``synthetic``. A synthetic run first renders a recording of
     ``frames`` frames with true poses. ``camera``, ``catheter``: YAML files; by default, those beside the recording,
-    or a synthetic camera and the dissertation's catheter if ``source`` is ``synthetic``. ``record``:
-    save every frame without loss for a later run. ``video``: write a video with the pose drawn on every frame.
+    or a synthetic camera and the dissertation's catheter if ``source`` is ``synthetic``. ``headset``: YAML file of the
+    camera's place on a headset; poses are also written in its frame. ``record``: save every frame without loss for a
+    later run. ``video``: write a video with the pose drawn on every frame.
     ``still``: measure the tip's stability; the catheter must rest. ``rate_hz``: frames per second without time stamps.
     """
 
@@ -28,6 +29,7 @@ class TrackSettings(Settings):
     source: Annotated[str, BeforeValidator(_camera_number)]
     camera: str | None = None
     catheter: str | None = None
+    headset: str | None = None
     frames: Count = 45
     method: Literal["ours", "thesis"] = "ours"
     record: bool = False

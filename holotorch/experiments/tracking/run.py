@@ -7,7 +7,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import IO, Any, TypeVar
@@ -23,6 +23,7 @@ from holotorch.experiments.runs.saving import Results
 from holotorch.experiments.runs.signals import deferred
 from holotorch.experiments.timing import timed
 from holotorch.experiments.tracking.config import SYNTHETIC, TrackSettings
+from holotorch.experiments.tracking.devices import build_headset, headset_covariance, load_headset
 from holotorch.experiments.tracking.report import COLUMNS, Log, Tracked, row, save_figure, summarise, verdict
 from holotorch.experiments.tracking.source import Tracker, TrackingInputs, open_inputs
 from holotorch.experiments.tracking.synthetic import compared, errors, frame_size, read_truth, write_synthetic
@@ -30,6 +31,7 @@ from holotorch.io.files import append, replacing, write_bytes
 from holotorch.io.recording import Recorder, free_bytes, recording_bytes
 from holotorch.io.video import Frame, replacing_video
 from holotorch.tracking import Pose, Status
+from holotorch.tracking.pose.alignment import in_frame
 from holotorch.tracking.pose.overlay import overlay
 from holotorch.tracking.streaming.packet import now
 
@@ -95,6 +97,7 @@ class TrackingExperiment:
     settings: TrackSettings
     inputs: TrackingInputs | None  # None for a synthetic source, which the run renders first
     truth: dict[str, list[float]]  # true tips in metres by frame number; empty if they are unknown
+    to_headset: Callable[[Pose], Pose] | None = None  # from the camera's frame to that of a headset
 
 
 def build_tracking(settings: TrackSettings) -> TrackingExperiment:
@@ -103,10 +106,14 @@ def build_tracking(settings: TrackSettings) -> TrackingExperiment:
     Raises:
         ConfigError: A source or file cannot be used, or the truth.csv of a recording cannot be read.
     """
+    to_headset = None
+    if settings.headset is not None:
+        headset = load_headset(settings.headset)
+        to_headset = partial(in_frame, matrix=build_headset(headset), covariance=headset_covariance(headset))
     if settings.source == SYNTHETIC:
-        return TrackingExperiment(settings, None, {})
+        return TrackingExperiment(settings, None, {}, to_headset)
     truth = read_truth(Path(settings.source))
-    return TrackingExperiment(settings, _open(settings, settings.source), truth)
+    return TrackingExperiment(settings, _open(settings, settings.source), truth, to_headset)
 
 
 def _open(settings: TrackSettings, source: str | Path) -> TrackingInputs:
@@ -144,9 +151,10 @@ def plan_tracking(experiment: TrackingExperiment) -> RunPlan:
 def run_tracking(experiment: TrackingExperiment, folder: RunFolder) -> bool:
     """Track a source and fill the run folder. Returns whether the run is complete.
 
-    The run writes ``poses.csv`` (a line per frame, ``COLUMNS``), ``overlay.mp4``, copies of the two YAML files,
-    ``recording`` if requested, and finally ``summary.json`` and the page. Ctrl-C, SIGTERM and closing the terminal end
-    the run and save the results so far; for a camera, this is the normal end. A killed process (``kill -9``) leaves
+    The run writes ``poses.csv`` (a line per frame, ``COLUMNS``), with a headset also ``headset_poses.csv``, the same in
+    its frame, ``overlay.mp4``, copies of the two YAML files, ``recording`` if requested, and finally ``summary.json``
+    and the page. Ctrl-C, SIGTERM and closing the terminal end the run and save the results so far; for a camera, this
+    is the normal end. A killed process (``kill -9``) leaves
     files with hidden names: ``.poses.csv.PID.partial``, complete except for its last line, and an overlay that players
     may refuse. Its recording can be tracked.
 
@@ -160,7 +168,7 @@ def run_tracking(experiment: TrackingExperiment, folder: RunFolder) -> bool:
     camera, catheter = _files(settings)
     recording = write_synthetic(folder.path / SYNTHETIC, settings.frames, camera=camera, catheter=catheter)
     inputs = _open(settings, recording)
-    return _tracked(TrackingExperiment(settings, inputs, read_truth(recording)), inputs, folder)
+    return _tracked(replace(experiment, inputs=inputs, truth=read_truth(recording)), inputs, folder)
 
 
 def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFolder) -> bool:
@@ -172,7 +180,7 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
         raise ConfigError([f"the recording takes {size / 1e9:.2f} GB and {free / 1e9:.2f} GB are free; choose --out"])
     opened: list[AbstractContextManager[Any]] = [frames]
     try:
-        _track_all(inputs, settings, run, log, opened)
+        _track_all(inputs, experiment, run, log, opened)
     except KeyboardInterrupt:
         pass
     except Exception as error:  # it is raised again after the poses before it are saved
@@ -209,10 +217,14 @@ def _tracked(experiment: TrackingExperiment, inputs: TrackingInputs, run: RunFol
 
 
 def _track_all(
-    inputs: TrackingInputs, settings: TrackSettings, run: RunFolder, log: Log, opened: list[AbstractContextManager[Any]]
+    inputs: TrackingInputs,
+    experiment: TrackingExperiment,
+    run: RunFolder,
+    log: Log,
+    opened: list[AbstractContextManager[Any]],
 ) -> None:
     """Track all frames and write the results until a signal arrives; the files it opens are appended to ``opened``."""
-    folder, frames = run.path, inputs.frames
+    folder, frames, settings = run.path, inputs.frames, experiment.settings
 
     def entered(context: AbstractContextManager[Entered]) -> Entered:
         value = context.__enter__()
@@ -223,6 +235,9 @@ def _track_all(
         write_bytes(folder / name, path.read_bytes())
     table = entered(replacing(folder / "poses.csv", buffering=0))
     _append(table, COLUMNS)
+    in_headset = entered(replacing(folder / "headset_poses.csv", buffering=0)) if experiment.to_headset else None
+    if in_headset:
+        _append(in_headset, COLUMNS)
     movie, source = None, iter(frames)
     if settings.video:
         movie = entered(replacing_video(folder / "overlay.mp4", frames.shape, frames.rate))
@@ -233,6 +248,8 @@ def _track_all(
     for item in follow(source, inputs.tracker):
         with deferred(run.pressed):
             _append(table, row(item))
+            if in_headset and experiment.to_headset:
+                _append(in_headset, row(item._replace(pose=experiment.to_headset(item.pose))))
             drawn = None
             if movie or log.wants(item):
                 black = torch.zeros(3, *frames.shape, dtype=torch.uint8)

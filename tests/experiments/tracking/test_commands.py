@@ -6,7 +6,6 @@ import shutil
 import socket
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -64,6 +63,27 @@ def test_track_a_recording_with_its_own_files(recording, capsys):
     assert json.loads(Path("here/summary.json").read_text())["status"] == "complete"
 
 
+def test_track_also_writes_poses_in_the_frame_of_a_headset(recording, capsys):
+    Path("headset.yaml").write_text(
+        "headset_from_camera: [[0, -1, 0, 0.1], [1, 0, 0, 0], [0, 0, 1, -0.05], [0, 0, 0, 1]]\n"
+        "covariance: [[0,0,0,0,0,0],[0,0,0,0,0,0],[0,0,0,0,0,0],[0,0,0,4.0e-6,0,0],[0,0,0,0,0,0],[0,0,0,0,0,0]]\n"
+    )
+    assert main(["track", str(recording), "--out", "here", "--no-video", "--headset", "headset.yaml"]) == 0
+    tables = []
+    for name in ("poses", "headset_poses"):
+        with open(f"here/{name}.csv", newline="") as stream:
+            tables.append(list(csv.DictReader(stream)))
+    for own, moved in zip(*tables, strict=True):
+        assert float(moved["tip_x_m"]) == pytest.approx(0.1 - float(own["tip_y_m"]), abs=1e-12)
+        assert float(moved["tip_y_m"]) == pytest.approx(float(own["tip_x_m"]), abs=1e-12)
+        assert float(moved["tip_z_m"]) == pytest.approx(float(own["tip_z_m"]) - 0.05, abs=1e-12)
+        assert float(moved["direction_x"]) == pytest.approx(-float(own["direction_y"]), abs=1e-12)
+        assert float(moved["cov_xx_m2"]) == pytest.approx(float(own["cov_yy_m2"]) + 4e-6, rel=1e-9)
+        assert (moved["frame"], moved["status"]) == (own["frame"], own["status"])
+    capsys.readouterr()
+    assert "none.yaml" in said(capsys, "track", str(recording), "--headset", "none.yaml")
+
+
 def test_track_the_synthetic_source_renders_it_first(monkeypatch, capsys):
     monkeypatch.setattr(run, "write_synthetic", lambda out, _, **given: write_synthetic(out, 1, (540, 960), **given))
     assert main(["track", "synthetic", "--no-video"]) == 0
@@ -98,10 +118,18 @@ def test_track_hands_its_arguments_on(monkeypatch):
 
     monkeypatch.setattr(execute, "execute", stand_in)
     words = ["--out", "o", "--method", "thesis", "--record", "--still", "--rate", "25"]
+    words += ["--headset", "h.yaml"]
     assert main(["track", "0", "--camera", "c.yaml", "--catheter", "t.yaml", *words]) == 0
     assert taken[1:] == [Path("o"), "track"]
     flags = {"method": "thesis", "record": True, "video": True, "still": True, "rate_hz": 25.0}
-    values = {"experiment": "track", "source": "0", "camera": "c.yaml", "catheter": "t.yaml", "frames": 45}
+    values = {
+        "experiment": "track",
+        "source": "0",
+        "camera": "c.yaml",
+        "catheter": "t.yaml",
+        "frames": 45,
+        "headset": "h.yaml",
+    }
     assert taken[0] == values | flags
 
 
@@ -207,10 +235,9 @@ def free_port() -> int:
         return one.getsockname()[1]
 
 
-def test_stream_check_on_a_free_port_and_on_one_in_use(monkeypatch, capsys):
+def test_stream_check_on_a_free_port_and_on_one_in_use(capsys):
     """Where others use the computer a packet may be slow; the status says so, and the counts are right all the same."""
-    monkeypatch.setattr(stream_check, "check", partial(stream_check.check, packets=150))
-    status = main(["stream", "--check", "--port", str(free_port())])
+    status = main(["stream", "--check", "--packets", "150", "--port", str(free_port())])
     lines = capsys.readouterr().out.splitlines()
     assert status == (1 if any(line.startswith("FAIL") for line in lines) else 0)
     assert lines[0].startswith("OK    port")
@@ -218,14 +245,16 @@ def test_stream_check_on_a_free_port_and_on_one_in_use(monkeypatch, capsys):
     assert sum(line.startswith("OK    lossy way") for line in lines) == 1
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.bind(("", 0))
-        assert main(["stream", "--check", "--port", str(one.getsockname()[1])]) == 1
+        assert main(["stream", "--check", "--packets", "100", "--port", str(one.getsockname()[1])]) == 1
     assert capsys.readouterr().out.startswith("FAIL  port")
 
 
 def test_stream_check_says_by_its_status_what_failed(monkeypatch, capsys):
     for sound, status in ((True, 0), (False, 1)):
-        monkeypatch.setattr(stream_check, "check", lambda port, sound=sound: sound and port == 4711 or False)
+        monkeypatch.setattr(stream_check, "check", lambda port, packets, sound=sound: sound and port == 4711)
         assert main(["stream", "--check", "--port", "4711"]) == status
+    assert "--packets belongs to --check" in said(capsys, "stream", "poses.csv", "--packets", "500")
+    assert "from 100 to 10 million, got '7'" in wrong(capsys, "stream", "--check", "--packets", "7")
 
 
 def test_stream_with_nobody_and_nothing_to_send(capsys):

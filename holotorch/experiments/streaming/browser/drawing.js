@@ -127,13 +127,16 @@ export function twin(toScreen, colour) {  // the virtual catheter onto which the
 }
 
 export const textures = {};  // by name: { texture, width, height }
-export function upload(name, source) {
+export function upload(name, source) {  // in a headset, where pictures are small, with reduced copies of them
   const { width, height } = source;
   const texture = (textures[name] || { texture: gl.createTexture() }).texture;
   textures[name] = { texture, width, height };
   gl.bindTexture(gl.TEXTURE_2D, texture);
   gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, source);
-  for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
+  const reduced = state.headset !== "";
+  if (reduced) gl.generateMipmap(gl.TEXTURE_2D);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, reduced ? gl.LINEAR_MIPMAP_LINEAR : gl.LINEAR);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
   for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
 }
 export function picture(name, toScreen, corner, right, down, alpha = 1, behind = false) {
