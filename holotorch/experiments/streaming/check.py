@@ -7,14 +7,17 @@ import json
 import math
 import random
 import struct
+import tempfile
 import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import torch
 from aiohttp import WSMsgType
 
+from holotorch.experiments.streaming.chromium import CHROMIUM, BrowserError, browser
 from holotorch.experiments.streaming.stream import own_address
 from holotorch.tracking import THESIS
 from holotorch.tracking.pose.status import Pose, Status
@@ -61,6 +64,8 @@ async def _rows(port: int, packets: int) -> list[tuple[bool, str]]:
     rows.append(await _page(min(300, packets // 5)))
     rows.append(await _panel(min(90, packets // 10)))
     rows.append(await _memory(packets))
+    if CHROMIUM is not None:
+        rows.append(await _drawn(min(90, packets // 10)))
     slicer = "not installed (optional); to add: pip install 'holotorch[slicer]'"
     if importlib.util.find_spec("pyigtl") is not None:
         slicer = "installed; holotorch stream ... --igtl 18944"
@@ -147,6 +152,31 @@ async def _panel(count: int) -> tuple[bool, str]:
     good = median < _PICTURE
     advice = "" if good else f"; above {_PICTURE * 1e3:g} ms: close what keeps this computer busy, and try again"
     return good, f"panel: 1080p at {rate:.0f} of 30 Hz, added latency median {median * 1e3:.0f} ms{advice}"
+
+
+async def _drawn(count: int) -> tuple[bool, str]:
+    """Whether a Chromium of this computer draws the same pictures in time, and capture to frame in words."""
+    from holotorch.experiments.streaming.page import PageServer
+    from holotorch.experiments.streaming.pictures import PATTERN, PanelSource
+
+    newest, delays = "view.pictures.pictures.panel", []
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        try:
+            async with (
+                PageServer(THESIS, port=0, panel=PanelSource(PATTERN)) as server,
+                browser(Path(folder)) as open_tab,
+            ):
+                tab = await open_tab(server.address)
+                await tab.until("view.state.offset !== null")
+                await tab.value("document.getElementById('panel').click()")
+                await tab.until(f"{newest} && {newest}.count > 10")
+                for _ in range(count):
+                    delays.append(await tab.value(f"{newest}.latency"))
+                    await asyncio.sleep(1 / 30)
+        except (BrowserError, OSError) as error:
+            return False, f"panel: Chromium failed: {error}"
+    median = float(torch.tensor(delays or [math.inf]).median())
+    return median < _PICTURE, f"panel: drawn by Chromium without a graphics card {median * 1e3:.0f} ms after capture"
 
 
 async def _memory(count: int) -> tuple[bool, str]:
