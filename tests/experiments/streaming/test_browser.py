@@ -1,7 +1,9 @@
 """The page in a real browser: where the tip appears, refusals, and connections that break. Skipped without Chromium."""
 
 import asyncio
+import csv
 import math
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,10 +16,14 @@ from scipy.ndimage import map_coordinates
 from holotorch.experiments.streaming import page as module
 from holotorch.experiments.streaming.aligning import Aligner
 from holotorch.experiments.streaming.chromium import CHROMIUM, browser
+from holotorch.experiments.streaming.opening import open_page
 from holotorch.experiments.streaming.page import PageServer
 from holotorch.experiments.streaming.pictures import PanelSource
 from holotorch.experiments.streaming.registered import register
-from holotorch.experiments.tracking.devices import build_headset, load_headset
+from holotorch.experiments.streaming.stream import stream
+from holotorch.experiments.tracking.devices import build_headset, load_headset, save_camera
+from holotorch.experiments.tracking.report import COLUMNS, Tracked, row
+from holotorch.io.video import Frame
 from holotorch.scene.volume import Volume
 from holotorch.tracking import THESIS, Camera
 from holotorch.tracking.pose.status import Pose, Status
@@ -91,6 +97,54 @@ def test_the_tip_appears_where_the_camera_sees_it(tmp_path):
             assert await tab.value("view.state.lost") == 0 == await tab.value("view.state.malformed")
 
     run(test)
+
+
+def test_a_replayed_run_is_drawn_where_its_poses_are(tmp_path):
+    """From poses.csv through `stream --view --replay` to the screen: 200 frames, each as it was drawn."""
+    save_camera(tmp_path / "camera.yaml", CAMERA, CAMERA.size)
+    given = [pose(i) for i in range(200)]
+    with open(tmp_path / "poses.csv", "w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(COLUMNS)
+        for i, each in enumerate(given):
+            frame = Frame(i / 20, torch.zeros(3, 1, 1, dtype=torch.uint8))
+            table.writerow(row(Tracked(i, frame, each, 0.0, {})))
+    server = open_page(str(tmp_path / "poses.csv"))
+    server.port = 0
+    seen: dict[int, list[float]] = {}
+    record = """window.drawn = {}; const note = () => { const at = window.view && view.tipOnScreen();
+      if (at) drawn[view.state.sequence] = at; requestAnimationFrame(note); }; requestAnimationFrame(note);"""
+
+    async def watch():
+        async with browser(tmp_path) as open_tab:
+            while server.port == 0:
+                await asyncio.sleep(0.02)
+            tab = await open_tab(server.address, record)
+            await tab.until("Object.keys(drawn).length >= 200", 60)
+            seen.update({int(key): value for key, value in (await tab.value("drawn")).items()})
+
+    def watching():
+        try:
+            asyncio.run(asyncio.wait_for(watch(), 90))
+        finally:
+            over.set()
+
+    over, send = threading.Event(), server.send
+
+    def until_seen(*words, **names) -> int:
+        if over.is_set():
+            raise KeyboardInterrupt  # as a user ends a replay
+        return send(*words, **names)
+
+    server.send = until_seen
+    watcher = threading.Thread(target=watching, daemon=True)
+    watcher.start()
+    streamed = stream([str(tmp_path / "poses.csv")], page=server, repeat=True, rate=25, show=lambda line: None)
+    watcher.join(30)
+    assert streamed.frames >= 200 and len(seen) >= 200
+    for number, (u, v) in seen.items():
+        x, y = CAMERA.project(given[number % 200].tip).tolist()
+        assert math.hypot(u - x, v - y) < 1e-3, number
 
 
 def test_a_refusal_is_said_and_an_old_pose_fades_and_goes(tmp_path):
@@ -303,8 +357,17 @@ def test_alignment_by_a_controller_puts_the_catheter_where_it_is(tmp_path):
                 after = await tab.value("[view.state.twin.tip, view.state.twin.direction]")
                 for now_, wanted in zip(after, target, strict=True):
                     assert math.dist(now_, wanted.tolist()) < 1e-6
-                server.send(aligner(given), now())
-                await tab.value("press('squeeze')")
+                if i < 5:
+                    server.send(aligner(given), now())
+                    await tab.value("press('squeeze')")
+                for _ in range(20 if i == 5 else 0):  # a short pinch at one place; a slow computer may miss its time
+                    server.send(aligner(given), now())
+                    await tab.value(f"press('selectstart'); {FRAMES}")
+                    await tab.value("press('selectend')")
+                    await tab.value(FRAMES)
+                    if await tab.value("view.state.alignment.count") == 6:
+                        break
+                    await asyncio.sleep(0.05)
                 answer = await tab.until(
                     f"view.state.alignment && view.state.alignment.count === {i + 1} && view.state.alignment"
                 )
