@@ -33,9 +33,11 @@ def gerchberg_saxton(
     ``deconvolution`` as well it is the thesis's Algorithm 1, :func:`iterative_pec`.
 
     Args:
-        propagator: Operator on fields [..., C, H, W] with ``adjoint``.
-        target: Wanted intensity, real [C, H, W], mean 1 per channel; its square root is the amplitude constraint.
-        start: Random phase phi_0 of the image in rad, real [..., C, H, W] (Algorithm 1).
+        propagator: Operator on fields [..., C, H, W] with ``adjoint``; also one to several depths with ``image_axes``
+            = 3, such as ``DepthStack``, whose images all constrain the one hologram (multi-plane phase retrieval).
+        target: Wanted intensity, real [C, H, W] or [C, D, H, W], mean 1 per channel; its square root is the amplitude
+            constraint.
+        start: Random phase phi_0 of the image in rad, real, of the shape of the target after batch axes (Algorithm 1).
         max_steps: Number of passes after the initial one.
         crosstalk: Operator on phases, or None.
         deconvolution: Function (wanted, last) that returns heater phases: ``wanted`` is the phase wanted after
@@ -48,7 +50,8 @@ def gerchberg_saxton(
         || T - |V| ||^2 of each pass within the mask, where T is the target amplitude and V the propagated field.
         ``converged`` is always False, as there is no stop rule.
     """
-    check_target(target, mask)
+    axes: int = getattr(propagator, "image_axes", 2)
+    check_target(target, mask, axes)
     for name, value in (("start", start), ("target", target), ("mask", mask)):
         fixed(name, value, f"the iterations have no derivative; give {name}.detach()")
     checks.all_finite("start", start)
@@ -71,7 +74,7 @@ def gerchberg_saxton(
             spread = phase if crosstalk is None else crosstalk(phase)
             formed = propagator(phasor(spread))
             magnitude = intensity(formed).sqrt()
-            losses.append((weight * (amplitude - magnitude)).square().sum((-2, -1)))
+            losses.append((weight * (amplitude - magnitude)).square().flatten(-axes).sum(-1))
             constrained = amplitude * torch.where(magnitude > 0, formed / torch.where(magnitude > 0, magnitude, 1), 1)
             image = weight * constrained + (1 - weight) * formed
             if callback and step:
@@ -92,7 +95,8 @@ def iterative_pec(
 ) -> Solution:
     """Iterative PEC (IPEC), thesis Algorithm 1: Gerchberg-Saxton that deconvolves the phase in every pass.
 
-    With a Fresnel propagator this is the iterative Fresnel PEC (IFPEC) of the thesis. Arguments and result are those of
+    With a Fresnel propagator this is the iterative Fresnel PEC (IFPEC) of the thesis, and with a ``DepthStack`` its
+    multi-plane form (Sec. 4.4.5.4). Arguments and result are those of
     :func:`gerchberg_saxton`. The deconvolution is :func:`deconvolve` with ``inner_steps``, starting at the wanted
     phase.
     """

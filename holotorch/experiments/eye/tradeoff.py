@@ -171,16 +171,22 @@ def fitted_prefactor(cases: list[Case]) -> float:
 
 
 def in_words(cases: list[Case]) -> list[str]:
-    """Lines of text: the fitted formula, its deviation from the best widths, and the best source of each case."""
-    prefactor = fitted_prefactor(cases)
+    """Lines of text: the fitted formula, how well it predicts the other distances, and the best source of each case.
+
+    Each optimum is compared with the formula whose prefactor was fitted to the cases at the other distances.
+    """
     inside = [case for case in cases if case.inside]
-    off = [case.best / case.formula(prefactor) - 1 for case in inside]
+    expected = {case: case.formula(fitted_prefactor([each for each in inside if each.distance != case.distance]))
+                for case in cases}  # fmt: skip
+    off = [case.best / expected[case] - 1 for case in inside if not math.isnan(expected[case])]
+    judged = f"off by {min(off):+.0%} to {max(off):+.0%}" if off else "which only several distances could test"
     return [
-        f"best FWHM = 2 x {prefactor:.2f} wavelength^2 / (aperture^2 distance): {len(inside)} of {len(cases)} optima "
-        f"lie inside the widths tried, off by {min(off, default=0):+.0%} to {max(off, default=0):+.0%}",
+        f"best FWHM = 2 x {fitted_prefactor(cases):.2f} wavelength^2 / (aperture^2 distance) in this scene: "
+        f"{len(inside)} of {len(cases)} optima lie inside the widths tried; with a prefactor from the other distances, "
+        f"{judged}",
         *(
             f"{case.distance * 1e3:g} mm, {case.wavelength * 1e9:.0f} nm, aperture {case.aperture:.3f}: best "
-            f"{case.best * 1e9:.1f} nm (formula {case.formula(prefactor) * 1e9:.1f}), nearest to a "
+            f"{case.best * 1e9:.1f} nm (from the other distances {expected[case] * 1e9:.1f}), nearest to a "
             f"{case.source.replace('_', ' ')}"
             for case in cases
         ),

@@ -44,10 +44,7 @@ def run_pec(experiment: PECExperiment, opened: RunFolder) -> bool:
                 log.save()
             results = {"corrected": _result(experiment, solution, seconds)}
             files.write(save_array, out / "arrays" / "phase.npy", results["corrected"].phase.float())
-        several = len(experiment.distances) > 1
-        if several and settings.report.baselines:
-            print("baselines are left out: they work at a single distance only", file=sys.stderr)
-        for name in () if several else settings.report.baselines:
+        for name in settings.report.baselines:
             try:
                 if not pressed:
                     unweighted = name == "unweighted"

@@ -23,15 +23,16 @@ from holotorch.correction import (
 )
 from holotorch.correction.problem import best_scale
 from holotorch.correction.run import Callback
-from holotorch.experiments.pec.baselines import IPEC_PASSES, PASSES
+from holotorch.experiments.pec.baselines import PASSES
 from holotorch.experiments.pec.config import PECSettings
 from holotorch.experiments.pec.experiment import PECExperiment
 from holotorch.io.images import fit_image, load_image, with_channels
-from holotorch.metrics import PerceptualSimilarity, psnr, ssim
+from holotorch.metrics import psnr, ssim
 from holotorch.modulator import PhasedArray, ThermalCrosstalk
 
 PHOTOGRAPHS = ("camera", "astronaut", "coffee", "page")
 WAVELENGTH, EXTENT, DISTANCE = 530e-9, 2e-3, 0.1  # metres; width of the chip and distance of the image of the thesis
+COLOURS = 630e-9, 530e-9, 445e-9  # metres; red, green and blue of the thesis
 # Settings of the propagator for each value of ``Bench.kind``.
 _PROPAGATORS = {
     "fourier": {"kind": "fraunhofer"},
@@ -41,18 +42,20 @@ _PROPAGATORS = {
 }
 
 
-def grey(name: str, size: tuple[int, int]) -> Tensor:
-    """Luminance of a photograph cropped and resampled to ``size`` (H, W), float64 [1, H, W]."""
-    return with_channels(fit_image(load_image(name), size, "crop"), 1)
+def photograph(name: str, size: tuple[int, int], channels: int = 1) -> Tensor:
+    """A photograph cropped and resampled to ``size`` (H, W), float64 [channels, H, W]: luminance, or three colours."""
+    return with_channels(fit_image(load_image(name), size, "crop"), channels)
 
 
 @dataclass(frozen=True)
 class Bench:
-    """One array, one kind of propagation, and C photographs as its channels, all at the same wavelength.
+    """One array, one kind of propagation, and the photographs as its C channels: grey ones, or the colours of each.
 
     Attributes:
         images: Names of the photographs.
-        size: Pixels of the array along each axis.
+        size: Pixels of the array from left to right; the array is 2 mm wide.
+        height: Pixels of the array from top to bottom; None for as many.
+        colour: Whether each photograph has three channels at the wavelengths of the thesis, instead of one at 530 nm.
         sigma_px: Width of the heat kernel exp(-d^2 / sigma^2) in pixels.
         kind: "fourier" (far field), "fresnel" (near field of the array repeated periodically, as in the thesis),
             "isolated" (near field of a single array, paraxial) or "exact" (the same, not paraxial).
@@ -60,36 +63,36 @@ class Bench:
         distances: Distances of the image in metres, except in the far field. Several distances divide the image into as
             many vertical bands.
         lowpass: Cut-off of a Butterworth filter on the targets in cycles per pixel, or 0 for no filter.
-        perceptual: Learned perceptual similarity (LPIPS) as a further score, or None.
         pictures: Targets [C, h, w] in place of the photographs.
     """
 
     images: Sequence[str] = PHOTOGRAPHS
     size: int = 128
+    height: int | None = None
+    colour: bool = False
     sigma_px: float = 0.66
     kind: str = "fourier"
     region: int = 0
     distances: tuple[float, ...] = (DISTANCE,)
     lowpass: float = 0.0
-    perceptual: PerceptualSimilarity | None = None
     pictures: Tensor | None = field(default=None, compare=False, repr=False)
 
     @cached_property
     def experiment(self) -> PECExperiment:
-        """An experiment of kind ``pec`` whose C colours are the photographs.
+        """An experiment of kind ``pec`` whose C colours are the channels of all photographs.
 
         The heat kernel has seven taps per axis, as in the thesis, or one tap if no heat spreads.
         """
-        pictures, side = self.pictures, self.region or self.size
+        pictures, shape = self.pictures, (self.region, self.region) if self.region else self.shape
         if pictures is None:
-            pictures = torch.cat([grey(name, (side, side)) for name in self.images])
+            pictures = torch.cat([photograph(name, shape, self.channels) for name in self.images])
             pictures = butterworth(pictures, self.lowpass) if self.lowpass else pictures
-        wavelengths = (WAVELENGTH,) * len(pictures)
+        wavelengths = (COLOURS if self.colour else (WAVELENGTH,)) * (len(pictures) // self.channels)
         propagator = _PROPAGATORS[self.kind] | ({} if self.kind == "fourier" else {"distance": self.distances})
         settings = PECSettings.model_validate(
             {
                 "experiment": "pec",
-                "grid": {"shape": self.size, "pitch": EXTENT / self.size},
+                "grid": {"shape": self.shape, "pitch": EXTENT / self.size},
                 "wavelengths": wavelengths,
                 "target": {"image": PHOTOGRAPHS[0], "region": self.region or None},  # required, but not loaded
                 "modulator": {"sigma_px": self.sigma_px},
@@ -100,6 +103,16 @@ class Bench:
         array = PhasedArray(wavelengths, ThermalCrosstalk(self.sigma_px, 7 if self.sigma_px else 1))
         lit = torch.ones(len(pictures), dtype=torch.bool)
         return PECExperiment(settings, pictures, lit, array, "hot", torch.device("cpu"))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Pixels (H, W) of the array."""
+        return self.height or self.size, self.size
+
+    @property
+    def channels(self) -> int:
+        """Channels of each photograph."""
+        return len(COLOURS) if self.colour else 1
 
     @property
     def crosstalk(self) -> ThermalCrosstalk:
@@ -141,7 +154,7 @@ class Bench:
         target, mask = problem.target, problem.mask
         begin = 2 * math.pi * torch.rand(target.shape, generator=torch.Generator().manual_seed(seed))
         if kind == "ipec":
-            return iterative_pec(propagator, self.crosstalk, target, begin, max_steps=IPEC_PASSES, mask=mask)
+            return iterative_pec(propagator, self.crosstalk, target, begin, max_steps=PASSES, mask=mask)
         spread = self.crosstalk if kind == "basic" else None
         return gerchberg_saxton(propagator, target, begin, max_steps=PASSES, crosstalk=spread, mask=mask)
 
@@ -152,24 +165,25 @@ class Bench:
     def scores(self, phase: Tensor, formed: Tensor | None = None) -> dict[str, float]:
         """Scores of heater phases by name.
 
-        ``ssim``, ``psnr``, ``power_rad`` (heater phase) and, if the bench has it, ``perceptual`` are means over the
-        photographs. ``efficiency`` is the fraction of the light in the picture, smallest over the photographs, and
-        ``peak_rad`` the largest phase after spreading. ``formed`` replaces the picture that the phases form.
+        ``ssim``, ``psnr`` and ``power_rad`` (heater phase) are means over the photographs, ``ssim_sd`` is the standard
+        deviation of the SSIM between them (each the mean of its colours). ``efficiency`` is the fraction of the light
+        in the picture, smallest over the channels, and ``peak_rad`` the largest phase after spreading. ``formed``
+        replaces the picture that the phases form.
         """
         formed = self.formed(phase) if formed is None else formed
-        image, light = self.experiment.image, formed.sum((-2, -1)) / self.size**2
+        image, light = self.experiment.image, formed.sum((-2, -1)) / math.prod(self.shape)
         if self.experiment.scale_free:
             formed = formed * best_scale(formed, self.experiment.wanted)[:, None, None]
         picture = (formed * image.mean((-2, -1), keepdim=True)).clamp(0, 1)
+        single = ssim(picture, image, data_range=1.0).reshape(-1, self.channels).mean(1)  # of each photograph
         scores = {
-            "ssim": ssim(picture, image, data_range=1.0).mean(),
+            "ssim": single.mean(),
+            "ssim_sd": single.std() if len(single) > 1 else single.new_zeros(()),
             "psnr": psnr(picture, image, data_range=1.0).mean(),
             "efficiency": light.min(),
             "peak_rad": self.crosstalk(phase.double()).max(),
             "power_rad": phase.double().mean(),
         }
-        if self.perceptual is not None:
-            scores["perceptual"] = self.perceptual(picture[:, None], image[:, None]).mean()
         return {name: value.item() for name, value in scores.items()}
 
 

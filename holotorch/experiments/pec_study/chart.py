@@ -2,6 +2,7 @@
 
 import csv
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
@@ -107,7 +108,7 @@ def _verdict(compared: list[dict]) -> list[str]:
         f"how many times fewer evaluations / less time than {BASE} to equal SSIM, at its lowest and highest level",
         f"sigma: {SIGMA_MEANING}",
     ]
-    goals = yaml.safe_load(GOALS.read_text(encoding="utf-8")) if GOALS.is_file() else {"solver": {}, "tables": {}}
+    goals = yaml.safe_load(GOALS.read_text(encoding="utf-8")) if GOALS.is_file() else {"solver": {}}
     for kind, sigma in product(KINDS, SIGMAS):
         ratios: dict[str, list[tuple[float, float]]] = {}
         for row in compared:
@@ -119,28 +120,41 @@ def _verdict(compared: list[dict]) -> list[str]:
             wanted = goal["evaluations"], goal["seconds"]
             met = [name for name, each in ratios.items() if all(a >= wanted[0] and b >= wanted[1] for a, b in each)]
             lines[-1] += f" (goal {wanted[0]:g}/{wanted[1]:g}: {'met by ' + '; '.join(met) if met else 'not met'})"
-    return lines + _tables(goals["tables"])
+    return lines + _tables(goals.get("thesis", {}), "reproduced") + _tables(goals.get("goals", {}), "met")
 
 
-def _tables(goals: dict[str, list[dict[str, Any]]]) -> list[str]:
-    """A line for each committed table of a study: how many of the statements about it in goals.yaml are met."""
+def _tables(statements: dict[str, list[dict[str, Any]]], word: str) -> list[str]:
+    """Verdicts on the committed tables of the studies: a line for each table, and one for each statement about it."""
     lines = []
-    for name, statements in goals.items():
+    for name, about in statements.items():
         path = GOALS.parent / name / "table.csv"
         if not path.is_file():
             continue
         rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
-        missed = []
-        for statement in statements:
-            value, (low, high) = _statistic(rows, statement), statement["within"]
-            if not low <= value <= high:
-                missed.append(f"; not met: {statement['says']} ({value:.3g}, expected {low:g} to {high:g})")
-        lines.append(f"{name}: {len(statements) - len(missed)} of {len(statements)} met" + "".join(missed))
+        judged = [(_judged(_statistic(rows, statement), statement, word), statement) for statement in about]
+        counts = Counter(verdict for (verdict, _), _ in judged)
+        lines.append(f"{name}: " + ", ".join(f"{counts[each]} {each}" for each in counts) + f" of {len(about)}")
+        lines += [f"  {verdict}: {each['says']} ({found})" for (verdict, found), each in judged if verdict != "met"]
     return lines
 
 
+def _judged(value: float, statement: dict[str, Any], word: str) -> tuple[str, str]:
+    """Verdict on a statement, and what was found beside what was expected."""
+    if math.isnan(value):
+        return "not testable here", "no such rows"
+    if "printed" in statement:
+        printed, margin = statement["printed"], statement["margin"]
+        verdict = word if abs(value - printed) <= margin else "exceeded" if value > printed else f"not {word}"
+        return verdict, f"{value:.3g}, printed {printed:g}, margin {margin:g}"
+    low, high = statement["within"]
+    return word if low <= value <= high else f"not {word}", f"{value:.3g}, expected {low:g} to {high:g}"
+
+
 def _statistic(rows: list[dict[str, str]], statement: dict[str, Any]) -> float:
-    """Mean, range or ratio of means of a table column, as a statement of goals.yaml says; NaN without matching rows."""
+    """Mean, range, ratio of means, or onset of a table column, as goals.yaml says; NaN without matching rows.
+
+    The onset is the smallest sigma at which the value has fallen by the share ``fall`` below that at the first one.
+    """
 
     def column(cells: dict[str, Any]) -> list[float]:
         allowed = {key: list(map(str, cell if isinstance(cell, list) else [cell])) for key, cell in cells.items()}
@@ -151,6 +165,10 @@ def _statistic(rows: list[dict[str, str]], statement: dict[str, Any]) -> float:
     values = column(statement["rows"])
     if not values:
         return math.nan
+    if statement.get("statistic") == "onset":
+        least = (1 - statement["fall"]) * values[0]
+        sigmas = [float(each) for each in statement["rows"]["sigma_px"]]
+        return next((sigma for sigma, value in zip(sigmas, values, strict=True) if value < least), math.inf)
     if statement.get("statistic") == "range":
         return max(values) - min(values)
     base = column(statement["rows"] | statement["over"]) if "over" in statement else [1.0]

@@ -1,6 +1,5 @@
 """Run of kind ``pec_study``: writes the table of a study as CSV and text, and as a picture."""
 
-import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +14,6 @@ from holotorch.experiments.runs.memory import peak_memory
 from holotorch.experiments.runs.saving import Checkpoint, Results
 from holotorch.experiments.runs.tables import write_table
 from holotorch.io.files import write_bytes, write_text
-from holotorch.metrics import PerceptualSimilarity
 
 
 @dataclass(frozen=True)
@@ -28,14 +26,14 @@ class Study:
 
 def build_study(settings: StudySettings) -> Study:
     """A study with the bench for its photographs."""
-    return Study(settings, Bench(images=settings.images, size=settings.size, perceptual=_perceptual()))
+    return Study(settings, Bench(images=settings.images, size=settings.size))
 
 
 def run_study(study: Study, opened: RunFolder) -> bool:
     """Run the missing cases of a study, fill the folder and print the table. True if the study is complete."""
     settings, bench = study.settings, study.bench
     folder, files = opened.path, Results()
-    inputs = {"images": (bench.experiment.image,), "perceptual": ("none" if bench.perceptual is None else "LPIPS",)}
+    inputs = {"images": (bench.experiment.image,)}
     cases = Cases(Checkpoint(folder / "checkpoint.pt", fingerprint(settings, inputs)))
     summary: dict[str, Any] = {"experiment": settings.experiment, "study": settings.study, "status": ""}
     try:
@@ -54,17 +52,6 @@ def run_study(study: Study, opened: RunFolder) -> bool:
     complete = conclude(opened, summary, files, done=True)
     print(text)
     return complete
-
-
-def _perceptual() -> PerceptualSimilarity | None:
-    """LPIPS, or None if the optional package is not installed or its weights cannot be read."""
-    try:
-        return PerceptualSimilarity()
-    except ImportError:
-        return None
-    except OSError as error:
-        print(f"LPIPS is left out: {error}", file=sys.stderr)
-        return None
 
 
 def table_text(rows: list[dict[str, Any]]) -> str:

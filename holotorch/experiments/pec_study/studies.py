@@ -37,6 +37,18 @@ def reproduction(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases
             yield from _methods(setup, steps, ("none", *_CORRECTED, *more))
 
 
+def photographs(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> Iterator[Row]:
+    """The thesis's own terms: colour photographs of 384 x 256 pixels in the far field, as in Fig. 4.9."""
+    for sigma in cases.each(sigmas, desc="photographs", unit="sigma"):
+        setup = replace(bench, sigma_px=sigma, height=bench.size * 2 // 3, colour=True)
+        yield from _methods(setup, steps, ("none", *_CORRECTED), setting=f"{len(bench.images)} colour photographs")
+
+
+def photographs_fresnel(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> Iterator[Row]:
+    """The same in the near field, as in Fig. 4.17."""
+    yield from photographs(replace(bench, kind="fresnel"), sigmas, steps, cases)
+
+
 def lowpass(bench: Bench, cutoffs: Sequence[float], steps: int, cases: Cases) -> Iterator[Row]:
     """Thesis Fig. 4.12: targets after a low-pass filter, by the cut-off of the filter in cycles per pixel."""
     for cutoff in cases.each(cutoffs, desc="low-pass targets", unit="cut-off"):
@@ -157,6 +169,8 @@ def targets(bench: Bench, sigmas: Sequence[float], steps: int, cases: Cases) -> 
 
 STUDIES: dict[str, Callable[[Bench, Sequence[float], int, Cases], Iterator[Row]]] = {
     "reproduction": reproduction,
+    "photographs": photographs,
+    "photographs_fresnel": photographs_fresnel,
     "lowpass": lowpass,
     "multiplexing": multiplexing,
     "iterations": iterations,
@@ -204,7 +218,7 @@ def _timed_row(bench: Bench, method: str, solve: Callable[[], Solution], setting
 def _row(
     bench: Bench, method: str, scores: dict[str, float], seconds: float = 0.0, setting: str = "", count: int | str = ""
 ) -> Row:
-    keys = ("ssim", "psnr", "perceptual", "error", "efficiency", "peak_rad", "power_rad")
+    keys = ("ssim", "ssim_sd", "psnr", "error", "efficiency", "peak_rad", "power_rad")
     return {
         "kind": bench.kind,
         "sigma_px": bench.sigma_px,
