@@ -12,6 +12,7 @@ from torch import Tensor
 from holotorch.core.grid import Pair
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.eye.config import ObserverSettings, PlanarSettings, SphericalSettings
+from holotorch.experiments.eye.speckle import grains, relative_speckle
 from holotorch.experiments.volume.evaluation import pooled
 from holotorch.experiments.volume.experiment import VolumeExperiment, build
 from holotorch.metrics import sharpness, speckle_contrast, ssim
@@ -234,6 +235,7 @@ class Observer:
             "contrast_predicted": [predicted_contrast(PRESETS[source](each), difference) for each in wavelengths],
             "ssim": quality.mean(0).tolist(),
             "sharpness": sharpness(shown, reference).mean(0).tolist(),
+            **grains(relative_speckle(shown, reference, LIT * peak)),
             "best_fwhm_nm_by_formula": [fwhm * 1e9 for fwhm in best],
         }
 

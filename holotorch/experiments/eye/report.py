@@ -7,7 +7,8 @@ from holotorch.experiments.runs.record import RunRecord
 
 _PREDICTED = (
     "The predicted contrast is that of an evenly filled round pupil and fully developed speckle; a scene with "
-    "structure has neither and measures lower."
+    "structure has neither and measures lower. Grains are measured in samples of the picture, with the scene divided "
+    "out; anisotropy is their length over their width."
 )
 
 
@@ -28,6 +29,7 @@ def eye_section(run: RunRecord) -> list[str]:
         parts.append(element("p", f"Synthetic volume: {summary['synthetic']}.", "warn"))
     synthetic = ", synthetic volume" if summary["synthetic"] else ""
     captions = {f"comparison_{f}": f"focus {depth:.4g} mm{synthetic}" for f, depth in enumerate(plan["focus_mm"])}
+    captions |= {"speckle": "spectrum of the speckle, at the first focus: the scene is divided out"}
     captions |= {"focus": "the eye's focus swept over the scene", "geometry": "geometry and sources"}
     parts += [figure(source, caption, "wide") for name, caption in captions.items() if (source := run.picture(name))]
     first = summary["rows"][0]
@@ -39,4 +41,6 @@ def eye_section(run: RunRecord) -> list[str]:
 
 
 def _cell(value: Any) -> str:
-    return " / ".join(f"{each:.3g}" for each in value) if isinstance(value, list) else plain(value)
+    if not isinstance(value, list):
+        return plain(value)
+    return " / ".join("-" if each is None else f"{each:.3g}" for each in value)

@@ -13,8 +13,9 @@ from tqdm import tqdm
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.eye import focus as eye_focus
 from holotorch.experiments.eye import geometry as eye_geometry
+from holotorch.experiments.eye import speckle as eye_speckle
 from holotorch.experiments.eye.config import ObserverSettings
-from holotorch.experiments.eye.experiment import Observer
+from holotorch.experiments.eye.experiment import LIT, Observer
 from holotorch.experiments.eye.report import by_wavelength
 from holotorch.experiments.eye.tradeoff import WHITE, fitted_prefactor, in_words, tradeoff
 from holotorch.experiments.registry import load_config
@@ -205,6 +206,14 @@ def _write(out: Path, eye: Observer, views: _Views, values: dict[str, Any], file
         for s, source in enumerate(sources)
         for f, depth in enumerate(focus)
     ]
+    peak = reference[0].amax((-2, -1), keepdim=True)
+    speckle = {
+        source: eye_speckle.relative_speckle(
+            equal_power(images[:, s, 0], reference[0].expand_as(images[:, s, 0])), reference[0], LIT * peak
+        )
+        for s, source in enumerate(sources)
+    }
+    files.write(write_bytes, out / "images" / "speckle.png", eye_speckle.draw(speckle))
     lengths = [wavelength * 1e9 for wavelength in wavelengths]
     flat = [by_wavelength(row, lengths) for row in measured]
     files.write(write_table, out / "table.csv", [{key: plain(value) for key, value in row.items()} for row in flat])

@@ -63,7 +63,10 @@ def test_a_run_shows_less_speckle_under_wider_sources(tmp_path, monkeypatch):
         assert led["wavelengths"][colour] >= laser["wavelengths"][colour]
     with open(folder / "table.csv", newline="") as stream:
         table = list(csv.DictReader(stream))
-    each = ("wavelengths", "followed", "contrast", "contrast_predicted", "ssim", "sharpness", "best_fwhm_nm_by_formula")
+    each = ("wavelengths", "followed", "contrast", "contrast_predicted", "ssim", "sharpness", "grain_y", "grain_x",
+            "anisotropy", "best_fwhm_nm_by_formula")  # fmt: skip
+    assert all(0.5 < laser[f"grain_{axis}"][colour] < 20 for axis in "yx" for colour in range(3))
+    assert all(1 <= value < 3 for value in laser["anisotropy"]) and (folder / "images" / "speckle.png").is_file()
     assert len(table) == 2 and list(table[0]) == [
         *("source", "focus_mm"),
         *(f"{name}_{wave}nm" for name in each for wave in (636, 520, 455)),
@@ -176,7 +179,7 @@ def test_what_observers_see_is_put_on_one_page(tmp_path, tiny):
         "Retina  ",
     ):
         assert words in page
-    assert page.count("data:image/png;base64,") == 4 and page.count("How to repeat") == 2
+    assert page.count("data:image/png;base64,") == 6 and page.count("How to repeat") == 2
 
 
 def test_both_ways_show_the_same_and_the_plan_tells_their_costs():
