@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.perception.analysis import figures, statistics
+from holotorch.experiments.perception.analysis.cells import cell_tests
 from holotorch.experiments.perception.analysis.config import AnalysisSettings
 from holotorch.experiments.perception.analysis.curves import (
     Curves,
@@ -108,7 +109,8 @@ def run_analysis(settings: AnalysisSettings, opened: RunFolder) -> bool:
     truths = [None if settings.logs else true_line(settings.simulation, target) for target in settings.targets]
     rows = [finding.row(truth) for finding, truth in zip(findings, truths, strict=True)]
     whole_frames = on_frames(responses)
-    text = in_words(settings, times, curves, findings, frames, whole_frames)
+    cells = cell_tests(times, settings.range_deg[0])
+    text = "\n".join([in_words(settings, times, curves, findings, frames, whole_frames), *cells.in_words()])
     if settings.repeated_measures is None and not _uses_repeated_measures(settings):
         text += "\nLeft out   repeated measures and the mixed model, which need statsmodels: pip install "
         text += "'holotorch[stats]' and run it again; the one-way ANOVA takes the answers of one participant as "
@@ -150,6 +152,7 @@ def run_analysis(settings: AnalysisSettings, opened: RunFolder) -> bool:
         "counts": times.counts,
         "quantisation": asdict(frames) | {"on_frames": in_json(whole_frames)},
         "rows": rows,
+        "cells": cells.to_json(),
         "power": power,
         "lines": text.splitlines(),
         "seconds": round(time.perf_counter() - started, 2),
