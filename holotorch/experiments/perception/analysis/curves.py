@@ -12,6 +12,7 @@ from scipy import ndimage
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.perception.analysis.config import CleaningSettings, TargetTimeSettings
+from holotorch.experiments.perception.analysis.fixations import fixated
 from holotorch.experiments.perception.analysis.statistics import Array, listed
 from holotorch.experiments.perception.study.log import read_logs
 from holotorch.perception.time import PerceptionTime
@@ -29,13 +30,15 @@ class Responses:
     frame_s: Array  # frame interval of the display
     simulated: bool = False  # whether the answers are simulated
     torn: int = 0  # number of logs whose last line is incomplete, because the recording was killed during a trial
+    broken: int | None = None  # number of trials left out because fixation was broken; None without an eye tracker
 
 
 def read_responses(paths: Iterable[str]) -> Responses:
     """Read the logs of a study: files, or folders with ``*.jsonl`` files.
 
     Raises:
-        ConfigError: A log cannot be read, contains no trials, or contains impossible angles.
+        ConfigError: A log cannot be read, contains no trials or impossible angles, or was recorded with the mouse in
+            place of an eye tracker.
     """
     files: list[Path] = []
     for path in map(Path, paths):
@@ -44,7 +47,12 @@ def read_responses(paths: Iterable[str]) -> Responses:
             raise ConfigError([f"logs: {path} holds no *.jsonl files, which 'holotorch study' writes"])
         files += logs
     logs = read_logs(files)
-    rows = [(log, trial) for log in logs for trial in log.trials if not trial["practice"]]
+    checked = [(log, *pair) for log in logs for pair in zip(log.trials, fixated(log), strict=True)]
+    checked = [(log, trial, held) for log, trial, held in checked if not trial["practice"]]
+    rows = [(log, trial) for log, trial, held in checked if held is not False]
+    broken = len(checked) - len(rows) if any(log.header.get("gaze") for log in logs) else None
+    if checked and not rows:
+        raise ConfigError([f"{log.path}: fixation is broken in every trial after the practice round" for log in logs])
     if not rows:
         raise ConfigError([f"{log.path}: the log is empty: no trials after the practice round" for log in logs])
     wrong = {
@@ -61,7 +69,7 @@ def read_responses(paths: Iterable[str]) -> Responses:
 
     pattern = column("eccentricity_deg"), column("size_deg"), column("target", bool)
     times = column("reaction_s"), column("frame_s")
-    return Responses(column("participant", int), *pattern, *times, torn=sum(log.torn for log in logs))
+    return Responses(column("participant", int), *pattern, *times, torn=sum(log.torn for log in logs), broken=broken)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +145,8 @@ def perception_times(responses: Responses, rule: CleaningSettings) -> Times:
     counts["conditions"] = int(shown.sum())
     counts["missing conditions"] = int(missing.sum())
     counts["unfinished trials"] = responses.torn
+    if responses.broken is not None:
+        counts["broken fixations"] = responses.broken
     if not np.isfinite(seconds).any():
         most = int(number.max())
         raise ConfigError([f"no condition has {rule.responses} answers (cleaning.responses); {most} at most"])

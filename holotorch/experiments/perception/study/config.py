@@ -28,6 +28,7 @@ from holotorch.experiments.config.settings import (
 )
 from holotorch.experiments.config.source import Key, read_source
 from holotorch.experiments.perception.study.design import MOST_TRIALS, Design, make_design, too_many
+from holotorch.experiments.perception.study.gaze import GazeSettings
 from holotorch.perception.geometry import CurvedScreen, FlatScreen
 
 Eccentricity = Annotated[
@@ -112,7 +113,10 @@ class TimingSettings(Settings):
 
 
 class StudySettings(Settings):
-    """A study; see ``make_design``. ``practice``: number of trials before the first round, excluded from analyses."""
+    """A study; see ``make_design``. ``practice``: number of trials before the first round, excluded from analyses.
+
+    ``gaze``: check of the fixation with an eye tracker; without it, nobody checks where the participant looks.
+    """
 
     seed: Whole
     screen: Annotated[FlatSettings | CurvedSettings, Discriminator("kind")]
@@ -122,6 +126,7 @@ class StudySettings(Settings):
     sides: Literal["both", "left", "right"] = "both"
     practice: Whole = 14
     timing: TimingSettings = TimingSettings()
+    gaze: GazeSettings | None = None
 
     @property
     def conditions(self) -> tuple[tuple[float, float], ...]:
@@ -133,6 +138,11 @@ class StudySettings(Settings):
         """Number of trials of each participant after the practice."""
         conditions = sum(len(group.eccentricities_deg) * len(group.sizes_deg) for group in self.patterns)
         return 2 * conditions * (self.repeats.target + self.repeats.distraction)
+
+    def recorded(self) -> dict[str, Any]:
+        """The settings that the page needs and the log keeps, as JSON data."""
+        names = {"screen", "timing"} | ({"gaze"} if self.gaze else set())
+        return self.model_dump(mode="json", include=names)
 
     def design(self, participant: int) -> Design:
         """The trials of one participant."""
