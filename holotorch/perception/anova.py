@@ -4,14 +4,14 @@ All of them assume independent values, normal within each group with one common 
 participant is in every group violates the first assumption: the p-values are then only nominal.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-from scipy import special
+import torch
+from torch import Tensor
 
-Array = NDArray[np.float64]
+from holotorch.perception import angles
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,7 @@ def one_way_from_summary(means: Any, deviations: Any, counts: Any) -> VarianceTe
     Source: Montgomery, Design and Analysis of Experiments, Sec. 3.3.
     """
     m, variance, n, freedom = _checked(means, deviations, counts)
-    k = m.size
-    return _contrast(np.eye(k)[1:] - np.eye(k)[:1], m.ravel(), n.ravel(), variance, freedom)
+    return _contrast(_differences(m.numel()), m.flatten(), n.flatten(), variance, freedom)
 
 
 def two_way_from_summary(means: Any, deviations: Any, counts: Any) -> TwoWayTest:
@@ -70,20 +69,63 @@ def two_way_from_summary(means: Any, deviations: Any, counts: Any) -> TwoWayTest
     """
     m, variance, n, freedom = _checked(means, deviations, counts)
     if m.ndim != 2 or min(m.shape) < 2:
-        raise ValueError(f"means must be [A, B] with two or more rows and columns, got {m.shape}")
+        raise ValueError(f"means must be [A, B] with two or more rows and columns, got {tuple(m.shape)}")
     a, b = m.shape
-    rows, columns = np.eye(a)[1:] - np.eye(a)[:1], np.eye(b)[1:] - np.eye(b)[:1]
-    hypotheses = np.kron(rows, np.ones(b) / b), np.kron(np.ones(a) / a, columns), np.kron(rows, columns)
-    return TwoWayTest(*(_contrast(each, m.ravel(), n.ravel(), variance, freedom) for each in hypotheses))
+    rows, columns = _differences(a), _differences(b)
+    average_a, average_b = m.new_full((1, a), 1 / a), m.new_full((1, b), 1 / b)
+    hypotheses = torch.kron(rows, average_b), torch.kron(average_a, columns), torch.kron(rows, columns)
+    return TwoWayTest(*(_contrast(each, m.flatten(), n.flatten(), variance, freedom) for each in hypotheses))
 
 
 def f_of_p(p: float, freedom: tuple[int, int]) -> float:
     """The F whose p-value is ``p`` in (0, 1), for degrees of freedom (hypothesis, error) >= 1."""
     if not (0 < p < 1 and min(freedom) >= 1):
         raise ValueError(f"expected 0 < p < 1 and degrees of freedom >= 1, got {p:g} and {freedom}")
+    low, high = -700.0, 700.0  # logarithm of F
+    for _ in range(100):  # the last bit of F, from a range of 1400
+        middle = (low + high) / 2
+        low, high = (middle, high) if p_of_f(math.exp(middle), freedom) > p else (low, middle)
+    return math.exp((low + high) / 2)
+
+
+def p_of_f(f: float, freedom: tuple[int, int]) -> float:
+    """Probability of an F >= ``f`` >= 0 by chance, for degrees of freedom (hypothesis, error) >= 1.
+
+    It is I_x(d2 / 2, d1 / 2) at x = d2 / (d2 + d1 f), with I the regularised incomplete beta function, which torch
+    lacks. Very small probabilities have all their digits.
+    Source: Abramowitz and Stegun, Eqs. 26.6.2 and 26.5.8.
+    """
     first, second = freedom
-    x = special.betaincinv(second / 2, first / 2, p)  # P(F > f) = I_x(d2 / 2, d1 / 2), exact for small p as well
-    return float(second / first * (1 - x) / x)
+    total = second + first * f
+    if math.isinf(total):
+        return 0.0
+    x, y = second / total, first * f / total  # y = 1 - x, without a loss of digits
+    a, b = second / 2, first / 2
+    if y == 0:
+        return 1.0
+    # The fraction converges quickly below the mean of the beta distribution; above it, I_x(a, b) = 1 - I_y(b, a).
+    below = x < (a + 1) / (a + b + 2)
+    value = _beta_fraction(a, b, x, y) if below else 1 - _beta_fraction(b, a, y, x)
+    return min(max(value, 0.0), 1.0)
+
+
+def _beta_fraction(a: float, b: float, x: float, y: float) -> float:
+    """I_x(a, b) by its continued fraction, evaluated from the front (modified Lentz method); y is 1 - x."""
+    beta = math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
+    front = math.exp(a * math.log(x) + b * math.log(y) - beta) / a
+    tiny = 1e-300
+    c, d = 1.0, 1 / ((1 - (a + b) * x / (a + 1)) or tiny)
+    value = d
+    for m in range(1, 10_000):
+        for term in (
+            m * (b - m) * x / ((a + 2 * m - 1) * (a + 2 * m)),
+            -(a + m) * (a + b + m) * x / ((a + 2 * m) * (a + 2 * m + 1)),
+        ):
+            d, c = 1 / ((1 + term * d) or tiny), (1 + term / c) or tiny
+            value *= d * c
+        if abs(d * c - 1) < 1e-15:
+            break
+    return front * value
 
 
 def error_freedom(f: float, p: float, between: int, *, f_step: float, p_step: float, most: int = 1000) -> list[int]:
@@ -97,23 +139,26 @@ def error_freedom(f: float, p: float, between: int, *, f_step: float, p_step: fl
         p_step: Last printed digit of p, such as 1e-4 for 0.0002.
         most: The greatest number to try.
     """
-    error = np.arange(1, most + 1)
-    above = special.fdtrc(between, error, f - f_step / 2) >= p - p_step / 2
-    below = special.fdtrc(between, error, f + f_step / 2) <= p + p_step / 2
-    return error[above & below].tolist()
+    low, high = p - p_step / 2, p + p_step / 2
+    return [
+        error
+        for error in range(1, most + 1)
+        if p_of_f(f - f_step / 2, (between, error)) >= low and p_of_f(f + f_step / 2, (between, error)) <= high
+    ]
 
 
-def _checked(means: Any, deviations: Any, counts: Any) -> tuple[Array, float, Array, int]:
-    """Means and counts as arrays, the variance within the groups, and its degrees of freedom."""
-    m, s, n = (np.asarray(value, dtype=np.float64) for value in (means, deviations, counts))
-    if not m.shape == s.shape == n.shape or m.size < 2:
-        shapes = f"{m.shape}, {s.shape} and {n.shape}"
+def _checked(means: Any, deviations: Any, counts: Any) -> tuple[Tensor, float, Tensor, int]:
+    """Means and counts as tensors, the variance within the groups, and its degrees of freedom."""
+    m, n = angles.as_tensor("means", means, "one unit").double(), angles.as_tensor("counts", counts, "values").double()
+    s = torch.as_tensor(deviations, dtype=torch.float64)
+    if not m.shape == s.shape == n.shape or m.numel() < 2:
+        shapes = f"{tuple(m.shape)}, {tuple(s.shape)} and {tuple(n.shape)}"
         raise ValueError(f"means, deviations and counts must share a shape with two or more groups, got {shapes}")
-    if not np.isfinite(n).all() or (n < 1).any() or (n % 1).any():
+    if (n < 1).any() or (n % 1).any():
         raise ValueError("counts must be whole numbers of 1 or more")
-    s = np.where(n > 1, s, 0.0)  # a single value has no deviation; often it is printed as NaN
-    if not (np.isfinite(m).all() and np.isfinite(s).all()) or (s < 0).any():
-        raise ValueError("means and deviations must be finite, and deviations not below zero")
+    s = torch.where(n > 1, s, 0.0)  # a single value has no deviation; often it is printed as NaN
+    if not s.isfinite().all() or (s < 0).any():
+        raise ValueError("deviations must be finite and not below zero")
     freedom = int((n - 1).sum())
     variance = float(((n - 1) * s**2).sum()) / freedom if freedom else 0.0
     if variance == 0:
@@ -121,10 +166,16 @@ def _checked(means: Any, deviations: Any, counts: Any) -> tuple[Array, float, Ar
     return m, variance, n, freedom
 
 
-def _contrast(hypothesis: NDArray[Any], means: Array, counts: Array, variance: float, freedom: int) -> VarianceTest:
+def _differences(groups: int) -> Tensor:
+    """Differences of all groups from the first, [groups - 1, groups]."""
+    identity = torch.eye(groups, dtype=torch.float64)
+    return identity[1:] - identity[:1]
+
+
+def _contrast(hypothesis: Tensor, means: Tensor, counts: Tensor, variance: float, freedom: int) -> VarianceTest:
     """Test of ``hypothesis`` [R, K] @ true means [K] = 0: F = m' L' (L N^-1 L')^-1 L m / (R variance)."""
     value = hypothesis @ means
-    squares = float(value @ np.linalg.solve(hypothesis / counts @ hypothesis.T, value))
-    f = squares / len(hypothesis) / variance
+    squares = float(value @ torch.linalg.solve(hypothesis / counts @ hypothesis.T, value))
     between = len(hypothesis)
-    return VarianceTest(f, float(special.fdtrc(between, freedom, f)), (between, freedom))
+    f = squares / between / variance
+    return VarianceTest(f, p_of_f(f, (between, freedom)), (between, freedom))

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from holotorch.perception import TABLE_2_2, one_way_from_summary, two_way_from_summary
-from holotorch.perception.anova import error_freedom, f_of_p
+from holotorch.perception.anova import error_freedom, f_of_p, p_of_f
 from holotorch.perception.table import ALL_CELLS_P
 
 
@@ -79,6 +79,7 @@ def test_what_is_no_summary_is_refused():
         (([1, 2], [1, 1], [3, 0]), "whole numbers of 1 or more"),
         (([1, 2], [1, 1], [3, 2.5]), "whole numbers of 1 or more"),
         (([1, np.nan], [1, 1], [3, 3]), "finite"),
+        (([1, 2], [1, np.inf], [3, 3]), "finite"),
         (([1, 2], [1, -1], [3, 3]), "not below zero"),
         (([1, 2], [0, 0], [3, 3]), "no variance"),
         (([1, 2], [1, 1], [1, 1]), "no group has two values"),
@@ -95,6 +96,13 @@ def test_what_is_no_summary_is_refused():
 @pytest.mark.parametrize(("p", "freedom"), [(0.3, (3, 10)), (1.3e-6, (51, 2028)), (1e-200, (3, 900))])
 def test_f_of_p_is_the_inverse(p, freedom):
     assert stats.f.sf(f_of_p(p, freedom), *freedom) == pytest.approx(p, rel=1e-7)
+
+
+def test_p_of_f_is_that_of_scipy():
+    generator = np.random.default_rng(8)
+    for f in (0, 1e-12, 1, 1e9, *generator.lognormal(0, 2, 500)):
+        freedom = (int(generator.integers(1, 80)), int(10 ** generator.uniform(0, 4)))
+        assert p_of_f(f, freedom) == pytest.approx(stats.f.sf(f, *freedom), rel=1e-9, abs=1e-300)
 
 
 def test_degrees_of_freedom_from_a_rounded_f_and_p():

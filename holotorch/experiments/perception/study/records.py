@@ -59,6 +59,8 @@ class TrialRecord(Record):
     attempt: Annotated[int, Field(ge=1, description="a count, 1 or more")] = 1
     fixated: Annotated[bool | None, Field(description="true, false or null")] = None
     onset_unix_s: Annotated[float | None, Field(description="a finite number or null")] = None
+    contrast: Annotated[float, Field(gt=0, le=1, description="a number above 0 and at most 1")] = 1.0
+    speed_deg_s: Annotated[float, Field(ge=0, description="a finite number, 0 or more")] = 0.0
 
     @model_validator(mode="after")
     def _response_is_consistent(self) -> Self:

@@ -2,12 +2,11 @@
 
 import sys
 import time
-from dataclasses import asdict
 from datetime import UTC, datetime
 from http import HTTPStatus
 from typing import Any
 
-from holotorch.experiments.perception.study.config import StudySettings
+from holotorch.experiments.perception.study.config import TRAVEL_DEG, StudySettings
 from holotorch.experiments.perception.study.design import Design
 from holotorch.experiments.perception.study.gaze import GazeFile, GazeTrack
 from holotorch.experiments.perception.study.log import TrialLog
@@ -46,6 +45,7 @@ class StudySession:
         return {
             "participant": self.design.participant,
             **self.settings.recorded(),
+            "travel_deg": TRAVEL_DEG,
             "trials": [appearance.to_json() for appearance in self.order.appearances],
             "next": len(self.log.trials),
         }
@@ -109,7 +109,7 @@ class StudySession:
     def _line(self, result: TrialResult) -> dict[str, Any]:
         appearance = self.order.appearances[result.index]
         trial = appearance.trial
-        planned = {key: value for key, value in asdict(trial).items() if key != "wait_s"}
+        planned = {key: value for key, value in trial.to_json().items() if key != "wait_s"}
         if self.settings.gaze:
             planned["attempt"] = appearance.attempt
         end = self._end(result)
