@@ -117,25 +117,26 @@ def test_the_page_draws_contrast_and_motion(tmp_path):
             grey = int((await tab.value("grey(0.3)")).split(",")[1])
             # Rows of the pattern's colour, all away from the fixation point, together with where it should be.
             rows = f"""(() => {{
+              if ({state} !== "shown") return null;
               const side = trial.side === "left" ? -1 : 1, left = side < 0 ? 0 : canvas.width / 2 + 40;
               const wide = canvas.width / 2 - 40, data = pen.getImageData(left, 0, wide, canvas.height).data;
               let [low, high] = [canvas.height, -1];
               for (let y = 0; y < canvas.height; y++) for (let x = 0; x < wide; x++)
                 if (Math.abs(data[4 * (y * wide + x)] - {grey}) <= 1)
                   [low, high] = [Math.min(low, y), Math.max(high, y)];
-              return [low, high, up, trial.eccentricity_deg];
+              return [low, high, up, trial.eccentricity_deg, (last - onset) / 1000];
             }})()"""
             seen = []
             for _ in range(12):
-                if await tab.value(state) != "shown":
-                    break
                 seen.append(await tab.value(rows))
-            return seen
+            return [found for found in seen if found]  # none once the pattern has gone
 
     seen = asyncio.run(asyncio.wait_for(take(), 60))
     runner.stop()
     assert len(seen) >= 4 and max(s[2] for s in seen) - min(s[2] for s in seen) > 1, seen
-    for low, high, up, angle in seen:
+    for low, high, up, angle, seconds in seen:
+        # A triangle of 2.5 deg up and down at 20 deg/s has a period of 0.5 s.
+        assert up == pytest.approx(5 / math.pi * math.asin(math.sin(4 * math.pi * seconds)), abs=1e-6)
         # The middle of a pattern on a flat screen of 2000 px/m at 0.25 m, 20 deg to the side and ``up`` above.
         centre = 300 - 500 * math.tan(math.radians(up)) / math.cos(math.radians(angle))
         assert (low + high + 1) / 2 == pytest.approx(centre, abs=1.5)
