@@ -66,7 +66,7 @@ RUNS: dict[str, list[str]] = {
 TEXTS: dict[str, list[str]] = {
     **{f"check {path.relative_to(ROOT)}": ["check", str(path.relative_to(ROOT))] for path in sorted(
         path for path in (ROOT / "configs").rglob("*.yaml")
-        if path.parent.name not in ("slm", "tracking") and path.name != "study.yaml"
+        if path.parent.name not in ("slm", "tracking") and path.name not in ("study.yaml", "factors.yaml")
     )},
     "unknown key": ["check", "configs/pec/fourier.yaml", "grid.pich=8um"],
     "unknown section": ["check", "configs/volume/c60.yaml", "holograms.shape=[8,8]"],

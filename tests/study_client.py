@@ -57,7 +57,7 @@ class Runner(Client):
     server: perception_run.StudyServer
     loop: asyncio.AbstractEventLoop
 
-    def __init__(self, folder: Path, participant: int = 1):
+    def __init__(self, folder: Path, participant: int = 1, text: str = TINY):
         ready = threading.Event()
 
         class Server(perception_run.StudyServer):
@@ -69,7 +69,7 @@ class Runner(Client):
                     yield
 
         config = folder / "tiny.yaml"
-        config.write_text(TINY)
+        config.write_text(text)
         self.status: int | None = None
         self.error: Exception | None = None
 

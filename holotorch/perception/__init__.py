@@ -3,6 +3,7 @@
 Angles are in degrees, and their names end in ``_deg``; times are in seconds.
 """
 
+from holotorch.perception.anova import one_way_from_summary, two_way_from_summary
 from holotorch.perception.cortical import (
     COWEY_ROLLS,
     DOUGHERTY,
@@ -53,8 +54,10 @@ __all__ = [
     "check_display",
     "cortical_scale",
     "eccentricity_of",
+    "one_way_from_summary",
     "overlaps",
     "peripheral_weight",
     "scale_layout",
     "separation",
+    "two_way_from_summary",
 ]

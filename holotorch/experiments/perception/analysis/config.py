@@ -12,6 +12,8 @@ Size = Annotated[Number, Field(gt=0, le=180)]
 Seconds = Annotated[Number, Field(gt=0, le=60)]
 Share = Annotated[Number, Field(ge=0, lt=1)]
 Spread = Annotated[Number, Field(ge=0, le=10)]
+Contrast = Annotated[Number, Field(ge=0.02, le=1)]
+Speed = Annotated[Number, Field(ge=0, le=60)]
 Resamples = Annotated[Count, Field(ge=100, le=1_000_000)]
 
 
@@ -82,6 +84,14 @@ class SimulationSettings(Settings):
     exponential. ``gaussian``: standard deviation of the Gaussian as a share of ``trial``. ``miss``: share of missed
     targets. ``false_alarm``: share of answered distractions. ``lapse``: share of answers that are delayed by up to
     1.5 s. ``frame``: frame interval of the display in seconds.
+
+    ``contrasts`` and ``speeds_deg_s``: every pattern is shown with each contrast and at each speed. They change the
+    time by the laws of ``holotorch.perception.factors``: (k + k' e) (1 / C - 1) - (m + m' e) g(V, E), with e the
+    eccentricity from 55 deg in units of 10 deg. ``contrast`` and ``motion`` are the means over participants of k and m
+    in seconds, ``contrast_growth`` and ``motion_growth`` are k' and m', and ``factor_spread`` is the standard deviation
+    of k / mean and m / mean between participants. The forms of the laws are cited there; these five numbers are
+    assumed, because no source gives them for the far periphery. That contrast and speed leave the misses and lapses
+    unchanged is assumed too.
     """
 
     participants: Annotated[Count, Field(le=100_000)] = 40
@@ -99,6 +109,13 @@ class SimulationSettings(Settings):
     false_alarm: Share = 0.03
     lapse: Share = 0.01
     frame: Annotated[Number, Field(gt=0, le=1)] = 1 / 60
+    contrasts: Annotated[tuple[Contrast, ...], BeforeValidator(several), Field(min_length=1)] = (1.0,)
+    speeds_deg_s: Annotated[tuple[Speed, ...], BeforeValidator(several), Field(min_length=1)] = (0.0,)
+    contrast: Annotated[Number, Field(ge=-1, le=1)] = 0.01
+    contrast_growth: Annotated[Number, Field(ge=-1, le=1)] = 0.0
+    motion: Annotated[Number, Field(ge=-1, le=1)] = 0.04
+    motion_growth: Annotated[Number, Field(ge=-1, le=1)] = 0.0
+    factor_spread: Spread = 0.5
 
     @model_validator(mode="after")
     def _scales_exist(self) -> "SimulationSettings":
@@ -106,6 +123,10 @@ class SimulationSettings(Settings):
         if least <= 0:
             text = "expected alpha and beta with sizes above zero from 40 to 80 deg, got {least:.3g} deg"
             raise PydanticCustomError("scale", "{text}", {"text": text.format(least=least)})
+        if 1 not in self.contrasts or 0 not in self.speeds_deg_s:
+            raise PydanticCustomError(
+                "factors", "expected contrast 1 and speed 0 among others: alpha and beta are theirs"
+            )
         return self
 
 

@@ -12,7 +12,9 @@ from scipy import ndimage
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.perception.analysis.config import CleaningSettings, TargetTimeSettings
+from holotorch.experiments.perception.analysis.fixations import fixated
 from holotorch.experiments.perception.analysis.statistics import Array, listed
+from holotorch.experiments.perception.study.design import AS_IN_THESIS
 from holotorch.experiments.perception.study.log import read_logs
 from holotorch.perception.time import PerceptionTime
 
@@ -29,13 +31,17 @@ class Responses:
     frame_s: Array  # frame interval of the display
     simulated: bool = False  # whether the answers are simulated
     torn: int = 0  # number of logs whose last line is incomplete, because the recording was killed during a trial
+    broken: int | None = None  # number of trials left out because fixation was broken; None without an eye tracker
+    contrast: Array | None = None  # Weber contrast of the pattern; None: 1 in all trials
+    speed_deg_s: Array | None = None  # speed of the pattern in degrees per second; None: 0 in all trials
 
 
 def read_responses(paths: Iterable[str]) -> Responses:
     """Read the logs of a study: files, or folders with ``*.jsonl`` files.
 
     Raises:
-        ConfigError: A log cannot be read, contains no trials, or contains impossible angles.
+        ConfigError: A log cannot be read, contains no trials or impossible angles, or was recorded with the mouse in
+            place of an eye tracker.
     """
     files: list[Path] = []
     for path in map(Path, paths):
@@ -44,7 +50,12 @@ def read_responses(paths: Iterable[str]) -> Responses:
             raise ConfigError([f"logs: {path} holds no *.jsonl files, which 'holotorch study' writes"])
         files += logs
     logs = read_logs(files)
-    rows = [(log, trial) for log in logs for trial in log.trials if not trial["practice"]]
+    checked = [(log, *pair) for log in logs for pair in zip(log.trials, fixated(log), strict=True)]
+    checked = [(log, trial, held) for log, trial, held in checked if not trial["practice"]]
+    rows = [(log, trial) for log, trial, held in checked if held is not False]
+    broken = len(checked) - len(rows) if any(log.header.get("gaze") for log in logs) else None
+    if checked and not rows:
+        raise ConfigError([f"{log.path}: fixation is broken in every trial after the practice round" for log in logs])
     if not rows:
         raise ConfigError([f"{log.path}: the log is empty: no trials after the practice round" for log in logs])
     wrong = {
@@ -56,17 +67,29 @@ def read_responses(paths: Iterable[str]) -> Responses:
     if wrong:
         raise ConfigError(sorted(wrong))
 
-    def column(key: str, dtype: type = float) -> NDArray:
-        return np.array([trial[key] for _, trial in rows], dtype)  # None becomes NaN
+    def column(key: str, dtype: type = float, default: float | None = None) -> NDArray:
+        return np.array([trial.get(key, default) for _, trial in rows], dtype)  # None becomes NaN
 
     pattern = column("eccentricity_deg"), column("size_deg"), column("target", bool)
     times = column("reaction_s"), column("frame_s")
-    return Responses(column("participant", int), *pattern, *times, torn=sum(log.torn for log in logs))
+    return Responses(
+        column("participant", int),
+        *pattern,
+        *times,
+        torn=sum(log.torn for log in logs),
+        broken=broken,
+        contrast=column("contrast", default=AS_IN_THESIS[0]),
+        speed_deg_s=column("speed_deg_s", default=AS_IN_THESIS[1]),
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Times:
-    """Perception times: the median of the answers of each of P participants in each condition."""
+    """Perception times: the median of the answers of each of P participants in each condition.
+
+    ``seconds`` and ``kept`` are of the patterns with the first of the ``variants``, the highest contrast and, with it,
+    the lowest speed.
+    """
 
     participants: NDArray[np.int64]  # numbers [P]
     eccentricities: Array  # degrees [E], rising
@@ -75,6 +98,13 @@ class Times:
     kept: NDArray[np.int64]  # number of answers behind each median, [P, E, S]
     counts: dict[str, int]  # number of all trials and of those that each criterion excluded, by name
     simulated: bool = False  # whether the answers are simulated
+    variants: tuple[tuple[float, float], ...] = (AS_IN_THESIS,)  # the W pairs of contrast and speed in deg/s
+    of_variants: Array | None = None  # medians of all of them [P, E, S, W]; None: W is 1
+
+    @property
+    def all_seconds(self) -> Array:
+        """Medians of all contrasts and speeds, [P, E, S, W]."""
+        return self.seconds[..., None] if self.of_variants is None else self.of_variants
 
     def of(self, target: TargetTimeSettings) -> Array:
         """The target time of each participant in seconds [P]. ConfigError for a pattern that was not shown."""
@@ -94,6 +124,8 @@ class Times:
 
 def perception_times(responses: Responses, rule: CleaningSettings) -> Times:
     """Remove the answers that ``rule`` excludes, and compute the medians.
+
+    A condition is an eccentricity and a size, with a contrast and a speed.
 
     Raises:
         ConfigError: No valid answer remains, or no condition has enough of them.
@@ -116,8 +148,9 @@ def perception_times(responses: Responses, rule: CleaningSettings) -> Times:
     participants, p = np.unique(responses.participant, return_inverse=True)
     eccentricities, e = np.unique(responses.eccentricity_deg, return_inverse=True)
     sizes, s = np.unique(responses.size_deg, return_inverse=True)
-    shape = (len(participants), len(eccentricities), len(sizes))
-    condition, conditions = np.ravel_multi_index((p, e, s), shape), math.prod(shape)
+    variants, w = _variants(responses)
+    shape = (len(participants), len(eccentricities), len(sizes), len(variants))
+    condition, conditions = np.ravel_multi_index((p, e, s, w), shape), math.prod(shape)
     kept = np.flatnonzero(valid)
     logarithm = np.log(np.maximum(time[kept], 1e-6))
     middle = _medians(condition[kept], logarithm, conditions)[condition[kept]]
@@ -137,11 +170,23 @@ def perception_times(responses: Responses, rule: CleaningSettings) -> Times:
     counts["conditions"] = int(shown.sum())
     counts["missing conditions"] = int(missing.sum())
     counts["unfinished trials"] = responses.torn
+    if responses.broken is not None:
+        counts["broken fixations"] = responses.broken
     if not np.isfinite(seconds).any():
         most = int(number.max())
         raise ConfigError([f"no condition has {rule.responses} answers (cleaning.responses); {most} at most"])
-    seconds, number = seconds.reshape(shape), number.reshape(shape)
-    return Times(participants, eccentricities, sizes, seconds, number, counts, responses.simulated)
+    seconds, number = seconds.reshape(shape), number.reshape(shape)[..., 0]
+    first = seconds[..., 0]
+    return Times(participants, eccentricities, sizes, first, number, counts, responses.simulated, variants, seconds)
+
+
+def _variants(responses: Responses) -> tuple[tuple[tuple[float, float], ...], NDArray[np.int64]]:
+    """The pairs of contrast and speed, the highest contrast and then the lowest speed first, and that of each trial."""
+    trials = len(responses.target)
+    contrast = np.full(trials, AS_IN_THESIS[0]) if responses.contrast is None else responses.contrast
+    speed = np.full(trials, AS_IN_THESIS[1]) if responses.speed_deg_s is None else responses.speed_deg_s
+    pairs, index = np.unique(np.stack([-contrast, speed], -1), axis=0, return_inverse=True)
+    return tuple((-first, second) for first, second in pairs.tolist()), index.reshape(-1)
 
 
 def _medians(group: NDArray[np.int64], values: Array, groups: int) -> Array:

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.perception.analysis import figures, statistics
+from holotorch.experiments.perception.analysis.cells import cell_tests
 from holotorch.experiments.perception.analysis.config import AnalysisSettings
 from holotorch.experiments.perception.analysis.curves import (
     Curves,
@@ -23,9 +24,10 @@ from holotorch.experiments.perception.analysis.curves import (
     perception_times,
     read_responses,
 )
+from holotorch.experiments.perception.analysis.factors import level_effects, model_effects
 from holotorch.experiments.perception.analysis.finding import Finding, in_json, in_words
 from holotorch.experiments.perception.analysis.power import needed, power_rows, with_slope
-from holotorch.experiments.perception.analysis.simulation import simulate, true_line
+from holotorch.experiments.perception.analysis.simulation import MIDDLE_DEG, simulate, true_line
 from holotorch.experiments.perception.study.frames import quantisation
 from holotorch.experiments.runs.folder import RunFolder, conclude
 from holotorch.experiments.runs.saving import Results
@@ -108,7 +110,10 @@ def run_analysis(settings: AnalysisSettings, opened: RunFolder) -> bool:
     truths = [None if settings.logs else true_line(settings.simulation, target) for target in settings.targets]
     rows = [finding.row(truth) for finding, truth in zip(findings, truths, strict=True)]
     whole_frames = on_frames(responses)
-    text = in_words(settings, times, curves, findings, frames, whole_frames)
+    cells = cell_tests(times, settings.range_deg[0])
+    factors, factor_words = _factors(times, settings.confidence)
+    words = in_words(settings, times, curves, findings, frames, whole_frames)
+    text = "\n".join([words, *cells.in_words(), *factor_words])
     if settings.repeated_measures is None and not _uses_repeated_measures(settings):
         text += "\nLeft out   repeated measures and the mixed model, which need statsmodels: pip install "
         text += "'holotorch[stats]' and run it again; the one-way ANOVA takes the answers of one participant as "
@@ -122,6 +127,8 @@ def run_analysis(settings: AnalysisSettings, opened: RunFolder) -> bool:
     files.write(write_table, folder / "metrics.csv", rows)
     files.write(write_table, folder / "conditions.csv", list(_conditions(times)))
     files.write(write_table, folder / "curves.csv", _curves(times, curves))
+    if factors:
+        files.write(write_table, folder / "factors.csv", factors)
     lines = [(finding.name, finding.line) for finding in findings]
     images = {
         "time_surface": figures.time_surface(times),
@@ -150,11 +157,22 @@ def run_analysis(settings: AnalysisSettings, opened: RunFolder) -> bool:
         "counts": times.counts,
         "quantisation": asdict(frames) | {"on_frames": in_json(whole_frames)},
         "rows": rows,
+        "cells": cells.to_json(),
+        "factors": factors,
         "power": power,
         "lines": text.splitlines(),
         "seconds": round(time.perf_counter() - started, 2),
     }
     return conclude(opened, summary, files, done=True)
+
+
+def _factors(times: Times, confidence: float) -> tuple[list[dict[str, Any]], list[str]]:
+    """Rows and words of the effects of contrast and motion; none if all patterns have the same."""
+    levels, model = level_effects(times, confidence), model_effects(times, MIDDLE_DEG, confidence)
+    contrast, speed = times.variants[0]
+    lines = [f"Factors    {effect.in_words()}, beside contrast {contrast:g} at {speed:g} deg/s" for effect in levels]
+    lines += [f"Factors    model at {MIDDLE_DEG:g} deg: {effect.in_words()}" for effect in model]
+    return [effect.row() for effect in (*levels, *model)], lines
 
 
 def _conditions(times: Times) -> Iterator[dict[str, Any]]:

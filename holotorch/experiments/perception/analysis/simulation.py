@@ -7,15 +7,19 @@ the actual times, because they are rounded up to whole frames.
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 from scipy import special, stats
 
 from holotorch.experiments.perception.analysis.config import SimulationSettings, TargetTimeSettings
 from holotorch.experiments.perception.analysis.curves import Responses
-from holotorch.experiments.perception.study.design import THESIS_CONDITIONS
+from holotorch.experiments.perception.analysis.statistics import Array
+from holotorch.experiments.perception.study.design import AS_IN_THESIS, THESIS_CONDITIONS
+from holotorch.perception.factors import contrast_term, motion_term
 
 _INNER = 40.0  # degrees; patterns nearer to the fixation point have no scale and only serve as targets
+MIDDLE_DEG = 55.0  # eccentricity at which the settings give the effects of contrast and motion
 _LATE = 1.5  # seconds; longest delay of a lapse
 
 
@@ -82,6 +86,7 @@ def simulate(
         else:
             middle = math.log(settings.alpha * angle + settings.beta)
             times[:, k] = base + slope * (math.log(size) - middle - shift[:, np.searchsorted(angles, angle)])
+    times, where, variants = _with_factors(settings, generator, times, where)
     repeats = targets + distractions
     shape = (people, len(where), repeats)
     gaussian = settings.trial * settings.gaussian
@@ -105,7 +110,32 @@ def simulate(
         reaction.ravel(),
         np.full(math.prod(shape), settings.frame),
         simulated=True,
+        contrast=np.tile(np.repeat(variants[:, 0], repeats), people),
+        speed_deg_s=np.tile(np.repeat(variants[:, 1], repeats), people),
     )
+
+
+def _with_factors(
+    settings: SimulationSettings, generator: np.random.Generator, times: Array, where: Array
+) -> tuple[Array, Array, Array]:
+    """Times [P, N W], (eccentricity, size) [N W, 2] and (contrast, speed) [N W, 2] of N conditions in W variants.
+
+    ``times`` [P, N] are those of black patterns at rest at the conditions ``where`` [N, 2]. No random number is drawn
+    if there are no others.
+    """
+    variants = np.array(list(product(settings.contrasts, settings.speeds_deg_s)))
+    conditions = len(where)
+    times, where = times.repeat(len(variants), 1), where.repeat(len(variants), 0)
+    variants = np.tile(variants, (conditions, 1))
+    if (variants == AS_IN_THESIS).all():
+        return times, where, variants
+    k, m = 1 + settings.factor_spread * generator.standard_normal((2, len(times), 1))
+    from_middle = (where[:, 0] - MIDDLE_DEG) / 10
+    k = settings.contrast * k + settings.contrast_growth * from_middle
+    m = settings.motion * m + settings.motion_growth * from_middle
+    c, g = contrast_term(variants[:, 0].copy()).numpy(), motion_term(variants[:, 1].copy(), where[:, 0].copy()).numpy()
+    change = k * c - m * g
+    return times + change, where, variants
 
 
 @lru_cache

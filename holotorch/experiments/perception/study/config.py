@@ -27,13 +27,16 @@ from holotorch.experiments.config.settings import (
     within,
 )
 from holotorch.experiments.config.source import Key, read_source
-from holotorch.experiments.perception.study.design import MOST_TRIALS, Design, make_design, too_many
+from holotorch.experiments.perception.study.design import AS_IN_THESIS, MOST_TRIALS, Design, make_design, too_many
+from holotorch.experiments.perception.study.gaze import GazeSettings
 from holotorch.perception.geometry import CurvedScreen, FlatScreen
 
 Eccentricity = Annotated[
     Number, within(0, 120, "an eccentricity between 0 and 120 deg (left and right are drawn by the design)")
 ]
 Size = Annotated[Number, within(0.1, 80, "a size between 0.1 and 80 deg")]
+Contrast = Annotated[Number, within(0.02, 1, "a contrast between 0.02 and 1, which is black")]
+Speed = Annotated[Number, within(0, 60, "a speed between 0 and 60 deg/s")]
 Metres = Annotated[Length, plausible(SCREEN)]
 
 
@@ -50,6 +53,7 @@ def _unit_if_unusual(value: Any) -> Any:
 Distance = Annotated[Metres, BeforeValidator(_unit_if_unusual)]
 Seconds = Annotated[Number, within(0.02, 60, "a time between 0.02 and 60 seconds, not milliseconds")]
 Whole = Annotated[int, BeforeValidator(number), Field(ge=0)]
+TRAVEL_DEG = 2.5  # a moving pattern goes up and down by this angle, so that its eccentricity hardly changes
 _TOLERANCE_PX = 0.5  # a pattern may extend this far beyond the edge of the screen, since nothing visible is lost
 
 
@@ -112,7 +116,12 @@ class TimingSettings(Settings):
 
 
 class StudySettings(Settings):
-    """A study; see ``make_design``. ``practice``: number of trials before the first round, excluded from analyses."""
+    """A study; see ``make_design``. ``practice``: number of trials before the first round, excluded from analyses.
+
+    ``contrasts``, ``speeds_deg_s``: every pattern is shown with each contrast and at each speed. Contrast is Weber's,
+    of a dark pattern on an sRGB screen. A moving pattern goes up and down at a constant speed, from where it appears.
+    ``gaze``: check of the fixation with an eye tracker; without it, nobody checks where the participant looks.
+    """
 
     seed: Whole
     screen: Annotated[FlatSettings | CurvedSettings, Discriminator("kind")]
@@ -122,6 +131,9 @@ class StudySettings(Settings):
     sides: Literal["both", "left", "right"] = "both"
     practice: Whole = 14
     timing: TimingSettings = TimingSettings()
+    contrasts: Annotated[tuple[Contrast, ...], BeforeValidator(several), Field(min_length=1)] = (AS_IN_THESIS[0],)
+    speeds_deg_s: Annotated[tuple[Speed, ...], BeforeValidator(several), Field(min_length=1)] = (AS_IN_THESIS[1],)
+    gaze: GazeSettings | None = None
 
     @property
     def conditions(self) -> tuple[tuple[float, float], ...]:
@@ -132,7 +144,13 @@ class StudySettings(Settings):
     def trials(self) -> int:
         """Number of trials of each participant after the practice."""
         conditions = sum(len(group.eccentricities_deg) * len(group.sizes_deg) for group in self.patterns)
-        return 2 * conditions * (self.repeats.target + self.repeats.distraction)
+        variants = len(self.contrasts) * len(self.speeds_deg_s)
+        return 2 * conditions * variants * (self.repeats.target + self.repeats.distraction)
+
+    def recorded(self) -> dict[str, Any]:
+        """The settings that the page needs and the log keeps, as JSON data."""
+        names = {"screen", "timing"} | ({"gaze"} if self.gaze else set())
+        return self.model_dump(mode="json", include=names)
 
     def design(self, participant: int) -> Design:
         """The trials of one participant."""
@@ -145,6 +163,7 @@ class StudySettings(Settings):
             sides=self.sides,
             practice=self.practice,
             wait_s=self.timing.wait_s,
+            variants=tuple(product(self.contrasts, self.speeds_deg_s)),
             seed=self.seed,
         )
 
@@ -175,6 +194,10 @@ def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudySettings
             mistakes.append((("screen", "size"), "expected an arc of at most one turn, 2 pi times the radius"))
     if settings.trials > MOST_TRIALS:  # listing the conditions would take too long
         raise ConfigError([source.mistake(("repeats",), too_many(settings.trials))])
+    for name in ("contrasts", "speeds_deg_s"):
+        values = getattr(settings, name)
+        if len(set(values)) < len(values):
+            mistakes.append(((name,), "expected different numbers; raise the repeats instead"))
     conditions: set[tuple[float, float]] = set()
     for i, group in enumerate(settings.patterns):
         for pair in group.pairs:
@@ -203,8 +226,9 @@ def beyond_screen(settings: StudySettings) -> list[Cut]:
     screen = build_screen(settings.screen)
     rows, columns = screen.shape
     cuts = []
+    up = TRAVEL_DEG if any(settings.speeds_deg_s) else 0.0
     for eccentricity, size in settings.conditions:
-        y, x = screen.pixels(*_outline(eccentricity, size))
+        y, x = screen.pixels(*_outline(eccentricity, size, up))
         # Pixel centres have integer coordinates, so that the screen ends half a pixel beyond the last centre.
         # Directions that do not meet the screen surface give NaN, which counts as outside.
         fits_width = ((x - (columns - 1) / 2).abs() <= columns / 2 + _TOLERANCE_PX).all()
@@ -226,10 +250,15 @@ def build_screen(settings: FlatSettings | CurvedSettings) -> FlatScreen | Curved
     return CurvedScreen(settings.shape, settings.size, settings.distance, settings.radius)
 
 
-def _outline(eccentricity: float, size: float) -> tuple[Tensor, Tensor]:
-    """(elevation, azimuth) in degrees of points on the circle pattern, which also encloses the cross pattern."""
+def _outline(eccentricity: float, size: float, up_deg: float = 0.0) -> tuple[Tensor, Tensor]:
+    """(elevation, azimuth) in degrees of points on the circle pattern, which also encloses the cross pattern.
+
+    ``up_deg``: elevation of the centre of the pattern, at the highest point of its motion.
+    """
     angle = torch.arange(0, 360, 5, dtype=torch.float64).deg2rad()
     centre, half = math.radians(eccentricity), math.tan(math.radians(size) / 2)
     u, v = half * angle.cos(), half * angle.sin()  # in the plane tangent to the unit sphere at the centre
-    x, z = math.sin(centre) + u * math.cos(centre), math.cos(centre) - u * math.sin(centre)
-    return torch.atan2(v, torch.hypot(x, z)).rad2deg(), torch.atan2(x, z).rad2deg()
+    up = math.radians(up_deg)
+    ahead, y = math.cos(up) - v * math.sin(up), math.sin(up) + v * math.cos(up)
+    x, z = ahead * math.sin(centre) + u * math.cos(centre), ahead * math.cos(centre) - u * math.sin(centre)
+    return torch.atan2(y, torch.hypot(x, z)).rad2deg(), torch.atan2(x, z).rad2deg()

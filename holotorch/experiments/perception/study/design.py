@@ -10,11 +10,12 @@ import json
 import random
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import product
 from typing import Any, Literal
 
 Pattern = Literal["cross", "circle"]
 Side = Literal["left", "right"]
-_Appearance = tuple[float, float, Side, Pattern, bool]  # eccentricity, size, side, pattern, target
+_Appearance = tuple[float, float, Side, Pattern, bool, float, float]  # as the fields of Trial, without its wait
 _OTHER: dict[Pattern, Pattern] = {"cross": "circle", "circle": "cross"}
 _SIDES: dict[str, tuple[Side, ...]] = {"left": ("left",), "right": ("right",), "both": ("left", "right")}
 ORDERS = ("thesis", "williams")
@@ -22,6 +23,7 @@ ORDERS = ("thesis", "williams")
 THESIS_CONDITIONS = tuple((float(e), float(s)) for e in (0, 10, 20, 30) for s in (5, 10, 15)) + tuple(
     (float(e), float(s)) for e in (40, 50, 60, 70, 80) for s in (5, 8, 11, 14, 17, 20, 23, 26)
 )
+AS_IN_THESIS = (1.0, 0.0)  # contrast and speed in deg/s of the patterns of the thesis: black and at rest
 MOST_TRIALS = 10_000  # largest number of trials per participant; they take seven hours at 2.5 s per trial
 # Target of each round, and which half of the trials with this target the round has.
 _ROUNDS: tuple[tuple[Pattern, int], ...] = (("cross", 1), ("circle", 1), ("cross", 2), ("circle", 2))
@@ -39,6 +41,15 @@ class Trial:
     pattern: Pattern
     target: bool  # whether the pattern is the target of the round, which should be answered
     wait_s: float  # time from the end of the previous trial to the appearance of the pattern
+    contrast: float = AS_IN_THESIS[0]  # Weber contrast of the dark pattern, 1 for black
+    speed_deg_s: float = AS_IN_THESIS[1]  # speed of the pattern, which moves up and down
+
+    def to_json(self) -> dict[str, Any]:
+        """The trial as JSON data; contrast and speed only if they differ from those of the thesis."""
+        data = asdict(self)
+        if (self.contrast, self.speed_deg_s) == AS_IN_THESIS:
+            del data["contrast"], data["speed_deg_s"]
+        return data
 
     @property
     def practice(self) -> bool:
@@ -61,7 +72,7 @@ class Design:
     @property
     def name(self) -> str:
         """A short hash of all trials, which differs if any trial differs."""
-        text = json.dumps([asdict(trial) for trial in self.trials], sort_keys=True)
+        text = json.dumps([trial.to_json() for trial in self.trials], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     def to_json(self) -> dict[str, Any]:
@@ -71,7 +82,7 @@ class Design:
             "version": 1,
             "participant": self.participant,
             "name": self.name,
-            "trials": [asdict(trial) for trial in self.trials],
+            "trials": [trial.to_json() for trial in self.trials],
         }
 
     @staticmethod
@@ -118,6 +129,7 @@ def make_design(
     sides: str = "both",
     practice: int = 14,
     wait_s: tuple[float, float] = (0.8, 1.6),
+    variants: Sequence[tuple[float, float]] = (AS_IN_THESIS,),
     seed: int = 0,
 ) -> Design:
     """Draw the trials of one participant; equal arguments give equal trials.
@@ -135,6 +147,7 @@ def make_design(
         practice: Number of practice trials, which have the target of the first round; limited to the number of trials
             in the two rounds with this target.
         wait_s: Bounds of the uniformly distributed time before each appearance.
+        variants: Pairs (contrast, speed in deg/s) with which every condition is shown.
         seed: Seed of the random numbers.
 
     Raises:
@@ -143,24 +156,24 @@ def make_design(
     """
     if isinstance(participant, bool) or participant < 1:
         raise ValueError(f"participant: expected a number from 1, got {participant}")
-    _check(conditions, target_repeats, distraction_repeats, practice, wait_s)
+    _check(conditions, target_repeats, distraction_repeats, practice, wait_s, variants)
     if sides not in _SIDES:
         raise ValueError(f"sides: expected left, right or both, got {sides!r}")
     orders = round_orders(order)
     rng = random.Random(f"holotorch {seed}" + (f" {participant}" if order == "williams" else ""))
     blocks: dict[tuple[Pattern, int], list[_Appearance]] = {}
     for goal in ("cross", "circle"):
-        drawn = _shuffled(rng, conditions, goal, target_repeats, distraction_repeats, sides)
+        drawn = _shuffled(rng, conditions, variants, goal, target_repeats, distraction_repeats, sides)
         half = (len(drawn) + 1) // 2
         blocks[goal, 1], blocks[goal, 2] = drawn[:half], drawn[half:]
     waits = {name: [round(rng.uniform(*wait_s), 4) for _ in block] for name, block in blocks.items()}
     rounds = [_ROUNDS[i] for i in orders[(participant - 1) % len(orders)]]
     rng = random.Random(f"holotorch practice {seed} {participant}")
-    drawn = _shuffled(rng, conditions, rounds[0][0], target_repeats, distraction_repeats, sides)
-    trials = [Trial(0, i, *item, round(rng.uniform(*wait_s), 4)) for i, item in enumerate(drawn[:practice], 1)]
+    drawn = _shuffled(rng, conditions, variants, rounds[0][0], target_repeats, distraction_repeats, sides)
+    trials = [_trial(0, i, item, round(rng.uniform(*wait_s), 4)) for i, item in enumerate(drawn[:practice], 1)]
     for number, name in enumerate(rounds, 1):
         timed = zip(blocks[name], waits[name], strict=True)
-        trials += [Trial(number, i, *item, wait) for i, (item, wait) in enumerate(timed, 1)]
+        trials += [_trial(number, i, item, wait) for i, (item, wait) in enumerate(timed, 1)]
     return Design(participant, tuple(trials))
 
 
@@ -169,26 +182,36 @@ def too_many(trials: int) -> str:
     return f"expected at most {MOST_TRIALS} trials for a participant, got {trials}; lower the repeats or conditions"
 
 
+def _trial(number: int, index: int, item: _Appearance, wait_s: float) -> Trial:
+    *first, contrast, speed = item
+    return Trial(number, index, *first, wait_s, contrast, speed)  # type: ignore[arg-type]
+
+
 def _shuffled(
-    rng: random.Random, conditions, goal: Pattern, targets: int, distractions: int, sides: str
+    rng: random.Random, conditions, variants, goal: Pattern, targets: int, distractions: int, sides: str
 ) -> list[_Appearance]:
     """All trials with the target ``goal``, in random order."""
     roles: tuple[tuple[Pattern, int], ...] = ((goal, targets), (_OTHER[goal], distractions))
     appearances: list[_Appearance] = []
-    for eccentricity, size in conditions:
+    for (eccentricity, size), (contrast, speed) in product(conditions, variants):
         for pattern, count in roles:
             start = rng.randrange(2)
             for i in range(start, start + count):
                 side = _SIDES[sides][i % len(_SIDES[sides])]
-                appearances.append((float(eccentricity), float(size), side, pattern, pattern == goal))
+                pair = float(eccentricity), float(size)
+                appearances.append((*pair, side, pattern, pattern == goal, float(contrast), float(speed)))
     rng.shuffle(appearances)
     return appearances
 
 
-def _check(conditions, targets: int, distractions: int, practice: int, wait_s: tuple[float, float]) -> None:
+def _check(conditions, targets: int, distractions: int, practice: int, wait_s: tuple[float, float], variants) -> None:
     if not conditions:
         raise ValueError("conditions: expected at least one pair of eccentricity and size, got none")
-    if (trials := 2 * len(conditions) * (targets + distractions)) > MOST_TRIALS:
+    if not variants or len(set(variants)) < len(variants):
+        raise ValueError(f"variants: expected different pairs of contrast and speed, got {list(variants)}")
+    if any(not (0 < contrast <= 1 and 0 <= speed < 1000) for contrast, speed in variants):
+        raise ValueError(f"variants: expected contrasts in (0, 1] and speeds from 0 deg/s, got {list(variants)}")
+    if (trials := 2 * len(conditions) * len(variants) * (targets + distractions)) > MOST_TRIALS:
         raise ValueError(too_many(trials))
     if len(set(conditions)) < len(conditions):
         twice = next(pair for pair in conditions if list(conditions).count(pair) > 1)

@@ -54,7 +54,7 @@ def read_log(path: Path) -> Trials:
             parse_record(LogHeader, header)
         except ValueError as error:
             mistakes.append(f"{path}:1:1: {error}")
-    first_lines: dict[tuple[int, int], int] = {}  # line number of the first line of each (round, trial)
+    first_lines: dict[tuple[int, int, int], int] = {}  # line number of the first line of each (round, trial, attempt)
     for number, trial in enumerate(trials, 2):
         if trial is None:
             continue
@@ -63,7 +63,7 @@ def read_log(path: Path) -> Trials:
         except ValueError as error:
             mistakes.append(f"{path}:{number}:1: not a trial: {error}")
             continue
-        key = (record.round, record.trial)
+        key = (record.round, record.trial, record.attempt)
         if key in first_lines:
             mistakes.append(f"{path}:{number}:1: round {key[0]}, trial {key[1]} is already in line {first_lines[key]}")
         elif header is not None and record.participant != (owner := header.get("participant")):

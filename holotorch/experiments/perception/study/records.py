@@ -27,13 +27,19 @@ class Record(BaseModel):
 
 
 class LogHeader(Record):
-    """The first line of a log."""
+    """The first line of a log. ``gaze``: the settings of the eye tracker, if there was one."""
 
     participant: Whole
+    gaze: Annotated[dict[str, Any] | None, Field(description="the settings of the gaze or null")] = None
 
 
 class TrialRecord(Record):
-    """A line of a log after the first: a trial and its outcome."""
+    """A line of a log after the first: a trial and its outcome.
+
+    With an eye tracker, ``onset_unix_s`` is the onset in seconds since 1970, ``attempt`` counts the appearances of the
+    trial, and ``fixated`` says whether the participant looked at the fixation point; it is null if the samples come in
+    a file later.
+    """
 
     eccentricity_deg: Finite
     size_deg: Finite
@@ -50,6 +56,11 @@ class TrialRecord(Record):
     pattern: Annotated[Literal["cross", "circle"], Field(description="cross or circle")]
     response_s: Annotated[float | None, Field(description="a finite number or null")]
     reaction_s: Annotated[float | None, Field(ge=0, description="a finite number, 0 or more, or null")]
+    attempt: Annotated[int, Field(ge=1, description="a count, 1 or more")] = 1
+    fixated: Annotated[bool | None, Field(description="true, false or null")] = None
+    onset_unix_s: Annotated[float | None, Field(description="a finite number or null")] = None
+    contrast: Annotated[float, Field(gt=0, le=1, description="a number above 0 and at most 1")] = 1.0
+    speed_deg_s: Annotated[float, Field(ge=0, description="a finite number, 0 or more")] = 0.0
 
     @model_validator(mode="after")
     def _response_is_consistent(self) -> Self:
@@ -65,8 +76,17 @@ class SessionRequest(Record):
     window: Annotated[str, Field(min_length=1, description="the name of the window")]
 
 
+class FixationRequest(SessionRequest):
+    """Request of the page, answered when fixation differs from ``fixated``, or after a second."""
+
+    fixated: Flag
+
+
 class TrialResult(SessionRequest):
-    """Request of the page after a trial; times are in seconds on the clock of the browser."""
+    """Request of the page after a trial; times are in seconds on the clock of the browser.
+
+    ``onset_unix_s`` is ``onset_s`` in seconds since 1970, to be compared with the times of gaze samples.
+    """
 
     index: Annotated[int, Field(ge=0, description="the index of the trial, 0 or more")]
     onset_s: Annotated[float, Field(ge=0, description="seconds, 0 or more")]
@@ -75,6 +95,7 @@ class TrialResult(SessionRequest):
     early: Count = 0
     dropped_frames: Count = 0
     device: Annotated[Device | None, Field(description="key, pointer, gamepad or null")] = None
+    onset_unix_s: Annotated[float | None, Field(ge=0, description="seconds, 0 or more, or null")] = None
 
     @property
     def reaction_s(self) -> float | None:
@@ -90,7 +111,8 @@ class TrialResult(SessionRequest):
     def measured(self) -> dict[str, Any]:
         """The measured part of a line of the log."""
         times = {"responded": self.response_s is not None, "reaction_s": self.reaction_s}
-        return times | self.model_dump(exclude={"index", "window"})
+        without = {"index", "window"} | ({"onset_unix_s"} if self.onset_unix_s is None else set())
+        return times | self.model_dump(exclude=without)
 
 
 Model = TypeVar("Model", bound=Record)

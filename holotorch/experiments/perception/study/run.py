@@ -4,17 +4,24 @@ import asyncio
 import os
 import re
 import secrets
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 
 from holotorch.experiments.config.errors import ConfigError
 from holotorch.experiments.perception.study.config import beyond_screen, build_screen, load_study
 from holotorch.experiments.perception.study.frames import quantisation
+from holotorch.experiments.perception.study.gaze import GazeFile
 from holotorch.experiments.perception.study.log import TrialLog
 from holotorch.experiments.perception.study.server import StudyServer
 from holotorch.experiments.perception.study.session import StudySession
 from holotorch.experiments.runs.signals import handling
 from holotorch.io.files import write_json
+
+_INTRODUCE = {
+    "tracker": "gaze: waiting for samples of the eye tracker at /gaze, with the token at the end of the address",
+    "file": "gaze: fixation is checked by the analysis, from a CSV file of samples beside the log",
+    "mouse": "gaze: the mouse stands in for an eye tracker; the analysis refuses these results",
+}
 
 
 def run_study_server(
@@ -55,11 +62,13 @@ def run_study_server(
     header = {
         "participant": participant,
         "design": design.name,
-        **settings.model_dump(mode="json", include={"screen", "timing"}),
+        **settings.recorded(),
         "cut": [[cut.eccentricity_deg, cut.size_deg] for cut in beyond_screen(settings)],
     }
-    with TrialLog(path, header) as log:
-        session = StudySession(settings, design, log)
+    with TrialLog(path, header) as log, ExitStack() as stack:
+        live = settings.gaze is not None and settings.gaze.live
+        gaze_file = stack.enter_context(closing(GazeFile(path.with_suffix(".gaze.csv")))) if live else None
+        session = StudySession(settings, design, log, gaze_file)
         if session.complete:
             text = f"{path}: participant {participant} is complete; choose another number, or another folder with --out"
             raise ConfigError([text])
@@ -89,8 +98,10 @@ def _introduction(server: StudyServer) -> str:
     field = build_screen(settings.screen).field_deg[1]
     lines.append(f"screen: {field:.1f} deg wide, {settings.screen.distance:g} m away")
     if done:
-        trial = f"trial {done + 1} of {len(design.trials)}"
+        trial = f"trial {done + 1} of {len(server.session.order.appearances)}"
         lines.append(f"participant {design.participant} goes on at {trial}; a new person needs a new number")
+    if settings.gaze:
+        lines.append(_INTRODUCE[settings.gaze.source])
     rows, columns = settings.screen.shape
     lines.append(f"open in full screen ({columns} x {rows} pixels): {server.address}#{server.token}")
     return "\n".join(lines)
@@ -100,8 +111,11 @@ def _summary(session: StudySession) -> str:
     log = session.log
     trials = [trial for trial in log.trials if not trial["practice"]]
     correct = sum(trial["responded"] == trial["target"] for trial in trials)
-    total = len(session.design.trials)
+    total = len(session.order.appearances)
     lines = [f"{len(log.trials)} of {total} trials in {log.path}; without practice {correct} of {len(trials)} correct"]
+    if session.gaze:
+        broken = sum(trial.get("fixated") is False for trial in trials)
+        lines.append(f"fixation broken in {broken} of {len(trials)} trials; {session.gaze}")
     steps = quantisation([trial["frame_s"] for trial in log.trials])
     return "\n".join(lines + ([str(steps)] if steps else []))
 

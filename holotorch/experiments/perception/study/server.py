@@ -9,6 +9,9 @@ servers on the machine.
 pattern can be visible. ``response_s`` is the time stamp of the key event on the same clock or, for a gamepad, which is
 polled once per frame, the time stamp of the frame. The delays of the screen and the keyboard, which vary little between
 trials, are not measured.
+
+With an eye tracker (see gaze.py), its program sends samples to ``/gaze``, and the page asks ``/fixation`` whether the
+participant looks at the fixation point.
 """
 
 import asyncio
@@ -16,6 +19,7 @@ import hmac
 import json
 import logging
 import socket
+import time
 import traceback
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -25,12 +29,14 @@ from typing import Any
 from aiohttp import web
 
 from holotorch.experiments.config.errors import ConfigError
-from holotorch.experiments.perception.study.records import SessionRequest, parse_record
+from holotorch.experiments.perception.study.records import FixationRequest, SessionRequest, parse_record
 from holotorch.experiments.perception.study.session import StudySession
 
 _LARGEST = 10_000  # largest body of a request in bytes; a result has about 200
 _CONNECTIONS = 64  # largest number of simultaneous connections; a browser opens six
-_SECONDS = 10.0  # longest duration of a connection; an answer takes milliseconds
+_SECONDS = 10.0  # longest duration of a connection; an answer takes milliseconds, one about the fixation a second
+_LATEST_S = 0.3  # how long the check of a trial waits for gaze samples that are still on their way
+_STEP_S = 0.01  # how often a waiting request looks again
 _HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -44,7 +50,8 @@ _QUIET.disabled = True
 class _Connections(web.Server):
     """Connections for one request each, which last ``_SECONDS`` at most; beyond ``_CONNECTIONS``, the oldest is closed.
 
-    A complete request is answered immediately, so that the oldest connection is one whose request is incomplete.
+    A complete request is answered immediately, so that the oldest connection is one whose request is incomplete, or one
+    that waits for a change of the fixation, which the page asks for again.
     """
 
     def __init__(self, handler: Any):
@@ -126,20 +133,46 @@ class StudyServer:
             return web.Response(text=self._page, content_type="text/html")
         self._check_sender(request)
         # Pages of other origins can send forms here, but JSON only with a CORS permission, which is not given.
-        accepted = request.method == "POST" and request.path in ("/session", "/trial")
+        paths = ("/session", "/trial", "/gaze", "/fixation") if self.session.gaze else ("/session", "/trial")
+        accepted = request.method == "POST" and request.path in paths
         if not accepted or request.content_type != "application/json":
-            raise web.HTTPNotFound(text="expected JSON at /session or /trial")
+            raise web.HTTPNotFound(text=f"expected JSON at {', '.join(paths[:-1])} or {paths[-1]}")
         value = await _read_json(request)
+        if request.path == "/gaze":
+            return web.json_response(self.session.look(value))
+        if request.path == "/fixation":
+            return web.json_response({"fixated": await self._fixation(value)})
         if request.path == "/session":
             try:
                 window = parse_record(SessionRequest, value).window
             except ValueError as error:
                 raise web.HTTPBadRequest(text=str(error)) from None
             return web.json_response(self.session.open(window))
+        await self._samples_until(self.session.end_of(value))
         status, answer = self.session.record(value)
         if self.session.complete:
             self.stop.set()  # pending requests are answered before the server ends
         return web.json_response(answer, status=status)
+
+    async def _fixation(self, value: Any) -> bool:
+        """Whether the fixation point is looked at, as soon as this differs from what the page knows."""
+        try:
+            known = parse_record(FixationRequest, value).fixated
+        except ValueError as error:
+            raise web.HTTPBadRequest(text=str(error)) from None
+        assert self.session.gaze is not None
+        end = time.monotonic() + 1
+        while (fixated := self.session.gaze.fixated(time.time())) == known and time.monotonic() < end:
+            if self.stop.is_set():
+                break
+            await asyncio.sleep(_STEP_S)
+        return fixated
+
+    async def _samples_until(self, moment: float | None) -> None:
+        """Wait until gaze samples of this Unix time have come, but not for long."""
+        end = time.monotonic() + _LATEST_S
+        while moment is not None and self.session.gaze and self.session.gaze.last < moment and time.monotonic() < end:
+            await asyncio.sleep(_STEP_S)
 
     def _check_host(self, request: web.BaseRequest) -> None:
         """Refuse requests whose host name is foreign but resolves to this machine (DNS rebinding)."""
