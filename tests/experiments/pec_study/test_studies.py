@@ -10,6 +10,7 @@ from holotorch.cli import main
 from holotorch.experiments.pec_study import chart as chart_pec
 from holotorch.experiments.pec_study import studies as pec_studies
 from holotorch.experiments.pec_study.bench import Bench, Track, butterworth, grey
+from holotorch.experiments.pec_study.chart import Amount
 from holotorch.experiments.pec_study.studies import STUDIES
 
 SWEEP = {"lowpass": "[0.2]"}
@@ -46,10 +47,7 @@ def test_check_says_what_a_study_does(study, capsys):
 
 
 def test_a_small_chart_of_pec_is_complete(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(chart_pec, "SIGMAS", (0.66,))
-    monkeypatch.setattr(chart_pec, "SIZE", 32)
-    monkeypatch.setattr(chart_pec, "STEPS", 24)
-    monkeypatch.setattr(chart_pec, "LEVELS", {0.66: (0.3, 0.6)})
+    monkeypatch.setattr(chart_pec, "FULL", Amount({0.66: (0.3, 0.6)}, size=32, steps=24))
     goals = tmp_path / "goals.yaml"
     monkeypatch.setattr(chart_pec, "GOALS", goals)
     goals.write_text("solver: {0.66: {evaluations: 0.01, seconds: 0.0001}}\ntables: {}\n")
@@ -68,7 +66,7 @@ def test_a_small_chart_of_pec_is_complete(tmp_path, monkeypatch, capsys):
 def test_goals_are_read_from_the_file_beside_the_charts(tmp_path, monkeypatch):
     """Only the chart command compares them; a study has none. The committed ones fit the committed table."""
     row = {"kind": "fresnel", "sigma_px": 1.0, "solver": "L-BFGS", "evaluations_ratio": 3.0, "seconds_ratio": 1.5}
-    lines = chart_pec._verdict([row])
+    lines = chart_pec._verdict([row], chart_pec.FULL)
     assert next(line for line in lines if line.startswith("fresnel, sigma 1:")).endswith("(goal 4/1.8: not met)")
     assert lines[-1] == "targets: 32 of 32 met"
     assert [line.split(" met")[0] for line in lines[-7:-1]] == [
@@ -76,7 +74,9 @@ def test_goals_are_read_from_the_file_beside_the_charts(tmp_path, monkeypatch):
         "focus: 8 of 8",
     ]  # fmt: skip
     monkeypatch.setattr(chart_pec, "GOALS", tmp_path / "goals.yaml")
-    assert not any("goal" in line or " met" in line for line in chart_pec._verdict([row]))  # an installed package
+    assert not any(
+        "goal" in line or " met" in line for line in chart_pec._verdict([row], chart_pec.FULL)
+    )  # an installed package
     (tmp_path / "one").mkdir()
     (tmp_path / "one" / "table.csv").write_text("method,sigma_px,ssim,seconds\na,1.0,0.5,2\na,2.0,0.9,4\nb,1.0,,6\n")
     (tmp_path / "goals.yaml").write_text(
@@ -92,7 +92,7 @@ tables:
 """
     )
     words = "; not met: less (0.5, expected 0.6 to 1); not met: none (nan, expected 0 to 1)"
-    assert chart_pec._verdict([row])[-1] == f"one: 3 of 5 met{words}"
+    assert chart_pec._verdict([row], chart_pec.FULL)[-1] == f"one: 3 of 5 met{words}"
 
 
 def test_bench_scores_what_the_solver_is_not_asked(tmp_path):
