@@ -45,7 +45,7 @@ class Amount:
 
 
 FULL = Amount()
-QUICK = Amount(128, 8, (30e-3,), ("laser",), others=2)
+QUICK = Amount(96, 8, (30e-3,), ("laser",), others=2)
 
 
 def eye(quick: bool = False) -> tuple[list[dict], list[dict], dict[str, bytes], list[str]]:
